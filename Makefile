@@ -1,0 +1,49 @@
+# Every target works from a fresh clone with Python >= 3.10 and make: what it needs is installed into .venv first.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+EXTRAS := learn,view,mujoco,dev
+STRICT := $(wildcard $(addprefix src/finssim/,geometry physics control localization))
+# Named by content, so that a fresh checkout or another branch with the same requirements installs nothing again.
+STAMP := $(VENV)/.installed-$(shell cat pyproject.toml constraints.txt | cksum | cut -d ' ' -f 1)
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test check format bench docs clean
+
+help:  ## list the targets
+	@sed -n 's/^\([a-z]*\):.*##/make \1\t/p' Makefile | expand -t 16
+
+demo: $(STAMP)  ## train, evaluate and report: the whole loop, result in demo/
+	$(BIN)/finssim demo
+
+test: check  ## check, then run every test
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadgroup
+
+check: $(STAMP)  ## lint, format and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy --strict $(STRICT)
+
+format: $(STAMP)  ## put the source into the common form
+	$(BIN)/ruff check --fix-only .
+	$(BIN)/ruff format .
+
+bench: $(STAMP)  ## measure speed on this machine
+	$(BIN)/finssim bench
+
+docs: $(STAMP)  ## build the pages into site/
+	$(BIN)/mkdocs build --strict
+
+clean:  ## remove what was built, the environment included
+	rm -rf $(VENV) build dist site .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	find src tests examples -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# torch goes first and alone: where a CPU wheel is at hand pip takes it, and no later step may exchange it.
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "Python >= 3.10 is needed; name one with: make PYTHON=python3.12")'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet "$$(grep '^torch==' constraints.txt)"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[$(EXTRAS)]"
+	@rm -f $(VENV)/.installed-*
+	@touch $@

@@ -1,0 +1,170 @@
+"""Output that is either whole or absent: written beside its target under another name, then renamed into place."""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+__all__ = ["OutputError", "atomic_directory", "atomic_write"]
+
+_WHAT_TO_DO = {
+    errno.ENOSPC: "the disk is full: free some space or write elsewhere",
+    errno.EDQUOT: "the disk quota is used up: free some space or write elsewhere",
+    errno.EFBIG: "the file grew past the limit on file sizes: raise the limit or write elsewhere",
+    errno.EROFS: "the file system is read-only: write elsewhere",
+    errno.EACCES: "permission denied: write elsewhere or ask for the right to write there",
+    errno.EPERM: "not permitted there: write elsewhere",
+    errno.ENOTDIR: "part of that path is a file, not a directory: write elsewhere",
+    errno.ENOENT: "the directory cannot be made there: write elsewhere",
+    errno.ENAMETOOLONG: "the name is too long: give a shorter one",
+}
+
+
+class OutputError(OSError):
+    """An output could not be written; the message is one sentence that names the path and what to do."""
+
+
+@contextmanager
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Write one file so that a reader sees the old file or the whole new one, never a part.
+
+    Yields the path of an empty temporary file beside the target, with the target's suffix (libraries that choose a
+    format by suffix work). When the block ends well, the file is flushed to disk and renamed over the target; when it
+    raises, is interrupted or the disk fills, the temporary file is removed and the target stays as it was. Missing
+    parent directories are made. A place that cannot be written is refused on entry, before any work is done.
+
+        with atomic_write("run/report.html") as temporary:
+            temporary.write_text(html)
+
+    Args:
+        path: File to write. A symbolic link is followed.
+
+    Raises:
+        OutputError: The target is a directory or a device, or the system refused to write.
+    """
+    target = Path(os.path.realpath(path))
+    with _one_sentence(target, shown=path):
+        if target.is_dir():
+            raise OutputError(f"cannot write {path}: it is a directory: give a file name")
+        if target.exists() and not target.is_file():
+            raise OutputError(f"cannot write {path}: it is not an ordinary file: write elsewhere")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = _beside(target)
+        temporary.touch(exist_ok=False)
+        try:
+            yield temporary
+            _flush(temporary)
+            os.replace(temporary, target)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+        _flush(target.parent)
+
+
+@contextmanager
+def atomic_directory(path: str | os.PathLike[str], *, replaces: str | None = None) -> Iterator[Path]:
+    """Fill a directory so that it appears whole or not at all.
+
+    Yields an empty temporary directory beside the target. When the block ends well its files are flushed to disk and it
+    takes the target's name; when it raises or is interrupted it is removed with all it holds.
+
+        with atomic_directory("runs/hold", replaces="policy.yaml") as temporary:
+            save_network(temporary / "policy.onnx")
+
+    Args:
+        path: Directory to make. It may exist if it is empty.
+        replaces: Name of a file that marks an earlier output of the same kind. A directory holding it is replaced as a
+            whole; any other directory with files in it is refused, so that nobody's files are lost.
+
+    Raises:
+        OutputError: The target is a file or holds other files, or the system refused to write.
+    """
+    target = Path(os.path.realpath(path))
+    with _one_sentence(target, shown=path):
+        _refuse_foreign(target, path, replaces)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = _beside(target)
+        temporary.mkdir()
+        try:
+            yield temporary
+            for file in temporary.rglob("*"):
+                _flush(file)
+            _refuse_foreign(target, path, replaces)
+            _take_the_place(target, temporary)
+        except BaseException:
+            shutil.rmtree(temporary, ignore_errors=True)
+            raise
+        _flush(target.parent)
+
+
+def _refuse_foreign(target: Path, shown: str | os.PathLike[str], replaces: str | None) -> None:
+    if not target.exists():
+        return
+    if not target.is_dir():
+        raise OutputError(f"cannot write {shown}: it is a file: give a directory name")
+    ours = replaces is not None and (target / replaces).is_file()
+    if not ours and any(target.iterdir()):
+        raise OutputError(f"cannot write {shown}: the directory already holds files: give a new or empty one")
+
+
+def _take_the_place(target: Path, temporary: Path) -> None:
+    """Rename `temporary` to `target`; an earlier output steps aside first and returns if the rename fails."""
+    if not target.exists():
+        os.rename(temporary, target)
+        return
+    earlier = _beside(target)
+    os.rename(target, earlier)
+    try:
+        os.rename(temporary, target)
+    except BaseException:
+        os.rename(earlier, target)
+        raise
+    shutil.rmtree(earlier, ignore_errors=True)
+
+
+def _beside(target: Path) -> Path:
+    """A hidden, unused name in the target's directory (a rename never crosses file systems)."""
+    return target.with_name(f".{target.stem[:100]}.{secrets.token_hex(6)}.partial{target.suffix}")
+
+
+def _flush(path: Path) -> None:
+    """Wait until a file's or directory's data is on disk. Where the system cannot flush a directory, that is left out."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except PermissionError:
+        if path.is_dir():  # Windows opens no directories
+            return
+        raise
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # this file system has no fsync
+            raise
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def _one_sentence(target: Path, *, shown: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn the system's refusals to write under the target's directory into one `OutputError`."""
+    try:
+        yield
+    except OutputError:
+        raise
+    except OSError as error:
+        if error.errno not in _WHAT_TO_DO or not _about_output(error, target):
+            raise
+        raise OutputError(f"cannot write {shown}: {_WHAT_TO_DO[error.errno]}") from error
+
+
+def _about_output(error: OSError, target: Path) -> bool:
+    """Whether the error is of the output: its file is under the target's directory or above it, or is not named."""
+    if error.filename is None:
+        return True
+    named = Path(os.path.abspath(os.fsdecode(error.filename)))
+    return named.is_relative_to(target.parent) or target.is_relative_to(named)
