@@ -19,6 +19,7 @@ _WHAT_TO_DO = {
     errno.EROFS: "the file system is read-only: write elsewhere",
     errno.EACCES: "permission denied: write elsewhere or ask for the right to write there",
     errno.EPERM: "not permitted there: write elsewhere",
+    errno.EEXIST: "part of that path is a file, not a directory: write elsewhere",
     errno.ENOTDIR: "part of that path is a file, not a directory: write elsewhere",
     errno.ENOENT: "the directory cannot be made there: write elsewhere",
     errno.ENAMETOOLONG: "the name is too long: give a shorter one",
@@ -133,7 +134,7 @@ def _beside(target: Path) -> Path:
 
 
 def _flush(path: Path) -> None:
-    """Wait until a file's or directory's data is on disk. Where the system cannot flush a directory, that is left out."""
+    """Wait until a file's or directory's data is on disk, as far as the system can flush it."""
     try:
         descriptor = os.open(path, os.O_RDONLY)
     except PermissionError:

@@ -1,0 +1,166 @@
+"""Output is whole or absent, and a refusal is one sentence."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from finssim.files import OutputError, atomic_directory, atomic_write
+
+
+def entries(directory):
+    """Names in a directory, hidden ones included."""
+    return sorted(entry.name for entry in directory.iterdir())
+
+
+def test_a_file_appears_whole_and_alone(tmp_path):
+    """The target holds what was written, parents are made, and no temporary file stays."""
+    target = tmp_path / "new" / "report.html"
+    with atomic_write(target) as temporary:
+        temporary.write_text("first")
+        assert temporary.suffix == ".html" and not target.exists()
+    assert target.read_text() == "first" and entries(target.parent) == ["report.html"]
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    """An error inside the block, of any kind, keeps the earlier content and removes the part."""
+    target = tmp_path / "table.csv"
+    target.write_text("old")
+    for error in (RuntimeError("boom"), KeyboardInterrupt()):
+        with pytest.raises(type(error)), atomic_write(target) as temporary:
+            temporary.write_text("half")
+            raise error
+    assert target.read_text() == "old" and entries(tmp_path) == ["table.csv"]
+
+
+def test_new_files_follow_the_umask(tmp_path):
+    """A result is as readable as any file the user makes."""
+    (tmp_path / "plain").touch()
+    with atomic_write(tmp_path / "ours"):
+        pass
+    assert (tmp_path / "ours").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_a_symbolic_link_is_followed(tmp_path):
+    """Writing to a link writes the file it names."""
+    (tmp_path / "real").write_text("old")
+    (tmp_path / "link").symlink_to("real")
+    with atomic_write(tmp_path / "link") as temporary:
+        temporary.write_text("new")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "real").read_text() == "new"
+
+
+@pytest.mark.parametrize("atomic", [atomic_write, atomic_directory])
+def test_a_file_as_parent_is_refused_on_entry(tmp_path, atomic):
+    """The path through a file is refused before the block runs."""
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match=r"cannot write .*/file/out: part of that path is a file"):
+        with atomic(tmp_path / "file" / "out"):
+            pytest.fail("the block ran")
+
+
+@pytest.mark.parametrize("atomic", [atomic_write, atomic_directory])
+def test_a_place_that_takes_no_files_is_refused_on_entry(atomic):
+    """/proc takes no files from anyone, the superuser included."""
+    with pytest.raises(OutputError, match=r"^cannot write /proc/finssim/out: .* write elsewhere$"):
+        with atomic("/proc/finssim/out"):
+            pytest.fail("the block ran")
+
+
+def test_directories_and_devices_are_no_files(tmp_path):
+    """A directory is not replaced by a file, and a device is not replaced at all."""
+    with pytest.raises(OutputError, match="is a directory"), atomic_write(tmp_path):
+        pass
+    with pytest.raises(OutputError, match="not an ordinary file"), atomic_write(os.devnull):
+        pass
+
+
+def test_a_full_disk_leaves_nothing(tmp_path):
+    """A write past the limit on file sizes fails as on a full disk: one sentence, no file."""
+    target = tmp_path / "big.bin"
+    script = (
+        "import sys; from finssim.files import *\n"
+        "try:\n"
+        "    with atomic_write(sys.argv[1]) as temporary: temporary.write_bytes(bytes(100_000))\n"
+        "except OutputError as error: print(error)\n"
+    )
+
+    def limit():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+
+    run = subprocess.run(
+        [sys.executable, "-B", "-c", script, target],
+        preexec_fn=limit,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert run.stdout.startswith(f"cannot write {target}: the file grew past the limit")
+    assert entries(tmp_path) == []
+
+
+def test_no_space_left_is_said_so(tmp_path):
+    """ENOSPC, here from the device that is always full, becomes its sentence; the part is removed."""
+    with pytest.raises(OutputError, match=r"cannot write .*log.csv: the disk is full: free some space"):
+        with atomic_write(tmp_path / "log.csv"), open("/dev/full", "w") as full:
+            full.write("x")
+    assert entries(tmp_path) == []
+
+
+def test_an_unreadable_input_is_not_called_an_output(tmp_path):
+    """An input missing elsewhere keeps its own error."""
+    with pytest.raises(FileNotFoundError, match="nowhere"), atomic_write(tmp_path / "out"):
+        open("/nowhere/at/all")
+
+
+def test_a_directory_appears_whole(tmp_path):
+    """Until the block ends the name is free; then it holds every file, and no temporary directory stays."""
+    with atomic_directory(tmp_path / "policy") as temporary:
+        (temporary / "sub").mkdir()
+        (temporary / "sub" / "a.txt").write_text("a")
+        assert not (tmp_path / "policy").exists()
+    assert (tmp_path / "policy" / "sub" / "a.txt").read_text() == "a" and entries(tmp_path) == ["policy"]
+
+
+def test_an_interrupted_directory_leaves_nothing(tmp_path):
+    """Control-C removes the part."""
+    with pytest.raises(KeyboardInterrupt), atomic_directory(tmp_path / "policy") as temporary:
+        (temporary / "half").touch()
+        raise KeyboardInterrupt
+    assert entries(tmp_path) == []
+
+
+def test_only_an_earlier_output_is_replaced(tmp_path):
+    """A directory with the mark of its kind is replaced as a whole; anyone else's files are refused on entry."""
+    policy = tmp_path / "policy"
+    for content in ("one", "two"):
+        with atomic_directory(policy, replaces="policy.yaml") as temporary:
+            (temporary / "policy.yaml").write_text(content)
+            (temporary / content).touch()
+    assert entries(policy) == ["policy.yaml", "two"] and entries(tmp_path) == ["policy"]
+    with pytest.raises(OutputError, match="already holds files"):
+        with atomic_directory(policy, replaces="report.html"):
+            pytest.fail("the block ran")
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="it is a file"), atomic_directory(tmp_path / "file"):
+        pass
+
+
+def test_a_killed_run_leaves_no_target(tmp_path):
+    """A process killed while it writes leaves the target's name free."""
+    script = (
+        "import sys, time; from finssim.files import *\n"
+        "with atomic_write(sys.argv[1]) as temporary:\n"
+        "    temporary.write_text('half'); print('writing', flush=True); time.sleep(60)\n"
+    )
+    run = subprocess.Popen(
+        [sys.executable, "-c", script, tmp_path / "out"], stdout=subprocess.PIPE, text=True
+    )
+    assert run.stdout.readline() == "writing\n"
+    run.kill()
+    run.wait()
+    assert not (tmp_path / "out").exists()
