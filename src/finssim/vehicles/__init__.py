@@ -1,0 +1,32 @@
+"""Vehicles: one file each, read, checked and frozen."""
+
+from finssim.vehicles.body import Body, Hull, Water
+from finssim.vehicles.equipment import DepthSensor, Dvl, Imu, Mcu, Mount, Safety, Sensors, Tags
+from finssim.vehicles.errors import VehicleError
+from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
+from finssim.vehicles.loader import catalogue, load_vehicle
+from finssim.vehicles.thruster import Thruster
+from finssim.vehicles.vehicle import AXES, Provenance, Vehicle
+
+__all__ = [
+    "AXES",
+    "Body",
+    "DepthSensor",
+    "Dvl",
+    "Hull",
+    "HydrodynamicSet",
+    "Imu",
+    "Mcu",
+    "MeshSet",
+    "Mount",
+    "Provenance",
+    "Safety",
+    "Sensors",
+    "Tags",
+    "Thruster",
+    "Vehicle",
+    "VehicleError",
+    "Water",
+    "catalogue",
+    "load_vehicle",
+]

@@ -1,0 +1,154 @@
+"""Sensors, tags, motor controller and safety limits of a vehicle file."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from finssim.vehicles.part import (
+    NonNegative,
+    Part,
+    Positive,
+    Probability,
+    Quaternion,
+    Vector3,
+    Vector6,
+    identity_quaternion,
+    refuse_section,
+)
+
+
+class Mount(Part):
+    """Pose of something fixed to the vehicle."""
+
+    position: Vector3
+    """From the body origin, body frame [m], (3,)."""
+    orientation: Quaternion = identity_quaternion()
+    """Mounted frame to body frame, xyzw, (4,)."""
+
+
+class Sensor(Mount):
+    """What every sensor has."""
+
+    rate: Positive
+    """[Hz]"""
+    latency: NonNegative = 0.0
+    """Age of a sample when it is delivered [s]."""
+    dropout: Probability = 0.0
+    """Chance that a sample is lost."""
+
+
+class Imu(Sensor):
+    """Gyroscope and accelerometer, per axis."""
+
+    gyro_noise_density: NonNegative
+    """[rad/s/√Hz]"""
+    gyro_bias_walk: NonNegative
+    """[rad/s²/√Hz]"""
+    gyro_bias_initial: NonNegative
+    """Standard deviation of the bias at power-on [rad/s]."""
+    gyro_quantisation: NonNegative = 0.0
+    """Step of the output [rad/s]; 0 for none."""
+    accel_noise_density: NonNegative
+    """[m/s²/√Hz]"""
+    accel_bias_walk: NonNegative
+    """[m/s³/√Hz]"""
+    accel_bias_initial: NonNegative
+    """Standard deviation of the bias at power-on [m/s²]."""
+    accel_quantisation: NonNegative = 0.0
+    """Step of the output [m/s²]; 0 for none."""
+
+
+class DepthSensor(Sensor):
+    """Pressure sensor reporting the depth of its port."""
+
+    noise_std: NonNegative
+    """[m]"""
+    bias_initial: NonNegative = 0.0
+    """Standard deviation of the bias at power-on [m]."""
+    bias_walk: NonNegative = 0.0
+    """[m/s/√Hz]"""
+    quantisation: NonNegative = 0.0
+    """[m]; 0 for none."""
+
+
+class Dvl(Sensor):
+    """Velocity over ground, in the sensor frame."""
+
+    noise_std: NonNegative
+    """Per axis [m/s]."""
+    bias_initial: NonNegative = 0.0
+    """Standard deviation of the bias at power-on [m/s]."""
+    bias_walk: NonNegative = 0.0
+    """[m/s²/√Hz]"""
+    quantisation: NonNegative = 0.0
+    """[m/s]; 0 for none."""
+
+
+class Sensors(Part):
+    """The sensors aboard; None where there is none."""
+
+    imu: Imu | None = None
+    depth: DepthSensor | None = None
+    dvl: Dvl | None = None
+
+
+class Tags(Part):
+    """Fiducial tags on the vehicle, seen by an overhead camera.
+
+    Tag frame: x to the right and y up in the printed image, z out of the printed side.
+    """
+
+    family: str
+    """AprilTag family, such as `tag25h9`."""
+    edge: Positive
+    """Edge of the black border [m]."""
+    mounts: dict[Annotated[int, Field(ge=0)], Mount]
+    """Pose of each tag, by tag id."""
+
+
+class Mcu(Part):
+    """The motor controller at the other end of the wire."""
+
+    rpm_full_scale: Positive
+    """Shaft speed of a command of 1 [rpm]."""
+    command_timeout: Positive
+    """The controller stops the motors this long after the last command [s]."""
+    outputs: Annotated[int, Field(strict=True, ge=1)]
+    """Number of motor outputs in a command frame."""
+
+
+class Safety(Part):
+    """Limits that stop the vehicle."""
+
+    command_timeout: Positive
+    """Longest silence of the commander before thrust is zeroed [s]."""
+    telemetry_timeout: Positive
+    """Longest silence of the vehicle [s]."""
+    state_timeout: Positive
+    """Oldest state a controller may act on [s]."""
+    command_rate: Positive
+    """Rate at which commands are repeated and watched [Hz]."""
+    max_tilt: Positive
+    """[rad]"""
+    max_tilt_duration: NonNegative
+    """Time above `max_tilt` that is tolerated [s]."""
+    workspace_lower: Vector3
+    """Lower corner of the allowed box, world frame (z = 0 at the surface) [m], (3,)."""
+    workspace_upper: Vector3
+    """Upper corner [m], (3,)."""
+    wrench_scale: Vector6 = Field(default_factory=lambda: np.ones(6))
+    """Share of `wrench_limits` used on the hardware, surge sway heave roll pitch yaw, each 0 to 1."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Safety:
+        if np.any(self.workspace_lower >= self.workspace_upper):
+            raise refuse_section(
+                f"workspace_lower {self.workspace_lower.tolist()} must be below "
+                f"workspace_upper {self.workspace_upper.tolist()} on every axis"
+            )
+        if np.any(self.wrench_scale < 0.0) or np.any(self.wrench_scale > 1.0):
+            raise refuse_section(f"wrench_scale {self.wrench_scale.tolist()} must lie between 0 and 1")
+        return self

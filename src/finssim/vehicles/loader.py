@@ -1,0 +1,224 @@
+"""From a name or a file to a checked `Vehicle`."""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from finssim.vehicles.errors import VehicleError
+from finssim.vehicles.part import did_you_mean
+from finssim.vehicles.reading import read_file
+from finssim.vehicles.vehicle import Provenance, Vehicle
+
+CATALOGUE = Path(__file__).parent / "catalogue"
+
+Tree = dict[str, Any]
+Origins = dict[str, Provenance]
+
+
+def catalogue() -> list[str]:
+    """Names of the vehicles that come with FinsSim."""
+    return sorted(path.stem for path in CATALOGUE.glob("*.yaml"))
+
+
+def load_vehicle(name_or_path: str | os.PathLike[str]) -> Vehicle:
+    """Read and check a vehicle.
+
+    Args:
+        name_or_path: A catalogue name such as `finsrov`, or the path of a YAML file.
+
+    Raises:
+        VehicleError: Unknown name, or a file that is refused; the message says where, what and what to do.
+    """
+    path, shown = _locate(name_or_path)
+    values, origins = _with_parents(path, shown, ())
+    values, origins = _expand_groups(values, origins, shown)
+    vehicle = _checked(values, origins, path.stem, path, shown)
+    if vehicle.hull is not None and vehicle.hull.file is not None:
+        try:
+            vehicle.hull_mesh()
+        except VehicleError as error:
+            raise VehicleError(f"{shown}: hull: {error}") from None
+    return vehicle
+
+
+def with_changes(vehicle: Vehicle, changes: Mapping[str, Any], provenance: Provenance) -> Vehicle:
+    """See `Vehicle.replace`."""
+    values, origins = vehicle.values(), dict(vehicle.provenance)
+    for path, value in changes.items():
+        for full in _set(values, path.split("."), value, vehicle.name):
+            for key in [key for key in origins if key == full or key.startswith(full + ".")]:
+                del origins[key]
+            origins[full] = provenance
+    return _checked(values, origins, vehicle.name, vehicle.path, vehicle.name)
+
+
+def _locate(name_or_path: str | os.PathLike[str], beside: Path | None = None) -> tuple[Path, str]:
+    """The file of a vehicle and what to call it in messages; `beside` is searched before the catalogue."""
+    text = os.fspath(name_or_path)
+    path = Path(text)
+    if path.suffix in (".yaml", ".yml") or path.name != text:
+        path = path if beside is None or path.is_absolute() else beside / path
+        if not path.is_file():
+            raise VehicleError(
+                f"{text}: no such file: give the path of a vehicle file, or one of {_available()}"
+            )
+        return path, text
+    if beside is not None and (beside / f"{text}.yaml").is_file():
+        return beside / f"{text}.yaml", f"{text}.yaml"
+    path = CATALOGUE / f"{text}.yaml"
+    if not path.is_file():
+        raise VehicleError(
+            f"unknown vehicle '{text}'{did_you_mean(text, catalogue())} available: {_available()}"
+        )
+    return path, f"catalogue/{text}.yaml"
+
+
+def _available() -> str:
+    return ", ".join(catalogue())
+
+
+def _with_parents(path: Path, shown: str, children: tuple[Path, ...]) -> tuple[Tree, Origins]:
+    """Values and origins of a file merged onto the file it extends."""
+    if path.resolve() in children:
+        raise VehicleError(f"{shown}: extends itself through {' -> '.join(child.stem for child in children)}")
+    values, origins = read_file(path, shown)
+    hull = values.get("hull")
+    if isinstance(hull, dict) and isinstance(hull.get("file"), str):
+        hull["file"] = path.parent.resolve() / hull["file"]
+    parent = values.pop("extends", None)
+    if parent is None:
+        return values, origins
+    if not isinstance(parent, str):
+        raise VehicleError(f"{shown}: extends is {parent!r}, expected the name or path of a vehicle")
+    try:
+        parent_path, parent_shown = _locate(parent, beside=path.parent)
+    except VehicleError as error:
+        raise VehicleError(f"{shown}: extends: {error}") from None
+    base_values, base_origins = _with_parents(parent_path, parent_shown, (*children, path.resolve()))
+    return _merged(base_values, values, (), base_origins), base_origins | origins
+
+
+def _merged(base: Any, change: Any, path: tuple[str, ...], origins: Origins) -> Any:
+    """`change` laid over `base`: sections merge, everything else replaces, null removes."""
+    if isinstance(base, dict) and isinstance(change, dict):
+        result = dict(base)
+        for key, value in change.items():
+            inner = (*path, key)
+            if value is None:
+                result.pop(key, None)
+                _forget(inner, origins)
+            else:
+                result[key] = _merged(base.get(key), value, inner, origins)
+        return result
+    _forget(path, origins)
+    return change
+
+
+def _forget(path: tuple[str, ...], origins: Origins) -> None:
+    prefix = ".".join(path)
+    for key in [key for key in origins if key == prefix or key.startswith(prefix + ".")]:
+        del origins[key]
+
+
+def _expand_groups(values: Tree, origins: Origins, shown: str) -> tuple[Tree, Origins]:
+    """Give every thruster the numbers of its group; its own come first."""
+    groups = values.pop("thruster_groups", {})
+    thrusters = values.get("thrusters")
+    if not isinstance(groups, dict) or not isinstance(thrusters, dict):
+        return values, origins
+    for name, thruster in thrusters.items():
+        if not isinstance(thruster, dict) or "group" not in thruster:
+            continue
+        group = str(thruster["group"])
+        if group not in groups:
+            raise VehicleError(
+                f"{shown}: thrusters.{name}: group is '{group}'{did_you_mean(group, list(groups))} "
+                f"expected one of {', '.join(groups) or 'thruster_groups, which the file does not give'}"
+            )
+        for key in groups[group]:
+            if key not in thruster:
+                for source in [o for o in origins if (o + ".").startswith(f"thruster_groups.{group}.{key}.")]:
+                    origins[source.replace(f"thruster_groups.{group}", f"thrusters.{name}", 1)] = origins[
+                        source
+                    ]
+        thrusters[name] = {**groups[group], **thruster}
+    return values, {key: value for key, value in origins.items() if not key.startswith("thruster_groups.")}
+
+
+def _checked(values: Tree, origins: Origins, name: str, path: Path | None, shown: str) -> Vehicle:
+    """The vehicle, with every refusal told as one sentence."""
+    for key in ("name", "path", "provenance"):
+        if key in values:
+            raise VehicleError(f"{shown}: unknown key '{key}': the name is that of the file")
+    try:
+        return Vehicle(**values, name=name, path=path, provenance=origins)
+    except ValidationError as error:
+        sentences = [
+            _sentence(detail, shown)
+            for detail in error.errors()
+            if detail["type"] != "default_factory_not_called"
+        ]
+        raise VehicleError("\n".join(sentences)) from None
+
+
+def _sentence(detail: Any, shown: str) -> str:
+    """One pydantic complaint in the form `file: section: key value, expectation: what to do`."""
+    where = [str(item) for item in detail["loc"] if not str(item).startswith("<")]
+    kind, given, context = detail["type"], detail.get("input"), detail.get("ctx", {})
+    if kind == "section":
+        return ": ".join(filter(None, [shown, ".".join(where), context["message"]]))
+    bounds = {
+        "greater_than": ("gt", ">"),
+        "greater_than_equal": ("ge", ">="),
+        "less_than": ("lt", "<"),
+        "less_than_equal": ("le", "<="),
+    }
+    if kind == "value":
+        problem = context["message"]
+    elif kind == "missing":
+        problem = "is missing: add it, with its origin"
+    elif kind in bounds:
+        key, sign = bounds[kind]
+        problem = f"is {given}, expected {sign} {context[key]:g}"
+    elif kind == "finite_number":
+        problem = f"is {given}, expected a finite number"
+    elif kind in ("float_type", "int_type", "float_parsing", "int_parsing"):
+        problem = f"is {given!r}, expected {'a whole' if kind.startswith('int') else 'a'} number"
+    elif kind == "literal_error":
+        problem = f"is {given!r}, expected {context['expected']}"
+    elif kind in ("model_type", "model_attributes_type", "dict_type"):
+        problem = f"is {given!r}, expected a section of keys"
+    else:
+        problem = f"is {given!r}: {detail['msg']}"
+    return ": ".join(filter(None, [shown, ".".join(where[:-1]), f"{where[-1]} {problem}"]))
+
+
+def _set(tree: Any, path: list[str], value: Any, shown: str, done: tuple[str, ...] = ()) -> list[str]:
+    """Assign at a dotted path in plain values; `*` is every key. Returns the full paths assigned."""
+    key, rest = path[0], path[1:]
+    if isinstance(tree, list):
+        if not key.isdigit() or int(key) >= len(tree):
+            raise VehicleError(f"{shown}: {'.'.join(done)}: no element '{key}' in a list of {len(tree)}")
+        index: Any = int(key)
+    elif isinstance(tree, dict):
+        if key == "*":
+            return [full for name in tree for full in _set(tree, [name, *rest], value, shown, done)]
+        index = key
+        if rest and key not in tree:
+            raise VehicleError(
+                f"{shown}: {'.'.join(done) or 'top level'}: no '{key}'{did_you_mean(key, list(tree))} "
+                f"there are {', '.join(tree)}"
+            )
+    else:
+        raise VehicleError(f"{shown}: {'.'.join(done)} is a value, it has no '{key}'")
+    if rest:
+        return _set(tree[index], rest, value, shown, (*done, key))
+    tree[index] = value.tolist() if isinstance(value, np.ndarray) else copy.deepcopy(value)
+    return [".".join((*done, key))]

@@ -1,0 +1,186 @@
+"""Base class and field types of everything a vehicle file may hold.
+
+Arrays are NumPy float64, read-only, and every message names the value it refuses and what was expected.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, model_validator
+from pydantic_core import PydanticCustomError
+
+UNIT_TOLERANCE = 1e-6
+SYMMETRY_TOLERANCE = 1e-3
+"""Asymmetry accepted as rounding of printed digits, relative to the largest entry."""
+
+
+def refuse_value(message: str) -> PydanticCustomError:
+    """Error about one key; `message` continues the key's name ("is -3, expected > 0: ...")."""
+    return PydanticCustomError("value", "{message}", {"message": message})
+
+
+def refuse_section(message: str) -> PydanticCustomError:
+    """Error about a whole section; `message` stands alone."""
+    return PydanticCustomError("section", "{message}", {"message": message})
+
+
+def did_you_mean(word: str, known: list[str]) -> str:
+    """`, did you mean 'x'?` for the nearest known word, or `;` where none is near."""
+    close = difflib.get_close_matches(word, known, n=1)
+    return f", did you mean '{close[0]}'?" if close else ";"
+
+
+class Part(BaseModel):
+    """A frozen section of a vehicle file: unknown keys are refused, equality is equality of the numbers."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys_only(cls, data: Any) -> Any:
+        if isinstance(data, dict):
+            known = [name for name, field in cls.model_fields.items() if not field.exclude]
+            for key in data:
+                if key not in cls.model_fields:
+                    raise refuse_section(
+                        f"unknown key '{key}'{did_you_mean(str(key), known)} known keys: {', '.join(known)}"
+                    )
+        return data
+
+    def values(self) -> dict[str, Any]:
+        """Plain nested dict of what was given (lists for arrays), ready to be read again."""
+        return self.model_dump(exclude_unset=True)
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and self.values() == other.values()  # type: ignore[attr-defined]
+
+    def __hash__(self) -> int:
+        return hash(json.dumps(self.values(), sort_keys=True, default=str))
+
+
+def _array(value: Any, shape: tuple[int, ...], expected: str) -> NDArray[np.float64]:
+    def is_number(x: Any) -> bool:
+        return isinstance(x, (int, float, np.number)) and not isinstance(x, bool)
+
+    def refuse_non_numbers(x: Any) -> None:
+        if isinstance(x, (list, tuple)):
+            for item in x:
+                refuse_non_numbers(item)
+        elif not is_number(x):
+            raise refuse_value(f"holds {x!r}, expected {expected}")
+
+    if not isinstance(value, (list, tuple, np.ndarray)):
+        raise refuse_value(f"is {value!r}, expected {expected}")
+    if not isinstance(value, np.ndarray):
+        refuse_non_numbers(value)
+    try:
+        array = np.array(value, dtype=np.float64)
+    except ValueError:
+        raise refuse_value(f"has rows of unequal length, expected {expected}") from None
+    if array.shape != shape:
+        raise refuse_value(f"has shape {array.shape}, expected {expected}")
+    if not np.all(np.isfinite(array)):
+        raise refuse_value(f"holds {array[~np.isfinite(array)][0]}, expected finite numbers: give {expected}")
+    return array
+
+
+def _frozen(array: NDArray[np.float64]) -> NDArray[np.float64]:
+    array = array + 0.0  # -0.0 becomes 0.0, so that equal numbers have equal hashes
+    array.flags.writeable = False
+    return array
+
+
+def _vector3(value: Any) -> NDArray[np.float64]:
+    return _frozen(_array(value, (3,), "3 numbers [x, y, z]"))
+
+
+def _vector6(value: Any) -> NDArray[np.float64]:
+    return _frozen(_array(value, (6,), "6 numbers [surge, sway, heave, roll, pitch, yaw]"))
+
+
+def _positive3(value: Any) -> NDArray[np.float64]:
+    array = _vector3(value)
+    if np.any(array <= 0.0):
+        raise refuse_value(f"is {array.tolist()}, expected 3 numbers > 0")
+    return array
+
+
+def _unit(array: NDArray[np.float64], what: str) -> NDArray[np.float64]:
+    length = float(np.linalg.norm(array))
+    if abs(length - 1.0) > UNIT_TOLERANCE:
+        raise refuse_value(f"has length {length:.7g}, expected 1: give a {what}")
+    return _frozen(array / length)
+
+
+def _axis(value: Any) -> NDArray[np.float64]:
+    return _unit(_vector3(value), "body-frame unit vector")
+
+
+def _quaternion(value: Any) -> NDArray[np.float64]:
+    return _unit(_array(value, (4,), "4 numbers [x, y, z, w]"), "unit quaternion [x, y, z, w]")
+
+
+def _square(value: Any, n: int) -> NDArray[np.float64]:
+    expected = f"{n} diagonal entries or {n} rows of {n}"
+    if isinstance(value, (list, tuple, np.ndarray)) and len(value) == n and np.ndim(value[0]) == 0:
+        return np.diag(_array(value, (n,), expected))
+    return _array(value, (n, n), expected)
+
+
+def _symmetric(value: Any, n: int) -> NDArray[np.float64]:
+    matrix = _square(value, n)
+    gap = np.abs(matrix - matrix.T)
+    if gap.max() > SYMMETRY_TOLERANCE * np.abs(matrix).max():
+        i, j = np.unravel_index(int(np.argmax(gap)), gap.shape)
+        raise refuse_value(
+            f"has {matrix[i, j]:.6g} at row {i + 1}, column {j + 1} but {matrix[j, i]:.6g} across the diagonal, "
+            "expected a symmetric matrix"
+        )
+    return (matrix + matrix.T) / 2.0
+
+
+def _inertia(value: Any) -> NDArray[np.float64]:
+    matrix = _symmetric(value, 3)
+    moments = np.linalg.eigvalsh(matrix)
+    printed = ", ".join(f"{moment:.6g}" for moment in moments)
+    if moments[0] <= 0.0:
+        raise refuse_value(f"has principal moments {printed} kg m², expected all > 0")
+    if moments[2] > (moments[0] + moments[1]) * (1.0 + 1e-9):
+        raise refuse_value(
+            f"has principal moments {printed} kg m², expected the largest to be at most the sum of the other two: "
+            "no body of positive mass has these"
+        )
+    return _frozen(matrix)
+
+
+_as_lists = PlainSerializer(lambda array: array.tolist())
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
+NonNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
+Negative = Annotated[float, Field(strict=True, allow_inf_nan=False, lt=0.0)]
+NonPositive = Annotated[float, Field(strict=True, allow_inf_nan=False, le=0.0)]
+Probability = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0, le=1.0)]
+Vector3 = Annotated[NDArray[np.float64], BeforeValidator(_vector3), _as_lists]
+Positive3 = Annotated[NDArray[np.float64], BeforeValidator(_positive3), _as_lists]
+Vector6 = Annotated[NDArray[np.float64], BeforeValidator(_vector6), _as_lists]
+Axis = Annotated[NDArray[np.float64], BeforeValidator(_axis), _as_lists]
+Quaternion = Annotated[NDArray[np.float64], BeforeValidator(_quaternion), _as_lists]
+Inertia = Annotated[NDArray[np.float64], BeforeValidator(_inertia), _as_lists]
+Matrix6 = Annotated[NDArray[np.float64], BeforeValidator(lambda v: _frozen(_square(v, 6))), _as_lists]
+Symmetric6 = Annotated[NDArray[np.float64], BeforeValidator(lambda v: _frozen(_symmetric(v, 6))), _as_lists]
+
+
+def zeros(*shape: int) -> NDArray[np.float64]:
+    """Read-only zeros, for defaults that mean "none"."""
+    return _frozen(np.zeros(shape))
+
+
+def identity_quaternion() -> NDArray[np.float64]:
+    """Read-only [0, 0, 0, 1]: mounted along the body axes."""
+    return _frozen(np.array([0.0, 0.0, 0.0, 1.0]))

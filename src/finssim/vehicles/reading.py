@@ -1,0 +1,147 @@
+"""Reading one vehicle file: YAML, and the origin of every number in it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Hashable
+from pathlib import Path
+from typing import Any, get_args
+
+import yaml
+
+from finssim.vehicles.errors import VehicleError
+from finssim.vehicles.part import did_you_mean
+from finssim.vehicles.vehicle import Provenance
+
+ORIGINS: tuple[str, ...] = get_args(Provenance.__annotations__["origin"]) or (
+    "measured",
+    "published",
+    "derived",
+    "guessed",
+)
+_MARKS = ("origin", "source", "note")
+
+
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """YAML 1.2 scalars (`1e-5` is a number, `on` is a word) and no silently repeated keys."""
+
+    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen: set[Any] = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if key in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key '{key}' is given twice", key_node.start_mark
+                )
+            seen.add(key)
+        return super().construct_mapping(node, deep)  # type: ignore[no-any-return]
+
+
+_Loader.add_implicit_resolver("tag:yaml.org,2002:null", re.compile(r"^(?:~|null|)$"), ["~", "n", ""])
+_Loader.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile(r"^(?:true|false)$"), list("tf"))
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:int", re.compile(r"^[-+]?(?:0|[1-9][0-9]*)$"), list("-+0123456789")
+)
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(
+        r"^(?:[-+]?(?:\.[0-9]+|[0-9]+\.?[0-9]*)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+    ),
+    list("-+0123456789."),
+)
+
+
+def read_file(path: Path, shown: str) -> tuple[dict[str, Any], dict[str, Provenance]]:
+    """Plain values of a vehicle file, and the origin of its numbers by dotted path.
+
+    Args:
+        path: The file.
+        shown: How messages call it.
+
+    Raises:
+        VehicleError: Unreadable, malformed, or a number without an origin.
+    """
+    try:
+        tree = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
+    except (OSError, UnicodeDecodeError) as error:
+        raise VehicleError(f"{shown}: cannot be read: {error}") from None
+    except yaml.MarkedYAMLError as error:
+        line = f" line {error.problem_mark.line + 1}:" if error.problem_mark else ""
+        raise VehicleError(f"{shown}:{line} not valid YAML: {error.problem}: correct that line") from None
+    except yaml.YAMLError as error:
+        raise VehicleError(f"{shown}: not valid YAML: {error}") from None
+    if not isinstance(tree, dict):
+        raise VehicleError(
+            f"{shown}: holds {type(tree).__name__}, expected sections such as 'body:' and 'thrusters:'"
+        )
+    provenance: dict[str, Provenance] = {}
+    values = _plain(tree, (), None, provenance, shown)
+    return values, provenance
+
+
+def _plain(
+    node: Any, path: tuple[str, ...], inherited: Provenance | None, found: dict[str, Provenance], shown: str
+) -> Any:
+    """Strip the origin marks from a tree, recording what they say about the numbers below them."""
+    if isinstance(node, dict):
+        here = _marked(node, path, inherited, shown)
+        if "value" in node:
+            for key in node:
+                if key not in ("value", *_MARKS):
+                    raise VehicleError(f"{shown}: {_where(path)}: unknown key '{key}' beside 'value'")
+            return _plain(node["value"], path, here, found, shown)
+        return {
+            str(key): _plain(value, (*path, str(key)), here, found, shown)
+            for key, value in node.items()
+            if key not in _MARKS
+        }
+    if isinstance(node, list):
+        items = [_plain(item, (*path, str(i)), inherited, found, shown) for i, item in enumerate(node)]
+        _fold(path, len(items), found)
+        return items
+    if isinstance(node, (int, float)) and not isinstance(node, bool):
+        if inherited is None:
+            raise VehicleError(
+                f"{shown}: {_where(path[:-1])}: {path[-1]} has no origin: write "
+                f"{{value: {node}, origin: measured, source: ...}} or give 'origin:' to its section or to the file"
+            )
+        found[".".join(path)] = inherited
+    return node
+
+
+def _marked(
+    node: dict[Any, Any], path: tuple[str, ...], inherited: Provenance | None, shown: str
+) -> Provenance | None:
+    """Origin in force inside a mapping: a new `origin` starts afresh, a new `source` or `note` refines."""
+    for mark in _MARKS:
+        if mark in node and not isinstance(node[mark], str):
+            raise VehicleError(f"{shown}: {_where(path)}: {mark} is {node[mark]!r}, expected words")
+    source, note = node.get("source", ""), node.get("note", "")
+    if "origin" in node:
+        origin = node["origin"]
+        if origin not in ORIGINS:
+            raise VehicleError(
+                f"{shown}: {_where(path)}: origin is '{origin}'{did_you_mean(origin, list(ORIGINS))} "
+                f"expected one of {', '.join(ORIGINS)}"
+            )
+        return Provenance(origin, source, note)
+    if inherited is None or not (source or note):
+        return inherited
+    return Provenance(
+        inherited.origin, source or inherited.source, note or ("" if source else inherited.note)
+    )
+
+
+def _fold(path: tuple[str, ...], length: int, found: dict[str, Provenance]) -> None:
+    """One entry for a list whose elements share their origin."""
+    keys = [".".join((*path, str(i))) for i in range(length)]
+    if keys and all(key in found for key in keys) and len({found[key] for key in keys}) == 1:
+        found[".".join(path)] = found[keys[0]]
+        for key in keys:
+            del found[key]
+
+
+def _where(path: tuple[str, ...]) -> str:
+    return ".".join(path) or "top level"

@@ -1,0 +1,223 @@
+"""The vehicle: everything a file says about it, and the matrices that follow directly."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationInfo, field_validator, model_validator
+
+from finssim.vehicles.body import Body, Hull, Water, moved_to_origin, skew
+from finssim.vehicles.equipment import Mcu, Safety, Sensors, Tags
+from finssim.vehicles.errors import VehicleError
+from finssim.vehicles.hydrodynamics import AnyHydrodynamicSet, HydrodynamicSet, MeshSet
+from finssim.vehicles.part import Part, Vector3, did_you_mean, refuse_section, refuse_value
+from finssim.vehicles.thruster import Thruster
+
+AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+
+Array = NDArray[np.float64]
+
+
+class Provenance(NamedTuple):
+    """Where a number comes from."""
+
+    origin: Literal["measured", "published", "derived", "guessed"]
+    source: str = ""
+    note: str = ""
+
+
+class Vehicle(Part):
+    """One vehicle. Frames: body x forward, y left, z up; wrenches and twists are linear then angular."""
+
+    title: str
+    """One line naming the vehicle and the set of numbers."""
+    description: str
+    """What it is, and what to know before using the numbers."""
+    water: Water
+    body: Body
+    hull: Hull | None = None
+    hydrodynamics: dict[str, AnyHydrodynamicSet]
+    """Sets by name: `calibrated`, `simplified`, `mesh`; only what the sources give."""
+    thrusters: dict[str, Thruster]
+    """By name, in the canonical order of every thruster vector."""
+    controlled_axes: tuple[Literal["surge", "sway", "heave", "roll", "pitch", "yaw"], ...] = AXES
+    """Axes the thrusters are there to control; the others are left to the water (an underactuated vehicle)."""
+    wrench_reference: Vector3 = Field(default_factory=lambda given: given["body"].center_of_gravity)
+    """Body point about which wrenches are commanded [m], (3,); the centre of gravity where the file gives none."""
+    sensors: Sensors = Field(default_factory=Sensors)
+    tags: Tags | None = None
+    mcu: Mcu | None = None
+    safety: Safety | None = None
+    name: str = Field(exclude=True)
+    """Name of the file without its suffix."""
+    path: Path | None = Field(default=None, exclude=True)
+    """The file it was read from."""
+    provenance: dict[str, Provenance] = Field(default_factory=dict, exclude=True)
+    """Origin of the numbers by dotted path; see `origin_of`."""
+
+    @field_validator("controlled_axes", mode="before")
+    @classmethod
+    def _as_tuple(cls, value: Any) -> Any:
+        if not isinstance(value, (list, tuple)) or not set(map(str, value)) <= set(AXES) or not value:
+            raise refuse_value(f"is {value!r}, expected a list drawn from {', '.join(AXES)}")
+        return tuple(axis for axis in AXES if axis in value)
+
+    @field_validator("hydrodynamics", "thrusters")
+    @classmethod
+    def _not_empty(cls, value: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+        if not value:
+            raise refuse_value("is empty, expected at least one entry")
+        return value
+
+    @model_validator(mode="after")
+    def _solvable(self) -> Vehicle:
+        for name, hydrodynamic_set in self.hydrodynamics.items():
+            smallest = float(np.linalg.eigvalsh(self.mass_matrix(name))[0])
+            if smallest <= 0.0:
+                raise refuse_section(
+                    f"hydrodynamics.{name}: added_mass makes M_RB + M_A not positive definite "
+                    f"(smallest eigenvalue {smallest:.4g}): no acceleration would follow from a force"
+                )
+            if isinstance(hydrodynamic_set, MeshSet) and self.hull is None:
+                raise refuse_section(
+                    f"hydrodynamics.{name}: needs a hull: give 'hull: {{parametric: true}}' or a mesh file"
+                )
+        return self
+
+    # -- numbers that follow directly -------------------------------------------------------------------------
+
+    @property
+    def thruster_names(self) -> tuple[str, ...]:
+        """Names in canonical order."""
+        return tuple(self.thrusters)
+
+    @property
+    def force_limits(self) -> tuple[Array, Array]:
+        """Lower and upper thrust in canonical order [N], (n,) each."""
+        lower = np.array([thruster.force_min for thruster in self.thrusters.values()])
+        upper = np.array([thruster.force_max for thruster in self.thrusters.values()])
+        return lower, upper
+
+    def thruster_matrix(self, point: Any = (0.0, 0.0, 0.0)) -> Array:
+        """B of tau = B f, for unit thrust in canonical order.
+
+        B = [a_1 ... a_n; (r_1 - point) × a_1 ... ]                                       (paper, eq. 17)
+
+        Args:
+            point: Body point about which moments are taken [m], (3,).
+
+        Returns:
+            Body frame, [-] and [m], (6, n).
+        """
+        axes = np.array([thruster.axis for thruster in self.thrusters.values()])
+        arms = np.array([thruster.position for thruster in self.thrusters.values()]) - np.asarray(point)
+        return np.vstack([axes.T, np.cross(arms, axes).T])
+
+    @property
+    def control_matrix(self) -> Array:
+        """B about `wrench_reference`, (6, n)."""
+        return self.thruster_matrix(self.wrench_reference)
+
+    @cached_property
+    def wrench_limits(self) -> Array:
+        """Largest wrench on each axis alone that the thrusters give in both directions [N, N m], (6,).
+
+        See `finssim.vehicles.capability.wrench_capability`; zero on axes that are not controlled.
+        """
+        from finssim.vehicles.capability import wrench_capability  # SciPy is slow to import
+
+        return np.asarray(wrench_capability(self).symmetric)
+
+    def rigid_body_mass_matrix(self) -> Array:
+        """M_RB about the body origin, (6, 6) [kg, kg m, kg m²]                       (Fossen 2021, eq. 3.49)."""
+        m, S = self.body.mass, skew(self.body.center_of_gravity)
+        return np.block([[m * np.eye(3), -m * S], [m * S, self.body.inertia - m * S @ S]])
+
+    def added_mass_matrix(self, name: str = "calibrated") -> Array:
+        """M_A of a set about the body origin, (6, 6) [kg, kg m, kg m²]."""
+        chosen = self.hydrodynamic_set(name)
+        return moved_to_origin(chosen.added_mass, chosen.reference_point)
+
+    def mass_matrix(self, name: str = "calibrated") -> Array:
+        """M_RB + M_A about the body origin, (6, 6) [kg, kg m, kg m²]."""
+        return self.rigid_body_mass_matrix() + self.added_mass_matrix(name)
+
+    def hydrodynamic_set(self, name: str) -> HydrodynamicSet | MeshSet:
+        """The set of that name.
+
+        Raises:
+            VehicleError: The file has no such set.
+        """
+        if name not in self.hydrodynamics:
+            raise VehicleError(
+                f"{self.name} has no hydrodynamic set '{name}'; available: {', '.join(self.hydrodynamics)}"
+            )
+        return self.hydrodynamics[name]
+
+    @property
+    def weight(self) -> float:
+        """[N]"""
+        return self.body.mass * self.water.gravity
+
+    @property
+    def buoyancy(self) -> float:
+        """Fully submerged [N]."""
+        return self.water.density * self.water.gravity * self.body.displaced_volume
+
+    def hull_mesh(self) -> tuple[Array, NDArray[np.int32]]:
+        """Vertices (n, 3) [m, body frame] and faces (m, 3) of the closed hull, normals outward.
+
+        Raises:
+            VehicleError: The file gives no hull, or its mesh cannot be used.
+        """
+        from finssim.vehicles.hull import hull_mesh
+
+        return hull_mesh(self)
+
+    # -- identity ---------------------------------------------------------------------------------------------
+
+    @cached_property
+    def sha256(self) -> str:
+        """Digest of every number of the vehicle and of its hull mesh; titles and comments do not enter."""
+        values = self.values()
+        for prose in ("title", "description"):
+            values.pop(prose)
+        if self.hull is not None and self.hull.file is not None:
+            values["hull"] = {"sha256": hashlib.sha256(self.hull.file.read_bytes()).hexdigest()}
+        values["thruster_names"] = self.thruster_names  # their order is part of the meaning
+        return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
+
+    def origin_of(self, path: str) -> Provenance:
+        """Provenance of the number at a dotted path, `body.mass` or `hydrodynamics.calibrated.linear_damping.3`.
+
+        Raises:
+            VehicleError: Nothing there has an origin.
+        """
+        parts = path.split(".")
+        for length in range(len(parts), 0, -1):
+            found = self.provenance.get(".".join(parts[:length]))
+            if found is not None:
+                return found
+        raise VehicleError(f"{self.name}: no number at '{path}'{did_you_mean(path, list(self.provenance))}")
+
+    def replace(self, changes: Mapping[str, Any], provenance: Provenance | None = None) -> Vehicle:
+        """A new vehicle with some values changed, checked like a file.
+
+        Args:
+            changes: Values by dotted path: `{"body.mass": 11.6, "thrusters.*.force_max": 5.0}`. `*` stands for every
+                entry, a number for a row or element of an array.
+            provenance: Origin of the new values; `guessed` where none is given.
+
+        Raises:
+            VehicleError: A path does not exist or a value is refused.
+        """
+        from finssim.vehicles.loader import with_changes
+
+        return with_changes(self, changes, provenance or Provenance("guessed", "", "changed in a program"))
