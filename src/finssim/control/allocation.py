@@ -1,0 +1,203 @@
+"""Wrench allocation: the thrusts that come nearest to a wanted wrench within the thrusters' limits, solved exactly.
+
+    min_f ||W (B f - tau)||^2 + lambda ||f||^2   with   f- <= f <= f+                  (paper, eq. 18)
+
+With H = B' W^2 B + lambda I and the unconstrained optimum f0 = H^-1 B' W^2 tau, the problem is
+min (f - f0)' H (f - f0) in the box. Once the set C of thrusters that sit at a limit is known, displaced there by
+d = f_C - f0_C, everything else is linear in d:
+
+    thrust of the others   f_F = f0_F - H_FF^-1 H_FC d
+    multipliers at limits  mu  = (H_CC - H_CF H_FF^-1 H_FC) d
+
+Eight thrusters have 256 such sets, so one 8x8 table per set (`allocation_tables`) holds both maps. The
+search for the right set is principal pivoting: change every thruster that breaks its optimality condition at once
+(Judice and Pires, 1994), and one at a time (Murty's rule, which cannot cycle) when that stops making progress.
+The entries of the tables stay of order one however small lambda is, which is what lets float32 solve the problem.
+"""
+
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,valid-type,misc,untyped-decorator"
+# ruff: noqa: UP018  (`int(0)` is how Warp is told that a number changes inside a loop)
+
+import warp as wp
+
+from finssim.physics.types import MAX_THRUSTERS, vec6, vec8
+
+__all__ = ["AllocationData", "allocate", "allocate_kernel", "allocation_residual", "residual_kernel"]
+
+BLOCK_PATIENCE = wp.constant(3)
+"""Block pivots without progress before single pivots take over."""
+
+MAX_PIVOTS = wp.constant(512)
+"""Bound on the pivots of one allocation. Of two million wrenches on vehicles' layouts none needed more than 7, of
+twenty million on random thruster matrices none more than 103."""
+
+TOLERANCE = wp.constant(2.0e-6)
+"""Rounding allowed in a free thruster's limit, relative to the unlimited thrusts (float32 carries 6e-8).
+
+The multipliers need none: a thruster clamped for exceeding its limit by this much has a multiplier of the right sign.
+"""
+
+
+@wp.struct
+class AllocationData:
+    """What `allocate` needs to know of each vehicle type; built by `allocation_data`, first index the type."""
+
+    gain: wp.array2d(dtype=vec8)
+    """Columns of H^-1 B' W^2: thrust per unit of wanted wrench [N/N, N/(N m)], (vehicles, 6)."""
+
+    clamped: wp.array3d(dtype=vec8)
+    """Columns of the map d -> (f_F - f0_F, mu) for every set C (bit i: thruster i at a limit), (vehicles, 256, 8)."""
+
+    hessian: wp.array2d(dtype=vec8)
+    """Columns of H / h, h the mean of its diagonal, (vehicles, 8)."""
+
+    lower: wp.array(dtype=vec8)
+    """Least thrust [N], (vehicles,)."""
+
+    upper: wp.array(dtype=vec8)
+    """Greatest thrust [N], (vehicles,)."""
+
+
+@wp.func
+def clip(f: vec8, lower: vec8, upper: vec8) -> vec8:
+    """`f` moved exactly onto the bounds it exceeds; NaN stays NaN."""
+    g = f
+    for i in range(MAX_THRUSTERS):
+        g[i] = wp.where(f[i] < lower[i], lower[i], wp.where(f[i] > upper[i], upper[i], f[i]))
+    return g
+
+
+@wp.func
+def unconstrained(tau: vec6, vehicle: int, data: AllocationData) -> vec8:
+    """Optimum without limits, f0 = H^-1 B' W^2 tau [N]."""
+    f0 = vec8()
+    for j in range(6):
+        f0 += data.gain[vehicle, j] * tau[j]
+    return f0
+
+
+@wp.func
+def bounded(f0: vec8, vehicle: int, data: AllocationData) -> vec8:
+    """Minimiser of (f - f0)' H (f - f0) within the limits, by principal pivoting [N]."""
+    lower = data.lower[vehicle]
+    upper = data.upper[vehicle]
+    size = float(0.0)
+    at_lower = int(0)
+    at_upper = int(0)
+    for i in range(MAX_THRUSTERS):
+        size = wp.max(size, wp.abs(f0[i]))
+        at_upper += wp.where(f0[i] > upper[i], 1 << i, 0)
+        at_lower += wp.where(f0[i] < lower[i], 1 << i, 0)
+    tolerance = TOLERANCE * size
+
+    f = f0
+    fewest = int(MAX_THRUSTERS + 1)
+    patience = int(BLOCK_PATIENCE)
+    for _pivot in range(MAX_PIVOTS):
+        clamped = at_lower | at_upper
+        y = vec8()
+        for j in range(MAX_THRUSTERS):
+            if (clamped >> j) & 1 != 0:
+                bound = wp.where((at_upper >> j) & 1 != 0, upper[j], lower[j])
+                f[j] = bound
+                y += data.clamped[vehicle, clamped, j] * (bound - f0[j])
+
+        # A free thruster must be within its limits; one at a limit must be pressed against it (mu <= 0 at the upper).
+        want_lower = int(0)
+        want_upper = int(0)
+        broken = int(0)
+        for i in range(MAX_THRUSTERS):
+            bit = 1 << i
+            if clamped & bit == 0:
+                f[i] = f0[i] + y[i]
+                if f[i] > upper[i] + tolerance:
+                    want_upper += bit
+                    broken += 1
+                elif f[i] < lower[i] - tolerance:
+                    want_lower += bit
+                    broken += 1
+            elif at_upper & bit != 0:
+                if y[i] > 0.0:
+                    broken += 1
+                else:
+                    want_upper += bit
+            else:
+                if y[i] < 0.0:
+                    broken += 1
+                else:
+                    want_lower += bit
+        if broken == 0:
+            break
+
+        change = (at_lower ^ want_lower) | (at_upper ^ want_upper)
+        if broken < fewest:
+            fewest = broken
+            patience = int(BLOCK_PATIENCE)
+        elif patience > 0:
+            patience -= 1
+        if patience == 0:
+            change = highest_bit(change)
+        at_lower = (at_lower & ~change) | (want_lower & change)
+        at_upper = (at_upper & ~change) | (want_upper & change)
+    return clip(f, lower, upper)
+
+
+@wp.func
+def highest_bit(mask: int) -> int:
+    """The highest of the bits set in an 8-bit mask, alone."""
+    bit = int(128)
+    while bit & mask == 0 and bit > 1:
+        bit >>= 1
+    return bit
+
+
+@wp.func
+def allocate(tau: vec6, vehicle: int, data: AllocationData) -> vec8:
+    """Thrusts nearest to a wanted wrench within the limits (paper, eq. 18), for one vehicle.
+
+    Args:
+        tau: Wanted wrench about the point that B was computed for, body frame [N, N m].
+        vehicle: Vehicle type, first index into `data`.
+        data: From `allocation_data`.
+
+    Returns:
+        Thrusts in the canonical order [N], never outside the limits. A wrench holding NaN gives NaN.
+    """
+    f0 = unconstrained(tau, vehicle, data)
+    excess = wp.max(wp.max(f0 - data.upper[vehicle]), wp.max(data.lower[vehicle] - f0))
+    if excess > 0.0:
+        return bounded(f0, vehicle, data)
+    return f0
+
+
+@wp.func
+def allocation_residual(f: vec8, tau: vec6, vehicle: int, data: AllocationData) -> float:
+    """Distance of `f` from optimality, max_i |f - clip(f - H (f - f0) / h)| [N]: zero only there."""
+    error = f - unconstrained(tau, vehicle, data)
+    gradient = vec8()
+    for j in range(MAX_THRUSTERS):
+        gradient += data.hessian[vehicle, j] * error[j]
+    step = f - clip(f - gradient, data.lower[vehicle], data.upper[vehicle])
+    return wp.max(wp.max(step), -wp.min(step))
+
+
+@wp.kernel(enable_backward=False)
+def allocate_kernel(
+    tau: wp.array(dtype=vec6), vehicle: wp.array(dtype=int), data: AllocationData, f: wp.array(dtype=vec8)
+):
+    """`allocate` for every world: wanted wrenches (worlds,) and vehicle types (worlds,) in, thrusts (worlds,) out."""
+    world = wp.tid()
+    f[world] = allocate(tau[world], vehicle[world], data)
+
+
+@wp.kernel(enable_backward=False)
+def residual_kernel(
+    f: wp.array(dtype=vec8),
+    tau: wp.array(dtype=vec6),
+    vehicle: wp.array(dtype=int),
+    data: AllocationData,
+    residual: wp.array(dtype=float),
+):
+    """`allocation_residual` for every world [N], (worlds,)."""
+    world = wp.tid()
+    residual[world] = allocation_residual(f[world], tau[world], vehicle[world], data)
