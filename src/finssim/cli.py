@@ -1,0 +1,264 @@
+"""The `finssim` command. Each handler imports what it runs, so that `finssim --help` answers at once."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from finssim import __version__, boundary
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    name="finssim",
+    help="Simulate underwater vehicles, train controllers for them, and check both against published measurements.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+)
+vehicles_app = typer.Typer(invoke_without_command=True, rich_markup_mode=None, add_completion=False)
+app.add_typer(vehicles_app, name="vehicles")
+
+Vehicle = Annotated[
+    str, typer.Option(help="Vehicle of the catalogue, or the path of a vehicle file.", metavar="NAME|FILE")
+]
+Hydrodynamics = Annotated[
+    str, typer.Option(help="Hydrodynamic model: calibrated, simplified or mesh.", metavar="MODEL")
+]
+Seed = Annotated[
+    int, typer.Option(help="Seed of every random number; equal seeds give equal results.", min=0)
+]
+Device = Annotated[str, typer.Option(help="Where to compute: cpu or cuda.", metavar="DEVICE")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
+
+
+def main() -> None:
+    """Run the command line and exit: 0 well, 1 a fault of FinsSim, 2 a refused input, 130 interrupted."""
+    sys.exit(boundary.run(app, sys.argv[1:]))
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"finssim {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _finssim(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version.", callback=_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Units are SI and radians unless an option's name says otherwise; z is up, and 0 on the still water surface."""
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Directory of the policy, the figures and the report.")] = Path(
+        "demo"
+    ),
+) -> None:
+    """Train a policy, evaluate it beside two PIDs on the eight published setpoints, write a report.
+
+    Example: finssim demo --out demo
+    """
+    from finssim.experiments.demo import demo as run
+
+    run(out)
+
+
+@app.command()
+def train(
+    task: Annotated[str, typer.Argument(help="Task to learn: t1 (station keeping).", metavar="TASK")],
+    out: Annotated[Path, typer.Option(help="Directory of the policy; an earlier policy there is replaced.")],
+    vehicle: Vehicle = "finsrov",
+    hydrodynamics: Hydrodynamics = "calibrated",
+    action: Annotated[
+        str, typer.Option(help="What the policy commands: wrench6 or thruster8.", metavar="MODE")
+    ] = "wrench6",
+    randomize: Annotated[
+        str | None,
+        typer.Option(
+            help="Ranges the vehicle and its water are drawn from: a file, or a name that ships.",
+            metavar="FILE",
+        ),
+    ] = None,
+    seed: Seed = 42,
+    worlds: Annotated[int | None, typer.Option(help="Worlds simulated at once.", min=1)] = None,
+    steps: Annotated[
+        int | None, typer.Option(help="Control steps to learn from, all worlds together.", min=1)
+    ] = None,
+    device: Device = "cpu",
+) -> None:
+    """Train a policy and write it to a directory that runs without the learner.
+
+    Example: finssim train t1 --vehicle finsrov --seed 1 --out runs/hold
+    """
+    from finssim.learning.train import train as run
+
+    run(
+        task,
+        vehicle=vehicle,
+        hydrodynamics=hydrodynamics,
+        action=action,
+        randomize=randomize,
+        seed=seed,
+        worlds=worlds,
+        steps=steps,
+        device=device,
+        out=out,
+    )
+
+
+@app.command()
+def evaluate(
+    controller: Annotated[
+        str, typer.Argument(help="A policy's directory, or pid, or pid-paper.", metavar="DIR|pid|pid-paper")
+    ],
+    task: Annotated[
+        str, typer.Option(help="Task to be tried on: t1 (station keeping).", metavar="TASK")
+    ] = "t1",
+    vehicle: Vehicle = "finsrov",
+    hydrodynamics: Hydrodynamics = "calibrated",
+    plant: Annotated[
+        str | None,
+        typer.Option(help="What differs from the vehicle file: a plant's name or file.", metavar="FILE|NAME"),
+    ] = None,
+    trials: Annotated[
+        int | None, typer.Option(help="Trials of 60 s; 8 are the published setpoints.", min=1)
+    ] = None,
+    seed: Seed = 42,
+    out: Annotated[Path | None, typer.Option(help="Directory for the table, JSON and figure.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Try a controller: success, errors [m, deg], time to settle [s], tracking cost.
+
+    Example: finssim evaluate runs/hold --plant current --trials 64 --out runs/hold-current
+    """
+    from finssim.learning.evaluate import evaluate as run
+
+    run(
+        controller,
+        task=task,
+        vehicle=vehicle,
+        hydrodynamics=hydrodynamics,
+        plant=plant,
+        trials=trials,
+        seed=seed,
+        out=out,
+        json=as_json,
+    )
+
+
+@app.command()
+def simulate(
+    vehicle: Annotated[
+        str,
+        typer.Option(help="Vehicle of the catalogue, or the path of a vehicle file.", metavar="NAME|FILE"),
+    ],
+    command: Annotated[
+        str,
+        typer.Option(
+            help='Constant wrench: "surge=10 yaw=1". surge sway heave in N, roll pitch yaw in N m; the rest is 0.',
+            metavar="WRENCH",
+        ),
+    ],
+    duration: Annotated[float, typer.Option(help="Simulated time [s].")],
+    out: Annotated[Path, typer.Option(help="File to write, one row per control step: .csv or .parquet.")],
+    hydrodynamics: Hydrodynamics = "calibrated",
+    depth: Annotated[float, typer.Option(help="Depth of the body origin at the start [m].")] = 0.5,
+    device: Device = "cpu",
+) -> None:
+    """Simulate a vehicle from rest under a constant wrench and record its motion.
+
+    Example: finssim simulate --vehicle finsrov --command "surge=10 yaw=1" --duration 10 --out run.csv
+    """
+    from finssim.experiments.simulate import simulate as run
+
+    run(
+        vehicle=vehicle,
+        command=command,
+        duration=duration,
+        hydrodynamics=hydrodynamics,
+        depth=depth,
+        device=device,
+        out=out,
+    )
+
+
+@vehicles_app.callback()
+def _vehicles(context: typer.Context) -> None:
+    """List the vehicles of the catalogue; `show NAME` prints one in full.
+
+    Example: finssim vehicles
+    """
+    if context.invoked_subcommand is None:
+        from rich.console import Console
+
+        from finssim.vehicles.show import print_catalogue
+
+        print_catalogue(Console())
+
+
+@vehicles_app.command("show")
+def _show(
+    name: Annotated[
+        str,
+        typer.Argument(help="Vehicle of the catalogue, or the path of a vehicle file.", metavar="NAME|FILE"),
+    ],
+    picture: Annotated[
+        Path | None, typer.Option(help="Also draw the thruster layout into this file (.png, .svg).")
+    ] = None,
+) -> None:
+    """Print mass [kg], trim, terminal speeds, wrench capability [N, N m], time constants [s] and thrusters.
+
+    Example: finssim vehicles show finsrov --picture finsrov.png
+    """
+    from rich.console import Console
+
+    from finssim.vehicles import load_vehicle
+    from finssim.vehicles.show import print_vehicle
+
+    print_vehicle(load_vehicle(name), Console(), picture)
+
+
+@app.command()
+def validate(
+    name: Annotated[str, typer.Argument(help="Vehicle with published responses: finsrov.", metavar="NAME")],
+    as_json: Json = False,
+) -> None:
+    """Print simulated beside published pool responses, and say where they disagree.
+
+    Example: finssim validate finsrov
+    """
+    from finssim.experiments.validate import validate as run
+
+    run(name, json=as_json)
+
+
+@app.command()
+def bench(as_json: Json = False) -> None:
+    """Measure this machine's speed: physics steps/s, environment steps/s, mesh faces/s.
+
+    Example: finssim bench --json > bench.json
+    """
+    from finssim.experiments.bench import bench as run
+
+    run(json=as_json)
+
+
+@app.command()
+def doctor(as_json: Json = False) -> None:
+    """Say what is installed, which devices compute, and what each missing extra would enable.
+
+    Example: finssim doctor
+    """
+    from finssim.doctor import doctor as run
+
+    if not run(json=as_json):
+        raise typer.Exit(1)

@@ -1,0 +1,172 @@
+"""`finssim doctor`: what is installed, which devices compute, what each missing extra would enable."""
+
+# No postponed annotations here: Warp reads those of its kernels.
+import json as json_module
+import os
+import platform
+from dataclasses import dataclass
+from typing import Any
+
+from finssim.provenance import package_versions, revision
+
+__all__ = ["EXTRAS", "EXTRA_OF_MODULE", "Extra", "doctor", "examine"]
+
+CORE = ("numpy", "scipy", "warp-lang", "pydantic", "PyYAML", "typer", "rich", "onnxruntime")
+"""Distributions FinsSim cannot do without."""
+
+
+@dataclass(frozen=True)
+class Extra:
+    """One optional part of the installation."""
+
+    distributions: dict[str, str]
+    """Distribution that pip installs -> module that Python imports."""
+    enables: str
+    """What a user can do once it is installed."""
+
+
+EXTRAS = {
+    "learn": Extra(
+        {
+            "torch": "torch",
+            "stable-baselines3": "stable_baselines3",
+            "gymnasium": "gymnasium",
+            "tensorboard": "tensorboard",
+            "onnx": "onnx",
+            "onnxscript": "onnxscript",
+            "matplotlib": "matplotlib",
+        },
+        "train policies, use the Gymnasium environments, draw figures and reports",
+    ),
+    "view": Extra(
+        {"matplotlib": "matplotlib", "viser": "viser"}, "draw pictures of vehicles and figures of evaluations"
+    ),
+    "mujoco": Extra({"mujoco": "mujoco"}, "simulate with MuJoCo's contacts, and compare speeds with it"),
+    "vision": Extra({"opencv-python-headless": "cv2"}, "nothing yet: kept for localization by camera"),
+    "ros2": Extra({"cyclonedds": "cyclonedds", "rosbags": "rosbags"}, "nothing yet: kept for ROS 2"),
+    "hardware": Extra({"pyserial": "serial"}, "nothing yet: kept for the link to a vehicle"),
+}
+
+EXTRA_OF_MODULE = {
+    module: name for name, extra in reversed(EXTRAS.items()) for module in extra.distributions.values()
+}
+"""Module that Python could not import -> extra that installs it."""
+
+
+def doctor(*, json: bool = False) -> bool:
+    """Print the examination.
+
+    Args:
+        json: Print one JSON object instead of text.
+
+    Returns:
+        Whether what everything needs is there: the core packages, and a processor that computes.
+    """
+    found = examine()
+    if json:
+        print(json_module.dumps(found, indent=2))
+    else:
+        _print(found)
+    return bool(found["healthy"])
+
+
+def examine() -> dict[str, Any]:
+    """What is installed and works, as plain values.
+
+    Returns:
+        `healthy`; `machine`; `core` (name -> version or None); `devices`, each with `name`, `works`, `detail`; `extras`
+        (name -> `complete`, `versions`, `missing`, `enables`).
+    """
+    core = package_versions(CORE)
+    devices = _devices() if "warp-lang" in core else []
+    extras = {}
+    for name, extra in EXTRAS.items():
+        versions = package_versions(tuple(extra.distributions))
+        missing = [distribution for distribution in extra.distributions if distribution not in versions]
+        extras[name] = {
+            "complete": not missing,
+            "versions": versions,
+            "missing": missing,
+            "enables": extra.enables,
+        }
+    works = any(device["name"] == "cpu" and device["works"] for device in devices)
+    return {
+        "healthy": works and len(core) == len(CORE),
+        "machine": {
+            "system": platform.platform(),
+            "python": platform.python_version(),
+            "cores": os.cpu_count(),
+            "revision": revision(),
+        },
+        "core": {name: core.get(name) for name in CORE},
+        "devices": devices,
+        "extras": extras,
+    }
+
+
+def _devices() -> list[dict[str, Any]]:
+    """Every device Warp knows, each tried with a real kernel."""
+    import numpy as np
+    import warp as wp
+
+    from finssim.quiet import start_warp
+
+    start_warp()
+
+    @wp.kernel
+    def square(x: wp.array(dtype=float), y: wp.array(dtype=float)):  # type: ignore[valid-type]
+        i = wp.tid()
+        y[i] = x[i] * x[i]
+
+    def attempt(device: Any) -> dict[str, Any]:
+        answer = {"name": device.alias, "works": True, "detail": device.name}
+        try:
+            x = wp.array(np.arange(100.0), dtype=float, device=device)
+            y = wp.zeros_like(x)
+            wp.launch(square, dim=100, inputs=[x, y], device=device)
+            if not np.array_equal(y.numpy(), np.arange(100.0) ** 2):
+                answer.update(works=False, detail="a kernel ran and gave a wrong answer")
+        except Exception as error:  # whatever a driver raises is the finding
+            answer.update(works=False, detail=" ".join(str(error).split()) or type(error).__name__)
+        return answer
+
+    found = [attempt(device) for device in wp.get_devices()]
+    if not wp.is_cuda_available():
+        found.append({"name": "cuda", "works": False, "detail": "no NVIDIA GPU or driver found"})
+    return found
+
+
+def _print(found: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    machine = found["machine"]
+    console.print(
+        f"Python {machine['python']} on {machine['system']}, {machine['cores']} cores", highlight=False
+    )
+    table = Table(box=None, pad_edge=False)
+    for heading in ("", "state", "what it is for, or found"):
+        table.add_column(heading, overflow="fold")
+    for name, version in found["core"].items():
+        table.add_row(
+            name, version or "[red]missing[/]", "needed: pip install finssim" if version is None else "core"
+        )
+    for device in found["devices"]:
+        absent = device["name"] == "cuda"
+        state = "[green]works[/]" if device["works"] else ("absent" if absent else "[red]fails[/]")
+        table.add_row(f"device {device['name']}", state, device["detail"].replace("[", r"\["))
+    for name, extra in found["extras"].items():
+        missing = "missing" if extra["missing"] else "[green]complete[/]"
+        table.add_row(f"extra {name}", missing, extra["enables"])
+        if extra["versions"]:
+            table.add_row(
+                "", "", "[dim]" + ", ".join(f"{k} {v}" for k, v in extra["versions"].items()) + "[/]"
+            )
+        if extra["missing"]:
+            wanted = ", ".join(extra["missing"])
+            table.add_row("", "", f"without {wanted}: pip install 'finssim\\[{name}]'")
+    console.print(table)
+    console.print(
+        "ready" if found["healthy"] else "[red]not ready: the core does not work[/]", highlight=False
+    )

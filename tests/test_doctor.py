@@ -1,0 +1,70 @@
+"""The doctor tells the truth about this machine."""
+
+import json
+from importlib import metadata
+
+import pytest
+
+from finssim import doctor
+from finssim.doctor import EXTRAS, examine
+
+
+def test_a_working_machine_is_called_healthy():
+    """Tests run where the core is installed; the CPU runs Warp's kernels."""
+    found = examine()
+    assert found["healthy"]
+    assert found["core"]["numpy"] == metadata.version("numpy")
+    assert {"name": "cpu", "works": True} == {key: found["devices"][0][key] for key in ("name", "works")}
+
+
+def test_a_missing_core_package_is_reported(monkeypatch, capsys):
+    """Without a core package the doctor says which and is not content."""
+    monkeypatch.setattr(doctor, "CORE", (*doctor.CORE, "no-such-distribution"))
+    assert not doctor.doctor()
+    out = capsys.readouterr().out
+    assert "no-such-distribution" in out and "not ready" in out
+
+
+def test_a_missing_extra_is_named_with_what_it_enables(monkeypatch, capsys):
+    """An extra that is not complete shows the package to install and the reason to."""
+    monkeypatch.setitem(EXTRAS, "learn", doctor.Extra({"no-such-learner": "nsl"}, "train policies"))
+    found = examine()["extras"]["learn"]
+    assert found == {
+        "complete": False,
+        "versions": {},
+        "missing": ["no-such-learner"],
+        "enables": "train policies",
+    }
+    assert doctor.doctor()
+    assert "no-such-learner" in capsys.readouterr().out
+
+
+def test_json_is_one_object(capfd):
+    """Standard output of --json is JSON alone, with what text shows."""
+    assert doctor.doctor(json=True)
+    assert json.loads(capfd.readouterr().out).keys() == {"healthy", "machine", "core", "devices", "extras"}
+
+
+def test_extras_are_those_of_the_package():
+    """The doctor knows the extras that the package declares, and each one's distributions."""
+    declared: dict[str, set[str]] = {}
+    for requirement in metadata.requires("finssim"):
+        name, _, marker = requirement.partition("; ")
+        if "extra ==" in marker:
+            extra = marker.split("extra == ")[1].strip("'\"")
+            declared.setdefault(extra, set()).add(name.split(">")[0].split("[")[0].lower())
+    for extra in ("all", "dev"):
+        declared.pop(extra)
+    assert declared == {name: {d.lower() for d in extra.distributions} for name, extra in EXTRAS.items()}
+
+
+@pytest.mark.parametrize("name", EXTRAS)
+def test_distributions_and_modules_belong_together(name):
+    """Where an extra's distribution is installed, it holds the module that the doctor names for it."""
+    owners = metadata.packages_distributions()
+    for distribution, module in EXTRAS[name].distributions.items():
+        try:
+            metadata.version(distribution)
+        except metadata.PackageNotFoundError:
+            continue
+        assert distribution.lower().replace("_", "-") in {d.lower().replace("_", "-") for d in owners[module]}

@@ -1,0 +1,141 @@
+"""Imports follow the arrows between layers, heavy libraries stay where they are needed, and importing is cheap."""
+
+import ast
+import subprocess
+import sys
+from itertools import chain
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).resolve().parents[1] / "src" / "finssim"
+MODULES = sorted(SOURCE.rglob("*.py"))
+
+ARROWS = {
+    "geometry": {},
+    "vehicles": {"geometry"},
+    "physics": {"vehicles"},
+    "sensors": {"physics"},
+    "engine": {"sensors"},
+    "control": {"physics"},
+    "localization": {"physics"},
+    "tasks": {"engine", "control", "localization"},
+    "learning": {"tasks"},
+    "calibration": {"physics", "localization"},
+    "robot": {"control", "localization"},
+    "ros2": {"robot"},
+    "pool": {"engine", "sensors", "robot"},
+}
+"""Layer -> the layers right below it. A layer may import everything below."""
+
+FOUNDATION = {"", "files", "provenance", "quiet"}
+"""Modules that every layer may import and that import no layer; "" is the package itself."""
+
+TOP = {"experiments", "viewer", "cli", "doctor", "boundary", "__main__"}
+"""What may import anything, and what only they import."""
+
+HOMES = {
+    "torch": {"learning/export.py"},
+    "stable_baselines3": set(),
+    "gymnasium": set(),
+    "onnx": {"learning/export.py"},
+    "onnxruntime": {"control/policy.py"},
+    "mujoco": set(),
+    "matplotlib": set(),
+    "cv2": set(),
+    "cyclonedds": set(),
+    "rclpy": set(),
+    "viser": set(),
+    "mitsuba": set(),
+}
+"""Library -> the files that may import it, each of which does."""
+
+
+def layer(path: Path) -> str:
+    """Name of the package or top module a source file belongs to; "" for the package itself."""
+    first = path.relative_to(SOURCE).parts[0].removesuffix(".py")
+    return "" if first == "__init__" else first
+
+
+def imports(path: Path) -> set[str]:
+    """Dotted names of all modules a file imports, inside functions too."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, (
+                f"{path}: relative import: name modules in full, so that the arrows can be read"
+            )
+            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def imported_layers(path: Path) -> set[str]:
+    """Layers of FinsSim that a file imports."""
+    known = {layer(module) for module in MODULES}
+    ours = {tuple(n.split(".")) for n in imports(path) if n.split(".")[0] == "finssim"}
+    return {parts[1] for parts in ours if len(parts) > 1 and parts[1] in known}
+
+
+def below(name: str) -> set[str]:
+    """Every layer that `name` may import: those right below it and theirs."""
+    return set(chain.from_iterable({under} | below(under) for under in ARROWS[name]))
+
+
+def test_every_module_has_its_place():
+    """Each package and top module stands in the drawing of the layers."""
+    assert {layer(path) for path in MODULES} <= ARROWS.keys() | FOUNDATION | TOP
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(SOURCE)))
+def test_imports_follow_the_arrows(path):
+    """A module imports its own layer, layers below it, and the foundation; nothing imports the top but the top."""
+    own = layer(path)
+    if own in TOP:
+        return
+    allowed = FOUNDATION | {own} | (set() if own in FOUNDATION else below(own))
+    assert imported_layers(path) <= allowed
+
+
+@pytest.mark.parametrize("library", HOMES)
+def test_heavy_libraries_stay_at_home(library):
+    """A heavy library is imported in the files that need it, and in no other."""
+    importers = {
+        path.relative_to(SOURCE).as_posix()
+        for path in MODULES
+        if any(name.partition(".")[0] == library for name in imports(path))
+    }
+    assert importers == HOMES[library]
+
+
+def fresh(script: str) -> str:
+    """Standard output of a Python that has imported nothing yet."""
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    return run.stdout
+
+
+@pytest.mark.parametrize(
+    ("module", "absent"),
+    [
+        ("finssim", {"numpy", "warp", "typer", "pydantic", "torch", "matplotlib", "mujoco"}),
+        ("finssim.cli", {"numpy", "warp", "pydantic", "torch", "matplotlib", "mujoco"}),
+        ("finssim.vehicles", {"warp", "torch", "matplotlib", "mujoco", "gymnasium"}),
+        ("finssim.control", {"torch", "matplotlib", "mujoco", "gymnasium", "finssim.engine"}),
+        ("finssim.engine", {"torch", "matplotlib", "mujoco", "gymnasium", "finssim.tasks"}),
+    ],
+)
+def test_a_part_costs_only_what_it_needs(module, absent):
+    """Importing one part loads none of the libraries that only other parts need."""
+    loaded = fresh(f"import sys, {module}; print(*sys.modules)").split()
+    assert not absent & set(loaded)
+
+
+def test_importing_finssim_costs_less_than_importing_numpy():
+    """`import finssim` in a fresh Python takes less time than `import numpy`, the best of several of each."""
+    script = "import time; t = time.perf_counter(); import {}; print(time.perf_counter() - t)"
+    times = {"finssim": [], "numpy": []}
+    for _ in range(5):
+        for module, measured in times.items():
+            measured.append(float(fresh(script.format(module))))
+    assert min(times["finssim"]) < min(times["numpy"])
