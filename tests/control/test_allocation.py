@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from finssim.control.allocation import AllocationData, allocate_kernel, allocation_residual
-from finssim.control.allocation_tables import allocation_data, regularisation_weight
+from finssim.control.allocation import AllocationData, allocate_kernel, allocation_data, allocation_residual
+from finssim.control.allocation_tables import regularisation_weight
 from finssim.control.allocator import Allocator
 from finssim.control.errors import ControlError
 from finssim.physics.types import vec6, vec8

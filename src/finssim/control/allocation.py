@@ -16,13 +16,26 @@ The entries of the tables stay of order one however small lambda is, which is wh
 """
 
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,valid-type,misc,untyped-decorator"
-# ruff: noqa: UP018  (`int(0)` is how Warp is told that a number changes inside a loop)
 
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 import warp as wp
 
+from finssim.control.allocation_tables import REGULARISATION, Tables, tables
+from finssim.control.errors import ControlError
 from finssim.physics.types import MAX_THRUSTERS, vec6, vec8
 
-__all__ = ["AllocationData", "allocate", "allocate_kernel", "allocation_residual", "residual_kernel"]
+__all__ = [
+    "AllocationData",
+    "allocate",
+    "allocate_kernel",
+    "allocation_data",
+    "allocation_residual",
+    "residual_kernel",
+]
 
 BLOCK_PATIENCE = wp.constant(3)
 """Block pivots without progress before single pivots take over."""
@@ -201,3 +214,37 @@ def residual_kernel(
     """`allocation_residual` for every world [N], (worlds,)."""
     world = wp.tid()
     residual[world] = allocation_residual(f[world], tau[world], vehicle[world], data)
+
+
+def allocation_data(
+    B: Sequence[npt.ArrayLike],
+    lower: Sequence[npt.ArrayLike],
+    upper: Sequence[npt.ArrayLike],
+    weights: Sequence[npt.ArrayLike],
+    regularisation: float = REGULARISATION,
+    device: Any = "cpu",
+) -> AllocationData:
+    """Tables of one or more vehicle types for `allocate`; every sequence has one entry per type.
+
+    Args:
+        B: Thruster matrices, wrench = B f about the commanded point in the body frame, (6, n) with n <= 8 each.
+        lower: Least thrusts f- [N], (n,) each, at most zero.
+        upper: Greatest thrusts f+ [N], (n,) each, at least zero.
+        weights: Diagonals of W [1/N, 1/(N m)], (6,) each: 1/wrench limit, and zero for an axis that does not matter.
+        regularisation: lambda as a fraction of the mean non-zero eigenvalue of B' W^2 B (so it has no unit).
+        device: Warp device that holds the tables.
+
+    Raises:
+        ControlError: Wrong shapes, limits that exclude zero, or numbers that make the problem singular.
+    """
+    if not len(B) == len(lower) == len(upper) == len(weights) > 0:
+        raise ControlError(
+            f"allocation has {len(B)} matrices, {len(lower)} lower and {len(upper)} upper limits, "
+            f"{len(weights)} weights: give one of each per vehicle type"
+        )
+    types = [tables(*one, regularisation) for one in zip(B, lower, upper, weights, strict=True)]
+    data = AllocationData()
+    for name in Tables._fields:
+        stacked = np.stack([getattr(one, name) for one in types])
+        setattr(data, name, wp.array(stacked, dtype=vec8, device=device))
+    return data

@@ -1,61 +1,21 @@
 """The tables that wrench allocation looks up, computed once per vehicle in float64."""
 
-# mypy: disable-error-code="no-untyped-call"
+from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import warp as wp
 
-from finssim.control.allocation import AllocationData
 from finssim.control.errors import ControlError
-from finssim.physics.types import MAX_THRUSTERS, vec8
+from finssim.physics.types import MAX_THRUSTERS
 
-__all__ = ["REGULARISATION", "allocation_data", "axis_weights", "regularisation_weight"]
+__all__ = ["REGULARISATION", "Tables", "regularisation_weight", "tables"]
 
 Array = npt.NDArray[np.float64]
 
 REGULARISATION = 1e-4
 """Default lambda, as a fraction of the mean non-zero eigenvalue of B' W^2 B: wrenches within reach are met to 1e-4."""
-
-
-def allocation_data(
-    B: Sequence[npt.ArrayLike],
-    lower: Sequence[npt.ArrayLike],
-    upper: Sequence[npt.ArrayLike],
-    weights: Sequence[npt.ArrayLike],
-    regularisation: float = REGULARISATION,
-    device: Any = "cpu",
-) -> AllocationData:
-    """Tables of one or more vehicle types for `allocate`; every sequence has one entry per type.
-
-    Args:
-        B: Thruster matrices, wrench = B f about the commanded point in the body frame, (6, n) with n <= 8 each.
-        lower: Least thrusts f- [N], (n,) each, at most zero.
-        upper: Greatest thrusts f+ [N], (n,) each, at least zero.
-        weights: Diagonals of W [1/N, 1/(N m)], (6,) each: 1/wrench limit, and zero for an axis that does not matter.
-        regularisation: lambda as a fraction of the mean non-zero eigenvalue of B' W^2 B (so it has no unit).
-        device: Warp device that holds the tables.
-
-    Raises:
-        ControlError: Wrong shapes, limits that exclude zero, or numbers that make the problem singular.
-    """
-    if not len(B) == len(lower) == len(upper) == len(weights) > 0:
-        raise ControlError(
-            f"allocation has {len(B)} matrices, {len(lower)} lower and {len(upper)} upper limits, "
-            f"{len(weights)} weights: give one of each per vehicle type"
-        )
-    types = [_tables(*one, regularisation) for one in zip(B, lower, upper, weights, strict=True)]
-    gain, clamped, hessian, low, high = (np.stack(parts) for parts in zip(*types, strict=True))
-    data = AllocationData()
-    data.gain = wp.array(gain, dtype=vec8, device=device)
-    data.clamped = wp.array(clamped, dtype=vec8, device=device)
-    data.hessian = wp.array(hessian, dtype=vec8, device=device)
-    data.lower = wp.array(low, dtype=vec8, device=device)
-    data.upper = wp.array(high, dtype=vec8, device=device)
-    return data
 
 
 def regularisation_weight(
@@ -66,14 +26,37 @@ def regularisation_weight(
     return regularisation * float(np.sum(WB**2)) / float(np.linalg.matrix_rank(WB))
 
 
-def _tables(
+class Tables(NamedTuple):
+    """Fields of `allocation.AllocationData` for one vehicle type, padded with absent thrusters (no gain, no thrust)."""
+
+    gain: npt.NDArray[np.float32]
+    """Columns of H^-1 B' W^2, (6, 8)."""
+
+    clamped: npt.NDArray[np.float32]
+    """Columns of the map d -> (f_F - f0_F, mu) for each set of thrusters at a limit, (256, 8, 8)."""
+
+    hessian: npt.NDArray[np.float32]
+    """Columns of H / h, h the mean of its diagonal, (8, 8)."""
+
+    lower: npt.NDArray[np.float32]
+    """Least thrust [N], (8,)."""
+
+    upper: npt.NDArray[np.float32]
+    """Greatest thrust [N], (8,)."""
+
+
+def tables(
     B: npt.ArrayLike,
     lower: npt.ArrayLike,
     upper: npt.ArrayLike,
     weights: npt.ArrayLike,
-    regularisation: float,
-) -> tuple[npt.NDArray[np.float32], ...]:
-    """Fields of `AllocationData` for one vehicle type, padded with absent thrusters (zero gain, limits of zero)."""
+    regularisation: float = REGULARISATION,
+) -> Tables:
+    """Tables of one vehicle type; arguments as one entry of `allocation.allocation_data`.
+
+    Raises:
+        ControlError: Wrong shapes, limits that exclude zero, or numbers that make the problem singular.
+    """
     B, W = np.asarray(B, float), np.asarray(weights, float)
     low, high = np.asarray(lower, float), np.asarray(upper, float)
     n = B.shape[-1]
@@ -104,13 +87,8 @@ def _tables(
         response = -np.linalg.solve(H[np.ix_(F, F)], H[np.ix_(F, C)])
         clamped[mask][np.ix_(C, F)] = response.T
         clamped[mask][np.ix_(C, C)] = (H[np.ix_(C, C)] + H[np.ix_(C, F)] @ response) / h
-    return (
-        gain.astype(np.float32),
-        clamped.astype(np.float32),
-        hessian.astype(np.float32),
-        _toward_zero(low),
-        _toward_zero(high),
-    )
+    single = (array.astype(np.float32) for array in (gain, clamped, hessian))
+    return Tables(*single, _toward_zero(low), _toward_zero(high))
 
 
 def _toward_zero(limits: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
@@ -120,10 +98,3 @@ def _toward_zero(limits: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
     beyond = np.abs(nearest.astype(float)) > np.abs(limits)
     rounded[: len(limits)] = np.where(beyond, np.nextafter(nearest, np.float32(0.0)), nearest)
     return rounded
-
-
-def axis_weights(wrench_limits: npt.ArrayLike) -> Array:
-    """Diagonal of W [1/N, 1/(N m)], (6,): one over each wrench limit, and zero on an axis with no authority."""
-    limits = np.asarray(wrench_limits, float)
-    weights: Array = np.divide(1.0, limits, out=np.zeros_like(limits), where=limits > 0.0)
-    return weights

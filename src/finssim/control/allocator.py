@@ -8,12 +8,12 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from finssim.control.allocation import allocate_kernel, residual_kernel
-from finssim.control.allocation_tables import REGULARISATION, allocation_data, axis_weights
+from finssim.control.allocation import allocate_kernel, allocation_data, residual_kernel
+from finssim.control.allocation_tables import REGULARISATION
 from finssim.control.errors import ControlError
 from finssim.physics.types import vec6, vec8
 
-__all__ = ["Allocator"]
+__all__ = ["Allocator", "axis_weights"]
 
 Array = npt.NDArray[np.float64]
 
@@ -112,3 +112,10 @@ class _Launch:
         for command in self._commands:
             command.launch()
         return self._f.astype(float), self._residual.astype(float)
+
+
+def axis_weights(wrench_limits: npt.ArrayLike) -> Array:
+    """Diagonal of W [1/N, 1/(N m)], (6,): one over each wrench limit, and zero on an axis with no authority."""
+    limits = np.asarray(wrench_limits, float)
+    weights: Array = np.divide(1.0, limits, out=np.zeros_like(limits), where=limits > 0.0)
+    return weights
