@@ -1,0 +1,168 @@
+"""A trained policy as a directory: `policy.yaml` says what goes in and out, `policy.onnx` is the network.
+
+The same directory is run by the evaluation, by the robot and by the virtual pool, with onnxruntime and without torch.
+What a policy was trained with is part of it, and `Policy.load` refuses to run it with anything else: a network fed in
+another order, or multiplied by other limits, still answers, and answers wrongly.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from finssim.control.policy_description import (
+    DESCRIPTION_FILE,
+    NETWORK_FILE,
+    ObservationSchema,
+    PolicyDescription,
+    PolicyError,
+    first_difference,
+    plain_data,
+    read_description,
+    read_file,
+)
+
+__all__ = ["Policy"]
+
+
+class Identified(Protocol):
+    """What a policy compares of a vehicle: its name and the SHA-256 of its file. A `Vehicle` has both."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def sha256(self) -> str: ...
+
+
+class Policy:
+    """A trained policy: observation in, action in [-1, 1] out. Make one with `Policy.load`."""
+
+    def __init__(self, description: PolicyDescription, session: Any) -> None:
+        self.description = description
+        self._session = session
+        self._size = description.observation.size
+
+    @classmethod
+    def load(
+        cls,
+        directory: str | Path,
+        *,
+        vehicle: Identified | None = None,
+        task: Mapping[str, Any] | None = None,
+        mode: Mapping[str, Any] | None = None,
+        control_period: float | None = None,
+    ) -> Policy:
+        """Reads a policy directory and checks that it fits what it will control; what is None goes unchecked.
+
+        Args:
+            directory: Folder with `policy.yaml` and `policy.onnx`.
+            vehicle: The vehicle it will control; its SHA-256 must be the one trained with.
+            task: The task's description, with keys `name` and `observation` (the schema as plain data).
+            mode: The action mode's `describe()`: name, size, limits, scale.
+            control_period: Time between two actions [s].
+
+        Raises:
+            PolicyError: One sentence naming the file or the first value that does not fit.
+        """
+        folder = Path(directory)
+        description = read_description(folder)
+        if task is not None:
+            _check_task(folder, description, task)
+        if mode is not None:
+            difference = first_difference(description.action, plain_data(mode), "action")
+            if difference:
+                raise PolicyError(f"{folder}: action does not fit: {difference}: train again with this mode")
+        if vehicle is not None and vehicle.sha256 != description.vehicle.sha256:
+            trained = description.vehicle
+            raise PolicyError(
+                f"{folder}: trained for vehicle {trained.name} {trained.sha256[:12]}, but this is {vehicle.name} "
+                f"{vehicle.sha256[:12]}: train again, or give the vehicle file it was trained with"
+            )
+        period = description.control_period
+        if control_period is not None and not math.isclose(control_period, period, rel_tol=1e-9):
+            raise PolicyError(
+                f"{folder}: trained with a control period of {period:g} s, "
+                f"but it would be called every {control_period:g} s: run it at its own rate"
+            )
+        return cls(description, _open_network(folder, description))
+
+    def act(self, observation: ArrayLike) -> NDArray[np.float32]:
+        """Action for each observation.
+
+        Args:
+            observation: Scaled and clipped as the schema says, shape (..., n); taken as float32.
+
+        Returns:
+            Action in [-1, 1], shape (..., m); its meaning is `description.action`.
+
+        Raises:
+            PolicyError: An observation has another length than n, or an element that is not finite.
+        """
+        x = np.asarray(observation, dtype=np.float32)
+        if x.ndim == 0 or x.shape[-1] != self._size:
+            length = x.shape[-1] if x.ndim else "no"
+            raise PolicyError(
+                f"observation has {length} elements, expected {self._size} as in {DESCRIPTION_FILE}"
+            )
+        finite = np.isfinite(x)
+        if not finite.all():
+            index = int(np.argwhere(~finite)[0, -1])
+            name = self.description.observation.name_at(index)
+            raise PolicyError(
+                f"observation element {index} ({name}) is {x[~finite][0]}, expected a finite number"
+            )
+        rows = x.reshape(-1, self._size)
+        action: NDArray[np.float32] = self._session.run(None, {"observation": rows})[0]
+        return action.reshape(*x.shape[:-1], action.shape[-1])
+
+
+def _open_network(folder: Path, description: PolicyDescription) -> Any:
+    """The network as an onnxruntime session on one thread: a batch of one gains nothing from more."""
+    path = folder / NETWORK_FILE
+    content = read_file(path)
+    digest = hashlib.sha256(content).hexdigest()
+    expected = description.files.get(NETWORK_FILE, "none")
+    if digest != expected:
+        raise PolicyError(
+            f"{path}: corrupt: its SHA-256 starts {digest[:12]}, "
+            f"but {DESCRIPTION_FILE} says {expected[:12]}: copy the directory again"
+        )
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise PolicyError("running a policy needs onnxruntime: pip install onnxruntime") from error
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    try:
+        session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime raises a class per error code, with no common base but Exception
+        reason = " ".join(str(error).split())
+        raise PolicyError(f"{path}: not a network onnxruntime can run ({reason})") from error
+    shapes = [tensor.shape[-1] for tensor in (*session.get_inputs(), *session.get_outputs())]
+    if shapes != [description.observation.size, description.action_size]:
+        raise PolicyError(
+            f"{path}: maps {shapes[0]} values to {shapes[-1]}, but {DESCRIPTION_FILE} describes "
+            f"{description.observation.size} to {description.action_size}"
+        )
+    return session
+
+
+def _check_task(folder: Path, description: PolicyDescription, task: Mapping[str, Any]) -> None:
+    if task["name"] != description.task:
+        sentence = f"trained for task {description.task!r}, but this is {task['name']!r}"
+        raise PolicyError(f"{folder}: {sentence}: give a policy trained for it")
+    trained = description.observation.model_dump(mode="json")
+    given = ObservationSchema.model_validate(plain_data(task["observation"])).model_dump(mode="json")
+    difference = first_difference(trained, given, "observation")
+    if difference:
+        raise PolicyError(
+            f"{folder}: observation schema does not fit: {difference}: train again with this task"
+        )

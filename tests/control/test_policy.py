@@ -1,0 +1,217 @@
+"""A policy directory runs only with what it was trained for, and says in one sentence what differs."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import re
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+from onnx import TensorProto, helper, numpy_helper
+
+from finssim.control.policy import Policy
+from finssim.control.policy_description import PolicyError
+
+GAIN = np.array([[0.5, 0.0, 0.0], [0.0, -0.25, 1.0]], dtype=np.float32)
+MODE = {"mode": "wrench2", "size": 2, "limits": [18.6, 6.9], "scale": [1.0, 0.5]}
+TASK = {
+    "name": "hold",
+    "observation": {
+        "size": 3,
+        "entries": [
+            {"name": "position_error_body", "indices": (0, 1), "unit": "m", "scale": 3.0, "clip": None},
+            {"name": "yaw_rate", "indices": (2,), "unit": "rad/s", "scale": 1.0, "clip": (-2.0, 2.0)},
+        ],
+    },
+}
+MINNOW = SimpleNamespace(name="minnow", sha256="ab" * 32)
+TROUT = SimpleNamespace(name="trout", sha256="cd" * 32)
+
+
+def network(inputs: int = 3) -> bytes:
+    """clip(GAIN x, -1, 1), as an ONNX file."""
+    weights = [numpy_helper.from_array(GAIN[:, :inputs], "gain")]
+    weights += [numpy_helper.from_array(np.float32(v), n) for v, n in ((-1, "low"), (1, "high"))]
+    nodes = [helper.make_node("Gemm", ["observation", "gain"], ["x"], transB=1)]
+    nodes += [helper.make_node("Clip", ["x", "low", "high"], ["action"])]
+    x = helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["N", inputs])
+    y = helper.make_tensor_value_info("action", TensorProto.FLOAT, ["N", 2])
+    graph = helper.make_graph(nodes, "policy", [x], [y], weights)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    return model.SerializeToString()
+
+
+def write(folder, content: bytes | None = None, **changes):
+    content = network() if content is None else content
+    description = {
+        "format": 1,
+        "task": TASK["name"],
+        "observation": yaml.safe_load(yaml.safe_dump(as_lists(TASK["observation"]))),
+        "action": MODE,
+        "control_period": 0.1,
+        "vehicle": {"name": MINNOW.name, "sha256": MINNOW.sha256},
+        "hydrodynamics": "calibrated",
+        "seed": 42,
+        "files": {"policy.onnx": hashlib.sha256(content).hexdigest()},
+    } | changes
+    folder.mkdir(exist_ok=True)
+    (folder / "policy.yaml").write_text(yaml.safe_dump(description))
+    (folder / "policy.onnx").write_bytes(content)
+    return folder
+
+
+def as_lists(value):
+    if isinstance(value, dict):
+        return {key: as_lists(item) for key, item in value.items()}
+    return [as_lists(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return write(tmp_path / "run")
+
+
+def test_the_action_is_the_network_of_the_observation(folder):
+    """clip(GAIN x): by hand for one vehicle, and row by row for many."""
+    policy = Policy.load(folder, vehicle=MINNOW, task=TASK, mode=MODE, control_period=0.1)
+    np.testing.assert_allclose(policy.act([1.0, 2.0, 0.25]), [0.5, -0.25], atol=1e-7)
+    np.testing.assert_allclose(policy.act([8.0, 0.0, -3.0]), [1.0, -1.0], atol=0)
+    many = np.random.default_rng(0).normal(size=(4, 5, 3))
+    actions = policy.act(many)
+    assert actions.dtype == np.float32
+    assert all(np.array_equal(actions[i, j], policy.act(many[i, j])) for i in range(4) for j in range(5))
+    assert policy.act(np.empty((0, 3))).shape == (0, 2)
+
+
+def test_arrays_and_tuples_describe_a_mode_as_lists_do(folder):
+    Policy.load(folder, mode=MODE | {"limits": np.array(MODE["limits"]), "scale": tuple(MODE["scale"])})
+
+
+def observation_with(entry: int, **changes):
+    task = copy.deepcopy(TASK)
+    task["observation"]["entries"][entry].update(changes)
+    return task
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        (
+            {"task": observation_with(0, scale=2.0)},
+            "observation.entries[0].scale is 3.0 in the policy and 2.0 here",
+        ),
+        (
+            {"task": observation_with(1, clip=None)},
+            "entries[1].clip is [-2.0, 2.0] in the policy and None here",
+        ),
+        (
+            {"task": observation_with(1, name="roll_rate")},
+            "schema does not fit: observation.entries[1].name is 'yaw_rate'",
+        ),
+        ({"task": TASK | {"name": "docking"}}, "trained for task 'hold', but this is 'docking'"),
+        (
+            {"mode": MODE | {"limits": [18.6, 7.1]}},
+            "does not fit: action.limits[1] is 6.9 in the policy and 7.1 here",
+        ),
+        (
+            {"mode": MODE | {"mode": "thruster2"}},
+            "action.mode is 'wrench2' in the policy and 'thruster2' here",
+        ),
+        ({"mode": MODE | {"slew": 4.0}}, "action.slew is not in the policy"),
+        ({"vehicle": TROUT}, "trained for vehicle minnow abababababab, but this is trout cdcdcdcdcdcd"),
+        ({"control_period": 0.05}, "control period of 0.1 s, but it would be called every 0.05 s"),
+    ],
+)
+def test_a_policy_refuses_what_it_was_not_trained_with(folder, given, sentence):
+    with pytest.raises(PolicyError, match=re.escape(sentence)) as error:
+        Policy.load(folder, **given)
+    assert "\n" not in str(error.value)
+
+
+def test_a_missing_directory_or_file_is_named(folder):
+    with pytest.raises(PolicyError, match="nowhere: no such policy directory"):
+        Policy.load(folder / "nowhere")
+    (folder / "policy.onnx").unlink()
+    with pytest.raises(PolicyError, match=r"policy\.onnx: cannot be read \(No such file or directory\)"):
+        Policy.load(folder)
+    (folder / "policy.yaml").unlink()
+    with pytest.raises(PolicyError, match=r"policy\.yaml: cannot be read"):
+        Policy.load(folder)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"format": 2}, "format is 2, but this version reads format 1"),
+        ({"colour": "red"}, "colour: Extra inputs are not permitted"),
+        ({"control_period": -0.1}, "control_period: Input should be greater than 0"),
+        (
+            {"action": {"mode": "wrench2"}},
+            "action: Value error, size is None, expected a positive whole number",
+        ),
+        ({"observation": {"size": 3, "entries": []}}, "expected each of 0 to 2 once"),
+    ],
+)
+def test_a_wrong_description_is_refused_by_key(tmp_path, changes, sentence):
+    with pytest.raises(PolicyError, match=re.escape(sentence)):
+        Policy.load(write(tmp_path / "run", **changes))
+
+
+def test_a_description_that_is_no_mapping_is_refused(folder):
+    for text, sentence in (
+        ("a: [1", "not valid YAML"),
+        ("- 1", "holds list, expected a mapping"),
+        ("", "NoneType"),
+    ):
+        (folder / "policy.yaml").write_text(text)
+        with pytest.raises(PolicyError, match=sentence) as error:
+            Policy.load(folder)
+        assert "\n" not in str(error.value)
+
+
+def test_a_changed_truncated_or_foreign_network_is_refused(folder, tmp_path):
+    content = (folder / "policy.onnx").read_bytes()
+    (folder / "policy.onnx").write_bytes(content[:-10])
+    with pytest.raises(PolicyError, match=r"policy\.onnx: corrupt"):
+        Policy.load(folder)
+    with pytest.raises(PolicyError, match="not a network onnxruntime can run"):
+        Policy.load(write(tmp_path / "other", content=b"not onnx"))
+    with pytest.raises(PolicyError, match=r"maps 2 values to 2, but policy\.yaml describes 3 to 2"):
+        Policy.load(write(tmp_path / "smaller", content=network(inputs=2)))
+
+
+def test_a_bad_observation_is_refused_by_name(folder):
+    policy = Policy.load(folder)
+    with pytest.raises(PolicyError, match=r"observation element 2 \(yaw_rate\) is nan"):
+        policy.act([0.0, 0.0, np.nan])
+    with pytest.raises(PolicyError, match=r"observation element 1 \(position_error_body\) is -inf"):
+        policy.act([[0.0, 0.0, 0.0], [0.0, -np.inf, 0.0]])
+    for wrong in (np.zeros(4), np.zeros((5, 2)), np.float32(0)):
+        with pytest.raises(PolicyError, match="elements, expected 3"):
+            policy.act(wrong)
+
+
+def test_one_action_takes_microseconds(folder):
+    """A robot calls it with N = 1; the bound is loose, for loaded machines."""
+    policy, observation = Policy.load(folder), np.zeros(3, dtype=np.float32)
+    durations = []
+    for _ in range(500):
+        start = time.perf_counter()
+        policy.act(observation)
+        durations.append(time.perf_counter() - start)
+    assert np.median(durations) < 100e-6
+
+
+def test_running_a_policy_needs_no_torch(folder):
+    code = (
+        "import sys; from finssim.control.policy import Policy\n"
+        f"Policy.load({str(folder)!r}).act([0, 0, 0])\n"
+        "assert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
