@@ -1,0 +1,1 @@
+"""Learning: training on the batched environment, and trained networks as policy directories."""
