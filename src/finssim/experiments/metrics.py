@@ -1,0 +1,191 @@
+"""The paper's measures of station keeping (T1, Table IV): errors late in the hold, success, settling time, jitter.
+
+A trial holds one goal for 60 s. Its samples are resampled to 10 Hz; a grid point in a gap of more than 0.25 s between
+samples has no value, and a trial with values at less than 0.9 of the window's points has no late errors.
+Names are the paper's: e_y is the vertical error, the paper's y pointing up.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = [
+    "EVALUATION_WINDOW",
+    "POSITION_TOLERANCE",
+    "SUCCESS_DURATION",
+    "YAW_TOLERANCE",
+    "measure_trial",
+    "pose_error",
+    "resample",
+    "summarize",
+]
+
+Array = NDArray[np.float64]
+
+POSITION_TOLERANCE = 0.10
+"""Largest error on each axis that counts as holding the position [m]."""
+
+YAW_TOLERANCE = math.radians(10.0)
+"""Largest yaw error that counts as holding the heading [rad]."""
+
+SUCCESS_DURATION = 10.0
+"""How long both must hold without a break [s]."""
+
+EVALUATION_WINDOW = (40.0, 60.0)
+"""Part of the trial in which the late errors are taken [s]."""
+
+RATE = 10.0
+"""Rate of the evaluation grid [Hz]."""
+
+MAX_GAP = 0.25
+"""Longest time between two samples across which values are interpolated [s]."""
+
+MIN_VALID = 0.9
+"""Smallest share of the window's grid points that must have a value."""
+
+MEANS = ("e_p_m", "e_y_m", "e_psi_deg", "J_p_m", "J_psi_deg")
+
+
+def measure_trial(t: ArrayLike, position: ArrayLike, yaw: ArrayLike, goal: ArrayLike) -> dict[str, Any]:
+    """Measures of one trial.
+
+    With e = position - goal and e_psi the yaw error, over the grid points of the evaluation window:
+    e_p = sqrt(mean |e|²), e_y = sqrt(mean e_z²), e_psi = sqrt(mean e_psi²). Success: |e_x|, |e_y|, |e_z| <= 0.10 m and
+    |e_psi| <= 10 deg for 10 s without a break, anywhere in the trial. t_s is when the first such 10 s begin. Jitter is
+    the RMS departure from the mean in those 10 s: J_p = sqrt(mean |p - mean p|²), J_psi likewise.
+
+    Args:
+        t: Time since the start of the hold [s], increasing, shape (T,).
+        position: Position, world frame [m], shape (T, 3).
+        yaw: Heading [rad], wrapped or not, shape (T,).
+        goal: [x, y, z [m], yaw [rad]] held throughout, world frame, shape (4,).
+
+    Returns:
+        `success` (bool); `e_p_m`, `e_y_m`, `e_psi_deg` (None without enough samples); `t_s_s`, `J_p_m`, `J_psi_deg`
+        (None without success); and `valid`, the share of the window's grid points that have a value.
+
+    Raises:
+        ValueError: Times do not increase, or lengths differ.
+
+    Note:
+        The paper says "jitter" without a formula, and "time to the first satisfaction of the criterion sustained for
+        10 s" without saying which end; these are our readings. The other end is t_s + 10 s.
+    """
+    goal = np.asarray(goal, dtype=np.float64)
+    grid, position, yaw = resample(t, position, yaw)
+    error, yaw_error = pose_error(position, yaw, goal)
+    in_window = (grid >= EVALUATION_WINDOW[0]) & (grid <= EVALUATION_WINDOW[1])
+    valid = float(np.mean(np.isfinite(yaw_error[in_window])))
+    measures: dict[str, Any] = {"success": False, "valid": valid}
+    measures |= dict.fromkeys(("e_p_m", "e_y_m", "e_psi_deg", "t_s_s", "J_p_m", "J_psi_deg"))
+    if valid >= MIN_VALID:
+        measures["e_p_m"] = _rms(np.linalg.norm(error[in_window], axis=-1))
+        measures["e_y_m"] = _rms(error[in_window, 2])
+        measures["e_psi_deg"] = math.degrees(_rms(yaw_error[in_window]))
+    held = np.all(np.abs(error) <= POSITION_TOLERANCE, axis=-1) & (np.abs(yaw_error) <= YAW_TOLERANCE)
+    first = _first_run(held, round(SUCCESS_DURATION * RATE) + 1)
+    if first is not None:
+        measures["success"] = True
+        measures["t_s_s"] = float(grid[first.start])
+        measures["J_p_m"] = _rms(np.linalg.norm(error[first] - error[first].mean(axis=0), axis=-1))
+        measures["J_psi_deg"] = math.degrees(_rms(yaw_error[first] - yaw_error[first].mean()))
+    return measures
+
+
+def summarize(trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """One controller's row of the table, from the measures of its trials.
+
+    Errors are means over the trials that have them, jitters over the successful ones, t_s is their median. A trial that
+    has no late errors (it ended early, or its samples are missing) still counts as a trial without success.
+
+    Args:
+        trials: What `measure_trial` gave, possibly with more keys.
+
+    Returns:
+        `trials` and `valid` (trials that have late errors), `success` (count), `e_p_m`, `e_y_m`, `e_psi_deg`, `t_s_s`,
+        `J_p_m`, `J_psi_deg` (None where no trial has one) and `per_trial`, the trials themselves.
+    """
+    row: dict[str, Any] = {
+        "trials": len(trials),
+        "valid": sum(trial["e_p_m"] is not None for trial in trials),
+        "success": sum(bool(trial["success"]) for trial in trials),
+    }
+    for key in MEANS:
+        row[key] = _over(np.mean, trials, key)
+    row["t_s_s"] = _over(np.median, trials, "t_s_s")
+    return row | {"per_trial": [dict(trial) for trial in trials]}
+
+
+def pose_error(position: Array, yaw: Array, goal: Array) -> tuple[Array, Array]:
+    """Position and yaw error.
+
+    Args:
+        position: World frame [m], shape (..., 3).
+        yaw: [rad], shape (...).
+        goal: [x, y, z [m], yaw [rad]], world frame, shape (..., 4).
+
+    Returns:
+        position - goal, world frame [m], shape (..., 3), and yaw - goal yaw in [-pi, pi) [rad], shape (...).
+    """
+    return position - goal[..., :3], (yaw - goal[..., 3] + math.pi) % (2.0 * math.pi) - math.pi
+
+
+def resample(t: ArrayLike, position: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array, Array]:
+    """A trial on the 10 Hz evaluation grid, from 0 to 60 s or to its own end if that is later.
+
+    Values are interpolated linearly, yaw the short way round. Samples that are not finite are left out. A grid point
+    before the first sample, after the last, or between two more than 0.25 s apart is NaN.
+
+    Args:
+        t: Time since the start of the hold [s], increasing, shape (T,).
+        position: [m], shape (T, 3).
+        yaw: [rad], wrapped or not, shape (T,).
+
+    Returns:
+        Grid times [s], shape (G,); position, shape (G, 3); unwrapped yaw, shape (G,).
+
+    Raises:
+        ValueError: Times do not increase, or lengths differ.
+    """
+    t, position, yaw = (np.asarray(x, dtype=np.float64) for x in (t, position, yaw))
+    if t.ndim != 1 or position.shape != (*t.shape, 3) or yaw.shape != t.shape:
+        raise ValueError(
+            f"t, position and yaw are {t.shape}, {position.shape}, {yaw.shape}, expected (T,), (T, 3), (T,)"
+        )
+    if np.any(np.diff(t) <= 0.0):
+        raise ValueError("sample times do not increase: sort the samples and drop repeated ones")
+    known = np.isfinite(position).all(axis=-1) & np.isfinite(yaw)
+    t, position, yaw = t[known], position[known], np.unwrap(yaw[known])
+    end = max(EVALUATION_WINDOW[1], t[-1] if len(t) else 0.0)
+    grid = np.arange(math.floor(end * RATE + 1e-6) + 1) / RATE
+    if len(t) == 0:
+        return grid, np.full((len(grid), 3), np.nan), np.full(len(grid), np.nan)
+    after = np.clip(np.searchsorted(t, grid), 1, max(len(t) - 1, 1))
+    before, after = after - 1, np.minimum(after, len(t) - 1)
+    nearest = np.where(np.abs(t[before] - grid) <= np.abs(t[after] - grid), t[before], t[after])
+    inside = (t[before] <= grid) & (grid <= t[after]) & (t[after] - t[before] <= MAX_GAP)
+    inside |= np.abs(nearest - grid) <= 1e-3  # a sample at the grid point itself, its time rounded as logs do
+    columns = [np.where(inside, np.interp(grid, t, column), np.nan) for column in (*position.T, yaw)]
+    return grid, np.stack(columns[:3], axis=-1), columns[3]
+
+
+def _first_run(held: NDArray[np.bool_], length: int) -> slice | None:
+    """The first `length` consecutive true elements, or None."""
+    count = np.concatenate([[0], np.cumsum(held)])
+    starts = np.flatnonzero(count[length:] - count[:-length] == length)
+    return slice(starts[0], starts[0] + length) if len(starts) else None
+
+
+def _rms(x: Array) -> float:
+    """Root mean square of the values there are."""
+    return math.sqrt(float(np.nanmean(np.square(x))))
+
+
+def _over(statistic: Any, trials: Sequence[Mapping[str, Any]], key: str) -> float | None:
+    values = [trial[key] for trial in trials if trial[key] is not None]
+    return float(statistic(values)) if values else None
