@@ -1,0 +1,64 @@
+"""The error envelope is the quartiles of the errors, and the figure shows them against the success limits."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from finssim.experiments.envelope import draw_envelopes, error_envelope, save_envelopes
+from finssim.files import OutputError
+
+GOAL = np.array([1.0, 0.3, -0.5, math.pi])
+T = np.arange(601) / 10.0
+
+
+def at_distance(distance, turn=0.0, t=T):
+    """A trial that stays `distance` below the goal, turned by `turn`."""
+    position = np.tile(GOAL[:3], (len(t), 1)) - np.outer(np.broadcast_to(distance, t.shape), [0.0, 0.0, 1.0])
+    return t, position, np.full(len(t), GOAL[3] - 2 * math.pi) + turn, GOAL
+
+
+def test_five_constant_errors_have_their_own_quartiles():
+    """Of 1, 2, 3, 4, 5 the quartiles are 2, 3, 4: in centimetres of distance and in degrees of either sign."""
+    envelope = error_envelope([at_distance(k / 100, math.radians(k) * (-1) ** k) for k in (5, 1, 4, 2, 3)])
+    expected = np.tile([[2.0], [3.0], [4.0]], len(T))
+    np.testing.assert_allclose(envelope.position * 100, expected)
+    np.testing.assert_allclose(np.degrees(envelope.yaw), expected)
+    np.testing.assert_allclose(envelope.t, T)
+
+
+def test_a_trial_that_ends_early_leaves_the_quartiles_to_the_others():
+    """One of three ends at 10 s; where two of three end, nothing is drawn."""
+    short = at_distance(0.9, t=T[:101])
+    two_left = error_envelope([at_distance(0.1), at_distance(0.3), short])
+    np.testing.assert_allclose(two_left.position[1, [100, 101, 600]], [0.3, 0.2, 0.2])
+    one_left = error_envelope([at_distance(0.1), short, short])
+    assert np.isfinite(one_left.position[:, 100]).all() and np.isnan(one_left.position[:, 101:]).all()
+
+
+def test_no_trials_have_no_envelope():
+    with pytest.raises(ValueError, match="at least one trial"):
+        error_envelope([])
+
+
+def test_the_figure_draws_each_median_and_both_limits(tmp_path):
+    envelopes = {
+        name: error_envelope([at_distance(d), at_distance(2 * d)])
+        for name, d in (("pid", 0.2), ("ppo", 0.01))
+    }
+    above, below = draw_envelopes(envelopes).axes
+    for axes, limit in ((above, 0.10), (below, 10.0)):
+        medians = [line.get_ydata() for line in axes.lines if len(line.get_xdata()) == len(T)]
+        assert len(medians) == 2
+        assert any(np.allclose(line.get_ydata(), limit) for line in axes.lines)
+    np.testing.assert_allclose(above.lines[0].get_ydata(), 0.3)
+    assert save_envelopes(envelopes, tmp_path / "envelope.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_figure_that_cannot_be_written_says_so(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="write elsewhere"):
+        save_envelopes({"pid": error_envelope([at_distance(0.1)])}, tmp_path / "file" / "envelope.png")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
