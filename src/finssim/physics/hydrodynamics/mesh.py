@@ -1,0 +1,259 @@
+"""Drag and displacement of a closed triangle mesh cut by the water surface (paper, eq. 3-4).
+
+The water surface is given as a plane in body axes: its upward normal and the signed height of the body origin above it.
+"""
+# mypy: disable-error-code="call-overload,valid-type,no-untyped-call,misc,attr-defined,operator,no-any-return"
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
+
+from finssim.geometry.mesh import check_closed, face_geometry, mesh_centroid, mesh_volume
+from finssim.physics.types import angular, join, linear, vec6, vec8
+
+__all__ = ["HullMesh", "hull_mesh", "mesh_displacement", "mesh_drag"]
+
+
+@wp.struct
+class HullMesh:
+    """Closed hulls of one or several kinds of vehicle, body frame; hull k owns faces start[k] to start[k + 1]."""
+
+    start: wp.array(dtype=wp.int32)
+    """First face of each hull, and the number of all faces at the end (kinds + 1,)."""
+    volume: wp.array(dtype=wp.float32)
+    """Enclosed volume (kinds,) [m³]."""
+    centroid: wp.array(dtype=wp.vec3)
+    """Centroid of the enclosed volume (kinds,) [m]."""
+    box_center: wp.array(dtype=wp.vec3)
+    """Centre of the box around the hull (kinds,) [m]."""
+    box_half: wp.array(dtype=wp.vec3)
+    """Half lengths of that box (kinds,) [m]."""
+    face: wp.array(dtype=vec8)
+    """Centroid [m], outward unit normal and area [m²] of each face (faces,), side by side for one read; then 0."""
+    corners: wp.array(dtype=wp.mat33)
+    """Corners of each face, a row each (faces,) [m]; only read near the surface."""
+
+
+def hull_mesh(hulls: Sequence[tuple[ArrayLike, ArrayLike]], device: str | None = None) -> HullMesh:
+    """Put closed hulls into the arrays that the mesh functions read.
+
+    Args:
+        hulls: For each kind of vehicle its vertices (n, 3) [m], body frame, and outward faces (m, 3).
+        device: Warp device; the default one if None.
+
+    Returns:
+        The hulls in float32; kind k is the k-th of `hulls`.
+
+    Raises:
+        MeshError: A hull is not closed and outward.
+    """
+    start, volume, centroid, box_center, box_half, face, corners = [0], [], [], [], [], [], []
+    for vertices, faces in hulls:
+        points, triangles = np.asarray(vertices, np.float64), np.asarray(faces)
+        check_closed(points, triangles)
+        normal, area, middle = face_geometry(points, triangles)
+        low, high = points[triangles].min(axis=(0, 1)), points[triangles].max(axis=(0, 1))
+        start.append(start[-1] + len(triangles))
+        volume.append(mesh_volume(points, triangles))
+        centroid.append(mesh_centroid(points, triangles))
+        box_center.append((low + high) / 2.0)
+        box_half.append((high - low) / 2.0)
+        face.append(np.column_stack([middle, normal, area, np.zeros(len(area))]))
+        corners.append(points[triangles])
+
+    result = HullMesh()
+    result.start = wp.array(start, dtype=wp.int32, device=device)
+    result.volume = wp.array(volume, dtype=wp.float32, device=device)
+    result.centroid = wp.array(np.array(centroid), dtype=wp.vec3, device=device)
+    result.box_center = wp.array(np.array(box_center), dtype=wp.vec3, device=device)
+    result.box_half = wp.array(np.array(box_half), dtype=wp.vec3, device=device)
+    result.face = wp.array(np.concatenate(face), dtype=vec8, device=device)
+    result.corners = wp.array(np.concatenate(corners), dtype=wp.mat33, device=device)
+    return result
+
+
+@wp.func
+def wet_corner(a: wp.vec3, b: wp.vec3, c: wp.vec3, h_a: float, h_b: float, h_c: float) -> wp.vec4:
+    """Centroid and share of the area of the part at a, the only corner below the surface (h_a < 0)."""
+    s = h_a / (h_a - h_b)
+    t = h_a / (h_a - h_c)
+    m = a + (s * (b - a) + t * (c - a)) / 3.0
+    return wp.vec4(m[0], m[1], m[2], s * t)
+
+
+@wp.func
+def wet_side(a: wp.vec3, b: wp.vec3, c: wp.vec3, h_a: float, h_b: float, h_c: float) -> wp.vec4:
+    """Centroid and share of the area of the part at b and c, a being the only corner above (h_a > 0)."""
+    s = h_b / (h_b - h_a)
+    t = h_c / (h_c - h_a)
+    p = b + s * (a - b)
+    q = c + t * (a - c)
+    # As two triangles (b, c, q) and (b, q, p): a difference of areas would cancel as the part gets small.
+    first = t
+    second = s * (1.0 - t)
+    m = b + (first * (c - b + q - b) + second * (q - b + p - b)) / (3.0 * wp.max(first + second, 1.0e-30))
+    return wp.vec4(m[0], m[1], m[2], first + second)
+
+
+@wp.func
+def wet_part(corners: wp.mat33, surface_normal: wp.vec3, surface_height: float) -> wp.vec4:
+    """Part of a triangle below the water surface.
+
+    Args:
+        corners: Corners a, b, c, a row each, body frame [m].
+        surface_normal: Upward unit normal of the surface, body frame.
+        surface_height: Height of the body origin above the surface [m].
+
+    Returns:
+        Centroid of the part, body frame [m], and its share of the triangle's area, 0 to 1.
+    """
+    a = corners[0]
+    b = corners[1]
+    c = corners[2]
+    h_a = surface_height + wp.dot(surface_normal, a)
+    h_b = surface_height + wp.dot(surface_normal, b)
+    h_c = surface_height + wp.dot(surface_normal, c)
+    if h_a >= 0.0 and h_b >= 0.0 and h_c >= 0.0:
+        return wp.vec4(0.0)
+    if h_a <= 0.0 and h_b <= 0.0 and h_c <= 0.0:
+        m = (a + b + c) / 3.0
+        return wp.vec4(m[0], m[1], m[2], 1.0)
+    # Cyclic order is kept, and the lone corner put first.
+    if h_a < 0.0 and h_b >= 0.0 and h_c >= 0.0:
+        return wet_corner(a, b, c, h_a, h_b, h_c)
+    if h_b < 0.0 and h_c >= 0.0 and h_a >= 0.0:
+        return wet_corner(b, c, a, h_b, h_c, h_a)
+    if h_c < 0.0 and h_a >= 0.0 and h_b >= 0.0:
+        return wet_corner(c, a, b, h_c, h_a, h_b)
+    if h_a > 0.0:
+        return wet_side(a, b, c, h_a, h_b, h_c)
+    if h_b > 0.0:
+        return wet_side(b, c, a, h_b, h_c, h_a)
+    return wet_side(c, a, b, h_c, h_a, h_b)
+
+
+@wp.func
+def face_drag(v: wp.vec3, normal: wp.vec3, form: float, skin: float) -> wp.vec3:
+    """Form and skin drag per area on a face in the flow v                              (paper, eq. 4)
+
+    form [-μ]_+ v |v| + skin v_t |v_t|,  μ = n·v / |v|,  v_t = (I - n nᵀ) v
+
+    Args:
+        v: Velocity of the water relative to the face, body frame [m/s].
+        normal: Outward unit normal of the face, body frame.
+        form: ½ ρ C_form [kg/m³].
+        skin: ½ ρ C_skin [kg/m³].
+
+    Returns:
+        Force per area, body frame [N/m²].
+    """
+    across = wp.dot(normal, v)
+    v_t = v - across * normal
+    # |v| cancels against the one in μ.
+    return form * wp.max(-across, 0.0) * v + skin * wp.length(v_t) * v_t
+
+
+@wp.func
+def mesh_drag(
+    hull: HullMesh,
+    kind: int,
+    nu: vec6,
+    v_water: wp.vec3,
+    flow_gradient: wp.mat33,
+    density: float,
+    form_drag: float,
+    skin_drag: float,
+    surface_normal: wp.vec3,
+    surface_height: float,
+) -> vec6:
+    """Form and skin drag over the part of the hull below the water surface             (paper, eq. 3-4)
+
+    The flow at a face is v_i = v_water + G c_i - (v + ω × c_i), at the centroid c_i of its part below the surface.
+
+    Args:
+        hull: The hulls.
+        kind: Which of them.
+        nu: Twist of the body at its origin, body frame [m/s, rad/s].
+        v_water: Velocity of the water at the body origin, body frame [m/s].
+        flow_gradient: G, derivative of the water's velocity by place, body frame [1/s].
+        density: ρ [kg/m³].
+        form_drag: C_form [-].
+        skin_drag: C_skin [-].
+        surface_normal: Upward unit normal of the water surface, body frame.
+        surface_height: Height of the body origin above the surface along that normal, negative below [m].
+
+    Returns:
+        Wrench about the body origin, body frame [N, N m].
+    """
+    form = 0.5 * density * form_drag
+    skin = 0.5 * density * skin_drag
+    v_origin = v_water - linear(nu)
+    turn = flow_gradient - wp.skew(angular(nu))
+    force = wp.vec3(0.0)
+    moment = wp.vec3(0.0)
+
+    middle = surface_height + wp.dot(surface_normal, hull.box_center[kind])
+    reach = wp.dot(wp.abs(surface_normal), hull.box_half[kind])
+    if middle + reach <= 0.0:
+        for i in range(hull.start[kind], hull.start[kind + 1]):
+            f = hull.face[i]
+            c = wp.vec3(f[0], f[1], f[2])
+            pull = f[6] * face_drag(v_origin + turn * c, wp.vec3(f[3], f[4], f[5]), form, skin)
+            force += pull
+            moment += wp.cross(c, pull)
+    elif middle - reach < 0.0:
+        for i in range(hull.start[kind], hull.start[kind + 1]):
+            wet = wet_part(hull.corners[i], surface_normal, surface_height)
+            if wet[3] > 0.0:
+                f = hull.face[i]
+                c = wp.vec3(wet[0], wet[1], wet[2])
+                pull = wet[3] * f[6] * face_drag(v_origin + turn * c, wp.vec3(f[3], f[4], f[5]), form, skin)
+                force += pull
+                moment += wp.cross(c, pull)
+    return join(force, moment)
+
+
+@wp.func
+def mesh_displacement(hull: HullMesh, kind: int, surface_normal: wp.vec3, surface_height: float) -> wp.vec4:
+    """Volume and centroid of the part of the hull below the water surface.
+
+    The sum over the faces' wet parts of the pyramids with apex P on the surface: V_i = A_i n_i·(c_i - P)/3, whose
+    centroid is P + 3/4 (c_i - P). The cut through the hull lies in the surface, as P does, so it adds nothing.
+
+    Args:
+        hull: The hulls.
+        kind: Which of them.
+        surface_normal: Upward unit normal of the water surface, body frame.
+        surface_height: Height of the body origin above the surface along that normal, negative below [m].
+
+    Returns:
+        Volume [m³] and its centroid, body frame [m]; zeros if the hull is dry.
+    """
+    center = hull.box_center[kind]
+    middle = surface_height + wp.dot(surface_normal, center)
+    reach = wp.dot(wp.abs(surface_normal), hull.box_half[kind])
+    if middle + reach <= 0.0:
+        c = hull.centroid[kind]
+        return wp.vec4(hull.volume[kind], c[0], c[1], c[2])
+    if middle - reach >= 0.0:
+        return wp.vec4(0.0)
+
+    # The point of the surface nearest to the hull's middle keeps the pyramids small and float32 exact enough.
+    apex = center - middle * surface_normal
+    volume = float(0.0)
+    moment = wp.vec3(0.0)
+    for i in range(hull.start[kind], hull.start[kind + 1]):
+        wet = wet_part(hull.corners[i], surface_normal, surface_height)
+        if wet[3] > 0.0:
+            f = hull.face[i]
+            arm = wp.vec3(wet[0], wet[1], wet[2]) - apex
+            pyramid = wet[3] * f[6] * wp.dot(wp.vec3(f[3], f[4], f[5]), arm) / 3.0
+            volume += pyramid
+            moment += pyramid * arm
+    # Below float32's resolution of the whole, the quotient of two rounding errors is no centroid.
+    if volume <= 1.0e-7 * hull.volume[kind]:
+        return wp.vec4(0.0)
+    c = apex + 0.75 * moment / volume
+    return wp.vec4(volume, c[0], c[1], c[2])
