@@ -1,0 +1,1 @@
+"""Rotations, frames, camera optics and hull meshes."""

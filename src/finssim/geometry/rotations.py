@@ -1,0 +1,151 @@
+"""Rotations in float64 NumPy over a leading `...` batch; quaternions are xyzw, body to world unless said otherwise.
+
+Euler angles are ZYX (yaw, then pitch, then roll). With y left and z up, a positive pitch is nose DOWN and a positive
+yaw is a LEFT turn.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = [
+    "matrix_to_quat",
+    "quat_conjugate",
+    "quat_from_euler",
+    "quat_from_rotvec",
+    "quat_from_yaw",
+    "quat_inverse_rotate",
+    "quat_multiply",
+    "quat_rotate",
+    "quat_to_euler",
+    "quat_to_matrix",
+    "quat_to_rotvec",
+    "quat_yaw",
+    "skew",
+    "wrap_angle",
+]
+
+Array = npt.NDArray[np.float64]
+
+
+def wrap_angle(angle: npt.ArrayLike) -> Array:
+    """The same angle in [-pi, pi) [rad], (...)."""
+    return np.asarray(np.remainder(np.asarray(angle, float) + np.pi, 2.0 * np.pi) - np.pi)
+
+
+def skew(a: npt.ArrayLike) -> Array:
+    """Matrix S(a) with S(a) b = a x b, (..., 3) -> (..., 3, 3)."""
+    x, y, z = np.moveaxis(np.asarray(a, float), -1, 0)
+    o = np.zeros_like(x)
+    entries: Array = np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1)
+    return entries.reshape(*x.shape, 3, 3)
+
+
+def quat_multiply(q_ab: npt.ArrayLike, q_bc: npt.ArrayLike) -> Array:
+    """Composition q_ac = q_ab q_bc, (..., 4)."""
+    a, b = np.asarray(q_ab, float), np.asarray(q_bc, float)
+    va, wa, vb, wb = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
+    vector = wa * vb + wb * va + np.cross(va, vb)
+    return np.concatenate([vector, wa * wb - np.sum(va * vb, axis=-1, keepdims=True)], axis=-1)
+
+
+def quat_conjugate(q: npt.ArrayLike) -> Array:
+    """Inverse rotation of a unit quaternion, (..., 4)."""
+    return np.asarray(q, float) * np.array([-1.0, -1.0, -1.0, 1.0])
+
+
+def quat_rotate(q_ab: npt.ArrayLike, vector_b: npt.ArrayLike) -> Array:
+    """A vector written in b, written in a: (..., 4), (..., 3) -> (..., 3)."""
+    q, v = np.asarray(q_ab, float), np.asarray(vector_b, float)
+    twice = 2.0 * np.cross(q[..., :3], v)
+    return np.asarray(v + q[..., 3:] * twice + np.cross(q[..., :3], twice))
+
+
+def quat_inverse_rotate(q_ab: npt.ArrayLike, vector_a: npt.ArrayLike) -> Array:
+    """A vector written in a, written in b: (..., 4), (..., 3) -> (..., 3)."""
+    return quat_rotate(quat_conjugate(q_ab), vector_a)
+
+
+def quat_to_matrix(q_ab: npt.ArrayLike) -> Array:
+    """Rotation matrix R_ab of a unit quaternion, (..., 4) -> (..., 3, 3)."""
+    q = np.asarray(q_ab, float)
+    S = skew(q[..., :3])
+    return np.asarray(np.eye(3) + 2.0 * q[..., 3, None, None] * S + 2.0 * S @ S)
+
+
+def matrix_to_quat(R_ab: npt.ArrayLike) -> Array:
+    """Unit quaternion of a rotation matrix, with w >= 0, (..., 3, 3) -> (..., 4)."""
+    R = np.asarray(R_ab, float)
+    xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    yx, zx, zy = R[..., 1, 0] + R[..., 0, 1], R[..., 2, 0] + R[..., 0, 2], R[..., 2, 1] + R[..., 1, 2]
+    xw, yw, zw = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
+    # Four times q q^T: every row is proportional to q, and the one with the largest diagonal loses no digits.
+    outer = np.stack(
+        [
+            np.stack([1.0 + xx - yy - zz, yx, zx, xw], -1),
+            np.stack([yx, 1.0 - xx + yy - zz, zy, yw], -1),
+            np.stack([zx, zy, 1.0 - xx - yy + zz, zw], -1),
+            np.stack([xw, yw, zw, 1.0 + xx + yy + zz], -1),
+        ],
+        axis=-2,
+    )
+    largest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    q = np.take_along_axis(outer, largest[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.asarray(np.where(q[..., 3:] < 0.0, -q, q))
+
+
+def quat_from_euler(roll: npt.ArrayLike, pitch: npt.ArrayLike, yaw: npt.ArrayLike) -> Array:
+    """Quaternion of R_z(yaw) R_y(pitch) R_x(roll) [rad], (...) each -> (..., 4)."""
+    r, p, y = np.broadcast_arrays(*(0.5 * np.asarray(angle, float) for angle in (roll, pitch, yaw)))
+    cr, cp, cy, sr, sp, sy = np.cos(r), np.cos(p), np.cos(y), np.sin(r), np.sin(p), np.sin(y)
+    return np.stack(
+        [
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ],
+        axis=-1,
+    )
+
+
+def quat_to_euler(q: npt.ArrayLike) -> tuple[Array, Array, Array]:
+    """Roll in [-pi, pi], pitch in [-pi/2, pi/2], yaw in [-pi, pi] [rad], (..., 4) -> (...) each.
+
+    Note:
+        At a pitch of +-90 degrees only roll -+ yaw is defined; the split returned there is arbitrary.
+    """
+    R = quat_to_matrix(q)
+    roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
+    pitch = np.arctan2(-R[..., 2, 0], np.hypot(R[..., 2, 1], R[..., 2, 2]))
+    return roll, pitch, np.arctan2(R[..., 1, 0], R[..., 0, 0])
+
+
+def quat_from_yaw(yaw: npt.ArrayLike) -> Array:
+    """Quaternion of a turn about the vertical, left positive [rad], (...) -> (..., 4)."""
+    return quat_from_euler(0.0, 0.0, yaw)
+
+
+def quat_yaw(q: npt.ArrayLike) -> Array:
+    """Heading of the body x axis, left positive [rad], (..., 4) -> (...)."""
+    return quat_to_euler(q)[2]
+
+
+def quat_from_rotvec(rotvec: npt.ArrayLike) -> Array:
+    """Quaternion of a rotation vector (axis times angle) [rad], (..., 3) -> (..., 4)."""
+    v = np.asarray(rotvec, float)
+    angle = np.linalg.norm(v, axis=-1, keepdims=True)
+    # sinc(x) = sin(pi x)/(pi x) stays exact through zero.
+    return np.concatenate([0.5 * np.sinc(angle / (2.0 * np.pi)) * v, np.cos(0.5 * angle)], axis=-1)
+
+
+def quat_to_rotvec(q: npt.ArrayLike) -> Array:
+    """Rotation vector of the shorter way round, length in [0, pi] [rad], (..., 4) -> (..., 3)."""
+    q = np.asarray(q, float)
+    q = np.where(q[..., 3:] < 0.0, -q, q)
+    sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
+    half = np.arctan2(sine, q[..., 3:])
+    ratio = np.divide(half, sine, out=np.ones_like(half), where=sine > 0.0)
+    return np.asarray(2.0 * ratio * q[..., :3])
