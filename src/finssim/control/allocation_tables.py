@@ -87,8 +87,13 @@ def tables(
         response = -np.linalg.solve(H[np.ix_(F, F)], H[np.ix_(F, C)])
         clamped[mask][np.ix_(C, F)] = response.T
         clamped[mask][np.ix_(C, C)] = (H[np.ix_(C, C)] + H[np.ix_(C, F)] @ response) / h
-    single = (array.astype(np.float32) for array in (gain, clamped, hessian))
-    return Tables(*single, _toward_zero(low), _toward_zero(high))
+    return Tables(
+        gain.astype(np.float32),
+        clamped.astype(np.float32),
+        hessian.astype(np.float32),
+        _toward_zero(low),
+        _toward_zero(high),
+    )
 
 
 def _toward_zero(limits: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
