@@ -2,6 +2,7 @@
 
 import json
 from importlib import metadata
+from importlib.util import find_spec
 
 import pytest
 
@@ -60,11 +61,10 @@ def test_extras_are_those_of_the_package():
 
 @pytest.mark.parametrize("name", EXTRAS)
 def test_distributions_and_modules_belong_together(name):
-    """Where an extra's distribution is installed, it holds the module that the doctor names for it."""
-    owners = metadata.packages_distributions()
+    """Where an extra's distribution is installed, the module that the doctor names for it can be found."""
     for distribution, module in EXTRAS[name].distributions.items():
         try:
             metadata.version(distribution)
         except metadata.PackageNotFoundError:
             continue
-        assert distribution.lower().replace("_", "-") in {d.lower().replace("_", "-") for d in owners[module]}
+        assert find_spec(module) is not None

@@ -1,0 +1,47 @@
+"""What the pages show works: their Python runs, their vehicle loads, and the strict build passes."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from finssim.vehicles import VehicleError, load_vehicle
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """Fenced code of one language, in the page's order."""
+    text = page.read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.stem)
+def test_python_on_a_page_runs(page, tmp_path):
+    """The Python blocks of a page run one after the other, as a reader would try them."""
+    code = "\n".join(blocks(page, "python"))
+    run = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+
+
+def test_the_vehicle_on_the_page_loads(tmp_path):
+    """The example vehicle is a vehicle, and a wrong axis in it gives the error that the page shows."""
+    (example,) = blocks(ROOT / "docs" / "vehicles.md", "yaml")
+    (tmp_path / "minnow.yaml").write_text(example, encoding="utf-8")
+    assert load_vehicle(tmp_path / "minnow.yaml").thruster_names == ("left", "right")
+    (tmp_path / "minnow.yaml").write_text(example.replace("[1, 0, 0]", "[0.94, 0, 0]", 1), encoding="utf-8")
+    with pytest.raises(VehicleError) as refused:
+        load_vehicle(tmp_path / "minnow.yaml")
+    shown = "minnow.yaml: thrusters.left: axis has length 0.94, expected 1: give a body-frame unit vector"
+    assert str(refused.value).endswith(shown)
+    assert shown in (ROOT / "docs" / "vehicles.md").read_text(encoding="utf-8")
+
+
+def test_pages_build_without_a_warning(tmp_path):
+    """Every link between pages leads to a page and to a heading of it."""
+    words = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", tmp_path / "site"]
+    run = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
