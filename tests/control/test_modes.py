@@ -1,0 +1,108 @@
+"""An action means a part of a limit, is refused when it cannot be one, and its definition travels as plain data."""
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from finssim.control.errors import ControlError
+from finssim.control.modes import MODES, Thruster8, Wrench4, Wrench6, action_mode, mode_from_dict
+
+
+@dataclass(frozen=True)
+class Craft:
+    """The parts of a vehicle that an action mode reads."""
+
+    control_matrix: np.ndarray
+    force_limits: tuple[np.ndarray, np.ndarray]
+    wrench_limits: np.ndarray
+    wrench_reference: tuple[float, float, float] = (0.0, 0.0, -0.08)
+    name: str = "craft"
+
+    @property
+    def thruster_names(self):
+        return tuple(f"T{i}" for i in range(self.control_matrix.shape[1]))
+
+
+@pytest.fixture
+def craft(layout):
+    return Craft(layout.B, (layout.lower, layout.upper), layout.wrench_limits)
+
+
+@pytest.mark.parametrize("name", MODES)
+def test_zero_action_is_zero_thrust(craft, name):
+    mode = action_mode(name, craft)
+    np.testing.assert_array_equal(
+        mode.to_thrusters(np.zeros(mode.size)), np.zeros(craft.control_matrix.shape[1])
+    )
+
+
+def test_thruster_actions_reach_each_limit(craft):
+    lower, upper = craft.force_limits
+    mode = Thruster8.from_vehicle(craft)
+    np.testing.assert_array_equal(mode.to_thrusters(np.ones(mode.size)), upper)
+    np.testing.assert_array_equal(mode.to_thrusters(-np.ones(mode.size)), lower)
+    np.testing.assert_allclose(mode.to_thrusters(np.full(mode.size, -0.5)), 0.5 * lower)
+
+
+def test_actions_beyond_one_saturate(craft):
+    for name in MODES:
+        mode = action_mode(name, craft)
+        np.testing.assert_array_equal(
+            mode.to_thrusters(np.full(mode.size, 3.0)), mode.to_thrusters(np.ones(mode.size))
+        )
+
+
+def test_wrench_actions_produce_their_part_of_each_axis_limit(finsrov):
+    craft = Craft(finsrov.B, (finsrov.lower, finsrov.upper), finsrov.wrench_limits)
+    mode = Wrench6.from_vehicle(craft, scale=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6))
+    for axis in range(6):
+        wrench = finsrov.B @ mode.to_thrusters(np.eye(6)[axis]) / finsrov.wrench_limits
+        np.testing.assert_allclose(wrench, np.eye(6)[axis] * mode.scale[axis], atol=3e-4)  # lambda
+
+
+def test_wrench4_asks_for_no_roll_or_pitch(craft):
+    mode = Wrench4.from_vehicle(craft)
+    assert mode.labels == ("surge", "sway", "heave", "yaw")
+    np.testing.assert_array_equal(
+        mode.to_wrench([0.1, 0.2, 0.3, 0.4]), np.array([0.1, 0.2, 0.3, 0, 0, 0.4]) * craft.wrench_limits
+    )
+
+
+def test_batches_equal_single_actions(craft):
+    for name in MODES:
+        mode = action_mode(name, craft)
+        actions = np.random.default_rng(0).uniform(-1, 1, (3, 4, mode.size))
+        np.testing.assert_array_equal(mode.to_thrusters(actions)[2, 1], mode.to_thrusters(actions[2, 1]))
+
+
+@pytest.mark.parametrize("name", MODES)
+def test_definition_survives_a_file(craft, name):
+    mode = action_mode(name, craft, scale=0.5)
+    assert mode_from_dict(json.loads(json.dumps(mode.describe())), craft) == mode
+
+
+@pytest.mark.parametrize("name", MODES)
+def test_another_vehicles_limits_are_refused(finsrov, name):
+    craft = Craft(finsrov.B, (finsrov.lower, finsrov.upper), finsrov.wrench_limits)
+    weaker = Craft(finsrov.B, (finsrov.lower, 0.9 * finsrov.upper), 0.9 * finsrov.wrench_limits)
+    with pytest.raises(ControlError, match="trained with"):
+        mode_from_dict(action_mode(name, craft).describe(), weaker)
+
+
+@pytest.mark.parametrize("name", MODES)
+def test_wrong_length_and_nan_are_refused(craft, name):
+    mode = action_mode(name, craft)
+    with pytest.raises(ControlError, match="expected"):
+        mode.to_thrusters(np.zeros(mode.size + 1))
+    with pytest.raises(ControlError, match="NaN"):
+        mode.to_thrusters(np.full(mode.size, np.nan))
+
+
+def test_unknown_modes_and_impossible_scales_are_refused(craft):
+    with pytest.raises(ControlError, match="available: thruster8, wrench6, wrench4"):
+        action_mode("wrench7", craft)
+    for scale in (1.5, -0.1, [1.0, 1.0, 1.0], float("nan")):
+        with pytest.raises(ControlError, match="scale"):
+            action_mode("wrench6", craft, scale)
