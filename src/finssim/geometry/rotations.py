@@ -38,8 +38,8 @@ def skew(a: npt.ArrayLike) -> Array:
     """Matrix S(a) with S(a) b = a x b, (..., 3) -> (..., 3, 3)."""
     x, y, z = np.moveaxis(np.asarray(a, float), -1, 0)
     o = np.zeros_like(x)
-    entries: Array = np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1)
-    return entries.reshape(*x.shape, 3, 3)
+    entries = np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1)
+    return np.asarray(entries.reshape(*x.shape, 3, 3))
 
 
 def quat_multiply(q_ab: npt.ArrayLike, q_bc: npt.ArrayLike) -> Array:
@@ -52,7 +52,7 @@ def quat_multiply(q_ab: npt.ArrayLike, q_bc: npt.ArrayLike) -> Array:
 
 def quat_conjugate(q: npt.ArrayLike) -> Array:
     """Inverse rotation of a unit quaternion, (..., 4)."""
-    return np.asarray(q, float) * np.array([-1.0, -1.0, -1.0, 1.0])
+    return np.asarray(np.asarray(q, float) * np.array([-1.0, -1.0, -1.0, 1.0]))
 
 
 def quat_rotate(q_ab: npt.ArrayLike, vector_b: npt.ArrayLike) -> Array:
