@@ -1,0 +1,289 @@
+"""The batched simulator: worlds × vehicles, stepped together by one kernel."""
+
+import difflib
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from finssim.engine.launch import Pipeline
+from finssim.engine.plant_arrays import SimulatorError, build_command, build_plant
+from finssim.engine.post_mortem import write_post_mortem
+from finssim.engine.state import HISTORY, State, clear_actuators, vec13
+from finssim.engine.step import physics_kernel, tick
+from finssim.engine.surroundings import Pool, TetherLine, Water
+from finssim.physics.contact import PoolWalls
+from finssim.physics.hydrodynamics import HYDRODYNAMICS
+from finssim.physics.hydrodynamics.mesh import HullMesh, hull_mesh
+from finssim.physics.plant import refresh_plant
+from finssim.physics.tether import Tether
+from finssim.physics.types import vec6, vec8
+from finssim.physics.water import advance_drift
+from finssim.vehicles import Vehicle, load_vehicle
+
+INTEGRATORS = ("euler", "rk4")
+
+
+def _one_of(value: str, available: Sequence[str], what: str) -> str:
+    if value not in available:
+        close = difflib.get_close_matches(value, available, n=1)
+        hint = f"; did you mean '{close[0]}'?" if close else ""
+        raise SimulatorError(f"unknown {what} '{value}'; available: {', '.join(sorted(available))}{hint}")
+    return value
+
+
+class Simulator:
+    """Many equal worlds, each with the same vehicles, in one batch.
+
+    Attributes:
+        state: Warp arrays by (world, vehicle); see `State`.
+        command: Thruster force commands [N] and disturbance wrenches; write them before `step`.
+        plant: Parameters by (world, vehicle); after writing any of them call `refresh`.
+        water: Water by world.
+    """
+
+    def __init__(
+        self,
+        vehicles: Vehicle | str | Sequence[Vehicle | str],
+        *,
+        worlds: int = 1,
+        hydrodynamics: str = "calibrated",
+        control_step: float = 0.1,
+        substeps: int = 10,
+        integrator: str = "euler",
+        water: Water | None = None,
+        pool: Pool | None = None,
+        tether: TetherLine | None = None,
+        device: str = "cpu",
+        threads: int | None = None,
+        seed: int = 0,
+        max_delay: float | None = None,
+        max_waves: int = 0,
+    ) -> None:
+        """Set up the worlds.
+
+        Args:
+            vehicles: One vehicle or several, each a `Vehicle`, a catalogue name or a file.
+            worlds: How many worlds.
+            hydrodynamics: Key of `HYDRODYNAMICS`: calibrated, mesh or simplified.
+            control_step: Time between commands [s].
+            substeps: Physics steps in a control step.
+            integrator: `euler` (semi-implicit) or `rk4`.
+            water: Currents and waves; still water if None.
+            pool: Walls and floor; open water if None.
+            tether: On every vehicle; none if None.
+            device: Warp device, `cpu` or `cuda`.
+            threads: Threads on a CPU; all processors if None.
+            seed: Of everything random in the worlds.
+            max_delay: Longest thruster delay that randomisation may set [s]; twice the vehicles' own if None.
+            max_waves: Room for this many randomised waves.
+
+        Raises:
+            SimulatorError: a name or number is out of its range; it says which.
+        """
+        given = [vehicles] if isinstance(vehicles, Vehicle | str) else list(vehicles)
+        self.vehicles = [v if isinstance(v, Vehicle) else load_vehicle(v) for v in given]
+        self.hydrodynamics = _one_of(hydrodynamics, tuple(HYDRODYNAMICS), "hydrodynamic model")
+        self.integrator = _one_of(integrator, INTEGRATORS, "integrator")
+        if worlds < 1 or substeps < 1 or not self.vehicles:
+            raise SimulatorError(f"worlds={worlds}, substeps={substeps}: expected at least one, and one vehicle")
+        if not (math.isfinite(control_step) and control_step > 0.0):
+            raise SimulatorError(f"control_step is {control_step} s, expected a finite time above 0 s")
+        self.worlds, self.control_step, self.substeps, self.seed = worlds, control_step, substeps, seed
+        self.device = _device(device)
+        self._surround(water or Water(), pool, tether, max_waves)
+        self._hulls()
+        n = len(self.vehicles)
+        self.plant = build_plant(self.vehicles, hydrodynamics, worlds, self._hull_index, self.device)
+        self.command = build_command(worlds, n, self.device)
+        longest = 2.0 * float(self.plant.delay.numpy().max()) if max_delay is None else max_delay
+        self.state = self._state(n, slots=math.ceil(longest / control_step) + 2)
+        self._all = wp.ones(worlds, dtype=wp.int32, device=self.device)
+        self._mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
+        self._threads = threads
+        self._reset_all = self.pipeline()
+        self.add_reset(self._reset_all, self._all)
+        self._reset_some = self.pipeline()
+        self.add_reset(self._reset_some, self._mask)
+        self._step = self.pipeline()
+        self.add_step(self._step)
+        self._reported: set[tuple[int, int]] = set()
+        self.refresh()
+        self.place(position=(0.0, 0.0, -0.5 * (pool.depth if pool else 1.0)))
+
+    def _surround(self, water: Water, pool: Pool | None, tether: TetherLine | None, max_waves: int) -> None:
+        fluid = self.vehicles[0].water
+        self.surroundings = (water, pool, tether)
+        self.water = water.arrays(self.worlds, fluid.density, fluid.gravity, self.device, max_waves)
+        self.walls = pool.walls() if pool else PoolWalls()
+        self.tether = tether.struct() if tether else Tether()
+
+    def _hulls(self) -> None:
+        meshes: list[tuple[NDArray[Any], NDArray[Any]]] = []
+        self._hull_index = [0] * len(self.vehicles)
+        if self.hydrodynamics == "mesh":
+            for i, vehicle in enumerate(self.vehicles):
+                self._hull_index[i] = i
+                meshes.append(vehicle.hull_mesh())
+        self.hull = hull_mesh(meshes, self.device) if meshes else HullMesh()
+
+    def _state(self, vehicles: int, slots: int) -> State:
+        shape = (self.worlds, vehicles)
+        state = State()
+        fields = {"position": wp.vec3, "quaternion": wp.quat, "velocity": vec6, "acceleration": vec6}
+        for name, dtype in (fields | {"actuator": vec8, "thrust": vec8}).items():
+            setattr(state, name, wp.zeros(shape, dtype=dtype, device=self.device))
+        state.quaternion.fill_(wp.quat(0.0, 0.0, 0.0, 1.0))
+        state.commands = wp.zeros((*shape, slots), dtype=vec8, device=self.device)
+        state.history = wp.zeros((HISTORY, *shape), dtype=vec13, device=self.device)
+        for name in ("steps", "episode", "broken", "frozen"):
+            setattr(state, name, wp.zeros(self.worlds, dtype=wp.int32, device=self.device))
+        return state
+
+    def pipeline(self) -> Pipeline:
+        """An empty pipeline over the simulator's worlds, for a caller that adds its own kernels around the step."""
+        return Pipeline(self.worlds, self.device, self._threads)
+
+    def add_step(self, pipeline: Pipeline) -> None:
+        """Append the kernels of one control step."""
+        if self.surroundings[0].drifting:
+            s = self.state
+            pipeline.add(advance_drift, [self.water, s.steps, self.control_step, self.seed, s.episode])
+        kernel = physics_kernel(
+            self.hydrodynamics,
+            self.integrator,
+            walls_present=self.surroundings[1] is not None,
+            tether_present=self.surroundings[2] is not None,
+            speed_lag=bool(self.plant.speed_lag.numpy().any()),
+        )
+        fixed = [self.hull, self.water, self.walls, self.tether, self.control_step, self.substeps]
+        pipeline.add(kernel, [self.state, self.command, self.plant, *fixed], vehicles=len(self.vehicles))
+        pipeline.add(tick, [self.state])
+
+    def add_reset(self, pipeline: Pipeline, mask: wp.array) -> None:
+        """Append the kernels that reset motors and clocks, where mask (by world, int32) is not 0."""
+        pipeline.add(clear_actuators, [self.state, mask])
+
+    def add_refresh(self, pipeline: Pipeline, mask: wp.array) -> None:
+        """Append the kernel that recomputes derived parameters, where mask (by world, int32) is not 0."""
+        h = self.control_step / self.substeps
+        pipeline.add(refresh_plant, [self.plant, h, mask], vehicles=len(self.vehicles))
+
+    def step(self) -> None:
+        """Advance every world by one control step under `command`."""
+        self._step.run()
+
+    def refresh(self) -> None:
+        """Recompute what depends on `plant` (mass matrix inverses, lag coefficients) after writing to it.
+
+        Raises:
+            SimulatorError: a delay is longer than the delay line.
+        """
+        longest = float(self.plant.delay.numpy().max())
+        if longest > (self.state.commands.shape[2] - 2) * self.control_step + 1e-6:
+            raise SimulatorError(f"thruster delay {longest} s exceeds the delay line; give max_delay={longest}")
+        pipeline = self.pipeline()
+        self.add_refresh(pipeline, self._all)
+        pipeline.run()
+
+    def reset(self, mask: ArrayLike | None = None) -> None:
+        """Stop the motors, empty the delay lines and set the clocks to zero; pose and velocity stay.
+
+        Args:
+            mask: Which worlds, bool by world; all if None. A frozen world moves again after its pose is set.
+        """
+        if mask is None:
+            self._reset_all.run()
+            return
+        self._mask.assign(np.asarray(mask, dtype=np.int32))
+        self._reset_some.run()
+
+    def place(
+        self,
+        position: ArrayLike = (0.0, 0.0, 0.0),
+        quaternion: ArrayLike = (0.0, 0.0, 0.0, 1.0),
+        velocity: ArrayLike = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    ) -> None:
+        """Put every vehicle somewhere and reset all worlds.
+
+        Args:
+            position: Of the body origin, world frame [m], shape broadcastable to (worlds, vehicles, 3).
+            quaternion: Body to world, xyzw, broadcastable to (..., 4).
+            velocity: nu, body frame [m/s, rad/s], broadcastable to (..., 6).
+
+        Raises:
+            SimulatorError: a number is not finite, or a quaternion has no length.
+        """
+        shape = (self.worlds, len(self.vehicles))
+        given = {"position": position, "quaternion": quaternion, "velocity": velocity}
+        for name, value in given.items():
+            array = np.asarray(value, dtype=np.float32)
+            if not np.isfinite(array).all():
+                raise SimulatorError(f"{name} to place a vehicle at has a number that is not finite")
+            if name == "quaternion":
+                length = np.linalg.norm(array, axis=-1, keepdims=True)
+                if not (length > 0.0).all():
+                    raise SimulatorError("quaternion to place a vehicle at has length 0, expected 1 (xyzw)")
+                array = array / length
+            full = np.broadcast_to(array, (*shape, array.shape[-1]))
+            getattr(self.state, name).assign(np.ascontiguousarray(full, dtype=np.float32))
+        self.reset()
+
+    def numpy(self, name: str) -> NDArray[Any]:
+        """A field of `state` as NumPy; on a CPU a view that shares memory, on a GPU a copy."""
+        return getattr(self.state, name).numpy()
+
+    def torch(self, name: str) -> Any:
+        """A field of `state` as a torch tensor that shares memory on its device."""
+        return wp.to_torch(getattr(self.state, name), requires_grad=False)
+
+    def set_thrust(self, force: ArrayLike) -> None:
+        """Command thruster forces.
+
+        Args:
+            force: [N], shape broadcastable to (worlds, vehicles, n), n thrusters in the vehicle's order.
+
+        Raises:
+            SimulatorError: the length is wrong or a number is not finite.
+        """
+        f = np.asarray(force, dtype=np.float32)
+        n = {len(v.thrusters) for v in self.vehicles}
+        if f.ndim == 0 or f.shape[-1] not in n:
+            got = f.shape[-1] if f.ndim else 0
+            raise SimulatorError(f"thrust command has {got} numbers, expected {max(n)}: one per thruster")
+        if not np.isfinite(f).all():
+            raise SimulatorError("thrust command has a number that is not finite: send a force in N for every thruster")
+        full = np.zeros((self.worlds, len(self.vehicles), 8), dtype=np.float32)
+        full[..., : f.shape[-1]] = f
+        self.command.thrust.assign(full)
+
+    def frozen_worlds(self) -> NDArray[np.int64]:
+        """Worlds that stand still because a number stopped being finite."""
+        return np.flatnonzero(self.state.frozen.numpy())
+
+    def report_frozen(self, directory: Path) -> list[Path]:
+        """Write the last 50 states of every newly frozen world to a CSV file.
+
+        Args:
+            directory: Where; made if missing.
+
+        Returns:
+            The files written.
+        """
+        episode = self.state.episode.numpy()
+        new = [w for w in self.frozen_worlds() if (int(w), int(episode[w])) not in self._reported]
+        self._reported |= {(int(w), int(episode[w])) for w in new}
+        return [write_post_mortem(self, int(w), directory) for w in new]
+
+
+def _device(name: str) -> wp.Device:
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    try:
+        return wp.get_device(name)
+    except (ValueError, RuntimeError):
+        have = ", ".join(str(d) for d in wp.get_devices())
+        raise SimulatorError(f"device '{name}' is not available here; available: {have}") from None

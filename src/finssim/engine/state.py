@@ -1,0 +1,57 @@
+"""State of every simulated vehicle, as one struct of Warp arrays."""
+
+import warp as wp
+
+from finssim.physics.types import vec6, vec8
+
+HISTORY = 50
+"""Control steps that are kept to explain a world that was frozen."""
+
+vec13 = wp.types.vector(length=13, dtype=wp.float32)
+
+
+@wp.struct
+class State:
+    """State by (world, vehicle); clocks and status by world; delay line and history with one more index."""
+
+    position: wp.array2d(dtype=wp.vec3)  # body origin, world frame [m]
+    quaternion: wp.array2d(dtype=wp.quat)  # body to world, xyzw
+    velocity: wp.array2d(dtype=vec6)  # nu, body frame [m/s, rad/s]
+    acceleration: wp.array2d(dtype=vec6)  # nu_dot of the last substep
+    actuator: wp.array2d(dtype=vec8)  # lagged force [N] or propeller speed [rad/s]
+    thrust: wp.array2d(dtype=vec8)  # delivered by each thruster [N]
+    commands: wp.array3d(dtype=vec8)  # delay line: past commands, a ring over control steps
+    steps: wp.array(dtype=int)  # control steps since the world's reset
+    episode: wp.array(dtype=int)  # resets so far
+    broken: wp.array(dtype=int)  # 1: a number stopped being finite in this control step
+    frozen: wp.array(dtype=int)  # 1: the world stands still since that happened
+    history: wp.array3d(dtype=vec13)  # (slot, world, vehicle): position, quaternion, velocity
+
+
+@wp.kernel(enable_backward=False)
+def clear_actuators(state: State, mask: wp.array(dtype=int), world_offset: int):
+    """Start an episode in the worlds where mask is not 0: motors at rest, delay line empty, clocks at zero."""
+    i = wp.tid()
+    w = world_offset + i
+    if mask[w] == 0:
+        return
+    for v in range(state.position.shape[1]):
+        state.acceleration[w, v] = vec6()
+        state.actuator[w, v] = vec8()
+        state.thrust[w, v] = vec8()
+        for k in range(state.commands.shape[2]):
+            state.commands[w, v, k] = vec8()
+    state.steps[w] = 0
+    state.episode[w] = state.episode[w] + 1
+    state.broken[w] = 0
+    state.frozen[w] = 0
+
+
+@wp.func
+def is_finite(position: wp.vec3, q: wp.quat, nu: vec6) -> bool:
+    """Whether every number of a state is finite."""
+    return (
+        wp.isfinite(wp.dot(position, position))
+        and wp.isfinite(q[0] + q[1] + q[2] + q[3])
+        and wp.isfinite(wp.dot(nu, nu))
+    )

@@ -1,0 +1,1 @@
+"""Equations of motion of one underwater vehicle, written once for CPU and GPU in Warp."""

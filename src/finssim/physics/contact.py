@@ -1,0 +1,80 @@
+"""Walls and floor of the pool, as a penalty on the corners of the vehicle's envelope."""
+
+import warp as wp
+
+from finssim.physics.types import join, vec6
+
+
+@wp.struct
+class PoolWalls:
+    """A rectangular pool centred on the world's z axis, and how hard its walls are."""
+
+    present: int
+    half_length: float  # half extent along world x [m]
+    half_width: float  # half extent along world y [m]
+    depth: float  # floor at z = -depth [m]
+    stiffness: float  # per corner [N/m]
+    damping: float  # per corner, against approach only [N s/m]
+    friction: float  # Coulomb coefficient
+
+
+@wp.func
+def wall_force(penetration: float, v: wp.vec3, n: wp.vec3, walls: PoolWalls) -> wp.vec3:
+    """Force of one wall on one corner: spring, damper against approach, and friction that never pulls.
+
+    Args:
+        penetration: Depth of the corner behind the wall [m]; no force unless positive.
+        v: Velocity of the corner, world frame [m/s].
+        n: Wall normal into the water, world frame.
+        walls: Stiffness, damping and friction.
+
+    Returns:
+        Force on the corner, world frame [N].
+    """
+    if penetration <= 0.0:
+        return wp.vec3(0.0)
+    v_n = wp.dot(v, n)
+    normal = walls.stiffness * penetration - walls.damping * wp.min(v_n, 0.0)
+    v_t = v - v_n * n
+    # Friction is linear below 1 cm/s: it stays dissipative and has no step at rest.
+    return normal * n - walls.friction * normal * v_t / wp.max(wp.length(v_t), 0.01)
+
+
+@wp.func
+def contact_wrench(walls: PoolWalls, position: wp.vec3, q: wp.quat, nu: vec6, half_size: wp.vec3) -> vec6:
+    """Wrench of walls and floor on the eight corners of the vehicle's envelope box.
+
+    Args:
+        walls: The pool.
+        position: Body origin, world frame [m].
+        q: Attitude, body to world.
+        nu: Twist, body frame [m/s, rad/s].
+        half_size: Half extents of the envelope about the body origin, body axes [m].
+
+    Returns:
+        Wrench about the body origin, body frame [N, N m].
+    """
+    tau = vec6()
+    if walls.present == 0:
+        return tau
+    reach = wp.length(half_size)
+    gap = wp.min(walls.half_length - wp.abs(position[0]), walls.half_width - wp.abs(position[1]))
+    if wp.min(gap, position[2] + walls.depth) > reach:
+        return tau
+    v = wp.vec3(nu[0], nu[1], nu[2])
+    omega = wp.vec3(nu[3], nu[4], nu[5])
+    for i in range(8):
+        sx = 1.0 - 2.0 * float(i & 1)
+        sy = 1.0 - 2.0 * float((i >> 1) & 1)
+        sz = 1.0 - 2.0 * float((i >> 2) & 1)
+        r = wp.cw_mul(wp.vec3(sx, sy, sz), half_size)
+        x = position + wp.quat_rotate(q, r)
+        v_w = wp.quat_rotate(q, v + wp.cross(omega, r))
+        f = wall_force(-(x[2] + walls.depth), v_w, wp.vec3(0.0, 0.0, 1.0), walls)
+        f += wall_force(x[0] - walls.half_length, v_w, wp.vec3(-1.0, 0.0, 0.0), walls)
+        f += wall_force(-x[0] - walls.half_length, v_w, wp.vec3(1.0, 0.0, 0.0), walls)
+        f += wall_force(x[1] - walls.half_width, v_w, wp.vec3(0.0, -1.0, 0.0), walls)
+        f += wall_force(-x[1] - walls.half_width, v_w, wp.vec3(0.0, 1.0, 0.0), walls)
+        f_b = wp.quat_rotate_inv(q, f)
+        tau += join(f_b, wp.cross(r, f_b))
+    return tau

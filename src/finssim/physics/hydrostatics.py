@@ -1,0 +1,42 @@
+"""Gravity and buoyancy about separate centres, with a smooth free surface."""
+
+import warp as wp
+
+from finssim.physics.types import join, vec6
+
+
+@wp.func
+def submerged_fraction(height: float, half_height: float) -> float:
+    """Part of the displaced volume that is under water.
+
+    A cubic step from 1 (centre of buoyancy deeper than half_height) to 0 (higher than half_height): it and its
+    derivative are continuous, and it depends on height alone, so buoyancy keeps a potential.
+
+    Args:
+        height: Height of the centre of buoyancy above the local water surface [m].
+        half_height: Half the height over which the vehicle emerges [m], positive.
+
+    Returns:
+        Fraction in [0, 1].
+    """
+    s = wp.clamp(0.5 - 0.5 * height / half_height, 0.0, 1.0)
+    return s * s * (3.0 - 2.0 * s)
+
+
+@wp.func
+def hydrostatic_wrench(weight: float, buoyancy: float, r_g: wp.vec3, r_b: wp.vec3, up: wp.vec3) -> vec6:
+    """Weight and buoyancy wrench about the body origin.
+
+    tau_H = [(B - W) k ;  (B r_b - W r_g) × k]                          (Fossen 2021, eq. 4.5, z up)
+
+    Args:
+        weight: m g [N].
+        buoyancy: ρ g V of the submerged volume [N].
+        r_g: Centre of gravity, body frame [m].
+        r_b: Centre of buoyancy, body frame [m].
+        up: World z axis in the body frame, unit length.
+
+    Returns:
+        Wrench, body frame [N, N m].
+    """
+    return join((buoyancy - weight) * up, wp.cross(buoyancy * r_b - weight * r_g, up))

@@ -1,0 +1,73 @@
+"""Inertial terms: Coriolis and centripetal wrench of the rigid body and of the added mass."""
+
+import warp as wp
+
+from finssim.physics.types import angular, join, linear, mat66, mat66d, vec6
+
+
+@wp.func
+def coriolis_wrench(momentum: vec6, nu: vec6) -> vec6:
+    """Coriolis and centripetal wrench C(nu) nu of any symmetric 6x6 inertia.
+
+    C(nu) nu = [ω × p ;  v × p + ω × h],   [p; h] = M nu      (Kirchhoff; Fossen 2021, theorem 3.2)
+
+    Args:
+        momentum: M nu, linear and angular momentum about the body origin, body frame [kg m/s, kg m²/s].
+        nu: Twist that the momentum belongs to, body frame [m/s, rad/s]; relative to the water for added mass.
+
+    Returns:
+        C(nu) nu, body frame [N, N m]; it does no work on nu.
+    """
+    omega = angular(nu)
+    p = linear(momentum)
+    return join(wp.cross(omega, p), wp.cross(linear(nu), p) + wp.cross(omega, angular(momentum)))
+
+
+@wp.func
+def rigid_body_momentum(mass: float, r_g: wp.vec3, inertia: wp.mat33, nu: vec6) -> vec6:
+    """Momentum M_RB nu about the body origin.
+
+    Args:
+        mass: Dry mass [kg].
+        r_g: Centre of gravity from the body origin, body frame [m].
+        inertia: Inertia about the body origin, body axes [kg m²].
+        nu: Twist of the body, body frame [m/s, rad/s].
+
+    Returns:
+        Linear and angular momentum, body frame [kg m/s, kg m²/s].
+    """
+    v = linear(nu)
+    omega = angular(nu)
+    return join(mass * (v + wp.cross(omega, r_g)), inertia * omega + mass * wp.cross(r_g, v))
+
+
+@wp.func
+def invert_spd(M: mat66) -> mat66:
+    """Inverse of a symmetric positive definite 6x6 matrix, by Gauss-Jordan in float64.
+
+    Pivoting is not needed for a positive definite matrix; float64 keeps six digits of the result for the condition
+    numbers of real vehicles (up to 1e8).
+    """
+    A = mat66d()
+    X = mat66d()
+    for i in range(6):
+        for j in range(6):
+            A[i, j] = wp.float64(M[i, j])
+            X[i, j] = wp.float64(0.0)
+        X[i, i] = wp.float64(1.0)
+    for k in range(6):
+        pivot = wp.float64(1.0) / A[k, k]
+        for j in range(6):
+            A[k, j] = A[k, j] * pivot
+            X[k, j] = X[k, j] * pivot
+        for i in range(6):
+            if i != k:
+                factor = A[i, k]
+                for j in range(6):
+                    A[i, j] = A[i, j] - factor * A[k, j]
+                    X[i, j] = X[i, j] - factor * X[k, j]
+    out = mat66()
+    for i in range(6):
+        for j in range(6):
+            out[i, j] = wp.float32(wp.float64(0.5) * (X[i, j] + X[j, i]))
+    return out

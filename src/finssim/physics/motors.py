@@ -1,0 +1,57 @@
+"""Actuator dynamics: delay line, dead zone, first-order lag, slew limit; the steady thrust curve T = c± ω|ω|."""
+
+import warp as wp
+
+from finssim.physics.types import MAX_THRUSTERS, vec8
+
+
+@wp.func
+def thrust_of_speed(omega: float, c_plus: float, c_minus: float) -> float:
+    """Steady thrust T = c± ω|ω| [N] of a propeller turning at omega [rad/s] (paper, eq. 16)."""
+    c = wp.where(omega >= 0.0, c_plus, c_minus)
+    return c * omega * wp.abs(omega)
+
+
+@wp.func
+def speed_of_thrust(thrust: float, c_plus: float, c_minus: float) -> float:
+    """Propeller speed [rad/s] that gives a steady thrust [N]: the inverse of `thrust_of_speed`; 0 where c is 0."""
+    c = wp.where(thrust >= 0.0, c_plus, c_minus)
+    return wp.where(c > 0.0, wp.sign(thrust) * wp.sqrt(wp.abs(thrust) / wp.max(c, 1.0e-20)), 0.0)
+
+
+@wp.func
+def admissible(command: vec8, lower: vec8, upper: vec8, dead_minus: vec8, dead_plus: vec8) -> vec8:
+    """A force command as the motors take it: inside [lower, upper], and zero inside (dead_minus, dead_plus) [N]."""
+    out = vec8()
+    for i in range(MAX_THRUSTERS):
+        # Comparisons, not clamp: a NaN must stay a NaN to be noticed.
+        f = wp.where(command[i] > upper[i], upper[i], wp.where(command[i] < lower[i], lower[i], command[i]))
+        out[i] = wp.where(f > dead_minus[i] and f < dead_plus[i], 0.0, f)
+    return out
+
+
+@wp.func
+def steps_ago(age: float, period: float) -> int:
+    """How many control steps ago the command that is `age` seconds old was issued (0: at the current step)."""
+    return wp.max(int(wp.ceil(age / period - 1.0e-4)), 0)
+
+
+@wp.func
+def first_order(x: vec8, target: vec8, alpha: vec8, max_change: vec8) -> vec8:
+    """One step of the motors' first-order lag, exact for a constant target, then limited in slew.
+
+    x <- x + clip(alpha (target - x), ±max_change),   alpha = 1 - exp(-h / time_constant)
+
+    Args:
+        x: Thrusts [N] or speeds [rad/s] now.
+        target: Commanded thrusts or speeds.
+        alpha: Part of the way made in one step, in (0, 1].
+        max_change: Slew limit times the step, same unit as x.
+
+    Returns:
+        Thrusts or speeds after the step.
+    """
+    out = vec8()
+    for i in range(MAX_THRUSTERS):
+        out[i] = x[i] + wp.clamp(alpha[i] * (target[i] - x[i]), -max_change[i], max_change[i])
+    return out

@@ -1,0 +1,30 @@
+"""The Warp vector and matrix types of the physics: 6-vectors of twists and wrenches, 8 thrusters, 6x6 and 6x8 matrices."""
+
+import warp as wp
+
+MAX_THRUSTERS = 8
+"""Thrusters a vehicle may have; a vehicle with fewer leaves the last columns zero."""
+
+vec6 = wp.types.vector(length=6, dtype=wp.float32)
+vec8 = wp.types.vector(length=MAX_THRUSTERS, dtype=wp.float32)
+mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float32)
+mat66d = wp.types.matrix(shape=(6, 6), dtype=wp.float64)
+mat68 = wp.types.matrix(shape=(6, MAX_THRUSTERS), dtype=wp.float32)
+
+
+@wp.func
+def linear(x: vec6) -> wp.vec3:
+    """First three components: linear velocity or force."""
+    return wp.vec3(x[0], x[1], x[2])
+
+
+@wp.func
+def angular(x: vec6) -> wp.vec3:
+    """Last three components: angular velocity or moment."""
+    return wp.vec3(x[3], x[4], x[5])
+
+
+@wp.func
+def join(a: wp.vec3, b: wp.vec3) -> vec6:
+    """A twist or wrench from its linear and angular parts."""
+    return vec6(a[0], a[1], a[2], b[0], b[1], b[2])

@@ -1,0 +1,20 @@
+"""Tasks, and the batched environment that runs any of them."""
+
+from finssim.tasks.environment import Environment, EnvironmentSetupError, Step
+from finssim.tasks.measurement import MeasurementNoise
+from finssim.tasks.station_keeping import StationKeeping
+from finssim.tasks.task import ObservationPart, Task
+
+TASKS = {"t1": StationKeeping}
+"""Every task by the name that commands take; call it for the task with its default settings."""
+
+__all__ = [
+    "TASKS",
+    "Environment",
+    "EnvironmentSetupError",
+    "MeasurementNoise",
+    "ObservationPart",
+    "StationKeeping",
+    "Step",
+    "Task",
+]

@@ -1,0 +1,48 @@
+"""The arrays through which task, action and learner meet: all indexed by world."""
+
+import warp as wp
+
+from finssim.physics.types import vec6
+
+
+@wp.struct
+class TaskArrays:
+    """Inputs and outputs of a task for every world; vehicle 0 of a world is the one that acts."""
+
+    action: wp.array2d(dtype=float)  # (worlds, size), each in [-1, 1]
+    previous_action: wp.array2d(dtype=float)
+    observation: wp.array2d(dtype=float)
+    final_observation: wp.array2d(dtype=float)  # last observation of the episode that ended in this step
+    reward: wp.array(dtype=float)
+    terminated: wp.array(dtype=int)  # 1: ended by the task (left the pool, broke)
+    truncated: wp.array(dtype=int)  # 1: ended by the time limit
+    done: wp.array(dtype=int)  # terminated or truncated: reset in this step
+    episode_return: wp.array(dtype=float)  # of the running episode
+    final_return: wp.array(dtype=float)  # of the episode that ended last
+    final_length: wp.array(dtype=int)  # its control steps
+    held: wp.array(dtype=float)  # time inside the success tolerance so far [s]
+    final_held: wp.array(dtype=float)  # the same when the last episode ended [s]
+    goal_position: wp.array(dtype=wp.vec3)  # world frame [m]
+    goal_quaternion: wp.array(dtype=wp.quat)  # body to world
+    position: wp.array2d(dtype=wp.vec3)  # as measured: the truth, or the truth with noise
+    quaternion: wp.array2d(dtype=wp.quat)
+    velocity: wp.array2d(dtype=vec6)
+
+
+def task_arrays(worlds: int, observation: int, action: int, device: wp.Device) -> TaskArrays:
+    """Zero arrays of the right size; the measured ones are left for the environment to fill or alias."""
+    out = TaskArrays()
+    for name, columns in {
+        "action": action,
+        "previous_action": action,
+        "observation": observation,
+        "final_observation": observation,
+    }.items():
+        setattr(out, name, wp.zeros((worlds, columns), dtype=wp.float32, device=device))
+    for name in ("reward", "episode_return", "final_return", "held", "final_held"):
+        setattr(out, name, wp.zeros(worlds, dtype=wp.float32, device=device))
+    for name in ("terminated", "truncated", "done", "final_length"):
+        setattr(out, name, wp.zeros(worlds, dtype=wp.int32, device=device))
+    out.goal_position = wp.zeros(worlds, dtype=wp.vec3, device=device)
+    out.goal_quaternion = wp.full(worlds, value=wp.quat(0.0, 0.0, 0.0, 1.0), dtype=wp.quat, device=device)
+    return out

@@ -1,0 +1,254 @@
+"""The batched environment: any task, any vehicle, thousands of worlds, with automatic reset."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from finssim.engine import Pool, Simulator, TetherLine, Water
+from finssim.engine.randomize import Randomization
+from finssim.physics.types import vec6
+from finssim.tasks.actions import ACTION_MODES, action_size, add_action
+from finssim.tasks.arrays import task_arrays
+from finssim.tasks.measurement import MeasurementNoise, measure
+from finssim.tasks.task import Task
+from finssim.vehicles import Vehicle, load_vehicle
+
+
+class EnvironmentSetupError(ValueError):
+    """An environment that cannot be set up, or an action it cannot take."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one step gave; NumPy views of the environment's own arrays, valid until the next step."""
+
+    observation: NDArray[np.float32]
+    """(worlds, size); the first of the new episode where one ended."""
+    reward: NDArray[np.float32]
+    """(worlds,)"""
+    terminated: NDArray[np.bool_]
+    """Ended by the task, (worlds,)."""
+    truncated: NDArray[np.bool_]
+    """Ended by the time limit, (worlds,)."""
+    final_observation: NDArray[np.float32]
+    """Last observation of the episodes that ended in this step; older rows elsewhere."""
+
+
+class Environment:
+    """Vehicle 0 of every world acts; the others, if any, keep their last command.
+
+    Attributes:
+        simulator: The worlds.
+        arrays: Actions, observations, rewards and goals, as Warp arrays by world.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        vehicle: Vehicle | str = "finsrov",
+        *,
+        worlds: int = 1,
+        hydrodynamics: str = "calibrated",
+        action: str = "wrench6",
+        wrench_scale: ArrayLike = 1.0,
+        randomization: Randomization | None = None,
+        noise: MeasurementNoise | None = None,
+        water: Water | None = None,
+        pool: Pool | None = None,
+        tether: TetherLine | None = None,
+        integrator: str = "euler",
+        device: str = "cpu",
+        threads: int | None = None,
+        seed: int = 0,
+        crash_directory: Path = Path("finssim-frozen"),
+        auto_reset: bool = True,
+    ) -> None:
+        """Set up the worlds and start an episode in each.
+
+        Args:
+            task: What to do.
+            vehicle: Who does it: a vehicle, a catalogue name or a file.
+            worlds: How many at once.
+            hydrodynamics: calibrated, mesh or simplified.
+            action: thruster8, wrench6 or wrench4.
+            wrench_scale: Part of each wrench limit that action 1 stands for, one number or (6,).
+            randomization: Drawn anew for every episode; none if None.
+            noise: On what the controller sees; none if None.
+            water: Currents and waves.
+            pool: Walls and floor; the paper's 4 × 2 × 1 m pool if None.
+            tether: On the vehicle.
+            integrator: euler or rk4.
+            device: cpu or cuda.
+            threads: Threads on a CPU.
+            seed: Of goals, starts, randomisation and noise.
+            crash_directory: Where the last states of a world that froze are written.
+            auto_reset: Start a new episode where one ended, in the same step.
+        """
+        self.task, self.action_mode, self.seed = task, action, int(seed)
+        self.crash_directory, self.auto_reset = crash_directory, auto_reset
+        if action not in ACTION_MODES:
+            raise EnvironmentSetupError(f"unknown action mode '{action}'; available: {', '.join(ACTION_MODES)}")
+        chosen = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
+        longest = max((t.delay for t in chosen.thrusters.values()), default=0.0)
+        extra = randomization.simulator_arguments(longest) if randomization else {}
+        self.simulator = Simulator(
+            chosen, worlds=worlds, hydrodynamics=hydrodynamics, control_step=task.control_step,
+            substeps=task.substeps, integrator=integrator, water=water, pool=pool or Pool(), tether=tether,
+            device=device, threads=threads, seed=self.seed, **extra,
+        )  # fmt: skip
+        self.worlds, self.device = worlds, self.simulator.device
+        size = action_size(action, len(self.simulator.vehicles[0].thrusters))
+        self.arrays = task_arrays(worlds, task.observation_size, size, self.device)
+        self.wrench_scale = np.broadcast_to(np.asarray(wrench_scale, dtype=float), (6,))
+        self.noise = noise or MeasurementNoise()
+        self.randomization = randomization
+        self._mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
+        self._connect_measurement()
+        self._build()
+        self.reset()
+
+    @property
+    def observation_size(self) -> int:
+        """Numbers in an observation."""
+        return self.task.observation_size
+
+    @property
+    def action_size(self) -> int:
+        """Numbers in an action."""
+        return int(self.arrays.action.shape[1])
+
+    def _connect_measurement(self) -> None:
+        state, a = self.simulator.state, self.arrays
+        if not self.noise.present:
+            # The controller sees the truth: no copy, the same arrays.
+            a.position, a.quaternion, a.velocity = state.position, state.quaternion, state.velocity
+            return
+        shape = (self.worlds, 1)
+        a.position = wp.zeros(shape, dtype=wp.vec3, device=self.device)
+        a.quaternion = wp.zeros(shape, dtype=wp.quat, device=self.device)
+        a.velocity = wp.zeros(shape, dtype=vec6, device=self.device)
+
+    def _build(self) -> None:
+        self._step = self.simulator.pipeline()
+        parameters = self.task.parameters()
+        add_action(self.action_mode, self.simulator, self.arrays, self.wrench_scale)(self._step)
+        self.simulator.add_step(self._step)
+        self._add_measure(self._step)
+        self._step.add(self.task.evaluate, [self.simulator.state, self.arrays, parameters])
+        if self.auto_reset:
+            self._add_start(self._step, self.arrays.done, parameters)
+        self._start = self.simulator.pipeline()
+        self._add_start(self._start, self._mask, parameters)
+
+    def _add_measure(self, pipeline: Any) -> None:
+        if self.noise.present:
+            n = self.noise
+            std = [n.position_std, n.yaw_std, n.velocity_std, n.rate_std]
+            pipeline.add(measure, [self.simulator.state, self.arrays, *std, self.seed])
+
+    def _add_start(self, pipeline: Any, mask: wp.array, parameters: Any) -> None:
+        simulator = self.simulator
+        simulator.add_reset(pipeline, mask)
+        if self.randomization is not None:
+            self.randomization.add(pipeline, simulator, mask, self.seed)
+            simulator.add_refresh(pipeline, mask)
+        pipeline.add(self.task.spawn, [simulator.state, self.arrays, parameters, self.seed, mask])
+        self._add_measure(pipeline)
+        pipeline.add(self.task.observe, [self.arrays, mask])
+
+    def reset(self, mask: ArrayLike | None = None, seed: int | None = None) -> NDArray[np.float32]:
+        """Start new episodes.
+
+        Args:
+            mask: In which worlds, bool by world; in all if None.
+            seed: Start the random streams over with this seed, as if the environment had just been made.
+
+        Returns:
+            Observations, (worlds, size).
+        """
+        if seed is not None:
+            if int(seed) != self.seed:
+                self.seed = self.simulator.seed = int(seed)
+                self._build()
+            self.simulator.state.episode.zero_()
+        self._mask.assign(np.ones(self.worlds, np.int32) if mask is None else np.asarray(mask, dtype=np.int32))
+        self._start.run()
+        return self.arrays.observation.numpy()
+
+    def start(self, position: ArrayLike, quaternion: ArrayLike, goal_position: ArrayLike, goal_quaternion: ArrayLike) -> NDArray[np.float32]:
+        """Start an episode in every world from given poses at rest, towards given goals.
+
+        Args:
+            position: World frame [m], broadcastable to (worlds, 3).
+            quaternion: Body to world, xyzw, broadcastable to (worlds, 4).
+            goal_position: World frame [m], broadcastable to (worlds, 3).
+            goal_quaternion: Body to world, broadcastable to (worlds, 4).
+
+        Returns:
+            Observations, (worlds, size).
+        """
+        self.reset()
+        for array, value, width in (
+            (self.simulator.state.position, position, 3),
+            (self.simulator.state.quaternion, quaternion, 4),
+        ):
+            everyone = array.numpy().copy()
+            everyone[:, 0] = np.broadcast_to(np.asarray(value, dtype=np.float32), (self.worlds, width))
+            array.assign(everyone)
+        self.simulator.state.velocity.zero_()
+        for array, value, width in (
+            (self.arrays.goal_position, goal_position, 3),
+            (self.arrays.goal_quaternion, goal_quaternion, 4),
+        ):
+            array.assign(np.array(np.broadcast_to(np.asarray(value, dtype=np.float32), (self.worlds, width))))
+        again = self.simulator.pipeline()
+        self._add_measure(again)
+        again.add(self.task.observe, [self.arrays, self._mask])
+        again.run()
+        return self.arrays.observation.numpy()
+
+    def step(self, action: ArrayLike) -> Step:
+        """Act for one control step.
+
+        Args:
+            action: (worlds, size), each in [-1, 1]; beyond is limited.
+
+        Raises:
+            EnvironmentSetupError: the shape is wrong or a number is not finite.
+        """
+        a = np.asarray(action, dtype=np.float32)
+        if a.shape != (self.worlds, self.action_size):
+            raise EnvironmentSetupError(f"action has shape {a.shape}, expected {(self.worlds, self.action_size)}: one row per world")
+        if not math.isfinite(float(a.sum())) and not np.isfinite(a).all():
+            world = int(np.flatnonzero(~np.isfinite(a).all(axis=1))[0])
+            raise EnvironmentSetupError(f"action of world {world} has a number that is not finite: {a[world].tolist()}")
+        self.arrays.action.assign(a)
+        self.advance()
+        return self.outcome()
+
+    def advance(self) -> None:
+        """One control step with the actions that are in `arrays.action` already (no check, no copy)."""
+        self._step.run()
+        if self.device.is_cpu and self.simulator.state.frozen.numpy().any():
+            self._revive()
+
+    def _revive(self) -> None:
+        """Report the worlds that froze, then start new episodes there; their step counts as terminated."""
+        frozen = self.simulator.state.frozen.numpy() != 0
+        files = self.simulator.report_frozen(self.crash_directory)
+        for path in files:
+            print(f"finssim: a number stopped being finite; last states in {path}", flush=True)
+        self.reset(mask=frozen)
+
+    def outcome(self) -> Step:
+        """The result of the last step."""
+        a = self.arrays
+        return Step(
+            a.observation.numpy(), a.reward.numpy(), a.terminated.numpy() != 0, a.truncated.numpy() != 0,
+            a.final_observation.numpy(),
+        )  # fmt: skip

@@ -1,0 +1,45 @@
+"""What a task is: an observation schema, times, and the kernels that score, start and observe an episode."""
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+
+@dataclass(frozen=True)
+class ObservationPart:
+    """A named run of numbers in the observation: value / scale, then limited to ±clip."""
+
+    name: str
+    size: int
+    unit: str
+    scale: float = 1.0
+    clip: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """Base of every task: plain data; its kernels are class attributes.
+
+    `evaluate(state, arrays, parameters, world_offset)` after each step, `spawn(state, arrays, parameters, seed, mask,
+    world_offset)` where an episode starts, `observe(arrays, mask, world_offset)` for its first observation.
+    """
+
+    name: str
+    observation: tuple[ObservationPart, ...] = field(repr=False)
+    control_step: float = 0.1
+    """Time between actions [s]."""
+    substeps: int = 10
+    """Physics steps between actions."""
+    time_limit: float = 20.0
+    """Length of an episode in training [s]."""
+    evaluate: ClassVar[Any]
+    spawn: ClassVar[Any]
+    observe: ClassVar[Any]
+
+    @property
+    def observation_size(self) -> int:
+        """Numbers in the observation."""
+        return sum(part.size for part in self.observation)
+
+    def parameters(self) -> Any:
+        """The struct that the kernels take."""
+        raise TypeError(f"task '{self.name}' does not say what its kernels take: define parameters()")
