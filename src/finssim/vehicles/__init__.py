@@ -1,6 +1,7 @@
 """Vehicles: one file each, read, checked and frozen."""
 
 from finssim.vehicles.body import Body, Hull, Water
+from finssim.vehicles.check import Finding, check_vehicle
 from finssim.vehicles.equipment import DepthSensor, Dvl, Imu, Mcu, Mount, Safety, Sensors, Tags
 from finssim.vehicles.errors import VehicleError
 from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
@@ -13,6 +14,7 @@ __all__ = [
     "Body",
     "DepthSensor",
     "Dvl",
+    "Finding",
     "Hull",
     "HydrodynamicSet",
     "Imu",
@@ -28,5 +30,6 @@ __all__ = [
     "VehicleError",
     "Water",
     "catalogue",
+    "check_vehicle",
     "load_vehicle",
 ]

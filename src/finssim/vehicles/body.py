@@ -46,6 +46,8 @@ class Hull(Part):
     """True: build the mesh from `body.size`, `body.displaced_volume` and `body.center_of_buoyancy`."""
     file: Path | None = None
     """STL in body axes [m]; a relative path starts at the vehicle file."""
+    scale: Positive = 1.0
+    """Factor on the coordinates of the file."""
 
     @model_validator(mode="after")
     def _one_of_two(self) -> Hull:

@@ -57,7 +57,7 @@ class Part(BaseModel):
         return self.model_dump(exclude_unset=True)
 
     def __eq__(self, other: object) -> bool:
-        return type(self) is type(other) and self.values() == other.values()  # type: ignore[attr-defined]
+        return type(self) is type(other) and self.values() == other.values()
 
     def __hash__(self) -> int:
         return hash(json.dumps(self.values(), sort_keys=True, default=str))

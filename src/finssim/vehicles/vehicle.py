@@ -20,7 +20,8 @@ from finssim.vehicles.hydrodynamics import AnyHydrodynamicSet, HydrodynamicSet, 
 from finssim.vehicles.part import Part, Vector3, did_you_mean, refuse_section, refuse_value
 from finssim.vehicles.thruster import Thruster
 
-AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+Axis = Literal["surge", "sway", "heave", "roll", "pitch", "yaw"]
+AXES: tuple[Axis, ...] = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 
 Array = NDArray[np.float64]
 
@@ -47,7 +48,7 @@ class Vehicle(Part):
     """Sets by name: `calibrated`, `simplified`, `mesh`; only what the sources give."""
     thrusters: dict[str, Thruster]
     """By name, in the canonical order of every thruster vector."""
-    controlled_axes: tuple[Literal["surge", "sway", "heave", "roll", "pitch", "yaw"], ...] = AXES
+    controlled_axes: tuple[Axis, ...] = AXES
     """Axes the thrusters are there to control; the others are left to the water (an underactuated vehicle)."""
     wrench_reference: Vector3 = Field(default_factory=lambda given: given["body"].center_of_gravity)
     """Body point about which wrenches are commanded [m], (3,); the centre of gravity where the file gives none."""
@@ -171,7 +172,7 @@ class Vehicle(Part):
         """Fully submerged [N]."""
         return self.water.density * self.water.gravity * self.body.displaced_volume
 
-    def hull_mesh(self) -> tuple[Array, NDArray[np.int32]]:
+    def hull_mesh(self) -> tuple[Array, NDArray[np.int64]]:
         """Vertices (n, 3) [m, body frame] and faces (m, 3) of the closed hull, normals outward.
 
         Raises:
@@ -190,7 +191,7 @@ class Vehicle(Part):
         for prose in ("title", "description"):
             values.pop(prose)
         if self.hull is not None and self.hull.file is not None:
-            values["hull"] = {"sha256": hashlib.sha256(self.hull.file.read_bytes()).hexdigest()}
+            values["hull"]["file"] = hashlib.sha256(self.hull.file.read_bytes()).hexdigest()
         values["thruster_names"] = self.thruster_names  # their order is part of the meaning
         return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
 

@@ -1,0 +1,206 @@
+"""What a vehicle can do with its thrusters: wrenches, terminal speeds, time constants, natural frequencies, trim."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.vehicles.body import moved_to_origin
+from finssim.vehicles.errors import VehicleError
+from finssim.vehicles.hydrodynamics import HydrodynamicSet
+from finssim.vehicles.vehicle import AXES, Vehicle
+
+__all__ = [
+    "Restoring",
+    "Trim",
+    "WrenchCapability",
+    "restoring",
+    "terminal_speed",
+    "terminal_speeds",
+    "time_constants",
+    "trim",
+    "wrench_capability",
+]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class WrenchCapability:
+    """Largest pure wrenches about `wrench_reference`, order surge sway heave roll pitch yaw [N, N m]."""
+
+    positive: Array
+    """In the positive direction, (6,)."""
+    negative: Array
+    """In the negative direction, as magnitudes, (6,)."""
+
+    @property
+    def symmetric(self) -> Array:
+        """Reachable in both directions, (6,)."""
+        return np.minimum(self.positive, self.negative)
+
+
+def wrench_capability(vehicle: Vehicle) -> WrenchCapability:
+    """Largest wrench on each controlled axis while the other controlled components are zero.
+
+    max t  subject to  (B f)_axis = t,  (B f)_j = 0 for the other controlled j,  f_min <= f <= f_max
+
+    A component the vehicle does not control is left free; its own limit is zero.
+
+    Returns:
+        Limits about `wrench_reference`, body frame.
+    """
+    from scipy.optimize import linprog
+
+    B = vehicle.control_matrix
+    lower, upper = vehicle.force_limits
+    controlled = [AXES.index(axis) for axis in vehicle.controlled_axes]
+    limits = np.zeros((2, 6))
+    for i in controlled:
+        others = [j for j in controlled if j != i]
+        for row, sign in enumerate((1.0, -1.0)):
+            result = linprog(
+                -sign * B[i],
+                A_eq=B[others] if others else None,
+                b_eq=np.zeros(len(others)) if others else None,
+                bounds=np.column_stack([lower, upper]),
+                method="highs",
+            )
+            if not result.success:
+                raise VehicleError(f"{vehicle.name}: no thrust gives pure {AXES[i]}: {result.message}")
+            limits[row, i] = max(0.0, -result.fun)
+    return WrenchCapability(positive=limits[0], negative=limits[1])
+
+
+def terminal_speed(d1: float, d2: float, tau: float) -> float:
+    """Steady speed under a constant load: the positive root of d1 v + d2 v² = tau; inf without damping.
+
+    Args:
+        d1: Linear damping [N s/m or N m s].
+        d2: Quadratic damping [N s²/m² or N m s²].
+        tau: Load, >= 0 [N or N m].
+
+    Returns:
+        [m/s or rad/s]
+    """
+    if tau == 0.0:
+        return 0.0
+    if d1 == 0.0 and d2 == 0.0:
+        return math.inf
+    return 2.0 * tau / (d1 + math.sqrt(d1 * d1 + 4.0 * d2 * tau))
+
+
+def terminal_speeds(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> Array:
+    """Steady speed on each axis alone at its symmetric wrench limit, from the diagonals of D1, D2 and Du.
+
+    Returns:
+        [m/s, rad/s], (6,)
+    """
+    chosen = _coefficients(vehicle, hydrodynamics)
+    quadratic = np.diag(chosen.quadratic_damping).copy()
+    quadratic[0] += chosen.surge_damping[0, 0]
+    return np.array(
+        [
+            terminal_speed(*row)
+            for row in zip(np.diag(chosen.linear_damping), quadratic, vehicle.wrench_limits, strict=True)
+        ]
+    )
+
+
+def time_constants(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> Array:
+    """m_eff / d1 on each axis, taken about the centre of gravity; inf where there is no linear damping.
+
+    Returns:
+        [s], (6,)
+    """
+    chosen = _coefficients(vehicle, hydrodynamics)
+    mass = np.diag(_at_center_of_gravity(vehicle, vehicle.mass_matrix(hydrodynamics)))
+    d1 = np.diag(
+        _at_center_of_gravity(vehicle, moved_to_origin(chosen.linear_damping, chosen.reference_point))
+    )
+    return np.asarray(np.divide(mass, d1, out=np.full(6, math.inf), where=d1 > 0.0))
+
+
+@dataclass(frozen=True)
+class Restoring:
+    """Small rotations about the centre of gravity of a submerged vehicle; arrays are (roll, pitch)."""
+
+    stiffness: Array
+    """Hydrostatic stiffness B (z_b - z_g) [N m/rad], (2,)."""
+    natural_frequency: Array
+    """Undamped [Hz], (2,); zero where the stiffness is not positive."""
+    damping_ratio: Array
+    """d1 / (2 sqrt(k I_eff)) [-], (2,)."""
+    static_tilt: Array
+    """Angle that the symmetric roll or pitch moment holds, asin(tau / k) [rad], (2,); nan where tau > k."""
+
+
+def restoring(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> Restoring:
+    """Hydrostatic stiffness in roll and pitch and what follows from it.
+
+    I_eff φ'' + d1 φ' + B (z_b - z_g) sin φ = tau            (uncoupled, fully submerged, weight nearly buoyancy)
+    """
+    chosen = _coefficients(vehicle, hydrodynamics)
+    arm = vehicle.body.center_of_buoyancy[2] - vehicle.body.center_of_gravity[2]
+    stiffness = np.full(2, vehicle.buoyancy * arm)
+    inertia = np.diag(_at_center_of_gravity(vehicle, vehicle.mass_matrix(hydrodynamics)))[3:5]
+    d1 = np.diag(
+        _at_center_of_gravity(vehicle, moved_to_origin(chosen.linear_damping, chosen.reference_point))
+    )[3:5]
+    k = np.maximum(stiffness, 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return Restoring(
+            stiffness=stiffness,
+            natural_frequency=np.sqrt(k / inertia) / (2.0 * math.pi),
+            damping_ratio=d1 / (2.0 * np.sqrt(k * inertia)),
+            static_tilt=np.arcsin(vehicle.wrench_limits[3:5] / k),
+        )
+
+
+@dataclass(frozen=True)
+class Trim:
+    """The wrench that holds a submerged vehicle level at rest."""
+
+    wrench: Array
+    """About `wrench_reference`, body frame [N, N m], (6,)."""
+    forces: Array | None
+    """Thrusts that give its controlled components, canonical order [N]; None where they exceed the limits."""
+
+
+def trim(vehicle: Vehicle) -> Trim:
+    """Thrust that balances weight and buoyancy with the vehicle level.
+
+    tau = -[(0, 0, B - W), (r_b - p) × (0, 0, B) + (r_g - p) × (0, 0, -W)],  p = wrench_reference
+
+    Uncontrolled components are left to the vehicle's own stability.
+    """
+    from scipy.optimize import lsq_linear
+
+    up = np.array([0.0, 0.0, 1.0])
+    point = vehicle.wrench_reference
+    force = (vehicle.buoyancy - vehicle.weight) * up
+    moment = np.cross(vehicle.body.center_of_buoyancy - point, vehicle.buoyancy * up) + np.cross(
+        vehicle.body.center_of_gravity - point, -vehicle.weight * up
+    )
+    wrench = -np.concatenate([force, moment])
+    rows = [AXES.index(axis) for axis in vehicle.controlled_axes]
+    lower, upper = vehicle.force_limits
+    result = lsq_linear(vehicle.control_matrix[rows], wrench[rows], bounds=(lower, upper), method="bvls")
+    missing = np.abs(vehicle.control_matrix[rows] @ result.x - wrench[rows]).max()
+    return Trim(wrench=wrench, forces=result.x if missing < 1e-6 * max(1.0, vehicle.weight) else None)
+
+
+def _coefficients(vehicle: Vehicle, name: str) -> HydrodynamicSet:
+    chosen = vehicle.hydrodynamic_set(name)
+    if not isinstance(chosen, HydrodynamicSet):
+        raise VehicleError(
+            f"{vehicle.name}: hydrodynamic set '{name}' is a mesh, it has no damping coefficients"
+        )
+    return chosen
+
+
+def _at_center_of_gravity(vehicle: Vehicle, matrix: Array) -> Array:
+    return moved_to_origin(matrix, -vehicle.body.center_of_gravity)

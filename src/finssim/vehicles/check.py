@@ -1,0 +1,198 @@
+"""Whether a vehicle's numbers make physical sense together: one sentence per finding."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.vehicles.capability import trim, wrench_capability
+from finssim.vehicles.errors import VehicleError
+from finssim.vehicles.hydrodynamics import HydrodynamicSet
+from finssim.vehicles.vehicle import AXES, Vehicle
+
+__all__ = ["Finding", "check_vehicle"]
+
+CURVE_TOLERANCE = 0.01
+"""Relative gap accepted between a force limit and the curve at the speed limit."""
+VOLUME_TOLERANCE = 0.02
+CENTROID_TOLERANCE = 0.02
+"""Distance accepted between the hull's centroid and the centre of buoyancy, relative to the longest side."""
+
+
+class Finding(NamedTuple):
+    """One thing that was checked."""
+
+    name: str
+    passed: bool
+    sentence: str
+
+
+def check_vehicle(vehicle: Vehicle) -> list[Finding]:
+    """Check what no single number shows; the loader has already refused what cannot be simulated at all.
+
+    Returns:
+        Every finding, passed or not: mass matrices, damping, allocation, thrust curves, trim, stability, hull.
+    """
+    return [
+        *_mass_matrices(vehicle),
+        *_damping(vehicle),
+        _allocation(vehicle),
+        *_thrust_curves(vehicle),
+        _trim(vehicle),
+        _stability(vehicle),
+        *_hull(vehicle),
+    ]
+
+
+def _mass_matrices(vehicle: Vehicle) -> Iterator[Finding]:
+    for name in vehicle.hydrodynamics:
+        M = vehicle.mass_matrix(name)
+        smallest = float(np.linalg.eigvalsh((M + M.T) / 2.0)[0])
+        symmetric = bool(np.allclose(M, M.T, rtol=0.0, atol=1e-9 * np.abs(M).max()))
+        yield Finding(
+            f"mass matrix ({name})",
+            symmetric and smallest > 0.0,
+            f"M_RB + M_A is {'' if symmetric else 'not '}symmetric, "
+            f"its smallest eigenvalue is {smallest:.4g}, expected > 0",
+        )
+
+
+def _damping(vehicle: Vehicle) -> Iterator[Finding]:
+    for name, chosen in vehicle.hydrodynamics.items():
+        if not isinstance(chosen, HydrodynamicSet):
+            continue
+        coupled = bool(np.any(chosen.quadratic_damping - np.diag(np.diag(chosen.quadratic_damping))))
+        parts = {"D1": chosen.linear_damping, "D2": chosen.quadratic_damping, "Du": chosen.surge_damping}
+        if coupled:
+            del parts["D2"]
+        smallest = {part: float(np.linalg.eigvalsh((D + D.T) / 2.0)[0]) for part, D in parts.items()}
+        passed = all(value >= -1e-9 * np.abs(parts[part]).max() for part, value in smallest.items())
+        printed = ", ".join(f"{part} {value:.3g}" for part, value in smallest.items())
+        sentence = f"smallest eigenvalue of the symmetric parts: {printed}, expected >= 0"
+        if coupled:
+            share = _least_power(chosen.quadratic_damping)
+            passed = passed and share >= 0.0
+            sentence += (
+                f"; D2 couples axes: over sampled velocities it takes out at least {share:.3g} of the power "
+                "of its diagonal, expected >= 0"
+            )
+        yield Finding(f"damping ({name})", passed, sentence)
+
+
+def _least_power(D2: NDArray[np.float64], samples: int = 4000) -> float:
+    """Smallest nu · D2 diag(|nu|) nu over the same with the diagonal alone, over sampled velocities.
+
+    With couplings the sign depends on nu and no eigenvalue of D2 tells it.
+    """
+    generator = np.random.default_rng(0)
+    nu = generator.standard_normal((samples, 6)) * 10.0 ** generator.uniform(-1.5, 1.5, (samples, 6))
+    square = nu * np.abs(nu)
+    power = np.einsum("ni,ij,nj->n", nu, D2, square)
+    return float(np.min(power / np.einsum("ni,i,ni->n", nu, np.diag(D2), square)))
+
+
+def _allocation(vehicle: Vehicle) -> Finding:
+    rows = [AXES.index(axis) for axis in vehicle.controlled_axes]
+    B = vehicle.control_matrix[rows]
+    rank = int(np.linalg.matrix_rank(B))
+    try:
+        reach = wrench_capability(vehicle).symmetric[rows]
+    except VehicleError:
+        reach = np.zeros(len(rows))
+    idle = [AXES[row] for row, limit in zip(rows, reach, strict=True) if limit < 1e-6]
+    singular = np.linalg.svd(B, compute_uv=False)
+    sentence = (
+        f"B has rank {rank} for {len(rows)} controlled axes ({', '.join(vehicle.controlled_axes)}), "
+        f"condition number {singular[0] / singular[-1] if singular[-1] > 0.0 else math.inf:.3g}"
+    )
+    if idle:
+        sentence += f"; no pure {', '.join(idle)} in both directions: take it out of controlled_axes"
+    return Finding("allocation", rank == len(rows) and not idle, sentence)
+
+
+def _thrust_curves(vehicle: Vehicle) -> Iterator[Finding]:
+    worst, where = 0.0, ""
+    for name, thruster in vehicle.thrusters.items():
+        for side, force, c, rpm in (
+            ("forward", thruster.force_max, thruster.c_plus, thruster.rpm_max),
+            ("reverse", -thruster.force_min, thruster.c_minus, -thruster.rpm_min),
+        ):
+            excess = force / (c * (rpm * math.pi / 30.0) ** 2) - 1.0
+            if excess > worst:
+                worst, where = excess, f" ({name}, {side})"
+    yield Finding(
+        "thrust curves",
+        worst <= CURVE_TOLERANCE,
+        f"force limits exceed the curve at the speed limit by at most {100.0 * worst:.2g} %{where}, expected <= 1 %",
+    )
+
+
+def _trim(vehicle: Vehicle) -> Finding:
+    level = trim(vehicle)
+    net = vehicle.buoyancy - vehicle.weight
+    drift = "rises" if net > 0.0 else "sinks"
+    sentence = f"it {drift} with {abs(net):.3g} N; level at rest needs {_wrench(level.wrench)}"
+    if level.forces is None:
+        return Finding("trim", False, f"{sentence}, more than the thrusters give")
+    left = [
+        a
+        for a, x in zip(AXES, level.wrench, strict=True)
+        if a not in vehicle.controlled_axes and abs(x) > 1e-6
+    ]
+    if left:
+        sentence += f"; {', '.join(left)} is not controlled and left to the water"
+    lower, upper = vehicle.force_limits
+    share = float(np.max(np.where(level.forces > 0.0, level.forces / upper, level.forces / lower)))
+    return Finding(
+        "trim", share < 1.0, f"{sentence}; the hardest thruster gives {100.0 * share:.2g} % of its limit"
+    )
+
+
+def _wrench(wrench: NDArray[np.float64]) -> str:
+    units = ("N", "N", "N", "N m", "N m", "N m")
+    parts = [
+        f"{value:.3g} {unit} of {axis}"
+        for value, unit, axis in zip(wrench, units, AXES, strict=True)
+        if abs(value) > 1e-6
+    ]
+    return " and ".join(parts) or "nothing"
+
+
+def _stability(vehicle: Vehicle) -> Finding:
+    arm = float(vehicle.body.center_of_buoyancy[2] - vehicle.body.center_of_gravity[2])
+    return Finding(
+        "upright",
+        arm > 0.0,
+        f"the centre of buoyancy lies {arm:.3g} m above the centre of gravity, expected > 0: "
+        "otherwise it turns over at rest",
+    )
+
+
+def _hull(vehicle: Vehicle) -> Iterator[Finding]:
+    if vehicle.hull is None:
+        return
+    from finssim.geometry.mesh import mesh_centroid, mesh_volume
+
+    try:
+        vertices, faces = vehicle.hull_mesh()
+    except VehicleError as error:
+        yield Finding("hull", False, str(error))
+        return
+    yield Finding("hull", True, f"the hull of {len(faces)} faces is closed and its normals point outward")
+    volume, given = mesh_volume(vertices, faces), vehicle.body.displaced_volume
+    yield Finding(
+        "hull volume",
+        abs(volume / given - 1.0) <= VOLUME_TOLERANCE,
+        f"the hull encloses {volume:.6g} m³, the displaced volume is {given:.6g} m³, "
+        f"expected within {100.0 * VOLUME_TOLERANCE:g} %",
+    )
+    gap = float(np.linalg.norm(mesh_centroid(vertices, faces) - vehicle.body.center_of_buoyancy))
+    yield Finding(
+        "hull centroid",
+        gap <= CENTROID_TOLERANCE * float(vehicle.body.size.max()),
+        f"the hull's centroid is {gap:.3g} m from the centre of buoyancy",
+    )

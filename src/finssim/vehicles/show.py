@@ -1,0 +1,228 @@
+"""Printing vehicles: the catalogue, and one vehicle in full."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.markup import escape
+from rich.table import Table
+
+from finssim.vehicles.capability import restoring, terminal_speeds, time_constants, wrench_capability
+from finssim.vehicles.check import check_vehicle
+from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
+from finssim.vehicles.loader import catalogue, load_vehicle
+from finssim.vehicles.vehicle import AXES, Vehicle
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+__all__ = ["print_catalogue", "print_vehicle"]
+
+_MARK = {"measured": "", "published": "", "derived": " ·", "guessed": " ?"}
+_LEGEND = "no mark: measured or published    · derived    ? guessed"
+
+
+def print_catalogue(console: Console) -> None:
+    """One line per vehicle that comes with FinsSim."""
+    table = Table(title="Vehicles", title_justify="left", box=None, pad_edge=False)
+    for column, justify in (
+        ("name", "left"),
+        ("mass [kg]", "right"),
+        ("thrusters", "right"),
+        ("axes", "right"),
+    ):
+        table.add_column(column, justify=justify)  # type: ignore[arg-type]
+    table.add_column("hydrodynamics")
+    table.add_column("what it is", overflow="fold")
+    for name in catalogue():
+        vehicle = load_vehicle(name)
+        table.add_row(
+            f"[bold]{name}[/bold]",
+            f"{vehicle.body.mass:g}",
+            str(len(vehicle.thrusters)),
+            str(len(vehicle.controlled_axes)),
+            " ".join(vehicle.hydrodynamics),
+            escape(vehicle.title),
+        )
+    console.print(table)
+
+
+def print_vehicle(vehicle: Vehicle, console: Console, picture: Path | None = None) -> None:
+    """Everything about one vehicle: numbers with their origin, what it can do, what its checks found.
+
+    Args:
+        vehicle: Any vehicle, of the catalogue or of a user's file.
+        console: Where to print.
+        picture: Where to save a picture of the thruster layout, or None for none.
+    """
+    console.print(f"[bold]{escape(vehicle.title)}[/bold]")
+    console.print(escape(vehicle.description.strip()))
+    counts = Counter(provenance.origin for provenance in vehicle.provenance.values())
+    console.print(
+        f"\n{vehicle.name}  {vehicle.path or ''}\nsha256 {vehicle.sha256}\n"
+        f"numbers: {', '.join(f'{count} {origin}' for origin, count in counts.most_common())}    {_LEGEND}\n",
+        highlight=False,
+    )
+    console.print(_body(vehicle))
+    for name, chosen in vehicle.hydrodynamics.items():
+        console.print(_hydrodynamics(vehicle, name, chosen))
+    console.print(_thrusters(vehicle))
+    console.print(_performance(vehicle))
+    console.print(_sources(vehicle))
+    console.print(_findings(vehicle))
+    if picture is not None:
+        from finssim.vehicles.picture import draw_vehicle  # Matplotlib is slow to import
+
+        draw_vehicle(vehicle, picture)
+        console.print(f"thruster layout: {picture}")
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False, title_style="bold")
+    for index, column in enumerate(columns):
+        table.add_column(column, justify="left" if index == 0 else "right")
+    return table
+
+
+def _mark(vehicle: Vehicle, path: str) -> str:
+    return _MARK[vehicle.origin_of(path).origin]
+
+
+def _numbers(values: Any) -> str:
+    return " ".join(f"{value:g}" for value in values)
+
+
+def _body(vehicle: Vehicle) -> Table:
+    table = _table("Body", "", "value", "unit")
+    body = vehicle.body
+    inertia = body.inertia
+    rows = [
+        ("mass", "body.mass", f"{body.mass:g}", "kg"),
+        ("inertia, roll pitch yaw", "body.inertia", _numbers(np.diag(inertia)), "kg m²"),
+        ("displaced volume", "body.displaced_volume", f"{body.displaced_volume:g}", "m³"),
+        ("centre of gravity", "body.center_of_gravity", _numbers(body.center_of_gravity), "m"),
+        ("centre of buoyancy", "body.center_of_buoyancy", _numbers(body.center_of_buoyancy), "m"),
+        ("size", "body.size", _numbers(body.size), "m"),
+        ("water density", "water.density", f"{vehicle.water.density:g}", "kg/m³"),
+    ]
+    for label, path, value, unit in rows:
+        table.add_row(label, value + _mark(vehicle, path), unit)
+    table.add_row("weight, buoyancy", f"{vehicle.weight:.2f} {vehicle.buoyancy:.2f}", "N")
+    return table
+
+
+def _hydrodynamics(vehicle: Vehicle, name: str, chosen: HydrodynamicSet | MeshSet) -> Table:
+    path = f"hydrodynamics.{name}"
+    if isinstance(chosen, MeshSet):
+        table = _table(f"Hydrodynamics: {name}", "", "form drag", "skin drag")
+        table.add_row(
+            "coefficient",
+            f"{chosen.form_drag:g}{_mark(vehicle, f'{path}.form_drag')}",
+            f"{chosen.skin_drag:g}{_mark(vehicle, f'{path}.skin_drag')}",
+        )
+        return table
+    table = _table(f"Hydrodynamics: {name} (diagonals)", "", *AXES)
+    for label, key in (
+        ("M_A", "added_mass"),
+        ("D1", "linear_damping"),
+        ("D2", "quadratic_damping"),
+        ("Du", "surge_damping"),
+    ):
+        matrix = getattr(chosen, key)
+        if not np.any(matrix):
+            continue
+        full = bool(np.any(matrix - np.diag(np.diag(matrix))))
+        marks = [_mark(vehicle, f"{path}.{key}.{i}" + (f".{i}" if full else "")) for i in range(6)]
+        table.add_row(
+            label + (" (full)" if full else ""),
+            *(f"{value:.6g}{mark}" for value, mark in zip(np.diag(matrix), marks, strict=True)),
+        )
+    return table
+
+
+def _thrusters(vehicle: Vehicle) -> Table:
+    table = _table("Thrusters", "", "position [m]", "axis", "force [N]", "rpm", "lag [s]", "acts on", "motor")
+    for name, thruster in vehicle.thrusters.items():
+        path = f"thrusters.{name}"
+        motor = (
+            "" if thruster.motor_index is None else f"M{thruster.motor_index + 1} {thruster.motor_sign:+d}"
+        )
+        table.add_row(
+            escape(name),
+            _rounded(thruster.position),
+            _rounded(thruster.axis),
+            f"{thruster.force_min:.2f} {thruster.force_max:+.2f}{_mark(vehicle, f'{path}.force_max')}",
+            f"{thruster.rpm_min:.0f} {thruster.rpm_max:+.0f}",
+            f"{thruster.delay:g} + {thruster.time_constant:g}{_mark(vehicle, f'{path}.time_constant')}",
+            thruster.domain,
+            motor,
+        )
+    return table
+
+
+def _rounded(vector: Any) -> str:
+    return " ".join(f"{value:6.3f}" for value in vector)
+
+
+def _performance(vehicle: Vehicle) -> Table:
+    capability = wrench_capability(vehicle)
+    table = _table("What it can do (each axis alone, about the wrench reference)", "", *AXES)
+    table.add_row("wrench + [N, N m]", *(f"{value:.3f}" for value in capability.positive))
+    table.add_row("wrench - [N, N m]", *(f"{value:.3f}" for value in capability.negative))
+    for name, chosen in vehicle.hydrodynamics.items():
+        if not isinstance(chosen, HydrodynamicSet):
+            continue
+        table.add_row(
+            escape(f"speed [m/s, rad/s] ({name})"),
+            *(f"{value:.3f}" for value in terminal_speeds(vehicle, name)),
+        )
+        table.add_row(
+            escape(f"time constant [s] ({name})"),
+            *(_finite(value) for value in time_constants(vehicle, name)),
+        )
+        swing = restoring(vehicle, name)
+        table.add_row(
+            f"natural frequency [Hz] ({name})",
+            "",
+            "",
+            "",
+            *(f"{value:.3f}" for value in swing.natural_frequency),
+            "",
+        )
+        table.add_row(
+            f"damping ratio ({name})", "", "", "", *(f"{value:.3f}" for value in swing.damping_ratio), ""
+        )
+    return table
+
+
+def _finite(value: float) -> str:
+    return f"{value:.3f}" if math.isfinite(value) else "-"
+
+
+def _sources(vehicle: Vehicle) -> Table:
+    table = _table("Where the numbers come from")
+    table.add_column("numbers")
+    table.add_column("origin")
+    table.add_column("source and note", overflow="fold")
+    entries: dict[tuple[str, str, str], list[str]] = {}
+    for path, provenance in vehicle.provenance.items():
+        entries.setdefault((provenance.origin, provenance.source, provenance.note), []).append(path)
+    for (origin, source, note), paths in entries.items():
+        shown = paths[0] if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
+        table.add_row(escape(shown), origin, escape("; ".join(filter(None, [source, note]))))
+    return table
+
+
+def _findings(vehicle: Vehicle) -> Table:
+    table = _table("Checks")
+    table.add_column("")
+    table.add_column("check")
+    table.add_column("finding", overflow="fold")
+    for finding in check_vehicle(vehicle):
+        mark = "[green]pass[/green]" if finding.passed else "[red]fail[/red]"
+        table.add_row(mark, finding.name, escape(finding.sentence))
+    return table
