@@ -24,6 +24,8 @@ app = typer.Typer(
 vehicles_app = typer.Typer(invoke_without_command=True, rich_markup_mode=None, add_completion=False)
 app.add_typer(vehicles_app, name="vehicles")
 
+PICTURES = (".png", ".svg", ".pdf")
+
 Vehicle = Annotated[
     str, typer.Option(help="Vehicle of the catalogue, or the path of a vehicle file.", metavar="NAME|FILE")
 ]
@@ -224,7 +226,19 @@ def _show(
     from finssim.vehicles import load_vehicle
     from finssim.vehicles.show import print_vehicle
 
-    print_vehicle(load_vehicle(name), Console(), picture)
+    if picture is not None and picture.suffix not in PICTURES:
+        raise typer.BadParameter(
+            f"{picture} ends in '{picture.suffix}', expected one of {' '.join(PICTURES)}"
+        )
+    vehicle = load_vehicle(name)
+    print_vehicle(vehicle, Console(), None)
+    if picture is not None:
+        from finssim.files import atomic_write
+        from finssim.vehicles.picture import draw_vehicle
+
+        with atomic_write(picture) as temporary:
+            draw_vehicle(vehicle, temporary)
+        typer.echo(f"thruster layout: {picture}")
 
 
 @app.command()
