@@ -26,13 +26,13 @@ def run(app: typer.Typer, arguments: Sequence[str]) -> int:
 
     Args:
         app: The commands.
-        arguments: The words after the program's name.
+        arguments: The words after the program's name; none asks for help.
 
     Returns:
         The exit status: 0 well, 2 refused, 130 interrupted, or what the command itself gave.
     """
     try:
-        status = app(list(arguments), prog_name="finssim", standalone_mode=False)
+        status = app(list(arguments) or ["--help"], prog_name="finssim", standalone_mode=False)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output has gone, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

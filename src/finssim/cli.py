@@ -15,7 +15,6 @@ __all__ = ["app", "main"]
 app = typer.Typer(
     name="finssim",
     help="Simulate underwater vehicles, train controllers for them, and check both against published measurements.",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
