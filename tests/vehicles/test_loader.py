@@ -1,0 +1,269 @@
+"""Files become vehicles, or one sentence that says where, what and what to do."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from finssim.geometry.mesh import parametric_hull, write_stl
+from finssim.vehicles import Vehicle, VehicleError, catalogue, load_vehicle
+from vehicles.minnow import MINNOW
+
+
+def load(tmp_path: Path, text: str, name: str = "minnow.yaml") -> Vehicle:
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    return load_vehicle(path)
+
+
+def refusal(tmp_path: Path, old: str, new: str) -> str:
+    """What the loader says of the minnow with `old` exchanged for `new`, after the file's name."""
+    assert MINNOW.count(old) >= 1
+    with pytest.raises(VehicleError) as caught:
+        load(tmp_path, MINNOW.replace(old, new, 1))
+    message = str(caught.value)
+    assert message.startswith(str(tmp_path / "minnow.yaml") + ":")
+    return message.removeprefix(str(tmp_path / "minnow.yaml") + ":").strip()
+
+
+def test_a_file_of_ones_own_loads_by_path(tmp_path):
+    vehicle = load(tmp_path, MINNOW)
+    assert vehicle.name == "minnow"
+    assert vehicle.thruster_names == ("front_left", "front_right", "up")
+    np.testing.assert_array_equal(vehicle.body.inertia, np.diag([0.2, 0.3, 0.4]))
+
+
+def test_numbers_of_the_group_reach_its_thrusters_and_own_numbers_win(tmp_path):
+    vehicle = load(tmp_path, MINNOW)
+    np.testing.assert_array_equal(vehicle.force_limits[0], [-4.0, -4.0, -4.0])
+    np.testing.assert_array_equal(vehicle.force_limits[1], [5.0, 5.0, 6.0])
+
+
+def test_every_number_knows_its_origin(tmp_path):
+    vehicle = load(tmp_path, MINNOW)
+    assert vehicle.origin_of("body.mass") == ("measured", "kitchen scale", "")
+    assert vehicle.origin_of("hydrodynamics.calibrated.linear_damping.4").origin == "measured"
+    assert vehicle.origin_of("hydrodynamics.calibrated.linear_damping.5") == ("guessed", "", "nobody spun it")
+    assert vehicle.origin_of("thrusters.up.rpm_max").origin == "measured"
+    with pytest.raises(VehicleError, match="no number at 'body.maas', did you mean 'body.mass'"):
+        vehicle.origin_of("body.maas")
+
+
+def test_a_new_origin_does_not_inherit_the_old_source(tmp_path):
+    text = MINNOW.replace("mass: 11.2", "mass: {value: 11.2, origin: guessed}")
+    assert load(tmp_path, text).origin_of("body.mass") == ("guessed", "", "")
+
+
+def test_a_section_may_give_the_origin_of_everything_inside(tmp_path):
+    text = MINNOW.replace("body:\n", "body:\n  origin: published\n  source: a book\n")
+    vehicle = load(tmp_path, text)
+    assert vehicle.origin_of("body.inertia") == ("published", "a book", "")
+    assert vehicle.origin_of("water.density").origin == "measured"
+
+
+def test_a_number_without_origin_is_refused(tmp_path):
+    message = refusal(tmp_path, "origin: measured\nsource: kitchen scale\n", "")
+    assert message.startswith("water: density has no origin: write {value: 1000.0, origin: measured")
+
+
+REFUSALS = {
+    "axis not of unit length": (
+        "axis: [0, 0, 1]",
+        "axis: [0, 0, 0.94]",
+        "thrusters.up: axis has length 0.94, expected 1: give a body-frame unit vector",
+    ),
+    "axis of two numbers": (
+        "axis: [0, 0, 1]",
+        "axis: [0, 1]",
+        "thrusters.up: axis has shape (2,), expected 3 numbers [x, y, z]",
+    ),
+    "negative mass": ("mass: 11.2", "mass: -11.2", "body: mass is -11.2, expected > 0"),
+    "mass not a number": ("mass: 11.2", "mass: heavy", "body: mass is 'heavy', expected a number"),
+    "mass nan": ("mass: 11.2", "mass: .nan", "body: mass is nan, expected a finite number"),
+    "infinite coordinate": (
+        "center_of_gravity: [0.0, 0.0, -0.02]",
+        "center_of_gravity: [0.0, .inf, 0.0]",
+        "body: center_of_gravity holds inf, expected finite numbers: give 3 numbers [x, y, z]",
+    ),
+    "missing key": ("  mass: 11.2\n", "", "body: mass is missing: add it, with its origin"),
+    "misspelt key": ("  mass: 11.2\n", "  mas: 11.2\n", "body: unknown key 'mas', did you mean 'mass'?"),
+    "unknown key": (
+        "title: Minnow",
+        "title: Minnow\ncolour: red",
+        "unknown key 'colour'; known keys: title,",
+    ),
+    "inertia of no body": (
+        "inertia: [0.2, 0.3, 0.4]",
+        "inertia: [0.1, 0.1, 0.4]",
+        "body: inertia has principal moments 0.1, 0.1, 0.4 kg m², expected the largest to be at most the sum",
+    ),
+    "inertia not positive": (
+        "inertia: [0.2, 0.3, 0.4]",
+        "inertia: [-0.2, 0.3, 0.4]",
+        "body: inertia has principal moments -0.2, 0.3, 0.4 kg m², expected all > 0",
+    ),
+    "added mass not symmetric": (
+        "added_mass: [5, 6, 7, 0.1, 0.1, 0.1]",
+        "added_mass: [[5,1,0,0,0,0],[0,6,0,0,0,0],[0,0,7,0,0,0],[0,0,0,1,0,0],[0,0,0,0,1,0],[0,0,0,0,0,1]]",
+        "hydrodynamics.calibrated: added_mass has 1 at row 1, column 2 but 0 across the diagonal",
+    ),
+    "added mass too negative": (
+        "added_mass: [5, 6, 7, 0.1, 0.1, 0.1]",
+        "added_mass: [-12, 6, 7, 0.1, 0.1, 0.1]",
+        "hydrodynamics.calibrated: added_mass makes M_RB + M_A not positive definite (smallest eigenvalue -",
+    ),
+    "damping of five numbers": (
+        "linear_damping: [10, 11, 12, 1, 1, ",
+        "linear_damping: [10, 11, 12, 1, ",
+        "hydrodynamics.calibrated: linear_damping has shape (5,), expected 6 diagonal entries or 6 rows of 6",
+    ),
+    "reverse force positive": ("force_min: -4.0", "force_min: 4.0", "force_min is 4.0, expected < 0"),
+    "unknown domain": ("domain: speed", "domain: torque", "domain is 'torque', expected 'force' or 'speed'"),
+    "unknown group": (
+        "up: {group: small",
+        "up: {group: smal",
+        "thrusters.up: group is 'smal', did you mean 'small'? expected one of small",
+    ),
+    "unknown axis to control": (
+        "controlled_axes: [surge, heave, yaw]",
+        "controlled_axes: [surge, have]",
+        "controlled_axes is ['surge', 'have'], expected a list drawn from surge, sway, heave, roll, pitch, yaw",
+    ),
+    "unknown origin": (
+        "origin: measured",
+        "origin: mesured",
+        "origin is 'mesured', did you mean 'measured'?",
+    ),
+    "key twice": (
+        "  mass: 11.2\n",
+        "  mass: 11.2\n  mass: 11.3\n",
+        "line 9: not valid YAML: key 'mass' is given twice",
+    ),
+    "bracket open": ("size: [0.5, 0.4, 0.3]", "size: [0.5, 0.4, 0.3", "line 14: not valid YAML:"),
+    "section a number": (
+        "water: {density: 1000.0, gravity: 9.81}",
+        "water: 1000",
+        "water is 1000, expected a section of keys",
+    ),
+    "no thrusters": (
+        MINNOW[MINNOW.index("thrusters:\n") : MINNOW.index("controlled")],
+        "thrusters: {}\n",
+        "thrusters is empty, expected at least one entry",
+    ),
+    "mesh drag without hull": (
+        "hydrodynamics:\n",
+        "hydrodynamics:\n  mesh: {form_drag: 1.0, skin_drag: 0.02}\n",
+        "hydrodynamics.mesh: needs a hull",
+    ),
+    "hull of two kinds": (
+        "hydrodynamics:\n",
+        "hull: {parametric: true, file: hull.stl}\nhydrodynamics:\n",
+        "hull: expected either 'parametric: true' or 'file: NAME.stl'",
+    ),
+    "hull file missing": ("hydrodynamics:\n", "hull: {file: hull.stl}\nhydrodynamics:\n", "hull: file "),
+    "mass a truth": ("mass: 11.2", "mass: true", "body: mass is True, expected a number"),
+    "name given": (
+        "title: Minnow",
+        "title: Minnow\nname: minnow",
+        "unknown key 'name': the name is that of the file",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_what_cannot_be_right_is_refused_in_one_sentence(case, tmp_path):
+    old, new, expected = REFUSALS[case]
+    first, *others = refusal(tmp_path, old, new).splitlines()
+    assert expected in first
+    assert all(expected in other for other in others)  # once per thruster where the group is at fault
+
+
+def test_an_open_hull_is_refused(tmp_path):
+    vertices, faces = parametric_hull([0.5, 0.4, 0.3], 0.0113)
+    write_stl(tmp_path / "hull.stl", vertices, faces[:-1])
+    message = refusal(tmp_path, "hydrodynamics:\n", "hull: {file: hull.stl}\nhydrodynamics:\n")
+    assert message.startswith("hull: file hull.stl: ") and "open" in message
+
+
+def test_an_inverted_hull_is_refused(tmp_path):
+    vertices, faces = parametric_hull([0.5, 0.4, 0.3], 0.0113)
+    write_stl(tmp_path / "hull.stl", vertices, faces[:, ::-1])
+    message = refusal(tmp_path, "hydrodynamics:\n", "hull: {file: hull.stl}\nhydrodynamics:\n")
+    assert message.startswith("hull: file hull.stl: ") and "inverted" in message
+
+
+def test_a_good_hull_is_read_from_beside_the_file_and_enters_the_digest(tmp_path):
+    vertices, faces = parametric_hull([0.5, 0.4, 0.3], 0.0113, [0.0, 0.0, 0.02])
+    write_stl(tmp_path / "hull.stl", vertices, faces)
+    text = MINNOW.replace("hydrodynamics:\n", "hull: {file: hull.stl}\nhydrodynamics:\n")
+    first = load(tmp_path, text)
+    assert len(first.hull_mesh()[1]) == len(faces)
+    digest = first.sha256
+    write_stl(tmp_path / "hull.stl", 0.99 * vertices, faces)
+    assert load(tmp_path, text).sha256 != digest
+
+
+def test_unknown_names_are_answered_with_the_known_ones():
+    with pytest.raises(
+        VehicleError, match="unknown vehicle 'finrov', did you mean 'finsrov'. available: bluerov2, "
+    ):
+        load_vehicle("finrov")
+    with pytest.raises(VehicleError, match="nowhere/minnow.yaml: no such file"):
+        load_vehicle("nowhere/minnow.yaml")
+
+
+def test_a_variant_replaces_lists_merges_sections_and_removes_with_null(tmp_path):
+    load(tmp_path, MINNOW)
+    vehicle = load(
+        tmp_path,
+        "extends: minnow\norigin: guessed\nbody: {mass: 12.0}\nthrusters: {up: null}\ncontrolled_axes: [surge, yaw]\n",
+        "heavy_minnow.yaml",
+    )
+    assert vehicle.name == "heavy_minnow"
+    assert vehicle.body.mass == 12.0
+    assert vehicle.body.displaced_volume == 0.0113
+    assert vehicle.thruster_names == ("front_left", "front_right")
+    assert vehicle.origin_of("body.mass").origin == "guessed"
+    assert vehicle.origin_of("body.displaced_volume").origin == "measured"
+
+
+def test_a_variant_of_a_group_reaches_the_thrusters_of_the_base(tmp_path):
+    load(tmp_path, MINNOW)
+    vehicle = load(
+        tmp_path,
+        "extends: minnow\norigin: guessed\nthruster_groups: {small: {force_max: 3.0}}\n",
+        "weak.yaml",
+    )
+    np.testing.assert_array_equal(vehicle.force_limits[1], [3.0, 3.0, 6.0])
+    assert vehicle.origin_of("thrusters.front_left.force_max").origin == "guessed"
+    assert vehicle.origin_of("thrusters.up.force_max").origin == "measured"
+
+
+def test_files_that_extend_each_other_are_refused(tmp_path):
+    (tmp_path / "b.yaml").write_text("extends: a\n", encoding="utf-8")
+    with pytest.raises(VehicleError, match="extends itself through"):
+        load(tmp_path, "extends: b\n", "a.yaml")
+
+
+def test_numbers_in_yaml_1_2_notation_are_numbers(tmp_path):
+    assert (
+        load(tmp_path, MINNOW.replace("c_plus: 4.1e-4", "c_plus: 41e-5")).thrusters["front_left"].c_plus
+        == 41e-5
+    )
+
+
+@pytest.mark.parametrize("name", catalogue())
+def test_loading_takes_less_than_a_control_step(name):
+    """Under 0.1 s even on a busy machine; the best of three leaves out what others do on it."""
+    load_vehicle(name)
+    best = min(_seconds(name) for _ in range(3))
+    assert best < 0.1
+
+
+def _seconds(name: str) -> float:
+    start = time.perf_counter()
+    load_vehicle(name)
+    return time.perf_counter() - start
