@@ -1,0 +1,6 @@
+"""Sensors: what a vehicle measures of its own motion, with the noise, delays and losses of real instruments."""
+
+from finssim.sensors.batch import SensorError
+from finssim.sensors.suite import SensorSuite
+
+__all__ = ["SensorError", "SensorSuite"]

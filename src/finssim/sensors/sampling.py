@@ -1,0 +1,143 @@
+"""When a sensor samples, how late a sample arrives, and the arrays that remember both."""
+# mypy: disable-error-code="valid-type,misc,index,no-any-return,no-untyped-def,untyped-decorator,attr-defined"
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+
+
+class SensedState(Protocol):
+    """The state arrays that sensors read; `finssim.engine` has them, and so may anything else."""
+
+    position: Any
+    """Body origin, world frame [m]: vec3 (W, V)."""
+    quaternion: Any
+    """Attitude, body to world, xyzw: quat (W, V)."""
+    velocity: Any
+    """nu at the body origin, body frame [m/s, rad/s]: vec6 (W, V)."""
+    acceleration: Any
+    """nu_dot, rate of the components of nu [m/s², rad/s²]: vec6 (W, V)."""
+    steps: Any
+    """Control steps since the world's reset: int (W,)."""
+    episode: Any
+    """Resets of the world so far: int (W,)."""
+
+
+@wp.struct
+class Timing:
+    """When one sensor of one vehicle samples."""
+
+    samples_per_step: wp.float64  # rate times control step; 0: the vehicle has no such sensor
+    latency: int  # control steps between a sample and its arrival
+
+
+@wp.struct
+class Sampling:
+    """What one kind of sensor knows about its samples, by (world, vehicle)."""
+
+    timing: wp.array(dtype=Timing)  # by vehicle
+    control_step: float  # [s]
+    seen: wp.array2d(dtype=int)  # step of the last update
+    last: wp.array2d(dtype=int)  # step of the last sample
+    sent: wp.array3d(dtype=wp.bool)  # whether the slot holds a sample on its way
+    stamp: wp.array2d(dtype=float)  # time since reset of the sample on display [s]; -1: none yet
+    fresh: wp.array2d(dtype=wp.bool)  # whether it arrived in this step
+
+
+@wp.func
+def samples_until(samples_per_step: wp.float64, step: int) -> int:
+    """Samples due in a number of control steps, floor(rate * time)."""
+    # In float64, and with a margin far below a step, so that 10 Hz on a 0.1 s step is one sample in every step.
+    return int(wp.floor(wp.float64(step) * samples_per_step + wp.float64(1.0e-6)))
+
+
+@wp.func
+def sample_due(sampling: Sampling, w: int, v: int, step: int) -> bool:
+    """Whether at least one sample fell due since the last one taken."""
+    n = sampling.timing[v].samples_per_step
+    return samples_until(n, step) > samples_until(n, sampling.last[w, v])
+
+
+@wp.func
+def root_of_wait(sampling: Sampling, w: int, v: int, step: int) -> float:
+    """Square root of the time since the last sample, by which a random walk grows [√s]."""
+    return wp.sqrt(float(step - sampling.last[w, v]) * sampling.control_step)
+
+
+@wp.func
+def slot_of(sampling: Sampling, step: int) -> int:
+    """Where the ring keeps the sample of a step."""
+    return step % sampling.sent.shape[2]
+
+
+@wp.func
+def begin_update(sampling: Sampling, w: int, v: int, step: int) -> bool:
+    """Mark the old sample as no longer fresh; tell whether there is anything to do in this step."""
+    sampling.fresh[w, v] = False
+    if sampling.timing[v].samples_per_step == wp.float64(0.0) or step == sampling.seen[w, v]:
+        return False
+    sampling.seen[w, v] = step
+    sampling.sent[w, v, slot_of(sampling, step)] = False
+    return True
+
+
+@wp.func
+def restart(sampling: Sampling, w: int, v: int, step: int):
+    """Forget all samples."""
+    sampling.seen[w, v] = step - 1
+    sampling.last[w, v] = step
+    sampling.stamp[w, v] = -1.0
+
+
+@wp.func
+def arrival(sampling: Sampling, w: int, v: int, step: int, restarting: bool) -> int:
+    """Slot of the sample that arrives in this step, or -1; its stamp goes on display.
+
+    Args:
+        sampling: Of this kind of sensor.
+        w: World.
+        v: Vehicle.
+        step: Control steps since the reset.
+        restarting: The sample taken at a reset arrives at once, as if the sensor had been running before.
+    """
+    taken = step
+    if not restarting:
+        taken = step - sampling.timing[v].latency
+    if taken < 0:
+        return -1
+    slot = slot_of(sampling, taken)
+    if not sampling.sent[w, v, slot]:
+        return -1
+    sampling.sent[w, v, slot] = False
+    sampling.stamp[w, v] = float(taken) * sampling.control_step
+    sampling.fresh[w, v] = True
+    return slot
+
+
+def new_sampling(
+    rates: Sequence[float], latencies: Sequence[float], worlds: int, control_step: float, device: Any
+) -> Sampling:
+    """Memory of one kind of sensor that has not sampled yet.
+
+    Args:
+        rates: By vehicle [Hz]; 0 where the vehicle has no such sensor.
+        latencies: By vehicle [s]; taken to the nearest control step, since only then can anybody look.
+        worlds: Number of worlds.
+        control_step: [s].
+        device: Warp device.
+    """
+    timing: Any = np.zeros(len(rates), dtype=Timing.numpy_dtype())
+    timing["samples_per_step"] = np.asarray(rates) * control_step
+    timing["latency"] = np.floor(np.asarray(latencies) / control_step + 0.5 + 1e-6)
+    sampling = Sampling()
+    shape = (worlds, len(rates))
+    sampling.timing = wp.array(timing, dtype=Timing, device=device)
+    sampling.control_step = control_step
+    sampling.seen = wp.full(shape, -1, dtype=int, device=device)
+    sampling.last = wp.zeros(shape, dtype=int, device=device)
+    sampling.sent = wp.zeros((*shape, int(timing["latency"].max()) + 1), dtype=wp.bool, device=device)
+    sampling.stamp = wp.full(shape, -1.0, dtype=float, device=device)
+    sampling.fresh = wp.zeros(shape, dtype=wp.bool, device=device)
+    return sampling
