@@ -5,20 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Hashable
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import yaml
 
 from finssim.vehicles.errors import VehicleError
 from finssim.vehicles.part import did_you_mean
-from finssim.vehicles.vehicle import Provenance
+from finssim.vehicles.vehicle import ORIGINS, Provenance
 
-ORIGINS: tuple[str, ...] = get_args(Provenance.__annotations__["origin"]) or (
-    "measured",
-    "published",
-    "derived",
-    "guessed",
-)
 _MARKS = ("origin", "source", "note")
 
 

@@ -23,13 +23,16 @@ from finssim.vehicles.thruster import Thruster
 Axis = Literal["surge", "sway", "heave", "roll", "pitch", "yaw"]
 AXES: tuple[Axis, ...] = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 
+Origin = Literal["measured", "published", "derived", "guessed"]
+ORIGINS: tuple[Origin, ...] = ("measured", "published", "derived", "guessed")
+
 Array = NDArray[np.float64]
 
 
 class Provenance(NamedTuple):
     """Where a number comes from."""
 
-    origin: Literal["measured", "published", "derived", "guessed"]
+    origin: Origin
     source: str = ""
     note: str = ""
 
