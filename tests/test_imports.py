@@ -41,7 +41,7 @@ HOMES = {
     "onnx": {"learning/export.py"},
     "onnxruntime": {"control/policy.py"},
     "mujoco": set(),
-    "matplotlib": set(),
+    "matplotlib": {"experiments/envelope.py", "vehicles/picture.py"},
     "cv2": set(),
     "cyclonedds": set(),
     "rclpy": set(),

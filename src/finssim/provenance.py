@@ -13,7 +13,17 @@ import finssim
 
 __all__ = ["package_versions", "provenance", "revision"]
 
-PACKAGES = ("numpy", "scipy", "warp-lang", "torch", "stable_baselines3", "gymnasium", "onnx", "onnxruntime", "mujoco")
+PACKAGES = (
+    "numpy",
+    "scipy",
+    "warp-lang",
+    "torch",
+    "stable_baselines3",
+    "gymnasium",
+    "onnx",
+    "onnxruntime",
+    "mujoco",
+)
 """Distributions whose version can change a result."""
 
 
@@ -65,7 +75,9 @@ def package_versions(names: tuple[str, ...]) -> dict[str, str]:
 
 def _git(directory: Path, *arguments: str) -> str | None:
     try:
-        answer = subprocess.run(["git", "-C", directory, *arguments], capture_output=True, text=True, timeout=10)
+        answer = subprocess.run(
+            ["git", "-C", directory, *arguments], capture_output=True, text=True, timeout=10
+        )
     except (OSError, subprocess.TimeoutExpired):
         return None
     return answer.stdout.strip() if answer.returncode == 0 else None
