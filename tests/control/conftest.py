@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 
 @dataclass(frozen=True)
@@ -84,3 +85,76 @@ def layout(request: pytest.FixtureRequest) -> Layout:
 def finsrov() -> Layout:
     """The published vehicle with limits of 7 N."""
     return FINSROV
+
+
+@dataclass
+class State:
+    """A batch of vehicles as a controller measures them."""
+
+    position: NDArray[np.float64]
+    quaternion: NDArray[np.float64]
+    nu: NDArray[np.float64]
+
+
+class Pool:
+    """A second, independent simulation of a vehicle: float64, 6 DOF at the centre of gravity, diagonal model.
+
+    (m + m_A) v_dot + omega x (m + m_A) v = force - D v, and Euler's equations with the Munk moment; weight and buoyancy
+    at their centres; each thruster behind a pure delay and a first-order lag. Written from the vehicle's numbers alone.
+    """
+
+    STEP = 1.0 / 120.0
+
+    def __init__(
+        self, vehicle, worlds, position=(0.0, 0.0, -0.5), yaw=0.0, current=(0.0, 0.0, 0.0), load=0.0
+    ):
+        calibrated = vehicle.hydrodynamics["calibrated"]
+        self.vehicle = vehicle
+        self.g = np.array(vehicle.body.center_of_gravity)
+        self.lever = np.array(vehicle.body.center_of_buoyancy) - self.g
+        rigid = np.concatenate([np.full(3, vehicle.body.mass), np.diag(vehicle.body.inertia)])
+        self.M = rigid + np.diag(calibrated.added_mass)
+        self.d1, self.d2 = np.diag(calibrated.linear_damping), np.diag(calibrated.quadratic_damping)
+        self.B = vehicle.thruster_matrix(vehicle.body.center_of_gravity)
+        self.lower, self.upper = vehicle.force_limits
+        lag = next(iter(vehicle.thrusters.values()))
+        self.decay, self.delay = 1.0 - np.exp(-self.STEP / lag.time_constant), round(lag.delay / self.STEP)
+        self.rotation = Rotation.from_rotvec(np.tile([0.0, 0.0, yaw], (worlds, 1)))
+        self.p = np.tile(position, (worlds, 1)) + self.rotation.apply(self.g)
+        self.nu = np.zeros((worlds, 6))
+        self.current, self.load = np.array(current), load
+        self.thrust = np.zeros((worlds, self.B.shape[1]))
+        self.queue = [self.thrust] * self.delay
+
+    @property
+    def measured(self):
+        """Pose and velocity of the body origin."""
+        nu = self.nu.copy()
+        nu[:, :3] -= np.cross(nu[:, 3:], self.g)
+        return State(self.p - self.rotation.apply(self.g), self.rotation.as_quat(), nu)
+
+    def advance(self, command, period):
+        """Moves on by one control period under commanded thrusts (worlds, n)."""
+        assert (command <= self.upper).all() and (command >= self.lower).all()
+        for _ in range(round(period / self.STEP)):
+            self.queue.append(command)
+            self.thrust = self.thrust + self.decay * (self.queue.pop(0) - self.thrust)
+            up = self.rotation.inv().apply([0.0, 0.0, 1.0])
+            relative = self.nu.copy()
+            relative[:, :3] -= self.rotation.inv().apply(self.current)
+            tau = self.thrust @ self.B.T - (self.d1 + self.d2 * np.abs(relative)) * relative
+            tau[:, :3] += (self.vehicle.buoyancy - self.vehicle.weight - self.load) * up
+            tau[:, 3:] += np.cross(self.lever, self.vehicle.buoyancy * up)
+            momentum = self.M * relative
+            v, omega = relative[:, :3], self.nu[:, 3:]
+            tau[:, :3] -= np.cross(omega, momentum[:, :3])
+            tau[:, 3:] -= np.cross(omega, momentum[:, 3:]) + np.cross(v, momentum[:, :3])
+            self.nu = self.nu + self.STEP * tau / self.M
+            self.p = self.p + self.STEP * self.rotation.apply(self.nu[:, :3])
+            self.rotation = self.rotation * Rotation.from_rotvec(self.STEP * self.nu[:, 3:])
+
+
+@pytest.fixture(scope="session")
+def pool():
+    """The class of the independent simulation."""
+    return Pool

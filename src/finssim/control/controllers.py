@@ -1,0 +1,31 @@
+"""The pose controllers by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from finssim.control.errors import ControlError
+from finssim.control.pid import Pid
+from finssim.control.pid_paper import PaperPid
+from finssim.control.tracking import Controller
+from finssim.vehicles import Vehicle
+
+__all__ = ["CONTROLLERS", "controller"]
+
+CONTROLLERS: dict[str, Callable[..., Controller]] = {
+    "pid": Pid.from_vehicle,
+    "pid-paper": PaperPid.from_vehicle,
+}
+"""Makers `(vehicle, hydrodynamics="calibrated", period=...) -> Controller` by name."""
+
+
+def controller(name: str, vehicle: Vehicle, **options: Any) -> Controller:
+    """The controller of that name for a vehicle; options are its maker's (`hydrodynamics`, `period`).
+
+    Raises:
+        ControlError: No such controller, or an option it refuses.
+    """
+    if name not in CONTROLLERS:
+        raise ControlError(f"unknown controller '{name}'; available: {', '.join(CONTROLLERS)}")
+    return CONTROLLERS[name](vehicle, **options)

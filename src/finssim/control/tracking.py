@@ -1,0 +1,109 @@
+"""What every pose controller is given and how far it is from its goal; the interface controllers share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.geometry.rotations import (
+    quat_conjugate,
+    quat_inverse_rotate,
+    quat_multiply,
+    quat_rotate,
+    quat_to_rotvec,
+    wrap_angle,
+)
+
+__all__ = ["Controller", "Goal", "Measured", "TrackingError", "tracking_error", "velocity_at"]
+
+Array = npt.NDArray[np.float64]
+
+
+class Measured(Protocol):
+    """A vehicle's state as a controller reads it; any object with these attributes will do."""
+
+    @property
+    def position(self) -> Any:
+        """Body origin, world frame [m], (..., 3)."""
+
+    @property
+    def quaternion(self) -> Any:
+        """Body to world, xyzw, (..., 4)."""
+
+    @property
+    def nu(self) -> Any:
+        """Velocity of the body origin and angular velocity, body frame [m/s, rad/s], (..., 6)."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """The pose to hold, and the velocity it moves with."""
+
+    position: Any
+    """Where the body origin should be, world frame [m], (..., 3)."""
+    quaternion: Any
+    """Attitude the body should have, body to world, xyzw, (..., 4)."""
+    velocity: Any = (0.0, 0.0, 0.0)
+    """Velocity of the goal, world frame [m/s], (..., 3)."""
+
+
+class Controller(Protocol):
+    """A controller keeps no state of its own: its memory goes in with every call and comes back."""
+
+    @property
+    def period(self) -> float:
+        """Time between two calls of `command` [s]."""
+
+    def reset(self, n: int | None = None) -> Any:
+        """Memory at the start, for one vehicle or for a batch of n."""
+
+    def command(self, memory: Any, measured: Measured, goal: Goal) -> tuple[Array, Any]:
+        """Wanted wrench about `vehicle.wrench_reference`, body frame [N, N m], (..., 6), and the memory after."""
+
+
+class TrackingError(NamedTuple):
+    """Goal minus measured, in the measured body's axes."""
+
+    pose: Array
+    """Three distances of a body point to its goal [m], then tilt about x and y and heading [rad], (..., 6)."""
+    velocity: Array
+    """Velocity of the goal, body frame; its angular part is zero [m/s, rad/s], (..., 6)."""
+
+
+def tracking_error(measured: Measured, goal: Goal, point: npt.ArrayLike) -> TrackingError:
+    """Error of a body point's position and of the attitude.
+
+    The rotation to the goal is split into a turn about the body's z (heading error, wrapped) and a tilt without any
+    turn about z, so that half a turn to make does not disturb the levelling.
+
+    Args:
+        measured: Where the vehicle is.
+        goal: Where it should be.
+        point: The body point, body frame [m], (3,).
+    """
+    q, q_goal = np.asarray(measured.quaternion, float), np.asarray(goal.quaternion, float)
+    to_goal = np.asarray(goal.position, float) - np.asarray(measured.position, float)
+    to_goal = to_goal + quat_rotate(q_goal, point)
+    distance = quat_inverse_rotate(q, to_goal) - np.asarray(point, float)
+
+    relative = quat_multiply(quat_conjugate(q), q_goal)
+    heading = wrap_angle(2.0 * np.arctan2(relative[..., 2], relative[..., 3]))
+    half, zero = 0.5 * heading, np.zeros_like(heading)
+    turn = np.stack([zero, zero, np.sin(half), np.cos(half)], axis=-1)
+    tilt = quat_to_rotvec(quat_multiply(relative, quat_conjugate(turn)))[..., :2]
+    drift = quat_inverse_rotate(q, np.asarray(goal.velocity, float))
+    return TrackingError(
+        np.concatenate([distance, tilt, heading[..., None]], axis=-1),
+        np.concatenate([drift, np.zeros_like(drift)], axis=-1),
+    )
+
+
+def velocity_at(nu: npt.ArrayLike, point: npt.ArrayLike) -> Array:
+    """Twist of the body at a body point: v + omega x r and omega, body frame, (..., 6)."""
+    nu = np.asarray(nu, float)
+    return np.concatenate(
+        [nu[..., :3] + np.cross(nu[..., 3:], np.asarray(point, float)), nu[..., 3:]], axis=-1
+    )
