@@ -12,6 +12,7 @@ from finssim.control.allocation_tables import regularisation_weight
 from finssim.control.allocator import Allocator
 from finssim.control.errors import ControlError
 from finssim.physics.types import vec6, vec8
+from finssim.vehicles import catalogue, load_vehicle
 
 
 def allocator(layout, regularisation=1e-4):
@@ -65,6 +66,15 @@ def test_a_hundred_thousand_allocations_carry_a_certificate_of_optimality(layout
     assert (f >= layout.lower).all() and (f <= layout.upper).all()
     saturated = (np.abs(f - layout.lower) < 1e-5) | (np.abs(f - layout.upper) < 1e-5)
     assert 0.2 < saturated.any(1).mean() < 0.95  # both branches are in the sample
+
+
+@pytest.mark.parametrize("name", catalogue())
+def test_allocations_of_every_catalogue_vehicle_are_optimal(finsrov, name):
+    vehicle = load_vehicle(name)
+    craft = type(finsrov)(name, vehicle.control_matrix, *vehicle.force_limits, vehicle.wrench_limits)
+    tau = wrenches(craft, 5000, seed=5)
+    f, _ = Allocator.from_vehicle(vehicle).allocate(tau)
+    assert (optimality_gap(craft, f, tau) <= 1e-5 * objective(craft, f, tau)).all()
 
 
 def assert_as_good_as_lsq_linear(layout, tau, regularisation=1e-4):
