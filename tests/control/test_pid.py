@@ -171,7 +171,7 @@ def holds_a_pose(name):
     ) and "calibrated" in craft.hydrodynamics
 
 
-@pytest.mark.parametrize("name", filter(holds_a_pose, catalogue()))
+@pytest.mark.parametrize("name", [name for name in catalogue() if holds_a_pose(name)])
 def test_every_vehicle_that_can_hold_a_pose_holds_it(name, pool):
     """Two body lengths away and turned by a radian or two: in place within 30 s."""
     craft = load_vehicle(name)
