@@ -83,7 +83,9 @@ class Pipeline:
         """
         for (offset, count), commands in zip(self.slices, self._recorded, strict=True):
             dim = count if vehicles is None else (count, vehicles)
-            command = wp.launch(kernel, dim=dim, inputs=[*inputs, offset], device=self.device, record_cmd=True)
+            command = wp.launch(
+                kernel, dim=dim, inputs=[*inputs, offset], device=self.device, record_cmd=True
+            )
             commands.append(command)
         self._graph = None
 

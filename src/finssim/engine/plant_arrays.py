@@ -7,8 +7,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.physics.plant import Command, Plant
-from finssim.physics.types import MAX_THRUSTERS, mat66, mat68, vec6, vec8
+from finssim.engine.packed import Packed
+from finssim.physics.plant import VehicleParameters
+from finssim.physics.types import MAX_THRUSTERS
 
 if TYPE_CHECKING:
     from finssim.vehicles import Vehicle
@@ -32,21 +33,23 @@ def twist_shift(r: Sequence[float]) -> Matrix:
 
 
 def vehicle_parameters(vehicle: "Vehicle", model: str) -> dict[str, Any]:
-    """Every field of `Plant` for one vehicle and one hydrodynamic model, as NumPy values (derived fields excepted).
+    """Every field of `VehicleParameters` but the derived ones, for one vehicle and one hydrodynamic model.
 
     Args:
         vehicle: The vehicle.
         model: Key of its hydrodynamics.
 
     Returns:
-        Field name to scalar, vector or matrix, in the units of `Plant`.
+        Field name to scalar, vector or matrix, in its units.
 
     Raises:
         SimulatorError: the vehicle has no such model, too many thrusters, or thrusters with different delays.
     """
     if model not in vehicle.hydrodynamics:
         have = ", ".join(sorted(vehicle.hydrodynamics))
-        raise SimulatorError(f"vehicle '{vehicle.name}' has no hydrodynamics '{model}'; its file gives: {have}")
+        raise SimulatorError(
+            f"vehicle '{vehicle.name}' has no hydrodynamics '{model}'; its file gives: {have}"
+        )
     body, hydro = vehicle.body, vehicle.hydrodynamics[model]
     zeros = np.zeros((6, 6))
     r_h = np.asarray(hydro.reference_point, dtype=float)
@@ -75,11 +78,13 @@ def vehicle_parameters(vehicle: "Vehicle", model: str) -> dict[str, Any]:
 
 
 def thruster_parameters(vehicle: "Vehicle") -> dict[str, Any]:
-    """The thruster fields of `Plant` for one vehicle; absent thrusters are zero."""
+    """The thruster fields of `VehicleParameters` for one vehicle; absent thrusters are zero."""
     thrusters = list(vehicle.thrusters.values())
     n = len(thrusters)
     if n > MAX_THRUSTERS:
-        raise SimulatorError(f"vehicle '{vehicle.name}' has {n} thrusters; at most {MAX_THRUSTERS} are simulated")
+        raise SimulatorError(
+            f"vehicle '{vehicle.name}' has {n} thrusters; at most {MAX_THRUSTERS} are simulated"
+        )
     delays = {t.delay for t in thrusters}
     domains = {t.domain for t in thrusters}
     if len(delays) > 1 or len(domains) > 1:
@@ -114,42 +119,14 @@ def _force_at(rpm: float | None, c: float | None) -> float:
     return (c or 0.0) * (abs(rpm or 0.0) * 2.0 * np.pi / 60.0) ** 2
 
 
-PLANT_TYPES: dict[str, Any] = {
-    **dict.fromkeys(
-        ("mass", "volume", "surface_half_height", "form_drag", "skin_drag", "delay"), wp.float32
-    ),
-    **dict.fromkeys(("hull", "speed_lag"), wp.int32),
-    **dict.fromkeys(("r_g", "r_b", "half_size", "r_h"), wp.vec3),
-    **dict.fromkeys(("M_A", "M_inv", "D1", "D2", "Du"), mat66),
-    **dict.fromkeys(
-        ("force_min", "force_max", "dead_minus", "dead_plus", "gain", "time_constant", "alpha", "slew", "c_plus", "c_minus"),
-        vec8,
-    ),
-    "inertia": wp.mat33,
-    "B": mat68,
-}
-"""Warp type of every field of `Plant`."""
-
-
 def build_plant(
     vehicles: Sequence["Vehicle"], model: str, worlds: int, hulls: Sequence[int], device: wp.Device
-) -> Plant:
-    """The `Plant` of `worlds` equal worlds that hold these vehicles; derived fields are zero until refreshed."""
+) -> Packed:
+    """Parameters of `worlds` equal worlds that hold these vehicles; derived fields are zero until refreshed."""
     parameters = [{**vehicle_parameters(v, model), "hull": h} for v, h in zip(vehicles, hulls, strict=True)]
-    plant = Plant()
-    for name, dtype in PLANT_TYPES.items():
-        if name in ("M_inv", "alpha"):
-            array = wp.zeros((worlds, len(vehicles)), dtype=dtype, device=device)
-        else:
-            row = np.stack([np.asarray(p[name]) for p in parameters])
-            array = wp.array(np.broadcast_to(row, (worlds, *row.shape)).copy(), dtype=dtype, device=device)
-        setattr(plant, name, array)
+    plant = Packed(VehicleParameters, (worlds, len(vehicles)), device)
+    for name in parameters[0]:
+        row = np.stack([np.asarray(p[name]) for p in parameters])
+        full = np.broadcast_to(row, (worlds, *row.shape))
+        plant.fields[name].assign(np.ascontiguousarray(full, dtype=plant.fields[name].numpy().dtype))
     return plant
-
-
-def build_command(worlds: int, vehicles: int, device: wp.Device) -> Command:
-    """Zero commands for all vehicles."""
-    command = Command()
-    command.thrust = wp.zeros((worlds, vehicles), dtype=vec8, device=device)
-    command.disturbance = wp.zeros((worlds, vehicles), dtype=vec6, device=device)
-    return command

@@ -34,6 +34,8 @@ def write_post_mortem(simulator: "Simulator", world: int, directory: Path) -> Pa
         file.write(",".join(COLUMNS) + "\n")
         for v in range(history.shape[1]):
             for step in range(max(0, last - HISTORY), last):
-                row = np.concatenate([[v, step, (step + 1) * simulator.control_step], history[step % HISTORY, v]])
+                row = np.concatenate(
+                    [[v, step, (step + 1) * simulator.control_step], history[step % HISTORY, v]]
+                )
                 file.write(",".join(f"{x:.9g}" for x in row) + "\n")
     return path

@@ -10,7 +10,7 @@ from finssim.engine.launch import Pipeline
 from finssim.engine.plant_arrays import build_plant, twist_shift, vehicle_parameters
 from finssim.engine.ranges_file import Ranges, load_ranges
 from finssim.engine.state import State
-from finssim.physics.plant import Plant
+from finssim.physics.plant import VehicleParameters
 from finssim.physics.types import MAX_THRUSTERS, mat66, vec6, vec8
 from finssim.physics.water import WaterArrays
 
@@ -53,7 +53,7 @@ class RangeArrays:
 class Nominal:
     """The vehicles as their files have them, by vehicle."""
 
-    plant: Plant  # one world
+    plant: wp.array2d(dtype=VehicleParameters)  # one world
     M_A: wp.array(dtype=mat66)  # added mass about the point where its coefficients hold
     H: wp.array(dtype=mat66)  # twist at that point from the twist at the body origin
 
@@ -87,7 +87,13 @@ def axis_factors(seed: int, stream: int, common: wp.vec2, low: vec6, high: vec6)
 
 @wp.kernel(enable_backward=False)
 def randomize_vehicles(
-    plant: Plant, nominal: Nominal, r: RangeArrays, state: State, seed: int, mask: wp.array(dtype=int), world_offset: int
+    plant: wp.array2d(dtype=VehicleParameters),
+    nominal: Nominal,
+    r: RangeArrays,
+    state: State,
+    seed: int,
+    mask: wp.array(dtype=int),
+    world_offset: int,
 ):
     """Draw the vehicles' parameters of the episode that starts, where mask is not 0; refresh the plant afterwards."""
     i, v = wp.tid()
@@ -103,40 +109,46 @@ def randomize_vehicles(
         volume = mass
     inertia = between(wp.randf(rng), r.inertia)
     drag = between(wp.randf(rng), r.mesh_drag)
-    plant.mass[w, v] = mass * n.mass[0, v]
-    plant.volume[w, v] = volume * n.volume[0, v]
-    plant.form_drag[w, v] = drag * n.form_drag[0, v]
-    plant.skin_drag[w, v] = drag * n.skin_drag[0, v]
-    plant.delay[w, v] = between(wp.randf(rng), r.delay) * n.delay[0, v]
-    plant.slew[w, v] = between(wp.randf(rng), r.slew) * n.slew[0, v]
-    plant.time_constant[w, v] = between(wp.randf(rng), r.time_constant) * n.time_constant[0, v]
+    plant[w, v].mass = mass * n[0, v].mass
+    plant[w, v].volume = volume * n[0, v].volume
+    plant[w, v].form_drag = drag * n[0, v].form_drag
+    plant[w, v].skin_drag = drag * n[0, v].skin_drag
+    plant[w, v].delay = between(wp.randf(rng), r.delay) * n[0, v].delay
+    plant[w, v].slew = between(wp.randf(rng), r.slew) * n[0, v].slew
+    plant[w, v].time_constant = between(wp.randf(rng), r.time_constant) * n[0, v].time_constant
     g = wp.vec3(wp.randf(rng), wp.randf(rng), wp.randf(rng))
     b = wp.vec3(wp.randf(rng), wp.randf(rng), wp.randf(rng))
     one = wp.vec3(1.0, 1.0, 1.0)
-    r_g = n.r_g[0, v] + r.center_of_gravity[0] * one + (r.center_of_gravity[1] - r.center_of_gravity[0]) * g
-    plant.r_g[w, v] = r_g
-    plant.r_b[w, v] = (
-        n.r_b[0, v] + r.center_of_buoyancy[0] * one + (r.center_of_buoyancy[1] - r.center_of_buoyancy[0]) * b
+    r_g = n[0, v].r_g + r.center_of_gravity[0] * one + (r.center_of_gravity[1] - r.center_of_gravity[0]) * g
+    plant[w, v].r_g = r_g
+    plant[w, v].r_b = (
+        n[0, v].r_b + r.center_of_buoyancy[0] * one + (r.center_of_buoyancy[1] - r.center_of_buoyancy[0]) * b
     )
     # The factor is on the inertia about the centre of gravity; Steiner's part follows mass and centre.
-    r_n = n.r_g[0, v]
-    I_n = n.inertia[0, v] - n.mass[0, v] * (wp.dot(r_n, r_n) * wp.identity(3, dtype=float) - wp.outer(r_n, r_n))
+    r_n = n[0, v].r_g
+    I_n = n[0, v].inertia - n[0, v].mass * (
+        wp.dot(r_n, r_n) * wp.identity(3, dtype=float) - wp.outer(r_n, r_n)
+    )
     steiner = wp.dot(r_g, r_g) * wp.identity(3, dtype=float) - wp.outer(r_g, r_g)
-    plant.inertia[w, v] = inertia * I_n + plant.mass[w, v] * steiner
+    plant[w, v].inertia = inertia * I_n + plant[w, v].mass * steiner
 
     H = nominal.H[v]
-    M_A = scaled_matrix(nominal.M_A[v], axis_factors(key, 8 * w + 1, r.added_mass, r.added_mass_low, r.added_mass_high))
-    plant.M_A[w, v] = wp.transpose(H) * M_A * H
-    plant.D1[w, v] = scaled_matrix(n.D1[0, v], axis_factors(key, 8 * w + 2, r.linear, r.linear_low, r.linear_high))
-    plant.D2[w, v] = scaled_matrix(
-        n.D2[0, v], axis_factors(key, 8 * w + 3, r.quadratic, r.quadratic_low, r.quadratic_high)
+    M_A = scaled_matrix(
+        nominal.M_A[v], axis_factors(key, 8 * w + 1, r.added_mass, r.added_mass_low, r.added_mass_high)
+    )
+    plant[w, v].M_A = wp.transpose(H) * M_A * H
+    plant[w, v].D1 = scaled_matrix(
+        n[0, v].D1, axis_factors(key, 8 * w + 2, r.linear, r.linear_low, r.linear_high)
+    )
+    plant[w, v].D2 = scaled_matrix(
+        n[0, v].D2, axis_factors(key, 8 * w + 3, r.quadratic, r.quadratic_low, r.quadratic_high)
     )
     rng_t = wp.rand_init(key, 8 * w + 4)
     every = between(wp.randf(rng_t), r.thrust)
     gain = vec8()
     for k in range(MAX_THRUSTERS):
         gain[k] = every * between(wp.randf(rng_t), r.each_thrust)
-    plant.gain[w, v] = gain
+    plant[w, v].gain = gain
 
 
 @wp.kernel(enable_backward=False)
@@ -178,23 +190,26 @@ class Randomization:
     def simulator_arguments(self, vehicle_delay: float) -> dict[str, Any]:
         """What a simulator must make room for: the longest delay [s] and the most waves."""
         waves = self.ranges.waves.count[1] if self.ranges.waves else 0
-        return {"max_delay": vehicle_delay * max(self.ranges.delay[1], 1.0), "max_waves": waves}
+        return {
+            "max_delay": vehicle_delay * max(self.ranges.delay[1], 1.0),
+            "max_waves": waves,
+            "water_moves": self.moves_water,
+        }
 
     def add(self, pipeline: Pipeline, simulator: "Simulator", mask: wp.array, seed: int) -> None:
         """Append the draw for the worlds where mask (by world, int32) is not 0; refresh the plant afterwards."""
         arrays = range_arrays(self.ranges)
         nominal = _nominal(simulator)
-        inputs = [simulator.plant, nominal, arrays, simulator.state, seed, mask]
+        inputs = [simulator.plant.array, nominal, arrays, simulator.state, seed, mask]
         pipeline.add(randomize_vehicles, inputs, vehicles=len(simulator.vehicles))
         if self.moves_water:
-            simulator.water.moving = 1
             pipeline.add(randomize_water, [simulator.water, arrays, simulator.state, seed, mask])
 
 
 def _nominal(simulator: "Simulator") -> Nominal:
     device, vehicles = simulator.device, simulator.vehicles
     out = Nominal()
-    out.plant = build_plant(vehicles, simulator.hydrodynamics, 1, [0] * len(vehicles), device)
+    out.plant = build_plant(vehicles, simulator.hydrodynamics, 1, [0] * len(vehicles), device).array
     H, M_A = [], []
     for vehicle in vehicles:
         values = vehicle_parameters(vehicle, simulator.hydrodynamics)
@@ -210,11 +225,25 @@ def _nominal(simulator: "Simulator") -> Nominal:
 def range_arrays(ranges: Ranges) -> RangeArrays:
     """The struct that the kernels take."""
     out = RangeArrays()
-    for name in ("mass", "inertia", "center_of_gravity", "center_of_buoyancy", "mesh_drag", "time_constant", "delay", "slew", "current"):
+    for name in (
+        "mass",
+        "inertia",
+        "center_of_gravity",
+        "center_of_buoyancy",
+        "mesh_drag",
+        "time_constant",
+        "delay",
+        "slew",
+        "current",
+    ):
         setattr(out, name, wp.vec2(*getattr(ranges, name)))
     out.volume_with_mass = int(ranges.volume == "with_mass")
     out.volume = wp.vec2(1.0, 1.0) if ranges.volume == "with_mass" else wp.vec2(*ranges.volume)
-    for ours, part in (("added_mass", ranges.added_mass), ("linear", ranges.linear_damping), ("quadratic", ranges.quadratic_damping)):
+    for ours, part in (
+        ("added_mass", ranges.added_mass),
+        ("linear", ranges.linear_damping),
+        ("quadratic", ranges.quadratic_damping),
+    ):
         low, high = part.bounds()
         setattr(out, ours, wp.vec2(*part.all))
         setattr(out, f"{ours}_low", vec6(*low))

@@ -114,7 +114,9 @@ def load_ranges(name_or_path: str | Path) -> Ranges:
     if not path.is_file():
         close = difflib.get_close_matches(str(name_or_path), available(), n=1)
         hint = f"; did you mean '{close[0]}'?" if close else ""
-        raise RangesError(f"no ranges '{name_or_path}': give a YAML file or one of {', '.join(available())}{hint}")
+        raise RangesError(
+            f"no ranges '{name_or_path}': give a YAML file or one of {', '.join(available())}{hint}"
+        )
     try:
         data: Any = yaml.safe_load(path.read_text())
     except yaml.YAMLError as error:

@@ -11,17 +11,18 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.engine.launch import Pipeline
-from finssim.engine.plant_arrays import SimulatorError, build_command, build_plant
+from finssim.engine.packed import Packed
+from finssim.engine.plant_arrays import SimulatorError, build_plant
 from finssim.engine.post_mortem import write_post_mortem
-from finssim.engine.state import HISTORY, State, clear_actuators, vec13
+from finssim.engine.state import HISTORY, State, VehicleState, clear_actuators, vec13
 from finssim.engine.step import physics_kernel, tick
 from finssim.engine.surroundings import Pool, TetherLine, Water
 from finssim.physics.contact import PoolWalls
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
 from finssim.physics.hydrodynamics.mesh import HullMesh, hull_mesh
-from finssim.physics.plant import refresh_plant
+from finssim.physics.plant import VehicleCommand, refresh_plant
 from finssim.physics.tether import Tether
-from finssim.physics.types import vec6, vec8
+from finssim.physics.types import vec8
 from finssim.physics.water import advance_drift
 from finssim.vehicles import Vehicle, load_vehicle
 
@@ -63,6 +64,7 @@ class Simulator:
         seed: int = 0,
         max_delay: float | None = None,
         max_waves: int = 0,
+        water_moves: bool = False,
     ) -> None:
         """Set up the worlds.
 
@@ -81,6 +83,7 @@ class Simulator:
             seed: Of everything random in the worlds.
             max_delay: Longest thruster delay that randomisation may set [s]; twice the vehicles' own if None.
             max_waves: Room for this many randomised waves.
+            water_moves: Simulate moving water even if `water` stands still: somebody will write currents or waves.
 
         Raises:
             SimulatorError: a name or number is out of its range; it says which.
@@ -90,16 +93,18 @@ class Simulator:
         self.hydrodynamics = _one_of(hydrodynamics, tuple(HYDRODYNAMICS), "hydrodynamic model")
         self.integrator = _one_of(integrator, INTEGRATORS, "integrator")
         if worlds < 1 or substeps < 1 or not self.vehicles:
-            raise SimulatorError(f"worlds={worlds}, substeps={substeps}: expected at least one, and one vehicle")
+            raise SimulatorError(
+                f"worlds={worlds}, substeps={substeps}: expected at least one, and one vehicle"
+            )
         if not (math.isfinite(control_step) and control_step > 0.0):
             raise SimulatorError(f"control_step is {control_step} s, expected a finite time above 0 s")
         self.worlds, self.control_step, self.substeps, self.seed = worlds, control_step, substeps, seed
         self.device = _device(device)
-        self._surround(water or Water(), pool, tether, max_waves)
+        self._surround(water or Water(), pool, tether, max_waves, water_moves)
         self._hulls()
         n = len(self.vehicles)
         self.plant = build_plant(self.vehicles, hydrodynamics, worlds, self._hull_index, self.device)
-        self.command = build_command(worlds, n, self.device)
+        self.command = Packed(VehicleCommand, (worlds, n), self.device)
         longest = 2.0 * float(self.plant.delay.numpy().max()) if max_delay is None else max_delay
         self.state = self._state(n, slots=math.ceil(longest / control_step) + 2)
         self._all = wp.ones(worlds, dtype=wp.int32, device=self.device)
@@ -115,10 +120,13 @@ class Simulator:
         self.refresh()
         self.place(position=(0.0, 0.0, -0.5 * (pool.depth if pool else 1.0)))
 
-    def _surround(self, water: Water, pool: Pool | None, tether: TetherLine | None, max_waves: int) -> None:
+    def _surround(
+        self, water: Water, pool: Pool | None, tether: TetherLine | None, max_waves: int, moves: bool
+    ) -> None:
         fluid = self.vehicles[0].water
         self.surroundings = (water, pool, tether)
         self.water = water.arrays(self.worlds, fluid.density, fluid.gravity, self.device, max_waves)
+        self.water.moving = int(moves or bool(self.water.moving))
         self.walls = pool.walls() if pool else PoolWalls()
         self.tether = tether.struct() if tether else Tether()
 
@@ -134,9 +142,10 @@ class Simulator:
     def _state(self, vehicles: int, slots: int) -> State:
         shape = (self.worlds, vehicles)
         state = State()
-        fields = {"position": wp.vec3, "quaternion": wp.quat, "velocity": vec6, "acceleration": vec6}
-        for name, dtype in (fields | {"actuator": vec8, "thrust": vec8}).items():
-            setattr(state, name, wp.zeros(shape, dtype=dtype, device=self.device))
+        self._vehicle_states = Packed(VehicleState, shape, self.device)
+        state.vehicle = self._vehicle_states.array
+        for name, view in self._vehicle_states.fields.items():
+            setattr(state, name, view)
         state.quaternion.fill_(wp.quat(0.0, 0.0, 0.0, 1.0))
         state.commands = wp.zeros((*shape, slots), dtype=vec8, device=self.device)
         state.history = wp.zeros((HISTORY, *shape), dtype=vec13, device=self.device)
@@ -156,12 +165,16 @@ class Simulator:
         kernel = physics_kernel(
             self.hydrodynamics,
             self.integrator,
+            water_moving=bool(self.water.moving),
             walls_present=self.surroundings[1] is not None,
             tether_present=self.surroundings[2] is not None,
             speed_lag=bool(self.plant.speed_lag.numpy().any()),
         )
         fixed = [self.hull, self.water, self.walls, self.tether, self.control_step, self.substeps]
-        pipeline.add(kernel, [self.state, self.command, self.plant, *fixed], vehicles=len(self.vehicles))
+        s = self.state
+        clocks = [s.commands, s.history, s.steps, s.broken, s.frozen]
+        inputs = [s.vehicle, self.command.array, *clocks, self.plant.array, *fixed]
+        pipeline.add(kernel, inputs, vehicles=len(self.vehicles))
         pipeline.add(tick, [self.state])
 
     def add_reset(self, pipeline: Pipeline, mask: wp.array) -> None:
@@ -171,7 +184,7 @@ class Simulator:
     def add_refresh(self, pipeline: Pipeline, mask: wp.array) -> None:
         """Append the kernel that recomputes derived parameters, where mask (by world, int32) is not 0."""
         h = self.control_step / self.substeps
-        pipeline.add(refresh_plant, [self.plant, h, mask], vehicles=len(self.vehicles))
+        pipeline.add(refresh_plant, [self.plant.array, h, mask], vehicles=len(self.vehicles))
 
     def step(self) -> None:
         """Advance every world by one control step under `command`."""
@@ -185,7 +198,9 @@ class Simulator:
         """
         longest = float(self.plant.delay.numpy().max())
         if longest > (self.state.commands.shape[2] - 2) * self.control_step + 1e-6:
-            raise SimulatorError(f"thruster delay {longest} s exceeds the delay line; give max_delay={longest}")
+            raise SimulatorError(
+                f"thruster delay {longest} s exceeds the delay line; give max_delay={longest}"
+            )
         pipeline = self.pipeline()
         self.add_refresh(pipeline, self._all)
         pipeline.run()
@@ -256,7 +271,9 @@ class Simulator:
             got = f.shape[-1] if f.ndim else 0
             raise SimulatorError(f"thrust command has {got} numbers, expected {max(n)}: one per thruster")
         if not np.isfinite(f).all():
-            raise SimulatorError("thrust command has a number that is not finite: send a force in N for every thruster")
+            raise SimulatorError(
+                "thrust command has a number that is not finite: send a force in N for every thruster"
+            )
         full = np.zeros((self.worlds, len(self.vehicles), 8), dtype=np.float32)
         full[..., : f.shape[-1]] = f
         self.command.thrust.assign(full)

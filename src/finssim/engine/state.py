@@ -11,9 +11,22 @@ vec13 = wp.types.vector(length=13, dtype=wp.float32)
 
 
 @wp.struct
-class State:
-    """State by (world, vehicle); clocks and status by world; delay line and history with one more index."""
+class VehicleState:
+    """State of one vehicle."""
 
+    position: wp.vec3  # body origin, world frame [m]
+    quaternion: wp.quat  # body to world, xyzw
+    velocity: vec6  # nu, body frame [m/s, rad/s]
+    acceleration: vec6  # nu_dot of the last substep
+    actuator: vec8  # lagged force [N] or propeller speed [rad/s]
+    thrust: vec8  # delivered by each thruster [N]
+
+
+@wp.struct
+class State:
+    """Views of the vehicles' states by (world, vehicle); clocks and status by world; delay line and history."""
+
+    vehicle: wp.array2d(dtype=VehicleState)  # the memory behind the six views that follow
     position: wp.array2d(dtype=wp.vec3)  # body origin, world frame [m]
     quaternion: wp.array2d(dtype=wp.quat)  # body to world, xyzw
     velocity: wp.array2d(dtype=vec6)  # nu, body frame [m/s, rad/s]

@@ -126,8 +126,13 @@ class Pool:
     friction: float = 0.2
 
     def __post_init__(self) -> None:
-        _require(min(self.length, self.width, self.depth) > 0.0, "pool: length, width and depth must exceed 0 m")
-        _require(min(self.stiffness, self.damping, self.friction) >= 0.0, "pool: wall coefficients must not be negative")
+        _require(
+            min(self.length, self.width, self.depth) > 0.0, "pool: length, width and depth must exceed 0 m"
+        )
+        _require(
+            min(self.stiffness, self.damping, self.friction) >= 0.0,
+            "pool: wall coefficients must not be negative",
+        )
 
     def walls(self) -> PoolWalls:
         """The struct that kernels take."""

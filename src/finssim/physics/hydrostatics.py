@@ -1,8 +1,18 @@
 """Gravity and buoyancy about separate centres, with a smooth free surface."""
 
+# mypy: disable-error-code="arg-type"
+
 import warp as wp
 
 from finssim.physics.types import join, vec6
+
+
+@wp.struct
+class WaterWrench:
+    """What a hydrodynamic model gives: its wrench, and how much water the vehicle displaces."""
+
+    tau: vec6  # about the body origin, body frame [N, N m]
+    displaced: float  # mass of water [kg]
 
 
 @wp.func

@@ -1,5 +1,7 @@
 """Inertial terms: Coriolis and centripetal wrench of the rigid body and of the added mass."""
 
+# mypy: disable-error-code="arg-type,operator"
+
 import warp as wp
 
 from finssim.physics.types import angular, join, linear, mat66, mat66d, vec6
@@ -39,6 +41,32 @@ def rigid_body_momentum(mass: float, r_g: wp.vec3, inertia: wp.mat33, nu: vec6) 
     v = linear(nu)
     omega = angular(nu)
     return join(mass * (v + wp.cross(omega, r_g)), inertia * omega + mass * wp.cross(r_g, v))
+
+
+@wp.func
+def water_acceleration_wrench(
+    M_A: mat66, r_b: wp.vec3, water_b: wp.vec3, a_b: wp.vec3, omega: wp.vec3, displaced: float
+) -> vec6:
+    """Wrench of accelerating water on a body: M_A d(nu_c)/dt and the Froude-Krylov force.
+
+    M_A [a_c - ω × v_c; 0] + [m_w a_c; r_b × m_w a_c]
+
+    The second part is the pressure gradient that accelerates the water itself: with it a neutral body at rest in the
+    water keeps moving with it, whatever its added mass.
+
+    Args:
+        M_A: Added mass about the body origin.
+        r_b: Centre of buoyancy, body frame [m].
+        water_b: Velocity of the water v_c, body frame [m/s].
+        a_b: Acceleration of the water a_c, body frame [m/s²].
+        omega: Angular velocity of the body, body frame [rad/s].
+        displaced: Mass of the water displaced, m_w [kg].
+
+    Returns:
+        Wrench about the body origin, body frame [N, N m].
+    """
+    f = displaced * a_b
+    return M_A * join(a_b - wp.cross(omega, water_b), wp.vec3(0.0)) + join(f, wp.cross(r_b, f))
 
 
 @wp.func

@@ -1,5 +1,7 @@
 """Actuator dynamics: delay line, dead zone, first-order lag, slew limit; the steady thrust curve T = c± ω|ω|."""
 
+# mypy: disable-error-code="no-any-return"
+
 import warp as wp
 
 from finssim.physics.types import MAX_THRUSTERS, vec8
@@ -22,18 +24,16 @@ def speed_of_thrust(thrust: float, c_plus: float, c_minus: float) -> float:
 @wp.func
 def admissible(command: vec8, lower: vec8, upper: vec8, dead_minus: vec8, dead_plus: vec8) -> vec8:
     """A force command as the motors take it: inside [lower, upper], and zero inside (dead_minus, dead_plus) [N]."""
-    out = vec8()
+    f = wp.min(wp.max(command, lower), upper)
     for i in range(MAX_THRUSTERS):
-        # Comparisons, not clamp: a NaN must stay a NaN to be noticed.
-        f = wp.where(command[i] > upper[i], upper[i], wp.where(command[i] < lower[i], lower[i], command[i]))
-        out[i] = wp.where(f > dead_minus[i] and f < dead_plus[i], 0.0, f)
-    return out
+        f[i] = wp.where(f[i] > dead_minus[i] and f[i] < dead_plus[i], 0.0, f[i])
+    return f
 
 
 @wp.func
-def steps_ago(age: float, period: float) -> int:
-    """How many control steps ago the command that is `age` seconds old was issued (0: at the current step)."""
-    return wp.max(int(wp.ceil(age / period - 1.0e-4)), 0)
+def steps_ago(age: float, rate: float) -> int:
+    """How many control steps ago, at `rate` steps a second, the command that is `age` seconds old was issued."""
+    return wp.max(int(wp.ceil(age * rate - 1.0e-4)), 0)
 
 
 @wp.func
@@ -51,7 +51,4 @@ def first_order(x: vec8, target: vec8, alpha: vec8, max_change: vec8) -> vec8:
     Returns:
         Thrusts or speeds after the step.
     """
-    out = vec8()
-    for i in range(MAX_THRUSTERS):
-        out[i] = x[i] + wp.clamp(alpha[i] * (target[i] - x[i]), -max_change[i], max_change[i])
-    return out
+    return x + wp.max(wp.min(wp.cw_mul(alpha, target - x), max_change), -max_change)

@@ -1,5 +1,7 @@
 """Drag of a straight, taut tether from an anchor to the vehicle."""
 
+# mypy: disable-error-code="arg-type"
+
 import warp as wp
 
 from finssim.physics.types import join, vec6
@@ -17,7 +19,9 @@ class Tether:
 
 
 @wp.func
-def tether_wrench(tether: Tether, density: float, position: wp.vec3, q: wp.quat, nu: vec6, water: wp.vec3) -> vec6:
+def tether_wrench(
+    tether: Tether, density: float, position: wp.vec3, q: wp.quat, nu: vec6, water: wp.vec3
+) -> vec6:
     """Wrench of the tether on the vehicle: the vehicle's share of the cross-flow drag, and half the wet weight.
 
     The tether is a straight line of length L whose velocity across itself grows linearly from 0 at the anchor to v_n at

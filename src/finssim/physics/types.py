@@ -1,4 +1,6 @@
-"""The Warp vector and matrix types of the physics: 6-vectors of twists and wrenches, 8 thrusters, 6x6 and 6x8 matrices."""
+"""The Warp vector and matrix types of the physics: twists and wrenches, eight thrusters, 6x6 and 6x8 matrices."""
+
+# mypy: disable-error-code="index,no-any-return,operator,valid-type"
 
 import warp as wp
 
@@ -28,3 +30,9 @@ def angular(x: vec6) -> wp.vec3:
 def join(a: wp.vec3, b: wp.vec3) -> vec6:
     """A twist or wrench from its linear and angular parts."""
     return vec6(a[0], a[1], a[2], b[0], b[1], b[2])
+
+
+@wp.func
+def symmetric_times(M: mat66, x: vec6) -> vec6:
+    """M x for a symmetric M, as xᵀ M: a sum of rows, which the compiler turns into vector instructions."""
+    return x * M

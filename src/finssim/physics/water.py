@@ -1,5 +1,7 @@
 """Moving water: uniform, sheared and drifting currents, linear waves at finite depth, and the surface itself."""
 
+# mypy: disable-error-code="assignment,no-untyped-def,operator,untyped-decorator,valid-type"
+
 import math
 
 import numpy as np

@@ -8,7 +8,7 @@ import warp as wp
 from finssim.control.allocation import AllocationData, allocate, allocation_data
 from finssim.control.allocator import axis_weights
 from finssim.engine.simulator import Simulator
-from finssim.physics.plant import Command
+from finssim.physics.plant import VehicleCommand
 from finssim.physics.types import MAX_THRUSTERS, vec6, vec8
 from finssim.tasks.arrays import TaskArrays
 
@@ -21,7 +21,14 @@ ACTION_MODES = ("thruster8", *WRENCH_AXES)
 
 
 @wp.kernel(enable_backward=False)
-def thruster_action(arrays: TaskArrays, command: Command, lower: vec8, upper: vec8, count: int, world_offset: int):
+def thruster_action(
+    arrays: TaskArrays,
+    command: wp.array2d(dtype=VehicleCommand),
+    lower: vec8,
+    upper: vec8,
+    count: int,
+    world_offset: int,
+):
     """Each action component is a part of its thruster's force limit: a ≥ 0 of the upper one, a < 0 of the lower."""
     w = world_offset + wp.tid()
     force = vec8()
@@ -29,13 +36,13 @@ def thruster_action(arrays: TaskArrays, command: Command, lower: vec8, upper: ve
         if i < count:
             a = wp.clamp(arrays.action[w, i], -1.0, 1.0)
             force[i] = wp.where(a >= 0.0, a * upper[i], -a * lower[i])
-    command.thrust[w, 0] = force
+    command[w, 0].thrust = force
 
 
 @wp.kernel(enable_backward=False)
 def wrench_action(
     arrays: TaskArrays,
-    command: Command,
+    command: wp.array2d(dtype=VehicleCommand),
     scale: wp.array(dtype=vec6),
     count: int,
     data: AllocationData,
@@ -49,7 +56,7 @@ def wrench_action(
     tau = vec6()
     for i in range(count):
         tau += wp.clamp(arrays.action[w, i], -1.0, 1.0) * scale[i]
-    command.thrust[w, 0] = allocate(tau, 0, data)
+    command[w, 0].thrust = allocate(tau, 0, data)
 
 
 def action_size(mode: str, thrusters: int) -> int:
@@ -57,7 +64,9 @@ def action_size(mode: str, thrusters: int) -> int:
     return thrusters if mode == "thruster8" else len(WRENCH_AXES[mode])
 
 
-def add_action(mode: str, simulator: Simulator, arrays: TaskArrays, wrench_scale: np.ndarray) -> Callable[..., None]:
+def add_action(
+    mode: str, simulator: Simulator, arrays: TaskArrays, wrench_scale: np.ndarray
+) -> Callable[..., None]:
     """The stage that turns actions into thruster commands.
 
     Args:
@@ -75,7 +84,7 @@ def add_action(mode: str, simulator: Simulator, arrays: TaskArrays, wrench_scale
     if mode == "thruster8":
         pad = [0.0] * (MAX_THRUSTERS - n)
         bounds = [vec8(*lower, *pad), vec8(*upper, *pad)]
-        return lambda pipeline: pipeline.add(thruster_action, [arrays, simulator.command, *bounds, n])
+        return lambda pipeline: pipeline.add(thruster_action, [arrays, simulator.command.array, *bounds, n])
     limits = vehicle.wrench_limits
     data = allocation_data(
         [vehicle.control_matrix], [lower], [upper], [axis_weights(limits)], device=simulator.device
@@ -84,4 +93,6 @@ def add_action(mode: str, simulator: Simulator, arrays: TaskArrays, wrench_scale
     rows = np.zeros((len(axes), 6), dtype=np.float32)
     rows[np.arange(len(axes)), axes] = (limits * wrench_scale)[list(axes)]
     scale = wp.array(rows, dtype=vec6, device=simulator.device)
-    return lambda pipeline: pipeline.add(wrench_action, [arrays, simulator.command, scale, len(axes), data])
+    return lambda pipeline: pipeline.add(
+        wrench_action, [arrays, simulator.command.array, scale, len(axes), data]
+    )

@@ -92,7 +92,9 @@ class Environment:
         self.task, self.action_mode, self.seed = task, action, int(seed)
         self.crash_directory, self.auto_reset = crash_directory, auto_reset
         if action not in ACTION_MODES:
-            raise EnvironmentSetupError(f"unknown action mode '{action}'; available: {', '.join(ACTION_MODES)}")
+            raise EnvironmentSetupError(
+                f"unknown action mode '{action}'; available: {', '.join(ACTION_MODES)}"
+            )
         chosen = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
         longest = max((t.delay for t in chosen.thrusters.values()), default=0.0)
         extra = randomization.simulator_arguments(longest) if randomization else {}
@@ -176,11 +178,15 @@ class Environment:
                 self.seed = self.simulator.seed = int(seed)
                 self._build()
             self.simulator.state.episode.zero_()
-        self._mask.assign(np.ones(self.worlds, np.int32) if mask is None else np.asarray(mask, dtype=np.int32))
+        self._mask.assign(
+            np.ones(self.worlds, np.int32) if mask is None else np.asarray(mask, dtype=np.int32)
+        )
         self._start.run()
         return self.arrays.observation.numpy()
 
-    def start(self, position: ArrayLike, quaternion: ArrayLike, goal_position: ArrayLike, goal_quaternion: ArrayLike) -> NDArray[np.float32]:
+    def start(
+        self, position: ArrayLike, quaternion: ArrayLike, goal_position: ArrayLike, goal_quaternion: ArrayLike
+    ) -> NDArray[np.float32]:
         """Start an episode in every world from given poses at rest, towards given goals.
 
         Args:
@@ -223,10 +229,14 @@ class Environment:
         """
         a = np.asarray(action, dtype=np.float32)
         if a.shape != (self.worlds, self.action_size):
-            raise EnvironmentSetupError(f"action has shape {a.shape}, expected {(self.worlds, self.action_size)}: one row per world")
+            raise EnvironmentSetupError(
+                f"action has shape {a.shape}, expected {(self.worlds, self.action_size)}: one row per world"
+            )
         if not math.isfinite(float(a.sum())) and not np.isfinite(a).all():
             world = int(np.flatnonzero(~np.isfinite(a).all(axis=1))[0])
-            raise EnvironmentSetupError(f"action of world {world} has a number that is not finite: {a[world].tolist()}")
+            raise EnvironmentSetupError(
+                f"action of world {world} has a number that is not finite: {a[world].tolist()}"
+            )
         self.arrays.action.assign(a)
         self.advance()
         return self.outcome()

@@ -1,4 +1,4 @@
-"""T1, station keeping: reach a pose in the pool and hold it (paper, section IV; success 0.10 m per axis and 10° for 10 s)."""
+"""T1, station keeping: reach a pose in the pool and hold it within 0.10 m per axis and 10° (paper, section IV)."""
 
 import math
 from dataclasses import dataclass, field
@@ -199,7 +199,7 @@ def uniform3(rng: wp.uint32, low: wp.vec3, high: wp.vec3) -> wp.vec3:
 def spawn(
     state: State, arrays: TaskArrays, p: Parameters, seed: int, mask: wp.array(dtype=int), world_offset: int
 ):
-    """Start an episode where mask is not 0: a goal pose, and a start pose and velocity, drawn for this episode alone."""
+    """Start an episode where mask is not 0: a goal pose, a start pose and velocity, drawn for this episode alone."""
     w = world_offset + wp.tid()
     if mask[w] == 0:
         return
@@ -207,7 +207,9 @@ def spawn(
     pi = 3.14159265
     arrays.goal_position[w] = uniform3(wp.rand_init(key, 4 * w), p.goal_low, p.goal_high)
     state.position[w, 0] = uniform3(wp.rand_init(key, 4 * w + 1), p.spawn_low, p.spawn_high)
-    angles = uniform3(wp.rand_init(key, 4 * w + 2), wp.vec3(-p.tilt, -p.tilt, -pi), wp.vec3(p.tilt, p.tilt, pi))
+    angles = uniform3(
+        wp.rand_init(key, 4 * w + 2), wp.vec3(-p.tilt, -p.tilt, -pi), wp.vec3(p.tilt, p.tilt, pi)
+    )
     rng = wp.rand_init(key, 4 * w + 3)
     z = wp.vec3(0.0, 0.0, 1.0)
     arrays.goal_quaternion[w] = wp.quat_from_axis_angle(z, wp.randf(rng, -pi, pi))
@@ -274,7 +276,17 @@ class StationKeeping(Task):
         p, r = Parameters(), self.reward
         for name in ("goal_low", "goal_high", "spawn_low", "spawn_high"):
             setattr(p, name, wp.vec3(*getattr(self, name)))
-        for name in ("tilt", "speed", "rate", "ceiling", "depth", "time_limit", "control_step", "tolerance", "yaw_tolerance"):
+        for name in (
+            "tilt",
+            "speed",
+            "rate",
+            "ceiling",
+            "depth",
+            "time_limit",
+            "control_step",
+            "tolerance",
+            "yaw_tolerance",
+        ):
             setattr(p, name, getattr(self, name))
         p.bounds = wp.vec3(*self.bounds, 0.0)
         p.position_weight, p.position_scale, p.distance_weight = r.position, r.position_scale, r.distance

@@ -1,67 +1,34 @@
-"""Calibrated Fossen hydrodynamics (paper, eq. 1-2): restoring, damping and added mass in moving water."""
+"""Calibrated Fossen hydrodynamics (paper, eq. 1-2): restoring and damping; the added mass is the engine's."""
+
+# mypy: disable-error-code="valid-type"
 
 import warp as wp
-from finssim.physics.hydrodynamics.mesh import HullMesh
 
 from finssim.physics.damping import damping_wrench, twist_at, wrench_from
-from finssim.physics.hydrostatics import hydrostatic_wrench, submerged_fraction
-from finssim.physics.inertia import coriolis_wrench
-from finssim.physics.plant import Plant
-from finssim.physics.types import join, vec6
+from finssim.physics.hydrodynamics.mesh import HullMesh
+from finssim.physics.hydrostatics import WaterWrench, hydrostatic_wrench, submerged_fraction
+from finssim.physics.plant import VehicleParameters
+from finssim.physics.types import vec6
 from finssim.physics.water import Flow, WaterArrays
 
 
 @wp.func
-def relative_twist(nu: vec6, water_b: wp.vec3) -> vec6:
-    """Twist relative to the water; water_b is the water's velocity in the body frame [m/s]."""
-    return nu - join(water_b, wp.vec3(0.0))
-
-
-@wp.func
-def water_acceleration_wrench(
-    plant: Plant, w: int, v: int, water_b: wp.vec3, a_b: wp.vec3, omega: wp.vec3, mass: float
-) -> vec6:
-    """Wrench of accelerating water on a body: M_A d(nu_c)/dt + Froude-Krylov force.
-
-    M_A [a_c - ω × v_c; 0] + [ρ V a_c; r_b × ρ V a_c]
-
-    The second part is the pressure gradient that accelerates the water itself: with it a neutral body at rest in the
-    water keeps moving with it, whatever its added mass.
-
-    Args:
-        plant: Parameters.
-        w: World.
-        v: Vehicle.
-        water_b: Velocity of the water, body frame [m/s].
-        a_b: Acceleration of the water, body frame [m/s²].
-        omega: Angular velocity of the body, body frame [rad/s].
-        mass: Mass of the water displaced, ρ V [kg].
-
-    Returns:
-        Wrench about the body origin, body frame [N, N m].
-    """
-    f = mass * a_b
-    spin = wp.vec3(0.0)
-    return plant.M_A[w, v] * join(a_b - wp.cross(omega, water_b), spin) + join(f, wp.cross(plant.r_b[w, v], f))
-
-
-@wp.func
 def fossen_wrench(
-    plant: Plant,
+    plant: wp.array2d(dtype=VehicleParameters),
     hull: HullMesh,
     water: WaterArrays,
     w: int,
     v: int,
     position: wp.vec3,
     q: wp.quat,
+    up: wp.vec3,
     nu: vec6,
+    nu_r: vec6,
     flow: Flow,
-) -> vec6:
-    """Hydrodynamic and hydrostatic wrench, without the part of added mass that multiplies nu_dot.
+) -> WaterWrench:
+    """Hydrostatic and damping wrench of a submerged or emerging vehicle.
 
-    tau_H + tau_D(nu_r) - C_A(nu_r) nu_r + M_A d(nu_c)/dt                            (paper, eq. 1)
-
-    The term -M_A nu_dot is on the left-hand side of the equation of motion: M_RB + M_A is solved as one matrix.
+    tau_H + tau_D(nu_r)                     (paper, eq. 1; its terms in M_A belong to the equation of motion)
 
     Args:
         plant: Parameters.
@@ -71,25 +38,22 @@ def fossen_wrench(
         v: Vehicle.
         position: Body origin, world frame [m].
         q: Attitude, body to world.
+        up: World z axis in the body frame.
         nu: Twist, body frame [m/s, rad/s].
+        nu_r: The same relative to the water.
         flow: Water at the body origin.
 
     Returns:
-        Wrench about the body origin, body frame [N, N m].
+        Wrench about the body origin and the mass of water displaced.
     """
-    up = wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
-    r_b = plant.r_b[w, v]
+    r_b = plant[w, v].r_b
     height = position[2] + wp.dot(up, r_b) - flow.elevation
-    wet = submerged_fraction(height, plant.surface_half_height[w, v])
-    displaced = water.density * plant.volume[w, v] * wet
-    tau = hydrostatic_wrench(plant.mass[w, v] * water.gravity, displaced * water.gravity, plant.r_g[w, v], r_b, up)
-    nu_r = nu
-    if water.moving != 0:
-        water_b = wp.quat_rotate_inv(q, flow.velocity)
-        omega = wp.vec3(nu[3], nu[4], nu[5])
-        nu_r = relative_twist(nu, water_b)
-        a_b = wp.quat_rotate_inv(q, flow.acceleration)
-        tau += water_acceleration_wrench(plant, w, v, water_b, a_b, omega, displaced)
-    r_h = plant.r_h[w, v]
-    tau_D = damping_wrench(twist_at(nu_r, r_h), plant.D1[w, v], plant.D2[w, v], plant.Du[w, v])
-    return tau + wet * wrench_from(tau_D, r_h) - coriolis_wrench(plant.M_A[w, v] * nu_r, nu_r)
+    wet = submerged_fraction(height, plant[w, v].surface_half_height)
+    out = WaterWrench()
+    out.displaced = water.density * plant[w, v].volume * wet
+    r_h = plant[w, v].r_h
+    tau_D = damping_wrench(twist_at(nu_r, r_h), plant[w, v].D1, plant[w, v].D2, plant[w, v].Du)
+    weight = plant[w, v].mass * water.gravity
+    tau_H = hydrostatic_wrench(weight, out.displaced * water.gravity, plant[w, v].r_g, r_b, up)
+    out.tau = tau_H + wet * wrench_from(tau_D, r_h)
+    return out
