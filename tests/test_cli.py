@@ -97,3 +97,19 @@ def test_doctor_as_json(capsys):
     """`doctor --json` prints one object."""
     assert finssim("doctor", "--json") == 0
     assert json.loads(capsys.readouterr().out)["healthy"] is True
+
+
+def test_simulate_writes_what_it_says(capfd, tmp_path):
+    """The example of the README: a table, where it was written, and nothing on standard error."""
+    words = ["simulate", "--vehicle", "finsrov", "--command", "surge=10 yaw=1", "--duration", "1"]
+    assert finssim(*words, "--out", tmp_path / "run.csv") == 0
+    out, err = capfd.readouterr()
+    assert err == "" and "wrench given" in out and "run.csv" in out.replace("\n", "")
+    assert (tmp_path / "run.csv").exists()
+
+
+def test_simulate_refuses_in_a_sentence(capsys, tmp_path):
+    """A wrong word in the command, and a place that takes no files."""
+    words = ["simulate", "--vehicle", "finsrov", "--duration", "1", "--out"]
+    assert "did you mean 'surge'?" in refusal(capsys, *words, tmp_path / "run.csv", "--command", "surg=10")
+    assert "write elsewhere" in refusal(capsys, *words, "/proc/x/run.csv", "--command", "surge=10")

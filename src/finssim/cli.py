@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from finssim import __version__, boundary
+from finssim.quiet import start_warp
 
 __all__ = ["app", "main"]
 
@@ -68,6 +69,7 @@ def demo(
 
     Example: finssim demo --out demo
     """
+    start_warp()
     from finssim.experiments.demo import demo as run
 
     run(out)
@@ -100,6 +102,7 @@ def train(
 
     Example: finssim train t1 --vehicle finsrov --seed 1 --out runs/hold
     """
+    start_warp()
     from finssim.learning.train import train as run
 
     run(
@@ -141,6 +144,7 @@ def evaluate(
 
     Example: finssim evaluate runs/hold --plant current --trials 64 --out runs/hold-current
     """
+    start_warp()
     from finssim.learning.evaluate import evaluate as run
 
     run(
@@ -170,15 +174,18 @@ def simulate(
         ),
     ],
     duration: Annotated[float, typer.Option(help="Simulated time [s].")],
-    out: Annotated[Path, typer.Option(help="File to write, one row per control step: .csv or .parquet.")],
+    out: Annotated[
+        Path, typer.Option(help="Table to write, one row per control step of 0.1 s: a .csv file.")
+    ],
     hydrodynamics: Hydrodynamics = "calibrated",
-    depth: Annotated[float, typer.Option(help="Depth of the body origin at the start [m].")] = 0.5,
+    depth: Annotated[float, typer.Option(help="Depth of the body origin at the start [m].")] = 5.0,
     device: Device = "cpu",
 ) -> None:
     """Simulate a vehicle from rest under a constant wrench and record its motion.
 
     Example: finssim simulate --vehicle finsrov --command "surge=10 yaw=1" --duration 10 --out run.csv
     """
+    start_warp()
     from finssim.experiments.simulate import simulate as run
 
     run(
@@ -249,6 +256,7 @@ def validate(
 
     Example: finssim validate finsrov
     """
+    start_warp()
     from finssim.experiments.validate import validate as run
 
     run(name, json=as_json)
@@ -260,6 +268,7 @@ def bench(as_json: Json = False) -> None:
 
     Example: finssim bench --json > bench.json
     """
+    start_warp()
     from finssim.experiments.bench import bench as run
 
     run(json=as_json)
