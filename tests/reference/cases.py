@@ -1,0 +1,57 @@
+"""Every catalogue vehicle with every hydrodynamic model that its file has, and random states."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from finssim.vehicles import catalogue, load_vehicle
+
+load = cache(load_vehicle)
+PAIRS = [(name, model) for name in catalogue() for model in sorted(load(name).hydrodynamics)]
+EVERY_VEHICLE_AND_MODEL = pytest.mark.parametrize(
+    ("name", "model"), PAIRS, ids=[f"{n}-{m}" for n, m in PAIRS]
+)
+ONE_VEHICLE_PER_MODEL = pytest.mark.parametrize("model", ["calibrated", "mesh", "simplified"])
+"""For claims about the engine rather than the numbers of a vehicle: FinsROV has all three."""
+
+
+def random_attitudes(rng, n):
+    """Uniform unit quaternions (n, 4), rounded to float32 as a simulator holds them."""
+    q = rng.normal(size=(n, 4))
+    return (q / np.linalg.norm(q, axis=1, keepdims=True)).astype(np.float32)
+
+
+def random_states(rng, n, *, depth=(-3.0, -2.0), speed=1.0, turn=1.0):
+    """Positions (n, 3) [m], attitudes (n, 4) and twists (n, 6) [m/s, rad/s] in float32."""
+    position = rng.uniform([-2.0, -2.0, depth[0]], [2.0, 2.0, depth[1]], (n, 3)).astype(np.float32)
+    nu = rng.normal(size=(n, 6)) * ([speed] * 3 + [turn] * 3)
+    return position, random_attitudes(rng, n), nu.astype(np.float32)
+
+
+def disturb(simulator, tau):
+    """Apply wrenches about the body origin, body frame, broadcastable to (worlds, vehicles, 6) [N, N m]."""
+    shape = (simulator.worlds, len(simulator.vehicles), 6)
+    tau = np.broadcast_to(np.asarray(tau, np.float32), shape)
+    simulator.command.disturbance.assign(np.ascontiguousarray(tau))
+
+
+def undamped(vehicle, model):
+    """The vehicle without any damping."""
+    chosen = vehicle.hydrodynamics[model]
+    names = [x for x in ("linear_damping", "quadratic_damping", "surge_damping") if hasattr(chosen, x)]
+    changes = {f"hydrodynamics.{model}.{x}": np.zeros((6, 6)).tolist() for x in names}
+    changes |= {f"hydrodynamics.{model}.{x}": 0.0 for x in ("form_drag", "skin_drag") if hasattr(chosen, x)}
+    return vehicle.replace(changes)
+
+
+def neutral(vehicle, buoyancy_above_gravity=0.0):
+    """The vehicle with as much buoyancy as weight, its centre a distance straight above the centre of gravity [m]."""
+    volume = vehicle.body.mass / vehicle.water.density
+    r_b = np.array(vehicle.body.center_of_gravity) + [0.0, 0.0, buoyancy_above_gravity]
+    return vehicle.replace({"body.displaced_volume": volume, "body.center_of_buoyancy": r_b.tolist()})
+
+
+def weightless(vehicle, model):
+    """Neither heavy nor light nor damped: only inertia is left."""
+    return neutral(undamped(vehicle, model))

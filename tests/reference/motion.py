@@ -1,0 +1,154 @@
+"""The equation of motion of one vehicle, all three models, over a batch of states.
+
+M_RB nu_dot + C_RB(nu) nu + M_A nu_r_dot + C_A(nu_r) nu_r + D(nu_r) nu_r + g = tau + tau_FK    (Fossen 2021, eq. 10.2)
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from reference.body import (
+    added_mass_coriolis,
+    rigid_body_coriolis,
+    rigid_body_mass,
+    rotation,
+    skew,
+    times,
+    transformation,
+)
+from reference.hull import displacement, drag, unsigned_cross
+from reference.water import flow
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """What the equation needs of a vehicle, float64, about the body origin."""
+
+    density: float
+    gravity: float
+    mass: float
+    r_g: np.ndarray
+    inertia_g: np.ndarray
+    volume: float
+    r_b: np.ndarray
+    half_height: float
+    M_RB: np.ndarray
+    M_A: np.ndarray
+    r_h: np.ndarray
+    D1: np.ndarray
+    D2: np.ndarray
+    Du: np.ndarray
+    form: float
+    skin: float
+    corners: np.ndarray | None
+
+
+def numbers(vehicle, model):
+    """Read a vehicle."""
+    body, chosen = vehicle.body, vehicle.hydrodynamics[model]
+    r_g, r_h = np.array(body.center_of_gravity, float), np.array(chosen.reference_point, float)
+    inertia_g = np.array(body.inertia, float)
+    H = transformation(r_h)
+    M_A = H.T @ np.array(chosen.added_mass, float) @ H * (model != "simplified")
+    zero = np.zeros((6, 6))
+    corners = None
+    if model == "mesh":
+        vertices, faces = vehicle.hull_mesh()
+        corners = vertices[faces]
+    return Numbers(
+        vehicle.water.density, vehicle.water.gravity, body.mass, r_g, inertia_g,
+        body.displaced_volume, np.array(body.center_of_buoyancy, float), body.surface_half_height,
+        rigid_body_mass(body.mass, r_g, inertia_g), M_A, r_h,
+        *(np.array(getattr(chosen, name, zero), float) for name in
+          ("linear_damping", "quadratic_damping", "surge_damping")),
+        getattr(chosen, "form_drag", 0.0), getattr(chosen, "skin_drag", 0.0), corners,
+    )  # fmt: skip
+
+
+def wrench_of_force(r, force):
+    """[F; r × F]."""
+    return np.concatenate([force, np.cross(r, force)], axis=-1)
+
+
+def damping(n, nu_r):
+    """Wrench about the body origin of the damping matrices, which hold at r_h."""
+    H = transformation(n.r_h)
+    nu_h = nu_r @ H.T
+    D = n.D1 + n.D2 * np.abs(nu_h)[..., None, :] + n.Du * np.abs(nu_h[..., :1, None])
+    return -times(D, nu_h) @ H, times(np.abs(D), np.abs(nu_h)) @ np.abs(H)
+
+
+def coriolis_size(M, nu):
+    """Magnitudes that C(nu) nu is a sum of: |ω| ⊗ |p| and |v| ⊗ |p| + |ω| ⊗ |h|, with no sign to cancel."""
+    momentum = np.abs(nu) @ np.abs(M).T
+    v, omega, p, h = np.abs(nu[:, :3]), np.abs(nu[:, 3:]), momentum[:, :3], momentum[:, 3:]
+    return np.concatenate(
+        [unsigned_cross(omega, p), unsigned_cross(v, p) + unsigned_cross(omega, h)], axis=-1
+    )
+
+
+def submersion(n, height):
+    """Share of the volume under water, from the height of the centre of buoyancy: 0 above half_height, 1 below it."""
+    s = np.clip((n.half_height - height) / (2.0 * n.half_height), 0.0, 1.0)
+    return 3.0 * s**2 - 2.0 * s**3
+
+
+def acceleration(n, model, position, q, nu, tau, water=None, t=0.0):
+    """nu_dot, and a bound of what it is a sum of, for rounding.
+
+    Args:
+        n: From `numbers`.
+        model: calibrated, mesh or simplified.
+        position: World frame (N, 3).
+        q: xyzw (N, 4).
+        nu: (N, 6).
+        tau: Other wrenches about the body origin, body frame (N, 6).
+        water: `finssim.engine.Water` without drift; still if None.
+        t: Time [s].
+
+    Returns:
+        nu_dot (N, 6) and |M⁻¹| |M| |M⁻¹| Σ |wrenches| (N, 6).
+    """
+    R = rotation(q)
+    Rt = np.swapaxes(R, -1, -2)
+    up = R[..., 2, :]
+    N = len(nu)
+    elevation, surface, height = np.zeros(N), up, position[:, 2]
+    v_c, a_c, G_b = np.zeros((N, 3)), np.zeros((N, 3)), np.zeros((N, 3, 3))
+    if water is not None:
+        around = flow(water, n.gravity, position, t)
+        elevation, surface = around.elevation, times(Rt, around.normal)
+        height = around.normal[:, 2] * (position[:, 2] - elevation)
+        v_c, a_c = times(Rt, around.velocity), times(Rt, around.acceleration)
+        G_b = Rt @ around.gradient @ R
+    nu_r = nu - np.concatenate([v_c, np.zeros((N, 3))], -1)
+    omega = nu[:, 3:]
+
+    terms = [tau, wrench_of_force(n.r_g, -n.mass * n.gravity * up)]
+    if model == "mesh":
+        whole = displacement(n.corners, np.array([[0.0, 0.0, 1.0]]), np.array([-1e3]))
+        volume, center = displacement(n.corners, surface, height)
+        displaced = n.density * n.volume * volume / whole[0]
+        terms.append(wrench_of_force(center - whole[1] + n.r_b, displaced[:, None] * n.gravity * up))
+        tau_D, size_D = drag(n.corners, surface, height, nu, v_c, G_b, n.density, n.form, n.skin)
+    else:
+        wet = submersion(n, position[:, 2] + up @ n.r_b - elevation)
+        displaced = n.density * n.volume * wet
+        terms.append(wrench_of_force(n.r_b, displaced[:, None] * n.gravity * up))
+        tau_D, size_D = (wet[:, None] * x for x in damping(n, nu if model == "simplified" else nu_r))
+    terms.append(-times(rigid_body_coriolis(n.mass, n.r_g, n.inertia_g, nu), nu))
+    sizes = [coriolis_size(n.M_RB, nu), size_D]
+    if model != "simplified":
+        v_c_dot = a_c - times(skew(omega), v_c)  # in the turning body frame
+        terms += [
+            -times(added_mass_coriolis(n.M_A, nu_r), nu_r),
+            times(n.M_A, np.concatenate([v_c_dot, np.zeros((N, 3))], -1)),
+            wrench_of_force(n.r_b, displaced[:, None] * a_c),
+        ]
+        sizes.append(coriolis_size(n.M_A, np.abs(nu_r) + np.abs(nu)))
+    total = sum(terms) + tau_D
+    size = sum(np.abs(x) for x in terms) + sum(sizes)
+    M = n.M_RB + n.M_A
+    M_inv = np.linalg.inv(M)
+    A = np.abs(M_inv)
+    return total @ M_inv.T, size @ (A @ np.abs(M) @ A).T
