@@ -82,7 +82,7 @@ def train(
     vehicle: Vehicle = "finsrov",
     hydrodynamics: Hydrodynamics = "calibrated",
     action: Annotated[
-        str, typer.Option(help="What the policy commands: wrench6 or thruster8.", metavar="MODE")
+        str, typer.Option(help="What the policy commands: wrench6, wrench4 or thruster8.", metavar="MODE")
     ] = "wrench6",
     randomize: Annotated[
         str | None,
@@ -145,7 +145,7 @@ def evaluate(
     Example: finssim evaluate runs/hold --plant current --trials 64 --out runs/hold-current
     """
     start_warp()
-    from finssim.learning.evaluate import evaluate as run
+    from finssim.experiments.evaluate import evaluate as run
 
     run(
         controller,
@@ -259,7 +259,7 @@ def validate(
     start_warp()
     from finssim.experiments.validate import validate as run
 
-    run(name, json=as_json)
+    run(name, as_json=as_json)
 
 
 @app.command()
@@ -271,7 +271,7 @@ def bench(as_json: Json = False) -> None:
     start_warp()
     from finssim.experiments.bench import bench as run
 
-    run(json=as_json)
+    run(as_json=as_json)
 
 
 @app.command()

@@ -1,0 +1,29 @@
+"""The paper's own results of station keeping, on its real vehicle: for orientation beside simulated ones."""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+from typing import Any
+
+__all__ = ["PAPER_T1", "paper_row"]
+
+KEYS = ("e_p_m", "e_y_m", "e_psi_deg", "success", "trials", "t_s_s", "J_p_m", "J_psi_deg")
+
+PAPER_T1 = MappingProxyType(
+    {
+        "calibrated": (0.077, 0.027, 6.54, 7, 8, 20.16, 0.032, 2.35),
+        "calibrated + DR": (0.092, 0.043, 5.42, 7, 8, 36.92, 0.034, 2.06),
+        "calibrated, localisation noise": (0.658, 0.079, 13.53, 2, 8, 41.16, 0.025, 3.98),
+        "mesh": (0.746, 0.108, 12.19, 0, 8, None, None, None),
+        "mesh + DR": (0.197, 0.103, 8.62, 0, 8, None, None, None),
+        "simplified": (0.598, 0.504, 23.37, 0, 8, None, None, None),
+        "simplified + DR": (0.609, 0.564, 5.48, 0, 8, None, None, None),
+        "PID": (0.176, 0.101, 44.08, 0, 8, None, None, None),
+    }
+)
+"""Table of T1: the model trained in (DR: domain randomisation) -> the figures in the order of `KEYS`, on hardware."""
+
+
+def paper_row(name: str) -> dict[str, Any]:
+    """One row with the keys of our own results, and `name`."""
+    return {"name": name, **dict(zip(KEYS, PAPER_T1[name], strict=True))}

@@ -1,0 +1,150 @@
+"""Plants: what differs, in an evaluation, from the vehicle file and from still water. One YAML file each."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from finssim.engine import Water
+from finssim.engine.randomize import Randomization
+from finssim.engine.ranges_file import Ranges, load_ranges
+from finssim.engine.surroundings import Wave
+from finssim.tasks import MeasurementNoise
+from finssim.vehicles import Vehicle
+
+__all__ = ["Plant", "PlantError", "available_plants", "load_plant"]
+
+SHIPPED = Path(__file__).parent / "plants"
+
+
+class PlantError(ValueError):
+    """A plant that is not there, or whose file cannot be used."""
+
+
+class Plant(BaseModel):
+    """What differs; everything left out is as in the vehicle file, in still water, without noise."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    title: str = ""
+    hydrodynamics: str | None = None
+    """calibrated, mesh or simplified."""
+    ranges: Ranges | None = None
+    """Drawn anew for every trial: a mapping, or the name or file of ranges."""
+    water: dict[str, Any] = Field(default_factory=dict)
+    """Arguments of `finssim.engine.Water`: current, shear, drift_std, drift_time, depth, waves."""
+    noise: dict[str, float] = Field(default_factory=dict)
+    """Arguments of `finssim.tasks.MeasurementNoise` [m, rad, m/s, rad/s]."""
+    extra_time_constant: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+    """Added to every thruster's [s]."""
+    extra_delay: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+    """Added to every thruster's [s]."""
+    vehicle: dict[str, Any] = Field(default_factory=dict)
+    """Dotted path in the vehicle file -> another value, such as body.mass: 12.5."""
+
+    @field_validator("ranges", mode="before")
+    @classmethod
+    def _named_ranges(cls, value: Any) -> Any:
+        return load_ranges(value) if isinstance(value, str) else value
+
+    @field_validator("water")
+    @classmethod
+    def _possible_water(cls, value: dict[str, Any]) -> dict[str, Any]:
+        _water(value)
+        return value
+
+    @field_validator("noise")
+    @classmethod
+    def _possible_noise(cls, value: dict[str, float]) -> dict[str, float]:
+        _made(MeasurementNoise, value)
+        return value
+
+    def changed(self, vehicle: Vehicle) -> Vehicle:
+        """The vehicle with this plant's numbers.
+
+        Raises:
+            VehicleError: A path is not in the vehicle file, or a value cannot be there.
+        """
+        new = dict(self.vehicle)
+        for name, thruster in vehicle.thrusters.items():
+            if self.extra_time_constant:
+                new[f"thrusters.{name}.time_constant"] = thruster.time_constant + self.extra_time_constant
+            if self.extra_delay:
+                new[f"thrusters.{name}.delay"] = thruster.delay + self.extra_delay
+        return vehicle.replace(new) if new else vehicle
+
+    def environment_arguments(self) -> dict[str, Any]:
+        """Arguments of `finssim.tasks.Environment`: water, noise, randomization."""
+        return {
+            "water": _water(self.water) if self.water else None,
+            "noise": MeasurementNoise(**self.noise) if self.noise else None,
+            "randomization": Randomization(self.ranges) if self.ranges else None,
+        }
+
+
+def available_plants() -> list[str]:
+    """Names of the plants that ship with FinsSim."""
+    return sorted(path.stem for path in SHIPPED.glob("*.yaml"))
+
+
+def load_plant(name_or_path: str | Path) -> Plant:
+    """A plant by name or from a file.
+
+    Raises:
+        PlantError: No such plant, or its file is wrong; names file, key and expectation.
+    """
+    path = Path(name_or_path)
+    if not path.is_file():
+        path = SHIPPED / f"{name_or_path}.yaml"
+    if not path.is_file():
+        close = difflib.get_close_matches(str(name_or_path), available_plants(), n=1)
+        hint = f"; did you mean '{close[0]}'?" if close else ""
+        known = ", ".join(available_plants())
+        raise PlantError(f"no plant '{name_or_path}': give a YAML file or one of {known}{hint}")
+    try:
+        data: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise PlantError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(data, dict):
+        raise PlantError(f"{path}: expected keys such as 'hydrodynamics: mesh', found {type(data).__name__}")
+    try:
+        return Plant(**{"name": path.stem, **data})
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(x) for x in first["loc"])
+        raise PlantError(f"{path}: {where}: {first['msg'].removeprefix('Value error, ')}") from None
+
+
+def _water(value: Mapping[str, Any]) -> Water:
+    waves = value.get("waves", ())
+    if not isinstance(waves, list | tuple) or not all(isinstance(wave, Mapping) for wave in waves):
+        raise ValueError("waves: expected a list of mappings such as {amplitude: 0.03, wavelength: 8}")
+    water: Water = _made(Water, {**value, "waves": tuple(_made(Wave, wave) for wave in waves)})
+    return water
+
+
+def _made(kind: type, arguments: Mapping[str, Any]) -> Any:
+    """`kind(**arguments)`, with unknown names and wrong types told in one sentence."""
+    known = kind.__dataclass_fields__  # type: ignore[attr-defined]
+    for key, value in arguments.items():
+        if key not in known:
+            raise ValueError(f"unknown key '{key}'; available: {', '.join(known)}")
+        if key != "waves" and not _finite(value):
+            raise ValueError(f"{key} is {value!r}, expected finite numbers")
+    try:
+        return kind(**arguments)
+    except TypeError as error:
+        raise ValueError(str(error).replace(f"{kind.__name__}.__init__() ", "")) from None
+
+
+def _finite(value: Any) -> bool:
+    if isinstance(value, list | tuple):
+        return len(value) == 3 and all(_finite(x) for x in value)
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -1,0 +1,138 @@
+"""Trials of station keeping: a controller, a vehicle and a plant, one world per trial, all stepped together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.control.tracking import Goal
+from finssim.engine import Recorder
+from finssim.experiments.metrics import measure_trial
+from finssim.experiments.plants import Plant
+from finssim.experiments.players import Player
+from finssim.experiments.setpoints import T1_SETPOINTS, T1_START
+from finssim.geometry.rotations import quat_from_yaw, quat_yaw
+from finssim.tasks import Environment, Task
+from finssim.vehicles import Vehicle
+
+__all__ = ["Trials", "run_trials"]
+
+Array = NDArray[np.float64]
+
+DURATION = 60.0
+"""Length of a trial [s]."""
+
+PHYSICS_STEP = 0.01
+"""Longest physics step [s]."""
+
+
+@dataclass(frozen=True)
+class Trials:
+    """What happened, by trial; world frame, SI. From the moment a world broke its numbers are NaN."""
+
+    setpoints: tuple[str, ...]
+    """Name of each trial's setpoint, n."""
+    goals: Array
+    """[x, y, z [m], yaw [rad]], (n, 4)."""
+    t: Array
+    """Time since the start [s], (T,)."""
+    position: Array
+    """Body origin [m], (T, n, 3)."""
+    yaw: Array
+    """Heading [rad], (T, n)."""
+
+    def measures(self) -> list[dict[str, Any]]:
+        """What `measure_trial` says of each trial, with its number, setpoint and goal."""
+        return [
+            {
+                "trial": i,
+                "setpoint": name,
+                "goal": [*self.goals[i, :3].tolist(), math.degrees(self.goals[i, 3])],
+                **measure_trial(*self.series(i)),
+            }
+            for i, name in enumerate(self.setpoints)
+        ]
+
+    def series(self, i: int) -> tuple[Array, Array, Array, Array]:
+        """t, position, yaw and goal of one trial, as the measures and the envelope take them."""
+        return self.t, self.position[:, i], self.yaw[:, i], self.goals[i]
+
+
+def run_trials(
+    player: Player,
+    task: Task,
+    vehicle: Vehicle,
+    plant: Plant,
+    *,
+    trials: int = 8,
+    hydrodynamics: str = "calibrated",
+    seed: int = 42,
+    record: Path | None = None,
+    crash_directory: Path = Path("finssim-frozen"),
+    show: Callable[[float], None] = lambda part: None,
+) -> Trials:
+    """Run trials of 60 s from the published start, level and at rest, towards the eight setpoints in turn.
+
+    Args:
+        player: Who acts.
+        task: Its observation is what the player sees.
+        vehicle: As its file has it; the plant changes it.
+        plant: What differs.
+        trials: How many, all at once.
+        hydrodynamics: Model, unless the plant names one.
+        seed: Of everything that the plant draws.
+        record: New folder for every state, command and thrust; none if None.
+        crash_directory: Where the last states of a world that broke are written.
+        show: Called with the part done.
+    """
+    names = tuple(list(T1_SETPOINTS)[i % len(T1_SETPOINTS)] for i in range(trials))
+    goals = np.array([T1_SETPOINTS[name] for name in names])
+    environment = Environment(
+        replace(task, control_step=player.period, substeps=math.ceil(player.period / PHYSICS_STEP - 1e-9)),
+        plant.changed(vehicle),
+        worlds=trials,
+        hydrodynamics=plant.hydrodynamics or hydrodynamics,
+        action=player.action,
+        wrench_scale=player.wrench_scale,
+        seed=seed,
+        auto_reset=False,
+        crash_directory=crash_directory,
+        **plant.environment_arguments(),
+    )
+    environment.start(T1_START[:3], quat_from_yaw(T1_START[3]), goals[:, :3], quat_from_yaw(goals[:, 3]))
+    with nullcontext() if record is None else Recorder(environment.simulator, record) as recorder:
+        t, position, yaw = _play(player, environment, goals, recorder, show)
+    return Trials(names, goals, t, position, yaw)
+
+
+def _play(
+    player: Player,
+    environment: Environment,
+    goals: Array,
+    recorder: Recorder | None,
+    show: Callable[[float], None],
+) -> tuple[Array, Array, Array]:
+    n, steps = len(goals), round(DURATION / player.period)
+    position, yaw = np.full((steps + 1, n, 3), np.nan), np.full((steps + 1, n), np.nan)
+    goal = Goal(goals[:, :3], quat_from_yaw(goals[:, 3]))
+    state = environment.simulator.state
+    episode = state.episode.numpy().copy()
+    memory = player.reset(n)
+    for k in range(steps + 1):
+        same = state.episode.numpy() == episode  # a world that broke has started over
+        position[k, same] = state.position.numpy()[same, 0]
+        yaw[k, same] = quat_yaw(state.quaternion.numpy()[same, 0])
+        if recorder is not None:
+            recorder.record()
+        if k < steps:
+            action, memory = player.act(memory, environment.arrays, goal)
+            environment.step(action)
+        show(k / steps)
+    return np.arange(steps + 1, dtype=np.float64) * player.period, position, yaw
