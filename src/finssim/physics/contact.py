@@ -1,10 +1,10 @@
 """Walls and floor of the pool, as a penalty on the corners of the vehicle's envelope."""
 
-# mypy: disable-error-code="arg-type,call-overload,no-any-return"
+# mypy: disable-error-code="arg-type,call-overload,index,no-any-return,operator"
 
 import warp as wp
 
-from finssim.physics.types import join, vec6
+from finssim.physics.types import angular, join, linear, vec6
 
 
 @wp.struct
@@ -59,24 +59,38 @@ def contact_wrench(walls: PoolWalls, position: wp.vec3, q: wp.quat, nu: vec6, ha
     tau = vec6()
     if walls.present == 0:
         return tau
-    reach = wp.length(half_size)
     gap = wp.min(walls.half_length - wp.abs(position[0]), walls.half_width - wp.abs(position[1]))
-    if wp.min(gap, position[2] + walls.depth) > reach:
+    gap = wp.min(gap, position[2] + walls.depth)
+    if gap > 0.0 and gap * gap > wp.dot(half_size, half_size):
         return tau
-    v = wp.vec3(nu[0], nu[1], nu[2])
-    omega = wp.vec3(nu[3], nu[4], nu[5])
-    for i in range(8):
+    # Half extents of the turned box along the world's axes: most vehicles near a wall still do not touch it.
+    R = wp.quat_to_matrix(q)
+    extent = wp.vec3(
+        wp.dot(wp.abs(R[0]), half_size), wp.dot(wp.abs(R[1]), half_size), wp.dot(wp.abs(R[2]), half_size)
+    )
+    if (
+        wp.abs(position[0]) + extent[0] <= walls.half_length
+        and wp.abs(position[1]) + extent[1] <= walls.half_width
+        and position[2] - extent[2] >= -walls.depth
+    ):
+        return tau
+    v = linear(nu)
+    omega = angular(nu)
+    corners = int(
+        8
+    )  # a variable, so that the loop is not unrolled: contact is rare, its code need not be near
+    for i in range(corners):
         sx = 1.0 - 2.0 * float(i & 1)
         sy = 1.0 - 2.0 * float((i >> 1) & 1)
         sz = 1.0 - 2.0 * float((i >> 2) & 1)
         r = wp.cw_mul(wp.vec3(sx, sy, sz), half_size)
-        x = position + wp.quat_rotate(q, r)
-        v_w = wp.quat_rotate(q, v + wp.cross(omega, r))
+        x = position + R * r
+        v_w = R * (v + wp.cross(omega, r))
         f = wall_force(-(x[2] + walls.depth), v_w, wp.vec3(0.0, 0.0, 1.0), walls)
-        f += wall_force(x[0] - walls.half_length, v_w, wp.vec3(-1.0, 0.0, 0.0), walls)
-        f += wall_force(-x[0] - walls.half_length, v_w, wp.vec3(1.0, 0.0, 0.0), walls)
-        f += wall_force(x[1] - walls.half_width, v_w, wp.vec3(0.0, -1.0, 0.0), walls)
-        f += wall_force(-x[1] - walls.half_width, v_w, wp.vec3(0.0, 1.0, 0.0), walls)
-        f_b = wp.quat_rotate_inv(q, f)
+        side_x = wp.sign(x[0])
+        f += wall_force(wp.abs(x[0]) - walls.half_length, v_w, wp.vec3(-side_x, 0.0, 0.0), walls)
+        side_y = wp.sign(x[1])
+        f += wall_force(wp.abs(x[1]) - walls.half_width, v_w, wp.vec3(0.0, -side_y, 0.0), walls)
+        f_b = wp.transpose(R) * f
         tau += join(f_b, wp.cross(r, f_b))
     return tau

@@ -1,0 +1,214 @@
+"""`finssim bench`: how fast this machine simulates, as rates and as ratios to MuJoCo stepping one free body."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from finssim.engine import Simulator
+from finssim.engine.launch import default_threads
+from finssim.provenance import provenance
+from finssim.tasks import Environment, StationKeeping
+
+__all__ = ["bench", "measure"]
+
+SECONDS = 1.0
+"""Time each figure is measured for; the best of its rounds counts, since other load only ever slows one down."""
+ROUNDS = 10
+PHYSICS_SUBSTEPS = 4
+PHYSICS_STEP = 0.04
+MODELS = ("calibrated", "simplified", "mesh")
+ACTIONS = ("thruster8", "wrench6")
+WORLDS = (1, 4096)
+MEMORY_WORLDS = 16384
+
+_MUJOCO_BODY = """<mujoco><option timestep="0.01" integrator="Euler"/><worldbody><body><freejoint/>
+<inertial pos="0 0 0" mass="12" diaginertia="0.13 0.23 0.25"/></body></worldbody></mujoco>"""
+
+
+def best_rate(step: Callable[[], object], work: float, seconds: float = SECONDS) -> float:
+    """Work done per second in the best of several rounds.
+
+    Args:
+        step: What is timed; called often enough to fill the time.
+        work: Done by one call.
+        seconds: Time for all rounds [s].
+
+    Returns:
+        Work per second of wall time.
+    """
+    step()
+    start = time.perf_counter()
+    step()
+    calls = max(1, round(seconds / ROUNDS / max(time.perf_counter() - start, 1e-7)))
+    best = 0.0
+    for _ in range(ROUNDS):
+        start = time.perf_counter()
+        for _ in range(calls):
+            step()
+        best = max(best, calls * work / (time.perf_counter() - start))
+    return best
+
+
+def physics_rate(model: str, worlds: int, threads: int | None = None, device: str = "cpu") -> float:
+    """Control steps per second: FinsROV, full 6x6 matrices, thrusters with lag and delay, 4 substeps, random thrust."""
+    simulator = Simulator(
+        "finsrov",
+        worlds=worlds,
+        hydrodynamics=model,
+        control_step=PHYSICS_STEP,
+        substeps=PHYSICS_SUBSTEPS,
+        threads=threads,
+        device=device,
+    )
+    simulator.place(position=(0.0, 0.0, -50.0))
+    simulator.set_thrust(np.random.default_rng(0).uniform(-5.0, 5.0, (worlds, 1, 8)))
+    return best_rate(simulator.step, worlds)
+
+
+def environment_rate(action: str, worlds: int, threads: int | None = None, device: str = "cpu") -> float:
+    """T1 environment steps per second at 10 Hz with 10 substeps: allocation, observation, reward and reset included."""
+    environment = Environment(StationKeeping(), worlds=worlds, action=action, threads=threads, device=device)
+    random = np.random.default_rng(0)
+    actions = [
+        random.uniform(-1.0, 1.0, (worlds, environment.action_size)).astype(np.float32) for _ in range(8)
+    ]
+    turn = iter(range(10**9))
+    return best_rate(lambda: environment.step(actions[next(turn) % 8]), worlds)
+
+
+def faces_rate(worlds: int = 1024) -> float:
+    """Hull triangles per second and core in the whole mesh model: one thread, wholly submerged."""
+    simulator = Simulator("finsrov", hydrodynamics="mesh")
+    faces = len(simulator.vehicles[0].hull_mesh()[1])
+    return physics_rate("mesh", worlds, threads=1) * PHYSICS_SUBSTEPS * faces
+
+
+def mujoco_rate() -> float | None:
+    """Steps per second of MuJoCo with one free body; None where it is not installed."""
+    try:
+        import mujoco
+    except ImportError:
+        return None
+    model = mujoco.MjModel.from_xml_string(_MUJOCO_BODY)
+    data = mujoco.MjData(model)
+
+    def thousand() -> None:
+        for _ in range(1000):
+            mujoco.mj_step(model, data)
+
+    return best_rate(thousand, 1000.0)
+
+
+def memory_mb(worlds: int) -> float:
+    """Peak resident memory of a process that runs T1 in `worlds` worlds [MB], the interpreter included."""
+    program = f"from finssim.experiments.bench import _use_memory; _use_memory({worlds})"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    return float(done.stdout.split()[-1])
+
+
+def _use_memory(worlds: int) -> None:
+    environment = Environment(StationKeeping(), worlds=worlds)
+    action = np.zeros((worlds, environment.action_size), dtype=np.float32)
+    for _ in range(3):
+        environment.step(action)
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0)
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were measured on."""
+    model = platform.processor() or platform.machine()
+    try:
+        with open("/proc/cpuinfo") as file:
+            model = next(line.split(":")[1].strip() for line in file if line.startswith("model name"))
+    except (OSError, StopIteration):
+        pass
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    return {"processor": model, "threads": default_threads(), "load_1min": load, **provenance()}
+
+
+def measure(device: str = "cpu", progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """All figures.
+
+    Args:
+        device: Warp device of the batched figures.
+        progress: Told what is measured next.
+
+    Returns:
+        The object that `finssim bench --json` prints.
+    """
+    physics: dict[str, float] = {}
+    env: dict[str, float] = {}
+    for model in MODELS:
+        for worlds in WORLDS:
+            progress(f"physics, {model}, {worlds} worlds")
+            physics[f"{model}/{worlds}"] = physics_rate(model, worlds, device=device)
+    progress("physics on one core")
+    physics[f"calibrated/{WORLDS[-1]}/1 thread"] = physics_rate("calibrated", WORLDS[-1], threads=1)
+    for action in ACTIONS:
+        for worlds in WORLDS:
+            progress(f"T1, {action}, {worlds} worlds")
+            env[f"{action}/{worlds}"] = environment_rate(action, worlds, device=device)
+    progress("hull triangles")
+    faces = faces_rate()
+    progress("MuJoCo, one free body")
+    reference = mujoco_rate()
+    progress(f"memory of {MEMORY_WORLDS} worlds")
+    return {
+        "physics_steps_per_s": physics,
+        "env_steps_per_s": env,
+        "faces_per_s": faces,
+        "single_step_us": 1e6 / physics["calibrated/1"],
+        "mujoco_steps_per_s": reference,
+        "physics_substeps_over_mujoco_steps": (
+            None if reference is None else PHYSICS_SUBSTEPS * physics[f"calibrated/{WORLDS[-1]}"] / reference
+        ),
+        f"memory_mb/{MEMORY_WORLDS}": memory_mb(MEMORY_WORLDS),
+        "device": device,
+        "machine": machine(),
+    }
+
+
+def bench(as_json: bool = False, device: str = "cpu") -> None:
+    """Measure and print; one JSON object if asked for."""
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task("", total=len(MODELS) * len(WORLDS) + len(ACTIONS) * len(WORLDS) + 4)
+        figures = measure(device, lambda what: bar.update(task, description=what, advance=1))
+    if as_json:
+        print(json.dumps(figures, indent=2))
+        return
+    table = Table(title="steps per second", box=None, pad_edge=False)
+    table.add_column("")
+    table.add_column("per second", justify="right")
+    for name, rate in figures["physics_steps_per_s"].items():
+        table.add_row(f"physics, {name}", f"{rate:,.0f}")
+    for name, rate in figures["env_steps_per_s"].items():
+        table.add_row(f"T1, {name}", f"{rate:,.0f}")
+    table.add_row("hull triangles, one core", f"{figures['faces_per_s']:,.0f}")
+    if figures["mujoco_steps_per_s"]:
+        table.add_row("MuJoCo, one free body", f"{figures['mujoco_steps_per_s']:,.0f}")
+    out = Console()
+    out.print(table)
+    ratio = figures["physics_substeps_over_mujoco_steps"]
+    if ratio:
+        out.print(f"batched physics substeps over MuJoCo steps: {ratio:.0f}", highlight=False)
+    memory = figures[f"memory_mb/{MEMORY_WORLDS}"]
+    out.print(
+        f"one step from Python {figures['single_step_us']:.1f} us; {MEMORY_WORLDS} worlds {memory:.0f} MB",
+        highlight=False,
+    )
+    on = figures["machine"]
+    out.print(f"on {on['processor']}, {on['threads']} threads, load {on['load_1min']}", highlight=False)

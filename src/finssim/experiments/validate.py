@@ -1,0 +1,163 @@
+"""`finssim validate`: simulated steady speeds beside those that the vehicle's authors measured in their pool."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from finssim.control.allocator import Allocator
+from finssim.engine import Simulator
+from finssim.provenance import provenance
+from finssim.vehicles import AXES, Vehicle, load_vehicle
+
+__all__ = ["Response", "ValidationError", "published", "simulate_responses", "validate"]
+
+PUBLISHED = Path(__file__).parent / "published"
+DURATION = 6.0
+"""Of each run [s]: eight of the slowest time constants, but too short for added mass to turn a straight run."""
+AGREES = 0.15
+"""Relative difference up to which a simulated speed is said to agree with the measured one."""
+
+
+class ValidationError(ValueError):
+    """There is nothing published to compare with."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """One published response, and ours."""
+
+    name: str
+    axis: str
+    command: float
+    """About the centre of gravity [N or N m]."""
+    applied: float
+    """The same axis of the wrench that the thrusters can give [N or N m]."""
+    simulated: float
+    """Steady speed [m/s or rad/s]."""
+    measured: tuple[float, float]
+    """Published, least and greatest [m/s or rad/s]."""
+    why: str = ""
+    """What is known of a disagreement."""
+
+    @property
+    def difference(self) -> float:
+        """(simulated - measured) / measured, from the nearer end of the measured range; 0 inside it."""
+        low, high = self.measured
+        speed = abs(self.simulated)
+        nearest = min(max(speed, low), high)
+        return (speed - nearest) / nearest
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the difference is at most `AGREES`."""
+        return abs(self.difference) <= AGREES
+
+
+def published(vehicle: Vehicle) -> dict[str, Any]:
+    """The responses published for a vehicle.
+
+    Raises:
+        ValidationError: none are, and it says for which vehicles some are.
+    """
+    path = PUBLISHED / f"{vehicle.name}.yaml"
+    if not path.is_file():
+        have = ", ".join(sorted(p.stem for p in PUBLISHED.glob("*.yaml")))
+        raise ValidationError(
+            f"no published responses of '{vehicle.name}' to compare with; available: {have}"
+        )
+    data: dict[str, Any] = yaml.safe_load(path.read_text())
+    return data
+
+
+def simulate_responses(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> list[Response]:
+    """Apply every published command to the vehicle at rest in deep water, all as worlds of one batch.
+
+    Args:
+        vehicle: The vehicle.
+        hydrodynamics: The model.
+
+    Returns:
+        One response per published one, in that order; speeds are means over the last quarter of the run.
+    """
+    cases = published(vehicle)["responses"]
+    axis = [AXES.index(case["axis"]) for case in cases]
+    tau = np.zeros((len(cases), 6))
+    tau[np.arange(len(cases)), axis] = [case["command"] for case in cases]
+    allocator = Allocator.from_vehicle(vehicle)
+    thrust, _ = allocator.allocate(tau)
+    speed = steady_speeds(vehicle, hydrodynamics, thrust)
+    given = allocator.achieved(thrust)
+    return [
+        Response(
+            name=case["name"],
+            axis=case["axis"],
+            command=case["command"],
+            applied=float(given[i, axis[i]]),
+            simulated=float(speed[i, axis[i]]),
+            measured=(case["measured"][0], case["measured"][1]),
+            why=case.get("why", "").strip(),
+        )
+        for i, case in enumerate(cases)
+    ]
+
+
+def steady_speeds(vehicle: Vehicle, hydrodynamics: str, thrust: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean nu over the last quarter of a run from rest under constant thrust, (cases, 6)."""
+    simulator = Simulator(vehicle, worlds=len(thrust), hydrodynamics=hydrodynamics, control_step=0.1)
+    simulator.place(position=(0.0, 0.0, -100.0))
+    simulator.set_thrust(thrust[:, None, :])
+    steps = round(DURATION / simulator.control_step)
+    total = np.zeros((len(thrust), 6))
+    for step in range(steps):
+        simulator.step()
+        if step >= 3 * steps // 4:
+            total += simulator.numpy("velocity")[:, 0]
+    return total / (steps - 3 * steps // 4)
+
+
+def validate(name: str, as_json: bool = False, hydrodynamics: str = "calibrated") -> None:
+    """Print simulated beside published steady speeds.
+
+    Args:
+        name: Vehicle name or file.
+        as_json: Print one JSON object instead of a table.
+        hydrodynamics: The model.
+
+    Raises:
+        ValidationError: nothing is published of this vehicle.
+    """
+    vehicle = load_vehicle(name)
+    source = published(vehicle)["source"]
+    responses = simulate_responses(vehicle, hydrodynamics)
+    if as_json:
+        rows = [{**asdict(r), "difference": r.difference, "agrees": r.agrees} for r in responses]
+        about = {"vehicle": {"name": vehicle.name, "sha256": vehicle.sha256}, "hydrodynamics": hydrodynamics}
+        print(
+            json.dumps({**about, "source": source, "responses": rows, "provenance": provenance()}, indent=2)
+        )
+        return
+    console = Console()
+    table = Table(title=f"{vehicle.name}, {hydrodynamics}: steady speeds", box=None, pad_edge=False)
+    for heading in ("command", "applied", "simulated", "measured in the pool", "difference", ""):
+        table.add_column(heading, justify="left" if heading in ("command", "") else "right")
+    for r in responses:
+        unit, speed = ("N m", "rad/s") if r.axis in AXES[3:] else ("N", "m/s")
+        low, high = r.measured
+        measured = f"{low:.3f}" if low == high else f"{low:.3f} to {high:.3f}"
+        verdict = "agrees" if r.agrees else "DISAGREES"
+        numbers = (f"{r.applied:.2f} {unit}", f"{abs(r.simulated):.3f} {speed}", f"{measured} {speed}")
+        table.add_row(r.name, *numbers, f"{100.0 * r.difference:+.0f} %", verdict)
+    console.print(table)
+    for r in responses:
+        if r.why and not r.agrees:
+            console.print(f"{r.name}: {r.why}", markup=False, highlight=False)
+    console.print(f"measured: {source}; agreement is within {100 * AGREES:.0f} %", highlight=False)
