@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from finssim.physics.types import vec6
 from finssim.sensors import SensorSuite
 from finssim.sensors.imu import angular_rate, specific_force
-from finssim.vehicles import Imu, catalogue, load_vehicle
+from finssim.vehicles import catalogue, load_vehicle
 
 WITH_IMU = [name for name in catalogue() if load_vehicle(name).sensors.imu is not None]
 EPS = float(np.finfo(np.float32).eps)
@@ -173,10 +173,7 @@ def test_readings_stop_at_the_range(rest: Any, vehicle: Any, ideal: Any) -> None
 def test_a_range_may_stand_in_the_file(vehicle: Any) -> None:
     """A file that gives a range limits the reading; one that gives none does not."""
 
-    class RangedImu(Imu):
-        gyro_range: float
-
     suite = SensorSuite(vehicle, worlds=1, control_step=0.1)
     assert np.isinf(suite.imu.parameters.numpy()["gyro_range"]).all()
-    suite.imu.use(0, RangedImu(**vehicle.sensors.imu.model_dump(), gyro_range=8.7), gravity=9.81)
+    suite = SensorSuite(vehicle.replace({"sensors.imu.gyro_range": 8.7}), worlds=1, control_step=0.1)
     np.testing.assert_allclose(suite.imu.parameters.numpy()["gyro_range"], 8.7, rtol=EPS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -110,9 +109,3 @@ class SensorBatch:
                 raise SensorError(f"no {self.kind} parameter '{name}'; available: {known}")
             table[name][:, vehicle] = value
         self.parameters.assign(table)  # type: ignore[no-untyped-call]
-
-
-def limit(entry: Any, name: str) -> float:
-    """A limit that a vehicle file may leave out; left out, there is none."""
-    value = getattr(entry, name, None)
-    return math.inf if value is None else float(value)

@@ -7,7 +7,7 @@ from typing import Any
 import warp as wp
 
 from finssim.physics.types import angular, linear, vec6
-from finssim.sensors.batch import SensorBatch, limit
+from finssim.sensors.batch import SensorBatch
 from finssim.sensors.noise import (
     TURN_ON,
     TURN_ON_2,
@@ -200,10 +200,10 @@ class DvlBatch(SensorBatch):
             noise=entry.noise_std,
             walk=entry.bias_walk,
             turn_on=entry.bias_initial,
-            scale=getattr(entry, "scale_error", 0.0),
+            scale=entry.scale_error,
             quantum=entry.quantisation,
-            range=limit(entry, "velocity_range"),
-            tilt_cosine=math.cos(min(limit(entry, "max_tilt"), math.pi)),
-            altitude_min=getattr(entry, "altitude_min", -math.inf) if knows_floor else -math.inf,
-            altitude_max=limit(entry, "altitude_max") if knows_floor else math.inf,
+            range=entry.velocity_range,
+            tilt_cosine=math.cos(min(entry.max_tilt, math.pi)),
+            altitude_min=entry.altitude_min if knows_floor else -math.inf,
+            altitude_max=entry.altitude_max if knows_floor else math.inf,
         )

@@ -7,7 +7,7 @@ from typing import Any
 import warp as wp
 
 from finssim.physics.types import angular, linear, vec6
-from finssim.sensors.batch import SensorBatch, limit
+from finssim.sensors.batch import SensorBatch
 from finssim.sensors.noise import (
     TURN_ON,
     TURN_ON_2,
@@ -192,10 +192,10 @@ class ImuBatch(SensorBatch):
             gyro_walk=entry.gyro_bias_walk,
             gyro_turn_on=entry.gyro_bias_initial,
             gyro_quantum=entry.gyro_quantisation,
-            gyro_range=limit(entry, "gyro_range"),
+            gyro_range=entry.gyro_range,
             accel_noise=entry.accel_noise_density * root_rate,
             accel_walk=entry.accel_bias_walk,
             accel_turn_on=entry.accel_bias_initial,
             accel_quantum=entry.accel_quantisation,
-            accel_range=limit(entry, "accel_range"),
+            accel_range=entry.accel_range,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 import numpy as np
@@ -59,6 +60,10 @@ class Imu(Sensor):
     """Standard deviation of the bias at power-on [m/s²]."""
     accel_quantisation: NonNegative = 0.0
     """Step of the output [m/s²]; 0 for none."""
+    gyro_range: Positive = math.inf
+    """Largest rate that is reported [rad/s]."""
+    accel_range: Positive = math.inf
+    """Largest specific force that is reported [m/s²]."""
 
 
 class DepthSensor(Sensor):
@@ -85,6 +90,16 @@ class Dvl(Sensor):
     """[m/s²/√Hz]"""
     quantisation: NonNegative = 0.0
     """[m/s]; 0 for none."""
+    scale_error: NonNegative = 0.0
+    """Standard deviation of the relative scale error at power-on [-]."""
+    velocity_range: Positive = math.inf
+    """Largest speed per axis that is reported [m/s]."""
+    max_tilt: Positive = math.inf
+    """Tilt beyond which the beams lose the floor [rad]."""
+    altitude_min: NonNegative = 0.0
+    """Least height above the floor with an echo [m]."""
+    altitude_max: Positive = math.inf
+    """Greatest height above the floor with an echo [m]."""
 
 
 class Sensors(Part):
