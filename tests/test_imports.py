@@ -41,7 +41,7 @@ HOMES = {
     "onnx": {"learning/export.py"},
     "onnxruntime": {"control/policy.py"},
     "mujoco": set(),
-    "matplotlib": {"experiments/envelope.py", "vehicles/picture.py"},
+    "matplotlib": {"experiments/envelope.py", "experiments/figures.py", "experiments/report.py", "vehicles/picture.py"},
     "cv2": set(),
     "cyclonedds": set(),
     "rclpy": set(),

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from finssim.experiments.metrics import summarize
 from finssim.experiments.paper_results import paper_row
 
-__all__ = ["COLUMNS", "cells", "paper_name", "print_results"]
+__all__ = ["COLUMNS", "cells", "paper_name", "print_comparison", "print_results"]
 
 COLUMNS = {
     "success": "success",
@@ -64,12 +65,7 @@ def print_results(result: Mapping[str, Any], console: Console) -> None:
         highlight=False,
     )
     paper = paper_name(result)
-    table = Table(
-        caption=f"{CAPTION} paper: its vehicle in its pool, {paper}, for orientation.", caption_justify="left"
-    )
-    table.add_column("setpoint")
-    for heading in COLUMNS.values():
-        table.add_column(heading, justify="right")
+    table = _table("setpoint", f"{CAPTION} paper: its vehicle in its pool, {paper}, for orientation.")
     trials = result["per_trial"]
     for name in sorted({trial["setpoint"] for trial in trials}):
         table.add_row(name, *cells(summarize([trial for trial in trials if trial["setpoint"] == name])))
@@ -78,3 +74,27 @@ def print_results(result: Mapping[str, Any], console: Console) -> None:
     table.add_section()
     table.add_row("paper", *cells(paper_row(paper)), style="dim")
     console.print(table)
+
+
+def print_comparison(results: Sequence[Mapping[str, Any]], console: Console) -> None:
+    """Print a row for each evaluation, and the paper's rows that answer to them."""
+    table = Table(
+        caption=f"{CAPTION} paper: its real vehicle in its pool.", caption_justify="left", box=box.SIMPLE_HEAD
+    )
+    table.add_column("controller", no_wrap=True)
+    for heading in COLUMNS.values():
+        table.add_column(heading, justify="right")
+    for result in results:
+        table.add_row(result["controller"]["name"], *cells(result))
+    table.add_section()
+    for name in dict.fromkeys(paper_name(result) for result in results):
+        table.add_row(f"paper, {name}", *cells(paper_row(name)), style="dim")
+    console.print(table)
+
+
+def _table(first: str, caption: str) -> Table:
+    table = Table(caption=caption, caption_justify="left", box=box.SIMPLE_HEAD)
+    table.add_column(first, no_wrap=True)
+    for heading in COLUMNS.values():
+        table.add_column(heading, justify="right")
+    return table

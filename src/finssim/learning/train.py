@@ -42,6 +42,7 @@ def train(
     steps: int | None = None,
     device: str = "cpu",
     console: Console | None = None,
+    shown: Path | None = None,
 ) -> Path:
     """Train a policy and write its directory.
 
@@ -59,6 +60,7 @@ def train(
         steps: Control steps of all worlds together; the settings' own if None.
         device: cpu or cuda.
         console: Where progress is shown; standard error if None.
+        shown: Name of the directory in messages, where `out` is a temporary one.
 
     Returns:
         The policy directory.
@@ -140,7 +142,9 @@ def train(
     export_policy(run.network, out, _after(description, done, not run.interrupted), curves=run.curves)
     took = time.perf_counter() - began
     so_far = " so far" if run.interrupted else ""
-    console.print(f"policy{so_far}: {out}  ({done:,} steps in {took:.1f} s)", highlight=False, soft_wrap=True)
+    console.print(
+        f"policy{so_far}: {shown or out}  ({done:,} steps in {took:.1f} s)", highlight=False, soft_wrap=True
+    )
     if run.interrupted:
         raise KeyboardInterrupt
     return Path(out)

@@ -1,0 +1,151 @@
+"""The demonstration's report: one HTML file that holds its pictures and loads nothing."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from finssim.experiments.envelope import draw_envelopes, error_envelope
+from finssim.experiments.evaluate import Evaluation
+from finssim.experiments.figures import draw_paths, draw_training_curve
+from finssim.experiments.metrics import summarize
+from finssim.experiments.paper_results import PAPER_T1, paper_row
+from finssim.experiments.results_table import CAPTION, COLUMNS, cells
+
+__all__ = ["report_html"]
+
+STYLE = """
+:root { color-scheme: light; }
+body { font: 16px/1.5 system-ui, sans-serif; color: #1c2733; background: #fff; max-width: 52rem; margin: 2rem auto;
+  padding: 0 1rem; }
+h1 { font-size: 1.6rem; margin-bottom: .2rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
+p.lead { font-size: 1.05rem; color: #34495e; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; width: 100%; }
+th, td { text-align: right; padding: .3rem .6rem; border-bottom: 1px solid #dde5ec; white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; } th { font-weight: 600; }
+tr.theirs td { color: #6b7a89; } tr.first td { border-top: 2px solid #9fb2c3; }
+img { max-width: 100%; height: auto; display: block; margin: .8rem auto; }
+p.note { color: #5d6d7c; font-size: .9rem; }
+pre { background: #f3f6f9; padding: .8rem; overflow-x: auto; font-size: .85rem; }
+"""
+
+
+NOTE = (
+    "e_y is the vertical error. Gray rows are the paper's own, measured on its real vehicle in its pool; the others "
+    "are simulated. They stand here for orientation: a simulated trial has no cable, no camera and no model error."
+)
+
+
+def report_html(
+    evaluations: Sequence[Evaluation], curves: Sequence[Mapping[str, Any]], training: Mapping[str, Any]
+) -> str:
+    """The report.
+
+    Args:
+        evaluations: The policy first, then what it is compared with, all on the same trials.
+        curves: Rows of the policy's `curves.csv`.
+        training: `seconds` (from start to written policy), `seed`, `task`, `vehicle`.
+    """
+    policy = evaluations[0]
+    result = policy.result
+    envelopes = {e.label: error_envelope(_series(e)) for e in evaluations}
+    sections = [
+        f"<h1>{_title(result)}</h1>",
+        f'<p class="lead">{_lead(evaluations, training)}</p>',
+        "<h2>Results</h2>",
+        _comparison(evaluations),
+        f'<p class="note">{escape(CAPTION)} {NOTE}</p>',
+        "<h2>Error against time</h2>",
+        _picture(draw_envelopes(envelopes), "Position and yaw error against time, median and middle half"),
+        "<h2>Paths of the policy</h2>",
+        _picture(draw_paths(policy.trials), "Paths of the eight trials from above and from the side"),
+        "<h2>Training</h2>",
+        _picture(draw_training_curve(curves), "Mean return and share of episodes held while training"),
+        "<h2>Every setpoint</h2>",
+        *(_per_setpoint(e) for e in evaluations),
+        "<h2>How to repeat it</h2>",
+        _commands(training),
+        "<h2>Provenance</h2>",
+        f"<pre>{escape(json.dumps(_provenance(result, training), indent=2))}</pre>",
+    ]
+    head = f'<meta charset="utf-8"><title>{_title(result)}</title><style>{STYLE}</style>'
+    return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(sections)}</body></html>\n'
+
+
+def _title(result: Mapping[str, Any]) -> str:
+    return escape(f"Station keeping of {result['vehicle']['name']}")
+
+
+def _lead(evaluations: Sequence[Evaluation], training: Mapping[str, Any]) -> str:
+    r = evaluations[0].result
+    errors = ""
+    if r["e_p_m"] is not None:
+        errors = f", with {100.0 * r['e_p_m']:.1f} cm and {r['e_psi_deg']:.1f}° of error once settled"
+    others = " and ".join(f"{e.label} {e.result['success']}" for e in evaluations[1:])
+    return escape(
+        f"A policy trained here in {training['seconds']:.0f} s, from nothing to a file that runs on the vehicle, holds "
+        f"{r['success']} of {r['trials']} published setpoints{errors}. On the same trials, successes: {others}."
+    )
+
+
+def _comparison(evaluations: Sequence[Evaluation]) -> str:
+    rows = [_row(e.label, e.result) for e in evaluations]
+    for i, name in enumerate(PAPER_T1):
+        if name in ("calibrated", "calibrated + DR", "PID"):
+            kind = "theirs first" if i == 0 else "theirs"
+            rows.append(_row(f"paper: {name}", paper_row(name), kind))
+    return _table("controller", rows)
+
+
+def _per_setpoint(evaluation: Evaluation) -> str:
+    trials = evaluation.result["per_trial"]
+    names = sorted({trial["setpoint"] for trial in trials})
+    rows = [_row(name, summarize([t for t in trials if t["setpoint"] == name])) for name in names]
+    return _table(evaluation.label, rows)
+
+
+def _table(first: str, rows: Sequence[str]) -> str:
+    heads = "".join(f"<th>{escape(h)}</th>" for h in (first, *COLUMNS.values()))
+    return f"<table><thead><tr>{heads}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+
+
+def _row(name: str, row: Mapping[str, Any], kind: str = "") -> str:
+    return f'<tr class="{kind}">' + "".join(f"<td>{escape(c)}</td>" for c in (name, *cells(row))) + "</tr>"
+
+
+def _series(evaluation: Evaluation) -> list[Any]:
+    return [evaluation.trials.series(i) for i in range(len(evaluation.trials.setpoints))]
+
+
+def _picture(figure: Figure, text: str) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=150)
+    data = base64.b64encode(buffer.getvalue()).decode("ascii")
+    return f'<img alt="{escape(text)}" src="data:image/png;base64,{data}">'
+
+
+def _commands(training: Mapping[str, Any]) -> str:
+    lines = [
+        f"finssim train {training['task']} --vehicle {training['vehicle']} --seed {training['seed']} --out policy",
+        "finssim evaluate policy",
+        "finssim evaluate pid",
+        "finssim evaluate pid-paper",
+    ]
+    return f"<pre>{escape(chr(10).join(lines))}</pre>"
+
+
+def _provenance(result: Mapping[str, Any], training: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "vehicle": result["vehicle"],
+        "hydrodynamics": result["hydrodynamics"],
+        "training seed": training["seed"],
+        "evaluation seed": result["seed"],
+        "policy": result["controller"].get("files", {}),
+        **result["provenance"],
+    }
