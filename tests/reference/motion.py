@@ -1,6 +1,6 @@
 """The equation of motion of one vehicle, all three models, over a batch of states.
 
-M_RB nu_dot + C_RB(nu) nu + M_A nu_r_dot + C_A(nu_r) nu_r + D(nu_r) nu_r + g = tau + tau_FK    (Fossen 2021, eq. 10.2)
+M_RB nu_dot + C_RB(nu) nu + M_A nu_r_dot + C_A(nu_r) nu_r + D(nu_r) nu_r + g = tau + tau_FK    (Fossen 2021, chapter 10)
 """
 
 from dataclasses import dataclass
