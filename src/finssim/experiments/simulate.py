@@ -16,6 +16,7 @@ from rich.table import Table
 
 from finssim.control.allocator import Allocator
 from finssim.engine import Simulator
+from finssim.engine.recorder import STATE_COLUMNS
 from finssim.experiments.wrench_words import CommandError, parse_wrench
 from finssim.files import atomic_write
 from finssim.geometry.rotations import quat_to_euler
@@ -30,20 +31,13 @@ CONTROL_STEP = 0.1
 LONGEST = 86400.0
 """Longest run that is recorded [s]: a table of a day has a million rows."""
 
-STATE = {
-    "position": ("x", "y", "z"),
-    "quaternion": ("qx", "qy", "qz", "qw"),
-    "velocity": ("u", "v", "w", "p", "q", "r"),
-    "acceleration": ("u_dot", "v_dot", "w_dot", "p_dot", "q_dot", "r_dot"),
-}
-"""Field of the simulator's state -> names of its columns, SI, world or body frame as the field."""
-
 
 def simulate(
     *, vehicle: str, command: str, duration: float, hydrodynamics: str, depth: float, device: str, out: Path
 ) -> None:
     """Simulate a vehicle in still, open water and write one row per control step.
 
+    Columns: t [s], the state as `finssim.engine.recorder` names it, and the delivered thrust of every thruster [N].
     Beside the table goes `OUT.json` with the vehicle's hash, the command and where the run came from.
 
     Args:
@@ -104,14 +98,14 @@ def _run(simulator: Simulator, thrust: NDArray[np.float64], depth: float, steps:
 
 
 def _row(simulator: Simulator, step: int, thrusters: int) -> NDArray[np.float64]:
-    state = [simulator.numpy(name)[0, 0] for name in STATE]
+    state = [simulator.numpy(name)[0, 0] for name in STATE_COLUMNS]
     return np.concatenate(
         [[step * simulator.control_step], *state, simulator.numpy("thrust")[0, 0, :thrusters]]
     )
 
 
 def _write_table(path: Path, vehicle: Vehicle, rows: NDArray[np.float64]) -> None:
-    columns = ["t", *(name for names in STATE.values() for name in names)]
+    columns = ["t", *(name for names in STATE_COLUMNS.values() for name in names)]
     columns += [f"thrust_{name}" for name in vehicle.thruster_names]
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
