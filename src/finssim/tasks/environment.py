@@ -19,6 +19,10 @@ from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle, load_vehicle
 
 
+GPU_FROZEN_CHECK = 100
+"""Steps between looks for frozen worlds on a GPU."""
+
+
 class EnvironmentSetupError(ValueError):
     """An environment that cannot be set up, or an action it cannot take."""
 
@@ -110,6 +114,7 @@ class Environment:
         self.noise = noise or MeasurementNoise()
         self.randomization = randomization
         self._mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
+        self._steps = 0
         self._connect_measurement()
         self._build()
         self.reset()
@@ -244,7 +249,10 @@ class Environment:
     def advance(self) -> None:
         """One control step with the actions that are in `arrays.action` already (no check, no copy)."""
         self._step.run()
-        if self.device.is_cpu and self.simulator.state.frozen.numpy().any():
+        self._steps += 1
+        # On a GPU the look costs a copy, so frozen worlds wait there for a while, reported as terminated meanwhile.
+        look = self.device.is_cpu or self._steps % GPU_FROZEN_CHECK == 0
+        if look and self.simulator.state.frozen.numpy().any():
             self._revive()
 
     def _revive(self) -> None:
