@@ -2,8 +2,12 @@
 
 import json
 import re
+import signal
+import subprocess
+import sys
 
 import pytest
+import yaml
 from typer.main import get_command
 
 from finssim import __version__, boundary
@@ -30,9 +34,9 @@ def finssim(*words):
 def refusal(capsys, *words):
     """The one sentence with which a command refuses its input."""
     assert finssim(*words) == 2
-    out, err = capsys.readouterr()
-    assert err.startswith("finssim: ") and err.count("\n") == 1
-    return err.removeprefix("finssim: ").strip()
+    (line,) = filter(None, capsys.readouterr().err.splitlines())
+    assert line.startswith("finssim: ")
+    return line.removeprefix("finssim: ")
 
 
 def test_commands_are_those_of_the_contract():
@@ -113,3 +117,115 @@ def test_simulate_refuses_in_a_sentence(capsys, tmp_path):
     words = ["simulate", "--vehicle", "finsrov", "--duration", "1", "--out"]
     assert "did you mean 'surge'?" in refusal(capsys, *words, tmp_path / "run.csv", "--command", "surg=10")
     assert "write elsewhere" in refusal(capsys, *words, "/proc/x/run.csv", "--command", "surge=10")
+
+
+@pytest.mark.long
+def test_an_interrupted_training_leaves_a_policy(tmp_path):
+    """Control-C ends with 130, one sentence and no traceback; the policy so far is whole, and says it is not done."""
+    out = tmp_path / "hold"
+    words = ["train", "t1", "--steps", "3000000", "--out", str(out)]
+    run = subprocess.Popen([sys.executable, "-m", "finssim", *words], stderr=subprocess.PIPE, text=True)
+    seen = next(line for line in run.stderr if "training" in line)
+    run.send_signal(signal.SIGINT)
+    said = seen + run.stderr.read()
+    assert run.wait() == 130
+    assert "finssim: interrupted" in said and "Traceback" not in said
+    description = yaml.safe_load((out / "policy.yaml").read_text())
+    assert description["training"]["complete"] is False
+    assert not [path for path in tmp_path.rglob("*") if ".partial" in path.name]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["train", "t9"], "unknown task 't9'; available: t1"),
+        (["train", "t1", "--action", "wrench7"], "unknown action mode 'wrench7'"),
+        (["train", "t1", "--vehicle", "finrov"], "did you mean 'finsrov'"),
+        (["train", "t1", "--hydrodynamics", "fosen"], "unknown hydrodynamic model 'fosen'"),
+        (["train", "t1", "--randomize", "nowhere.yaml"], "nowhere.yaml"),
+        (["train", "t1", "--device", "tpu"], "device 'tpu' is not available"),
+        (["train", "t1", "--worlds", "0"], "Invalid value for '--worlds'"),
+        (["train", "t1", "--seed", "-1"], "Invalid value for '--seed'"),
+    ],
+)
+def test_train_refuses_in_a_sentence(capsys, tmp_path, words, sentence):
+    """What cannot be trained is refused, and nothing is written."""
+    assert sentence in refusal(capsys, *words, "--out", tmp_path / "policy")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_train_refuses_a_place_before_it_works(capsys, tmp_path):
+    """A directory with somebody's files, and a place that takes none."""
+    (tmp_path / "thesis.tex").touch()
+    assert "already holds files" in refusal(capsys, "train", "t1", "--out", tmp_path)
+    assert "write elsewhere" in refusal(capsys, "train", "t1", "--out", "/proc/x/policy")
+
+
+@pytest.mark.long
+def test_train_then_evaluate(capfd, tmp_path):
+    """What `train` wrote is what `evaluate` reads; its result is a table, a JSON object and a directory."""
+    policy = tmp_path / "policy"
+    assert finssim("train", "t1", "--steps", "20000", "--worlds", "64", "--seed", "3", "--out", policy) == 0
+    assert finssim("evaluate", policy, "--task", "t1", "--trials", "2", "--out", tmp_path / "result") == 0
+    capfd.readouterr()
+    assert finssim("evaluate", policy, "--task", "t1", "--trials", "2", "--json") == 0
+    result = json.loads(capfd.readouterr().out)
+    keys = {"trials", "success", "e_p_m", "e_y_m", "e_psi_deg", "t_s_s", "J_p_m", "J_psi_deg", "per_trial"}
+    assert keys <= result.keys() and result["trials"] == len(result["per_trial"]) == 2
+    written = json.loads((tmp_path / "result" / "evaluation.json").read_text())
+    assert {key: written[key] for key in keys} == {key: result[key] for key in keys}
+    assert (tmp_path / "result" / "error_envelope.png").stat().st_size > 0
+
+
+@pytest.mark.parametrize("controller", ["pid", "pid-paper"])
+def test_pids_are_controllers_like_any(capfd, controller):
+    """Both PIDs are evaluated by name."""
+    assert finssim("evaluate", controller, "--task", "t1", "--trials", "1", "--json") == 0
+    assert json.loads(capfd.readouterr().out)["controller"]["name"] == controller
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["evaluate", "nowhere"], "nowhere"),
+        (["evaluate", "pid", "--task", "t9"], "unknown task 't9'"),
+        (["evaluate", "pid", "--plant", "currant"], "current"),
+        (["evaluate", "pid", "--trials", "0"], "Invalid value for '--trials'"),
+        (["evaluate", "pid", "--out", "/proc/x/result"], "write elsewhere"),
+        (["validate", "rexrov"], "available: finsrov"),
+        (["demo", "--out", "/proc/x/demo"], "write elsewhere"),
+        (["bench", "--device", "tpu"], "device 'tpu' is not available"),
+    ],
+)
+def test_experiments_refuse_in_a_sentence(capsys, words, sentence):
+    """What cannot be evaluated, validated, shown or measured is refused before the work."""
+    assert sentence in refusal(capsys, *words)
+
+
+def test_validate_as_json(capfd):
+    """Each published response stands beside the simulated one, with a verdict."""
+    assert finssim("validate", "finsrov", "--json") == 0
+    result = json.loads(capfd.readouterr().out)
+    assert result["vehicle"]["name"] == "finsrov"
+    assert {"yaw", "surge", "sway", "heave"} == {response["axis"] for response in result["responses"]}
+    assert all({"simulated", "measured", "agrees"} <= response.keys() for response in result["responses"])
+
+
+@pytest.mark.long
+def test_demo_writes_its_report(capfd, tmp_path):
+    """The whole loop, cut short: a policy, its evaluation and those of both PIDs, and a report that names them."""
+    assert finssim("demo", "--steps", "20000", "--out", tmp_path / "demo") == 0
+    assert "report" in capfd.readouterr().out
+    report = (tmp_path / "demo" / "report.html").read_text(encoding="utf-8")
+    assert "pid-paper" in report and "http://" not in report.replace("http://www.w3.org", "")
+    assert (tmp_path / "demo" / "policy" / "policy.onnx").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["demo"]
+
+
+@pytest.mark.long
+def test_bench_as_json(capfd):
+    """The rates by model or action and world count, and the machine they were measured on."""
+    assert finssim("bench", "--json") == 0
+    result = json.loads(capfd.readouterr().out)
+    assert {"physics_steps_per_s", "env_steps_per_s", "faces_per_s", "machine"} <= result.keys()
+    assert all(rate > 0 for rate in result["physics_steps_per_s"].values())

@@ -40,8 +40,15 @@ HOMES = {
     "gymnasium": {"learning/gymnasium_env.py", "learning/spaces.py"},
     "onnx": {"learning/export.py"},
     "onnxruntime": {"control/policy.py"},
-    "mujoco": set(),
-    "matplotlib": {"experiments/envelope.py", "experiments/figures.py", "experiments/report.py", "vehicles/picture.py"},
+    "mujoco": {"experiments/bench.py"},
+    "pandas": {"engine/recorder.py"},
+    "pyarrow": {"engine/recorder.py"},
+    "matplotlib": {
+        "experiments/envelope.py",
+        "experiments/figures.py",
+        "experiments/report.py",
+        "vehicles/picture.py",
+    },
     "cv2": set(),
     "cyclonedds": set(),
     "rclpy": set(),
@@ -122,7 +129,10 @@ def fresh(script: str) -> str:
         ("finssim.cli", {"numpy", "warp", "pydantic", "torch", "matplotlib", "mujoco"}),
         ("finssim.vehicles", {"warp", "torch", "matplotlib", "mujoco", "gymnasium"}),
         ("finssim.control", {"torch", "matplotlib", "mujoco", "gymnasium", "finssim.engine"}),
-        ("finssim.engine", {"torch", "matplotlib", "mujoco", "gymnasium", "finssim.tasks"}),
+        (
+            "finssim.engine",
+            {"torch", "pandas", "pyarrow", "matplotlib", "mujoco", "gymnasium", "finssim.tasks"},
+        ),
     ],
 )
 def test_a_part_costs_only_what_it_needs(module, absent):

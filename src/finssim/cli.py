@@ -35,6 +35,10 @@ Hydrodynamics = Annotated[
 Seed = Annotated[
     int, typer.Option(help="Seed of every random number; equal seeds give equal results.", min=0)
 ]
+Steps = Annotated[
+    int | None,
+    typer.Option(help="Control steps to learn from, all worlds together; a good number if not given.", min=1),
+]
 Device = Annotated[str, typer.Option(help="Where to compute: cpu or cuda.", metavar="DEVICE")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
 
@@ -61,9 +65,11 @@ def _finssim(
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option(help="Directory of the policy, the figures and the report.")] = Path(
+    out: Annotated[Path, typer.Option(help="Directory of the policy, the results and the report.")] = Path(
         "demo"
     ),
+    seed: Seed = 1,
+    steps: Steps = None,
 ) -> None:
     """Train a policy, evaluate it beside two PIDs on the eight published setpoints, write a report.
 
@@ -72,7 +78,7 @@ def demo(
     start_warp()
     from finssim.experiments.demo import demo as run
 
-    run(out)
+    run(out, seed=seed, steps=steps)
 
 
 @app.command()
@@ -93,9 +99,7 @@ def train(
     ] = None,
     seed: Seed = 42,
     worlds: Annotated[int | None, typer.Option(help="Worlds simulated at once.", min=1)] = None,
-    steps: Annotated[
-        int | None, typer.Option(help="Control steps to learn from, all worlds together.", min=1)
-    ] = None,
+    steps: Steps = None,
     device: Device = "cpu",
 ) -> None:
     """Train a policy and write it to a directory that runs without the learner.
@@ -131,7 +135,10 @@ def evaluate(
     hydrodynamics: Hydrodynamics = "calibrated",
     plant: Annotated[
         str | None,
-        typer.Option(help="What differs from the vehicle file: a plant's name or file.", metavar="FILE|NAME"),
+        typer.Option(
+            help="What differs from the vehicle file: a plant that ships (nominal, current, ...) or a file.",
+            metavar="FILE|NAME",
+        ),
     ] = None,
     trials: Annotated[
         int | None, typer.Option(help="Trials of 60 s; 8 are the published setpoints.", min=1)
@@ -250,6 +257,7 @@ def _show(
 @app.command()
 def validate(
     name: Annotated[str, typer.Argument(help="Vehicle with published responses: finsrov.", metavar="NAME")],
+    hydrodynamics: Hydrodynamics = "calibrated",
     as_json: Json = False,
 ) -> None:
     """Print simulated beside published pool responses, and say where they disagree.
@@ -263,7 +271,7 @@ def validate(
 
 
 @app.command()
-def bench(as_json: Json = False) -> None:
+def bench(device: Device = "cpu", as_json: Json = False) -> None:
     """Measure this machine's speed: physics steps/s, environment steps/s, mesh faces/s.
 
     Example: finssim bench --json > bench.json
@@ -271,7 +279,7 @@ def bench(as_json: Json = False) -> None:
     start_warp()
     from finssim.experiments.bench import bench as run
 
-    run(as_json=as_json)
+    run(as_json=as_json, device=device)
 
 
 @app.command()

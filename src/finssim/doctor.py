@@ -35,13 +35,13 @@ EXTRAS = {
             "onnx": "onnx",
             "onnxscript": "onnxscript",
             "matplotlib": "matplotlib",
+            "pandas": "pandas",
+            "pyarrow": "pyarrow",
         },
-        "train policies, use the Gymnasium environments, draw figures and reports",
+        "train policies, use the Gymnasium environments, record runs, draw figures and reports",
     ),
-    "view": Extra(
-        {"matplotlib": "matplotlib", "viser": "viser"}, "draw pictures of vehicles and figures of evaluations"
-    ),
-    "mujoco": Extra({"mujoco": "mujoco"}, "simulate with MuJoCo's contacts, and compare speeds with it"),
+    "view": Extra({"matplotlib": "matplotlib"}, "draw pictures of vehicles and figures of evaluations"),
+    "mujoco": Extra({"mujoco": "mujoco"}, "measure speed as a ratio to MuJoCo's"),
     "vision": Extra({"opencv-python-headless": "cv2"}, "nothing yet: kept for localization by camera"),
     "ros2": Extra({"cyclonedds": "cyclonedds", "rosbags": "rosbags"}, "nothing yet: kept for ROS 2"),
     "hardware": Extra({"pyserial": "serial"}, "nothing yet: kept for the link to a vehicle"),
