@@ -1,6 +1,5 @@
 """The batched environment: any task, any vehicle, thousands of worlds, with automatic reset."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from finssim.tasks.arrays import task_arrays
 from finssim.tasks.measurement import MeasurementNoise, measure
 from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle, load_vehicle
-
 
 GPU_FROZEN_CHECK = 100
 """Steps between looks for frozen worlds on a GPU."""
@@ -117,7 +115,7 @@ class Environment:
         self._steps = 0
         self._connect_measurement()
         self._build()
-        self.reset()
+        self.reset(seed=self.seed)
 
     @property
     def observation_size(self) -> int:
@@ -237,7 +235,7 @@ class Environment:
             raise EnvironmentSetupError(
                 f"action has shape {a.shape}, expected {(self.worlds, self.action_size)}: one row per world"
             )
-        if not math.isfinite(float(a.sum())) and not np.isfinite(a).all():
+        if not np.isfinite(a).all():
             world = int(np.flatnonzero(~np.isfinite(a).all(axis=1))[0])
             raise EnvironmentSetupError(
                 f"action of world {world} has a number that is not finite: {a[world].tolist()}"
