@@ -23,6 +23,9 @@ __all__ = ["Checkpoint", "PpoSettings", "Run", "settings_for", "settings_record"
 ROLLOUT_SAMPLES = 8192
 """Fewest samples between two updates: with few worlds, rollouts are longer."""
 
+CHECKPOINT_STEPS = 500_000
+"""Control steps of all worlds together between two checkpoints."""
+
 RANDOMIZED_STEPS = 3_000_000
 """Control steps when every episode has another vehicle: what must be learnt is more."""
 
@@ -87,7 +90,6 @@ def train_ppo(
     log: Path | None = None,
     show: Callable[[Mapping[str, Any]], None] = lambda row: None,
     checkpoint: Checkpoint | None = None,
-    checkpoint_every: int = 500_000,
 ) -> Run:
     """Train a policy network.
 
@@ -98,8 +100,7 @@ def train_ppo(
         device: Where torch computes, cpu or cuda.
         log: Folder for TensorBoard; no log if None.
         show: Called with every row of the training curve.
-        checkpoint: Called every `checkpoint_every` steps.
-        checkpoint_every: Control steps of all worlds together.
+        checkpoint: Called every `CHECKPOINT_STEPS`.
 
     Returns:
         The run; after Ctrl-C too, with the network as it was.
@@ -124,7 +125,7 @@ def train_ppo(
         },
     )
     model.set_logger(configure(str(log) if log else None, ["tensorboard"] if log else []))
-    watch = _Watch(show, checkpoint, checkpoint_every, venv.environment.task)
+    watch = _Watch(show, checkpoint, venv.environment.task)
     interrupted = False
     try:
         model.learn(settings.steps, callback=watch)
@@ -148,12 +149,11 @@ class _Watch(BaseCallback):
         self,
         show: Callable[[Mapping[str, Any]], None],
         checkpoint: Checkpoint | None,
-        every: int,
         task: Any,
     ) -> None:
         super().__init__()
         self.curves: list[dict[str, Any]] = []
-        self._show, self._checkpoint, self._every, self._next = show, checkpoint, every, every
+        self._show, self._checkpoint, self._next = show, checkpoint, CHECKPOINT_STEPS
         self._hold = float(getattr(task, "hold", 0.0))
         self._start = time.perf_counter()
 
@@ -179,7 +179,7 @@ class _Watch(BaseCallback):
         self.logger.record("rollout/reward_mean", row["mean_reward"])
         self._show(row)
         if self._checkpoint is not None and self.num_timesteps >= self._next:
-            self._next += self._every
+            self._next += CHECKPOINT_STEPS
             self._checkpoint(_network(self.model), self.num_timesteps, self.curves)  # type: ignore[arg-type]
 
 

@@ -70,6 +70,9 @@ def train(
         KeyboardInterrupt: After Ctrl-C, when the policy so far has been written.
     """
     console = console or Console(stderr=True)
+    for name, number in (("worlds", worlds), ("steps", steps)):
+        if number is not None and number < 1:
+            raise TrainingError(f"{name} is {number}, expected 1 or more")
     if task not in TASKS:
         raise TrainingError(f"unknown task '{task}'; available: {', '.join(TASKS)}")
     chosen = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)

@@ -1,0 +1,221 @@
+"""`finssim evaluate`: trials as published, in every plant, for policies and PIDs, as table, JSON and files."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+from torch import nn
+
+from finssim.control.errors import ControlError
+from finssim.control.modes import action_mode
+from finssim.control.policy_description import PolicyDescription, PolicyError, VehicleIdentity
+from finssim.engine import read_run
+from finssim.experiments import trials as trials_module
+from finssim.experiments.evaluate import EvaluationError, evaluate, evaluate_controller
+from finssim.experiments.paper_results import PAPER_T1
+from finssim.experiments.plants import Plant, PlantError, available_plants, load_plant
+from finssim.experiments.players import PidPlayer
+from finssim.experiments.setpoints import T1_SETPOINTS, T1_START
+from finssim.experiments.trials import run_trials
+from finssim.files import OutputError
+from finssim.learning.description import observation_schema
+from finssim.learning.export import export_policy
+from finssim.tasks import StationKeeping
+from finssim.vehicles import load_vehicle
+
+FINSROV = load_vehicle("finsrov")
+KEYS = {"trials", "success", "e_p_m", "e_y_m", "e_psi_deg", "t_s_s", "J_p_m", "J_psi_deg", "per_trial"}
+NOMINAL = load_plant("nominal")
+
+
+def proportional(folder, vehicle=FINSROV, action="wrench6"):
+    """A policy that needs no training: thrust towards the goal and against velocity, written by hand as one layer."""
+    layer = nn.Linear(16, 6)
+    with torch.no_grad():
+        layer.weight.zero_()
+        layer.bias.zero_()
+        for axis in range(3):
+            layer.weight[axis, axis], layer.weight[axis, 9 + axis] = 6.0, -3.0
+        # Index 4 is the sine of the yaw to turn; index 14 the yaw rate.
+        layer.weight[5, 4], layer.weight[5, 14] = 0.3, -0.3
+    task = StationKeeping()
+    description = PolicyDescription(
+        task="t1",
+        observation=observation_schema(task),
+        action=action_mode(action, vehicle).describe(),
+        control_period=task.control_step,
+        vehicle=VehicleIdentity(name=vehicle.name, sha256=vehicle.sha256),
+        hydrodynamics="calibrated",
+        seed=0,
+        training={"randomization": None},
+    )
+    return export_policy(nn.Sequential(layer), folder, description)
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+    return proportional(tmp_path_factory.mktemp("policies") / "by_hand")
+
+
+def test_the_tuned_pid_holds_all_setpoints_in_the_nominal_plant():
+    result = evaluate_controller("pid", NOMINAL).result
+    assert (result["success"], result["trials"]) == (8, 8)
+    assert result["e_p_m"] < 0.02 and result["e_psi_deg"] < 1.5
+
+
+def test_a_policy_directory_is_flown(policy):
+    """A hand-written feedback holds the setpoints that ask for no half turn."""
+    result = evaluate_controller(policy, NOMINAL).result
+    held = {trial["setpoint"]: trial["success"] for trial in result["per_trial"]}
+    assert held["P01"] and held["P05"] and held["P06"]
+    assert result["controller"]["name"] == "by_hand" and result["controller"]["kind"] == "policy"
+
+
+def test_trials_are_those_of_the_protocol():
+    """60 s from the published start, level and at rest, the eight setpoints in turn, at the controller's rate."""
+    player = PidPlayer("pid", FINSROV)
+    done = run_trials(player, StationKeeping(), FINSROV, NOMINAL, trials=10)
+    assert done.setpoints == (*T1_SETPOINTS, "P01", "P02")
+    np.testing.assert_allclose(done.position[0], np.broadcast_to(T1_START[:3], (10, 3)), atol=1e-6)
+    np.testing.assert_allclose(done.yaw[0], 0.0, atol=1e-6)
+    np.testing.assert_allclose(done.goals[3], T1_SETPOINTS["P04"])
+    assert done.t[-1] == pytest.approx(60.0) and done.t[1] == player.period
+    # Equal goals in an undisturbed plant are equal trials.
+    np.testing.assert_array_equal(done.position[:, 0], done.position[:, 8])
+
+
+@pytest.mark.parametrize("name", available_plants())
+@pytest.mark.parametrize("controller", ["pid", "pid-paper"])
+def test_every_plant_can_be_flown_in(name, controller, monkeypatch):
+    """Numbers are finite in every plant that ships (short trials)."""
+    monkeypatch.setattr(trials_module, "DURATION", 2.0)
+    result = evaluate_controller(controller, load_plant(name), trials=3).result
+    assert result["plant"]["name"] == name and result["success"] == 0
+    assert all(trial["e_p_m"] is None for trial in result["per_trial"])  # the window was never reached
+
+
+def test_plants_make_a_difference(monkeypatch):
+    """A current pushes, noise shakes, lag delays: each path differs from the nominal one."""
+    monkeypatch.setattr(trials_module, "DURATION", 5.0)
+    nominal = evaluate_controller("pid", NOMINAL, trials=2).trials.position
+    for name in set(available_plants()) - {"nominal"}:
+        other = evaluate_controller("pid", load_plant(name), trials=2).trials.position
+        assert np.abs(other - nominal).max() > 1e-3, name
+
+
+def test_seeds_decide_what_is_drawn(monkeypatch):
+    """Equal seeds are equal trials, others are not, and a trial does not depend on how many there are."""
+    monkeypatch.setattr(trials_module, "DURATION", 3.0)
+    plant = load_plant("randomised")
+    one, again, other = (
+        evaluate_controller("pid", plant, trials=4, seed=s).trials.position for s in (1, 1, 2)
+    )
+    many = evaluate_controller("pid", plant, trials=70, seed=1).trials.position
+    np.testing.assert_array_equal(one, again)
+    np.testing.assert_array_equal(one, many[:, :4])
+    assert np.abs(one - other).max() > 1e-4
+
+
+def test_json_is_one_object_with_the_agreed_keys(capsys, policy):
+    """Nothing else is on standard output, and every trial has its setpoint and measures."""
+    evaluate(policy, trials=9, json=True)
+    printed = json.loads(capsys.readouterr().out)
+    assert printed.keys() >= KEYS | {"provenance", "vehicle", "plant", "seed"}
+    assert printed["trials"] == len(printed["per_trial"]) == 9
+    assert printed["vehicle"]["sha256"] == FINSROV.sha256
+    for trial in printed["per_trial"]:
+        assert trial.keys() >= (KEYS - {"trials", "per_trial"}) | {"setpoint", "goal", "trial"}
+    assert printed["per_trial"][1]["goal"][3] == pytest.approx(math.degrees(T1_SETPOINTS["P02"][3]))
+
+
+def test_the_table_has_a_row_per_setpoint_all_and_the_papers(capsys):
+    evaluate("pid", console=Console(width=100))
+    out = capsys.readouterr().out
+    assert all(f"{name} " in out for name in [*T1_SETPOINTS, "all", "paper"])
+    assert "8/8" in out and "44.08" in out and "its vehicle in its pool, PID, for orientation" in out
+
+
+def test_a_directory_holds_result_figure_and_trajectories(tmp_path, capsys):
+    """All open, agree with each other, and may be replaced by the next evaluation."""
+    for _ in range(2):
+        evaluation = evaluate("pid", out=tmp_path / "e", json=True)
+    stored = json.loads((tmp_path / "e" / "evaluation.json").read_text(encoding="utf-8"))
+    assert stored == json.loads(capsys.readouterr().out.splitlines()[-1]) == evaluation.result
+    assert (tmp_path / "e" / "error_envelope.png").read_bytes().startswith(b"\x89PNG")
+    table = read_run(tmp_path / "e" / "trajectories")
+    path = table[table.world == 4].sort_values("t")
+    np.testing.assert_allclose(path[["x", "y", "z"]], evaluation.trials.position[:, 4], atol=1e-6)
+    np.testing.assert_allclose(path.t, evaluation.trials.t, atol=1e-6)
+
+
+def test_a_world_that_breaks_fails_its_trial_alone(tmp_path, monkeypatch):
+    """From then on it has no numbers, and no success; the other trials are as if nothing had been."""
+    act, calls = PidPlayer.act, []
+
+    def breaking(self, memory, arrays, goal):
+        calls.append(None)
+        if len(calls) == 100:
+            velocity = arrays.velocity.numpy()
+            velocity[2, 0, 0] = np.nan
+            arrays.velocity.assign(velocity)
+            return np.zeros((8, 6), np.float32), memory
+        return act(self, memory, arrays, goal)
+
+    monkeypatch.setattr(PidPlayer, "act", breaking)
+    done = run_trials(
+        PidPlayer("pid", FINSROV), StationKeeping(), FINSROV, NOMINAL, trials=8, crash_directory=tmp_path
+    )
+    assert np.isfinite(done.position[:100]).all()
+    assert np.isnan(done.position[100:, 2]).all() and np.isfinite(np.delete(done.position, 2, axis=1)).all()
+    measures = done.measures()
+    assert [m["success"] for m in measures] == [i != 2 for i in range(8)] and measures[2]["e_p_m"] is None
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_policy_for_another_vehicle_is_refused(tmp_path):
+    policy = proportional(tmp_path / "p", FINSROV.replace({"body.mass": 12.5}))
+    with pytest.raises(PolicyError, match="trained for vehicle finsrov .*, but this is finsrov"):
+        evaluate_controller(policy, NOMINAL)
+
+
+def test_a_plant_may_change_what_a_policy_was_trained_for(policy, monkeypatch):
+    """That is what plants are for: the policy is checked against the vehicle's file."""
+    monkeypatch.setattr(trials_module, "DURATION", 1.0)
+    heavy = Plant(name="heavy", vehicle={"body.mass": 12.5})
+    assert evaluate_controller(policy, heavy, trials=1).result["plant"]["vehicle"] == {"body.mass": 12.5}
+
+
+@pytest.mark.parametrize(
+    ("controller", "options", "error", "sentence"),
+    [
+        ("no/such/policy", {}, PolicyError, "no such policy directory"),
+        ("pid", {"task": "t9"}, EvaluationError, "unknown task 't9'; available: t1"),
+        ("pid", {"trials": 0}, EvaluationError, "trials is 0, expected 1 or more"),
+        ("pid", {"plant": "pool"}, PlantError, "no plant 'pool'"),
+        ("pid", {"hydrodynamics": "fosen"}, ValueError, "unknown hydrodynamic model 'fosen'"),
+    ],
+)
+def test_what_cannot_be_evaluated_gets_its_sentence(controller, options, error, sentence, tmp_path):
+    with pytest.raises(error, match=sentence):
+        evaluate(controller, out=tmp_path / "e", **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unknown_controller_is_taken_for_a_directory():
+    with pytest.raises((PolicyError, ControlError), match="pidd"):
+        evaluate_controller("pidd", NOMINAL)
+
+
+def test_somebodys_files_are_not_replaced(policy):
+    """Not even a policy's: an evaluation needs a directory of its own."""
+    with pytest.raises(OutputError, match="already holds files"):
+        evaluate(policy, out=policy)
+
+
+def test_the_papers_rows_are_the_published_table():
+    """Table of T1: eight trials each, the best at 7 of 8."""
+    assert {row[4] for row in PAPER_T1.values()} == {8} and max(row[3] for row in PAPER_T1.values()) == 7
+    assert PAPER_T1["calibrated + DR"][:3] == (0.092, 0.043, 5.42)

@@ -1,0 +1,102 @@
+"""The Gymnasium adapters pass Gymnasium's own checks and keep ends and final observations apart."""
+
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+from finssim.learning.gymnasium_env import Env, VectorEnv
+from finssim.tasks import StationKeeping
+
+SHORT = StationKeeping(time_limit=0.5)
+
+
+@pytest.mark.parametrize("action", ["wrench6", "thruster8"])
+@pytest.mark.filterwarnings("ignore:.*infinity.*")  # offsets have no bound, and the space says so
+def test_the_single_environment_passes_the_checker(action):
+    check_env(Env("t1", action=action), skip_render_check=True)
+
+
+@pytest.mark.filterwarnings("ignore:.*infinity.*")
+def test_it_can_be_made_by_name():
+    """`gymnasium.make` and `make_vec` know the task, and pass options on."""
+    env = gymnasium.make("finssim/StationKeeping-v0", action="thruster8")
+    assert env.reset(seed=1)[0].shape == (16,) and env.action_space.shape == (8,)
+    batch = gymnasium.make_vec("finssim/StationKeeping-v0", num_envs=3)
+    assert batch.reset(seed=1)[0].shape == (3, 16)
+
+
+def test_observations_lie_in_their_space():
+    env = Env(SHORT)
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    for _ in range(40):
+        observation, _, terminated, truncated, info = env.step(env.action_space.sample())
+        assert env.observation_space.contains(observation)
+        assert info["position_error"] >= 0.0
+        if terminated or truncated:
+            assert info["episode"]["l"] == 5
+            env.reset()
+
+
+def test_the_last_observation_is_returned_with_the_end():
+    """A single environment stays at its end: the same observation as the batch keeps as final."""
+    env, batch = Env(SHORT), VectorEnv(1, SHORT)
+    env.reset(seed=4)
+    batch.reset(seed=4)
+    for _ in range(5):
+        observation, reward, terminated, truncated, _ = env.step(np.full(6, 0.2, np.float32))
+        *_, info = batch.step(np.full((1, 6), 0.2, np.float32))
+    assert (terminated, truncated) == (False, True)
+    np.testing.assert_array_equal(observation, info["final_obs"][0])
+    assert isinstance(reward, float)
+
+
+def test_the_batch_says_how_it_resets_and_gives_final_observations():
+    """SAME_STEP: the observation is the next episode's first; final_obs, with its mask, the last of the old."""
+    batch = VectorEnv(6, SHORT)
+    assert batch.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    first, info = batch.reset(seed=1)
+    assert first.shape == (6, 16) and info == {}
+    batch.reset(options={"reset_mask": np.arange(6) < 2})
+    batch.environment.simulator.state.steps.assign(np.array([0, 0, 2, 2, 2, 2], np.int32))
+    for _ in range(3):
+        observation, reward, terminated, truncated, info = batch.step(np.zeros((6, 6), np.float32))
+    assert truncated.tolist() == [False, False, True, True, True, True] and not terminated.any()
+    assert info["_final_obs"].tolist() == truncated.tolist() and info["final_obs"][0] is None
+    assert batch.single_observation_space.contains(info["final_obs"][3])
+    assert not np.allclose(info["final_obs"][3], observation[3])
+    assert info["final_info"]["episode_length"].tolist() == [0, 0, 5, 5, 5, 5]
+    assert batch.observation_space.contains(observation) and reward.shape == (6,)
+
+
+def test_what_was_returned_stays():
+    """Results are copies: the next step does not change them."""
+    batch = VectorEnv(2)
+    first, _ = batch.reset(seed=3)
+    kept = first.copy()
+    observation, reward, *_ = batch.step(np.ones((2, 6), np.float32))
+    after = observation.copy(), reward.copy()
+    batch.step(-np.ones((2, 6), np.float32))
+    np.testing.assert_array_equal(first, kept)
+    np.testing.assert_array_equal(observation, after[0])
+    np.testing.assert_array_equal(reward, after[1])
+
+
+def test_seeds_repeat():
+    for make in (lambda: Env(), lambda: VectorEnv(4)):
+        first, second = make().reset(seed=5)[0], make().reset(seed=5)[0]
+        np.testing.assert_array_equal(first, second)
+        assert not np.array_equal(first, make().reset(seed=6)[0])
+
+
+def test_an_unknown_task_is_refused():
+    with pytest.raises(ValueError, match="unknown task 't9'; available: t1"):
+        Env("t9")
+
+
+def test_a_task_with_other_settings_is_taken():
+    assert Env(replace(SHORT, time_limit=0.2)).environment.task.time_limit == 0.2
