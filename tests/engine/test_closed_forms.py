@@ -8,15 +8,13 @@ import pytest
 
 from finssim.engine import Simulator
 from reference.body import transformation
-from reference.cases import PAIRS, disturb, load, neutral, undamped
+from reference.cases import PAIRS, disturb, for_each, load, neutral, undamped
 from reference.hull import drag
 
 EPS = float(np.finfo(np.float32).eps)
 FOSSEN = [(name, model) for name, model in PAIRS if model != "mesh"]
 MESH = [(name, model) for name, model in PAIRS if model == "mesh" and name != "rexrov"]
 """Not RexROV: its hull is not symmetric, so drag on one axis alone has a moment."""
-EVERY_FOSSEN = pytest.mark.parametrize(("name", "model"), FOSSEN, ids=[f"{n}-{m}" for n, m in FOSSEN])
-EVERY_MESH = pytest.mark.parametrize(("name", "model"), MESH, ids=[f"{n}-{m}" for n, m in MESH])
 AXES = np.vstack([np.eye(6), -np.eye(6)])
 
 
@@ -45,7 +43,7 @@ def numbers_of_axes(vehicle, model):
     return m, np.diag(chosen.linear_damping), d2, transformation(chosen.reference_point)
 
 
-@EVERY_FOSSEN
+@for_each(FOSSEN)
 def test_a_steady_wrench_leads_to_the_terminal_speed(name, model):
     """d1 v + d2 v|v| = tau on each axis, both ways, at the reference point: 12 worlds, 0.5 m/s or 1 rad/s.
 
@@ -76,7 +74,7 @@ def test_a_steady_wrench_leads_to_the_terminal_speed(name, model):
     assert error[AXES == 0].max() < 1e-4
 
 
-@EVERY_MESH
+@for_each(MESH)
 def test_a_mesh_reaches_the_speed_at_which_its_drag_balances(name, model):
     """k v² = F along each axis, both ways, with k of the float64 reference at 1 m/s: drag is quadratic in speed."""
     vehicle = bare(name, model)
@@ -94,7 +92,7 @@ def test_a_mesh_reaches_the_speed_at_which_its_drag_balances(name, model):
     assert simulator.numpy("velocity")[:, 0] == pytest.approx(ways * speed, abs=1e-3 * speed)
 
 
-@EVERY_FOSSEN
+@for_each(FOSSEN)
 @pytest.mark.parametrize("net", [0.03, -0.03], ids=["rises", "sinks"])
 def test_a_light_or_heavy_vehicle_rises_or_sinks_at_its_terminal_speed(name, model, net):
     """d1 w + d2 w² = (ρ V - m) g: buoyancy 3 % more or less than weight, above the centre of gravity."""
@@ -114,7 +112,7 @@ def test_a_light_or_heavy_vehicle_rises_or_sinks_at_its_terminal_speed(name, mod
     assert simulator.numpy("velocity")[0, 0, 2] == pytest.approx(w, rel=tolerance)
 
 
-@EVERY_FOSSEN
+@for_each(FOSSEN)
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
 def test_each_axis_coasts_down_as_the_closed_solution(name, model, integrator):
     """m dv/dt = -(d1 + d2 |v|) v from v0 gives v = d1 v0 E / (d1 + d2 |v0| (1 - E)) with E = exp(-d1 t/m).
@@ -142,7 +140,7 @@ def test_each_axis_coasts_down_as_the_closed_solution(name, model, integrator):
         assert found == pytest.approx(AXES * expected, abs=tolerance * v0.max())
 
 
-@pytest.mark.parametrize(("name", "model"), FOSSEN + MESH, ids=[f"{n}-{m}" for n, m in FOSSEN + MESH])
+@for_each(FOSSEN + MESH)
 def test_roll_and_pitch_swing_as_a_damped_pendulum(name, model):
     """I θ'' + d1 θ' + W h θ = 0 from rest at 0.01 rad: it swings and decays as the roots of I s² + d1 s + W h say.
 
@@ -176,4 +174,4 @@ def test_roll_and_pitch_swing_as_a_damped_pendulum(name, model):
         a, b = roots[:, 0], roots[:, 1]
         expected = angle * np.real((a * np.exp(b * t) - b * np.exp(a * t)) / (a - b))
         found = 2.0 * simulator.numpy("quaternion")[[0, 1], 0, [0, 1]]
-        assert found == pytest.approx(expected, abs=2e-3 * angle)
+        assert found == pytest.approx(expected, abs=5e-4 * angle)

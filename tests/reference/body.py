@@ -12,7 +12,7 @@ def skew(a):
 
 
 def rotation(q):
-    """R(q) = I + 2 η S(ε) + 2 S(ε)², body to world, for unit quaternions (ε, η) (..., 4)   (Fossen 2021, section 2.2)."""
+    """R(q) = I + 2 η S(ε) + 2 S(ε)², body to world, for unit quaternions (ε, η) (..., 4)  (Fossen 2021, section 2.2)."""
     q = np.asarray(q, float)
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     S = skew(q[..., :3])
@@ -20,14 +20,14 @@ def rotation(q):
 
 
 def transformation(r):
-    """H(r) = [[I, S(r)ᵀ], [0, I]]: the twist at r from the twist at the origin              (Fossen 2021, appendix C)."""
+    """H(r) = [[I, S(r)ᵀ], [0, I]]: the twist at r from the twist at the origin  (Fossen 2021, appendix C)."""
     H = np.eye(6)
     H[:3, 3:] = skew(np.asarray(r, float)).T
     return H
 
 
 def rigid_body_mass(mass, r_g, inertia_g):
-    """M_RB = H(r_g)ᵀ diag(m I, I_g) H(r_g) about the body origin                          (Fossen 2021, section 3.3)."""
+    """M_RB = H(r_g)ᵀ diag(m I, I_g) H(r_g) about the body origin  (Fossen 2021, section 3.3)."""
     H = transformation(r_g)
     M_g = np.zeros((6, 6))
     M_g[:3, :3], M_g[3:, 3:] = mass * np.eye(3), inertia_g
@@ -35,7 +35,7 @@ def rigid_body_mass(mass, r_g, inertia_g):
 
 
 def rigid_body_coriolis(mass, r_g, inertia_g, nu):
-    """C_RB(nu) = H(r_g)ᵀ [[m S(ω), 0], [0, -S(I_g ω)]] H(r_g), free of linear velocity     (Fossen 2021, section 3.3)."""
+    """C_RB(nu) = H(r_g)ᵀ [[m S(ω), 0], [0, -S(I_g ω)]] H(r_g), free of linear velocity  (Fossen 2021, section 3.3)."""
     omega = nu[..., 3:]
     H = transformation(r_g)
     C = np.zeros((*nu.shape[:-1], 6, 6))
@@ -45,7 +45,7 @@ def rigid_body_coriolis(mass, r_g, inertia_g, nu):
 
 
 def added_mass_coriolis(M_A, nu_r):
-    """C_A(nu_r) = [[0, -S(A11 v + A12 ω)], [-S(A11 v + A12 ω), -S(A21 v + A22 ω)]]         (Fossen 2021, theorem 3.2)."""
+    """C_A(nu_r) = [[0, -S(A11 v + A12 ω)], [-S(A11 v + A12 ω), -S(A21 v + A22 ω)]]  (Fossen 2021, theorem 3.2)."""
     momentum = nu_r @ M_A.T
     C = np.zeros((*nu_r.shape[:-1], 6, 6))
     C[..., :3, 3:] = C[..., 3:, :3] = -skew(momentum[..., :3])

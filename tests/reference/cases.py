@@ -9,9 +9,14 @@ from finssim.vehicles import catalogue, load_vehicle
 
 load = cache(load_vehicle)
 PAIRS = [(name, model) for name in catalogue() for model in sorted(load(name).hydrodynamics)]
-EVERY_VEHICLE_AND_MODEL = pytest.mark.parametrize(
-    ("name", "model"), PAIRS, ids=[f"{n}-{m}" for n, m in PAIRS]
-)
+
+
+def for_each(pairs):
+    """Parametrise a test by (name, model)."""
+    return pytest.mark.parametrize(("name", "model"), pairs, ids=[f"{n}-{m}" for n, m in pairs])
+
+
+EVERY_VEHICLE_AND_MODEL = for_each(PAIRS)
 ONE_VEHICLE_PER_MODEL = pytest.mark.parametrize("model", ["calibrated", "mesh", "simplified"])
 """For claims about the engine rather than the numbers of a vehicle: FinsROV has all three."""
 

@@ -152,3 +152,25 @@ def acceleration(n, model, position, q, nu, tau, water=None, t=0.0):
     M_inv = np.linalg.inv(M)
     A = np.abs(M_inv)
     return total @ M_inv.T, size @ (A @ np.abs(M) @ A).T
+
+
+def energy(n, model, position, q, nu):
+    """Kinetic energy of body and added mass, potential energy of weight and buoyancy, in still water (N,) [J].
+
+    T + m g z_g + U_b with U_b the work against buoyancy: -ρ g ∫ z dV over the wet hull, or of the faded volume
+    -ρ g V ∫ s dz; a hull whose centroid is not the centre of buoyancy is shifted by the difference, if it is submerged.
+    """
+    R = rotation(q)
+    up = R[..., 2, :]
+    kinetic = 0.5 * np.einsum("ni,ij,nj->n", nu, n.M_RB + n.M_A, nu)
+    weight = n.mass * n.gravity * (position[:, 2] + up @ n.r_g)
+    full = n.density * n.gravity * n.volume
+    if model == "mesh":
+        whole = displacement(n.corners, np.array([[0.0, 0.0, 1.0]]), np.array([-1e3]))
+        volume, center = displacement(n.corners, up, position[:, 2])
+        height = position[:, 2] + np.einsum("ni,ni->n", up, center) + up @ (n.r_b - whole[1][0])
+        return kinetic, weight, -full * volume / whole[0] * height
+    s = (n.half_height - position[:, 2] - up @ n.r_b) / (2.0 * n.half_height)
+    c = np.clip(s, 0.0, 1.0)
+    # ∫ s(z) dz from above: 2 H (c³ - c⁴/2), and 2 H (s - 1) more where wholly under water.
+    return kinetic, weight, full * 2.0 * n.half_height * (c**3 - 0.5 * c**4 + np.maximum(s - 1.0, 0.0))
