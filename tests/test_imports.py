@@ -31,7 +31,7 @@ ARROWS = {
 FOUNDATION = {"", "files", "provenance", "quiet"}
 """Modules that every layer may import and that import no layer; "" is the package itself."""
 
-TOP = {"experiments", "viewer", "cli", "doctor", "boundary", "__main__"}
+TOP = {"experiments", "viewer", "cli", "cli_options", "doctor", "boundary", "__main__"}
 """What may import anything, and what only they import."""
 
 HOMES = {

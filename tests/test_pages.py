@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from finssim.engine.ranges_file import load_ranges
+from finssim.experiments.plants import load_plant
 from finssim.vehicles import VehicleError, load_vehicle
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -40,6 +42,14 @@ def test_the_vehicle_on_the_page_loads(tmp_path):
     shown = "minnow.yaml: thrusters.left: axis has length 0.94, expected 1: give a body-frame unit vector"
     assert str(refused.value).endswith(shown)
     assert shown in (ROOT / "docs" / "vehicles.md").read_text(encoding="utf-8")
+
+
+def test_the_ranges_and_the_plant_on_the_pages_load(tmp_path):
+    """The example files of the learning and evaluation pages are what the commands take."""
+    for page, load in (("learning", load_ranges), ("evaluation", load_plant)):
+        (example,) = blocks(ROOT / "docs" / f"{page}.md", "yaml")
+        (tmp_path / f"{page}.yaml").write_text(example, encoding="utf-8")
+        load(tmp_path / f"{page}.yaml")
 
 
 def test_pages_build_without_a_warning(tmp_path):

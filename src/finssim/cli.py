@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from finssim import __version__, boundary
+from finssim.cli_options import Device, Hydrodynamics, Json, Seed, Steps, Vehicle
 from finssim.quiet import start_warp
 
 __all__ = ["app", "main"]
@@ -25,22 +26,6 @@ vehicles_app = typer.Typer(invoke_without_command=True, rich_markup_mode=None, a
 app.add_typer(vehicles_app, name="vehicles")
 
 PICTURES = (".png", ".svg", ".pdf")
-
-Vehicle = Annotated[
-    str, typer.Option(help="Vehicle of the catalogue, or the path of a vehicle file.", metavar="NAME|FILE")
-]
-Hydrodynamics = Annotated[
-    str, typer.Option(help="Hydrodynamic model: calibrated, simplified or mesh.", metavar="MODEL")
-]
-Seed = Annotated[
-    int, typer.Option(help="Seed of every random number; equal seeds give equal results.", min=0)
-]
-Steps = Annotated[
-    int | None,
-    typer.Option(help="Control steps to learn from, all worlds together; a good number if not given.", min=1),
-]
-Device = Annotated[str, typer.Option(help="Where to compute: cpu or cuda.", metavar="DEVICE")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
 
 
 def main() -> None:
@@ -93,7 +78,8 @@ def train(
     randomize: Annotated[
         str | None,
         typer.Option(
-            help="Ranges the vehicle and its water are drawn from: a file, or a name that ships.",
+            help="Ranges that vehicle and water are drawn from: "
+            "hold_for_position, fossen_learn_to_swim, equivalent_box, or a file.",
             metavar="FILE",
         ),
     ] = None,
@@ -136,7 +122,8 @@ def evaluate(
     plant: Annotated[
         str | None,
         typer.Option(
-            help="What differs from the vehicle file: a plant that ships (nominal, current, ...) or a file.",
+            help="What differs from the vehicle file: "
+            "current, lag, mesh, noise, randomised, simplified, waves, or a file.",
             metavar="FILE|NAME",
         ),
     ] = None,
@@ -169,10 +156,7 @@ def evaluate(
 
 @app.command()
 def simulate(
-    vehicle: Annotated[
-        str,
-        typer.Option(help="Vehicle of the catalogue, or the path of a vehicle file.", metavar="NAME|FILE"),
-    ],
+    vehicle: Vehicle,
     command: Annotated[
         str,
         typer.Option(
