@@ -12,7 +12,7 @@ def skew(a):
 
 
 def rotation(q):
-    """R(q) = I + 2 η S(ε) + 2 S(ε)², body to world, for unit quaternions (ε, η) (..., 4)  (Fossen 2021, section 2.2)."""
+    """R(q) = I + 2 η S(ε) + 2 S(ε)², body to world, for unit quaternions (ε, η) (..., 4)  (Fossen 2021, 2.2)."""
     q = np.asarray(q, float)
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     S = skew(q[..., :3])
