@@ -19,7 +19,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.rotations import matrix_to_quat, quat_inverse_rotate, quat_multiply, quat_rotate
+from finssim.geometry.rotations import (
+    matrix_to_quat,
+    quat_inverse_rotate,
+    quat_multiply,
+    quat_rotate,
+    quat_to_matrix,
+)
 
 __all__ = [
     "FROM_CONTROLLER",
@@ -29,10 +35,14 @@ __all__ = [
     "TO_FOSSEN",
     "TO_OPTICAL",
     "Axes",
+    "acceleration_from_mujoco",
     "camera_from_optical",
+    "mujoco_acceleration",
+    "mujoco_inertia",
     "mujoco_velocity",
     "optical_from_camera",
     "velocity_from_mujoco",
+    "wrench_from_mujoco",
     "wxyz_from_xyzw",
     "xyzw_from_wxyz",
 ]
@@ -150,3 +160,32 @@ def velocity_from_mujoco(qvel: npt.ArrayLike, quaternion: npt.ArrayLike) -> Arra
     """`nu` in the body frame from a free joint's qvel, (..., 6)."""
     qvel = np.asarray(qvel, float)
     return np.concatenate([quat_inverse_rotate(quaternion, qvel[..., :3]), qvel[..., 3:]], axis=-1)
+
+
+def mujoco_acceleration(nu_dot: npt.ArrayLike, nu: npt.ArrayLike, quaternion: npt.ArrayLike) -> Array:
+    """A free joint's qacc from `nu_dot`, (..., 6): d(R v)/dt = R (v_dot + omega x v), and omega_dot as it is."""
+    return mujoco_velocity(np.asarray(nu_dot, float) + _turning(nu), quaternion)
+
+
+def acceleration_from_mujoco(qacc: npt.ArrayLike, nu: npt.ArrayLike, quaternion: npt.ArrayLike) -> Array:
+    """`nu_dot` in the body frame from a free joint's qacc, (..., 6)."""
+    return np.asarray(velocity_from_mujoco(qacc, quaternion) - _turning(nu))
+
+
+def _turning(nu: npt.ArrayLike) -> Array:
+    """[omega x v; 0]: what the linear acceleration has in the world and `nu_dot` has not, body axes, (..., 6)."""
+    v, omega = np.split(np.asarray(nu, float), 2, axis=-1)
+    return np.concatenate([np.cross(omega, v), np.zeros_like(v)], axis=-1)
+
+
+def mujoco_inertia(M: npt.ArrayLike, quaternion: npt.ArrayLike) -> Array:
+    """A 6x6 inertia about the body origin in a free joint's coordinates, (..., 6, 6): the same energy for its qvel."""
+    T = np.zeros((*np.shape(quaternion)[:-1], 6, 6))
+    T[..., :3, :3] = quat_to_matrix(quaternion)
+    T[..., 3:, 3:] = np.eye(3)
+    return np.asarray(T @ np.asarray(M, float) @ np.swapaxes(T, -1, -2))
+
+
+def wrench_from_mujoco(qfrc: npt.ArrayLike, quaternion: npt.ArrayLike) -> Array:
+    """Wrench about the body origin, body frame, from the generalised force of a free joint, (..., 6)."""
+    return velocity_from_mujoco(qfrc, quaternion)
