@@ -124,7 +124,8 @@ def evaluate_controller(
     body = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
     the_task = TASKS[task]()
     player = make_player(controller, body, the_task)
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    screen = Console(stderr=True)
+    with Progress(console=screen, transient=True, disable=not screen.is_terminal) as progress:
         bar = progress.add_task(f"{trials} trials", total=1.0)
         done = run_trials(
             player,

@@ -17,6 +17,7 @@ from rich.progress import (
     TextColumn,
     TimeRemainingColumn,
 )
+from rich.table import Column
 from rich.text import Text
 
 __all__ = ["TrainingView"]
@@ -48,9 +49,9 @@ class TrainingView:
         self._next = 0.1
         columns = (
             TextColumn("training"),
-            BarColumn(),
+            BarColumn(bar_width=16),
             TaskProgressColumn(),
-            _Results(),
+            _Results(table_column=Column(no_wrap=True)),
             TimeRemainingColumn(compact=True),
         )
         self._progress = Progress(*columns, console=self.console, disable=not self._live)
