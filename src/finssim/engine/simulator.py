@@ -199,7 +199,7 @@ class Simulator:
         longest = float(self.plant.delay.numpy().max())
         if longest > (self.state.commands.shape[2] - 2) * self.control_step + 1e-6:
             raise SimulatorError(
-                f"thruster delay {longest} s exceeds the delay line; give max_delay={longest}"
+                f"thruster delay {longest:.6g} s exceeds the delay line; give max_delay={longest:.6g}"
             )
         pipeline = self.pipeline()
         self.add_refresh(pipeline, self._all)

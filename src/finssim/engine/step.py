@@ -91,6 +91,12 @@ def slot_before(head: int, steps: int, slots: int) -> int:
     return wp.where(slot < 0, slot + slots, slot)
 
 
+@wp.func
+def snapshot(p: wp.vec3, q: wp.quat, nu: vec6) -> vec13:
+    """A row of the history: position, quaternion, velocity."""
+    return vec13(p[0], p[1], p[2], q[0], q[1], q[2], q[3], nu[0], nu[1], nu[2], nu[3], nu[4], nu[5])
+
+
 @cache
 def physics_kernel(
     model: str,
@@ -208,6 +214,7 @@ def physics_kernel(
         if not is_finite(wp.vec3(0.0), wp.quat_identity(), command[w, v].disturbance) or not wp.isfinite(
             wp.dot(command[w, v].thrust, command[w, v].thrust)
         ):
+            history[step % wp.static(HISTORY), w, v] = snapshot(position, q, nu)
             broken[w] = 1
             return
         newest = admissible(
@@ -268,10 +275,7 @@ def physics_kernel(
                 position = position + h * position_rate(q, nu)
                 q = rotate_by(q, wp.vec3(nu[3], nu[4], nu[5]), h)
         q = wp.normalize(q)
-        p = position
-        history[step % wp.static(HISTORY), w, v] = vec13(
-            p[0], p[1], p[2], q[0], q[1], q[2], q[3], nu[0], nu[1], nu[2], nu[3], nu[4], nu[5]
-        )
+        history[step % wp.static(HISTORY), w, v] = snapshot(position, q, nu)
         if not is_finite(position, q, nu):
             broken[w] = 1
             return
