@@ -59,7 +59,8 @@ class Reward:
     """Weights of the reward; each term has one reason.
 
     r = position · exp(-e / position_scale)      a slope that does not vanish at the goal: centimetres count
-      - distance · e                             a slope everywhere: far goals are approached
+      - distance · e                             a slope everywhere: far goals are approached. A weight of 0.3 was too
+                                                 little: with random buoyancy, lying on the floor was learnt
       + heading · exp(-θ / heading_scale) - turn · θ     the same for the attitude error θ, roll and pitch included
       - action · mean(a²)                        the cheapest thrusts that do it
       - change · mean(Δa²)                       commands that a motor can follow, no chatter
@@ -69,7 +70,7 @@ class Reward:
 
     position: float = 1.0
     position_scale: float = 0.15
-    distance: float = 0.30
+    distance: float = 1.0
     heading: float = 0.6
     heading_scale: float = 0.20
     turn: float = 0.15
