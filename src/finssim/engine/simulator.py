@@ -231,7 +231,7 @@ class Simulator:
             velocity: nu, body frame [m/s, rad/s], broadcastable to (..., 6).
 
         Raises:
-            SimulatorError: a number is not finite, or a quaternion has no length.
+            SimulatorError: a number is not finite, a quaternion has no length, or a shape does not fit.
         """
         shape = (self.worlds, len(self.vehicles))
         given = {"position": position, "quaternion": quaternion, "velocity": velocity}
@@ -244,7 +244,7 @@ class Simulator:
                 if not (length > 0.0).all():
                     raise SimulatorError("quaternion to place a vehicle at has length 0, expected 1 (xyzw)")
                 array = array / length
-            full = np.broadcast_to(array, (*shape, array.shape[-1]))
+            full = _broadcast(array, (*shape, {"position": 3, "quaternion": 4, "velocity": 6}[name]), name)
             getattr(self.state, name).assign(np.ascontiguousarray(full, dtype=np.float32))
         self.reset()
 
@@ -263,7 +263,7 @@ class Simulator:
             force: [N], shape broadcastable to (worlds, vehicles, n), n thrusters in the vehicle's order.
 
         Raises:
-            SimulatorError: the length is wrong or a number is not finite.
+            SimulatorError: the shape is wrong or a number is not finite.
         """
         f = np.asarray(force, dtype=np.float32)
         n = {len(v.thrusters) for v in self.vehicles}
@@ -275,7 +275,7 @@ class Simulator:
                 "thrust command has a number that is not finite: send a force in N for every thruster"
             )
         full = np.zeros((self.worlds, len(self.vehicles), 8), dtype=np.float32)
-        full[..., : f.shape[-1]] = f
+        full[..., : f.shape[-1]] = _broadcast(f, (*full.shape[:2], f.shape[-1]), "thrust command")
         self.command.thrust.assign(full)
 
     def frozen_worlds(self) -> NDArray[np.int64]:
@@ -295,6 +295,16 @@ class Simulator:
         new = [w for w in self.frozen_worlds() if (int(w), int(episode[w])) not in self._reported]
         self._reported |= {(int(w), int(episode[w])) for w in new}
         return [write_post_mortem(self, int(w), directory) for w in new]
+
+
+def _broadcast(array: NDArray[Any], shape: tuple[int, int, int], what: str) -> NDArray[Any]:
+    """The array for every world and vehicle."""
+    try:
+        return np.broadcast_to(array, shape)
+    except ValueError:
+        raise SimulatorError(
+            f"{what} has shape {array.shape}, expected (worlds, vehicles, numbers) = {shape} or the last of these alone"
+        ) from None
 
 
 def _device(name: str) -> wp.Device:
