@@ -40,7 +40,7 @@ HOMES = {
     "gymnasium": {"learning/gymnasium_env.py", "learning/spaces.py"},
     "onnx": {"learning/export.py"},
     "onnxruntime": {"control/policy.py"},
-    "mujoco": {"experiments/bench.py"},
+    "mujoco": {"engine/scene_model.py", "engine/scene_picture.py", "experiments/bench.py"},
     "pandas": {"engine/recorder.py"},
     "pyarrow": {"engine/recorder.py"},
     "matplotlib": {
