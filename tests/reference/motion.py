@@ -93,7 +93,7 @@ def submersion(n, height):
     return 3.0 * s**2 - 2.0 * s**3
 
 
-def acceleration(n, model, position, q, nu, tau, water=None, t=0.0):
+def acceleration(n, model, position, q, nu, tau, water=None, t=0.0, thrust=None):
     """nu_dot, and a bound of what it is a sum of, for rounding.
 
     Args:
@@ -105,6 +105,7 @@ def acceleration(n, model, position, q, nu, tau, water=None, t=0.0):
         tau: Other wrenches about the body origin, body frame (N, 6).
         water: `finssim.engine.Water` without drift; still if None.
         t: Time [s].
+        thrust: Wrench of the thrusters (N, 6), which fades with the part of the volume that is out of the water.
 
     Returns:
         nu_dot (N, 6) and |M⁻¹| |M| |M⁻¹| Σ |wrenches| (N, 6).
@@ -128,7 +129,8 @@ def acceleration(n, model, position, q, nu, tau, water=None, t=0.0):
     if model == "mesh":
         whole = displacement(n.corners, np.array([[0.0, 0.0, 1.0]]), np.array([-1e3]))
         volume, center = displacement(n.corners, surface, height)
-        displaced = n.density * n.volume * volume / whole[0]
+        wet = volume / whole[0]
+        displaced = n.density * n.volume * wet
         terms.append(wrench_of_force(center - whole[1] + n.r_b, displaced[:, None] * n.gravity * up))
         tau_D, size_D = drag(n.corners, surface, height, nu, v_c, G_b, n.density, n.form, n.skin)
     else:
@@ -136,6 +138,8 @@ def acceleration(n, model, position, q, nu, tau, water=None, t=0.0):
         displaced = n.density * n.volume * wet
         terms.append(wrench_of_force(n.r_b, displaced[:, None] * n.gravity * up))
         tau_D, size_D = (wet[:, None] * x for x in damping(n, nu if model == "simplified" else nu_r))
+    if thrust is not None:
+        terms.append(wet[:, None] * thrust)
     terms.append(-times(rigid_body_coriolis(n.mass, n.r_g, n.inertia_g, nu), nu))
     sizes = [coriolis_size(n.M_RB, nu), size_D]
     if model != "simplified":

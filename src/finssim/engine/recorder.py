@@ -26,8 +26,8 @@ STATE_COLUMNS = {
 }
 """Field of the simulator's state -> its columns, SI; world frame for the first two, body frame for the others."""
 
-ABOUT = "run.json"
-"""What the run was: vehicles with their hashes, model, times, seed, revision."""
+ABOUT = "_run.json"
+"""What the run was: vehicles with their hashes, model, times, seed, revision. Parquet readers skip names with a `_`."""
 
 
 class Recorder:

@@ -1,6 +1,5 @@
 """The batched simulator: worlds × vehicles, stepped together by one kernel."""
 
-import difflib
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from finssim.engine.arguments import find_device, one_of, shared_water
 from finssim.engine.launch import Pipeline
 from finssim.engine.packed import Packed
 from finssim.engine.plant_arrays import SimulatorError, build_plant
@@ -27,14 +27,6 @@ from finssim.physics.water import advance_drift
 from finssim.vehicles import Vehicle, load_vehicle
 
 INTEGRATORS = ("euler", "rk4")
-
-
-def _one_of(value: str, available: Sequence[str], what: str) -> str:
-    if value not in available:
-        close = difflib.get_close_matches(value, available, n=1)
-        hint = f"; did you mean '{close[0]}'?" if close else ""
-        raise SimulatorError(f"unknown {what} '{value}'; available: {', '.join(sorted(available))}{hint}")
-    return value
 
 
 class Simulator:
@@ -90,8 +82,8 @@ class Simulator:
         """
         given = [vehicles] if isinstance(vehicles, Vehicle | str) else list(vehicles)
         self.vehicles = [v if isinstance(v, Vehicle) else load_vehicle(v) for v in given]
-        self.hydrodynamics = _one_of(hydrodynamics, tuple(HYDRODYNAMICS), "hydrodynamic model")
-        self.integrator = _one_of(integrator, INTEGRATORS, "integrator")
+        self.hydrodynamics = one_of(hydrodynamics, tuple(HYDRODYNAMICS), "hydrodynamic model")
+        self.integrator = one_of(integrator, INTEGRATORS, "integrator")
         if worlds < 1 or substeps < 1 or not self.vehicles:
             raise SimulatorError(
                 f"worlds={worlds}, substeps={substeps}: expected at least one, and one vehicle"
@@ -99,7 +91,7 @@ class Simulator:
         if not (math.isfinite(control_step) and control_step > 0.0):
             raise SimulatorError(f"control_step is {control_step} s, expected a finite time above 0 s")
         self.worlds, self.control_step, self.substeps, self.seed = worlds, control_step, substeps, seed
-        self.device = _device(device)
+        self.device = find_device(device)
         self._surround(water or Water(), pool, tether, max_waves, water_moves)
         self._hulls()
         n = len(self.vehicles)
@@ -123,7 +115,7 @@ class Simulator:
     def _surround(
         self, water: Water, pool: Pool | None, tether: TetherLine | None, max_waves: int, moves: bool
     ) -> None:
-        fluid = self.vehicles[0].water
+        fluid = shared_water(self.vehicles)
         self.surroundings = (water, pool, tether)
         self.water = water.arrays(self.worlds, fluid.density, fluid.gravity, self.device, max_waves)
         self.water.moving = int(moves or bool(self.water.moving))
@@ -305,12 +297,3 @@ def _broadcast(array: NDArray[Any], shape: tuple[int, int, int], what: str) -> N
         raise SimulatorError(
             f"{what} has shape {array.shape}, expected (worlds, vehicles, numbers) = {shape} or the last of these alone"
         ) from None
-
-
-def _device(name: str) -> wp.Device:
-    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-    try:
-        return wp.get_device(name)
-    except (ValueError, RuntimeError):
-        have = ", ".join(str(d) for d in wp.get_devices())
-        raise SimulatorError(f"device '{name}' is not available here; available: {have}") from None

@@ -141,20 +141,23 @@ def physics_kernel(
         position: wp.vec3,
         q: wp.quat,
         nu: vec6,
-        tau_applied: vec6,
+        tau_thrust: vec6,
+        tau_other: vec6,
         t: float,
         t_step: float,
     ) -> vec6:
         """Acceleration from the equation of motion, with nu_r = nu - [v_c; 0] and the water's v_c in the body frame.
 
-        (M_RB + M_A) nu_dot = tau_model + tau_applied - C_RB(nu) nu - C_A(nu_r) nu_r + M_A d(nu_c)/dt + tau_FK
+        (M_RB + M_A) nu_dot = tau_model + wet tau_thrust + tau_other - C_RB(nu) nu - C_A(nu_r) nu_r
+                              + M_A d(nu_c)/dt + tau_FK
 
         Solved with M_RB + M_A together: as an applied force, added mass diverges once M_A exceeds M_RB. Both Coriolis
-        terms share ω, so C_RB(nu) nu + C_A(nu_r) nu_r is that of the summed momentum less [0; v_c × p_A].
+        terms share ω, so C_RB(nu) nu + C_A(nu_r) nu_r is that of the summed momentum less [0; v_c × p_A]. Propellers
+        push in proportion to the part of the vehicle that is wet: in the air they have nothing to push against.
         """
         up = up_in_body(q)
         momentum = rigid_body_momentum(plant[w, v].mass, plant[w, v].r_g, plant[w, v].inertia, nu)
-        tau = tau_applied
+        tau = tau_other
         flow = Flow()
         nu_r = nu
         if wp.static(water_moving):
@@ -164,14 +167,15 @@ def physics_kernel(
             momentum_A = symmetric_times(plant[w, v].M_A, nu_r)
             wet = hydrodynamic_wrench(plant, hull, water, w, v, position, q, up, nu, nu_r, flow)
             a_b = wp.quat_rotate_inv(q, flow.acceleration)
-            tau += wet.tau + join(wp.vec3(0.0), wp.cross(water_b, linear(momentum_A)))
+            tau += wet.tau + wet.wet * tau_thrust + join(wp.vec3(0.0), wp.cross(water_b, linear(momentum_A)))
             tau += water_acceleration_wrench(
                 plant[w, v].M_A, plant[w, v].r_b, water_b, a_b, angular(nu), wet.displaced
             )
             momentum += momentum_A
         else:
             flow.normal = wp.vec3(0.0, 0.0, 1.0)
-            tau += hydrodynamic_wrench(plant, hull, water, w, v, position, q, up, nu, nu, flow).tau
+            wet = hydrodynamic_wrench(plant, hull, water, w, v, position, q, up, nu, nu, flow)
+            tau += wet.tau + wet.wet * tau_thrust
             if wp.static(added_mass):
                 momentum += symmetric_times(plant[w, v].M_A, nu)
         if wp.static(walls_present):
@@ -209,6 +213,7 @@ def physics_kernel(
         q = state[w, v].quaternion
         nu = state[w, v].velocity
         actuator = state[w, v].actuator
+        other = command[w, v].disturbance
         nu_dot = vec6()
         thrust = vec8()
         if not is_finite(wp.vec3(0.0), wp.quat_identity(), command[w, v].disturbance) or not wp.isfinite(
@@ -237,16 +242,18 @@ def physics_kernel(
             actuator = first_order(actuator, target, plant[w, v].alpha, max_change)
             thrust = thrust_of(plant, w, v, actuator)
             if wp.static(runge_kutta):
-                tau = plant[w, v].B * (0.5 * (before + thrust)) + command[w, v].disturbance
+                tau = plant[w, v].B * (0.5 * (before + thrust))
                 x1 = position_rate(q, nu)
                 q1 = quaternion_rate(q, wp.vec3(nu[3], nu[4], nu[5]))
-                n1 = nu_dot_of(plant, hull, water, walls, tether, w, v, position, q, nu, tau, t, elapsed)
+                n1 = nu_dot_of(
+                    plant, hull, water, walls, tether, w, v, position, q, nu, tau, other, t, elapsed
+                )
                 nu2 = nu + 0.5 * h * n1
                 qm = wp.normalize(q + 0.5 * h * q1)
                 x2 = position_rate(qm, nu2)
                 q2 = quaternion_rate(qm, wp.vec3(nu2[3], nu2[4], nu2[5]))
                 n2 = nu_dot_of(
-                    plant, hull, water, walls, tether, w, v, position + 0.5 * h * x1, qm, nu2, tau,
+                    plant, hull, water, walls, tether, w, v, position + 0.5 * h * x1, qm, nu2, tau, other,
                     t + 0.5 * h, elapsed + 0.5 * h,
                 )  # fmt: skip
                 nu3 = nu + 0.5 * h * n2
@@ -254,7 +261,7 @@ def physics_kernel(
                 x3 = position_rate(qn, nu3)
                 q3 = quaternion_rate(qn, wp.vec3(nu3[3], nu3[4], nu3[5]))
                 n3 = nu_dot_of(
-                    plant, hull, water, walls, tether, w, v, position + 0.5 * h * x2, qn, nu3, tau,
+                    plant, hull, water, walls, tether, w, v, position + 0.5 * h * x2, qn, nu3, tau, other,
                     t + 0.5 * h, elapsed + 0.5 * h,
                 )  # fmt: skip
                 nu4 = nu + h * n3
@@ -262,15 +269,17 @@ def physics_kernel(
                 x4 = position_rate(qe, nu4)
                 q4 = quaternion_rate(qe, wp.vec3(nu4[3], nu4[4], nu4[5]))
                 n4 = nu_dot_of(
-                    plant, hull, water, walls, tether, w, v, position + h * x3, qe, nu4, tau, t + h, elapsed + h
+                    plant, hull, water, walls, tether, w, v, position + h * x3, qe, nu4, tau, other, t + h, elapsed + h
                 )  # fmt: skip
                 nu_dot = (n1 + 2.0 * n2 + 2.0 * n3 + n4) / 6.0
                 position = position + (h / 6.0) * (x1 + 2.0 * x2 + 2.0 * x3 + x4)
                 q = wp.normalize(q + (h / 6.0) * (q1 + 2.0 * q2 + 2.0 * q3 + q4))
                 nu = nu + h * nu_dot
             else:
-                tau = plant[w, v].B * thrust + command[w, v].disturbance
-                nu_dot = nu_dot_of(plant, hull, water, walls, tether, w, v, position, q, nu, tau, t, elapsed)
+                tau = plant[w, v].B * thrust
+                nu_dot = nu_dot_of(
+                    plant, hull, water, walls, tether, w, v, position, q, nu, tau, other, t, elapsed
+                )
                 nu = nu + h * nu_dot
                 position = position + h * position_rate(q, nu)
                 q = rotate_by(q, wp.vec3(nu[3], nu[4], nu[5]), h)

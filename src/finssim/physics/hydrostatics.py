@@ -9,10 +9,11 @@ from finssim.physics.types import join, vec6
 
 @wp.struct
 class WaterWrench:
-    """What a hydrodynamic model gives: its wrench, and how much water the vehicle displaces."""
+    """What a hydrodynamic model gives: its wrench, and how far the vehicle is in the water."""
 
     tau: vec6  # about the body origin, body frame [N, N m]
     displaced: float  # mass of water [kg]
+    wet: float  # part of the displaced volume that is under water
 
 
 @wp.func

@@ -156,15 +156,17 @@ def advance_drift(
 ):
     """Draw the drifting current of the coming control step: a Gauss-Markov process, exact for its sampling.
 
-    d(t + T) = a d(t) + sqrt(1 - a²) σ N(0, 1),  a = exp(-T / time)
+    d(0) = σ N(0, 1),  d(t + T) = a d(t) + sqrt(1 - a²) σ N(0, 1),  a = exp(-T / time)
     """
     w = world_offset + wp.tid()
     if water.drift_time[w] <= 0.0:
         return
-    start = water.drift[w] + control_step * water.drift_rate[w]
     rng = wp.rand_init(seed + 7919 * episode[w], w * 65536 + steps[w])
     a = wp.exp(-control_step / water.drift_time[w])
     noise = wp.vec3(wp.randn(rng), wp.randn(rng), wp.randn(rng))
+    start = water.drift[w] + control_step * water.drift_rate[w]
+    if steps[w] == 0:
+        start = wp.cw_mul(water.drift_std[w], wp.vec3(wp.randn(rng), wp.randn(rng), wp.randn(rng)))
     new = a * start + wp.sqrt(1.0 - a * a) * wp.cw_mul(water.drift_std[w], noise)
     water.drift[w] = start
     water.drift_rate[w] = (new - start) / control_step

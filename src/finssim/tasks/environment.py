@@ -1,5 +1,6 @@
 """The batched environment: any task, any vehicle, thousands of worlds, with automatic reset."""
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -258,7 +259,9 @@ class Environment:
         frozen = self.simulator.state.frozen.numpy() != 0
         files = self.simulator.report_frozen(self.crash_directory)
         for path in files:
-            print(f"finssim: a number stopped being finite; last states in {path}", flush=True)
+            print(
+                f"finssim: a number stopped being finite; last states in {path}", file=sys.stderr, flush=True
+            )
         self.reset(mask=frozen)
 
     def outcome(self) -> Step:

@@ -44,12 +44,13 @@ def fossen_wrench(
         flow: Water at the body origin.
 
     Returns:
-        Wrench about the body origin and the mass of water displaced.
+        Wrench about the body origin, the mass of water displaced and the part under water.
     """
     r_b = plant[w, v].r_b
     height = position[2] + wp.dot(up, r_b) - flow.elevation
     wet = submerged_fraction(height, plant[w, v].surface_half_height)
     out = WaterWrench()
+    out.wet = wet
     out.displaced = water.density * plant[w, v].volume * wet
     r_h = plant[w, v].r_h
     tau_D = damping_wrench(twist_at(nu_r, r_h), plant[w, v].D1, plant[w, v].D2, plant[w, v].Du)

@@ -45,7 +45,7 @@ def mesh_wrench(
         flow: Water at the body origin.
 
     Returns:
-        Wrench about the body origin and the mass of water displaced.
+        Wrench about the body origin, the mass of water displaced and the part under water.
     """
     kind = plant[w, v].hull
     normal = up
@@ -57,7 +57,8 @@ def mesh_wrench(
     height = flow.normal[2] * (position[2] - flow.elevation)
     wet = mesh_displacement(hull, kind, normal, height)
     out = WaterWrench()
-    out.displaced = water.density * plant[w, v].volume * wet[0] / hull.volume[kind]
+    out.wet = wet[0] / hull.volume[kind]
+    out.displaced = water.density * plant[w, v].volume * out.wet
     center = wp.vec3(wet[1], wet[2], wet[3]) + plant[w, v].r_b - hull.centroid[kind]
     weight = plant[w, v].mass * water.gravity
     tau = hydrostatic_wrench(weight, out.displaced * water.gravity, plant[w, v].r_g, center, up)
