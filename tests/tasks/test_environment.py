@@ -194,7 +194,7 @@ def test_a_world_that_breaks_is_reported_and_starts_over(tmp_path, capsys, auto_
     rest = np.arange(8) != 5
     np.testing.assert_array_equal(step.observation[rest], other.observation[rest])
     (file,) = tmp_path.iterdir()
-    assert str(file) in capsys.readouterr().out
+    assert str(file) in capsys.readouterr().err
     table = pandas.read_csv(file)
     assert len(table) == 4 and table.iloc[:-1].notna().all(axis=None) and table.iloc[-1].isna().any()
     again = broken.step(np.full((8, 6), 0.1))

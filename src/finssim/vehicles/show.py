@@ -35,7 +35,7 @@ def print_catalogue(console: Console) -> None:
         ("thrusters", "right"),
         ("axes", "right"),
     ):
-        table.add_column(column, justify=justify)  # type: ignore[arg-type]
+        table.add_column(column, justify=justify, no_wrap=True)  # type: ignore[arg-type]
     table.add_column("hydrodynamics")
     table.add_column("what it is", overflow="fold")
     for name in catalogue():
