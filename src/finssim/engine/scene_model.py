@@ -234,7 +234,7 @@ def _add_cameras(mj: ModuleType, spec: Any, body: Any, size: float, pool: Pool |
     half = 0.55 * max(high, 0.75 * wide)  # fits a picture of 4:3 with a margin
     overhead = parent.add_camera(name="overhead", mode=mode, pos=[0.0, 0.0, span])
     overhead.fovy = float(np.degrees(2.0 * np.arctan(half / span)))
-    corner = parent.add_camera(name="corner", mode=mode, fovy=50.0)
+    corner = parent.add_camera(name="corner", mode=mode, fovy=42.0)
     corner.pos = middle + span * np.array([-0.7, -0.85, 0.9])
     back = (corner.pos - middle) / np.linalg.norm(corner.pos - middle)
     right = np.cross([0.0, 0.0, 1.0], back)
