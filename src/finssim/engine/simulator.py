@@ -161,6 +161,7 @@ class Simulator:
             walls_present=self.surroundings[1] is not None,
             tether_present=self.surroundings[2] is not None,
             speed_lag=bool(self.plant.speed_lag.numpy().any()),
+            surge_coupled=bool(self.plant.Du.numpy().any()),
         )
         fixed = [self.hull, self.water, self.walls, self.tether, self.control_step, self.substeps]
         s = self.state

@@ -6,6 +6,7 @@ import warp as wp
 
 from finssim.engine.state import HISTORY, State, VehicleState, is_finite, vec13
 from finssim.physics.contact import PoolWalls, contact_wrench
+from finssim.physics.damping import surge_coupled_wrench, twist_at, wrench_from
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
 from finssim.physics.hydrodynamics.mesh import HullMesh
 from finssim.physics.inertia import coriolis_wrench, rigid_body_momentum, water_acceleration_wrench
@@ -105,6 +106,7 @@ def physics_kernel(
     walls_present: bool = True,
     tether_present: bool = True,
     speed_lag: bool = True,
+    surge_coupled: bool = True,
 ) -> wp.Kernel:
     """The kernel for one hydrodynamic model and one integrator, without the code that a simulation does not need.
 
@@ -115,6 +117,7 @@ def physics_kernel(
         walls_present: Whether there is a pool to bump into.
         tether_present: Whether there is a tether.
         speed_lag: Whether some vehicle's motors lag in speed rather than in force.
+        surge_coupled: Whether some vehicle's damping is coupled to surge (Du is not zero).
 
     Returns:
         A kernel over (worlds of the slice, vehicles).
@@ -163,7 +166,8 @@ def physics_kernel(
         if wp.static(water_moving):
             flow = flow_at(water, w, position, t, t_step)
             water_b = wp.quat_rotate_inv(q, flow.velocity)
-            nu_r = nu - join(water_b, wp.vec3(0.0))
+            if wp.static(added_mass):
+                nu_r = nu - join(water_b, wp.vec3(0.0))
             momentum_A = symmetric_times(plant[w, v].M_A, nu_r)
             wet = hydrodynamic_wrench(plant, hull, water, w, v, position, q, up, nu, nu_r, flow)
             a_b = wp.quat_rotate_inv(q, flow.acceleration)
@@ -178,6 +182,10 @@ def physics_kernel(
             tau += wet.tau + wet.wet * tau_thrust
             if wp.static(added_mass):
                 momentum += symmetric_times(plant[w, v].M_A, nu)
+        if wp.static(surge_coupled):
+            r_h = plant[w, v].r_h
+            nu_h = twist_at(nu_r, r_h)
+            tau += wet.wet * wrench_from(surge_coupled_wrench(nu_h, plant[w, v].Du), r_h)
         if wp.static(walls_present):
             tau += contact_wrench(walls, position, q, nu, plant[w, v].half_size)
         if wp.static(tether_present):

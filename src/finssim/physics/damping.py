@@ -20,7 +20,19 @@ def damping_wrench(nu_r: vec6, D1: mat66, D2: mat66, Du: mat66) -> vec6:
     Returns:
         Wrench about the same point, body frame [N, N m].
     """
-    return -(D1 * nu_r + D2 * wp.cw_mul(wp.abs(nu_r), nu_r) + wp.abs(nu_r[0]) * (Du * nu_r))
+    return uncoupled_damping_wrench(nu_r, D1, D2) + surge_coupled_wrench(nu_r, Du)
+
+
+@wp.func
+def uncoupled_damping_wrench(nu_r: vec6, D1: mat66, D2: mat66) -> vec6:
+    """`damping_wrench` of a vehicle without surge coupling (Du = 0), which most are: a matrix product less."""
+    return -(D1 * nu_r + D2 * wp.cw_mul(wp.abs(nu_r), nu_r))
+
+
+@wp.func
+def surge_coupled_wrench(nu_r: vec6, Du: mat66) -> vec6:
+    """The part of `damping_wrench` that grows with the surge speed: -Du |u_r| nu_r."""
+    return -wp.abs(nu_r[0]) * (Du * nu_r)
 
 
 @wp.func

@@ -4,7 +4,7 @@
 
 import warp as wp
 
-from finssim.physics.damping import damping_wrench, twist_at, wrench_from
+from finssim.physics.damping import twist_at, uncoupled_damping_wrench, wrench_from
 from finssim.physics.hydrodynamics.mesh import HullMesh
 from finssim.physics.hydrostatics import WaterWrench, hydrostatic_wrench, submerged_fraction
 from finssim.physics.plant import VehicleParameters
@@ -28,7 +28,10 @@ def fossen_wrench(
 ) -> WaterWrench:
     """Hydrostatic and damping wrench of a submerged or emerging vehicle.
 
-    tau_H + tau_D(nu_r)                     (paper, eq. 1; its terms in M_A belong to the equation of motion)
+    tau_H + tau_D(nu_r)                     (paper, eq. 1)
+
+    Its terms in M_A belong to the equation of motion, and so does the damping that is coupled to surge, which most
+    vehicles do not have: the kernel leaves it out for them.
 
     Args:
         plant: Parameters.
@@ -53,7 +56,7 @@ def fossen_wrench(
     out.wet = wet
     out.displaced = water.density * plant[w, v].volume * wet
     r_h = plant[w, v].r_h
-    tau_D = damping_wrench(twist_at(nu_r, r_h), plant[w, v].D1, plant[w, v].D2, plant[w, v].Du)
+    tau_D = uncoupled_damping_wrench(twist_at(nu_r, r_h), plant[w, v].D1, plant[w, v].D2)
     weight = plant[w, v].mass * water.gravity
     tau_H = hydrostatic_wrench(weight, out.displaced * water.gravity, plant[w, v].r_g, r_b, up)
     out.tau = tau_H + wet * wrench_from(tau_D, r_h)
