@@ -4,6 +4,7 @@ from functools import cache
 
 import warp as wp
 
+from finssim.engine.actuation import delayed_command, delivered_thrust, lag_target
 from finssim.engine.state import HISTORY, State, VehicleState, is_finite, vec13
 from finssim.physics.contact import PoolWalls, contact_wrench
 from finssim.physics.damping import surge_coupled_wrench, twist_at, wrench_from
@@ -11,10 +12,10 @@ from finssim.physics.hydrodynamics import HYDRODYNAMICS
 from finssim.physics.hydrodynamics.mesh import HullMesh
 from finssim.physics.inertia import coriolis_wrench, rigid_body_momentum, water_acceleration_wrench
 from finssim.physics.kinematics import position_rate, quaternion_rate, rotate_by, up_in_body
-from finssim.physics.motors import admissible, first_order, speed_of_thrust, steps_ago, thrust_of_speed
+from finssim.physics.motors import admissible, first_order
 from finssim.physics.plant import VehicleCommand, VehicleParameters
 from finssim.physics.tether import Tether, tether_wrench
-from finssim.physics.types import MAX_THRUSTERS, angular, join, linear, symmetric_times, vec6, vec8
+from finssim.physics.types import angular, join, linear, symmetric_times, vec6, vec8
 from finssim.physics.water import Flow, WaterArrays, flow_at
 
 MODULE_OPTIONS = {
@@ -22,80 +23,6 @@ MODULE_OPTIONS = {
     " -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
 }
 """Warp's defaults, but with fused multiply-adds and no limit on the depth of SLP vectorisation: a quarter faster."""
-
-
-@wp.func
-def delivered_thrust(plant: wp.array2d(dtype=VehicleParameters), w: int, v: int, actuator: vec8) -> vec8:
-    """Force of each thruster [N] for the state of its lag."""
-    T = actuator
-    if plant[w, v].speed_lag != 0:
-        c_plus = plant[w, v].c_plus
-        c_minus = plant[w, v].c_minus
-        for k in range(MAX_THRUSTERS):
-            T[k] = thrust_of_speed(actuator[k], c_plus[k], c_minus[k])
-    return wp.cw_mul(plant[w, v].gain, T)
-
-
-@wp.func
-def lag_target(plant: wp.array2d(dtype=VehicleParameters), w: int, v: int, force: vec8) -> vec8:
-    """What the lag tends to for a force command: the force itself, or the propeller speed that gives it."""
-    target = force
-    if plant[w, v].speed_lag != 0:
-        c_plus = plant[w, v].c_plus
-        c_minus = plant[w, v].c_minus
-        for k in range(MAX_THRUSTERS):
-            target[k] = speed_of_thrust(force[k], c_plus[k], c_minus[k])
-    return target
-
-
-@wp.func
-def delayed_command(
-    commands: wp.array3d(dtype=vec8),
-    w: int,
-    v: int,
-    head: int,
-    elapsed: float,
-    delay: float,
-    h: float,
-    rate: float,
-) -> vec8:
-    """Mean of the delayed command over the coming substep.
-
-    Args:
-        commands: The delay line, by world, vehicle and slot.
-        w: World.
-        v: Vehicle.
-        head: Slot of the delay line that holds the newest command.
-        elapsed: Time since the newest command was issued [s].
-        delay: Of the command [s].
-        h: Substep [s].
-        rate: Commands a second [1/s].
-
-    Returns:
-        Command in lag units; the exact mean, also when the delay ends inside the substep.
-    """
-    age = delay - elapsed
-    old = steps_ago(age, rate)
-    new = steps_ago(age - h, rate)
-    command = commands[w, v, slot_before(head, old, commands.shape[2])]
-    if new != old:
-        part = wp.clamp((age * rate - float(new)) / (h * rate), 0.0, 1.0)
-        newer = commands[w, v, slot_before(head, new, commands.shape[2])]
-        command = part * command + (1.0 - part) * newer
-    return command
-
-
-@wp.func
-def slot_before(head: int, steps: int, slots: int) -> int:
-    """Slot of a ring that lies `steps` (fewer than `slots`) before its head."""
-    slot = head - steps
-    return wp.where(slot < 0, slot + slots, slot)
-
-
-@wp.func
-def snapshot(p: wp.vec3, q: wp.quat, nu: vec6) -> vec13:
-    """A row of the history: position, quaternion, velocity."""
-    return vec13(p[0], p[1], p[2], q[0], q[1], q[2], q[3], nu[0], nu[1], nu[2], nu[3], nu[4], nu[5])
 
 
 @cache
