@@ -73,9 +73,3 @@ def slot_before(head: int, steps: int, slots: int) -> int:
     """Slot of a ring that lies `steps` (fewer than `slots`) before its head."""
     slot = head - steps
     return wp.where(slot < 0, slot + slots, slot)
-
-
-@wp.func
-def snapshot(p: wp.vec3, q: wp.quat, nu: vec6) -> vec13:
-    """A row of the history: position, quaternion, velocity."""
-    return vec13(p[0], p[1], p[2], q[0], q[1], q[2], q[3], nu[0], nu[1], nu[2], nu[3], nu[4], nu[5])

@@ -68,3 +68,9 @@ def is_finite(position: wp.vec3, q: wp.quat, nu: vec6) -> bool:
         and wp.isfinite(q[0] + q[1] + q[2] + q[3])
         and wp.isfinite(wp.dot(nu, nu))
     )
+
+
+@wp.func
+def snapshot(p: wp.vec3, q: wp.quat, nu: vec6) -> vec13:
+    """A row of the history: position, quaternion, velocity."""
+    return vec13(p[0], p[1], p[2], q[0], q[1], q[2], q[3], nu[0], nu[1], nu[2], nu[3], nu[4], nu[5])

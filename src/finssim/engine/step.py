@@ -5,7 +5,7 @@ from functools import cache
 import warp as wp
 
 from finssim.engine.actuation import delayed_command, delivered_thrust, lag_target
-from finssim.engine.state import HISTORY, State, VehicleState, is_finite, vec13
+from finssim.engine.state import HISTORY, State, VehicleState, is_finite, snapshot, vec13
 from finssim.physics.contact import PoolWalls, contact_wrench
 from finssim.physics.damping import surge_coupled_wrench, twist_at, wrench_from
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
