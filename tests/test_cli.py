@@ -193,6 +193,7 @@ def test_pids_are_controllers_like_any(capfd, controller):
         (["evaluate", "pid", "--trials", "0"], "Invalid value for '--trials'"),
         (["evaluate", "pid", "--out", "/proc/x/result"], "write elsewhere"),
         (["validate", "rexrov"], "available: finsrov"),
+        (["validate", "finsrov", "--hydrodynamics", "fosen"], "unknown hydrodynamic model 'fosen'"),
         (["demo", "--out", "/proc/x/demo"], "write elsewhere"),
         (["bench", "--device", "tpu"], "device 'tpu' is not available"),
     ],
@@ -209,6 +210,17 @@ def test_validate_as_json(capfd):
     assert result["vehicle"]["name"] == "finsrov"
     assert {"yaw", "surge", "sway", "heave"} == {response["axis"] for response in result["responses"]}
     assert all({"simulated", "measured", "agrees"} <= response.keys() for response in result["responses"])
+
+
+def test_validate_takes_the_model_it_is_given(capfd):
+    """Another model is another water: it is named, and the speeds differ."""
+    results = []
+    for model in ("calibrated", "simplified"):
+        assert finssim("validate", "finsrov", "--hydrodynamics", model, "--json") == 0
+        results.append(json.loads(capfd.readouterr().out))
+    assert [result["hydrodynamics"] for result in results] == ["calibrated", "simplified"]
+    speeds = [[response["simulated"] for response in result["responses"]] for result in results]
+    assert speeds[0] != speeds[1]
 
 
 @pytest.mark.long

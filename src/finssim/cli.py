@@ -251,7 +251,7 @@ def validate(
     start_warp()
     from finssim.experiments.validate import validate as run
 
-    run(name, as_json=as_json)
+    run(name, as_json=as_json, hydrodynamics=hydrodynamics)
 
 
 @app.command()
