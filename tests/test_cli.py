@@ -146,6 +146,10 @@ def test_an_interrupted_training_leaves_a_policy(tmp_path):
         (["train", "t1", "--device", "tpu"], "device 'tpu' is not available"),
         (["train", "t1", "--worlds", "0"], "Invalid value for '--worlds'"),
         (["train", "t1", "--seed", "-1"], "Invalid value for '--seed'"),
+        (
+            ["train", "t1", "--seed", "4294967296"],
+            "'--seed': Input should be less than or equal to 2147483647",
+        ),
     ],
 )
 def test_train_refuses_in_a_sentence(capsys, tmp_path, words, sentence):

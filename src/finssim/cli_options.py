@@ -15,7 +15,8 @@ Hydrodynamics = Annotated[
     str, typer.Option(help="Hydrodynamic model: calibrated, simplified or mesh.", metavar="MODEL")
 ]
 Seed = Annotated[
-    int, typer.Option(help="Seed of every random number; equal seeds give equal results.", min=0)
+    int,
+    typer.Option(help="Seed of every random number; equal seeds give equal results.", min=0, max=2**31 - 1),
 ]
 Steps = Annotated[
     int | None,

@@ -70,6 +70,8 @@ def test_any_number_of_the_vehicle_can_differ(tmp_path):
         ("noise: {position_std: .nan}", "noise"),
         ("noise: {yaw: 1}", "noise: unknown key 'yaw'; available: position_std"),
         ("extra_delay: -1", "extra_delay: Input should be greater than or equal to 0"),
+        ("extra_delay: 1e9", "extra_delay: Input should be less than or equal to 5"),
+        ("extra_time_constant: 5.1", "less than or equal to 5"),
         ("a: [", "not valid YAML"),
         ("- 1", "expected keys such as"),
     ],

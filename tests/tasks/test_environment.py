@@ -107,6 +107,18 @@ def test_infinities_of_both_signs_are_refused():
         environment().step(action)
 
 
+@pytest.mark.parametrize("seed", [-1, 2**31])
+def test_a_seed_that_kernels_cannot_take_is_refused(seed):
+    """At the start and at a reset; the environment goes on as it was."""
+    task = StationKeeping()
+    with pytest.raises(EnvironmentSetupError, match=f"seed is {seed}, expected 0 to 2147483647"):
+        Environment(task, seed=seed)
+    environment = Environment(task, seed=2**31 - 1)
+    with pytest.raises(EnvironmentSetupError, match=f"seed is {seed}"):
+        environment.reset(seed=seed)
+    assert environment.seed == 2**31 - 1
+
+
 def test_unknown_names_are_refused():
     with pytest.raises(EnvironmentSetupError, match="unknown action mode 'wrench5'; available: thruster8"):
         environment(action="wrench5")

@@ -22,6 +22,9 @@ __all__ = ["Plant", "PlantError", "available_plants", "load_plant"]
 
 SHIPPED = Path(__file__).parent / "plants"
 
+LONGEST_LAG = 5.0
+"""Most that may be added to a thruster's lag or delay [s]: far beyond any motor, and a delay takes memory."""
+
 
 class PlantError(ValueError):
     """A plant that is not there, or whose file cannot be used."""
@@ -42,9 +45,9 @@ class Plant(BaseModel):
     """Arguments of `finssim.engine.Water`: current, shear, drift_std, drift_time, depth, waves."""
     noise: dict[str, float] = Field(default_factory=dict)
     """Arguments of `finssim.tasks.MeasurementNoise` [m, rad, m/s, rad/s]."""
-    extra_time_constant: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+    extra_time_constant: float = Field(default=0.0, ge=0.0, le=LONGEST_LAG, allow_inf_nan=False)
     """Added to every thruster's [s]."""
-    extra_delay: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+    extra_delay: float = Field(default=0.0, ge=0.0, le=LONGEST_LAG, allow_inf_nan=False)
     """Added to every thruster's [s]."""
     vehicle: dict[str, Any] = Field(default_factory=dict)
     """Dotted path in the vehicle file -> another value, such as body.mass: 12.5."""

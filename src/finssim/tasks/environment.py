@@ -21,6 +21,9 @@ from finssim.vehicles import Vehicle, load_vehicle
 GPU_FROZEN_CHECK = 100
 """Steps between looks for frozen worlds on a GPU."""
 
+GREATEST_SEED = 2**31 - 1
+"""Kernels take seeds as 32-bit integers."""
+
 
 class EnvironmentSetupError(ValueError):
     """An environment that cannot be set up, or an action it cannot take."""
@@ -88,11 +91,14 @@ class Environment:
             integrator: euler or rk4.
             device: cpu or cuda.
             threads: Threads on a CPU.
-            seed: Of goals, starts, randomisation and noise.
+            seed: Of goals, starts, randomisation and noise; 0 to 2³¹ - 1.
             crash_directory: Where the last states of a world that froze are written.
             auto_reset: Start a new episode where one ended, in the same step.
+
+        Raises:
+            EnvironmentSetupError: unknown action mode, or a seed out of range.
         """
-        self.task, self.action_mode, self.seed = task, action, int(seed)
+        self.task, self.action_mode, self.seed = task, action, _checked_seed(seed)
         self.crash_directory, self.auto_reset = crash_directory, auto_reset
         if action not in ACTION_MODES:
             raise EnvironmentSetupError(
@@ -176,9 +182,12 @@ class Environment:
 
         Returns:
             Observations, (worlds, size).
+
+        Raises:
+            EnvironmentSetupError: the seed is out of range.
         """
         if seed is not None:
-            if int(seed) != self.seed:
+            if _checked_seed(seed) != self.seed:
                 self.seed = self.simulator.seed = int(seed)
                 self._build()
             self.simulator.state.episode.zero_()
@@ -271,3 +280,10 @@ class Environment:
             a.observation.numpy(), a.reward.numpy(), a.terminated.numpy() != 0, a.truncated.numpy() != 0,
             a.final_observation.numpy(),
         )  # fmt: skip
+
+
+def _checked_seed(seed: int) -> int:
+    """The seed, if the kernels can take it."""
+    if not 0 <= seed <= GREATEST_SEED:
+        raise EnvironmentSetupError(f"seed is {seed}, expected 0 to {GREATEST_SEED}")
+    return int(seed)
