@@ -28,7 +28,7 @@ ARROWS = {
 }
 """Layer -> the layers right below it. A layer may import everything below."""
 
-FOUNDATION = {"", "files", "provenance", "quiet"}
+FOUNDATION = {"", "files", "provenance", "quiet", "yaml_file"}
 """Modules that every layer may import and that import no layer; "" is the package itself."""
 
 TOP = {"experiments", "viewer", "cli", "cli_options", "doctor", "boundary", "__main__"}

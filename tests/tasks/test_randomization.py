@@ -212,7 +212,7 @@ def test_ranges_of_one_change_nothing():
         ("mass: [.nan, 1]", "expected two finite numbers"),
         ("masse: [1, 1]", "ranges.yaml: masse: Extra inputs"),
         ("added_mass: {axes: {sorge: [1, 1]}}", "added_mass.axes.sorge"),
-        ("[1, 2", "ranges.yaml: not valid YAML"),
+        ("[1, 2", "ranges.yaml: line .: not valid YAML"),
         ("- 1", "ranges.yaml: expected keys"),
     ],
 )

@@ -80,6 +80,22 @@ REFUSALS = {
         "axis: [0, 1]",
         "thrusters.up: axis has shape (2,), expected 3 numbers [x, y, z]",
     ),
+    "nan without origin": (
+        "origin: measured\nsource: kitchen scale\n\nwater: {density: 1000.0,",
+        "water: {density: .nan,",
+        "water: density is nan, expected a finite number",
+    ),
+    "infinity without origin": (
+        "origin: measured\nsource: kitchen scale\n\nwater: {density: 1000.0,",
+        "water: {density: -.inf,",
+        "water: density is -inf, expected a finite number",
+    ),
+    "extends a number": (
+        "title: Minnow",
+        "title: Minnow\nextends: 5",
+        "extends is 5, expected the name or path of a vehicle, such as finsrov",
+    ),
+    "list as a key": ("title: Minnow", "[a, b]: Minnow", "line 1: not valid YAML: "),
     "negative mass": ("mass: 11.2", "mass: -11.2", "body: mass is -11.2, expected > 0"),
     "mass not a number": ("mass: 11.2", "mass: heavy", "body: mass is 'heavy', expected a number"),
     "mass nan": ("mass: 11.2", "mass: .nan", "body: mass is nan, expected a finite number"),

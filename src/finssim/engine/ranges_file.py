@@ -3,10 +3,11 @@
 import difflib
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+from finssim.yaml_file import read_mapping
 
 SHIPPED = Path(__file__).parent / "ranges"
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
@@ -117,14 +118,9 @@ def load_ranges(name_or_path: str | Path) -> Ranges:
         raise RangesError(
             f"no ranges '{name_or_path}': give a YAML file or one of {', '.join(available())}{hint}"
         )
+    data = read_mapping(path, RangesError, such_as="mass: [0.98, 1.02]")
     try:
-        data: Any = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
-        raise RangesError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(data, dict):
-        raise RangesError(f"{path}: expected keys such as 'mass: [0.98, 1.02]', found {type(data).__name__}")
-    try:
-        return Ranges(**{"name": path.stem, **data})
+        return Ranges.model_validate({"name": path.stem, **data})
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(x) for x in first["loc"])

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from finssim.engine import Water
@@ -17,6 +16,7 @@ from finssim.engine.ranges_file import Ranges, load_ranges
 from finssim.engine.surroundings import Wave
 from finssim.tasks import MeasurementNoise
 from finssim.vehicles import Vehicle
+from finssim.yaml_file import read_mapping
 
 __all__ = ["Plant", "PlantError", "available_plants", "load_plant"]
 
@@ -111,14 +111,9 @@ def load_plant(name_or_path: str | Path) -> Plant:
         hint = f"; did you mean '{close[0]}'?" if close else ""
         known = ", ".join(available_plants())
         raise PlantError(f"no plant '{name_or_path}': give a YAML file or one of {known}{hint}")
+    data = read_mapping(path, PlantError, such_as="hydrodynamics: mesh")
     try:
-        data: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise PlantError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(data, dict):
-        raise PlantError(f"{path}: expected keys such as 'hydrodynamics: mesh', found {type(data).__name__}")
-    try:
-        return Plant(**{"name": path.stem, **data})
+        return Plant.model_validate({"name": path.stem, **data})
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(x) for x in first["loc"])

@@ -2,49 +2,16 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Hashable
+import math
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from finssim.vehicles.errors import VehicleError
 from finssim.vehicles.part import did_you_mean
 from finssim.vehicles.vehicle import ORIGINS, Provenance
+from finssim.yaml_file import read_mapping
 
 _MARKS = ("origin", "source", "note")
-
-
-class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """YAML 1.2 scalars (`1e-5` is a number, `on` is a word) and no silently repeated keys."""
-
-    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        seen: set[Any] = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if key in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"key '{key}' is given twice", key_node.start_mark
-                )
-            seen.add(key)
-        return super().construct_mapping(node, deep)  # type: ignore[no-any-return]
-
-
-_Loader.add_implicit_resolver("tag:yaml.org,2002:null", re.compile(r"^(?:~|null|)$"), ["~", "n", ""])
-_Loader.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile(r"^(?:true|false)$"), list("tf"))
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:int", re.compile(r"^[-+]?(?:0|[1-9][0-9]*)$"), list("-+0123456789")
-)
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(
-        r"^(?:[-+]?(?:\.[0-9]+|[0-9]+\.?[0-9]*)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
-    ),
-    list("-+0123456789."),
-)
 
 
 def read_file(path: Path, shown: str) -> tuple[dict[str, Any], dict[str, Provenance]]:
@@ -57,18 +24,10 @@ def read_file(path: Path, shown: str) -> tuple[dict[str, Any], dict[str, Provena
     Raises:
         VehicleError: Unreadable, malformed, or a number without an origin.
     """
-    try:
-        tree = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
-    except (OSError, UnicodeDecodeError) as error:
-        raise VehicleError(f"{shown}: cannot be read: {error}") from None
-    except yaml.MarkedYAMLError as error:
-        line = f" line {error.problem_mark.line + 1}:" if error.problem_mark else ""
-        raise VehicleError(f"{shown}:{line} not valid YAML: {error.problem}: correct that line") from None
-    except yaml.YAMLError as error:
-        raise VehicleError(f"{shown}: not valid YAML: {error}") from None
-    if not isinstance(tree, dict):
+    tree = read_mapping(path, VehicleError, such_as="body: {mass: 11.2}", shown=shown)
+    if not isinstance(tree.get("extends"), str | None):
         raise VehicleError(
-            f"{shown}: holds {type(tree).__name__}, expected sections such as 'body:' and 'thrusters:'"
+            f"{shown}: extends is {tree['extends']!r}, expected the name or path of a vehicle, such as finsrov"
         )
     provenance: dict[str, Provenance] = {}
     values = _plain(tree, (), None, provenance, shown)
@@ -97,6 +56,10 @@ def _plain(
         return items
     if isinstance(node, (int, float)) and not isinstance(node, bool):
         if inherited is None:
+            if not math.isfinite(node):
+                raise VehicleError(
+                    f"{shown}: {_where(path[:-1])}: {path[-1]} is {node}, expected a finite number"
+                )
             raise VehicleError(
                 f"{shown}: {_where(path[:-1])}: {path[-1]} has no origin: write "
                 f"{{value: {node}, origin: measured, source: ...}} or give 'origin:' to its section or to the file"
