@@ -246,6 +246,22 @@ def test_a_variant_replaces_lists_merges_sections_and_removes_with_null(tmp_path
     assert vehicle.origin_of("body.displaced_volume").origin == "measured"
 
 
+def test_a_variant_exchanges_one_kind_of_hull_for_the_other(tmp_path):
+    """A given file drops the inherited `parametric`; `parametric: true` drops the inherited file and its scale."""
+    vertices, faces = parametric_hull([0.5, 0.4, 0.3], 0.0113, [0.0, 0.0, 0.02])
+    write_stl(tmp_path / "hull.stl", 1000.0 * vertices, faces)
+    load(tmp_path, MINNOW + "hull: {parametric: true}\n")
+    head = "origin: guessed\nhull: "
+    scanned = load(tmp_path, f"extends: minnow\n{head}{{file: hull.stl, scale: 0.001}}\n", "scanned.yaml")
+    assert scanned.hull.file == (tmp_path / "hull.stl").resolve() and not scanned.hull.parametric
+    np.testing.assert_allclose(np.ptp(scanned.hull_mesh()[0], axis=0), np.ptp(vertices, axis=0), rtol=1e-6)
+    back = load(tmp_path, f"extends: scanned\n{head}{{parametric: true}}\n", "back.yaml")
+    assert back.hull.values() == {"parametric": True}
+    assert not [key for key in back.provenance if key.startswith("hull")]
+    with pytest.raises(VehicleError, match="hull: expected either"):
+        load(tmp_path, f"extends: minnow\n{head}{{parametric: true, file: hull.stl}}\n", "both.yaml")
+
+
 def test_a_variant_of_a_group_reaches_the_thrusters_of_the_base(tmp_path):
     load(tmp_path, MINNOW)
     vehicle = load(

@@ -95,8 +95,6 @@ def _with_parents(path: Path, shown: str, children: tuple[Path, ...]) -> tuple[T
     parent = values.pop("extends", None)
     if parent is None:
         return values, origins
-    if not isinstance(parent, str):
-        raise VehicleError(f"{shown}: extends is {parent!r}, expected the name or path of a vehicle")
     try:
         parent_path, parent_shown = _locate(parent, beside=path.parent)
     except VehicleError as error:
@@ -109,6 +107,9 @@ def _merged(base: Any, change: Any, path: tuple[str, ...], origins: Origins) -> 
     """`change` laid over `base`: sections merge, everything else replaces, null removes."""
     if isinstance(base, dict) and isinstance(change, dict):
         result = dict(base)
+        for key in _replaced_hull(change) if path == ("hull",) else ():
+            result.pop(key, None)
+            _forget((*path, key), origins)
         for key, value in change.items():
             inner = (*path, key)
             if value is None:
@@ -119,6 +120,13 @@ def _merged(base: Any, change: Any, path: tuple[str, ...], origins: Origins) -> 
         return result
     _forget(path, origins)
     return change
+
+
+def _replaced_hull(change: Tree) -> tuple[str, ...]:
+    """Inherited keys of a hull that a new one does not keep: it is parametric or from a file, never both."""
+    if change.get("file") is not None:
+        return ("parametric",)
+    return ("file", "scale") if change.get("parametric") is True else ()
 
 
 def _forget(path: tuple[str, ...], origins: Origins) -> None:
