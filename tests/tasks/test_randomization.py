@@ -208,7 +208,7 @@ def test_ranges_of_one_change_nothing():
             "mass: [1.2, 0.8]",
             r"ranges.yaml: mass: is \[1.2, 0.8\], expected two finite numbers \[low, high\]",
         ),
-        ("mass: [-1, 1]", "expected numbers of 0 or more"),
+        ("mass: [-1, 1]", "expected numbers above 0"),
         ("mass: [.nan, 1]", "expected two finite numbers"),
         ("masse: [1, 1]", "ranges.yaml: masse: Extra inputs"),
         ("added_mass: {axes: {sorge: [1, 1]}}", "added_mass.axes.sorge"),

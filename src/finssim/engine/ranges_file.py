@@ -3,14 +3,25 @@
 import difflib
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
+from finssim.engine.surroundings import SurroundingsError, Wave
 from finssim.yaml_file import read_mapping
 
 SHIPPED = Path(__file__).parent / "ranges"
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+MOST_WAVES = 8
+"""Most waves that may be drawn for a world: every one costs time in every step."""
 
 
 class RangesError(ValueError):
@@ -29,8 +40,38 @@ def _positive(pair: tuple[float, float]) -> tuple[float, float]:
     return pair
 
 
+def _above_zero(pair: tuple[float, float]) -> tuple[float, float]:
+    if pair[0] <= 0.0:
+        raise ValueError(f"is {list(pair)}, expected numbers above 0")
+    return pair
+
+
+def _factor_or_with_mass(value: Any) -> Any:
+    if isinstance(value, str) and value != "with_mass":
+        raise ValueError(f"is '{value}', expected two numbers [low, high] or with_mass")
+    return value
+
+
+def _positive_or_with_mass(value: Any) -> Any:
+    return value if value == "with_mass" else _above_zero(_ordered(value))
+
+
+def _count(pair: tuple[int, int]) -> tuple[int, int]:
+    if not 0 <= pair[0] <= pair[1] <= MOST_WAVES:
+        raise ValueError(
+            f"is {list(pair)}, expected two whole numbers [low, high] with 0 <= low <= high <= {MOST_WAVES}"
+        )
+    return pair
+
+
 Interval = Annotated[tuple[float, float], AfterValidator(_ordered)]
 Scale = Annotated[Interval, AfterValidator(_positive)]
+Above0 = Annotated[Interval, AfterValidator(_above_zero)]
+Volume = Annotated[
+    tuple[float, float] | Literal["with_mass"],
+    BeforeValidator(_factor_or_with_mass),
+    AfterValidator(_positive_or_with_mass),
+]
 
 
 class Part(BaseModel):
@@ -61,11 +102,23 @@ class ThrustScales(Part):
 class WaveRanges(Part):
     """Waves of random number, size and direction; the period follows from the length and the depth."""
 
-    count: tuple[int, int]
+    count: Annotated[tuple[int, int], AfterValidator(_count)]
     amplitude: Scale
     """[m]"""
-    wavelength: Scale
+    wavelength: Above0
     """[m]"""
+
+    @model_validator(mode="after")
+    def _unbroken(self) -> Self:
+        highest, shortest = self.amplitude[1], self.wavelength[0]
+        try:
+            Wave(amplitude=highest, wavelength=shortest)
+        except SurroundingsError:
+            raise ValueError(
+                f"amplitude is {list(self.amplitude)}, expected less than 0.07 of the shortest wavelength, "
+                f"{0.07 * shortest:.3g} m here: a linear wave breaks above it"
+            ) from None
+        return self
 
 
 class Ranges(Part):
@@ -73,10 +126,10 @@ class Ranges(Part):
 
     name: str
     source: str = ""
-    mass: Scale = (1.0, 1.0)
-    volume: Scale | Literal["with_mass"] = (1.0, 1.0)
+    mass: Above0 = (1.0, 1.0)
+    volume: Volume = (1.0, 1.0)
     """A factor, or `with_mass`: the volume follows the mass, so that the trim is kept."""
-    inertia: Scale = (1.0, 1.0)
+    inertia: Above0 = (1.0, 1.0)
     center_of_gravity: Interval = (0.0, 0.0)
     """Offset along each axis [m]."""
     center_of_buoyancy: Interval = (0.0, 0.0)
@@ -123,6 +176,6 @@ def load_ranges(name_or_path: str | Path) -> Ranges:
         return Ranges.model_validate({"name": path.stem, **data})
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(str(x) for x in first["loc"])
+        where = ".".join(str(x) for x in first["loc"] if "[" not in str(x))  # not pydantic's names of types
         message = first["msg"].removeprefix("Value error, ")
         raise RangesError(f"{path}: {where}: {message}") from None
