@@ -69,7 +69,9 @@ def demo(
 @app.command()
 def train(
     task: Annotated[str, typer.Argument(help="Task to learn: t1 (station keeping).", metavar="TASK")],
-    out: Annotated[Path, typer.Option(help="Directory of the policy; an earlier policy there is replaced.")],
+    out: Annotated[
+        Path, typer.Option(help="Directory of the policy; an earlier policy there is replaced when done.")
+    ],
     vehicle: Vehicle = "finsrov",
     hydrodynamics: Hydrodynamics = "calibrated",
     action: Annotated[

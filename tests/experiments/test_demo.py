@@ -5,8 +5,11 @@ import re
 
 import pytest
 
+from finssim.control.policy import Policy
+from finssim.experiments import demo as demo_module
 from finssim.experiments.demo import demo
 from finssim.files import OutputError
+from finssim.learning import ppo
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +45,32 @@ def test_the_report_has_every_controller_the_paper_and_the_provenance(folder):
     for word in ("<td>policy</td>", "<td>pid</td>", "<td>pid-paper</td>", "paper: PID", "P08", "Provenance"):
         assert word in html
     assert policy["vehicle"]["sha256"] in html and str(policy["provenance"]["revision"]) in html
+
+
+def interrupt(*_, **__):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("when", ["training", "evaluation"])
+def test_an_interrupted_demonstration_keeps_its_policy_where_it_says(tmp_path, monkeypatch, capsys, when):
+    """Ctrl-C in the second rollout, or in the evaluation: a whole policy beside the demonstration, and nothing else."""
+    record = ppo._Watch._on_rollout_end
+
+    def stop(self):
+        record(self)
+        if len(self.curves) == 2:
+            raise KeyboardInterrupt
+
+    if when == "training":
+        monkeypatch.setattr(ppo._Watch, "_on_rollout_end", stop)
+    else:
+        monkeypatch.setattr(demo_module, "evaluate_controller", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        demo(tmp_path / "demo", steps=100_000 if when == "training" else 8192)
+    kept = tmp_path / "demo-training" / "interrupted"
+    assert Policy.load(kept).description.training["complete"] is (when == "evaluation")
+    assert f": {kept}" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["demo-training"]
 
 
 def test_somebodys_files_are_not_replaced(tmp_path):

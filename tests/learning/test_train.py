@@ -2,6 +2,7 @@
 
 import csv
 import hashlib
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -90,20 +91,50 @@ def test_options_reach_the_policy(tmp_path):
     assert told.hydrodynamics == "simplified" and told.training["randomization"]["mass"] == [0.98, 1.02]
 
 
-def test_an_interrupted_training_writes_the_policy_so_far(tmp_path, monkeypatch):
-    """Ctrl-C in the third update: a whole policy directory, that says so, then the interrupt goes on."""
+def interrupt_after(rollouts, monkeypatch):
+    """Ctrl-C at the end of that rollout, before the update that follows it."""
     record = ppo._Watch._on_rollout_end
 
     def interrupt(self):
         record(self)
-        if len(self.curves) == 3:
+        if len(self.curves) == rollouts:
             raise KeyboardInterrupt
 
     monkeypatch.setattr(ppo._Watch, "_on_rollout_end", interrupt)
+
+
+def test_an_interrupted_training_writes_the_policy_so_far(tmp_path, monkeypatch):
+    """Ctrl-C in the third update: a whole policy directory, that says so, then the interrupt goes on."""
+    interrupt_after(3, monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         train("t1", out=tmp_path / "p", worlds=16, steps=100_000)
     told = Policy.load(tmp_path / "p").description.training
     assert told["complete"] is False and told["steps_done"] == 3 * 8192
+
+
+def test_an_interrupted_training_leaves_an_earlier_policy_alone(trained, tmp_path, monkeypatch, capsys):
+    """The policy so far goes beside it, which is said; a finished training replaces it as ever."""
+    out = tmp_path / "p"
+    shutil.copytree(trained, out)
+    interrupt_after(2, monkeypatch)
+    with pytest.raises(KeyboardInterrupt):
+        train("t1", out=out, worlds=16, steps=100_000)
+    kept = tmp_path / "p-training" / "interrupted"
+    assert network(out) == network(trained) and Policy.load(out).description.training["complete"] is True
+    assert Policy.load(kept).description.training["complete"] is False
+    assert f"policy so far: {kept}" in capsys.readouterr().err
+
+
+def test_a_training_interrupted_before_it_learned_writes_no_policy(trained, tmp_path, monkeypatch, capsys):
+    """Neither anew nor over an earlier one: the network would be the random one that it started as."""
+    interrupt_after(1, monkeypatch)
+    shutil.copytree(trained, tmp_path / "earlier")
+    for name in ("new", "earlier"):
+        with pytest.raises(KeyboardInterrupt):
+            train("t1", out=tmp_path / name, worlds=16, steps=100_000)
+        assert "no policy: interrupted before anything was learned" in capsys.readouterr().err
+        assert not list((tmp_path / f"{name}-training").rglob("policy.yaml"))
+    assert not (tmp_path / "new").exists() and network(tmp_path / "earlier") == network(trained)
 
 
 def test_checkpoints_are_policies(tmp_path, monkeypatch):

@@ -5,14 +5,18 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import sys
 import time
 import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
+from finssim.control.policy_description import DESCRIPTION_FILE
 from finssim.experiments.evaluate import Evaluation, evaluate_controller
 from finssim.experiments.plants import load_plant
 from finssim.experiments.results_table import print_comparison
@@ -37,9 +41,13 @@ def demo(out: Path, *, steps: int | None = None, seed: int = SEED, console: Cons
 
     Returns:
         Path of the report.
+
+    Raises:
+        KeyboardInterrupt: After Ctrl-C. The policy so far is then in `OUT-training/interrupted`, and `out` as it was.
     """
     began = time.perf_counter()
     console = console or Console(stderr=True)
+    rescue = out.with_name(f"{out.name}-training") / "interrupted"
     with atomic_directory(out, replaces=REPORT_FILE) as folder:
         policy = train(
             TASK,
@@ -49,20 +57,34 @@ def demo(out: Path, *, steps: int | None = None, seed: int = SEED, console: Cons
             steps=steps,
             console=console,
             shown=out / "policy",
+            interrupted=rescue,
         )
         training = {"seconds": time.perf_counter() - began, "seed": seed, "task": TASK, "vehicle": VEHICLE}
         plant = load_plant("nominal")
-        evaluations = [
-            evaluate_controller(controller, plant, task=TASK, vehicle=VEHICLE)
-            for controller in (policy, "pid", "pid-paper")
-        ]
-        _write(folder, evaluations, policy, training)
+        with _rescued(policy, rescue, console):
+            evaluations = [
+                evaluate_controller(controller, plant, task=TASK, vehicle=VEHICLE)
+                for controller in (policy, "pid", "pid-paper")
+            ]
+            _write(folder, evaluations, policy, training)
     print_comparison([e.result for e in evaluations], Console())
     report = Path(out) / REPORT_FILE
     print(f"report: {report}")
     if _has_display():
         webbrowser.open(report.resolve().as_uri())
     return report
+
+
+@contextmanager
+def _rescued(policy: Path, rescue: Path, console: Console) -> Iterator[None]:
+    """Keep a trained policy when what follows its training is interrupted, and `folder` goes."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        with atomic_directory(rescue, replaces=DESCRIPTION_FILE) as copy:
+            shutil.copytree(policy, copy, dirs_exist_ok=True)
+        console.print(f"policy kept: {rescue}", highlight=False, soft_wrap=True)
+        raise
 
 
 def _write(folder: Path, evaluations: list[Evaluation], policy: Path, training: dict[str, Any]) -> None:

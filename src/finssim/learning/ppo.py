@@ -79,6 +79,8 @@ class Run:
     """A row for every update: steps, wall time, mean return, ..."""
     interrupted: bool
     """Whether it was stopped before its time, by Ctrl-C."""
+    learned: bool
+    """Whether the network was updated at all."""
 
 
 def train_ppo(
@@ -133,7 +135,7 @@ def train_ppo(
         interrupted = True
     finally:
         model.logger.close()
-    return Run(_network(model), watch.curves, interrupted)
+    return Run(_network(model), watch.curves, interrupted, learned=model._n_updates > 0)
 
 
 def _network(model: PPO) -> nn.Module:

@@ -43,6 +43,7 @@ def train(
     device: str = "cpu",
     console: Console | None = None,
     shown: Path | None = None,
+    interrupted: Path | None = None,
 ) -> Path:
     """Train a policy and write its directory.
 
@@ -61,13 +62,15 @@ def train(
         device: cpu or cuda.
         console: Where progress is shown; standard error if None.
         shown: Name of the directory in messages, where `out` is a temporary one.
+        interrupted: Where the policy so far goes after Ctrl-C; if None, `out`, or `OUT-training/interrupted` where
+            `out` holds an earlier policy.
 
     Returns:
         The policy directory.
 
     Raises:
         TrainingError: Unknown task, or numbers that do not fit.
-        KeyboardInterrupt: After Ctrl-C, when the policy so far has been written.
+        KeyboardInterrupt: After Ctrl-C, when the policy so far, if there is one, has been written.
     """
     console = console or Console(stderr=True)
     for name, number in (("worlds", worlds), ("steps", steps)):
@@ -141,16 +144,25 @@ def train(
             show=view.update,
             checkpoint=checkpoint,
         )
-    done = run.curves[-1]["steps"] if run.curves else 0
-    export_policy(run.network, out, _after(description, done, not run.interrupted), curves=run.curves)
+    place, what, where = Path(out), "policy", shown or Path(out)
+    if run.interrupted:
+        if not run.learned:
+            console.print("no policy: interrupted before anything was learned", soft_wrap=True)
+            raise KeyboardInterrupt
+        place = where = interrupted or _place_beside(place, side)
+        what = "policy so far"
+    done = run.curves[-1]["steps"]
+    export_policy(run.network, place, _after(description, done, not run.interrupted), curves=run.curves)
     took = time.perf_counter() - began
-    so_far = " so far" if run.interrupted else ""
-    console.print(
-        f"policy{so_far}: {shown or out}  ({done:,} steps in {took:.1f} s)", highlight=False, soft_wrap=True
-    )
+    console.print(f"{what}: {where}  ({done:,} steps in {took:.1f} s)", highlight=False, soft_wrap=True)
     if run.interrupted:
         raise KeyboardInterrupt
-    return Path(out)
+    return place
+
+
+def _place_beside(out: Path, side: Path) -> Path:
+    """Where an unfinished policy goes: a finished one that is there already must not be lost to it."""
+    return side / "interrupted" if (out / DESCRIPTION_FILE).is_file() else out
 
 
 def _after(description: PolicyDescription, steps: int, complete: bool) -> PolicyDescription:
