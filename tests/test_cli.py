@@ -181,6 +181,16 @@ def test_train_then_evaluate(capfd, tmp_path):
     assert (tmp_path / "result" / "error_envelope.png").stat().st_size > 0
 
 
+def test_evaluate_takes_several_plants(capfd):
+    """One object with one for each plant; one plant gives its object alone."""
+    words = ["evaluate", "pid", "--trials", "1", "--json", "--plant", "lag"]
+    assert finssim(*words) == 0
+    alone = json.loads(capfd.readouterr().out)
+    assert finssim(*words, "--plant", "nominal") == 0
+    plants = json.loads(capfd.readouterr().out)["plants"]
+    assert plants[0] == alone and [one["plant"]["name"] for one in plants] == ["lag", "nominal"]
+
+
 @pytest.mark.parametrize("controller", ["pid", "pid-paper"])
 def test_pids_are_controllers_like_any(capfd, controller):
     """Both PIDs are evaluated by name."""

@@ -122,18 +122,20 @@ def evaluate(
     vehicle: Vehicle = "finsrov",
     hydrodynamics: Hydrodynamics = "calibrated",
     plant: Annotated[
-        str | None,
+        list[str] | None,
         typer.Option(
-            help="What differs from the vehicle file: "
-            "current, lag, mesh, noise, randomised, simplified, waves, or a file.",
+            help="What differs from the vehicle file: nominal (nothing), current, lag, mesh, noise, "
+            "randomised, simplified, waves, or a file. May be given several times.",
             metavar="FILE|NAME",
         ),
     ] = None,
     trials: Annotated[
-        int | None, typer.Option(help="Trials of 60 s; 8 are the published setpoints.", min=1)
+        int | None, typer.Option(help="Trials of 60 s in each plant; 8 are the published setpoints.", min=1)
     ] = None,
     seed: Seed = 42,
-    out: Annotated[Path | None, typer.Option(help="Directory for the table, JSON and figure.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Directory for evaluation.json, the figure and trajectories.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Try a controller: success, errors [m, deg], time to settle [s], tracking cost.
@@ -148,7 +150,7 @@ def evaluate(
         task=task,
         vehicle=vehicle,
         hydrodynamics=hydrodynamics,
-        plant=plant,
+        plant=plant or "nominal",
         trials=trials,
         seed=seed,
         out=out,
@@ -168,7 +170,10 @@ def simulate(
     ],
     duration: Annotated[float, typer.Option(help="Simulated time [s].")],
     out: Annotated[
-        Path, typer.Option(help="Table to write, one row per control step of 0.1 s: a .csv file.")
+        Path,
+        typer.Option(
+            help="Table to write, one row per control step of 0.1 s: a .csv file. OUT.json tells its origin."
+        ),
     ],
     hydrodynamics: Hydrodynamics = "calibrated",
     depth: Annotated[float, typer.Option(help="Depth of the body origin at the start [m].")] = 5.0,

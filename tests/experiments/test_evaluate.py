@@ -141,7 +141,7 @@ def test_the_table_has_a_row_per_setpoint_all_and_the_papers(capsys):
 def test_a_directory_holds_result_figure_and_trajectories(tmp_path, capsys):
     """All open, agree with each other, and may be replaced by the next evaluation."""
     for _ in range(2):
-        evaluation = evaluate("pid", out=tmp_path / "e", json=True)
+        (evaluation,) = evaluate("pid", out=tmp_path / "e", json=True)
     stored = json.loads((tmp_path / "e" / "evaluation.json").read_text(encoding="utf-8"))
     assert stored == json.loads(capsys.readouterr().out.splitlines()[-1]) == evaluation.result
     assert (tmp_path / "e" / "error_envelope.png").read_bytes().startswith(b"\x89PNG")
@@ -149,6 +149,24 @@ def test_a_directory_holds_result_figure_and_trajectories(tmp_path, capsys):
     path = table[table.world == 4].sort_values("t")
     np.testing.assert_allclose(path[["x", "y", "z"]], evaluation.trials.position[:, 4], atol=1e-6)
     np.testing.assert_allclose(path.t, evaluation.trials.t, atol=1e-6)
+
+
+def test_several_plants_are_one_table_one_object_and_one_directory(tmp_path, capsys):
+    """A row for each plant; under `plants` the object that each gives alone; trajectories in folders of their names."""
+    plants = ["nominal", "simplified"]
+    evaluate("pid", plant=plants, console=Console(width=100), out=tmp_path / "e")
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines if "8/8" in line] == plants
+    assert any("paper, PID" in line for line in lines)
+    assert sorted(path.name for path in (tmp_path / "e" / "trajectories").iterdir()) == plants
+    assert len(read_run(tmp_path / "e" / "trajectories" / "simplified")) > 0
+    assert (tmp_path / "e" / "error_envelope.png").stat().st_size > 0
+
+    evaluate("pid", plant=plants, json=True)
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == json.loads((tmp_path / "e" / "evaluation.json").read_text(encoding="utf-8"))
+    assert list(printed) == ["plants"]
+    assert printed["plants"] == [evaluate_controller("pid", load_plant(name)).result for name in plants]
 
 
 def test_a_world_that_breaks_fails_its_trial_alone(tmp_path, monkeypatch):
@@ -195,6 +213,9 @@ def test_a_plant_may_change_what_a_policy_was_trained_for(policy, monkeypatch):
         ("pid", {"task": "t9"}, EvaluationError, "unknown task 't9'; available: t1"),
         ("pid", {"trials": 0}, EvaluationError, "trials is 0, expected 1 or more"),
         ("pid", {"plant": "pool"}, PlantError, "no plant 'pool'"),
+        ("pid", {"plant": ["lag", "pool"]}, PlantError, "no plant 'pool'"),
+        ("pid", {"plant": ["lag", "lag"]}, EvaluationError, "two plants are named 'lag'"),
+        ("pid", {"plant": []}, EvaluationError, "no plant is given"),
         ("pid", {"hydrodynamics": "fosen"}, ValueError, "unknown hydrodynamic model 'fosen'"),
     ],
 )
@@ -202,6 +223,14 @@ def test_what_cannot_be_evaluated_gets_its_sentence(controller, options, error, 
     with pytest.raises(error, match=sentence):
         evaluate(controller, out=tmp_path / "e", **options)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_plant_that_cannot_name_a_folder_is_refused_among_several(tmp_path):
+    """Its trajectories would be written elsewhere."""
+    for name in ("../x", "..", ""):
+        (tmp_path / "plant.yaml").write_text(f"name: '{name}'\n", encoding="utf-8")
+        with pytest.raises(EvaluationError, match="cannot name a folder"):
+            evaluate("pid", plant=["lag", tmp_path / "plant.yaml"], out=tmp_path / "e")
 
 
 def test_an_unknown_controller_is_taken_for_a_directory():

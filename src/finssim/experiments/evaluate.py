@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_module
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from rich.progress import Progress
 from finssim.experiments.metrics import summarize
 from finssim.experiments.plants import Plant, load_plant
 from finssim.experiments.players import make_player
-from finssim.experiments.results_table import print_results
+from finssim.experiments.results_table import print_plants, print_results
 from finssim.experiments.setpoints import T1_SETPOINTS
 from finssim.experiments.trials import Trials, run_trials
 from finssim.files import atomic_directory
@@ -55,31 +56,34 @@ def evaluate(
     task: str = "t1",
     vehicle: str | Vehicle = "finsrov",
     hydrodynamics: str = "calibrated",
-    plant: str | Path | None = None,
+    plant: str | Path | Sequence[str | Path] = "nominal",
     trials: int | None = None,
     seed: int = 42,
     out: Path | None = None,
     json: bool = False,
     console: Console | None = None,
-) -> Evaluation:
-    """Run the trials, print the table (or one JSON object) and write the directory.
+) -> list[Evaluation]:
+    """Run the trials in every plant, print the table (or one JSON object) and write the directory.
 
     Args:
         controller: A policy directory, pid or pid-paper.
         task: Key of `TASKS`.
         vehicle: A vehicle, a catalogue name or a file.
         hydrodynamics: Model, unless the plant names one.
-        plant: Name or file; nominal if None.
-        trials: How many; the eight setpoints once if None.
+        plant: Name or file, or several.
+        trials: How many in each plant; the eight setpoints once if None.
         seed: Of what the plant draws.
         out: Directory for `evaluation.json`, the figure and the trajectories; an earlier evaluation is replaced.
         json: Print the result in place of the table.
         console: Where the table goes; standard output if None.
 
+    Returns:
+        One evaluation for each plant, in their order.
+
     Raises:
         EvaluationError, PolicyError, ControlError, PlantError, VehicleError, OutputError: As they say.
     """
-    chosen = load_plant("nominal" if plant is None else plant)
+    plants = _plants([plant] if isinstance(plant, str | Path) else plant)
     count = len(T1_SETPOINTS) if trials is None else trials
     options: dict[str, Any] = {
         "task": task,
@@ -89,19 +93,47 @@ def evaluate(
         "seed": seed,
     }
     if out is None:
-        evaluation = evaluate_controller(controller, chosen, **options)
+        evaluations = [evaluate_controller(controller, one, **options) for one in plants]
     else:
         with atomic_directory(out, replaces=EVALUATION_FILE) as folder:
-            evaluation = evaluate_controller(controller, chosen, record=folder / TRAJECTORIES, **options)
-            _write(evaluation, folder)
+            records = folder / TRAJECTORIES
+            evaluations = [
+                evaluate_controller(
+                    controller, one, record=records / one.name if len(plants) > 1 else records, **options
+                )
+                for one in plants
+            ]
+            _write(evaluations, folder)
     if json:
-        print(json_module.dumps(evaluation.result, allow_nan=False))
-        return evaluation
+        print(json_module.dumps(_document(evaluations), allow_nan=False))
+        return evaluations
     console = console or Console()
-    print_results(evaluation.result, console)
+    if len(evaluations) == 1:
+        print_results(evaluations[0].result, console)
+    else:
+        print_plants([evaluation.result for evaluation in evaluations], console)
     if out is not None:
         console.print(f"written: {out}", highlight=False, soft_wrap=True)
-    return evaluation
+    return evaluations
+
+
+def _plants(names: Sequence[str | Path]) -> list[Plant]:
+    """The plants; each must have a name of its own, under which its results are told apart."""
+    if not names:
+        raise EvaluationError("no plant is given: name at least one, such as 'nominal'")
+    plants = [load_plant(name) for name in names]
+    for i, plant in enumerate(plants):
+        if plant.name in (earlier.name for earlier in plants[:i]):
+            raise EvaluationError(f"two plants are named '{plant.name}': give each once, or rename one file")
+        if len(plants) > 1 and (plant.name in ("", "..") or Path(plant.name).name != plant.name):
+            raise EvaluationError(f"plant '{plant.name}' cannot name a folder: rename it")
+    return plants
+
+
+def _document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
+    """What is printed and stored: the object of one plant, or those of several under `plants`."""
+    results = [evaluation.result for evaluation in evaluations]
+    return results[0] if len(results) == 1 else {"plants": results}
 
 
 def evaluate_controller(
@@ -151,13 +183,14 @@ def evaluate_controller(
     return Evaluation(result, done)
 
 
-def _write(evaluation: Evaluation, folder: Path) -> None:
+def _write(evaluations: Sequence[Evaluation], folder: Path) -> None:
     from finssim.experiments.envelope import error_envelope, save_envelopes
 
-    text = json_module.dumps(evaluation.result, indent=2, allow_nan=False) + "\n"
+    text = json_module.dumps(_document(evaluations), indent=2, allow_nan=False) + "\n"
     (folder / EVALUATION_FILE).write_text(text, encoding="utf-8")
-    trials = evaluation.trials
-    envelope = error_envelope([trials.series(i) for i in range(len(trials.setpoints))])
-    save_envelopes(
-        {evaluation.label: envelope}, folder / FIGURE_FILE, evaluation.result["plant"].get("title", "")
-    )
+    envelopes = {
+        e.label: error_envelope([e.trials.series(i) for i in range(len(e.trials.setpoints))])
+        for e in evaluations
+    }
+    title = evaluations[0].result["plant"].get("title", "") if len(evaluations) == 1 else ""
+    save_envelopes(envelopes, folder / FIGURE_FILE, title)

@@ -12,7 +12,7 @@ from rich.table import Table
 from finssim.experiments.metrics import summarize
 from finssim.experiments.paper_results import paper_row
 
-__all__ = ["COLUMNS", "cells", "paper_name", "print_comparison", "print_results"]
+__all__ = ["COLUMNS", "cells", "paper_name", "print_comparison", "print_plants", "print_results"]
 
 COLUMNS = {
     "success": "success",
@@ -76,16 +76,25 @@ def print_results(result: Mapping[str, Any], console: Console) -> None:
     console.print(table)
 
 
-def print_comparison(results: Sequence[Mapping[str, Any]], console: Console) -> None:
-    """Print a row for each evaluation, and the paper's rows that answer to them."""
+def print_plants(results: Sequence[Mapping[str, Any]], console: Console) -> None:
+    """Print a row for each plant that one controller was evaluated in, and the paper's rows."""
+    first = results[0]
+    console.print(
+        f"{first['task']} · {first['controller']['name']} · {first['vehicle']['name']}", highlight=False
+    )
+    print_comparison(results, console, by="plant")
+
+
+def print_comparison(results: Sequence[Mapping[str, Any]], console: Console, by: str = "controller") -> None:
+    """Print a row for each evaluation, named by its controller or plant, and the paper's rows that answer to them."""
     table = Table(
         caption=f"{CAPTION} paper: its real vehicle in its pool.", caption_justify="left", box=box.SIMPLE_HEAD
     )
-    table.add_column("controller", no_wrap=True)
+    table.add_column(by, no_wrap=True)
     for heading in COLUMNS.values():
         table.add_column(heading, justify="right")
     for result in results:
-        table.add_row(result["controller"]["name"], *cells(result))
+        table.add_row(result[by]["name"], *cells(result))
     table.add_section()
     for name in dict.fromkeys(paper_name(result) for result in results):
         table.add_row(f"paper, {name}", *cells(paper_row(name)), style="dim")

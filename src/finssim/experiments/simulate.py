@@ -128,4 +128,4 @@ def _print(
     place = [*(f"{x:.2f}" for x in last[1:4]), *(f"{x:.1f}" for x in angles_deg)]
     table.add_row("place " + escape("[m, deg]"), *place)
     console.print(table)
-    console.print(f"written: {out}", highlight=False, markup=False)
+    console.print(f"written: {out} and {out}.json", highlight=False, markup=False)
