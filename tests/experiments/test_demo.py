@@ -44,6 +44,7 @@ def test_the_report_has_every_controller_the_paper_and_the_provenance(folder):
     policy = json.loads((folder / "policy.json").read_text(encoding="utf-8"))
     for word in ("<td>policy</td>", "<td>pid</td>", "<td>pid-paper</td>", "paper: PID", "P08", "Provenance"):
         assert word in html
+    assert "finssim train t1 --vehicle finsrov --seed 1 --steps 8192 --out policy" in html
     assert policy["vehicle"]["sha256"] in html and str(policy["provenance"]["revision"]) in html
 
 

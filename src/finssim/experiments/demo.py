@@ -16,6 +16,7 @@ from typing import Any
 
 from rich.console import Console
 
+from finssim.control.policy import Policy
 from finssim.control.policy_description import DESCRIPTION_FILE
 from finssim.experiments.evaluate import Evaluation, evaluate_controller
 from finssim.experiments.plants import load_plant
@@ -59,7 +60,13 @@ def demo(out: Path, *, steps: int | None = None, seed: int = SEED, console: Cons
             shown=out / "policy",
             interrupted=rescue,
         )
-        training = {"seconds": time.perf_counter() - began, "seed": seed, "task": TASK, "vehicle": VEHICLE}
+        training = {
+            "seconds": time.perf_counter() - began,
+            "seed": seed,
+            "steps": Policy.load(policy).description.training["steps"],
+            "task": TASK,
+            "vehicle": VEHICLE,
+        }
         plant = load_plant("nominal")
         with _rescued(policy, rescue, console):
             evaluations = [

@@ -50,7 +50,7 @@ def report_html(
     Args:
         evaluations: The policy first, then what it is compared with, all on the same trials.
         curves: Rows of the policy's `curves.csv`.
-        training: `seconds` (from start to written policy), `seed`, `task`, `vehicle`.
+        training: `seconds` (from start to written policy), `seed`, `steps`, `task`, `vehicle`.
     """
     policy = evaluations[0]
     result = policy.result
@@ -132,7 +132,8 @@ def _picture(figure: Figure, text: str) -> str:
 
 def _commands(training: Mapping[str, Any]) -> str:
     lines = [
-        f"finssim train {training['task']} --vehicle {training['vehicle']} --seed {training['seed']} --out policy",
+        f"finssim train {training['task']} --vehicle {training['vehicle']} --seed {training['seed']}"
+        f" --steps {training['steps']} --out policy",
         "finssim evaluate policy",
         "finssim evaluate pid",
         "finssim evaluate pid-paper",
