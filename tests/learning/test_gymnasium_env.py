@@ -100,3 +100,29 @@ def test_an_unknown_task_is_refused():
 
 def test_a_task_with_other_settings_is_taken():
     assert Env(replace(SHORT, time_limit=0.2)).environment.task.time_limit == 0.2
+
+
+def test_after_its_end_an_episode_goes_on_until_reset():
+    """Stepping further moves the same vehicle; every step is reported as truncated."""
+    env = Env(SHORT)
+    env.reset(seed=1)
+    ends = [env.step(np.ones(6, np.float32))[3] for _ in range(8)]
+    assert ends == [False] * 4 + [True] * 4
+    assert env.environment.simulator.state.steps.numpy().tolist() == [8]
+
+
+def test_a_world_that_breaks_has_started_over_when_step_returns(tmp_path):
+    """The last finite observation, reward 0, terminated; the next step is the new episode's first."""
+    env = Env("t1", crash_directory=tmp_path)
+    env.reset(seed=1)
+    still = np.zeros(6, np.float32)
+    last = env.step(still)[0]
+    velocity = env.environment.simulator.state.velocity
+    broken = velocity.numpy()
+    broken[0, 0, 0] = np.nan
+    velocity.assign(broken)
+    observation, reward, terminated, truncated, info = env.step(still)
+    np.testing.assert_array_equal(observation, last)
+    assert (reward, terminated, truncated, info["episode"]["l"]) == (0.0, True, False, 2)
+    assert env.environment.simulator.state.steps.numpy().tolist() == [0]
+    assert env.step(still)[2] is False
