@@ -32,9 +32,9 @@ def _task(task: str | Task) -> Task:
 class Env(gymnasium.Env[Any, Any]):
     """One world. An episode that ended is simulated further, if stepped, until `reset`.
 
-    A world in which a number stopped being finite reports its episode as terminated, with the last finite observation and
-    reward 0. On a CPU a new episode has begun there when `step` returns, and the rest of `info` is of that one; on a GPU it
-    may take up to 100 steps, each reported as terminated.
+    A world in which a number stopped being finite reports its episode as terminated, with the last finite observation
+    and reward 0. On a CPU a new episode has begun there when `step` returns, and the rest of `info` is of that one; on
+    a GPU it may take up to 100 steps, each reported as terminated.
 
     `info` holds, in SI units, `position_error` [m], `held` (time within the success tolerance without a break [s]) and,
     at the end, `episode` with its return `r` and length `l`.
