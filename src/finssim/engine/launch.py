@@ -16,37 +16,52 @@ MIN_SLICE = 64
 """Worlds below which a slice is not worth waking a thread for."""
 
 
+class _Job:
+    """One slice of one run: done when its event is set."""
+
+    def __init__(self, commands: list[wp.Launch]) -> None:
+        self.commands = commands
+        self.queued = False
+        self.done = threading.Event()
+        self.error: BaseException | None = None
+
+    def run(self) -> None:
+        if self.done.is_set():
+            return
+        try:
+            for command in self.commands:
+                command.launch()
+        except BaseException as error:
+            self.error = error
+        self.done.set()
+
+
 class _Worker(threading.Thread):
-    """A thread that runs one slice when asked."""
+    """A thread that runs slices, one after the other."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True, name="finssim-slice")
-        self._jobs: queue.SimpleQueue = queue.SimpleQueue()
-        self._done = threading.Semaphore(0)
-        self._error: BaseException | None = None
+        self.jobs: queue.SimpleQueue[_Job] = queue.SimpleQueue()
         self.start()
-
-    def submit(self, commands: list[wp.Launch]) -> None:
-        self._jobs.put(commands)
-
-    def wait(self) -> None:
-        self._done.acquire()
-        if self._error is not None:
-            error, self._error = self._error, None
-            raise error
 
     def run(self) -> None:
         while True:
-            try:
-                for command in self._jobs.get():
-                    command.launch()
-            except BaseException as error:
-                self._error = error
-            self._done.release()
+            self.jobs.get().run()
 
 
 _workers: list[_Worker] = []
 _pool_lock = threading.Lock()
+
+
+def _forget_workers() -> None:
+    """In a forked child: threads do not survive a fork, so the child makes its own when it needs them."""
+    global _pool_lock
+    _workers.clear()
+    _pool_lock = threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_workers)
 
 
 def default_threads() -> int:
@@ -112,10 +127,35 @@ class Pipeline:
         with _pool_lock:
             while len(_workers) < len(self._recorded) - 1:
                 _workers.append(_Worker())
-            used = _workers[: len(self._recorded) - 1]
-            for worker, commands in zip(used, self._recorded[1:], strict=True):
-                worker.submit(commands)
-            for command in self._recorded[0]:
-                command.launch()
-            for worker in used:
-                worker.wait()
+            jobs = [_Job(commands) for commands in self._recorded]
+            interrupt: BaseException | None = None
+            try:
+                for worker, job in zip(_workers, jobs[1:], strict=False):
+                    job.queued = True
+                    worker.jobs.put(job)
+                jobs[0].run()
+            except KeyboardInterrupt as error:
+                interrupt = error
+                for worker, job in zip(_workers, jobs[1:], strict=False):
+                    if job.queued:  # whether it came as far as the queue is not known; run twice, it does nothing
+                        worker.jobs.put(job)
+            interrupt = _finish(jobs) or interrupt
+        for failure in (interrupt, *(job.error for job in jobs)):
+            if failure is not None:
+                raise failure
+
+
+def _finish(jobs: list[_Job]) -> BaseException | None:
+    """Wait for all queued jobs, through Ctrl-C too; the interrupt, if there was one.
+
+    Worlds must not move on while somebody reads them, frees them or starts the next step.
+    """
+    interrupt: BaseException | None = None
+    while True:
+        try:
+            for job in jobs:
+                if job.queued:
+                    job.done.wait()
+            return interrupt
+        except KeyboardInterrupt as error:
+            interrupt = error

@@ -30,6 +30,10 @@ def write_post_mortem(simulator: "Simulator", world: int, directory: Path) -> Pa
     history = simulator.state.history.numpy()[:, world]
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / f"frozen-world{world}-episode{episode}.csv"
+    again = 2
+    while path.exists():  # an earlier run's
+        path = directory / f"frozen-world{world}-episode{episode}-{again}.csv"
+        again += 1
     with atomic_write(path) as temporary, open(temporary, "w") as file:
         file.write(",".join(COLUMNS) + "\n")
         for v in range(history.shape[1]):

@@ -44,6 +44,8 @@ class RangeArrays:
     delay: wp.vec2
     slew: wp.vec2
     current: wp.vec2
+    base_current: wp.vec3  # of the given water; what is drawn adds to it [m/s]
+    given_waves: int  # waves of the given water stay in the first slots
     wave_count: wp.vec2
     amplitude: wp.vec2
     wavelength: wp.vec2
@@ -155,7 +157,7 @@ def randomize_vehicles(
 def randomize_water(
     water: WaterArrays, r: RangeArrays, state: State, seed: int, mask: wp.array(dtype=int), world_offset: int
 ):
-    """Draw the current and the waves of the episode that starts, where mask is not 0."""
+    """Draw current and waves of the episode that starts, on top of the given water, where mask is not 0."""
     w = world_offset + wp.tid()
     if mask[w] == 0:
         return
@@ -163,12 +165,12 @@ def randomize_water(
     two_pi = 6.2831853
     speed = between(wp.randf(rng), r.current)
     direction = two_pi * wp.randf(rng)
-    water.current[w] = wp.vec3(speed * wp.cos(direction), speed * wp.sin(direction), 0.0)
+    water.current[w] = r.base_current + speed * wp.vec3(wp.cos(direction), wp.sin(direction), 0.0)
     count = int(between(wp.randf(rng), wp.vec2(r.wave_count[0], r.wave_count[1] + 0.999)))
-    for i in range(water.n_waves):
+    for i in range(r.given_waves, water.n_waves):
         k = two_pi / wp.max(between(wp.randf(rng), r.wavelength), 0.1)
         amplitude = between(wp.randf(rng), r.amplitude)
-        water.wave_amplitude[w, i] = wp.where(i < count, amplitude, 0.0)
+        water.wave_amplitude[w, i] = wp.where(i - r.given_waves < count, amplitude, 0.0)
         water.wave_number[w, i] = k
         water.wave_frequency[w, i] = wp.sqrt(water.gravity * k * wp.tanh(k * water.depth))
         water.wave_heading[w, i] = two_pi * wp.randf(rng)
@@ -199,6 +201,8 @@ class Randomization:
     def add(self, pipeline: Pipeline, simulator: "Simulator", mask: wp.array, seed: int) -> None:
         """Append the draw for the worlds where mask (by world, int32) is not 0; refresh the plant afterwards."""
         arrays = range_arrays(self.ranges)
+        given = simulator.surroundings[0]
+        arrays.base_current, arrays.given_waves = wp.vec3(*given.current), len(given.waves)
         nominal = _nominal(simulator)
         inputs = [simulator.plant.array, nominal, arrays, simulator.state, seed, mask]
         pipeline.add(randomize_vehicles, inputs, vehicles=len(simulator.vehicles))

@@ -136,7 +136,7 @@ def read_run(folder: str | Path) -> "pandas.DataFrame":
         folder: What `Recorder` was given.
 
     Returns:
-        One row per world, vehicle and time; `.attrs` holds what `run.json` says.
+        One row per world, vehicle and time; `.attrs` holds what `_run.json` says.
 
     Raises:
         SimulatorError: the folder holds no run.

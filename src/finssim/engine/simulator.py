@@ -74,7 +74,7 @@ class Simulator:
             threads: Threads on a CPU; all processors if None.
             seed: Of everything random in the worlds.
             max_delay: Longest thruster delay that randomisation may set [s]; twice the vehicles' own if None.
-            max_waves: Room for this many randomised waves.
+            max_waves: Room for this many randomised waves besides those of `water`.
             water_moves: Simulate moving water even if `water` stands still: somebody will write currents or waves.
 
         Raises:
@@ -90,6 +90,8 @@ class Simulator:
             )
         if not (math.isfinite(control_step) and control_step > 0.0):
             raise SimulatorError(f"control_step is {control_step} s, expected a finite time above 0 s")
+        if threads is not None and threads < 1:
+            raise SimulatorError(f"threads is {threads}, expected at least 1")
         self.worlds, self.control_step, self.substeps, self.seed = worlds, control_step, substeps, seed
         self.device = find_device(device)
         self._surround(water or Water(), pool, tether, max_waves, water_moves)
@@ -253,16 +255,18 @@ class Simulator:
         """Command thruster forces.
 
         Args:
-            force: [N], shape broadcastable to (worlds, vehicles, n), n thrusters in the vehicle's order.
+            force: [N], shape broadcastable to (worlds, vehicles, n), n thrusters in the vehicle's order; vehicles with
+                fewer thrusters leave the last numbers unused.
 
         Raises:
             SimulatorError: the shape is wrong or a number is not finite.
         """
         f = np.asarray(force, dtype=np.float32)
-        n = {len(v.thrusters) for v in self.vehicles}
-        if f.ndim == 0 or f.shape[-1] not in n:
+        n = max(len(v.thrusters) for v in self.vehicles)
+        if f.ndim == 0 or f.shape[-1] != n:
             got = f.shape[-1] if f.ndim else 0
-            raise SimulatorError(f"thrust command has {got} numbers, expected {max(n)}: one per thruster")
+            most = " of the vehicle that has most" if len(self.vehicles) > 1 else ""
+            raise SimulatorError(f"thrust command has {got} numbers, expected {n}: one per thruster{most}")
         if not np.isfinite(f).all():
             raise SimulatorError(
                 "thrust command has a number that is not finite: send a force in N for every thruster"
@@ -270,6 +274,16 @@ class Simulator:
         full = np.zeros((self.worlds, len(self.vehicles), 8), dtype=np.float32)
         full[..., : f.shape[-1]] = _broadcast(f, (*full.shape[:2], f.shape[-1]), "thrust command")
         self.command.thrust.assign(full)
+
+    def restart_episodes(self, mask: ArrayLike | None = None) -> None:
+        """Count episodes from zero again, so that the random streams repeat: where mask is true, everywhere if None."""
+        if mask is None:
+            self.state.episode.zero_()
+        else:
+            self.state.episode.assign(
+                np.where(np.asarray(mask), 0, self.state.episode.numpy()).astype(np.int32)
+            )
+        self._reported.clear()
 
     def frozen_worlds(self) -> NDArray[np.int64]:
         """Worlds that stand still because a number stopped being finite."""

@@ -78,12 +78,12 @@ class Water:
     def arrays(
         self, worlds: int, density: float, gravity: float, device: wp.Device, max_waves: int = 0
     ) -> WaterArrays:
-        """The same water for every world, as Warp arrays; room for max_waves waves at least."""
+        """The same water for every world, as Warp arrays; and room for max_waves more waves."""
 
         def full(value: object, dtype: object) -> wp.array:
             return wp.full(worlds, value=value, dtype=dtype, device=device)
 
-        n = max(len(self.waves), max_waves)
+        n = len(self.waves) + max_waves
         k = np.array([2.0 * math.pi / w.wavelength for w in self.waves])
         columns = {
             "wave_amplitude": [w.amplitude for w in self.waves],
@@ -126,6 +126,8 @@ class Pool:
     friction: float = 0.2
 
     def __post_init__(self) -> None:
+        numbers = (self.length, self.width, self.depth, self.stiffness, self.damping, self.friction)
+        _require(all(math.isfinite(x) for x in numbers), "pool: every number must be finite")
         _require(
             min(self.length, self.width, self.depth) > 0.0, "pool: length, width and depth must exceed 0 m"
         )
@@ -158,6 +160,8 @@ class TetherLine:
     """In water, per length [N/m]; 0 is neutral."""
 
     def __post_init__(self) -> None:
+        numbers = (*self.anchor, *self.attachment, self.diameter, self.drag_coefficient, self.wet_weight)
+        _require(all(math.isfinite(x) for x in numbers), "tether: every number must be finite")
         _require(self.diameter > 0.0, f"tether: diameter is {self.diameter}, expected more than 0 m")
         _require(self.drag_coefficient >= 0.0, "tether: drag_coefficient must not be negative")
 

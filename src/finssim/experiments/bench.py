@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import warp as wp
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -38,26 +39,35 @@ _MUJOCO_BODY = """<mujoco><option timestep="0.01" integrator="Euler"/><worldbody
 <inertial pos="0 0 0" mass="12" diaginertia="0.13 0.23 0.25"/></body></worldbody></mujoco>"""
 
 
-def best_rate(step: Callable[[], object], work: float, seconds: float = SECONDS) -> float:
+def best_rate(
+    step: Callable[[], object],
+    work: float,
+    seconds: float = SECONDS,
+    finish: Callable[[], object] = lambda: None,
+) -> float:
     """Work done per second in the best of several rounds.
 
     Args:
         step: What is timed; called often enough to fill the time.
         work: Done by one call.
         seconds: Time for all rounds [s].
+        finish: Waits for what steps have started; a GPU works on after a step returns.
 
     Returns:
         Work per second of wall time.
     """
     step()
+    finish()
     start = time.perf_counter()
     step()
+    finish()
     calls = max(1, round(seconds / ROUNDS / max(time.perf_counter() - start, 1e-7)))
     best = 0.0
     for _ in range(ROUNDS):
         start = time.perf_counter()
         for _ in range(calls):
             step()
+        finish()
         best = max(best, calls * work / (time.perf_counter() - start))
     return best
 
@@ -75,7 +85,7 @@ def physics_rate(model: str, worlds: int, threads: int | None = None, device: st
     )
     simulator.place(position=(0.0, 0.0, -50.0))
     simulator.set_thrust(np.random.default_rng(0).uniform(-5.0, 5.0, (worlds, 1, 8)))
-    return best_rate(simulator.step, worlds)
+    return best_rate(simulator.step, worlds, finish=lambda: wp.synchronize_device(simulator.device))
 
 
 def environment_rate(action: str, worlds: int, threads: int | None = None, device: str = "cpu") -> float:

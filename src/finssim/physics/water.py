@@ -161,7 +161,8 @@ def advance_drift(
     w = world_offset + wp.tid()
     if water.drift_time[w] <= 0.0:
         return
-    rng = wp.rand_init(seed + 7919 * episode[w], w * 65536 + steps[w])
+    stream = wp.rand_init(seed + 7919 * episode[w], w)
+    rng = wp.rand_init(wp.randi(stream), steps[w])
     a = wp.exp(-control_step / water.drift_time[w])
     noise = wp.vec3(wp.randn(rng), wp.randn(rng), wp.randn(rng))
     start = water.drift[w] + control_step * water.drift_rate[w]

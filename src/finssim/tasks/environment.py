@@ -190,7 +190,7 @@ class Environment:
             if _checked_seed(seed) != self.seed:
                 self.seed = self.simulator.seed = int(seed)
                 self._build()
-            self.simulator.state.episode.zero_()
+            self.simulator.restart_episodes(mask)
         self._mask.assign(
             np.ones(self.worlds, np.int32) if mask is None else np.asarray(mask, dtype=np.int32)
         )
@@ -266,11 +266,12 @@ class Environment:
     def _revive(self) -> None:
         """Report the worlds that froze, then start new episodes there; their step counts as terminated."""
         frozen = self.simulator.state.frozen.numpy() != 0
-        files = self.simulator.report_frozen(self.crash_directory)
-        for path in files:
-            print(
-                f"finssim: a number stopped being finite; last states in {path}", file=sys.stderr, flush=True
-            )
+        try:
+            notes = [f"last states in {path}" for path in self.simulator.report_frozen(self.crash_directory)]
+        except OSError as error:  # a report that cannot be written must not end a long training
+            notes = [f"its last states could not be written: {error}"]
+        for note in notes:
+            print(f"finssim: a number stopped being finite; {note}", file=sys.stderr, flush=True)
         self.reset(mask=frozen)
 
     def outcome(self) -> Step:

@@ -46,7 +46,8 @@ def measure(
 ):
     """Copy the state of vehicle 0 with noise; the draw depends on seed, world, episode and step alone."""
     w = world_offset + wp.tid()
-    rng = wp.rand_init(seed + 104729 * state.episode[w] + 1, w * 65536 + state.steps[w])
+    stream = wp.rand_init(seed + 104729 * state.episode[w] + 1, w)
+    rng = wp.rand_init(wp.randi(stream), state.steps[w])
     n = wp.vec3(wp.randn(rng), wp.randn(rng), wp.randn(rng))
     arrays.position[w, 0] = state.position[w, 0] + position_std * n
     turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw_std * wp.randn(rng))
