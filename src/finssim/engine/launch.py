@@ -137,7 +137,9 @@ class Pipeline:
             except KeyboardInterrupt as error:
                 interrupt = error
                 for worker, job in zip(_workers, jobs[1:], strict=False):
-                    if job.queued:  # whether it came as far as the queue is not known; run twice, it does nothing
+                    if (
+                        job.queued
+                    ):  # whether it came as far as the queue is not known; run twice, it does nothing
                         worker.jobs.put(job)
             interrupt = _finish(jobs) or interrupt
         for failure in (interrupt, *(job.error for job in jobs)):
