@@ -23,8 +23,8 @@ def test_a_step_is_over_when_it_returns_even_after_an_interrupt() -> None:
     """SIGINTs in the middle of steps; afterwards every step moves all slices by exactly one step."""
     threaded, alone = simulator(2), simulator(1)
     for delay in (1e-4, 3e-4, 6e-4, 1e-3, 2e-3):
-        threading.Timer(delay, os.kill, (os.getpid(), signal.SIGINT)).start()
         with pytest.raises(KeyboardInterrupt):
+            threading.Timer(delay, os.kill, (os.getpid(), signal.SIGINT)).start()
             while True:
                 threaded.step()
     for made in (threaded, alone):

@@ -29,6 +29,9 @@ class Packed:
             for name, dtype in struct.cls.__annotations__.items()
         }
         """Every field as an array that shares the structs' memory."""
+        for view in self.fields.values():
+            # As Warp's own views do: a view keeps the memory alive, under NumPy and torch too.
+            view._ref = self.array
 
     def __getattr__(self, name: str) -> wp.array:
         try:
