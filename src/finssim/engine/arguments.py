@@ -2,8 +2,11 @@
 
 import difflib
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from finssim.engine.plant_arrays import SimulatorError
 from finssim.quiet import start_warp
@@ -42,3 +45,13 @@ def shared_water(vehicles: Sequence[Vehicle]) -> Fluid:
                 f"({fluid} and {other.water}): replace water.density and water.gravity of one"
             )
     return fluid
+
+
+def broadcast(array: NDArray[Any], shape: tuple[int, int, int], what: str) -> NDArray[Any]:
+    """The array for every world and vehicle."""
+    try:
+        return np.broadcast_to(array, shape)
+    except ValueError:
+        raise SimulatorError(
+            f"{what} has shape {array.shape}, expected (worlds, vehicles, numbers) = {shape} or the last of these alone"
+        ) from None

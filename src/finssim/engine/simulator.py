@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.engine.arguments import find_device, one_of, shared_water
+from finssim.engine.arguments import broadcast, find_device, one_of, shared_water
 from finssim.engine.launch import Pipeline
 from finssim.engine.packed import Packed
 from finssim.engine.plant_arrays import SimulatorError, build_plant
@@ -239,7 +239,7 @@ class Simulator:
                 if not (length > 0.0).all():
                     raise SimulatorError("quaternion to place a vehicle at has length 0, expected 1 (xyzw)")
                 array = array / length
-            full = _broadcast(array, (*shape, {"position": 3, "quaternion": 4, "velocity": 6}[name]), name)
+            full = broadcast(array, (*shape, {"position": 3, "quaternion": 4, "velocity": 6}[name]), name)
             getattr(self.state, name).assign(np.ascontiguousarray(full, dtype=np.float32))
         self.reset()
 
@@ -272,7 +272,7 @@ class Simulator:
                 "thrust command has a number that is not finite: send a force in N for every thruster"
             )
         full = np.zeros((self.worlds, len(self.vehicles), 8), dtype=np.float32)
-        full[..., : f.shape[-1]] = _broadcast(f, (*full.shape[:2], f.shape[-1]), "thrust command")
+        full[..., : f.shape[-1]] = broadcast(f, (*full.shape[:2], f.shape[-1]), "thrust command")
         self.command.thrust.assign(full)
 
     def restart_episodes(self, mask: ArrayLike | None = None) -> None:
@@ -302,13 +302,3 @@ class Simulator:
         new = [w for w in self.frozen_worlds() if (int(w), int(episode[w])) not in self._reported]
         self._reported |= {(int(w), int(episode[w])) for w in new}
         return [write_post_mortem(self, int(w), directory) for w in new]
-
-
-def _broadcast(array: NDArray[Any], shape: tuple[int, int, int], what: str) -> NDArray[Any]:
-    """The array for every world and vehicle."""
-    try:
-        return np.broadcast_to(array, shape)
-    except ValueError:
-        raise SimulatorError(
-            f"{what} has shape {array.shape}, expected (worlds, vehicles, numbers) = {shape} or the last of these alone"
-        ) from None
