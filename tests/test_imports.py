@@ -21,7 +21,7 @@ ARROWS = {
     "localization": {"physics"},
     "tasks": {"engine", "control", "localization"},
     "learning": {"tasks"},
-    "calibration": {"physics", "localization"},
+    "calibration": {"engine", "control", "localization"},
     "robot": {"control", "localization"},
     "ros2": {"robot"},
     "pool": {"engine", "sensors", "robot"},

@@ -1,0 +1,100 @@
+"""What a calibration found: estimates with intervals, what they rest on, and what could not be told."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.vehicles import Vehicle
+
+__all__ = ["Correlation", "Curve", "Estimate", "Fit"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """One parameter."""
+
+    name: str
+    """`surge.m_eff`, `surge.added_mass`, `surge.d1`, `surge.d2`, `surge.bias`, `roll.k`, `buoyancy_excess`, `thrust_scale`,
+    `thrust_lag`, `thrust_delay`, `CC.c_plus`, ...; coupled terms `added_mass.surge.pitch`, `d1.sway.yaw`."""
+    estimate: float
+    ci95: tuple[float, float]
+    """95 % interval; infinite or NaN ends where the data say nothing."""
+    unit: str
+    identifiable: bool
+    """Whether the data determine it; False also where it rests on a bound."""
+    note: str = ""
+    """Why it is not identifiable, or what the number rests on."""
+    path: str | None = None
+    """Dotted path of the number in the vehicle file, where it has one."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values; a number that is not finite becomes None."""
+
+        def plain(x: float) -> float | None:
+            return float(x) if math.isfinite(x) else None
+
+        return {
+            "estimate": plain(self.estimate),
+            "ci95": [plain(x) for x in self.ci95],
+            "unit": self.unit,
+            "identifiable": self.identifiable,
+            "note": self.note,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Correlation:
+    """How the errors of the estimates go together."""
+
+    names: tuple[str, ...]
+    matrix: Array
+    """(n, n)"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curve:
+    """Measured and fitted values along one abscissa, for the report's figures."""
+
+    title: str
+    x_label: str
+    y_label: str
+    x: Array
+    measured: Array
+    fitted: Array
+    kind: str = "line"
+    """`line` (against time) or `scatter`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit:
+    """A finished calibration."""
+
+    kind: str
+    """thruster, motor or hydrodynamics"""
+    method: str
+    vehicle: Vehicle
+    """As it was before."""
+    estimates: dict[str, Estimate]
+    """By name, in the order of a report."""
+    changes: dict[str, Any]
+    """For `Vehicle.replace`: dotted path -> value, only of what the data determine."""
+    quality: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Axis or thruster -> figures of the fit: r2, rmse, nrmse, samples, rejected, ..."""
+    correlation: Correlation | None = None
+    warnings: tuple[str, ...] = ()
+    """One sentence each: bounds, degeneracies, speeds of less than a decade, trials left out."""
+    curves: tuple[Curve, ...] = ()
+    trials: dict[str, str] = field(default_factory=dict)
+    """Name of a trial or table -> SHA-256 of its numbers."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Method options, seed."""
+    interrupted: bool = False
+    """Whether Ctrl-C ended it before it converged; the estimates are the best until then."""
