@@ -1,0 +1,203 @@
+"""How far estimates can be trusted: what every trial says about them, and how the trials agree.
+
+Notation: a fit minimises Σ_g |W_g^½ r_g(theta)|² over trials g. Trial g contributes N_g = J_gᵀ W J_g to the normal
+matrix and s_g = J_gᵀ W r_g to the score, r = measured - predicted, both at the solution, where Σ s_g = 0. Nothing else
+is needed, so this serves linear regressions and simulation-error fits alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Covariance", "Evidence", "bootstrap", "correlated_samples", "intervals", "trial_covariance"]
+
+Array = NDArray[np.float64]
+
+FLOOR = 1e-13
+"""Eigenvalue of the scaled normal matrix (unit diagonal) below which a direction counts as unknown."""
+
+ALONE = 0.9
+"""Share of the information on a parameter above which it rests on one trial."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """What each trial says about the parameters, linearised at the solution."""
+
+    names: tuple[str, ...]
+    """(P,)"""
+    normal: Array
+    """N_g with W the inverse variance of the residuals, (G, P, P)."""
+    score: Array
+    """s_g, (G, P); they add up to zero where no bound is active."""
+    unit: str = "trials"
+    """What g counts: `trials`, or `blocks` of consecutive samples where there are too few trials."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Covariance:
+    """Two answers to one question; where they differ much, the model or the noise is not as assumed."""
+
+    names: tuple[str, ...]
+    local: Array
+    """Inverse information Σ_g N_g: errors independent and of the stated variance, (P, P)."""
+    trials: Array
+    """From the disagreement of the trials, (P, P): holds whatever the noise is within a trial."""
+    dof: Array
+    """Degrees of freedom of each variance in `trials`, (P,); infinite where `local` has to serve."""
+    alone: NDArray[np.bool_]
+    """Whether a parameter rests on one trial, so that no disagreement can show, (P,)."""
+
+    @property
+    def std(self) -> Array:
+        """Standard errors, (P,): from the trials, from `local` for what rests on one trial."""
+        variance = np.where(self.alone, np.maximum(self.variance("local"), self.variance("trials")), 0.0)
+        return np.asarray(np.sqrt(np.where(self.alone, variance, self.variance("trials"))))
+
+    def variance(self, which: str) -> Array:
+        """Diagonal of `local` or `trials`, (P,)."""
+        return np.diagonal(self.local if which == "local" else self.trials)
+
+
+def _whitener(normal: Array) -> tuple[Array, Array]:
+    """T (P, K) with Tᵀ N T = 1 on the K known directions, and the parameters that touch unknown ones, (P,) bool."""
+    scale = np.sqrt(np.maximum(np.diagonal(normal), 0.0))
+    safe = np.where(scale > 0.0, scale, 1.0)
+    values, vectors = np.linalg.eigh(normal / np.outer(safe, safe))
+    known = values > FLOOR
+    T = vectors[:, known] / np.sqrt(values[known]) / safe[:, None]
+    unknown = (np.abs(vectors[:, ~known]) > 1e-6).any(axis=1) | (scale == 0.0)
+    return T, unknown
+
+
+def trial_covariance(evidence: Evidence) -> Covariance:
+    """Local and trial-based covariance of the estimates.
+
+    V = N⁻¹ [Σ_g A_g s_g s_gᵀ A_gᵀ] N⁻¹,  A_g = (1 - N_g N⁻¹)^-½                (Bell and McCaffrey 2002)
+
+    A_g undoes the shrinking of each trial's residuals by its own leverage, exactly so when errors are independent; the
+    degrees of freedom are Satterthwaite's under the same assumption, so that few or unequal trials give wide intervals.
+
+    Args:
+        evidence: Contributions of G trials; with one, `local` has to serve for all.
+
+    Returns:
+        Infinite variances where the information matrix is singular.
+    """
+    N_g, s_g = np.asarray(evidence.normal, float), np.asarray(evidence.score, float)
+    P = len(evidence.names)
+    T, unknown = _whitener(N_g.sum(axis=0))
+    local = T @ T.T
+    local[unknown, unknown] = np.inf
+    if len(N_g) < 2 or T.shape[1] == 0:
+        return Covariance(
+            names=evidence.names,
+            local=local,
+            trials=local.copy(),
+            dof=np.full(P, np.inf),
+            alone=np.ones(P, bool),
+        )
+    B = T.T @ N_g @ T  # leverage of each trial: the shares of the information, they add up to 1
+    share, axes = np.linalg.eigh(B)
+    left = 1.0 - np.clip(share, 0.0, 1.0)
+    root = np.where(left > 1e-3, 1.0 / np.sqrt(np.maximum(left, 1e-3)), 0.0)
+    A = np.einsum("gij,gj,gkj->gik", axes, root, axes)
+    errors = np.einsum("pk,gkl,gl->gp", T, A, s_g @ T)
+    trials = errors.T @ errors
+
+    a = np.einsum("pk,gkl->gpl", T, A)  # A_gᵀ N⁻¹ e_p, whitened
+    Ba = np.einsum("gkl,gpl->gpk", B, a)
+    gram = -np.einsum("gpk,hpk->pgh", Ba, Ba)
+    index = np.arange(len(N_g))
+    gram[:, index, index] += np.einsum("gpk,gpk->pg", a, Ba)
+    trace = np.trace(gram, axis1=1, axis2=2)
+    square = np.einsum("pgh,pgh->p", gram, gram)
+    dof = np.where(square > 0.0, trace**2 / np.maximum(square, 1e-300), 1.0)
+
+    variance = np.maximum(np.diagonal(T @ T.T), 1e-300)
+    alone = (np.einsum("pk,gkl,pl->gp", T, B, T) / variance).max(axis=0) > ALONE
+    trials[unknown, unknown] = np.inf
+    return Covariance(
+        names=evidence.names,
+        local=local,
+        trials=trials,
+        dof=np.where(alone, np.inf, np.clip(dof, 1.0, len(N_g) - 1.0)),
+        alone=alone | unknown,
+    )
+
+
+def intervals(theta: Array, covariance: Covariance, *, level: float = 0.95) -> Array:
+    """Student intervals of the estimates.
+
+    Args:
+        theta: Estimates, (P,).
+        covariance: Theirs.
+        level: Probability.
+
+    Returns:
+        Lower and upper ends, (P, 2); infinite where nothing is known.
+    """
+    from scipy.stats import norm, t
+
+    p = 0.5 + level / 2.0
+    finite = np.isfinite(covariance.dof)
+    quantile = np.where(finite, t.ppf(p, np.where(finite, covariance.dof, 1.0)), norm.ppf(p))
+    half = quantile * covariance.std
+    return np.stack([theta - half, theta + half], axis=-1)
+
+
+def bootstrap(evidence: Evidence, theta: Array, *, resamples: int = 2000, seed: int = 0) -> Array:
+    """Estimates from trials drawn with replacement, by one Gauss-Newton step from the solution.
+
+    theta* = theta + (Σ_g n_g N_g)⁻¹ Σ_g n_g s_g,  n ~ multinomial(G, 1/G)
+
+    The step is exact for a linear model. With few trials these replicates spread a little less than the truth (by
+    √(1 - 1/G) and the leverage); `trial_covariance` corrects for it, so intervals come from there.
+
+    Args:
+        evidence: Contributions of G trials.
+        theta: Estimates, (P,).
+        resamples: R.
+        seed: Of the draws.
+
+    Returns:
+        (R, P); rows are NaN where a draw leaves a parameter without information.
+    """
+    N_g, s_g = np.asarray(evidence.normal, float), np.asarray(evidence.score, float)
+    G, P = s_g.shape
+    scale = np.sqrt(np.maximum(np.diagonal(N_g.sum(axis=0)), 1e-300))
+    N_g, s_g = N_g / np.outer(scale, scale), s_g / scale
+    counts = np.random.default_rng(seed).multinomial(G, np.full(G, 1.0 / G), size=resamples).astype(float)
+    normal = np.einsum("rg,gij->rij", counts, N_g)
+    score = counts @ s_g
+    good = np.linalg.eigvalsh(normal)[:, 0] > 1e-9
+    steps = np.full((resamples, P), np.nan)
+    if good.any():
+        steps[good] = np.linalg.solve(normal[good], score[good][..., None])[..., 0]
+    return np.asarray(theta + steps / scale)
+
+
+def correlated_samples(residual: Array, breaks: Sequence[int] = ()) -> float:
+    """Samples that one independent sample stands for: 1 + 2 Σ ρ_k up to the first pair with negative sum (Geyer 1992).
+
+    Args:
+        residual: Equally spaced, (n,).
+        breaks: Indices at which a new stretch begins; no product runs across.
+
+    Returns:
+        At least 1.
+    """
+    stretches = [part - np.mean(residual) for part in np.split(residual, list(breaks)) if len(part)]
+    longest = max(len(part) for part in stretches)
+    size = 2 ** int(np.ceil(np.log2(2 * longest)))
+    power = sum(np.abs(np.fft.rfft(part, size)) ** 2 for part in stretches)
+    rho = np.fft.irfft(power, size)[:longest]
+    if rho[0] <= 0.0:
+        return 1.0
+    pairs = rho[: longest // 2 * 2].reshape(-1, 2).sum(axis=1) / rho[0]
+    ends = np.flatnonzero(pairs <= 0.0)
+    return float(max(1.0, 2.0 * pairs[: ends[0] if len(ends) else None].sum() - 1.0))

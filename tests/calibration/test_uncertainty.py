@@ -1,0 +1,156 @@
+"""Intervals hold what they promise, whatever the trials have in common; trade-offs are named."""
+
+import numpy as np
+import pytest
+
+from finssim.calibration.degeneracy import correlation, degeneracy
+from finssim.calibration.uncertainty import (
+    Evidence,
+    bootstrap,
+    correlated_samples,
+    intervals,
+    trial_covariance,
+)
+
+TRUTH = np.array([3.0, -1.0, 0.5])
+
+
+def fitted(rng, trials, *, shared=0.0, unequal=False, samples=20):
+    """Least squares on trials whose errors share an offset and a slope within each trial: estimate, evidence."""
+    X, y = [], []
+    for g in range(trials):
+        x = np.column_stack([np.ones(samples), rng.normal(size=(samples, 2)) + [rng.normal(), 0.0]])
+        x = x * (1 + 2 * (g % 3)) if unequal else x
+        noise = rng.normal(size=samples) + shared * (rng.normal() + x[:, 1] * rng.normal())
+        X.append(x)
+        y.append(x @ TRUTH + noise)
+    theta = np.linalg.lstsq(np.concatenate(X), np.concatenate(y), rcond=None)[0]
+    r = [b - a @ theta for a, b in zip(X, y, strict=True)]
+    variance = np.mean(np.concatenate(r) ** 2)
+    return theta, Evidence(
+        names=("a", "b", "c"),
+        normal=np.array([a.T @ a for a in X]) / variance,
+        score=np.array([a.T @ b for a, b in zip(X, r, strict=True)]) / variance,
+    )
+
+
+@pytest.mark.parametrize("trials", [3, 4, 6, 10, 30])
+@pytest.mark.parametrize("shared", [0.0, 0.5])
+@pytest.mark.parametrize("unequal", [False, True])
+def test_intervals_cover_the_truth(trials, shared, unequal):
+    """95 % intervals hold the truth in 90 to 99.5 % of 400 fits, for few, unequal and internally correlated trials."""
+    rng = np.random.default_rng(trials)
+    hits = np.zeros(3)
+    for _ in range(400):
+        theta, evidence = fitted(rng, trials, shared=shared, unequal=unequal)
+        ends = intervals(theta, trial_covariance(evidence))
+        hits += (ends[:, 0] <= TRUTH) & (TRUTH <= ends[:, 1])
+    assert (hits >= 0.88 * 400).all()  # 0.90 less 1.3 standard errors of the count
+    assert (hits <= 0.998 * 400).all()
+
+
+def test_local_covariance_is_too_narrow_when_trials_differ_and_trials_are_not():
+    """Errors shared within a trial: the local covariance misses them, the disagreement of the trials shows them."""
+    rng = np.random.default_rng(0)
+    errors, local, trials = [], [], []
+    for _ in range(300):
+        theta, evidence = fitted(rng, 20, shared=1.0)
+        covariance = trial_covariance(evidence)
+        errors.append(theta - TRUTH)
+        local.append(covariance.variance("local"))
+        trials.append(covariance.variance("trials"))
+    truth = np.var(errors, axis=0)[:2]
+    assert (np.mean(local, axis=0)[:2] < 0.4 * truth).all()
+    assert np.mean(trials, axis=0)[:2] == pytest.approx(truth, rel=0.25)
+
+
+def test_bootstrap_agrees_with_the_sandwich_for_many_trials():
+    """Two ways to read the same disagreement."""
+    theta, evidence = fitted(np.random.default_rng(1), 60, shared=0.5)
+    replicates = bootstrap(evidence, theta, resamples=2000, seed=3)
+    assert replicates.std(axis=0) == pytest.approx(trial_covariance(evidence).std, rel=0.2)
+    assert np.array_equal(replicates, bootstrap(evidence, theta, resamples=2000, seed=3))
+
+
+def test_one_trial_leaves_the_local_answer():
+    """With one trial there is no disagreement: the local covariance has to serve."""
+    theta, evidence = fitted(np.random.default_rng(2), 1, samples=200)
+    covariance = trial_covariance(evidence)
+    assert covariance.alone.all()
+    half = np.diff(intervals(theta, covariance), axis=1)[:, 0] / 2
+    assert half == pytest.approx(1.96 * np.sqrt(np.diagonal(np.linalg.inv(evidence.normal[0]))), rel=1e-3)
+
+
+def test_what_only_one_trial_shows_is_not_called_certain():
+    """The score of a trial that alone informs a parameter is zero; its interval comes from the residuals instead."""
+    rng = np.random.default_rng(3)
+    X = [np.column_stack([rng.normal(size=50), np.zeros(50)]) for _ in range(6)]
+    X[0][:, 1] = rng.normal(size=50)
+    y = [x @ [1.0, 2.0] + rng.normal(size=50) for x in X]
+    theta = np.linalg.lstsq(np.concatenate(X), np.concatenate(y), rcond=None)[0]
+    r = [b - a @ theta for a, b in zip(X, y, strict=True)]
+    covariance = trial_covariance(
+        Evidence(
+            names=("a", "b"),
+            normal=np.array([a.T @ a for a in X]),
+            score=np.array([a.T @ b for a, b in zip(X, r, strict=True)]),
+        )
+    )
+    assert covariance.alone.tolist() == [False, True]
+    assert covariance.std[1] > 0.9 / np.sqrt(50)
+
+
+def test_unknown_directions_have_infinite_intervals():
+    """Two regressors that are always equal: neither is known, the third is."""
+    rng = np.random.default_rng(4)
+    x = [np.column_stack([a := rng.normal(size=30), a, rng.normal(size=30)]) for _ in range(5)]
+    evidence = Evidence(
+        names=("a", "b", "c"),
+        normal=np.array([a.T @ a for a in x]),
+        score=rng.normal(size=(5, 3)) * [1, 1, 1],
+    )
+    half = np.diff(intervals(np.zeros(3), trial_covariance(evidence)), axis=1)[:, 0]
+    assert np.isinf(half[:2]).all() and np.isfinite(half[2])
+
+
+def test_correlated_samples_of_an_autoregression():
+    """An AR(1) series with coefficient φ: one independent sample stands for (1 + φ)/(1 - φ)."""
+    from scipy.signal import lfilter
+
+    noise = np.random.default_rng(5).normal(size=40000)
+    assert correlated_samples(noise) == pytest.approx(1.0, abs=0.1)
+    series = lfilter([1.0], [1.0, -0.8], noise)
+    assert correlated_samples(series) == pytest.approx(9.0, rel=0.15)
+    assert correlated_samples(series, [10000, 20000]) == pytest.approx(9.0, rel=0.15)
+
+
+def test_thrust_scale_against_mass_is_named():
+    """Known to 1 % as ratios and to 40 % each: the sentence names all of them and how to settle it."""
+    theta = np.array([1.0, 25.0, 40.0, 0.3])
+    relative = 0.4**2 * np.ones((4, 4)) + 0.01**2 * np.eye(4)
+    relative[3, :3] = relative[:3, 3] = 0.0
+    names = ("thrust_scale", "surge.m_eff", "surge.d1", "yaw.d1")
+    found, sentences = degeneracy(names, relative * np.outer(theta, theta), theta)
+    assert found.matrix[0, 1] == pytest.approx(1.0, abs=1e-3)
+    assert len(sentences) == 1
+    for word in ("thrust_scale", "surge.m_eff", "surge.d1", "weighing"):
+        assert word in sentences[0]
+    assert "yaw" not in sentences[0]
+
+
+def test_well_known_parameters_need_no_warning():
+    """Strong correlation does not matter where every parameter is known to 1 %."""
+    theta = np.array([25.0, 40.0])
+    covariance = np.array([[1.0, 0.999], [0.999, 1.0]]) * np.outer(0.01 * theta, 0.01 * theta)
+    assert degeneracy(("surge.d1", "surge.d2"), covariance, theta)[1] == []
+    _, sentences = degeneracy(("surge.d1", "surge.d2"), 1600 * covariance, theta)
+    assert "other speeds" in sentences[0]
+
+
+def test_infinite_variance_is_said():
+    """A parameter without information is named and does not spoil the correlations of the others."""
+    covariance = np.array([[1.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, np.inf]])
+    found, sentences = degeneracy(("a", "b", "sway.d1"), covariance)
+    assert "sway.d1" in sentences[0]
+    assert found.matrix[0, 1] == pytest.approx(0.5)
+    assert np.isfinite(correlation(("a", "b", "c"), covariance).matrix).all()
