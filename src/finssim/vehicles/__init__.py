@@ -4,6 +4,7 @@ from finssim.vehicles.body import Body, Hull, Water
 from finssim.vehicles.check import Finding, check_vehicle
 from finssim.vehicles.equipment import DepthSensor, Dvl, Imu, Mcu, Mount, Safety, Sensors, Tags
 from finssim.vehicles.errors import VehicleError
+from finssim.vehicles.esc import Esc
 from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
 from finssim.vehicles.loader import catalogue, load_vehicle
 from finssim.vehicles.thruster import Thruster
@@ -14,6 +15,7 @@ __all__ = [
     "Body",
     "DepthSensor",
     "Dvl",
+    "Esc",
     "Finding",
     "Hull",
     "HydrodynamicSet",

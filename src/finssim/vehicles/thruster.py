@@ -5,9 +5,15 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from finssim.vehicles.errors import VehicleError
+from finssim.vehicles.esc import Esc
 from finssim.vehicles.part import Axis, Negative, NonNegative, NonPositive, Part, Positive, Vector3
+
+Array = NDArray[np.float64]
 
 
 class Thruster(Part):
@@ -47,3 +53,59 @@ class Thruster(Part):
     """Output of the motor controller that drives this thruster, from 0."""
     motor_sign: Literal[-1, 1] | None = None
     """Sign between positive thrust and the controller's positive command."""
+    esc: Esc | None = None
+    """Speed controller, for vehicles that log or take pulse widths."""
+
+    def thrust(self, shaft_speed: ArrayLike) -> Array:
+        """Steady thrust T = c± ω|ω| [N] (paper, eq. 16), positive along `axis`.
+
+        Args:
+            shaft_speed: ω [rad/s], (...).
+
+        Returns:
+            (...); force and speed limits and the dead zone do not enter.
+        """
+        omega = np.asarray(shaft_speed, dtype=np.float64)
+        return np.where(omega >= 0.0, self.c_plus, self.c_minus) * omega * np.abs(omega)
+
+    def speed(self, force: ArrayLike) -> Array:
+        """Shaft speed [rad/s] whose steady thrust is `force` [N], (...): the inverse of `thrust`."""
+        wanted = np.asarray(force, dtype=np.float64)
+        c = np.where(wanted >= 0.0, self.c_plus, self.c_minus)
+        return np.sign(wanted) * np.sqrt(np.abs(wanted) / c)
+
+    def shaft_speed(self, pulse_us: ArrayLike, voltage: ArrayLike | None = None) -> Array:
+        """Steady shaft speed at a pulse width; where `motor_sign` is -1, small pulses are positive thrust.
+
+        Args:
+            pulse_us: [µs], (...).
+            voltage: Of the battery [V], broadcast with the pulses; that of the ESC's numbers where not given.
+
+        Returns:
+            [rad/s], (...), positive for positive thrust.
+
+        Raises:
+            VehicleError: The vehicle file gives this thruster no `esc`.
+        """
+        esc = self._need_esc()
+        pulse = np.asarray(pulse_us, dtype=np.float64)
+        mirrored = np.where(pulse <= 0.0, pulse, 2.0 * esc.pulse_neutral - pulse)
+        return esc.shaft_speed(mirrored if self.motor_sign == -1 else pulse, voltage)
+
+    def pulse(self, shaft_speed: ArrayLike, voltage: ArrayLike | None = None) -> Array:
+        """Pulse width [µs] that makes a steady shaft speed [rad/s]: the inverse of `shaft_speed`.
+
+        Raises:
+            VehicleError: The vehicle file gives this thruster no `esc`.
+        """
+        esc = self._need_esc()
+        pulse = esc.pulse(shaft_speed, voltage)
+        return 2.0 * esc.pulse_neutral - pulse if self.motor_sign == -1 else pulse
+
+    def _need_esc(self) -> Esc:
+        if self.esc is None:
+            raise VehicleError(
+                "this thruster has no 'esc' section, so pulse widths cannot become shaft speeds: fit one with "
+                "'finssim calibrate thruster', or give shaft speeds or thrusts instead"
+            )
+        return self.esc
