@@ -1,6 +1,7 @@
 """Vehicles: one file each, read, checked and frozen."""
 
 from finssim.vehicles.body import Body, Hull, Water
+from finssim.vehicles.calibration_record import CalibrationRecord
 from finssim.vehicles.check import Finding, check_vehicle
 from finssim.vehicles.equipment import DepthSensor, Dvl, Imu, Mcu, Mount, Safety, Sensors, Tags
 from finssim.vehicles.errors import VehicleError
@@ -13,6 +14,7 @@ from finssim.vehicles.vehicle import AXES, Provenance, Vehicle
 __all__ = [
     "AXES",
     "Body",
+    "CalibrationRecord",
     "DepthSensor",
     "Dvl",
     "Esc",

@@ -114,7 +114,8 @@ def _unit(array: NDArray[np.float64], what: str) -> NDArray[np.float64]:
     length = float(np.linalg.norm(array))
     if abs(length - 1.0) > UNIT_TOLERANCE:
         raise refuse_value(f"has length {length:.7g}, expected 1: give a {what}")
-    return _frozen(array / length)
+    # A vector that was normalised before stays bit by bit what it is, so that its file keeps its hash.
+    return _frozen(array if abs(length - 1.0) < 4.0 * np.finfo(np.float64).eps else array / length)
 
 
 def _axis(value: Any) -> NDArray[np.float64]:

@@ -29,8 +29,13 @@ def read_file(path: Path, shown: str) -> tuple[dict[str, Any], dict[str, Provena
         raise VehicleError(
             f"{shown}: extends is {tree['extends']!r}, expected the name or path of a vehicle, such as finsrov"
         )
+    records = tree.pop(
+        "calibrations", None
+    )  # what a fit did, not numbers of the vehicle: they need no origin
     provenance: dict[str, Provenance] = {}
     values = _plain(tree, (), None, provenance, shown)
+    if records is not None:
+        values["calibrations"] = records
     return values, provenance
 
 

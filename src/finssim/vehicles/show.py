@@ -67,6 +67,8 @@ def print_vehicle(vehicle: Vehicle, console: Console, picture: Path | None = Non
         f"numbers: {', '.join(f'{count} {origin}' for origin, count in counts.most_common())}    {_LEGEND}\n",
         highlight=False,
     )
+    for record in vehicle.calibrations:
+        console.print(f"calibrated: {record.sentence()}", highlight=False, markup=False)
     console.print(_body(vehicle))
     for name, chosen in vehicle.hydrodynamics.items():
         console.print(_hydrodynamics(vehicle, name, chosen))

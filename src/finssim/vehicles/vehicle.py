@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from finssim.vehicles.body import Body, Hull, Water, moved_to_origin, skew
+from finssim.vehicles.calibration_record import CalibrationRecord
 from finssim.vehicles.equipment import Mcu, Safety, Sensors, Tags
 from finssim.vehicles.errors import VehicleError
 from finssim.vehicles.hydrodynamics import AnyHydrodynamicSet, HydrodynamicSet, MeshSet
@@ -59,6 +60,8 @@ class Vehicle(Part):
     tags: Tags | None = None
     mcu: Mcu | None = None
     safety: Safety | None = None
+    calibrations: tuple[CalibrationRecord, ...] = ()
+    """How its numbers were fitted to trials, oldest first; not part of `sha256`."""
     name: str = Field(exclude=True)
     """Name of the file without its suffix."""
     path: Path | None = Field(default=None, exclude=True)
@@ -189,14 +192,18 @@ class Vehicle(Part):
 
     @cached_property
     def sha256(self) -> str:
-        """Digest of every number of the vehicle and of its hull mesh; titles and comments do not enter."""
+        """Digest of every number of the vehicle and of its hull mesh; no titles, comments or calibration records."""
         values = self.values()
-        for prose in ("title", "description"):
-            values.pop(prose)
+        for prose in ("title", "description", "calibrations"):
+            values.pop(prose, None)
         if self.hull is not None and self.hull.file is not None:
             values["hull"]["file"] = hashlib.sha256(self.hull.file.read_bytes()).hexdigest()
         values["thruster_names"] = self.thruster_names  # their order is part of the meaning
         return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
+
+    def fitted_on(self, sha256: str) -> bool:
+        """Whether one of its calibrations used the trial or table of that digest."""
+        return any(sha256 in record.trials.values() for record in self.calibrations)
 
     def origin_of(self, path: str) -> Provenance:
         """Provenance of the number at a dotted path, `body.mass` or `hydrodynamics.calibrated.linear_damping.3`.
