@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,6 +57,7 @@ def record(
     depth: float | None = None,
     spread: float = 1.0,
     threads: int | None = None,
+    each_step: Callable[[Simulator], None] | None = None,
 ) -> Recording:
     """The motion that programmes cause, each in a world of one simulator, through motors and allocation.
 
@@ -74,6 +75,8 @@ def record(
         spread: Scales the initial conditions, which are at rest and level at 0: at 1, standard deviations of 0.02 m/s,
             0.02 rad/s, 0.01 rad of roll and pitch, and any heading (in a pool 0.05 rad).
         threads: Of the simulator.
+        each_step: Called before every step, for what the engine does not have: it may read the simulator's state and
+            write `command.disturbance` or plant fields that nothing is derived from, such as `gain`.
 
     Raises:
         CalibrationError: There is no programme, a field of the plant is unknown, or the motion did not stay finite.
@@ -107,6 +110,8 @@ def record(
     for i in range(n):
         if i > 0:
             simulator.command.thrust.numpy()[:, 0, :k] = command[i - 1]
+            if each_step is not None:
+                each_step(simulator)
             simulator.step()
         for name, out in states.items():
             out[i] = simulator.numpy(name)[:, 0, : shapes[name]]
