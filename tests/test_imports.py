@@ -44,6 +44,7 @@ HOMES = {
     "pandas": {"engine/recorder.py"},
     "pyarrow": {"engine/recorder.py"},
     "matplotlib": {
+        "calibration/replay_figure.py",
         "experiments/envelope.py",
         "experiments/figures.py",
         "experiments/report.py",
