@@ -42,7 +42,7 @@ HOMES = {
     "onnxruntime": {"control/policy.py"},
     "mujoco": {"engine/scene_model.py", "engine/scene_picture.py", "experiments/bench.py"},
     "pandas": {"engine/recorder.py"},
-    "pyarrow": {"engine/recorder.py"},
+    "pyarrow": {"calibration/table_file.py", "engine/recorder.py"},
     "matplotlib": {
         "calibration/replay_figure.py",
         "experiments/envelope.py",

@@ -23,15 +23,17 @@ class Conversion(_Section):
     rename: dict[str, str] = Field(default_factory=dict)
     """Column of the log -> canonical column."""
     scale: dict[str, float] = Field(default_factory=dict)
-    """Canonical column -> factor to SI, after renaming; -1 turns a sign, 0.0174533 makes radians of degrees."""
+    """Canonical column -> factor to SI, after renaming; -1 turns a sign, 0.0174533 makes radians of degrees.
+    `force_*` stands for every column that begins so."""
     offset: dict[str, float] = Field(default_factory=dict)
-    """Canonical column -> added after scaling."""
+    """Canonical column -> added after scaling; `force_*` as in `scale`."""
     body: Literal["FLU", "FRD"] = "FLU"
     """Body axes of velocities, wrenches, accelerations and attitudes in the log."""
     world: Literal["z_up", "NED"] = "z_up"
     """World axes of position and attitude in the log."""
     time_offset: dict[str, float] = Field(default_factory=dict)
-    """Canonical column, or group (`command velocity rates acceleration attitude position depth`) -> seconds added to its times."""
+    """Canonical column, or group (`command velocity rates acceleration attitude position depth`) -> seconds added to its
+    times."""
 
 
 class TrialWater(_Section):
@@ -58,6 +60,8 @@ class Header(_Section):
     inputs: Literal["applied", "commanded"] | None = None
     """Whether the input columns are what acted (measured, reconstructed) or what was asked for, before delay and lag.
     `None`: `rpm_*`, `force_*` and `tau_*` acted, `pwm_*` and `command_*` were asked for."""
+    inputs_between: Literal["held", "linear"] | None = None
+    """What the inputs did between two samples. `None`: what was asked for is held, what acted goes in a straight line."""
     passive: bool = False
     """Thrusters off: no input columns are needed."""
     wrench_at: Point | Literal["center_of_gravity", "origin"] | None = None
@@ -82,5 +86,3 @@ class Header(_Section):
     def meaning(self) -> dict[str, Any]:
         """The parts that change what the numbers mean, as plain values: all but description, role and vehicle."""
         return self.model_dump(mode="json", exclude={"description", "role", "vehicle", "convert", "axis"})
-
-

@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.calibration.columns import column_of
+from finssim.calibration.errors import CalibrationError
 from finssim.calibration.header import Header
 
 __all__ = ["PHASES", "Array", "Trial"]
@@ -43,6 +45,22 @@ class Trial:
     path: Path | None = None
     """Folder or file it was read from."""
 
+    def __post_init__(self) -> None:
+        t = self.t
+        if t.ndim != 1 or len(t) < 2 or not (np.isfinite(t).all() and (np.diff(t) > 0.0).all()):
+            raise CalibrationError(f"{self.name}: t is not at least 2 strictly increasing times in s")
+        for column, values in self.channels.items():
+            if column_of(column) is None:
+                raise CalibrationError(f"{self.name}: '{column}' is not a column of a trial")
+            if values.shape != t.shape:
+                raise CalibrationError(
+                    f"{self.name}: {column} has shape {values.shape}, expected {t.shape} like t"
+                )
+        if self.phase is not None and (self.phase.shape != t.shape or not set(self.phase) <= {*PHASES, ""}):
+            raise CalibrationError(
+                f"{self.name}: phase must hold {len(t)} words of {', '.join(PHASES)}, or empty ones"
+            )
+
     def has(self, *columns: str) -> bool:
         """Whether every one of these columns holds at least two finite samples."""
         return all(c in self.channels and np.isfinite(self.channels[c]).sum() >= 2 for c in columns)
@@ -69,7 +87,8 @@ class Trial:
         digest = hashlib.sha256(np.ascontiguousarray(self.t).tobytes())
         for column in sorted(self.channels):
             digest.update(column.encode())
-            digest.update(np.ascontiguousarray(self.channels[column] + 0.0).tobytes())
+            values = self.channels[column] + 0.0  # no -0.0, and one NaN: equal numbers have equal bytes
+            digest.update(np.where(np.isnan(values), np.nan, values).tobytes())
         if self.phase is not None:
             digest.update("\n".join(self.phase.tolist()).encode())
         digest.update(json.dumps(self.header.meaning(), sort_keys=True).encode())
