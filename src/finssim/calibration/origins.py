@@ -9,7 +9,7 @@ import numpy as np
 
 from finssim.vehicles import Provenance, Vehicle
 
-__all__ = ["file_tree", "folded", "leaves", "number_origins"]
+__all__ = ["file_tree", "folded", "leaves", "number_origins", "numbers"]
 
 Path = tuple[str, ...]
 
@@ -34,15 +34,18 @@ def leaves(node: Any, path: Path = ()) -> Iterator[tuple[Path, float]]:
 
 def number_origins(vehicle: Vehicle) -> dict[Path, Provenance]:
     """Origin of every number of `file_tree(vehicle)`, by path; calibration records are not numbers of the vehicle."""
-    tree = file_tree(vehicle)
+    return {path: vehicle.origin_of(".".join(whole)) for path, whole, _ in numbers(vehicle)}
+
+
+def numbers(vehicle: Vehicle) -> Iterator[tuple[Path, Path, float]]:
+    """Every number of `file_tree(vehicle)`: its path there, its path in `vehicle.values()`, and its value.
+
+    The two paths differ in a diagonal matrix, where the tree has one row; calibration records are left out.
+    """
+    tree, whole = file_tree(vehicle), vehicle.values()
     tree.pop("calibrations", None)
-    whole = vehicle.values()
-    origins = {}
-    for path, _ in leaves(tree):
-        # Of a diagonal that is shown as one row, the origin stands at row and column.
-        shown = (*path, path[-1]) if _is_list(_at(whole, path)) else path
-        origins[path] = vehicle.origin_of(".".join(shown))
-    return origins
+    for path, value in leaves(tree):
+        yield path, (*path, path[-1]) if isinstance(_at(whole, path), list) else path, value
 
 
 def folded(tree: Any, origins: Mapping[Path, Provenance]) -> dict[str, Provenance]:
