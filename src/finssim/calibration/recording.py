@@ -15,7 +15,7 @@ from finssim.engine import Pool, Simulator, TetherLine, Water
 from finssim.geometry.rotations import quat_from_euler
 from finssim.vehicles import Vehicle
 
-__all__ = ["Recording", "record", "thrust_coefficients"]
+__all__ = ["Recording", "record"]
 
 Array = NDArray[np.float64]
 
@@ -175,13 +175,8 @@ def _commands(programmes: Sequence[Programme], vehicle: Vehicle) -> NDArray[np.f
 
 
 def _nominal_thrust(actuator: NDArray[np.float32], vehicle: Vehicle, speeds: bool) -> NDArray[np.float32]:
+    """Thrusts from what lags in the simulator: forces already, or shaft speeds."""
     if not speeds:
         return actuator
-    c_plus, c_minus = thrust_coefficients(vehicle)
-    return np.asarray(np.where(actuator >= 0.0, c_plus, c_minus) * actuator * np.abs(actuator), np.float32)
-
-
-def thrust_coefficients(vehicle: Vehicle) -> tuple[Array, Array]:
-    """c± of every thruster by the vehicle file [N s²/rad²], (k,) each."""
     thrusters = vehicle.thrusters.values()
-    return np.array([t.c_plus for t in thrusters]), np.array([t.c_minus for t in thrusters])
+    return np.stack([x.thrust(actuator[..., k]) for k, x in enumerate(thrusters)], axis=-1).astype(np.float32)

@@ -5,8 +5,8 @@ Time stamps. Row k of a trial at `rate` has time t_k = k / rate and holds
 - the state at t_k: velocity of the body origin, attitude, position, angular rate, and what an accelerometer at the
   IMU's place reads at t_k (later by the sensor's latency where the vehicle's own sensors measure);
 - commands that are held over [t_k, t_k + 1/rate);
-- applied inputs (`rpm_*`, `force_*`, `tau_*`) as `sampling` says: `held` (the mean over [t_k, t_k + 1/rate), which
-  carries the row's impulse at any rate) or `instant` (the value at t_k, as telemetry gives it).
+- applied inputs (`rpm_*`, `force_*`, `tau_*`) as `sampling` says: `instant`, the value at t_k, as telemetry gives it (they
+  are continuous, for motors lag); or `held`, the mean over [t_k, t_k + 1/rate), the impulse of the row.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation import Programme
 from finssim.calibration.header import Header, TrialWater
 from finssim.calibration.measurement import NOISE_PROFILES, NoiseProfile, measure
-from finssim.calibration.recording import Recording, record, thrust_coefficients
+from finssim.calibration.recording import Recording, record
 from finssim.calibration.trial import Trial
 from finssim.vehicles import Vehicle
 
@@ -50,7 +50,7 @@ def simulate_programme(
     rate: float = 50.0,
     columns: Sequence[str] | None = None,
     inputs: Sequence[Input] = ("rpm", "wrench"),
-    sampling: Literal["held", "instant"] = "held",
+    sampling: Literal["instant", "held"] = "instant",
     **plant: Any,
 ) -> list[Trial]:
     """Trials of a vehicle, one for each programme: `record` and then `trials_of`.
@@ -95,7 +95,7 @@ def trials_of(
     rate: float = 50.0,
     columns: Sequence[str] | None = None,
     inputs: Sequence[Input] = ("rpm", "wrench"),
-    sampling: Literal["held", "instant"] = "held",
+    sampling: Literal["instant", "held"] = "instant",
     current: tuple[float, float, float] | None = None,
 ) -> list[Trial]:
     """Trials that measure a recording; arguments as for `simulate_programme`.
@@ -190,25 +190,13 @@ def _inputs(
 
 def _rpm(thrust: Array, vehicle: Vehicle, k: int) -> Array:
     """Shaft speed at which the file says thruster k gives a thrust [rpm]."""
-    c_plus, c_minus = thrust_coefficients(vehicle)
-    omega = np.sign(thrust) * np.sqrt(np.abs(thrust) / np.where(thrust >= 0.0, c_plus[k], c_minus[k]))
-    return np.asarray(omega * 60.0 / (2.0 * np.pi))
+    return vehicle.thrusters[vehicle.thruster_names[k]].speed(thrust) * (60.0 / (2.0 * np.pi))
 
 
 def _pulse(thrust: Array, vehicle: Vehicle, k: int) -> Array:
-    """Pulse width that the file's speed controller turns into a thrust of thruster k [µs]."""
-    thruster = list(vehicle.thrusters.values())[k]
-    esc = getattr(thruster, "esc", None)
-    if esc is None:
-        raise CalibrationError(
-            f"{vehicle.name}: thruster {vehicle.thruster_names[k]} has no esc, so no pulse widths"
-        )
-    pulses = np.arange(1000.0, 2000.5, 1.0)
-    speeds = np.asarray(esc.shaft_speed(pulses))
-    c_plus, c_minus = thrust_coefficients(vehicle)
-    table = np.where(speeds >= 0.0, c_plus[k], c_minus[k]) * speeds * np.abs(speeds)
-    resting = 0.5 * (pulses[speeds == 0.0].min() + pulses[speeds == 0.0].max())
-    return np.where(thrust == 0.0, resting, np.interp(thrust, table, pulses))
+    """Pulse width at which the file says thruster k gives a thrust [µs]."""
+    thruster = vehicle.thrusters[vehicle.thruster_names[k]]
+    return thruster.pulse(thruster.speed(thrust))
 
 
 def _end(programme: Programme, recording: Recording, world: int) -> float:
