@@ -5,8 +5,8 @@ Time stamps. Row k of a trial at `rate` has time t_k = k / rate and holds
 - the state at t_k: velocity of the body origin, attitude, position, angular rate, and what an accelerometer at the
   IMU's place reads at t_k (later by the sensor's latency where the vehicle's own sensors measure);
 - commands that are held over [t_k, t_k + 1/rate);
-- applied inputs (`rpm_*`, `force_*`, `tau_*`) as `sampling` says: `instant`, the value at t_k, as telemetry gives it (they
-  are continuous, for motors lag); or `held`, the mean over [t_k, t_k + 1/rate), the impulse of the row.
+- applied inputs (`rpm_*`, `force_*`, `tau_*`) as `sampling` says: `instant`, the value at t_k, as telemetry gives it
+  (motors lag, so they are continuous); or `held`, the mean over [t_k, t_k + 1/rate), the impulse of the row.
 """
 
 from __future__ import annotations
