@@ -15,7 +15,7 @@ from finssim.calibration.origins import Path, file_tree, folded, leaves, numbers
 from finssim.provenance import provenance
 from finssim.vehicles import CalibrationRecord, Provenance, Vehicle, VehicleError, check_vehicle
 
-__all__ = ["calibrated", "concerns", "kept", "number_in"]
+__all__ = ["calibrated", "concerns", "estimate_at", "kept", "number_in"]
 
 
 def calibrated(fit: Fit) -> Vehicle:
@@ -103,6 +103,14 @@ def number_in(vehicle: Vehicle, path: str) -> float | None:
         if _same_place(wanted, leaf, vehicle):
             return value
     return None
+
+
+def estimate_at(path: str, fit: Fit, vehicle: Vehicle) -> Estimate | None:
+    """The estimate that is of the number at a dotted path, or None; an entry of a matrix by row and column."""
+    leaf = tuple(path.split("."))
+    return _estimate_of(leaf, fit.estimates, vehicle) or (
+        _estimate_of(leaf[:-1], fit.estimates, vehicle) if leaf[-1] == leaf[-2] else None
+    )
 
 
 def _record(fit: Fit) -> CalibrationRecord:
