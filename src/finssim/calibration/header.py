@@ -32,8 +32,8 @@ class Conversion(_Section):
     world: Literal["z_up", "NED"] = "z_up"
     """World axes of position and attitude in the log."""
     time_offset: dict[str, float] = Field(default_factory=dict)
-    """Canonical column, or group (`command velocity rates acceleration attitude position depth`) -> seconds added to its
-    times."""
+    """Canonical column, or group (`command velocity rates acceleration attitude position depth`) -> seconds added to
+    its times."""
 
 
 class TrialWater(_Section):
@@ -61,7 +61,7 @@ class Header(_Section):
     """Whether the input columns are what acted (measured, reconstructed) or what was asked for, before delay and lag.
     `None`: `rpm_*`, `force_*` and `tau_*` acted, `pwm_*` and `command_*` were asked for."""
     inputs_between: Literal["held", "linear"] | None = None
-    """What the inputs did between two samples. `None`: what was asked for is held, what acted goes in a straight line."""
+    """What inputs did between two samples. `None`: what was asked for is held, what acted goes in a straight line."""
     passive: bool = False
     """Thrusters off: no input columns are needed."""
     wrench_at: Point | Literal["center_of_gravity", "origin"] | None = None
