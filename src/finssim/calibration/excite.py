@@ -17,6 +17,7 @@ from finssim.calibration.synthetic import simulate_programme
 from finssim.calibration.trial_files import write_trial
 from finssim.control.allocator import Allocator
 from finssim.files import atomic_directory, atomic_write
+from finssim.quiet import start_warp
 from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["excite", "write_programme"]
@@ -71,6 +72,7 @@ def excite(
     Raises:
         CalibrationError, VehicleError, OutputError: As they say.
     """
+    start_warp()
     chosen = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
     plan = programmes(
         axes,

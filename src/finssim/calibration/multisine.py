@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation import RATE, Programme
 from finssim.control.allocator import Allocator
+from finssim.quiet import start_warp
 from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.vehicle import Axis
@@ -126,6 +127,7 @@ def _travel(force: Array, axis: int, vehicle: Vehicle) -> float:
 
 def _feasible(tau: Array, vehicle: Vehicle) -> float:
     """Largest factor up to 1 at which the thrusters give the whole wrench at every time."""
+    start_warp()
     allocator = Allocator.from_vehicle(vehicle)
     weights = np.where(vehicle.wrench_limits > 0.0, 1.0 / np.maximum(vehicle.wrench_limits, 1e-9), 0.0)
 
