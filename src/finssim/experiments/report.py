@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import json
 from collections.abc import Mapping, Sequence
@@ -17,24 +16,9 @@ from finssim.experiments.figures import draw_paths, draw_training_curve
 from finssim.experiments.metrics import summarize
 from finssim.experiments.paper_results import PAPER_T1, paper_row
 from finssim.experiments.results_table import CAPTION, COLUMNS, cells
+from finssim.page import html_page, html_picture, html_table
 
 __all__ = ["report_html"]
-
-STYLE = """
-:root { color-scheme: light; }
-body { font: 16px/1.5 system-ui, sans-serif; color: #1c2733; background: #fff; max-width: 52rem; margin: 2rem auto;
-  padding: 0 1rem; }
-h1 { font-size: 1.6rem; margin-bottom: .2rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
-p.lead { font-size: 1.05rem; color: #34495e; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; width: 100%; }
-th, td { text-align: right; padding: .3rem .6rem; border-bottom: 1px solid #dde5ec; white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; } th { font-weight: 600; }
-tr.theirs td { color: #6b7a89; } tr.first td { border-top: 2px solid #9fb2c3; }
-img { max-width: 100%; height: auto; display: block; margin: .8rem auto; }
-p.note { color: #5d6d7c; font-size: .9rem; }
-pre { background: #f3f6f9; padding: .8rem; overflow-x: auto; font-size: .85rem; }
-"""
-
 
 NOTE = (
     "e_y is the vertical error. Gray rows are the paper's own, measured on its real vehicle in its pool; the others "
@@ -56,7 +40,7 @@ def report_html(
     result = policy.result
     envelopes = {e.label: error_envelope(_series(e)) for e in evaluations}
     sections = [
-        f"<h1>{_title(result)}</h1>",
+        f"<h1>{escape(_title(result))}</h1>",
         f'<p class="lead">{_lead(evaluations, training)}</p>',
         "<h2>Results</h2>",
         _comparison(evaluations),
@@ -74,12 +58,11 @@ def report_html(
         "<h2>Provenance</h2>",
         f"<pre>{escape(json.dumps(_provenance(result, training), indent=2))}</pre>",
     ]
-    head = f'<meta charset="utf-8"><title>{_title(result)}</title><style>{STYLE}</style>'
-    return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(sections)}</body></html>\n'
+    return html_page(_title(result), sections)
 
 
 def _title(result: Mapping[str, Any]) -> str:
-    return escape(f"Station keeping of {result['vehicle']['name']}")
+    return f"Station keeping of {result['vehicle']['name']}"
 
 
 def _lead(evaluations: Sequence[Evaluation], training: Mapping[str, Any]) -> str:
@@ -111,8 +94,7 @@ def _per_setpoint(evaluation: Evaluation) -> str:
 
 
 def _table(first: str, rows: Sequence[str]) -> str:
-    heads = "".join(f"<th>{escape(h)}</th>" for h in (first, *COLUMNS.values()))
-    return f"<table><thead><tr>{heads}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+    return html_table((first, *COLUMNS.values()), rows)
 
 
 def _row(name: str, row: Mapping[str, Any], kind: str = "") -> str:
@@ -126,8 +108,7 @@ def _series(evaluation: Evaluation) -> list[Any]:
 def _picture(figure: Figure, text: str) -> str:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=150)
-    data = base64.b64encode(buffer.getvalue()).decode("ascii")
-    return f'<img alt="{escape(text)}" src="data:image/png;base64,{data}">'
+    return html_picture(buffer.getvalue(), text)
 
 
 def _commands(training: Mapping[str, Any]) -> str:
