@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from finssim.calibration.fit import Correlation, Curve, Estimate
+from finssim.calibration.fit import Correlation, Curve, Estimate, Fit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["draw_correlation", "draw_curves", "draw_estimates", "png"]
+__all__ = ["draw_correlation", "draw_curves", "draw_estimates", "fit_pictures"]
 
 BLUE, ORANGE, GRAY = "#0072B2", "#D55E00", "0.6"
 PER_FIGURE = 6
@@ -24,11 +24,17 @@ WIDE = 1.0
 """Half width of the axis of relative intervals."""
 
 
-def png(figure: Figure) -> bytes:
-    """The picture as a file's content, the same for equal figures."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=150, metadata={"Software": None})
-    return buffer.getvalue()
+def fit_pictures(fit: Fit) -> dict[str, tuple[str, bytes]]:
+    """File name -> what the picture shows, and the PNG; equal fits give equal pictures."""
+    found: dict[str, tuple[str, Figure]] = {}
+    estimates = draw_estimates(list(fit.estimates.values()))
+    if estimates is not None:
+        found["estimates.png"] = ("95 % intervals relative to the estimates", estimates)
+    if fit.correlation is not None and len(fit.correlation.names) > 1:
+        found["correlation.png"] = ("Correlation of the errors", draw_correlation(fit.correlation))
+    for i, figure in enumerate(draw_curves(fit.curves), start=1):
+        found[f"curves_{i}.png"] = ("Measured and fitted, and the residual", figure)
+    return {name: (text, _png(figure)) for name, (text, figure) in found.items()}
 
 
 def draw_estimates(estimates: Sequence[Estimate]) -> Figure | None:
@@ -90,6 +96,12 @@ def draw_curves(curves: Sequence[Curve]) -> Iterator[Figure]:
         for cell, curve in zip(cells, part, strict=False):
             _draw(cell, curve)
         yield figure
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=150, metadata={"Software": None})
+    return buffer.getvalue()
 
 
 def _draw(cell: object, curve: Curve) -> None:

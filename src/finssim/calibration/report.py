@@ -7,18 +7,14 @@ import os
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from finssim.calibration.calibrate import kept, number_in
 from finssim.calibration.fit import Fit
-from finssim.calibration.fit_figures import MOST_CURVES, draw_correlation, draw_curves, draw_estimates, png
+from finssim.calibration.fit_figures import MOST_CURVES, fit_pictures
 from finssim.calibration.fit_output import fit_json, interval_text, number_text, quality_text, state_text
 from finssim.files import atomic_directory
 from finssim.page import html_page, html_picture, html_table
 from finssim.vehicles import Vehicle
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["FIT_FILE", "REPORT_FILE", "estimate_rows", "write_report"]
 
@@ -56,7 +52,7 @@ def write_report(
         OutputError: The directory holds other files, or cannot be written.
     """
     with atomic_directory(folder, replaces=FIT_FILE) as temporary:
-        pictures = {name: (text, png(figure)) for name, text, figure in _figures(fit)}
+        pictures = fit_pictures(fit)
         for name, (_, data) in pictures.items():
             (temporary / name).write_bytes(data)
         text = json.dumps(fit_json(fit, vehicle, out=out, warnings=list(warnings)), indent=2, allow_nan=False)
@@ -79,19 +75,6 @@ def estimate_rows(fit: Fit, vehicle: Vehicle) -> list[tuple[str, ...]]:
         )
         for name, e in fit.estimates.items()
     ]
-
-
-def _figures(fit: Fit) -> list[tuple[str, str, Figure]]:
-    """File name, what it shows, and the picture."""
-    found: list[tuple[str, str, Figure]] = []
-    estimates = draw_estimates(list(fit.estimates.values()))
-    if estimates is not None:
-        found.append(("estimates.png", "95 % intervals relative to the estimates", estimates))
-    if fit.correlation is not None and len(fit.correlation.names) > 1:
-        found.append(("correlation.png", "Correlation of the errors", draw_correlation(fit.correlation)))
-    for i, figure in enumerate(draw_curves(fit.curves), start=1):
-        found.append((f"curves_{i}.png", "Measured and fitted, and the residual", figure))
-    return found
 
 
 class _Body:
