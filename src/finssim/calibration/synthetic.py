@@ -140,6 +140,7 @@ def trials_of(
                     axis=programme.axes,
                     description=f"simulated: {programme.name}",
                     inputs="commanded" if set(inputs) <= {"command", "pwm"} else "applied",
+                    inputs_between="held" if sampling == "held" else None,
                     acceleration="specific_force",
                     water=water,
                 ),
