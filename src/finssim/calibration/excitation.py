@@ -127,7 +127,8 @@ def programmes(
     FinsROV was validated. `multisine` drives all axes at once, for coupled fits; see `multisine`.
 
     Levels are FinsROV's, times the ratio of this vehicle's wrench limit to FinsROV's on that axis (two digits), and
-    never above the limit. A large vehicle in a small pool needs `levels` or `room`.
+    never above the limit. Where `room` is given, the levels of a linear axis are brought down together until the
+    strongest step, with its coast, stays within it by the damping of the vehicle's file.
 
     Args:
         axes: As for `which_axes`.
@@ -139,7 +140,7 @@ def programmes(
         coast: Longest coast after a dive [s].
         duration: Of one multi-sine [s].
         band: Of a multi-sine [Hz].
-        room: Distance that a multi-sine may travel on each linear axis [m]; no bound where not given.
+        room: Longest way along a linear axis [m]; no bound where not given.
 
     Raises:
         CalibrationError: An axis, level, kind or count that cannot be.
@@ -149,6 +150,8 @@ def programmes(
         raise CalibrationError(f"unknown kind of programme '{kind}'; available: {', '.join(KINDS)}")
     if repeats < 1:
         raise CalibrationError(f"repeats is {repeats}, expected at least 1")
+    if room is not None and not room > 0.0:
+        raise CalibrationError(f"room is {room:g} m, expected a length above 0 m")
     by_axis = {axis: _levels(axis, vehicle, levels, kind) for axis in chosen}
     if kind == "multisine":
         from finssim.calibration.multisine import multisine
@@ -162,6 +165,9 @@ def programmes(
         raise CalibrationError(f"coast is {coast} s, expected a time above 0 s")
     out = []
     for axis in chosen:
+        if room is not None and AXES.index(axis) < 3:
+            given = levels.get(axis) if isinstance(levels, Mapping) else levels
+            by_axis[axis] = _in_room(room, by_axis[axis], given is not None, axis, vehicle)
         for level in by_axis[axis]:
             for sign in (1.0, -1.0):
                 out += [_step(axis, sign * level, kind, coast, r, repeats) for r in range(repeats)]
@@ -196,6 +202,26 @@ def _levels(
                 f"levels of {axis}: {value:g} {unit} is beyond {vehicle.name}'s limit of {limit:.4g} {unit}"
             )
     return tuple(sorted({float(x) for x in given}))
+
+
+def _in_room(
+    room: float, levels: tuple[float, ...], given: bool, axis: Axis, vehicle: Vehicle
+) -> tuple[float, ...]:
+    """Levels of a linear axis that stay within `room`; given ones are refused rather than changed."""
+    from finssim.calibration.travel import travel, within
+
+    hold, after = (np.full(round(seconds * RATE), x) for seconds, x in ((9.0, levels[-1]), (3.0, 0.0)))
+    force = np.concatenate([hold, after])
+    if not given:
+        factor = within(room, force, RATE, axis, vehicle)
+        return levels if factor == 1.0 else tuple(sorted({float(f"{factor * x:.2g}") for x in levels}))
+    way = travel(force, RATE, axis, vehicle)
+    if way > room:
+        raise CalibrationError(
+            f"levels of {axis}: {levels[-1]:g} N would take {vehicle.name} {way:.3g} m, the room is {room:g} m: "
+            "give less"
+        )
+    return levels
 
 
 def _two_digits(x: float) -> float:

@@ -61,7 +61,7 @@ def excite(
         coast: Longest coast after a dive [s].
         duration: Of a multi-sine [s].
         band: Of a multi-sine [Hz].
-        room: Distance that a multi-sine may travel [m].
+        room: Longest way along a linear axis [m].
         hydrodynamics: Set of the vehicle that is simulated.
         columns: Measured columns of simulated trials.
         inputs: Inputs that simulated trials log.

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation import RATE, Programme
+from finssim.calibration.travel import within
 from finssim.control.allocator import Allocator
 from finssim.quiet import start_warp
 from finssim.vehicles import AXES, Vehicle
-from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.vehicle import Axis
 
 __all__ = ["multisine"]
@@ -59,8 +59,6 @@ def multisine(
         raise CalibrationError(
             f"band is {low:g} to {high:g} Hz, expected rising, above 0 and up to {0.2 * RATE:g} Hz"
         )
-    if room is not None and not room > 0.0:
-        raise CalibrationError(f"room is {room:g} m, expected a length above 0 m")
     harmonics = np.arange(math.ceil(low * duration - 1e-9), math.floor(high * duration + 1e-9) + 1)
     if len(harmonics) < 3 * len(peaks):
         raise CalibrationError(
@@ -74,7 +72,7 @@ def multisine(
         shape = _lowest_peak(harmonics[i :: len(peaks)], t / duration, rng)
         tau[:, AXES.index(axis)] = peak * shape / np.abs(shape).max()
         if room is not None and AXES.index(axis) < 3:
-            tau[:, AXES.index(axis)] *= _within(room, tau[:, AXES.index(axis)], AXES.index(axis), vehicle)
+            tau[:, AXES.index(axis)] *= within(room, tau[:, AXES.index(axis)], RATE, axis, vehicle)
     tau *= _feasible(tau, vehicle)
     parts = (("rest", 50), ("baseline", 50), ("excitation", len(t)), ("coast", 100), ("rest", 50))
     phase = np.concatenate([np.full(count, word) for word, count in parts])
@@ -94,35 +92,6 @@ def _lowest_peak(harmonics: NDArray[np.int64], turns: Array, rng: np.random.Gene
             best = wave
     assert best is not None
     return np.asarray(best)
-
-
-def _within(room: float, force: Array, axis: int, vehicle: Vehicle) -> float:
-    """Factor that keeps the way along one axis within `room`."""
-    factor = 1.0
-    for _ in range(6):
-        travelled = _travel(factor * force, axis, vehicle)
-        if travelled <= room:
-            return factor
-        factor *= 0.95 * room / travelled
-    return factor
-
-
-def _travel(force: Array, axis: int, vehicle: Vehicle) -> float:
-    """Way from the nearest to the farthest point along one axis alone: m v_dot = force - (d1 + d2 |v|) v  [m]."""
-    name = "calibrated" if "calibrated" in vehicle.hydrodynamics else next(iter(vehicle.hydrodynamics))
-    chosen = vehicle.hydrodynamics[name]
-    m = float(vehicle.mass_matrix(name)[axis, axis])
-    d1 = d2 = 0.0
-    if isinstance(chosen, HydrodynamicSet):
-        d1, d2 = float(chosen.linear_damping[axis, axis]), float(chosen.quadratic_damping[axis, axis])
-    v = x = near = far = 0.0
-    h = 1.0 / RATE
-    for f in force:
-        # Implicit in the damping, so that a light and draggy vehicle does not ring.
-        v = (v + h * f / m) / (1.0 + h * (d1 + d2 * abs(v)) / m)
-        x += h * v
-        near, far = min(near, x), max(far, x)
-    return far - near
 
 
 def _feasible(tau: Array, vehicle: Vehicle) -> float:
