@@ -1,0 +1,182 @@
+"""Zero-phase smoothing of unevenly sampled signals, its strength chosen from the data.
+
+A penalised cubic B-spline (Eilers and Marx 1996), with a knot per sample, fitted to every stretch without a gap:
+
+    min Σ (y_i - f(t_i))² + λ Σ (Δᵐ c)²
+
+λ is the one under which the data are most likely (restricted maximum likelihood; Wahba 1985), with the spectrum of the
+smoother on a uniform grid, where sines diagonalise it. Nothing is assumed of the noise but that it is white.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dst
+from scipy.linalg import solveh_banded
+
+__all__ = ["Smooth", "longest_step", "smooth", "stretches", "without_spikes"]
+
+Array = NDArray[np.float64]
+
+FEWEST = 5
+"""Samples that a stretch needs; shorter ones are left out."""
+
+CANDIDATES = 80
+"""Values of λ that are tried."""
+
+SPIKE = 8.0
+"""Robust standard deviations beyond which a sample is a spike."""
+
+
+class Smooth(NamedTuple):
+    """Signals on a grid; NaN where no stretch of samples reaches."""
+
+    value: Array
+    """(m, c)"""
+    slope: Array
+    """Its time derivative, (m, c)."""
+    noise: Array
+    """Standard deviation of one sample, (c,)."""
+    value_std: Array
+    """Standard deviation of `value` from that noise, (c,)."""
+    slope_std: Array
+    """Standard deviation of `slope` from that noise, (c,)."""
+
+
+def longest_step(t: Array) -> float:
+    """Longest time between samples that is still bridged [s]: 0.2 s, or four usual steps."""
+    return max(0.2, 4.0 * float(np.median(np.diff(t)))) if len(t) > 1 else 0.2
+
+
+def stretches(t: Array, max_gap: float) -> list[slice]:
+    """Runs of samples with no step longer than `max_gap`."""
+    edges = [0, *(np.flatnonzero(np.diff(t) > max_gap) + 1), len(t)]
+    return [slice(a, b) for a, b in zip(edges, edges[1:], strict=False) if b > a]
+
+
+def without_spikes(t: Array, y: Array) -> NDArray[np.bool_]:
+    """Which samples are not spikes: far from the median of their five nearest, by the spread of all such distances.
+
+    Args:
+        t: Times [s], (n,).
+        y: Values, (n, c).
+
+    Returns:
+        (n,); at most a twentieth is refused, for what happens more often is no spike.
+    """
+    n = len(t)
+    if n < 9:
+        return np.ones(n, bool)
+    padded = np.concatenate([y[2:0:-1], y, y[-2:-4:-1]])
+    median = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0), axis=-1)
+    distance = np.abs(y - median)
+    spread = 1.4826 * np.median(distance, axis=0)
+    floor = 0.02 * (np.percentile(y, 95.0, axis=0) - np.percentile(y, 5.0, axis=0)) + 1e-12
+    bad = np.any(distance > SPIKE * np.maximum(spread, floor), axis=1)
+    return ~bad if bad.sum() <= 0.05 * n else np.ones(n, bool)
+
+
+def smooth(
+    t: Array, y: Array, at: Array, *, order: int = 2, max_gap: float | None = None, together: bool = False
+) -> Smooth:
+    """Smooth signals that share their sample times.
+
+    Args:
+        t: Times of the samples, increasing [s], (n,).
+        y: Finite values, (n, c).
+        at: Times asked for [s], (m,).
+        order: m, the difference that is penalised: 2 for signals whose slope may jump, as velocities under a step of
+            force; 3 for their integrals.
+        max_gap: Longest step that is bridged [s]; `longest_step` if None.
+        together: One λ for all columns, for parts of one quantity such as a quaternion.
+
+    Returns:
+        On `at`.
+    """
+    good = without_spikes(t, y)
+    gap = longest_step(t) if max_gap is None else max_gap
+    t, y = t[good], y[good]
+    m, c = len(at), y.shape[1]
+    value, slope = np.full((m, c), np.nan), np.full((m, c), np.nan)
+    runs = [run for run in stretches(t, gap) if run.stop - run.start >= FEWEST]
+    if not runs:
+        return Smooth(value, slope, *(np.full(c, np.nan) for _ in range(3)))
+    penalty, omega, power = _spectra(t, y, runs, order)
+    shared = [slice(0, c)] if together else [slice(i, i + 1) for i in range(c)]
+    figures = np.empty((3, c))
+    for columns in shared:
+        strength, figures[:, columns] = _choose(penalty, omega, power[:, columns])
+        for run in runs:
+            inside = (at >= t[run][0] - 1e-6) & (at <= t[run][-1] + 1e-6)
+            if inside.any():
+                f = _fit(t[run], y[run, columns], strength, order, at[inside])
+                value[inside, columns], slope[inside, columns] = f
+    return Smooth(value, slope, *figures)
+
+
+def _spectra(t: Array, y: Array, runs: list[slice], order: int) -> tuple[Array, Array, Array]:
+    """Penalty eigenvalue (k,), angular frequency (k,) [rad/s] and power by column (k, c) of every stretch's sines."""
+    penalties, frequencies, powers = [], [], []
+    for run in runs:
+        n = run.stop - run.start
+        grid = np.linspace(t[run][0], t[run][-1], n)
+        even = np.stack([np.interp(grid, t[run], column) for column in y[run].T], axis=-1)
+        part = (np.arange(n) / (n - 1))[:, None]
+        even = even - (1.0 - part) * even[0] - part * even[-1]
+        theta = np.pi * np.arange(1, n - 1) / (n - 1)
+        symbol = (2.0 + np.cos(theta)) / 3.0  # a cubic B-spline sampled at its knots
+        penalties.append((2.0 * np.sin(theta / 2.0)) ** (2 * order) / symbol**2)
+        frequencies.append(theta * (n - 1) / (grid[-1] - grid[0]))
+        powers.append(dst(even[1:-1], type=1, norm="ortho", axis=0) ** 2)
+    return np.concatenate(penalties), np.concatenate(frequencies), np.concatenate(powers)
+
+
+def _choose(penalty: Array, omega: Array, power: Array) -> tuple[float, Array]:
+    """λ, and noise, value_std and slope_std by column (3, c)."""
+    n = len(penalty)
+    candidates = np.geomspace(1e-4 / penalty.max(), 1e1 / penalty.min(), CANDIDATES)
+    lost = candidates[:, None] * penalty / (1.0 + candidates[:, None] * penalty)  # eigenvalues of 1 - H
+    likely = n * np.log(lost @ power.sum(axis=1) + 1e-300) - np.log(lost).sum(axis=1)
+    best = int(np.argmin(likely))
+    h = 1.0 - lost[best]
+    noise = np.sqrt((lost[best] ** 2 @ power) / lost[best].sum())
+    figures = [noise, noise * np.sqrt(np.mean(h**2)), noise * np.sqrt(np.mean((h * omega) ** 2))]
+    return float(candidates[best]), np.stack(figures)
+
+
+def _fit(t: Array, y: Array, strength: float, order: int, at: Array) -> tuple[Array, Array]:
+    """Value and slope at given times inside [t[0], t[-1]] of the penalised spline, (m, c) each."""
+    intervals = len(t) - 1
+    h = (t[-1] - t[0]) / intervals
+    count = intervals + 3
+    cell, weights, _ = _basis((t - t[0]) / h, intervals)
+    band = np.zeros((4, count))
+    for a in range(4):
+        for b in range(a, 4):
+            band[b - a] += np.bincount(cell + a, weights[a] * weights[b], count)
+    difference = np.array([1.0])
+    for _ in range(order):
+        difference = np.convolve(difference, [1.0, -1.0])
+    for a in range(order + 1):
+        for b in range(a, order + 1):
+            band[b - a, a : a + count - order] += strength * difference[a] * difference[b]
+    right = np.stack(
+        [sum(np.bincount(cell + a, weights[a] * column, count) for a in range(4)) for column in y.T], axis=-1
+    )
+    coefficients = solveh_banded(band, right, lower=True, check_finite=False)
+    cell, weights, slopes = _basis((at - t[0]) / h, intervals)
+    parts = coefficients[cell[:, None] + np.arange(4)]
+    return np.einsum("am,mac->mc", weights, parts), np.einsum("am,mac->mc", slopes, parts) / h
+
+
+def _basis(x: Array, intervals: int) -> tuple[NDArray[np.intp], Array, Array]:
+    """Cell, and values and slopes of the four uniform cubic B-splines that are not zero there, (4, m) each."""
+    cell = np.clip(np.floor(x).astype(np.intp), 0, intervals - 1)
+    s = x - cell
+    r = 1.0 - s
+    values = [r**3, 3.0 * s**3 - 6.0 * s**2 + 4.0, 3.0 * r**3 - 6.0 * r**2 + 4.0, s**3]
+    slopes = [-(r**2), 3.0 * s**2 - 4.0 * s, -3.0 * r**2 + 4.0 * r, s**2]
+    return cell, np.stack(values) / 6.0, np.stack(slopes) / 2.0
