@@ -23,6 +23,17 @@ COMMANDS = [
     "validate",
     "bench",
     "doctor",
+    "trials",
+    "trials check",
+    "trials import",
+    "excite",
+    "calibrate",
+    "calibrate thruster",
+    "calibrate motor",
+    "calibrate hydrodynamics",
+    "replay",
+    "experiment",
+    "experiment replay",
 ]
 
 

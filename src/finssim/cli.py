@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from finssim import __version__, boundary
+from finssim import __version__, boundary, cli_calibrate, cli_trials
 from finssim.cli_options import Device, Hydrodynamics, Json, Seed, Steps, Vehicle
 from finssim.quiet import start_warp
 
@@ -16,7 +16,7 @@ __all__ = ["app", "main"]
 
 app = typer.Typer(
     name="finssim",
-    help="Simulate underwater vehicles, train controllers for them, and check both against published measurements.",
+    help="Identify underwater vehicles from logs, simulate them, train controllers, and check all of it.",
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -24,6 +24,11 @@ app = typer.Typer(
 )
 vehicles_app = typer.Typer(invoke_without_command=True, rich_markup_mode=None, add_completion=False)
 app.add_typer(vehicles_app, name="vehicles")
+app.add_typer(cli_trials.trials_app, name="trials")
+app.command()(cli_trials.excite)
+app.add_typer(cli_calibrate.calibrate_app, name="calibrate")
+app.command()(cli_calibrate.replay)
+app.add_typer(cli_calibrate.experiment_app, name="experiment")
 
 PICTURES = (".png", ".svg", ".pdf")
 

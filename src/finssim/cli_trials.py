@@ -1,0 +1,202 @@
+"""`finssim trials` and `finssim excite`: logs of trials, and how to make good ones."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from finssim.cli_options import Hydrodynamics, Json, Seed, Vehicle
+from finssim.quiet import start_warp
+
+__all__ = ["excite", "trials_app"]
+
+trials_app = typer.Typer(rich_markup_mode=None, add_completion=False, invoke_without_command=True)
+
+
+@trials_app.callback()
+def _trials(context: typer.Context) -> None:
+    """Look at logs of trials, and make trials of foreign logs.
+
+    Example: finssim trials check trials
+    """
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+@trials_app.command()
+def check(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Trial folders, folders of them, or bare .csv or .parquet tables.", metavar="TRIAL"
+        ),
+    ],
+    vehicle: Annotated[
+        str | None,
+        typer.Option(help="Vehicle that made them, where their headers name none.", metavar="NAME|FILE"),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Say what trials can and cannot identify: rates [Hz], gaps [s], clock jumps, saturation, excitation.
+
+    Example: finssim trials check trials --vehicle bluerov2
+    """
+    from finssim.calibration.check import check as run
+
+    run(paths, vehicle=vehicle, as_json=as_json)
+
+
+@trials_app.command("import")
+def _import(
+    logs: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Tables (.csv, .parquet), ArduSub logs (.BIN, .tlog), ROS 2 bags (.mcap, .db3, folder).",
+            metavar="LOG",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder in which the trial folders are made.", metavar="DIR")],
+    column_map: Annotated[
+        Path | None,
+        typer.Option(
+            "--map",
+            help="Map of the log's columns or topics, with units and frames (.yaml).",
+            metavar="FILE",
+        ),
+    ] = None,
+    format: Annotated[
+        str, typer.Option(help="auto (by suffix), csv, ardupilot or rosbag.", metavar="FORMAT")
+    ] = "auto",
+    vehicle: Annotated[
+        str | None, typer.Option(help="Vehicle that made the logs.", metavar="NAME|FILE")
+    ] = None,
+    split: Annotated[
+        str | None,
+        typer.Option(
+            help="Several trials of one log: by phase, gaps, gaps=SECONDS, arming or column.", metavar="RULE"
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Make trial folders of logs, in SI units and the body frame x forward, y left, z up.
+
+    Example: finssim trials import dive.BIN --vehicle bluerov2 --split arming --out trials
+    """
+    from finssim.calibration.importers.dispatch import import_trials
+
+    def say(note: str) -> None:
+        typer.echo(note, err=True)
+
+    folders = import_trials(
+        logs,
+        out=out,
+        column_map=column_map,
+        format=format,  # type: ignore[arg-type]
+        vehicle=vehicle,
+        split=split,
+        say=say,
+    )
+    _print_folders(folders, as_json)
+
+
+def excite(
+    axes: Annotated[
+        str,
+        typer.Argument(
+            help="all, or of surge,sway,heave,roll,pitch,yaw separated by commas.", metavar="AXES"
+        ),
+    ],
+    vehicle: Vehicle,
+    out: Annotated[Path, typer.Option(help="Directory of the programmes or trials.", metavar="DIR")],
+    kind: Annotated[
+        str,
+        typer.Option(
+            help="published (steps, dive-and-coast, pulses), validation, or multisine.", metavar="KIND"
+        ),
+    ] = "published",
+    levels: Annotated[
+        list[str] | None,
+        typer.Option(
+            help='Magnitudes [N, N m]: "5,10" for every axis or "surge=5,10"; may be given several times.',
+            metavar="LEVELS",
+        ),
+    ] = None,
+    repeats: Annotated[int, typer.Option(help="How often every programme comes.", min=1, max=100)] = 1,
+    simulate: Annotated[
+        bool, typer.Option("--simulate", help="Run them in the simulator and write the trials they make.")
+    ] = False,
+    hydrodynamics: Hydrodynamics = "calibrated",
+    noise: Annotated[
+        str, typer.Option(help="Noise of simulated trials: sensors, published or none.", metavar="NAME")
+    ] = "sensors",
+    rate: Annotated[float, typer.Option(help="Rows of a simulated trial per second [Hz].")] = 50.0,
+    coast: Annotated[float, typer.Option(help="Longest coast after a dive [s].")] = 30.0,
+    duration: Annotated[float, typer.Option(help="Of a multi-sine [s].")] = 60.0,
+    room: Annotated[
+        float | None,
+        typer.Option(help="Longest way along a linear axis [m]: lowers the levels to fit a pool."),
+    ] = None,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Write excitation programmes (wrench [N, N m] and thrust [N] at 50 Hz) for a robot, or simulate them.
+
+    Example: finssim excite surge,yaw --vehicle finsrov --simulate --out trials
+    """
+    wanted = _levels(levels)
+    start_warp()
+    from finssim.calibration.excite import excite as run
+
+    folders = run(
+        axes,
+        vehicle=vehicle,
+        out=out,
+        simulate=simulate,
+        kind=kind,
+        levels=wanted,
+        repeats=repeats,
+        rate=rate,
+        noise=noise,
+        seed=seed,
+        coast=coast,
+        duration=duration,
+        room=room,
+        hydrodynamics=hydrodynamics,
+    )
+    _print_folders(folders, as_json)
+
+
+def _levels(words: list[str] | None) -> dict[str, list[float]] | list[float] | None:
+    """Levels by axis from `surge=5,10`, or for every axis from `5,10`."""
+    if not words:
+        return None
+    named: dict[str, list[float]] = {}
+    common: list[float] = []
+    for word in words:
+        axis, sign, numbers = word.rpartition("=")
+        try:
+            values = [float(number) for number in numbers.split(",")]
+        except ValueError:
+            values = [math.nan]
+        if not all(math.isfinite(value) for value in values):
+            raise typer.BadParameter(f"levels are '{word}', expected numbers such as 5,10 or surge=5,10")
+        if sign:
+            named.setdefault(axis.strip(), []).extend(values)
+        else:
+            common.extend(values)
+    if named and common:
+        raise typer.BadParameter("levels are given for every axis and for single ones: give one of the two")
+    return named or common
+
+
+def _print_folders(folders: list[Path], as_json: bool) -> None:
+    if as_json:
+        import json
+
+        typer.echo(json.dumps({"trials": [str(folder) for folder in folders]}))
+    else:
+        for folder in folders:
+            typer.echo(str(folder))
