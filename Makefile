@@ -3,7 +3,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-EXTRAS := learn,view,mujoco,dev
+EXTRAS := learn,logs,view,mujoco,dev
 STRICT := $(wildcard $(addprefix src/finssim/,geometry physics control localization))
 # Named by content, so that a fresh checkout or another branch with the same requirements installs nothing again.
 STAMP := $(VENV)/.installed-$(shell cat pyproject.toml constraints.txt | cksum | cut -d ' ' -f 1)
@@ -14,7 +14,7 @@ STAMP := $(VENV)/.installed-$(shell cat pyproject.toml constraints.txt | cksum |
 help:  ## list the targets
 	@sed -n 's/^\([a-z]*\):.*##/make \1\t/p' Makefile | expand -t 16
 
-demo: $(STAMP)  ## train, evaluate and report: the whole loop, result in demo/
+demo: $(STAMP)  ## identify, train, evaluate and report: the whole loop, result in demo/
 	$(BIN)/finssim demo
 
 test: check  ## check, then run every test

@@ -40,6 +40,16 @@ EXTRAS = {
         },
         "train policies, use the Gymnasium environments, record runs, draw figures and reports",
     ),
+    "logs": Extra(
+        {
+            "matplotlib": "matplotlib",
+            "pandas": "pandas",
+            "pyarrow": "pyarrow",
+            "pymavlink": "pymavlink",
+            "rosbags": "rosbags",
+        },
+        "read Parquet, ArduSub logs and ROS 2 bags, draw the report of a calibration and the figures of a replay",
+    ),
     "view": Extra({"matplotlib": "matplotlib"}, "draw pictures of vehicles and figures of evaluations"),
     "mujoco": Extra({"mujoco": "mujoco"}, "measure speed as a ratio to MuJoCo's"),
     "vision": Extra({"opencv-python-headless": "cv2"}, "nothing yet: kept for localization by camera"),
