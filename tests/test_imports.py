@@ -61,6 +61,8 @@ HOMES = {
         "experiments/report.py",
         "vehicles/picture.py",
     },
+    "pymavlink": {"calibration/importers/ardupilot_log.py"},
+    "rosbags": {"calibration/importers/rosbag.py"},
     "cv2": set(),
     "cyclonedds": set(),
     "rclpy": set(),
