@@ -1,0 +1,118 @@
+"""Levels and steps in a signal that is held and changed, such as the command of a bench."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Step", "find_steps", "last_parts", "levels"]
+
+Array = NDArray[np.float64]
+
+LAST = 0.4
+"""Part of a level that counts as settled: the last 2 s of 5 s."""
+SHORTEST = 0.5
+"""Shortest level that can settle [s]."""
+LEAST_COVERED = 0.5
+"""Share of the time that levels must cover for a log to be one of levels; a slower sweep is used as it is."""
+TOLERANCE = 0.02
+"""Band around a level within which a measured signal still counts as held, of its range."""
+
+
+class Step(NamedTuple):
+    """A change of a held signal and what follows until the next one."""
+
+    start: float
+    """Time of the last sample before the change, from which the signal could have changed [s]."""
+    time: float
+    """Time of the first sample after the change [s]."""
+    end: float
+    """Time of the last sample before the next change, or of the log [s]."""
+    before: float
+    after: float
+
+
+def levels(x: Array, tolerance: float) -> list[tuple[int, int]]:
+    """Runs of samples that stay within `tolerance` of their running median, [first, last) each, covering all.
+
+    One stray sample does not end a run, two do.
+    """
+    runs, first = [], 0
+    centre = float(x[0]) if x.size else 0.0
+    for i in range(1, len(x)):
+        outside = abs(x[i] - centre) > tolerance
+        lasts = i + 1 >= len(x) or abs(x[i + 1] - centre) > tolerance
+        if outside and lasts:
+            runs.append((first, i))
+            first, centre = i, float(x[i])
+        elif not outside and i - first < 50:
+            centre = float(np.median(x[first : i + 1]))
+    if x.size:
+        runs.append((first, len(x)))
+    return runs
+
+
+def last_parts(values: dict[str, Array]) -> tuple[dict[str, Array], str]:
+    """Steady rows of a log over time: the mean over the last 40 % of each level of the pulse or of the speed.
+
+    Args:
+        values: `time` [s] and any of speed, force, pulse, voltage, (n,) each.
+
+    Returns:
+        The same without `time`, one row per level, and a sentence; the rows as they are if the log holds no levels (a
+        slow sweep).
+    """
+    times = values["time"]
+    others = {key: value for key, value in values.items() if key != "time"}
+    drive = values.get("pulse", values.get("speed"))
+    assert drive is not None
+    good = np.flatnonzero(np.isfinite(drive) & np.isfinite(times))
+    span = float(np.ptp(drive[good])) if good.size else 0.0
+    band = TOLERANCE * span if "pulse" not in values else 0.002 * span
+    rows, covered = [], 0.0
+    for first, last in levels(drive[good], band):
+        index = good[first:last]
+        length = float(times[index[-1]] - times[index[0]])
+        half = len(index) // 2
+        if length < SHORTEST or half < 2:
+            continue
+        settled = index[times[index] >= times[index[-1]] - LAST * length]
+        drift = abs(np.mean(drive[index[half:]]) - np.mean(drive[index[half // 2 : half]]))
+        if drift <= 0.25 * band:
+            rows.append(settled)
+            covered += length
+    if len(rows) < 3 or covered < LEAST_COVERED * float(times[good[-1]] - times[good[0]]):
+        return others, f"read as a sweep of {len(times)} rows, for it holds few constant levels"
+    steady = {key: np.array([_mean(value[row]) for row in rows]) for key, value in others.items()}
+    return steady, f"read as {len(rows)} levels, of each the last {100 * LAST:g} %"
+
+
+def _mean(values: Array) -> float:
+    good = values[np.isfinite(values)]
+    return float(np.mean(good)) if good.size else float("nan")
+
+
+def find_steps(t: Array, command: Array, *, shortest: float = 0.2) -> list[Step]:
+    """Every change of a held command that lasts.
+
+    Args:
+        t: Times [s], (n,).
+        command: Its values, finite, (n,).
+        shortest: Levels shorter than this are passed over [s].
+
+    Returns:
+        Steps in order of time; none where the command never holds still.
+    """
+    span = float(np.ptp(command)) if command.size else 0.0
+    if span == 0.0:
+        return []
+    runs = levels(command, 0.01 * span)
+    held = [(a, b) for a, b in runs if t[b - 1] - t[a] >= shortest]
+    if len(runs) > 4 * len(held):  # a command that moves all the time
+        return []
+    return [
+        Step(float(t[a2 - 1]), float(t[a2]), float(t[b2 - 1]), _mean(command[a1:b1]), _mean(command[a2:b2]))
+        for (a1, b1), (a2, b2) in zip(held, held[1:], strict=False)
+    ]
