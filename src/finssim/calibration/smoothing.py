@@ -41,9 +41,9 @@ class Smooth(NamedTuple):
     noise: Array
     """Standard deviation of one sample, (c,)."""
     value_std: Array
-    """Standard deviation of `value` from that noise, (c,)."""
+    """Standard deviation of `value`, of what noise remains and what signal was lost (Wahba 1983), (c,)."""
     slope_std: Array
-    """Standard deviation of `slope` from that noise, (c,)."""
+    """Standard deviation of `slope`, in the same sense, (c,)."""
 
 
 def longest_step(t: Array) -> float:
@@ -143,7 +143,7 @@ def _choose(penalty: Array, omega: Array, power: Array) -> tuple[float, Array]:
     best = int(np.argmin(likely))
     h = 1.0 - lost[best]
     noise = np.sqrt((lost[best] ** 2 @ power) / lost[best].sum())
-    figures = [noise, noise * np.sqrt(np.mean(h**2)), noise * np.sqrt(np.mean((h * omega) ** 2))]
+    figures = [noise, noise * np.sqrt(np.mean(h)), noise * np.sqrt(np.mean(h * omega**2))]
     return float(candidates[best]), np.stack(figures)
 
 

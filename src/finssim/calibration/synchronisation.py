@@ -1,0 +1,148 @@
+"""Constant time offsets between streams that see the same motion."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.calibration.accelerations import ACCELERATION, holds_gravity
+from finssim.calibration.attitude_signal import attitude_signal, up_in_body
+from finssim.calibration.smoothing import smooth
+from finssim.calibration.trial import Trial
+from finssim.geometry.rotations import quat_rotate
+from finssim.vehicles import Vehicle
+
+__all__ = ["Offset", "stream_offsets"]
+
+Array = NDArray[np.float64]
+
+RATE = 100.0
+"""Of the grid on which streams are compared [Hz]; the peak is found between its points."""
+
+LONGEST = 1.0
+"""Offsets up to this are looked for [s]."""
+
+NEAR = 0.15
+"""Distance from the most shared motion within which the peak is refined [s]."""
+
+LEAST = 0.6
+"""Correlation below which two streams do not agree on any motion, so that nothing is said."""
+
+
+class Offset(NamedTuple):
+    """How one stream lies in time to another."""
+
+    reference: str
+    """Group of columns that it was compared with."""
+    seconds: float
+    """What to add to the stream's times so that both agree: a value for `convert.time_offset`."""
+    std: float
+    """Standard deviation of `seconds` [s]."""
+    correlation: float
+    """Of the two streams once they agree, -1 to 1."""
+
+
+def stream_offsets(trial: Trial, vehicle: Vehicle) -> dict[str, Offset]:
+    """Offsets of streams whose motion another stream measures too.
+
+    Compared are attitude with gyro, position with velocity, depth with vertical position or velocity, and acceleration
+    with velocity.
+
+    Args:
+        trial: The trial.
+        vehicle: Gives gravity.
+
+    Returns:
+        Group of columns -> its offset to another group. Groups that nothing else sees, or whose motion is not above the
+        noise, are left out.
+    """
+    t = np.arange(trial.t[0], trial.t[-1], 1.0 / RATE)
+    if len(t) < 10:
+        return {}
+    omega, _ = _on_grid(trial, ("p", "q", "r"), t, 2)
+    attitude = attitude_signal(trial, t)
+    found = {"attitude": _offset("rates", omega, attitude.rates)}
+    if found["attitude"] is not None:  # the others are compared through the attitude as it should be
+        attitude = attitude_signal(trial, t - found["attitude"].seconds)
+    world = _on_grid(trial, ("x", "y", "z"), t, 3)[1]
+    nu, nu_slope = _on_grid(trial, ("u", "v", "w"), t, 2)
+    depth = _on_grid(trial, ("depth",), t, 3)[1]
+    through_world = quat_rotate(attitude.turn, nu)
+    if not attitude.tilt:
+        through_world[:, 2] = np.nan
+    vertical = world[:, 2:] if trial.has("z") else through_world[:, 2:]
+    kinematic = _kinematic(trial, t, attitude.quaternion, nu, omega, vehicle)
+    pairs = {
+        "position": ("velocity", through_world, world),
+        "depth": ("position" if trial.has("z") else "velocity", vertical, -depth),
+        "acceleration": ("velocity", nu_slope, kinematic),
+    }
+    found |= {group: _offset(reference, *signals) for group, (reference, *signals) in pairs.items()}
+    return {group: offset for group, offset in found.items() if offset is not None}
+
+
+def _on_grid(trial: Trial, columns: tuple[str, ...], t: Array, order: int) -> tuple[Array, Array]:
+    """Values and slopes of columns, (m, c) each; NaN where there are none."""
+    value, slope = np.full((len(t), len(columns)), np.nan), np.full((len(t), len(columns)), np.nan)
+    for i, name in enumerate(columns):
+        at, y = trial.series(name)
+        if len(at) >= 2:
+            s = smooth(at, y[:, None], t, order=order)
+            value[:, i], slope[:, i] = s.value[:, 0], s.slope[:, 0]
+    return value, slope
+
+
+def _kinematic(trial: Trial, t: Array, quaternion: Array, nu: Array, omega: Array, vehicle: Vehicle) -> Array:
+    """About v_dot from the accelerometer, without lever arms, (m, 3)."""
+    a, _ = _on_grid(trial, ACCELERATION, t, 2)
+    if holds_gravity(trial, vehicle.water.gravity):
+        a = a - vehicle.water.gravity * up_in_body(quaternion)
+    return a - np.cross(np.nan_to_num(omega), np.nan_to_num(nu))
+
+
+def _offset(reference: str, fixed: Array, moved: Array) -> Offset | None:
+    """The offset of `moved` to `fixed`, (m, c) each, from the peak of their correlation."""
+    both = np.isfinite(fixed).any(axis=0) & np.isfinite(moved).any(axis=0)
+    if not both.any():
+        return None
+    x, y = _centred(fixed[:, both]), _centred(moved[:, both])
+    longest = min(int(LONGEST * RATE), len(x) // 3)
+    lags = np.arange(-longest, longest + 1)
+    energy = np.nansum(x**2) * np.nansum(y**2)
+    if not energy > 0.0:
+        return None
+    shared, correlation = np.array([_agreement(*_overlap(x, y, k)) for k in lags]).T
+    # The most shared motion finds the peak; the correlation of what overlaps, which the ends do not pull, refines it.
+    near = np.abs(lags - lags[int(np.argmax(shared))]) <= NEAR * RATE
+    best = int(np.argmax(np.where(near, correlation, -1.0)))
+    if correlation[best] < LEAST or best in (0, len(lags) - 1) or not near[best - 1] or not near[best + 1]:
+        return None
+    before, peak, after = correlation[best - 1 : best + 2]
+    bend = before - 2.0 * peak + after
+    part = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
+    # With y = x(t - d) + e: var d = var e / Σ x_dot², for as many independent e as e has zero crossings.
+    a, b = _overlap(x, y, lags[best])
+    error = a - np.sum(a * b) / np.sum(b**2) * b
+    crossings = max(1, int(np.sum(error[1:] * error[:-1] < 0.0)))
+    std = np.sqrt(np.mean(error**2) / (np.mean(np.square(np.gradient(a, 1.0 / RATE, axis=0))) * crossings))
+    return Offset(reference, -float(lags[best] + part) / RATE, float(std), float(peak))
+
+
+def _centred(x: Array) -> Array:
+    return np.asarray(x - np.nanmedian(x, axis=0))
+
+
+def _overlap(x: Array, y: Array, lag: int) -> tuple[Array, Array]:
+    """x(t) and y(t + lag) where both are known, 0 elsewhere."""
+    n = len(x)
+    a, b = x[max(0, -lag) : n - max(0, lag)], y[max(0, lag) : n - max(0, -lag)]
+    known = np.isfinite(a) & np.isfinite(b)
+    return np.where(known, a, 0.0), np.where(known, b, 0.0)
+
+
+def _agreement(a: Array, b: Array) -> tuple[float, float]:
+    """Sum of products, and correlation, over all rows and columns."""
+    product, size = float(np.sum(a * b)), np.sqrt(np.sum(a**2) * np.sum(b**2))
+    return product, float(product / size) if size > 0.0 else 0.0
