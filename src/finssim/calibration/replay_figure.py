@@ -38,6 +38,8 @@ SYMBOLS = {
 def normalised(pair: Pair, values: Array, axis: Axis) -> tuple[Array, Array] | None:
     """A response over the time since the onset, sign-aligned and relative to the measured P5-P95 span.
 
+    Signs are those of the input, and of the response itself where there is none.
+
     Args:
         pair: The trial.
         values: Measured or simulated response of the axis, (n,).
@@ -52,8 +54,10 @@ def normalised(pair: Pair, values: Array, axis: Axis) -> tuple[Array, Array] | N
         return None
     start = onset(pair, axis)
     begin = int(np.argmax(pair.scored())) if start is None else start
-    real = pair.measured[pair.response(axis)][pair.scored()]
-    sign = 1.0 if np.nanmean(real) >= 0.0 else -1.0
+    inside = pair.scored()
+    push = pair.tau[inside, AXES.index(axis)]
+    leading = push if start is not None else pair.measured[pair.response(axis)][inside]
+    sign = 1.0 if np.nansum(leading) >= 0.0 else -1.0
     return pair.t - pair.t[begin], sign * values / width
 
 
@@ -117,7 +121,9 @@ def draw_overlay(pair: Pair) -> Figure:
     _input_panel(axes_of[0], pair)
     models = models_of([pair])
     for axes, response in zip(axes_of[1:], responses, strict=True):
-        axes.plot(pair.t, pair.measured[response], color=BLACK, linewidth=1.1, label="measured")
+        if response in pair.raw:
+            axes.plot(pair.t, pair.raw[response], color="0.8", linewidth=0.8)
+        axes.plot(pair.t, pair.measured[response], color=BLACK, linewidth=2.4, label="measured")
         for model in models:
             values = _broken(pair, pair.simulated[model][response])
             figure_of = score(pair, model, response).value
@@ -143,7 +149,7 @@ def draw_overlay(pair: Pair) -> Figure:
 def _envelope_panel(axes: Any, axis: Axis, pairs: Sequence[Pair], models: Sequence[str]) -> None:
     grid = _grid(pairs, axis)
     measured = [_on(grid, normalised(p, p.measured[p.response(axis)], axis)) for p in pairs]
-    _band(axes, grid, np.array(measured), BLACK, "measured", (0, ()), zorder=2.5)
+    _band(axes, grid, np.array(measured), BLACK, "measured", (0, ()), zorder=2.5, width=3.2)
     for k, model in enumerate(models):
         values = [
             _on(grid, normalised(p, p.simulated[model][p.response(axis)], axis))
@@ -155,18 +161,8 @@ def _envelope_panel(axes: Any, axis: Axis, pairs: Sequence[Pair], models: Sequen
         scores = [{axis: score(p, model, p.response(axis)).value} for p in pairs if model in p.simulated]
         value = aggregate(scores, resamples=1).value
         if value is not None:
-            place = (0.985, 0.875 - 0.095 * k)
-            axes.text(
-                *place,
-                f"{value:.3f}",
-                transform=axes.transAxes,
-                color=color,
-                fontsize=8,
-                ha="right",
-                va="top",
-            )
-    note = {"transform": axes.transAxes, "ha": "right", "va": "top"}
-    axes.text(0.985, 0.97, "NRMSE", color="0.45", fontsize=7, **note)
+            place = (1.0 - 0.14 * (len(models) - 1 - k), 1.03)
+            axes.text(*place, f"{value:.3f}", transform=axes.transAxes, color=color, fontsize=8, ha="right")
     coast = [p.t[np.argmax(p.phase == "coast")] - p.t[onset(p, axis) or 0] for p in pairs if _coasts(p, axis)]
     if coast:
         axes.axvspan(float(np.median(coast)), grid[-1], color="0.945", zorder=0, linewidth=0.0)
@@ -175,7 +171,7 @@ def _envelope_panel(axes: Any, axis: Axis, pairs: Sequence[Pair], models: Sequen
             xytext=(3, 1), textcoords="offset points", fontsize=7, color="0.45",
         )  # fmt: skip
     count = f"{len(pairs)} trial{'s' if len(pairs) != 1 else ''}"
-    axes.set_title(f"{axis}  ({count})", fontsize=9, loc="left")
+    axes.set_title(f"{axis} ({count})", fontsize=9, loc="left")
     axes.set_xlim(grid[0], grid[-1])
     _tidy(axes)
 
@@ -219,7 +215,16 @@ def _on(grid: Array, aligned: tuple[Array, Array] | None) -> Array:
     return np.asarray(np.interp(grid, t[good], x[good], left=np.nan, right=np.nan))
 
 
-def _band(axes: Any, grid: Array, values: Array, color: str, label: str, style: Any, zorder: float) -> None:
+def _band(
+    axes: Any,
+    grid: Array,
+    values: Array,
+    color: str,
+    label: str,
+    style: Any,
+    zorder: float,
+    width: float = 1.5,
+) -> None:
     """Median and middle half where at least half of the trials have a value."""
     enough = np.isfinite(values).mean(axis=0) >= 0.5
     quartiles = np.full((3, len(grid)), np.nan)
@@ -227,7 +232,7 @@ def _band(axes: Any, grid: Array, values: Array, color: str, label: str, style: 
         quartiles[:, enough] = np.nanquantile(values[:, enough], (0.25, 0.5, 0.75), axis=0)
     low, median, high = quartiles
     axes.fill_between(grid, low, high, color=color, alpha=0.18, linewidth=0.0, zorder=zorder - 1.0)
-    axes.plot(grid, median, color=color, linewidth=1.5, linestyle=style, label=label, zorder=zorder)
+    axes.plot(grid, median, color=color, linewidth=width, linestyle=style, label=label, zorder=zorder)
 
 
 def _broken(pair: Pair, values: Array) -> Array:

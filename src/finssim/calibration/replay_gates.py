@@ -56,7 +56,8 @@ def gates(pair: Pair, model: str, axis: Axis) -> dict[str, Gate]:
     - steady value: relative difference of the means over the last quarter of the excitation
     - coast t10: relative difference of the times to fall to a tenth of the speed at the start of the coast
 
-    The onset is where the input reaches a tenth of its greatest magnitude.
+    The onset is where the input reaches a tenth of its greatest magnitude. Slope, steady value and decay are those of
+    the measurement before smoothing, which would delay them.
 
     Args:
         pair: Trial and replays.
@@ -70,7 +71,7 @@ def gates(pair: Pair, model: str, axis: Axis) -> dict[str, Gate]:
     width = response_span(pair, response)
     if width.value is None:
         return {name: Gate(None, limit, width.why) for name, limit in LIMITS.items()}
-    real, simulated = pair.measured[response], pair.simulated[model][response]
+    real, simulated = pair.raw.get(response, pair.measured[response]), pair.simulated[model][response]
     found = {
         "input wrench": _input_difference(pair, model, axis),
         "excitation": phase_score(pair, model, response, "excitation"),
@@ -140,7 +141,11 @@ def _initial_slope(pair: Pair, axis: Axis, real: Array, simulated: Array) -> Sco
     if both.sum() < 4:
         return Score(None, f"fewer than 4 samples in the first {INITIAL:g} s after the onset")
     t = pair.t[rows][both]
+    covered = pair.measured[pair.response(axis)][rows]
+    covered = covered[np.isfinite(covered)]
     theirs, ours = np.polyfit(t - t[0], np.c_[real[rows][both], simulated[rows][both]], 1)[0]
+    if abs(theirs) * INITIAL < 0.5 * float(np.ptp(covered)):
+        return Score(None, f"the response turns within {INITIAL:g} s of the onset")
     return _relative(ours, theirs, _slope_noise(t, pair.noise.get(pair.response(axis), 0.0)), "initial slope")
 
 
@@ -161,6 +166,9 @@ def _steady_value(pair: Pair, axis: Axis, real: Array, simulated: Array) -> Scor
     both = np.isfinite(real[rows]) & np.isfinite(simulated[rows])
     if both.sum() < 4:
         return Score(None, "fewer than 4 samples at the end of the excitation")
+    smooth = pair.measured[pair.response(axis)][rows]
+    if np.nanstd(smooth) > STEADY * abs(float(np.nanmean(smooth))):
+        return Score(None, "the response is not steady at the end of the excitation")
     noise = pair.noise.get(pair.response(axis), 0.0) / np.sqrt(both.sum())
     return _relative(
         float(simulated[rows][both].mean()), float(real[rows][both].mean()), noise, "steady value"
@@ -180,6 +188,8 @@ def _decay(pair: Pair, real: Array, simulated: Array) -> Score:
         return Score(None, "no coast after the excitation")
     first = rows[: np.argmax(np.diff(rows, append=rows[-1] + 2) > 1) + 1]
     theirs, ours = (_fall_time(x[first], pair.rate) for x in (real, simulated))
+    if theirs == 0.0:
+        return Score(None, "the coast is no decay: the response oscillates, or there is none")
     if theirs is None:
         return Score(None, "the measured speed does not fall to a tenth within the coast")
     if ours is None:
@@ -192,7 +202,7 @@ def _decay(pair: Pair, real: Array, simulated: Array) -> Score:
 
 
 def _fall_time(x: Array, rate: float) -> float | None:
-    """Time until the magnitude is a tenth of what it was at first [s]; None if it never is."""
+    """Time until the magnitude is a tenth of what it was at first [s]; None if it never is, 0 if it comes back."""
     width = max(1, round(SMOOTHING * rate))
     good = np.isfinite(x)
     if good.sum() < 4 * min(width, 2):
@@ -200,7 +210,7 @@ def _fall_time(x: Array, rate: float) -> float | None:
     full = np.interp(np.arange(len(x)), np.flatnonzero(good), x[good])
     padded = np.pad(full, (width // 2, width - 1 - width // 2), mode="edge")
     smooth = np.abs(np.convolve(padded, np.full(width, 1.0 / width), mode="valid"))
-    if not smooth[0] > 0.0:
-        return None
     below = np.flatnonzero(smooth <= 0.1 * smooth[0])
-    return float(max(below[0], 1) / rate) if len(below) else None
+    if not len(below):
+        return None
+    return 0.0 if smooth[below[0] :].max() > 0.3 * smooth[0] else float(max(below[0], 1) / rate)

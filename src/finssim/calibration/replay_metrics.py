@@ -32,8 +32,9 @@ RESAMPLES, SEED = 2000, 20260903
 FEWEST = 8
 """Samples that a score needs at least."""
 
-NOISE_SPAN = 4.0
-"""A response must span this many standard deviations of its noise: noise alone spans 3.3 from P5 to P95."""
+NOISE_SPAN = 2.0
+"""A smoothed response must span this many standard deviations of a sample's noise, another twice as many: noise alone
+spans 3.3 from P5 to P95, and half of that or less after smoothing."""
 
 
 class Score(NamedTuple):
@@ -80,30 +81,47 @@ def response_span(pair: Pair, response: str) -> Score:
     width, noise = span(x), pair.noise.get(response, 0.0)
     if not width > 1e-12:
         return Score(None, "the measured response does not vary: its P5 to P95 span is zero")
-    if np.isfinite(noise) and width < NOISE_SPAN * noise:
+    smoothed = pair.raw.get(response) is not values
+    if np.isfinite(noise) and width < (NOISE_SPAN if smoothed else 2.0 * NOISE_SPAN) * noise:
         return Score(
             None, f"the measured response, {width:.3g} from P5 to P95, is its noise (std {noise:.3g})"
         )
     return Score(width)
 
 
-def score(pair: Pair, model: str, response: str) -> Score:
-    """NRMSE of one response of one model over the excitation and the coast of a trial."""
-    width = response_span(pair, response)
-    if width.value is None:
-        return width
-    return nrmse(pair.measured[response], pair.simulated[model][response], width.value, pair.scored())
+def score(pair: Pair, model: str, response: str, *, raw: bool = False) -> Score:
+    """NRMSE of one response of one model over the excitation and the coast of a trial.
+
+    Args:
+        pair: Trial and replays.
+        model: Which replay.
+        response: Of `RESPONSES`.
+        raw: Against the measurement as it is, with its noise, rather than smoothed.
+    """
+    if raw and response not in pair.raw:
+        return Score(None, "not measured")
+    return _scored(pair, model, response, pair.scored(), pair.raw if raw else pair.measured)
 
 
 def phase_score(pair: Pair, model: str, response: str, phase: str) -> Score:
     """NRMSE in one phase; the RMSE is of the phase, the span is that of the trial, so that phases can be compared."""
-    width = response_span(pair, response)
-    if width.value is None:
-        return width
     where = pair.phase == phase
     if not where.any():
         return Score(None, f"the trial has no {phase}")
-    return nrmse(pair.measured[response], pair.simulated[model][response], width.value, where)
+    return _scored(pair, model, response, where, pair.measured)
+
+
+def _scored(
+    pair: Pair, model: str, response: str, where: NDArray[np.bool_], measured: Mapping[str, Array]
+) -> Score:
+    width = response_span(pair, response)
+    if width.value is None:
+        return width
+    if model in pair.diverged:
+        return Score(
+            None, f"the simulation does not stay finite: it ends {pair.diverged[model]:.2f} s into the trial"
+        )
+    return nrmse(measured[response], pair.simulated[model][response], width.value, where)
 
 
 class Aggregate(NamedTuple):
@@ -172,7 +190,7 @@ class Ahead(NamedTuple):
     persistence: Array
     """The same of the prediction that nothing changes, (H,)."""
     nrmse: Array
-    """rmse / span, (H,)"""
+    """Root mean square of error / span, (H,)"""
     count: NDArray[np.int64]
     """Predictions compared, (H,)."""
 
@@ -184,7 +202,7 @@ class Ahead(NamedTuple):
 
 
 def error_ahead(
-    starts: Array, ahead: Array, measured: Array, simulated: Array, width: float, seconds: ArrayLike
+    starts: Array, ahead: Array, measured: Array, simulated: Array, width: ArrayLike, seconds: ArrayLike
 ) -> Ahead:
     """Root mean square over all predictions of the error a given time after each start.
 
@@ -193,7 +211,7 @@ def error_ahead(
         ahead: Times since the start [s], (T,).
         measured: (T, S), NaN where there is no measurement.
         simulated: (T, S).
-        width: Span that `nrmse` is relative to.
+        width: Span that `nrmse` is relative to, of all or for each prediction, (S,).
         seconds: Times of interest [s], (H,); the nearest of `ahead` is taken.
     """
     wanted = np.asarray(seconds, dtype=np.float64)
@@ -207,4 +225,4 @@ def error_ahead(
         return np.asarray(np.sqrt(np.divide(total, count, out=np.full(len(wanted), np.nan), where=count > 0)))
 
     rmse = rms(ours)
-    return Ahead(wanted, rmse, rms(theirs), rmse / width, count)
+    return Ahead(wanted, rmse, rms(theirs), rms(ours / np.asarray(width, dtype=np.float64)), count)

@@ -41,6 +41,8 @@ class Pair:
     sha256: str
     t: Array
     """Since the trial's first sample [s], uniform, (n,)."""
+    t0: float = 0.0
+    """The trial's first sample on its own clock [s]."""
     rate: float
     """[1/s]"""
     axes: tuple[Axis, ...]
@@ -50,17 +52,21 @@ class Pair:
     tau: Array
     """Wrench that acted, from the log, about the vehicle's `wrench_reference` [N, N m], (n, 6)."""
     measured: dict[str, Array]
-    """Response (of `RESPONSES`) -> (n,)."""
+    """Response (of `RESPONSES`) -> (n,); velocities and angles smoothed as for a fit."""
+    raw: dict[str, Array] = field(default_factory=dict)
+    """The same as it was measured; only where it was."""
     source: dict[str, str] = field(default_factory=dict)
     """Response -> "measured", or what it was derived from."""
     noise: dict[str, float] = field(default_factory=dict)
-    """Response -> standard deviation of its noise, in its unit."""
+    """Response -> standard deviation of the noise of one measured sample, in its unit."""
     simulated: dict[str, dict[str, Array]] = field(default_factory=dict)
     """Model -> response -> (n,)."""
     applied: dict[str, Array] = field(default_factory=dict)
     """Model -> wrench that the simulation applied, as `tau`, (n, 6)."""
     segment: NDArray[np.int64] | None = None
     """Which uninterrupted replay a sample belongs to, -1 for none, (n,); None for a single one."""
+    diverged: dict[str, float] = field(default_factory=dict)
+    """Model -> time when its simulation stopped being finite [s]; only where it did."""
     in_sample: bool = False
     """Whether the vehicle was fitted on this very trial."""
     notes: tuple[str, ...] = ()
