@@ -44,6 +44,20 @@ def thruster(
     ],
     vehicle: Vehicle,
     out: Out,
+    group: Annotated[
+        str | None,
+        typer.Option(help="Propeller group that all tables speak about.", metavar="NAME"),
+    ] = None,
+    voltage: Annotated[
+        float | None,
+        typer.Option(help="Battery voltage at which the numbers shall hold [V], where tables have several."),
+    ] = None,
+    pool_voltages: Annotated[
+        bool,
+        typer.Option(
+            "--pool-voltages", help="Fit all voltages together instead of checking one on the others."
+        ),
+    ] = False,
     report: Report = None,
     seed: Seed = 0,
     as_json: Json = False,
@@ -55,7 +69,17 @@ def thruster(
     start_warp()
     from finssim.calibration.commands import calibrate_thruster as run
 
-    run(tables, vehicle=vehicle, out=out, report=report, seed=seed, as_json=as_json)
+    run(
+        tables,
+        vehicle=vehicle,
+        group=group,
+        voltage=voltage,
+        pool_voltages=pool_voltages,
+        out=out,
+        report=report,
+        seed=seed,
+        as_json=as_json,
+    )
 
 
 @calibrate_app.command()

@@ -42,7 +42,7 @@ def test_a_reader_finds_what_they_need(folder, name):
     for words in (
         "37.9 to 40.2",
         "5 of 7 parameters",
-        "yaw.d2 0.47763",
+        "yaw.d2 0.4776",
         "rests on its bound",
         "11" * 32,
         COMMAND,

@@ -136,3 +136,16 @@ def test_the_file_is_for_people(tmp_path):
     numbers = sum(1 for _ in leaves(file_tree(vehicle)))
     assert len(text.splitlines()) < numbers
     assert text.count("c_plus:") == 2 and "mass: 12.11  # [kg]" in text
+
+
+def test_numbers_of_one_source_share_it_and_keep_their_notes(tmp_path):
+    """Each with an interval of its own: the source stands once, at the section."""
+    vehicle = load_vehicle("finsrov")
+    for i, key in enumerate(("mass", "displaced_volume", "surface_half_height")):
+        vehicle = vehicle.replace(
+            {f"body.{key}": (12.0, 0.0119, 0.11)[i]}, Provenance("measured", "our scale", f"note {i}")
+        )
+    vehicle = vehicle.replace({"body.size": [0.5, 0.4, 0.3]}, Provenance("measured", "our scale"))
+    write_vehicle(vehicle, tmp_path / "v.yaml")
+    assert (tmp_path / "v.yaml").read_text(encoding="utf-8").count("our scale") == 1
+    assert load_vehicle(tmp_path / "v.yaml").provenance == vehicle.provenance

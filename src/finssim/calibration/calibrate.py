@@ -32,7 +32,8 @@ def calibrated(fit: Fit) -> Vehicle:
     record = _record(fit)
     source = f"calibration {number}: {record.sentence()}"
     try:
-        after = before.replace(fit.changes, Provenance("measured", source)) if fit.changes else before
+        changes = {path: _rounded(value) for path, value in fit.changes.items()}
+        after = before.replace(changes, Provenance("measured", source)) if changes else before
     except VehicleError as error:
         raise CalibrationError(
             f"the estimates make no vehicle: {error}: use fewer axes, or trials that excite them more"
@@ -125,6 +126,17 @@ def _record(fit: Fit) -> CalibrationRecord:
         revision=origin["revision"],
         interrupted=fit.interrupted,
     )
+
+
+def _rounded(value: Any) -> Any:
+    """Numbers with seven digits: far more than any interval is worth, and a file that can be read."""
+    if isinstance(value, Mapping):
+        return {key: _rounded(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [_rounded(item) for item in value]
+    if isinstance(value, (float, np.floating)):
+        return float(f"{value:.7g}")
+    return value
 
 
 def _plain(value: Any) -> Any:

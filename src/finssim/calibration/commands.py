@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,17 +32,29 @@ def calibrate_thruster(
     *,
     vehicle: str,
     out: Path,
+    group: str | None = None,
+    voltage: float | None = None,
+    pool_voltages: bool = False,
     report: Path | None = None,
     seed: int = 0,
     as_json: bool = False,
 ) -> Vehicle:
-    """Fit thrust curves to tables of a bench and write the vehicle; arguments as `calibrate_hydrodynamics`."""
+    """Fit thrust curves to tables of a bench and write the vehicle; arguments as `calibrate_hydrodynamics`.
+
+    Args:
+        group: Propeller group that all tables speak about.
+        voltage: At which the numbers shall hold [V].
+        pool_voltages: Fit all voltages together.
+    """
     places = _Places(out, report)
-    command = _command("thruster", tables, vehicle=vehicle, out=out, report=report, seed=seed)
+    options = {"group": group, "voltage": voltage, "pool_voltages": pool_voltages}
+    command = _command("thruster", tables, vehicle=vehicle, out=out, report=report, seed=seed, **options)
     body = load_vehicle(vehicle)
     from finssim.calibration.thruster import fit_thruster
 
-    fit = fit_thruster([str(table) for table in tables], body, seed=seed)
+    fit = fit_thruster(
+        list(tables), body, group=group, voltage=voltage, pool_voltages=pool_voltages, seed=seed
+    )
     return _finish(fit, places, command, as_json)
 
 
@@ -256,7 +269,7 @@ def _finish(fit: Fit, places: _Places, command: str, as_json: bool) -> Vehicle:
         document = fit_json(fit, vehicle, out=places.out, warnings=warnings)
         print(json.dumps(document, allow_nan=False))
     else:
-        console = Console()
+        console = Console() if sys.stdout.isatty() else Console(width=100)
         print_fit(fit, vehicle, console, warnings)
         _print_places(fit, vehicle, places, console)
     if fit.interrupted:
@@ -278,8 +291,9 @@ def _command(kind: str, inputs: Sequence[Path], **options: Any) -> str:
     """The command line that does this again."""
     words = ["finssim", "calibrate", kind, *map(str, inputs)]
     for name, value in options.items():
+        option = f"--{name.replace('_', '-')}"
         if value is True:
-            words.append(f"--{name}")
+            words.append(option)
         elif value is not None and value is not False:
-            words += [f"--{name}", str(value)]
+            words += [option, str(value)]
     return shlex.join(words)

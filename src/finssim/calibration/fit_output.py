@@ -76,7 +76,7 @@ def print_fit(
     table = Table(box=box.SIMPLE_HEAD)
     for heading in ("parameter", "estimate", "95 % interval", "unit", "file had", "state"):
         right = heading in ("estimate", "file had")
-        table.add_column(heading, justify="right" if right else "left", no_wrap=True)
+        table.add_column(heading, justify="right" if right else "left", overflow="fold")
     notes: dict[str, list[str]] = {}
     for name, estimate in fit.estimates.items():
         table.add_row(
@@ -100,8 +100,13 @@ def print_fit(
 
 
 def number_text(value: float | None) -> str:
-    """Five significant digits; – where there is none."""
-    return "–" if value is None or not math.isfinite(value) else f"{value:.5g}"
+    """Four significant digits, small numbers as 3.71e-4; – where there is none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    mantissa, _, exponent = f"{value:.3e}".partition("e")
+    if value != 0.0 and not -4 < int(exponent) < 6:
+        return f"{float(mantissa):g}e{int(exponent)}"
+    return f"{value:.4g}" if abs(value) < 1e4 else f"{value:.0f}"
 
 
 def interval_text(estimate: Estimate) -> str:
@@ -109,7 +114,7 @@ def interval_text(estimate: Estimate) -> str:
     low, high = estimate.ci95
     if not (math.isfinite(low) and math.isfinite(high)):
         return "unknown"
-    return f"{low:.4g} to {high:.4g}"
+    return f"{number_text(low)} to {number_text(high)}"
 
 
 def state_text(estimate: Estimate, fit: Fit, vehicle: Vehicle) -> str:

@@ -148,18 +148,24 @@ def _flow(node: Any, path: Path, inherited: Provenance | None, origins: Mapping[
 def _common(
     node: Any, path: Path, origins: Mapping[Path, Provenance], inherited: Provenance | None
 ) -> Provenance | None:
-    """The origin to state for a section: the one that most of its values have, counting a list once."""
-    counts: Counter[Provenance] = Counter()
+    """The origin to state for a section: that of most of its values, counting a list once.
+
+    Values of one origin and source that differ in their notes share the section's, each with its note alone.
+    """
+    notes: dict[tuple[Any, str], list[str]] = {}
     seen: set[tuple[Path, Provenance]] = set()
     for leaf, _ in leaves(node, path):
         value = leaf[:-1] if leaf[-1].isdigit() else leaf
         if leaf in origins and (value, origins[leaf]) not in seen:
             seen.add((value, origins[leaf]))
-            counts[origins[leaf]] += 1
-    if not counts:
+            notes.setdefault(origins[leaf][:2], []).append(origins[leaf].note)
+    if not notes:
         return inherited
-    best, number = counts.most_common(1)[0]
-    return inherited if inherited is not None and counts[inherited] >= number else best
+    best = max(notes, key=lambda pair: len(notes[pair]))
+    if inherited is not None and len(notes.get(inherited[:2], [])) >= len(notes[best]):
+        return inherited
+    shared = notes[best][0] if len(set(notes[best])) == 1 else ""
+    return Provenance(*best, shared)
 
 
 def _uniform(node: list[Any], path: Path, origins: Mapping[Path, Provenance]) -> bool:
