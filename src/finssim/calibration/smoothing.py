@@ -27,6 +27,9 @@ FEWEST = 5
 CANDIDATES = 80
 """Values of λ that are tried."""
 
+STIFFEST = 1e11
+"""Largest λ: far above it the equations of the spline lose all digits of float64."""
+
 SPIKE = 8.0
 """Robust standard deviations beyond which a sample is a spike."""
 
@@ -137,7 +140,7 @@ def _spectra(t: Array, y: Array, runs: list[slice], order: int) -> tuple[Array, 
 def _choose(penalty: Array, omega: Array, power: Array) -> tuple[float, Array]:
     """λ, and noise, value_std and slope_std by column (3, c)."""
     n = len(penalty)
-    candidates = np.geomspace(1e-4 / penalty.max(), 1e1 / penalty.min(), CANDIDATES)
+    candidates = np.geomspace(1e-4 / penalty.max(), min(1e1 / penalty.min(), STIFFEST), CANDIDATES)
     lost = candidates[:, None] * penalty / (1.0 + candidates[:, None] * penalty)  # eigenvalues of 1 - H
     likely = n * np.log(lost @ power.sum(axis=1) + 1e-300) - np.log(lost).sum(axis=1)
     best = int(np.argmin(likely))
