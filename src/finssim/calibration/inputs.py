@@ -186,9 +186,10 @@ def _columns(trial: Trial, vehicle: Vehicle, kind: str) -> list[str]:
     names = {c.removeprefix(kind): c for c in trial.channels if c.startswith(kind)}
     for name, column in names.items():
         if name not in vehicle.thrusters:
+            meant = next((own for own in vehicle.thrusters if own.lower() == name.lower()), name)
             raise CalibrationError(
                 f"{trial.name}: {column}: {vehicle.name} has no thruster '{name}'"
-                f"{did_you_mean(name, list(vehicle.thrusters))} it has {', '.join(vehicle.thrusters)}"
+                f"{did_you_mean(meant, list(vehicle.thrusters))} it has {', '.join(vehicle.thrusters)}"
             )
     return [names[name] for name in vehicle.thrusters if name in names and trial.has(names[name])]
 
