@@ -145,6 +145,17 @@ def test_outputs_push_as_the_autopilot_means_them(frame, name):
         np.testing.assert_array_equal(np.sign(wrench[used]), np.sign(meant[used]))
 
 
+def test_pulses_of_a_thruster_wired_the_other_way_are_left_to_the_vehicle_file():
+    """With motor_sign -1 the file itself says that short pulses push forward: the thrust must come out the same."""
+    vehicle = load_vehicle("bluerov2")
+    turned = vehicle.replace({"thrusters.T1.motor_sign": -1})
+    given = {f"C{i + 1}": name for i, name in enumerate(vehicle.thrusters)}
+    for one in (vehicle, turned):
+        outputs, _ = outputs_of(one, {}, given)
+        name, sign = outputs[1]
+        assert one.thrusters[name].shaft_speed(1500.0 + sign * 200.0) > 0.0
+
+
 def test_an_explicit_map_of_outputs_comes_first(tmp_path):
     """Two outputs exchanged, one turned."""
     text = "vehicle: bluerov2\nardusub: {outputs: {C1: T2, C2: T1, C3: -T3, C4: T4, C5: T5, C6: T6}}\n"

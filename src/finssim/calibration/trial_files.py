@@ -17,7 +17,7 @@ from finssim.calibration.trial import Trial
 from finssim.calibration.trial_table import trial_from_table
 from finssim.files import OutputError, atomic_directory
 
-__all__ = ["load_trial", "load_trials", "write_trial"]
+__all__ = ["load_trial", "load_trials", "trials_at", "write_trial"]
 
 HEADER = "trial.yaml"
 DATA = ("data.csv", "data.parquet")
@@ -54,7 +54,7 @@ def load_trials(paths: Iterable[str | os.PathLike[str]]) -> list[Trial]:
     Raises:
         CalibrationError: One cannot be used, there are none, or one is there twice.
     """
-    found = [trial for path in paths for trial in _trials_at(Path(path))]
+    found = [trial for path in paths for trial in trials_at(Path(path))]
     trials = [load_trial(path) for path in found]
     seen: dict[str, Path] = {}
     for path, trial in zip(found, trials, strict=True):
@@ -126,7 +126,7 @@ def _locate(path: Path) -> tuple[str, Path, Path | None]:
     return path.stem, path, None
 
 
-def _trials_at(path: Path) -> list[Path]:
+def trials_at(path: Path) -> list[Path]:
     """The trial at a path, or those in the folder there, in natural order of their names."""
     if not path.is_dir() or any((path / file).is_file() for file in DATA):
         return [path]

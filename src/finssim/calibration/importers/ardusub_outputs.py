@@ -75,7 +75,10 @@ LEAST_LIKENESS = 1.4
 def outputs_of(
     vehicle: Vehicle, parameters: Mapping[str, float], given: Mapping[str, str]
 ) -> tuple[dict[int, tuple[str, int]], str]:
-    """Output (from 1) -> thruster, and -1 where longer pulses push against its axis; and a note.
+    """Output (from 1) -> thruster, and -1 where its pulses have to be turned about neutral; and a note.
+
+    Turned pulses are as the vehicle file has the thruster wired: longer ones push along its axis, or against it where its
+    motor_sign is -1.
 
     From `given` (`C1: T1`, `C2: -T2`), else from the vehicle's motor_index, else from the frame and the motor
     directions that the autopilot's parameters name, matched with where the vehicle's thrusters sit.
@@ -90,11 +93,14 @@ def outputs_of(
         found = {
             _output_of(int(thruster.motor_index or 0) + 1, parameters): (name, thruster.motor_sign or 1)
             for name, thruster in vehicle.thrusters.items()
-        }
+        }  # the motor_sign is the vehicle file's, so that no pulse is turned below
         how = "by the motor_index of the vehicle file"
     else:
         found, frame = _by_frame(vehicle, parameters)
         how = f"by the frame {frame} of the log"
+    found = {
+        output: (name, sign * (vehicle.thrusters[name].motor_sign or 1)) for output, (name, sign) in found.items()
+    }
     pairs = ", ".join(
         f"C{output} {'-' if sign < 0 else ''}{name}" for output, (name, sign) in sorted(found.items())
     )
