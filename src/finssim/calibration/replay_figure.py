@@ -163,6 +163,8 @@ def _envelope_panel(axes: Any, axis: Axis, pairs: Sequence[Pair], models: Sequen
         if value is not None:
             place = (1.0 - 0.14 * (len(models) - 1 - k), 1.03)
             axes.text(*place, f"{value:.3f}", transform=axes.transAxes, color=color, fontsize=8, ha="right")
+    place = (1.0 - 0.14 * len(models), 1.03)
+    axes.text(*place, "NRMSE", transform=axes.transAxes, color="0.45", fontsize=7, ha="right")
     coast = [p.t[np.argmax(p.phase == "coast")] - p.t[onset(p, axis) or 0] for p in pairs if _coasts(p, axis)]
     if coast:
         axes.axvspan(float(np.median(coast)), grid[-1], color="0.945", zorder=0, linewidth=0.0)
@@ -195,7 +197,7 @@ def _coasts(pair: Pair, axis: Axis) -> bool:
 
 
 def _grid(pairs: Sequence[Pair], axis: Axis) -> Array:
-    """Times since the onset that at least half of the trials cover [s]."""
+    """Times since the onset that three quarters of the trials cover [s], so that no trial's end shows as a step."""
     ends = []
     for pair in pairs:
         aligned = normalised(pair, pair.t, axis)
@@ -203,7 +205,9 @@ def _grid(pairs: Sequence[Pair], axis: Axis) -> Array:
         ends.append(aligned[0][np.flatnonzero(pair.scored())[-1]])
     first = max(-BEFORE, float(np.median([-(p.t[onset(p, axis) or 0] - p.t[0]) for p in pairs])))
     rate = max(pair.rate for pair in pairs)
-    return np.asarray(np.arange(np.ceil(first * rate), np.floor(float(np.median(ends)) * rate) + 1) / rate)
+    return np.asarray(
+        np.arange(np.ceil(first * rate), np.floor(float(np.quantile(ends, 0.25)) * rate) + 1) / rate
+    )
 
 
 def _on(grid: Array, aligned: tuple[Array, Array] | None) -> Array:

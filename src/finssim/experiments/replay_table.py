@@ -1,0 +1,119 @@
+"""The replay experiment as a person reads it: its table beside the paper's, and its folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from finssim.calibration.replay_figure import MODEL_LABELS, draw_response_envelopes
+from finssim.calibration.replay_json import DEFINITION
+from finssim.calibration.replay_pairs import Pair
+from finssim.calibration.vehicle_file import write_vehicle
+from finssim.files import atomic_directory
+from finssim.vehicles import Vehicle
+
+__all__ = ["RESULT_FILE", "markdown", "print_table", "write_results"]
+
+RESULT_FILE = "replay_experiment.json"
+
+NOTE = (
+    "ours: held-out trials of a virtual plant outside all three model classes. paper: Unity replaying trials of the "
+    "real FinsROV in its pool. These are different experiments and stand side by side for orientation."
+)
+LEVELS = {
+    "same_levels": "held-out repeats of the fitted levels",
+    "other_levels": "the validation sweeps, levels that no fit has seen",
+}
+
+
+def rows_of(result: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Head and rows of the table: ours by level set and model, then the paper's."""
+    axes = list(next(iter(result["same_levels"]["models"].values()))["by_axis"])
+    heads = ["model", "NRMSE", "95 % interval", *axes]
+    rows = []
+    for key, words in LEVELS.items():
+        rows.append([words, *[""] * (len(heads) - 1)])
+        for model, m in result[key]["models"].items():
+            values = [f"{m['by_axis'][a]:.3f}" if a in m["by_axis"] else "–" for a in axes]
+            rows.append(
+                [f"  ours, {MODEL_LABELS[model]}", f"{m['aggregate']:.3f}", _range(m["ci95"]), *values]
+            )
+    rows.append(["the paper, its hardware in its pool", *[""] * (len(heads) - 1)])
+    for model, p in result["paper"].items():
+        label = f"  paper, {MODEL_LABELS[model]}"
+        rows.append([label, f"{p['aggregate']:.3f}", _range(p["ci95"]), *["–"] * len(axes)])
+    return heads, rows
+
+
+def print_table(result: Mapping[str, Any], console: Console) -> None:
+    """Print it."""
+    console.print(_headline(result), highlight=False)
+    heads, rows = rows_of(result)
+    table = Table(box=box.SIMPLE_HEAD, caption=NOTE, caption_justify="left")
+    for k, head in enumerate(heads):
+        table.add_column(head, justify="right" if k else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*row, style="dim" if "paper" in row[0] else None)
+    console.print(table)
+
+
+def markdown(result: Mapping[str, Any]) -> str:
+    """`replay_experiment.md`."""
+    heads, rows = rows_of(result)
+    lines = [heads, ["---"] + ["--:"] * (len(heads) - 1)]
+    lines += [[f"**{r[0]}**", *r[1:]] if not r[1] else [r[0].strip(), *r[1:]] for r in rows]
+    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    hashes = ", ".join(fit["vehicle_sha256"][:12] for fit in result["fits"])
+    origin = result["provenance"]
+    about = (
+        f"Vehicle file {result['vehicle']['name']} {result['vehicle']['sha256'][:12]}; calibrated vehicles {hashes}; "
+        f"seeds {', '.join(map(str, result['seeds']))}; FinsSim {origin['finssim']}, revision {origin['revision']}."
+    )
+    parts = ["# Replay error of three hydrodynamic models", _headline(result), table, NOTE]
+    parts += ["![Response envelopes](envelope.png)", DEFINITION, about]
+    return "\n\n".join(parts) + "\n"
+
+
+def write_results(
+    result: Mapping[str, Any], out: Path, pairs: Sequence[Pair], vehicles: Sequence[Vehicle]
+) -> None:
+    """Write the folder; an earlier experiment there is replaced.
+
+    Args:
+        result: What `replay_experiment` returns.
+        out: The directory.
+        pairs: Held-out trials with their replays, for the figure.
+        vehicles: Calibrated, one for each seed.
+
+    Raises:
+        OutputError: The directory cannot be written.
+    """
+    with atomic_directory(out, replaces=RESULT_FILE) as folder:
+        text = json.dumps(result, indent=2, allow_nan=False) + "\n"
+        (folder / RESULT_FILE).write_text(text, encoding="utf-8")
+        (folder / "replay_experiment.md").write_text(markdown(result), encoding="utf-8")
+        draw_response_envelopes(pairs).savefig(folder / "envelope.png", dpi=200)
+        (folder / "vehicles").mkdir()
+        for seed, vehicle in zip(result["seeds"], vehicles, strict=True):
+            write_vehicle(vehicle, folder / "vehicles" / f"seed_{seed}.yaml")
+
+
+def _headline(result: Mapping[str, Any]) -> str:
+    counts = result["trials_per_seed"]
+    seeds = len(result["seeds"])
+    note = f" (interrupted: {result['seeds_asked_for']} were asked for)" if result["interrupted"] else ""
+    who = f"{result['vehicle']['name']}, {seeds} seed{'s' if seeds != 1 else ''}{note}"
+    return (
+        f"{who}: fitted on {counts['fitted']} trials each, replayed on {counts['same_levels']} others of the same "
+        f"levels and {counts['other_levels']} of other levels"
+    )
+
+
+def _range(ci95: Sequence[float]) -> str:
+    return f"[{ci95[0]:.3f}, {ci95[1]:.3f}]"
