@@ -204,7 +204,7 @@ def test_a_passive_trial_needs_no_inputs():
         ({"u": [0, 1]}, "no input columns, expected tau_x .* or write 'passive: true'"),
         (
             {"force_T1": [0, 1]},
-            "force_T2, force_T3, force_T4, force_T5, force_T6 are missing, expected a column for each of the 6 thrusters of bluerov2",
+            "force_T2, force_T3, force_T4, force_T5, force_T6 are missing, .* each of the 6 thrusters of bluerov2",
         ),
         ({"rpm_t1": [0, 1]}, "rpm_t1: bluerov2 has no thruster 't1', did you mean 'T1'"),
         ({"force_T9": [0, 1]}, "has no thruster 'T9'.* it has T1, T2"),

@@ -12,7 +12,7 @@ from finssim.calibration.trial import Trial
 from finssim.calibration.velocities import Velocities
 from finssim.vehicles import Vehicle
 
-__all__ = ["accelerations", "holds_gravity", "slopes"]
+__all__ = ["accelerations", "accelerometer_place", "holds_gravity", "slopes"]
 
 Array = NDArray[np.float64]
 
@@ -58,11 +58,7 @@ def accelerations(
                 ("ax, ay, az hold gravity, and roll and pitch are not measured: they were not used",),
             )
         f = f - gravity * up_in_body(attitude.quaternion)
-    at_point = trial.header.acceleration_at
-    if at_point is None:
-        imu = vehicle.sensors.imu
-        at_point = (0.0, 0.0, 0.0) if imu is None else tuple(imu.position)
-    r = np.asarray(at_point, float)
+    r = accelerometer_place(trial, vehicle)
     nu = np.nan_to_num(found.nu)
     v, omega, omega_dot = nu[:, :3], nu[:, 3:], np.nan_to_num(nu_dot[:, 3:])
     a = f - np.cross(omega, v) - np.cross(omega_dot, r) - np.cross(omega, np.cross(omega, r))
@@ -73,6 +69,14 @@ def accelerations(
             nu_dot[~np.isfinite(found.nu[:, i]), i] = np.nan
             source[i] = "imu"
     return nu_dot, tuple(source), ()
+
+
+def accelerometer_place(trial: Trial, vehicle: Vehicle) -> Array:
+    """Body point of the accelerometer [m], (3,): the header's, the vehicle's IMU, or the origin."""
+    if trial.header.acceleration_at is not None:
+        return np.asarray(trial.header.acceleration_at, float)
+    imu = vehicle.sensors.imu
+    return np.zeros(3) if imu is None else np.asarray(imu.position, float)
 
 
 def holds_gravity(trial: Trial, gravity: float) -> bool:

@@ -76,7 +76,8 @@ def without_spikes(t: Array, y: Array) -> NDArray[np.bool_]:
     padded = np.concatenate([y[2:0:-1], y, y[-2:-4:-1]])
     median = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0), axis=-1)
     distance = np.abs(y - median)
-    spread = 1.4826 * np.median(distance, axis=0)
+    usual_step = np.median(np.abs(np.diff(y, axis=0)), axis=0)
+    spread = np.maximum(1.4826 * np.median(distance, axis=0), 0.5 * usual_step)
     floor = 0.02 * (np.percentile(y, 95.0, axis=0) - np.percentile(y, 5.0, axis=0)) + 1e-12
     bad = np.any(distance > SPIKE * np.maximum(spread, floor), axis=1)
     return ~bad if bad.sum() <= 0.05 * n else np.ones(n, bool)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.accelerations import ACCELERATION, holds_gravity
+from finssim.calibration.accelerations import ACCELERATION, accelerometer_place, holds_gravity
 from finssim.calibration.attitude_signal import attitude_signal, up_in_body
 from finssim.calibration.smoothing import smooth
 from finssim.calibration.trial import Trial
@@ -48,7 +48,7 @@ def stream_offsets(trial: Trial, vehicle: Vehicle) -> dict[str, Offset]:
     """Offsets of streams whose motion another stream measures too.
 
     Compared are attitude with gyro, position with velocity, depth with vertical position or velocity, and acceleration
-    with velocity.
+    with velocity and attitude, or with the attitude alone.
 
     Args:
         trial: The trial.
@@ -73,11 +73,12 @@ def stream_offsets(trial: Trial, vehicle: Vehicle) -> dict[str, Offset]:
     if not attitude.tilt:
         through_world[:, 2] = np.nan
     vertical = world[:, 2:] if trial.has("z") else through_world[:, 2:]
-    kinematic = _kinematic(trial, t, attitude.quaternion, nu, omega, vehicle)
+    reference, predicted = _predicted(trial, vehicle, t, attitude.quaternion, nu, nu_slope, omega)
+    measured = _on_grid(trial, ACCELERATION, t, 2)[0]
     pairs = {
         "position": ("velocity", through_world, world),
         "depth": ("position" if trial.has("z") else "velocity", vertical, -depth),
-        "acceleration": ("velocity", nu_slope, kinematic),
+        "acceleration": (reference, predicted, measured),
     }
     found |= {group: _offset(reference, *signals) for group, (reference, *signals) in pairs.items()}
     return {group: offset for group, offset in found.items() if offset is not None}
@@ -94,12 +95,25 @@ def _on_grid(trial: Trial, columns: tuple[str, ...], t: Array, order: int) -> tu
     return value, slope
 
 
-def _kinematic(trial: Trial, t: Array, quaternion: Array, nu: Array, omega: Array, vehicle: Vehicle) -> Array:
-    """About v_dot from the accelerometer, without lever arms, (m, 3)."""
-    a, _ = _on_grid(trial, ACCELERATION, t, 2)
+def _predicted(
+    trial: Trial, vehicle: Vehicle, t: Array, quaternion: Array, v: Array, v_dot: Array, omega: Array
+) -> tuple[str, Array]:
+    """What the accelerometer should read by the other streams, and the group that tells most of it, (m, 3).
+
+    Velocity, rates and attitude have their right times here, and the accelerometer is compared as it is: gravity taken
+    off a late signal would leave what the tilt did meanwhile.
+    """
+    if np.isfinite(v).any(axis=0).all():
+        group = "velocity"
+        turning = np.nan_to_num(omega)
+        turning_dot = np.nan_to_num(_on_grid(trial, ("p", "q", "r"), t, 2)[1])
+        r = accelerometer_place(trial, vehicle)
+        a = v_dot + np.cross(turning, v) + np.cross(turning_dot, r) + np.cross(turning, np.cross(turning, r))
+    else:
+        group, a = "attitude", np.zeros((len(t), 3))
     if holds_gravity(trial, vehicle.water.gravity):
-        a = a - vehicle.water.gravity * up_in_body(quaternion)
-    return a - np.cross(np.nan_to_num(omega), np.nan_to_num(nu))
+        return group, a + vehicle.water.gravity * up_in_body(quaternion)
+    return group, a
 
 
 def _offset(reference: str, fixed: Array, moved: Array) -> Offset | None:
