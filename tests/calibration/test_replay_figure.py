@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from finssim.calibration.replay_figure import draw_overlay, draw_response_envelopes, normalised
+from finssim.calibration.replay_figure import draw_ahead, draw_overlay, draw_response_envelopes, normalised
+from finssim.calibration.replay_metrics import error_ahead
 from finssim.calibration.replay_pairs import Pair, find_phases
 
 T = np.arange(501) / 50.0
+MODELS = (("calibrated", 0.8), ("mesh", 1.5))
+"""Name and gain of two models."""
 
 
 def square(level, gain=1.0, axis=0, in_sample=False, name="a"):
@@ -80,6 +83,25 @@ def test_the_overlay_has_the_input_every_response_and_its_score(tmp_path):
     assert set(lines(figure.axes[1])) == {"measured", "Calibrated Fossen 0.432"}
     figure.savefig(tmp_path / "overlay.png")
     assert (tmp_path / "overlay.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_passive_trial_has_no_panel_of_inputs():
+    pair = square(5.0)
+    pair.tau[:] = 0.0
+    figure = draw_overlay(pair)
+    assert [a.get_ylabel() for a in figure.axes] == ["$u$ [m/s]"] and "passive" in figure.get_suptitle()
+
+
+def test_the_error_ahead_is_drawn_for_every_model_beside_persistence():
+    ahead = np.arange(0, 101) / 50.0
+    measured = np.outer(ahead, np.ones(3))
+    found = {m: error_ahead(np.zeros(3), ahead, measured, g * measured, 2.0, [1.0, 2.0]) for m, g in MODELS}
+    figure = draw_ahead({"surge": found, "yaw": found})
+    assert [a.get_title(loc="left") for a in figure.axes if a.get_visible()] == ["surge", "yaw"]
+    drawn = lines(figure.axes[0])
+    np.testing.assert_allclose(drawn["Calibrated Fossen"], [0.1, 0.2])
+    np.testing.assert_allclose(drawn["Physics-mesh"], [0.25, 0.5])
+    np.testing.assert_allclose(drawn["persistence"], [0.5, 1.0])
 
 
 def test_no_line_joins_two_replays():

@@ -13,7 +13,8 @@ import numpy as np
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.replay_metrics import SEED, Aggregate, Ahead, Score, aggregate, error_ahead, score
 from finssim.calibration.replay_pairs import Pair
-from finssim.calibration.replay_run import check_models, replay_pairs, replay_predictions
+from finssim.calibration.replay_predictions import replay_predictions
+from finssim.calibration.replay_run import check_models, replay_pairs
 from finssim.calibration.trial import Array, Trial
 from finssim.quiet import start_warp
 from finssim.vehicles import Vehicle, load_vehicle

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from finssim.calibration.replay_metrics import aggregate, response_span, score
+from finssim.calibration.replay_metrics import Ahead, aggregate, response_span, score
 from finssim.calibration.replay_pairs import UNITS, Pair, models_of, onset
 from finssim.calibration.trial import Array
 from finssim.vehicles.vehicle import AXES, Axis
@@ -15,7 +15,7 @@ from finssim.vehicles.vehicle import AXES, Axis
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["MODEL_LABELS", "draw_overlay", "draw_response_envelopes", "normalised"]
+__all__ = ["MODEL_LABELS", "draw_ahead", "draw_overlay", "draw_response_envelopes", "normalised"]
 
 MODEL_LABELS = {"calibrated": "Calibrated Fossen", "mesh": "Physics-mesh", "simplified": "Simplified Fossen"}
 COLORS = {"calibrated": "#0072B2", "mesh": "#009E73", "simplified": "#D55E00"}
@@ -27,12 +27,7 @@ STYLES = {"calibrated": (0, ()), "mesh": (0, (6, 1.6)), "simplified": (0, (1.6, 
 
 BEFORE = 0.5
 """Time shown before the onset [s]."""
-SYMBOLS = {
-    "roll": "roll",
-    "pitch": "pitch",
-    "depth": "depth",
-    **{name: f"${name}$" for name in "uvwpqr"},
-}
+SYMBOLS = {"roll": "roll", "pitch": "pitch", "depth": "depth"} | {name: f"${name}$" for name in "uvwpqr"}
 
 
 def normalised(pair: Pair, values: Array, axis: Axis) -> tuple[Array, Array] | None:
@@ -73,9 +68,6 @@ def draw_response_envelopes(pairs: Sequence[Pair], title: str = "") -> Figure:
     Raises:
         ValueError: No trial has a response that could be drawn.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     held_out = [pair for pair in pairs if not pair.in_sample]
     shown = held_out or list(pairs)
     panels = {axis: [p for p in shown if axis in p.axes and _drawable(p, axis)] for axis in AXES}
@@ -87,11 +79,7 @@ def draw_response_envelopes(pairs: Sequence[Pair], title: str = "") -> Figure:
     models = models_of(shown)
     columns = 1 if len(panels) == 1 else 2
     rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(3.6 * columns, 2.15 * rows + 0.55), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes_of = figure.subplots(rows, columns, squeeze=False)
-    for axes in axes_of.flat[len(panels) :]:
-        axes.set_visible(False)
+    figure, axes_of = _panels(len(panels), rows, columns, (3.6 * columns, 2.15 * rows + 0.55))
     for i, (axis, chosen) in enumerate(panels.items()):
         _envelope_panel(axes_of.flat[i], axis, chosen, models)
     for i in range(0, len(panels), columns):
@@ -101,26 +89,25 @@ def draw_response_envelopes(pairs: Sequence[Pair], title: str = "") -> Figure:
     handles, labels = axes_of.flat[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False, fontsize=8.5)
     warning = "" if held_out else "in-sample: the vehicle was fitted on these trials"
-    heading = "\n".join(filter(None, (title, warning)))
-    if heading:
+    if title or warning:
+        heading = "\n".join(filter(None, (title, warning)))
         figure.suptitle(heading, fontsize=10, color="#a00000" if warning else BLACK)
     return figure
 
 
 def draw_overlay(pair: Pair) -> Figure:
-    """One trial: the input, the responses of the excited axes, and attitude and depth where they were measured."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
+    """One trial: the input if any, the responses of the excited axes, attitude and depth where they were measured."""
     responses = [pair.response(axis) for axis in pair.axes]
     responses += [r for r in ("roll", "pitch", "depth") if response_span(pair, r).value is not None]
     responses = [r for r in responses if r in pair.measured]
-    figure = Figure(figsize=(7.2, 1.1 + 1.45 * (len(responses) + 1)), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes_of = figure.subplots(len(responses) + 1, 1, sharex=True, squeeze=False)[:, 0]
-    _input_panel(axes_of[0], pair)
+    driven = bool(np.nan_to_num(pair.tau).any())
+    rows = len(responses) + driven
+    figure, grid = _panels(rows, rows, 1, (7.2, 1.1 + 1.45 * rows), sharex=True)
+    axes_of = grid[:, 0]
+    if driven:
+        _input_panel(axes_of[0], pair)
     models = models_of([pair])
-    for axes, response in zip(axes_of[1:], responses, strict=True):
+    for axes, response in zip(axes_of[driven:], responses, strict=True):
         if response in pair.raw:
             axes.plot(pair.t, pair.raw[response], color="0.8", linewidth=0.8)
         axes.plot(pair.t, pair.measured[response], color=BLACK, linewidth=2.4, label="measured")
@@ -141,9 +128,56 @@ def draw_overlay(pair: Pair) -> Figure:
         _tidy(axes)
         axes.set_xlim(pair.t[0], pair.t[-1])
     axes_of[-1].set_xlabel("time [s]")
-    label = f"{pair.name}: {', '.join(pair.axes) or 'passive'}" + (", in-sample" if pair.in_sample else "")
+    label = f"{pair.name}: {', '.join(pair.axes) if driven else 'passive'}" + (
+        ", in-sample" if pair.in_sample else ""
+    )
     figure.suptitle(label, fontsize=10, color="#a00000" if pair.in_sample else BLACK)
     return figure
+
+
+def draw_ahead(ahead: Mapping[Axis, Mapping[str, Ahead]]) -> Figure:
+    """Error of predictions from measured states by how far they look ahead, a panel for each axis.
+
+    Relative to the span of the response; persistence, the prediction that nothing changes, is gray.
+
+    Args:
+        ahead: Axis -> model -> error.
+    """
+    columns = min(len(ahead), 3)
+    rows = -(-len(ahead) // columns)
+    figure, axes_of = _panels(len(ahead), rows, columns, (1.2 + 2.4 * columns, 2.0 * rows + 0.5))
+    for axes, (axis, by_model) in zip(axes_of.flat, ahead.items(), strict=False):
+        for model, a in by_model.items():
+            label, color = MODEL_LABELS.get(model, model), _color(model, tuple(by_model))
+            look = {"color": color, "linestyle": _style(model), "linewidth": 1.4}
+            axes.plot(a.seconds, a.nrmse, marker="o", markersize=3, label=label, **look)
+        first = next(iter(by_model.values()))
+        axes.plot(first.seconds, first.nrmse_persistence, "s-", color=GRAY, ms=3, lw=1.2, label="persistence")
+        axes.set_title(axis, fontsize=9, loc="left")
+        axes.set_xlabel("seconds ahead")
+        axes.set_ylim(bottom=0.0)
+        axes.set_xlim(left=0.0)
+        _tidy(axes)
+    for row in axes_of:
+        row[0].set_ylabel("error / span")
+    handles, labels = axes_of.flat[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False, fontsize=8.5)
+    return figure
+
+
+def _panels(
+    count: int, rows: int, columns: int, size: tuple[float, float], **shared: Any
+) -> tuple[Figure, Any]:
+    """A figure of that size [inch] with `count` visible axes in a grid, (rows, columns)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes_of = figure.subplots(rows, columns, squeeze=False, **shared)
+    for axes in axes_of.flat[count:]:
+        axes.set_visible(False)
+    return figure, axes_of
 
 
 def _envelope_panel(axes: Any, axis: Axis, pairs: Sequence[Pair], models: Sequence[str]) -> None:

@@ -191,6 +191,8 @@ class Ahead(NamedTuple):
     """The same of the prediction that nothing changes, (H,)."""
     nrmse: Array
     """Root mean square of error / span, (H,)"""
+    nrmse_persistence: Array
+    """The same of persistence, (H,)."""
     count: NDArray[np.int64]
     """Predictions compared, (H,)."""
 
@@ -225,4 +227,5 @@ def error_ahead(
         return np.asarray(np.sqrt(np.divide(total, count, out=np.full(len(wanted), np.nan), where=count > 0)))
 
     rmse = rms(ours)
-    return Ahead(wanted, rmse, rms(theirs), rms(ours / np.asarray(width, dtype=np.float64)), count)
+    scale = np.asarray(width, dtype=np.float64)
+    return Ahead(wanted, rmse, rms(theirs), rms(ours / scale), rms(theirs / scale), count)

@@ -12,7 +12,7 @@ from finssim.calibration.columns import NU
 from finssim.calibration.trial import Array
 from finssim.vehicles.vehicle import AXES, Axis
 
-__all__ = ["RESPONSES", "UNITS", "Pair", "excited_axes", "find_phases", "models_of", "onset"]
+__all__ = ["RESPONSES", "UNITS", "Pair", "excited_axes", "find_phases", "models_of", "onset", "resampled"]
 
 RESPONSES = (*NU, "roll", "pitch", "depth")
 """What is compared: body velocities, and attitude and depth where they were measured."""
@@ -148,3 +148,19 @@ def models_of(pairs: Sequence[Pair]) -> tuple[str, ...]:
     """The replayed models, in their order."""
     found: Mapping[str, None] = {model: None for pair in pairs for model in pair.simulated}
     return tuple(found)
+
+
+def resampled(t: Array, values: Array, wanted: Array) -> Array:
+    """Linear interpolation that leaves holes holes: NaN where a neighbour is, or is far, or there is none."""
+    if values.ndim == 2:
+        return np.stack([resampled(t, column, wanted) for column in values.T], axis=-1)
+    good = np.isfinite(values)
+    if not good.any():
+        return np.full(len(wanted), np.nan)
+    t, values = t[good], values[good]
+    out = np.interp(wanted, t, values, left=np.nan, right=np.nan)
+    right = np.clip(np.searchsorted(t, wanted), 0, len(t) - 1)
+    left = np.maximum(np.searchsorted(t, wanted, side="right") - 1, 0)
+    usual = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
+    out[t[right] - t[left] > max(3.0 * usual, 0.1)] = np.nan
+    return np.asarray(out)

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from finssim.calibration.replay import Replay
-from finssim.calibration.replay_figure import MODEL_LABELS, draw_overlay, draw_response_envelopes
+from finssim.calibration.replay_figure import MODEL_LABELS, draw_ahead, draw_overlay, draw_response_envelopes
 from finssim.calibration.replay_gates import classify, gates
 from finssim.calibration.replay_json import DEFINITION
 from finssim.calibration.replay_metrics import Aggregate, phase_score
@@ -46,7 +46,7 @@ def replay_markdown(replay: Replay) -> str:
         parts.append("![Response envelopes](envelope.png)")
     if replay.ahead:
         parts += ["## Error ahead", "Relative to the span; in brackets the skill against persistence."]
-        parts.append(_markdown(*_ahead_table(replay)))
+        parts += [_markdown(*_ahead_table(replay)), "![Error ahead](ahead.png)"]
     parts += ["## Trials", _markdown(*_trial_table(replay))]
     parts += ["\n".join(f"- {sentence}" for sentence in _remarks(replay)), DEFINITION]
     parts.append(f"Vehicle {replay.vehicle.sha256}.")
@@ -67,6 +67,8 @@ def write_replay(replay: Replay, out: Path) -> None:
             draw_response_envelopes(replay.pairs).savefig(folder / "envelope.png", dpi=200)
         except ValueError:
             pass  # nothing was measured on an excited axis; the tables say so
+        if replay.ahead:
+            draw_ahead(replay.ahead).savefig(folder / "ahead.png", dpi=200)
         (folder / "trials").mkdir()
         for pair in replay.pairs:
             name = "".join(c if c.isalnum() or c in "-_.+" else "_" for c in pair.name)
@@ -138,21 +140,26 @@ def _ahead_table(replay: Replay) -> tuple[list[str], Rows]:
 
 
 def _remarks(replay: Replay) -> list[str]:
-    """What could not be scored or replayed, what was derived, and why there is no interval."""
-    out = [*replay.left_out]
-    for model in replay.models:
-        why = replay.aggregate(model).why
-        if why:
-            out.append(f"{MODEL_LABELS.get(model, model)}: {why}")
+    """What could not be scored or replayed, what was derived, and why there is no interval; equal ones together."""
+    found: dict[str, list[str]] = {}
     for pair, scores in zip(replay.pairs, replay.scores[replay.models[0]], strict=True):
-        out += [f"{pair.name}, {axis}: {one.why}" for axis, one in scores.items() if one.why]
-        if not scores:
-            out.append(f"{pair.name}: no axis is excited and measured")
+        said = [f"{axis}: {one.why}" for axis, one in scores.items() if one.why]
         for axis in scores:
             source = pair.source.get(pair.response(axis), "")
             if source not in ("", "measured"):
-                out.append(f"{pair.name}, {axis}: the velocity was not measured but {source}")
-    return list(dict.fromkeys(out))
+                said.append(f"{axis}: the velocity was not measured but {source}")
+        if not scores:
+            said.append("no axis is excited and measured")
+        for sentence in said:
+            found.setdefault(sentence, []).append(pair.name)
+    out = [*replay.left_out]
+    for model in replay.models:
+        why = replay.aggregate(model).why
+        out += [f"{MODEL_LABELS.get(model, model)}: {why}"] if why else []
+    for sentence, names in found.items():
+        shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+        out.append(f"{sentence} ({shown})")
+    return out
 
 
 def _number(value: float | None) -> str:

@@ -3,33 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from finssim.calibration.columns import NU
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.replay_metrics import response_span
-from finssim.calibration.replay_pairs import Pair, excited_axes, find_phases
+from finssim.calibration.replay_pairs import Pair, excited_axes, find_phases, resampled
 from finssim.calibration.rollout import Response, Rollouts
 from finssim.calibration.segments import Segment, Streams, segments, streams
 from finssim.calibration.trial import Array, Trial
 from finssim.geometry.rotations import quat_rotate, quat_to_euler
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
 from finssim.vehicles import Vehicle
-from finssim.vehicles.vehicle import AXES, Axis
+from finssim.vehicles.vehicle import AXES
 
-__all__ = ["Predictions", "check_models", "replay_pairs", "replay_predictions"]
+__all__ = ["STEP", "check_models", "replay_pairs"]
 
 RATE = 50.0
 """Responses are compared at this rate, or at the log's own where that is slower [1/s]."""
 
 STEP = 0.02
 """Of the simulation; integrated by RK4 [s]."""
-
-STAGGER = 4
-"""Predictions start this many times per horizon."""
 
 
 def check_models(vehicle: Vehicle, models: Sequence[str]) -> tuple[str, ...]:
@@ -102,13 +98,13 @@ def _bare_pair(s: Streams, vehicle: Vehicle) -> Pair:
     rate = _rate(s, vehicle)
     t = np.arange(0.0, float(trial.t[-1] - trial.t[0]) + 0.5 / rate, 1.0 / rate)
     clock = t + float(trial.t[0])
-    tau = _shifted(_resampled(m.t, m.tau, clock), vehicle.wrench_reference)
+    tau = _shifted(resampled(m.t, m.tau, clock), vehicle.wrench_reference)
     axes = excited_axes(tau, np.asarray(vehicle.wrench_limits), trial.header.axis)
     named = None
     if trial.phase is not None:
         rows = np.clip(np.searchsorted(trial.t, clock + 1e-9, side="right") - 1, 0, len(trial.t) - 1)
         named = trial.phase[rows]
-    nu, raw_nu = _resampled(m.t, m.nu, clock), _resampled(m.t, m.raw, clock)
+    nu, raw_nu = resampled(m.t, m.nu, clock), resampled(m.t, m.raw, clock)
     measured = {name: nu[:, k] for k, name in enumerate(NU)}
     raw = {name: raw_nu[:, k] for k, name in enumerate(NU)}
     source = {name: m.nu_source[k] for k, name in enumerate(NU)}
@@ -117,8 +113,8 @@ def _bare_pair(s: Streams, vehicle: Vehicle) -> Pair:
     for name in ("roll", "pitch", "depth"):
         if name in s.measured:
             t_raw, values = s.measured[name]
-            raw[name] = _resampled(t_raw, values, clock)
-            measured[name] = _resampled(m.t, smooth[name], clock) if name in smooth else raw[name]
+            raw[name] = resampled(t_raw, values, clock)
+            measured[name] = resampled(m.t, smooth[name], clock) if name in smooth else raw[name]
             source[name], noise[name] = "measured", _sample_noise(values)
     return Pair(
         name=trial.name,
@@ -209,101 +205,4 @@ def _shifted(tau: Array, point: Array) -> Array:
     """Moments about a body point, of wrenches about the body origin, (n, 6)."""
     out = np.array(tau, dtype=np.float64)
     out[:, 3:] -= np.cross(np.asarray(point, dtype=np.float64), out[:, :3])
-    return out
-
-
-def _resampled(t: Array, values: Array, wanted: Array) -> Array:
-    """Linear interpolation that leaves holes holes: NaN where a neighbour is, or is far, or there is none."""
-    if values.ndim == 2:
-        return np.stack([_resampled(t, column, wanted) for column in values.T], axis=-1)
-    good = np.isfinite(values)
-    if not good.any():
-        return np.full(len(wanted), np.nan)
-    t, values = t[good], values[good]
-    out = np.interp(wanted, t, values, left=np.nan, right=np.nan)
-    right = np.clip(np.searchsorted(t, wanted), 0, len(t) - 1)
-    left = np.maximum(np.searchsorted(t, wanted, side="right") - 1, 0)
-    usual = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
-    out[t[right] - t[left] > max(3.0 * usual, 0.1)] = np.nan
-    return np.asarray(out)
-
-
-@dataclass(frozen=True)
-class Predictions:
-    """Predictions of one axis of several trials from many measured states, by one model."""
-
-    ahead: Array
-    """Times since each start [s], (T,)."""
-    start: Array
-    """Response in the state that each starts from, (S,)."""
-    measured: Array
-    """(T, S), NaN where not measured or outside excitation and coast."""
-    simulated: dict[str, Array]
-    """Model -> (T, S)."""
-    width: Array
-    """P95 - P5 of the trial that each belongs to, (S,)."""
-
-
-def replay_predictions(
-    trials: Sequence[Trial], pairs: Sequence[Pair], vehicle: Vehicle, models: Sequence[str], horizon: float
-) -> dict[Axis, Predictions]:
-    """Short replays that start from measured states all along the trials.
-
-    Args:
-        trials: Those of the pairs, in their order.
-        pairs: Which axes and samples count.
-        vehicle: The vehicle.
-        models: Keys of its hydrodynamics.
-        horizon: How far to look ahead [s].
-
-    Returns:
-        By axis; only where a prediction can be compared.
-    """
-    cut: list[Segment] = []
-    for i, trial in enumerate(trials):
-        s = streams(trial, vehicle)
-        for k in range(STAGGER):
-            start = k * horizon / STAGGER
-            parts = int((trial.duration - start) / horizon)
-            if parts > 0:
-                length = (trial.duration - start) / parts
-                cut += segments(s, vehicle, length=length, step=STEP, start=start, index=i)
-    if not cut:
-        return {}
-    steps = round(horizon / STEP)
-    ahead = STEP * np.arange(steps + 1)
-    responses = {model: Rollouts(vehicle, cut, hydrodynamics=model).run() for model in models}
-    out: dict[Axis, Predictions] = {}
-    for axis in AXES:
-        k = AXES.index(axis)
-        chosen = [
-            i
-            for i, segment in enumerate(cut)
-            if axis in pairs[segment.index].axes
-            and segment.known[k]
-            and response_span(pairs[segment.index], NU[k]).value is not None
-        ]
-        if not chosen:
-            continue
-        out[axis] = Predictions(
-            ahead=ahead,
-            start=np.array([cut[i].nu[k] for i in chosen]),
-            measured=np.stack([_ahead(pairs[cut[i].index], cut[i], ahead, NU[k]) for i in chosen], axis=-1),
-            simulated={m: _padded(r.nu[:, 0, chosen, k], steps + 1) for m, r in responses.items()},
-            width=np.array([response_span(pairs[cut[i].index], NU[k]).value for i in chosen]),
-        )
-    return out
-
-
-def _ahead(pair: Pair, segment: Segment, ahead: Array, response: str) -> Array:
-    """What was measured at times after a segment's start, where it counts, (T,)."""
-    since = ahead + segment.t0 - pair.t0
-    values = _resampled(pair.t, np.where(pair.scored(), pair.measured[response], np.nan), since)
-    return np.where(ahead <= segment.duration + 1e-9, values, np.nan)
-
-
-def _padded(values: NDArray[np.float32], rows: int) -> Array:
-    """The first rows, NaN below the last, (rows, S)."""
-    out = np.full((rows, values.shape[1]), np.nan)
-    out[: len(values[:rows])] = values[:rows]
     return out
