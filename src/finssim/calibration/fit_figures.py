@@ -38,8 +38,17 @@ def fit_pictures(fit: Fit) -> dict[str, tuple[str, bytes]]:
 
 
 def draw_estimates(estimates: Sequence[Estimate]) -> Figure | None:
-    """95 % intervals relative to their estimates, one row each; None where no interval is finite."""
-    shown = [e for e in estimates if e.estimate != 0.0 and all(map(math.isfinite, (e.estimate, *e.ci95)))]
+    """95 % intervals relative to their estimates, one row each; None where no interval is finite.
+
+    Biases, which should be nothing, have no place in it.
+    """
+    shown = [
+        e
+        for e in estimates
+        if e.estimate != 0.0
+        and not e.name.endswith("bias")
+        and all(map(math.isfinite, (e.estimate, *e.ci95)))
+    ]
     if not shown:
         return None
     figure = _figure(7.2, 0.9 + 0.27 * len(shown))
@@ -54,6 +63,7 @@ def draw_estimates(estimates: Sequence[Estimate]) -> Figure | None:
             if abs(end) > WIDE:
                 axes.plot([math.copysign(WIDE, end)], [row], mark, color=color, markersize=6)
     axes.set_yticks(rows, [f"{e.name}  {e.estimate:.4g} {e.unit}" for e in shown], fontsize=8)
+    axes.set_ylim(-0.8, len(shown) - 0.2)
     axes.axvline(0.0, color=GRAY, linewidth=0.8)
     reach = max(abs(x / e.estimate - 1.0) for e in shown for x in e.ci95)
     axes.set_xlim(-1.05 * min(reach, WIDE), 1.05 * min(reach, WIDE))

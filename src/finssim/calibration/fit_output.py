@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,10 +19,27 @@ from finssim.vehicles import Vehicle
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["fit_json", "interval_text", "number_text", "print_fit", "quality_text", "state_text"]
+__all__ = [
+    "file_number",
+    "fit_json",
+    "interval_text",
+    "number_text",
+    "print_fit",
+    "quality_text",
+    "state_text",
+]
 
-QUALITY = {"r2": "R²", "nrmse": "NRMSE", "rmse": "RMSE", "samples": "samples", "rejected": "rejected"}
-"""Figures of a fit that the tables name in this form, in this order."""
+QUALITY = {
+    "r2": "R²",
+    "nrmse": "NRMSE",
+    "rmse": "RMSE",
+    "trials": "trials",
+    "samples": "samples",
+    "rejected": "rejected",
+    "speed_low": "speeds from",
+    "speed_high": "to",
+}
+"""Figures of a fit that the table on the terminal shows, in this order; the report has all."""
 
 
 def fit_json(
@@ -84,7 +102,7 @@ def print_fit(
             number_text(estimate.estimate),
             interval_text(estimate),
             escape(estimate.unit),
-            number_text(None if estimate.path is None else number_in(fit.vehicle, estimate.path)),
+            number_text(file_number(estimate, fit.vehicle)),
             state_text(estimate, fit, vehicle),
             style="" if estimate.identifiable else "yellow",
         )
@@ -92,7 +110,7 @@ def print_fit(
             notes.setdefault(estimate.note, []).append(name)
     console.print(table)
     for what, figures in fit.quality.items():
-        console.print(f"  {what}: {quality_text(figures)}", highlight=False, markup=False)
+        console.print(f"  {what}: {quality_text(figures, whole=False)}", highlight=False, markup=False)
     for note, names in notes.items():
         console.print(f"· {', '.join(names)}: {note}", highlight=False, markup=False)
     for sentence in warnings:
@@ -117,6 +135,13 @@ def interval_text(estimate: Estimate) -> str:
     return f"{number_text(low)} to {number_text(high)}"
 
 
+def file_number(estimate: Estimate, vehicle: Vehicle) -> float | None:
+    """The vehicle's own number for an estimate; None where the file holds something else that follows from it."""
+    if estimate.path is None or estimate.path.startswith("body."):
+        return None
+    return number_in(vehicle, estimate.path)
+
+
 def state_text(estimate: Estimate, fit: Fit, vehicle: Vehicle) -> str:
     """What became of a parameter: `written`, `file kept`, or whether the data tell it where the file has no place."""
     if estimate.path is None:
@@ -127,11 +152,16 @@ def state_text(estimate: Estimate, fit: Fit, vehicle: Vehicle) -> str:
     return "file kept"
 
 
-def quality_text(figures: dict[str, float]) -> str:
-    """`R² 0.998, NRMSE 0.021, samples 1204`, and what else the fit says."""
-    known = [key for key in QUALITY if key in figures]
-    other = [key for key in figures if key not in QUALITY]
-    return ", ".join(f"{QUALITY.get(key, key.replace('_', ' '))} {figures[key]:.4g}" for key in known + other)
+def quality_text(figures: Mapping[str, float], *, whole: bool = True) -> str:
+    """`R² 0.998, NRMSE 0.021, samples 1204`.
+
+    Args:
+        figures: By key.
+        whole: All of them, or those of `QUALITY` alone.
+    """
+    keys = [key for key in QUALITY if key in figures]
+    keys += [key for key in figures if key not in QUALITY] if whole or not keys else []
+    return ", ".join(f"{QUALITY.get(key, key.replace('_', ' '))} {number_text(figures[key])}" for key in keys)
 
 
 def _finite(value: Any) -> float | None:

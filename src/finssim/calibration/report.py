@@ -8,10 +8,17 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
-from finssim.calibration.calibrate import kept, number_in
+from finssim.calibration.calibrate import kept
 from finssim.calibration.fit import Fit
 from finssim.calibration.fit_figures import MOST_CURVES, fit_pictures
-from finssim.calibration.fit_output import fit_json, interval_text, number_text, quality_text, state_text
+from finssim.calibration.fit_output import (
+    file_number,
+    fit_json,
+    interval_text,
+    number_text,
+    quality_text,
+    state_text,
+)
 from finssim.files import atomic_directory
 from finssim.page import html_page, html_picture, html_table
 from finssim.vehicles import Vehicle
@@ -70,7 +77,7 @@ def estimate_rows(fit: Fit, vehicle: Vehicle) -> list[tuple[str, ...]]:
             number_text(e.estimate),
             interval_text(e),
             e.unit,
-            number_text(None if e.path is None else number_in(fit.vehicle, e.path)),
+            number_text(file_number(e, fit.vehicle)),
             state_text(e, fit, vehicle),
         )
         for name, e in fit.estimates.items()

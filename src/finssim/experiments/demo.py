@@ -1,4 +1,4 @@
-"""`finssim demo`: train, evaluate beside two PIDs, report."""
+"""`finssim demo`: identify a vehicle from trials, train in what was identified, evaluate beside two PIDs, report."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rich.console import Console
 from finssim.control.policy import Policy
 from finssim.control.policy_description import DESCRIPTION_FILE
 from finssim.experiments.evaluate import Evaluation, evaluate_controller
-from finssim.experiments.plants import load_plant
+from finssim.experiments.identify import PLANT_FILE, Identification, commands, identify, vehicle_files
 from finssim.experiments.results_table import print_comparison
 from finssim.files import atomic_directory
 from finssim.learning.train import train
@@ -32,12 +32,14 @@ TASK, VEHICLE = "t1", "finsrov"
 
 
 def demo(out: Path, *, steps: int | None = None, seed: int = SEED, console: Console | None = None) -> Path:
-    """Train T1 for the calibrated FinsROV, try it beside `pid` and `pid-paper` on the eight setpoints, write a report.
+    """Identify FinsROV from trials, train T1 in what was identified, try it in the plant that the trials came from.
+
+    Beside the policy, `pid` and `pid-paper` try the eight setpoints, tuned from the identified vehicle too.
 
     Args:
-        out: Directory for the policy, the results and `report.html`; an earlier demonstration there is replaced.
+        out: Directory for trials, vehicle, policy, results and `report.html`; an earlier one there is replaced.
         steps: Control steps to train; as `finssim train` if None.
-        seed: Of the training.
+        seed: Of the trials and of the training.
         console: Where progress is shown; standard error if None.
 
     Returns:
@@ -46,14 +48,23 @@ def demo(out: Path, *, steps: int | None = None, seed: int = SEED, console: Cons
     Raises:
         KeyboardInterrupt: After Ctrl-C. The policy so far is then in `OUT-training/interrupted`, and `out` as it was.
     """
-    began = time.perf_counter()
     console = console or Console(stderr=True)
     rescue = out.with_name(f"{out.name}-training") / "interrupted"
     with atomic_directory(out, replaces=REPORT_FILE) as folder:
+        with console.status("identifying the vehicle from trials"):
+            found = identify(folder, VEHICLE, seed=seed, shown=out)
+        told = sum(e.identifiable for e in found.fit.estimates.values())
+        console.print(
+            f"identified from {len(found.fit.trials)} trials in {found.seconds:.0f} s: {told} of "
+            f"{len(found.fit.estimates)} parameters told, NRMSE on {len(found.replay.pairs)} other trials "
+            f"{found.replay.aggregate('calibrated').value:.3f}",
+            highlight=False,
+        )
+        began = time.perf_counter()
         policy = train(
             TASK,
             out=folder / "policy",
-            vehicle=VEHICLE,
+            vehicle=found.vehicle,
             seed=seed,
             steps=steps,
             console=console,
@@ -65,15 +76,16 @@ def demo(out: Path, *, steps: int | None = None, seed: int = SEED, console: Cons
             "seed": seed,
             "steps": Policy.load(policy).description.training["steps"],
             "task": TASK,
-            "vehicle": VEHICLE,
+            "vehicle": out / vehicle_files(VEHICLE)[1],
+            "plant": out / PLANT_FILE,
+            "before": commands(out, VEHICLE, seed),
         }
-        plant = load_plant("nominal")
         with _rescued(policy, rescue, console):
             evaluations = [
-                evaluate_controller(controller, plant, task=TASK, vehicle=VEHICLE)
+                evaluate_controller(controller, found.plant, task=TASK, vehicle=found.vehicle)
                 for controller in (policy, "pid", "pid-paper")
             ]
-            _write(folder, evaluations, policy, training)
+            _write(folder, found, evaluations, policy, training)
     print_comparison([e.result for e in evaluations], Console())
     report = Path(out) / REPORT_FILE
     print(f"report: {report}")
@@ -94,7 +106,14 @@ def _rescued(policy: Path, rescue: Path, console: Console) -> Iterator[None]:
         raise
 
 
-def _write(folder: Path, evaluations: list[Evaluation], policy: Path, training: dict[str, Any]) -> None:
+def _write(
+    folder: Path,
+    found: Identification,
+    evaluations: list[Evaluation],
+    policy: Path,
+    training: dict[str, Any],
+) -> None:
+    from finssim.experiments.identification_report import identification_section
     from finssim.experiments.report import report_html
 
     for evaluation in evaluations:
@@ -103,7 +122,9 @@ def _write(folder: Path, evaluations: list[Evaluation], policy: Path, training: 
         (folder / f"{name}.json").write_text(text, encoding="utf-8")
     with (policy / "curves.csv").open(encoding="utf-8", newline="") as file:
         curves = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
-    (folder / REPORT_FILE).write_text(report_html(evaluations, curves, training), encoding="utf-8")
+    (folder / REPORT_FILE).write_text(
+        report_html(evaluations, curves, training, identification_section(found)), encoding="utf-8"
+    )
 
 
 def _has_display() -> bool:

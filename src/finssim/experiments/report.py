@@ -27,14 +27,19 @@ NOTE = (
 
 
 def report_html(
-    evaluations: Sequence[Evaluation], curves: Sequence[Mapping[str, Any]], training: Mapping[str, Any]
+    evaluations: Sequence[Evaluation],
+    curves: Sequence[Mapping[str, Any]],
+    training: Mapping[str, Any],
+    first: Sequence[str] = (),
 ) -> str:
     """The report.
 
     Args:
         evaluations: The policy first, then what it is compared with, all on the same trials.
         curves: Rows of the policy's `curves.csv`.
-        training: `seconds` (from start to written policy), `seed`, `steps`, `task`, `vehicle`.
+        training: `seconds` (of the training), `seed`, `steps`, `task`; `vehicle` and `plant`, the files; `before`, the
+            commands that lead to the vehicle.
+        first: HTML of what comes before the results.
     """
     policy = evaluations[0]
     result = policy.result
@@ -42,6 +47,7 @@ def report_html(
     sections = [
         f"<h1>{escape(_title(result))}</h1>",
         f'<p class="lead">{_lead(evaluations, training)}</p>',
+        *first,
         "<h2>Results</h2>",
         _comparison(evaluations),
         f'<p class="note">{escape(CAPTION)} {NOTE}</p>',
@@ -112,12 +118,13 @@ def _picture(figure: Figure, text: str) -> str:
 
 
 def _commands(training: Mapping[str, Any]) -> str:
+    vehicle = f"--vehicle {training['vehicle']}"
+    plant = f"{vehicle} --plant {training['plant']}"
     lines = [
-        f"finssim train {training['task']} --vehicle {training['vehicle']} --seed {training['seed']}"
-        f" --steps {training['steps']} --out policy",
-        "finssim evaluate policy",
-        "finssim evaluate pid",
-        "finssim evaluate pid-paper",
+        *training["before"],
+        f"finssim train {training['task']} {vehicle} --seed {training['seed']} --steps {training['steps']}"
+        " --out policy",
+        *(f"finssim evaluate {controller} {plant}" for controller in ("policy", "pid", "pid-paper")),
     ]
     return f"<pre>{escape(chr(10).join(lines))}</pre>"
 

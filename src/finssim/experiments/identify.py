@@ -1,0 +1,180 @@
+"""The first part of the demonstration: a vehicle nobody measured, a pool, trials, and what they tell."""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from finssim.calibration.calibrate import calibrated, concerns
+from finssim.calibration.excitation import Programme, programmes
+from finssim.calibration.fit import Fit
+from finssim.calibration.regression import regress
+from finssim.calibration.replay import Replay, replay
+from finssim.calibration.replay_figure import draw_response_envelopes
+from finssim.calibration.report import write_report
+from finssim.calibration.synthetic import simulate_programme
+from finssim.calibration.trial import Trial
+from finssim.calibration.trial_files import write_trial
+from finssim.calibration.vehicle_file import write_vehicle
+from finssim.experiments.plants import Plant, load_plant
+from finssim.quiet import start_warp
+from finssim.vehicles import HydrodynamicSet, Provenance, Vehicle, load_vehicle
+
+__all__ = ["PLANT_FILE", "Identification", "commands", "identify", "rough_vehicle", "vehicle_files"]
+
+TRIALS, PLANT_FILE = "trials", "pool.yaml"
+SET = "hydrodynamics.calibrated"
+
+HELD_OUT = {"surge": [9.0], "sway": [6.0], "heave": [9.0], "yaw": [1.0]}
+"""Levels that no trial of the fit has [N, N m]."""
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What the trials told."""
+
+    vehicle: Vehicle
+    """As read back from its file."""
+    fit: Fit
+    replay: Replay
+    """On the held-out trials, of the identified vehicle."""
+    plant: Plant
+    """The plant that the trials came from, as it differs from the identified vehicle."""
+    truth: Vehicle
+    """The vehicle in that plant."""
+    picture: bytes
+    """PNG of the held-out trials, measured and replayed."""
+    warnings: tuple[str, ...]
+    seconds: float
+
+
+def rough_vehicle(truth: Vehicle) -> Vehicle:
+    """What one knows of a vehicle before any trial: weighed, measured out, thrusters from a bench.
+
+    Its hydrodynamics are guesses: added mass of half the displaced water on every linear axis, damping of the order of
+    other small vehicles.
+    """
+    half = 0.5 * truth.water.density * truth.body.displaced_volume
+    guess = {
+        f"{SET}.added_mass": [half, half, half, 0.1, 0.1, 0.1],
+        f"{SET}.linear_damping": [20.0, 20.0, 20.0, 1.0, 1.0, 1.0],
+        f"{SET}.quadratic_damping": [50.0, 50.0, 50.0, 1.0, 1.0, 1.0],
+    }
+    return truth.replace(
+        guess, Provenance("guessed", "", "the order of other small vehicles, before any trial")
+    )
+
+
+def identify(folder: Path, name: str, *, seed: int, shown: Path | None = None) -> Identification:
+    """Make trials of a vehicle in the pool, identify it from some, replay the others; write all of it.
+
+    Into the folder go `NAME_rough.yaml` (the vehicle before), `trials/fit` and `trials/held-out`,
+    `NAME_identified.yaml`, `calibration` (the report), `replay.json` with `replay.png`, and `pool.yaml` (for
+    `finssim evaluate --plant`).
+
+    Args:
+        folder: Existing directory.
+        name: Vehicle of the catalogue that stands in the pool.
+        seed: Of initial conditions and noise of the trials.
+        shown: Name of the folder in the report, where `folder` is a temporary one.
+
+    Returns:
+        What was found.
+    """
+    began = time.perf_counter()
+    start_warp()
+    truth = load_vehicle(name)
+    rough = rough_vehicle(truth)
+    start_file, vehicle_file = vehicle_files(name)
+    write_vehicle(rough, folder / start_file)
+    rough = load_vehicle(folder / start_file)
+    plans = {"fit": programmes("all", truth), "held-out": programmes(tuple(HELD_OUT), truth, levels=HELD_OUT)}
+    recorded = _trials(plans, truth, seed)
+    for role, trials in recorded.items():
+        for trial in trials:
+            write_trial(trial, folder / TRIALS / role / trial.name, format="parquet")
+    fit = regress(recorded["fit"], rough, seed=seed)
+    found = calibrated(fit)
+    warnings = (*fit.warnings, *concerns(fit, found))
+    write_vehicle(found, folder / vehicle_file)
+    vehicle = load_vehicle(folder / vehicle_file)
+    place = folder if shown is None else shown
+    write_report(
+        fit,
+        folder / "calibration",
+        vehicle,
+        command=commands(place, name, seed)[1],
+        warnings=warnings,
+        out=place / vehicle_file,
+    )
+    scored = replay(recorded["held-out"], vehicle, seed=seed)
+    picture = _write_replay(scored, folder)
+    _write_plant(truth, folder / PLANT_FILE)
+    return Identification(
+        vehicle=vehicle,
+        fit=fit,
+        replay=scored,
+        plant=load_plant(folder / PLANT_FILE),
+        truth=truth,
+        picture=picture,
+        warnings=warnings,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def vehicle_files(name: str) -> tuple[str, str]:
+    """Names of the vehicle's files before and after."""
+    return f"{name}_rough.yaml", f"{name}_identified.yaml"
+
+
+def commands(place: Path, name: str, seed: int) -> list[str]:
+    """Command lines that identify and replay from the trials again."""
+    start, vehicle = (place / file for file in vehicle_files(name))
+    trials = place / TRIALS
+    return [
+        f"finssim trials check {trials / 'fit'} --vehicle {start}",
+        f"finssim calibrate hydrodynamics {trials / 'fit'} --vehicle {start} --out {vehicle} --seed {seed}",
+        f"finssim replay {trials / 'held-out'} --vehicle {vehicle}",
+    ]
+
+
+def _trials(
+    plans: dict[Literal["fit", "held-out"], Sequence[Programme]], truth: Vehicle, seed: int
+) -> dict[str, list[Trial]]:
+    """All programmes run at once; each trial's header says what it is for."""
+    every = [programme for plan in plans.values() for programme in plan]
+    trials = iter(simulate_programme(every, truth, noise="sensors", seed=seed))
+    return {
+        role: [
+            replace(trial, header=trial.header.model_copy(update={"role": role}))
+            for _, trial in zip(plan, trials, strict=False)
+        ]
+        for role, plan in plans.items()
+    }
+
+
+def _write_replay(scored: Replay, folder: Path) -> bytes:
+    """Write `replay.json` and `replay.png`; returns the picture."""
+    text = json.dumps(scored.as_json(), indent=2, allow_nan=False) + "\n"
+    (folder / "replay.json").write_text(text, encoding="utf-8")
+    buffer = io.BytesIO()
+    draw_response_envelopes(scored.pairs).savefig(buffer, format="png", dpi=150)
+    (folder / "replay.png").write_bytes(buffer.getvalue())
+    return buffer.getvalue()
+
+
+def _write_plant(truth: Vehicle, path: Path) -> None:
+    chosen = truth.hydrodynamic_set("calibrated")
+    assert isinstance(chosen, HydrodynamicSet)
+    plant: dict[str, Any] = {
+        "title": f"the plant that the trials came from: {truth.title}",
+        "vehicle": {"body": truth.body.values(), SET: chosen.values()},
+    }
+    path.write_text(yaml.safe_dump(plant, sort_keys=False, allow_unicode=True), encoding="utf-8")

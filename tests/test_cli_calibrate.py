@@ -1,0 +1,198 @@
+"""`finssim calibrate`, `replay` and `experiment`, as a person types them."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from finssim import boundary
+from finssim.calibration.trial_files import load_trials, write_trial
+from finssim.cli import app
+from finssim.engine.ranges_file import load_ranges
+from finssim.vehicles import load_vehicle
+
+PARAMETER = {"estimate", "ci95", "unit", "identifiable", "note"}
+KEYS = {
+    "kind", "method", "vehicle", "parameters", "quality", "correlation", "warnings", "trials", "out", "provenance",
+}  # fmt: skip
+
+
+def finssim(*words):
+    """Run a command here and now; returns its exit status."""
+    return boundary.run(app, [str(word) for word in words])
+
+
+def refusal(capsys, *words):
+    """The one sentence with which a command refuses its input."""
+    capsys.readouterr()
+    assert finssim(*words) == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith("finssim: ")
+    return line.removeprefix("finssim: ")
+
+
+@pytest.fixture(scope="module")
+def trials(tmp_path_factory):
+    """Simulated trials of surge: six to fit on, two at another level to keep."""
+    folder = tmp_path_factory.mktemp("trials")
+    words = ["--vehicle", "finsrov", "--simulate"]
+    assert finssim("excite", "surge", *words, "--seed", "1", "--out", folder / "fit") == 0
+    assert finssim("excite", "surge", *words, "--levels", "9", "--out", folder / "held-out") == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def fitted(trials):
+    """A vehicle fitted on them, its report and its ranges."""
+    words = ["calibrate", "hydrodynamics", trials / "fit", "--vehicle", "finsrov", "--axes", "surge"]
+    folder = trials / "fitted"
+    outputs = ["--out", folder / "v.yaml", "--report", folder / "report", "--ranges", folder / "r.yaml"]
+    assert finssim(*words, *outputs) == 0
+    return folder
+
+
+def test_hydrodynamics_writes_vehicle_report_and_ranges(fitted):
+    """The damping of surge is measured now and near the truth; the file remembers its trials; the rest is as before."""
+    truth, vehicle = load_vehicle("finsrov"), load_vehicle(fitted / "v.yaml")
+    d1 = vehicle.hydrodynamic_set("calibrated").linear_damping
+    assert vehicle.origin_of("hydrodynamics.calibrated.linear_damping.0").origin == "measured"
+    assert d1[0, 0] == pytest.approx(truth.hydrodynamic_set("calibrated").linear_damping[0, 0], rel=0.05)
+    assert d1[1, 1] == truth.hydrodynamic_set("calibrated").linear_damping[1, 1]
+    assert all(vehicle.fitted_on(trial.sha256) for trial in load_trials([fitted.parent / "fit"]))
+    assert {"report.html", "report.md", "fit.json"} <= {f.name for f in (fitted / "report").iterdir()}
+    assert "finssim calibrate hydrodynamics" in (fitted / "report" / "report.md").read_text("utf-8")
+    low, high = load_ranges(fitted / "r.yaml").linear_damping.axes["surge"]
+    assert 0.8 < low < 1.0 < high < 1.2
+
+
+@pytest.mark.parametrize("method", ["regression", "simulation"])
+def test_hydrodynamics_as_json(capfd, tmp_path, trials, method):
+    """One object with the keys of the contract, and nothing else on standard output."""
+    words = [
+        "calibrate",
+        "hydrodynamics",
+        trials / "fit",
+        "--vehicle",
+        "finsrov",
+        "--axes",
+        "surge",
+        "--json",
+    ]
+    assert finssim(*words, "--method", method, "--out", tmp_path / "v.yaml") == 0
+    found = json.loads(capfd.readouterr().out)
+    assert found.keys() >= KEYS and found["method"].startswith(method)
+    assert found["parameters"]["surge.d1"].keys() == PARAMETER
+    assert found["parameters"]["surge.d1"]["estimate"] == pytest.approx(39.07, rel=0.1)
+    assert found["out"] == str(tmp_path / "v.yaml")
+
+
+def test_held_out_trials_are_left_out_and_it_is_said(capsys, tmp_path, trials):
+    """A trial that its header keeps for replay is no part of the fit."""
+    every = load_trials([trials / "fit"])
+    for trial in every:
+        role = "held-out" if trial.name == "surge_plus_12" else "fit"
+        header = trial.header.model_copy(update={"role": role})
+        write_trial(type(trial)(**{**vars_of(trial), "header": header}), tmp_path / "t" / trial.name)
+    words = ["calibrate", "hydrodynamics", tmp_path / "t", "--vehicle", "finsrov", "--axes", "surge"]
+    assert finssim(*words, "--out", tmp_path / "v.yaml") == 0
+    assert "surge_plus_12: left out: its header says that it is held out" in capsys.readouterr().err
+    vehicle = load_vehicle(tmp_path / "v.yaml")
+    assert len(vehicle.calibrations[0].trials) == 5
+    assert not any(vehicle.fitted_on(t.sha256) for t in every if t.name == "surge_plus_12")
+    for folder in (tmp_path / "t").iterdir():
+        text = (folder / "trial.yaml").read_text("utf-8").replace("role: fit", "role: held-out")
+        (folder / "trial.yaml").write_text(text, "utf-8")
+    assert "every trial is marked held-out" in refusal(capsys, *words, "--out", tmp_path / "w.yaml")
+
+
+def vars_of(trial):
+    """Fields of a trial by name."""
+    return {name: getattr(trial, name) for name in trial.__dataclass_fields__}
+
+
+def test_replay_labels_what_the_vehicle_was_fitted_on(capfd, tmp_path, trials, fitted):
+    """In-sample trials are named so; held-out ones are scored, as JSON and as a folder."""
+    words = ["replay", trials / "held-out", "--vehicle", fitted / "v.yaml"]
+    assert finssim(*words, "--json", "--out", tmp_path / "replay") == 0
+    found = json.loads(capfd.readouterr().out)
+    assert {"nrmse", "aggregate", "ci95", "in_sample"} <= found.keys() and found["in_sample"] is False
+    assert any((tmp_path / "replay").iterdir())
+    assert finssim("replay", trials / "fit", "--vehicle", fitted / "v.yaml", "--json") == 0
+    assert json.loads(capfd.readouterr().out)["in_sample"] is True
+
+
+def test_thruster_as_json_and_as_a_vehicle(capfd, tmp_path):
+    """The published table of a T200: the curve is written for every thruster of the group."""
+    table = Path(__file__).parent / "data" / "t200" / "t200_16V_bluerobotics_2019.csv"
+    words = ["calibrate", "thruster", table, "--vehicle", "bluerov2", "--out", tmp_path / "v.yaml"]
+    assert finssim(*words, "--json") == 0
+    found = json.loads(capfd.readouterr().out)
+    assert found.keys() >= KEYS and found["kind"] == "thruster"
+    assert all(parameter.keys() == PARAMETER for parameter in found["parameters"].values())
+    vehicle = load_vehicle(tmp_path / "v.yaml")
+    for thruster in vehicle.thrusters.values():
+        assert thruster.c_plus == pytest.approx(found["parameters"]["T200.c_plus"]["estimate"], rel=1e-6)
+    assert finssim(*words) == 0
+    assert "T200.c_plus" in capfd.readouterr().out
+
+
+HYDRODYNAMICS = ["calibrate", "hydrodynamics", "TRIALS", "--vehicle", "finsrov"]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ([*HYDRODYNAMICS, "--out", "v.json"], "v.json ends in '.json', expected .yaml"),
+        ([*HYDRODYNAMICS, "--out", "/proc/x/v.yaml"], "write elsewhere"),
+        ([*HYDRODYNAMICS, "--out", "v.yaml", "--axes", "surg"], "unknown axis 'surg'"),
+        ([*HYDRODYNAMICS, "--out", "v.yaml", "--method", "magic"], "unknown method 'magic'"),
+        ([*HYDRODYNAMICS, "--out", "v.yaml", "--full"], "--full needs --method simulation"),
+        (
+            [*HYDRODYNAMICS, "--out", "v.yaml", "--estimate", "thrust_lag"],
+            "--estimate needs --method simulation",
+        ),
+        ([*HYDRODYNAMICS, "--out", "v.yaml", "--damping", "cubic"], "cubic"),
+        ([*HYDRODYNAMICS, "--out", "v.yaml", "--ranges", "r.json"], "r.json ends in '.json'"),
+        ([*HYDRODYNAMICS, "--out", "v.yaml", "--report", "/proc/x/r"], "write elsewhere"),
+        (
+            ["calibrate", "hydrodynamics", "nowhere", "--vehicle", "finsrov", "--out", "v.yaml"],
+            "nowhere: no such",
+        ),
+        (["calibrate", "hydrodynamics", "TRIALS", "--vehicle", "finrov", "--out", "v.yaml"], "did you mean"),
+        (["calibrate", "motor", "nowhere", "--vehicle", "finsrov", "--out", "v.yaml"], "nowhere: no such"),
+        (["calibrate", "thruster", "nowhere.csv", "--vehicle", "bluerov2", "--out", "v.yaml"], "nowhere.csv"),
+        (["replay", "TRIALS", "--vehicle", "finsrov", "--hydrodynamics", "fosen"], "fosen"),
+        (["replay", "TRIALS", "--vehicle", "finsrov", "--horizon", "-1"], "horizon is -1 s"),
+        (["experiment", "replay", "--seeds", "0", "--out", "x"], "Invalid value for '--seeds'"),
+        (["experiment", "replay", "--out", "/proc/x/y"], "write elsewhere"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_in_a_sentence(capsys, tmp_path, monkeypatch, trials, words, sentence):
+    """Before the work, and nothing is written."""
+    monkeypatch.chdir(tmp_path)
+    given = [trials / "fit" if word == "TRIALS" else word for word in words]
+    assert sentence in refusal(capsys, *given)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupted_fit_leaves_the_best_so_far(capsys, tmp_path, monkeypatch, trials):
+    """Ctrl-C while candidates are simulated: a whole vehicle that says so, and status 130."""
+    from finssim.calibration import simulation_fit
+
+    whole = simulation_fit.fit_by_simulation
+
+    def interrupted(*args, progress=None, **options):
+        calls = []
+
+        def show(*given):
+            calls.append(given)
+            if len(calls) == 3:
+                raise KeyboardInterrupt
+
+        return whole(*args, progress=show, **options)
+
+    monkeypatch.setattr(simulation_fit, "fit_by_simulation", interrupted)
+    words = ["calibrate", "hydrodynamics", trials / "fit", "--vehicle", "finsrov", "--axes", "surge"]
+    assert finssim(*words, "--method", "simulation", "--out", tmp_path / "v.yaml") == 130
+    assert load_vehicle(tmp_path / "v.yaml").calibrations[0].interrupted
+    assert "(interrupted)" in capsys.readouterr().out
