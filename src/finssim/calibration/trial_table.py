@@ -19,6 +19,7 @@ from finssim.calibration.conversion import (
 )
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.header import Header
+from finssim.calibration.repeats import without_repeats
 from finssim.calibration.table_file import Table
 from finssim.calibration.time_base import ordered, sampled
 from finssim.calibration.trial import PHASES, Trial
@@ -61,6 +62,7 @@ def trial_from_table(name: str, table: Table, header: Header, path: Path | None 
         factor, offset = change.get(column, (1.0, 0.0))
         channels[column] = np.where(infinite, np.nan, values) * factor + offset
     t, channels, phase = _in_order(t, channels, phase, notes)
+    notes += without_repeats(channels)
     channels = in_our_frames(channels, header.convert)
     notes += tidy_quaternions(channels)
     if upside_down(channels):
