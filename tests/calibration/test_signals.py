@@ -263,3 +263,20 @@ def test_rates_and_gaps_must_be_positive(wrong):
     """A refusal that names the number."""
     with pytest.raises(CalibrationError, match="expected a number above 0"):
         motion(trial({"r": T * 0.0}), VEHICLE, **wrong)
+
+
+def test_an_accelerometer_that_tells_less_than_the_velocity_is_not_used():
+    """Too noisy, or sampled too slowly to follow: the slope of the velocity is closer to the truth."""
+    body = MovingBody(17)
+    rng = np.random.default_rng(0)
+    channels = body.columns(T, "velocity", "rates", "quaternion", "acceleration")
+    for name in "uvw":
+        channels[name] = channels[name] + 0.003 * rng.normal(size=len(T))
+    noisy = channels | {name: channels[name] + 3.0 * rng.normal(size=len(T)) for name in ("ax", "ay", "az")}
+    sparse = channels | {
+        name: np.where(np.arange(len(T)) % 30 == 0, channels[name], np.nan) for name in ("ax", "ay", "az")
+    }
+    for made in (noisy, sparse):
+        m = motion(trial(made), VEHICLE)
+        assert m.nu_dot_source == ("smoothed velocity",) * 6
+    assert motion(trial(channels), VEHICLE).nu_dot_source[:3] == ("imu",) * 3

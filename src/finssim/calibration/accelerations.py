@@ -18,6 +18,9 @@ Array = NDArray[np.float64]
 
 ACCELERATION = ("ax", "ay", "az")
 
+NOTHING = 1e-3
+"""Errors below this are no reason to prefer one source to another [m/s²]."""
+
 
 def accelerations(
     trial: Trial,
@@ -34,7 +37,8 @@ def accelerations(
         a_P = v_dot + ω × v + ω_dot × r + ω × (ω × r),   so   v_dot = f + g - ω × v - ω_dot × r - ω × (ω × r).
 
     Its bias, and what a wrong attitude leaves of gravity, would be a force: the median difference from the slope of the
-    smoothed velocity is taken off. ω_dot is the slope of the smoothed rates.
+    smoothed velocity is taken off. ω_dot is the slope of the smoothed rates. An accelerometer that is sampled much more
+    slowly than the velocity, or tells less than its slope by the errors that smoothing estimates of both, is not used.
 
     Returns:
         nu_dot (m, 6), its source by axis, and notes.
@@ -44,11 +48,13 @@ def accelerations(
     given = [name for name in ACCELERATION if trial.has(name)]
     if not given:
         return nu_dot, tuple(source), ()
-    f = np.full((len(at), 3), np.nan)
+    f, std = np.full((len(at), 3), np.nan), np.full(3, np.nan)
     for i, name in enumerate(ACCELERATION):
         t, y = trial.series(name)
         if len(t) >= 2:
-            f[:, i] = smooth(t, y[:, None], at, order=2, max_gap=max_gap).value[:, 0]
+            s = smooth(t, y[:, None], at, order=2, max_gap=max_gap)
+            f[:, i], std[i] = s.value[:, 0], s.value_std[0]
+    slow = _slow(trial)
     gravity = vehicle.water.gravity
     if holds_gravity(trial, gravity):
         if not attitude.tilt:
@@ -64,11 +70,25 @@ def accelerations(
     a = f - np.cross(omega, v) - np.cross(omega_dot, r) - np.cross(omega, np.cross(omega, r))
     for i in range(3):
         both = np.isfinite(a[:, i]) & np.isfinite(nu_dot[:, i])
-        if both.any():
+        if both.any() and std[i] <= found.slope_std[i] + NOTHING and not slow[i]:
             nu_dot[:, i] = a[:, i] - np.median(a[both, i] - nu_dot[both, i])
             nu_dot[~np.isfinite(found.nu[:, i]), i] = np.nan
             source[i] = "imu"
     return nu_dot, tuple(source), ()
+
+
+def _slow(trial: Trial) -> list[bool]:
+    """Whether ax, ay, az are sampled at less than half the rate of what the velocity comes from."""
+
+    def step(names: tuple[str, ...]) -> float:
+        return min(float(np.median(np.diff(trial.series(n)[0]))) if trial.has(n) else np.inf for n in names)
+
+    from_velocity = [step((name,)) for name in ("u", "v", "w")]
+    usual = step(("x", "y", "z", "depth"))
+    return [
+        step((name,)) > 2.0 * (usual if np.isinf(own) else own)
+        for name, own in zip(ACCELERATION, from_velocity, strict=True)
+    ]
 
 
 def accelerometer_place(trial: Trial, vehicle: Vehicle) -> Array:

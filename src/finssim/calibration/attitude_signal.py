@@ -29,6 +29,8 @@ class AttitudeSignal:
     """omega from the derivative of the attitude, body frame [rad/s], (m, 3); NaN where unknown."""
     rates_std: Array
     """Standard deviation of `rates` [rad/s], (3,)."""
+    rates_slope_std: Array
+    """Standard deviation of the slope of `rates` [rad/s²], (3,)."""
     turn: Array
     """Rotation to use for vectors: `quaternion`, or level with the measured heading, (m, 4); NaN where unknown."""
     heading: bool
@@ -73,6 +75,7 @@ def attitude_signal(trial: Trial, at: Array, max_gap: float | None = None) -> At
             quaternion=nothing,
             rates=nothing[:, :3],
             rates_std=np.full(3, np.nan),
+            rates_slope_std=np.full(3, np.nan),
             turn=nothing,
             heading=False,
             tilt=False,
@@ -82,15 +85,15 @@ def attitude_signal(trial: Trial, at: Array, max_gap: float | None = None) -> At
     quaternion = s.value / length
     # q_dot = q omega / 2, with omega in body axes; the length of q drops out of the vector part.
     rates = 2.0 * quat_multiply(quat_conjugate(quaternion), s.slope / length)[:, :3]
-    rates_std = np.full(3, 2.0 * float(np.mean(s.slope_std)))
+    stds = 2.0 * np.mean([s.slope_std, s.bend_std], axis=1)
     tilt, heading = "roll" in given, "yaw" in given
-    measured = [tilt, tilt, heading]
-    rates[:, ~np.array(measured)] = np.nan
-    rates_std[~np.array(measured)] = np.nan
+    measured = np.array([tilt, tilt, heading])
+    rates[:, ~measured] = np.nan
     return AttitudeSignal(
         quaternion=quaternion if tilt else nothing,
         rates=rates,
-        rates_std=rates_std,
+        rates_std=np.where(measured, stds[0], np.nan),
+        rates_slope_std=np.where(measured, stds[1], np.nan),
         turn=quaternion,
         heading=heading,
         tilt=tilt,

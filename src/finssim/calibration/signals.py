@@ -59,7 +59,7 @@ class Motion:
     nu_source: tuple[str, ...]
     """By axis: `measured`, `derived from position`, `derived from depth`, `derived from attitude`, or nothing."""
     nu_dot_source: tuple[str, ...]
-    """By axis: `imu`, `smoothed velocity`, or nothing."""
+    """By axis: `imu`, where that tells more than the velocity, `smoothed velocity`, or nothing."""
     noise_std: Array
     """By axis, the standard deviation of one sample of a measured velocity, or of the value of a derived one, (6,)."""
     notes: tuple[str, ...] = ()

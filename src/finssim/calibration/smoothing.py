@@ -47,6 +47,8 @@ class Smooth(NamedTuple):
     """Standard deviation of `value`, of what noise remains and what signal was lost (Wahba 1983), (c,)."""
     slope_std: Array
     """Standard deviation of `slope`, in the same sense, (c,)."""
+    bend_std: Array
+    """Standard deviation of the slope of `slope`, in the same sense, (c,)."""
 
 
 def longest_step(t: Array) -> float:
@@ -107,10 +109,10 @@ def smooth(
     value, slope = np.full((m, c), np.nan), np.full((m, c), np.nan)
     runs = [run for run in stretches(t, gap) if run.stop - run.start >= FEWEST]
     if not runs:
-        return Smooth(value, slope, *(np.full(c, np.nan) for _ in range(3)))
+        return Smooth(value, slope, *(np.full(c, np.nan) for _ in range(4)))
     penalty, omega, power = _spectra(t, y, runs, order)
     shared = [slice(0, c)] if together else [slice(i, i + 1) for i in range(c)]
-    figures = np.empty((3, c))
+    figures = np.empty((4, c))
     for columns in shared:
         strength, figures[:, columns] = _choose(penalty, omega, power[:, columns])
         for run in runs:
@@ -139,7 +141,7 @@ def _spectra(t: Array, y: Array, runs: list[slice], order: int) -> tuple[Array, 
 
 
 def _choose(penalty: Array, omega: Array, power: Array) -> tuple[float, Array]:
-    """λ, and noise, value_std and slope_std by column (3, c)."""
+    """λ, and noise, value_std, slope_std and bend_std by column (4, c)."""
     n = len(penalty)
     candidates = np.geomspace(1e-4 / penalty.max(), min(1e1 / penalty.min(), STIFFEST), CANDIDATES)
     lost = candidates[:, None] * penalty / (1.0 + candidates[:, None] * penalty)  # eigenvalues of 1 - H
@@ -147,8 +149,8 @@ def _choose(penalty: Array, omega: Array, power: Array) -> tuple[float, Array]:
     best = int(np.argmin(likely))
     h = 1.0 - lost[best]
     noise = np.sqrt((lost[best] ** 2 @ power) / lost[best].sum())
-    figures = [noise, noise * np.sqrt(np.mean(h)), noise * np.sqrt(np.mean(h * omega**2))]
-    return float(candidates[best]), np.stack(figures)
+    errors = [noise * np.sqrt(np.mean(h * omega ** (2 * k))) for k in range(3)]
+    return float(candidates[best]), np.stack([noise, *errors])
 
 
 def _fit(t: Array, y: Array, strength: float, order: int, at: Array) -> tuple[Array, Array]:

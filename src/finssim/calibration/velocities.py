@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,8 @@ class Velocities:
     source: tuple[str, ...]
     noise_std: Array
     """(6,)"""
+    slope_std: Array
+    """Standard deviation of the slope of `nu` [m/s², rad/s²], (6,)."""
     position: Array
     """World frame [m], (m, 3)."""
     notes: tuple[str, ...]
@@ -47,6 +49,7 @@ class _Column:
     raw: Array
     noise: float = np.nan
     slope_std: float = np.nan
+    bend_std: float = np.nan
 
 
 def velocities(
@@ -65,11 +68,12 @@ def velocities(
     measured = [_column(trial, name, at, 2, max_gap) for name in NU]
     nu = np.stack([c.value for c in measured], axis=-1)
     raw = np.stack([c.raw for c in measured], axis=-1)
-    noise = np.array([c.noise for c in measured])
+    noise, slope_std = np.array([(c.noise, c.slope_std) for c in measured]).T
     source = ["measured" if trial.has(name) else "" for name in NU]
     for i in range(3, 6):
         if not source[i] and np.isfinite(attitude.rates[:, i - 3]).any():
             nu[:, i], noise[i] = attitude.rates[:, i - 3], attitude.rates_std[i - 3]
+            slope_std[i] = attitude.rates_slope_std[i - 3]
             source[i] = "derived from attitude"
     omega = nu[:, 3:]
     arm = np.asarray(header.velocity_at, float)
@@ -84,10 +88,19 @@ def velocities(
         drift = quat_inverse_rotate(attitude.turn, np.asarray(header.water.current, float))
         nu[:, :3] += drift
         raw[:, :3] += drift
-    position, flow, flow_std = _origin(trial, vehicle, at, attitude, omega, max_gap)
-    _derive(nu, noise, source, flow, flow_std, attitude, trial, notes)
+    position, flow, stds = _origin(trial, vehicle, at, attitude, omega, max_gap)
+    for i, (column, name) in enumerate(_derived(nu, source, flow, attitude, trial, notes)):
+        if name:
+            nu[:, i], source[i] = column, name
+            noise[i], slope_std[i] = stds[2] if i == 2 else stds[:2].mean(axis=0)
     return Velocities(
-        nu=nu, raw=raw, source=tuple(source), noise_std=noise, position=position, notes=tuple(notes)
+        nu=nu,
+        raw=raw,
+        source=tuple(source),
+        noise_std=noise,
+        slope_std=slope_std,
+        position=position,
+        notes=tuple(notes),
     )
 
 
@@ -112,7 +125,9 @@ def _column(trial: Trial, name: str, at: Array, order: int, max_gap: float | Non
     gap = longest_step(t) if max_gap is None else max_gap
     bridged = (at >= t[0] - 1e-6) & (at <= t[-1] + 1e-6) & (t[i + 1] - t[i] <= gap)
     raw = np.where(bridged, np.interp(at, t, y), np.nan)
-    return _Column(s.value[:, 0], s.slope[:, 0], raw, float(s.noise[0]), float(s.slope_std[0]))
+    return _Column(
+        s.value[:, 0], s.slope[:, 0], raw, *(float(std[0]) for std in (s.noise, s.slope_std, s.bend_std))
+    )
 
 
 def _origin(
@@ -123,13 +138,14 @@ def _origin(
     omega: Array,
     max_gap: float | None,
 ) -> tuple[Array, Array, Array]:
-    """Position and velocity of the body origin in the world, (m, 3) each, and the latter's standard deviation (3,)."""
+    """Position and velocity of the body origin in the world, (m, 3) each, and the standard deviations of the latter and
+    of its slope by axis, (3, 2)."""
     header = trial.header
     x, y, z = (_column(trial, name, at, 3, max_gap) for name in "xyz")
     arms = [np.asarray(header.position_at, float)] * 3
     if not trial.has("z") and trial.has("depth"):
         depth = _column(trial, "depth", at, 3, max_gap)
-        z = _Column(-depth.value, -depth.slope, -depth.raw, depth.noise, depth.slope_std)
+        z = replace(depth, value=-depth.value, slope=-depth.slope)
         arms[2] = _depth_at(trial, vehicle)
     known = np.isfinite(attitude.turn).all(axis=1)
     turn = np.where(known[:, None], attitude.turn, [0.0, 0.0, 0.0, 1.0])
@@ -139,7 +155,9 @@ def _origin(
         if arm.any():
             value[:, i] -= quat_rotate(turn, arm)[:, i]
             slope[:, i] -= quat_rotate(turn, arm_velocity(omega, arm))[:, i]
-    return value, slope, np.array([x.slope_std, y.slope_std, z.slope_std])
+            if attitude.tilt or attitude.heading:
+                value[~known, i] = slope[~known, i] = np.nan
+    return value, slope, np.array([(c.slope_std, c.bend_std) for c in (x, y, z)])
 
 
 def _depth_at(trial: Trial, vehicle: Vehicle) -> Array:
@@ -148,31 +166,21 @@ def _depth_at(trial: Trial, vehicle: Vehicle) -> Array:
     return np.zeros(3) if vehicle.sensors.depth is None else np.asarray(vehicle.sensors.depth.position, float)
 
 
-def _derive(
-    nu: Array,
-    noise: Array,
-    source: list[str],
-    flow: Array,
-    flow_std: Array,
-    attitude: AttitudeSignal,
-    trial: Trial,
-    notes: list[str],
-) -> None:
-    """Fill the linear velocities that are not measured from the world velocity of the origin, in place."""
+def _derived(
+    nu: Array, source: list[str], flow: Array, attitude: AttitudeSignal, trial: Trial, notes: list[str]
+) -> list[tuple[Array, str]]:
+    """u, v, w from the world velocity of the origin, and the names of their sources; no name where it tells nothing."""
     known = np.isfinite(attitude.turn).all(axis=1)
     turn = np.where(known[:, None], attitude.turn, [0.0, 0.0, 0.0, 1.0])
     horizontal = trial.has("x", "y") and attitude.heading
     vertical = bool(np.isfinite(flow[:, 2]).any())
-    wanted = [i for i in range(3) if not source[i] and (horizontal if i < 2 else vertical)]
-    if not wanted:
-        return
-    if not attitude.tilt:
+    wanted = [not source[i] and (vertical if i == 2 else horizontal) for i in range(3)]
+    if any(wanted) and not attitude.tilt:
         notes.append(
             "roll and pitch are not measured: velocities from position or depth take the vehicle as level"
         )
     if horizontal:
-        world = np.where(np.isfinite(flow), flow, 0.0 if not vertical else np.nan)
-        world[~np.isfinite(flow[:, :2]).all(axis=1)] = np.nan
+        world = flow if vertical else np.concatenate([flow[:, :2], np.zeros((len(flow), 1))], axis=1)
         body = quat_inverse_rotate(turn, world)
         body[~known] = np.nan
     else:
@@ -180,11 +188,8 @@ def _derive(
         up = quat_inverse_rotate(turn, np.array([0.0, 0.0, 1.0]))
         if attitude.tilt:
             up[~known] = np.nan
-        body = np.full((len(nu), 3), np.nan)
         rest = np.sum(up[:, :2] * np.nan_to_num(nu[:, :2]), axis=1)
-        body[:, 2] = np.where(up[:, 2] > STEEPEST, (flow[:, 2] - rest) / up[:, 2], np.nan)
-    for i in wanted:
-        nu[:, i] = body[:, i]
-        from_depth = i == 2 and not trial.has("z")
-        source[i] = "derived from depth" if from_depth else "derived from position"
-        noise[i] = flow_std[2] if i == 2 else float(np.mean(flow_std[:2]))
+        heave = np.where(up[:, 2] > STEEPEST, (flow[:, 2] - rest) / up[:, 2], np.nan)
+        body = np.stack([heave * np.nan, heave * np.nan, heave], axis=-1)
+    names = ["derived from position"] * 2 + [f"derived from {'position' if trial.has('z') else 'depth'}"]
+    return [(column, name if use else "") for column, name, use in zip(body.T, names, wanted, strict=True)]
