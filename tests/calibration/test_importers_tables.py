@@ -7,6 +7,7 @@ import pytest
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.importers import import_trials
+from finssim.calibration.importers.column_map import read_map
 from finssim.calibration.importers.dispatch import read_trials
 from finssim.calibration.importers.units import factor
 from finssim.calibration.trial_files import load_trial
@@ -333,3 +334,10 @@ def test_a_folder_with_other_files_is_not_overwritten(folder, tmp_path):
     with pytest.raises(OutputError, match="other files"):
         import_trials(paths, out=tmp_path / "out")
     assert (tmp_path / "out" / "log" / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["hinsdale.yaml", "full.yaml", "dive.yaml", "bag.yaml"])
+def test_the_maps_of_the_page_are_maps(tmp_path, name):
+    """What the page prints can be read."""
+    (tmp_path / name).write_text(shipped_map(name), encoding="utf-8")
+    read_map(tmp_path / name)

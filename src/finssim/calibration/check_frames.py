@@ -238,7 +238,8 @@ def _through_world(trial: Trial, t: Array, attitude: AttitudeSignal) -> Array:
     nu, _ = _on(trial, ("u", "v", "w"), t)
     known = np.isfinite(attitude.turn).all(axis=1)
     through = quat_rotate(np.where(known[:, None], attitude.turn, [0.0, 0.0, 0.0, 1.0]), np.nan_to_num(nu))
-    through[~known & attitude.heading] = np.nan
+    if attitude.heading:
+        through[~known] = np.nan
     through[~np.isfinite(nu[:, :2]).all(axis=1), :2] = np.nan
     through[~np.isfinite(nu[:, 2]), 2] = np.nan
     return np.asarray(through)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from finssim.calibration.check_report import AxisReport, Told
+from finssim.calibration.columns import NU
 from finssim.calibration.inputs import Drive
 from finssim.calibration.signals import Motion
 from finssim.vehicles import AXES, Vehicle
@@ -68,7 +69,7 @@ def _blocked(report: AxisReport, inputs: Drive) -> str:
 
 
 def _no_velocity(axis: str) -> str:
-    column = dict(zip(AXES, ("u", "v", "w", "p", "q", "r"), strict=True))[axis]
+    column = dict(zip(map(str, AXES), NU, strict=True))[axis]
     other = {
         "surge": " nor x, y with a heading",
         "sway": " nor x, y with a heading",
