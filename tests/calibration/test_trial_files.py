@@ -314,3 +314,14 @@ def test_places_without_a_trial_are_refused(tmp_path):
     (tmp_path / "cut.parquet").write_bytes(b"PAR1 and then nothing")
     with pytest.raises(CalibrationError, match="not a whole Parquet file"):
         load_trial(tmp_path / "cut.parquet")
+
+
+def test_the_header_on_the_page_is_read(tmp_path):
+    """The example of the trial format's page, with a log that it fits."""
+    page = (Path(__file__).resolve().parents[2] / "docs" / "trials.md").read_text(encoding="utf-8")
+    example = page.split("```yaml\n")[1].split("```")[0]
+    trial = load_trial(csv(tmp_path / "x", "t,vx,vy,vz,heading,p\n0,1,2,3,90,0\n1,1,2,3,90,0\n", example))
+    assert trial.header.role == "fit" and trial.header.axis == ("surge",)
+    np.testing.assert_allclose(trial.t, [-0.08, 0.0, 0.92, 1.0])
+    assert trial.channels["v"][0] == -2.0
+    assert trial.channels["yaw"][1] == pytest.approx(-np.pi / 2.0, rel=1e-5)
