@@ -77,8 +77,8 @@ def outputs_of(
 ) -> tuple[dict[int, tuple[str, int]], str]:
     """Output (from 1) -> thruster, and -1 where its pulses have to be turned about neutral; and a note.
 
-    Turned pulses are as the vehicle file has the thruster wired: longer ones push along its axis, or against it where its
-    motor_sign is -1.
+    Turned pulses are as the vehicle file has the thruster wired: longer ones push along its axis, or against it where
+    its motor_sign is -1.
 
     From `given` (`C1: T1`, `C2: -T2`), else from the vehicle's motor_index, else from the frame and the motor
     directions that the autopilot's parameters name, matched with where the vehicle's thrusters sit.
@@ -99,7 +99,8 @@ def outputs_of(
         found, frame = _by_frame(vehicle, parameters)
         how = f"by the frame {frame} of the log"
     found = {
-        output: (name, sign * (vehicle.thrusters[name].motor_sign or 1)) for output, (name, sign) in found.items()
+        output: (name, sign * (vehicle.thrusters[name].motor_sign or 1))
+        for output, (name, sign) in found.items()
     }
     pairs = ", ".join(
         f"C{output} {'-' if sign < 0 else ''}{name}" for output, (name, sign) in sorted(found.items())
