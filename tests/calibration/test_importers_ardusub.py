@@ -175,6 +175,13 @@ def test_a_frame_of_other_thrusters_is_refused():
         read_trials([TLOG], vehicle="bluerov2")
 
 
+def test_a_passive_trial_needs_no_outputs(tmp_path):
+    """Towed or hanging: outputs that fit no thruster of the vehicle do not matter."""
+    (tmp_path / "map.yaml").write_text("vehicle: bluerov2\npassive: true\n")
+    (trial,) = read_trials([TLOG], column_map=tmp_path / "map.yaml")
+    assert trial.has("p", "depth") and not any(c.startswith("pwm") for c in trial.channels)
+
+
 def test_position_deltas_become_body_velocity():
     """A DVL that reports 5 cm forward, 2 cm right and 1 cm down in 0.1 s: u = 0.5, v = -0.2, w = -0.1 m/s."""
     deltas = [{"dt": 0.1, "PosDX": 0.05, "PosDY": 0.02, "PosDZ": 0.01}] * 5

@@ -240,7 +240,10 @@ def test_two_sources_of_one_column_are_refused(tmp_path):
 
 @pytest.mark.parametrize("name", ["broken.mcap", "broken.db3"])
 def test_what_is_no_bag_is_refused(tmp_path, name):
-    """A file of zeros."""
+    """A file of zeros, and a kind that was given wrongly."""
     (tmp_path / name).write_bytes(bytes(4096))
     with pytest.raises(CalibrationError, match="broken"):
         read_trials([tmp_path / name])
+    (tmp_path / "table.csv").write_text("t,u\n0,1\n")
+    with pytest.raises(CalibrationError, match="cannot be opened as a bag"):
+        read_trials([tmp_path / "table.csv"], format="rosbag")

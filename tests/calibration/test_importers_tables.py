@@ -295,6 +295,11 @@ def test_roles_of_single_trials(folder, tmp_path):
             "log.csv fits none of the files of the map: other.csv",
         ),
         ("time: t\ncolumns: {vx: vel_x, vy: vel_x, vz: vel_x}", "without an attitude"),
+        (
+            "time: t\ncolumns: {u: vel_x}\nvehicle: bluerov",
+            "unknown vehicle 'bluerov', did you mean 'bluerov2'?",
+        ),
+        ("time: t\ncolumns: 3", "columns: is 3, expected {CANONICAL: COLUMN}"),
         ("time: t\ncolumns: {u: vel_x}\nsplit: phase", "cannot be split by phase"),
         ("time: t\ncolumns: {u: vel_x}\nsplit: {windows: {a: [3, 2]}}", "window a"),
     ],
@@ -302,7 +307,7 @@ def test_roles_of_single_trials(folder, tmp_path):
 def test_one_sentence_says_what_is_wrong(folder, tmp_path, text, sentence):
     """Wrong columns, units, keys: where, what, and what there is."""
     paths = folder(log__csv="t,vel_x,name\n" + "".join(f"{0.1 * i},{i},x\n" for i in range(30)))
-    with pytest.raises(CalibrationError) as refused:
+    with pytest.raises(ValueError) as refused:
         one(paths, text, tmp_path)
     assert sentence in str(refused.value) and "\n" not in str(refused.value)
 

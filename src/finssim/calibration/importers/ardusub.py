@@ -40,13 +40,16 @@ ARMED_FLAG = 128
 """MAV_MODE_FLAG_SAFETY_ARMED"""
 
 
-def read_ardusub(path: Path, asked: ArduSubMap, vehicle: Vehicle | None) -> list[Stream]:
+def read_ardusub(
+    path: Path, asked: ArduSubMap, vehicle: Vehicle | None, *, pulses: bool = True
+) -> list[Stream]:
     """What an ArduSub log says, one stream for each kind of message.
 
     Args:
         path: `.BIN` or `.tlog`.
         asked: What is taken.
         vehicle: Whose thrusters the outputs drive; without it the pulses keep the numbers of the outputs.
+        pulses: Whether the outputs are wanted; they are not of a passive trial.
 
     Raises:
         CalibrationError: Not a log, or outputs that cannot be told apart.
@@ -60,7 +63,7 @@ def read_ardusub(path: Path, asked: ArduSubMap, vehicle: Vehicle | None) -> list
         _voltage(log),
         _arming(log),
         velocity_stream(log, asked.velocity),
-        *_pulses(log, asked, vehicle),
+        *(_pulses(log, asked, vehicle) if pulses else ()),
     ]
     found = [stream for stream in streams if stream is not None and len(stream.t) >= 2]
     if not any(stream.channels for stream in found):

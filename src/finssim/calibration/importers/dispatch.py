@@ -79,9 +79,13 @@ def read_trials(
     """The trials that logs hold; see `import_trials`."""
     if format not in FORMATS:
         raise CalibrationError(f"format is '{format}', expected one of {', '.join(FORMATS)}")
-    if vehicle is not None:
-        load_vehicle(vehicle)  # an unknown one is refused before any log is read
     mapped = read_map(Path(column_map)) if column_map is not None else ColumnMap.model_validate({})
+    for name in (
+        vehicle or mapped.header.get("vehicle"),
+        *(keys.get("vehicle") for keys in mapped.trials.values()),
+    ):
+        if name is not None:
+            load_vehicle(name)  # an unknown one is refused before any log is read
     rule = split_rule(split) if isinstance(split, str) else split or mapped.split
     trials: list[Trial] = []
     for name, streams in _groups(
@@ -114,9 +118,9 @@ def _groups(
             from finssim.calibration.importers.ardusub import read_ardusub
 
             name = vehicle or mapped.header.get("vehicle")
-            groups.append(
-                (path.stem, read_ardusub(path, mapped.ardusub, load_vehicle(name) if name else None))
-            )
+            pulses = not mapped.header.get("passive", False)
+            body = load_vehicle(name) if name else None
+            groups.append((path.stem, read_ardusub(path, mapped.ardusub, body, pulses=pulses)))
         elif kind == "rosbag":
             from finssim.calibration.importers.rosbag import read_bag
 

@@ -65,8 +65,8 @@ def _opened(path: Path) -> Iterator[tuple[Any, list[str]]]:
 
     notes: list[str] = []
     with whole_mcap(path, notes) as readable:
-        reader = AnyReader([readable], default_typestore=get_typestore(Stores.LATEST))
         try:
+            reader = AnyReader([readable], default_typestore=get_typestore(Stores.LATEST))
             reader.open()
         except (AnyReaderError, AssertionError, OSError) as error:
             raise CalibrationError(

@@ -147,6 +147,16 @@ class SourceMap(Part):
             raise refuse_section("is a list, expected columns: {CANONICAL: FIELD}")
         return {} if data is None else data
 
+    @field_validator("columns", mode="before")
+    @classmethod
+    def _same_names(cls, columns: Any) -> Any:
+        """A list is of columns that the log calls as we do."""
+        if isinstance(columns, (list, tuple)) and all(isinstance(name, str) for name in columns):
+            return {name: name for name in columns}
+        if not isinstance(columns, dict):
+            raise refuse_value(f"is {columns!r}, expected {{CANONICAL: COLUMN}}")
+        return columns
+
     @field_validator("columns")
     @classmethod
     def _known(cls, columns: dict[str, ColumnSource]) -> dict[str, ColumnSource]:

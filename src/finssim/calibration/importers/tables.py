@@ -133,10 +133,7 @@ def _time(table: table_file.Table, time: TimeColumn, shown: str) -> Array:
         return table.numbers[time.column] * TIME_UNITS[time.unit]
     try:
         dates = np.array(
-            [
-                re.sub(r"(Z|[+-]00:?00)$", "", word.strip()) or "NaT"
-                for word in _text(table, time.column, shown)
-            ],
+            [_date(word) for word in _text(table, time.column, shown)],
             dtype="datetime64[us]",
         )
     except ValueError:
@@ -146,6 +143,12 @@ def _time(table: table_file.Table, time: TimeColumn, shown: str) -> Array:
         ) from None
     seconds = dates.astype(np.int64) * 1e-6
     return np.where(np.isnat(dates), np.nan, seconds)
+
+
+def _date(word: str) -> str:
+    """A date as NumPy reads it: universal time without saying so, and a day for a time without one."""
+    word = re.sub(r"(Z|[+-]00:?00)$", "", word.strip())
+    return f"1970-01-01T{word}" if re.match(r"\d\d:\d", word) else word or "NaT"
 
 
 def _listed(table: table_file.Table) -> str:
