@@ -196,3 +196,17 @@ def test_an_interrupted_fit_leaves_the_best_so_far(capsys, tmp_path, monkeypatch
     assert finssim(*words, "--method", "simulation", "--out", tmp_path / "v.yaml") == 130
     assert load_vehicle(tmp_path / "v.yaml").calibrations[0].interrupted
     assert "(interrupted)" in capsys.readouterr().out
+
+
+def test_motors_from_steps(capfd, tmp_path):
+    """Simulated steps with logged commands and thrust: lag and delay of the vehicle file come back."""
+    words = ["excite", "surge", "--vehicle", "finsrov", "--simulate", "--levels", "6,12"]
+    assert finssim(*words, "--inputs", "force,command", "--out", tmp_path / "steps") == 0
+    words = ["calibrate", "motor", tmp_path / "steps", "--vehicle", "finsrov", "--out", tmp_path / "v.yaml"]
+    capfd.readouterr()
+    assert finssim(*words, "--json") == 0
+    found = json.loads(capfd.readouterr().out)
+    assert found.keys() >= KEYS and found["kind"] == "motor"
+    thruster = load_vehicle(tmp_path / "v.yaml").thrusters["H_LF"]
+    assert thruster.time_constant == pytest.approx(0.12, rel=0.1)
+    assert thruster.delay == pytest.approx(0.05, abs=0.01)

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from finssim.files import OutputError, atomic_directory, atomic_write
+from finssim.files import OutputError, atomic_directory, atomic_write, refuse_unwritable
 
 
 def entries(directory):
@@ -164,3 +164,13 @@ def test_a_killed_run_leaves_no_target(tmp_path):
     run.kill()
     run.wait()
     assert not (tmp_path / "out").exists()
+
+
+def test_a_place_is_tried_without_leaving_anything(tmp_path):
+    """Before long work: what cannot be written is refused, what can stays as it was."""
+    (tmp_path / "old.yaml").write_text("old")
+    refuse_unwritable(atomic_write(tmp_path / "old.yaml"))
+    refuse_unwritable(atomic_directory(tmp_path / "new"))
+    assert entries(tmp_path) == ["old.yaml"] and (tmp_path / "old.yaml").read_text() == "old"
+    with pytest.raises(OutputError, match="already holds files"):
+        refuse_unwritable(atomic_directory(tmp_path))

@@ -55,13 +55,13 @@ def _finssim(
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option(help="Directory of the policy, the results and the report.")] = Path(
+    out: Annotated[Path, typer.Option(help="Directory of trials, vehicle, policy, results and report.")] = Path(
         "demo"
     ),
     seed: Seed = 1,
     steps: Steps = None,
 ) -> None:
-    """Train a policy, evaluate it beside two PIDs on the eight published setpoints, write a report.
+    """Identify a vehicle from trials, train a policy in it, evaluate it beside two PIDs, write a report.
 
     Example: finssim demo --out demo
     """

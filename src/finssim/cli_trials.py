@@ -132,6 +132,12 @@ def excite(
     noise: Annotated[
         str, typer.Option(help="Noise of simulated trials: sensors, published or none.", metavar="NAME")
     ] = "sensors",
+    inputs: Annotated[
+        str,
+        typer.Option(
+            help="Inputs that simulated trials log, of wrench,rpm,force,pwm,command.", metavar="NAMES"
+        ),
+    ] = "rpm,wrench",
     rate: Annotated[float, typer.Option(help="Rows of a simulated trial per second [Hz].")] = 50.0,
     coast: Annotated[float, typer.Option(help="Longest coast after a dive [s].")] = 30.0,
     duration: Annotated[float, typer.Option(help="Of a multi-sine [s].")] = 60.0,
@@ -165,6 +171,7 @@ def excite(
         duration=duration,
         room=room,
         hydrodynamics=hydrodynamics,
+        inputs=tuple(word.strip() for word in inputs.split(",")),
     )
     _print_folders(folders, as_json)
 

@@ -7,10 +7,10 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
-__all__ = ["OutputError", "atomic_directory", "atomic_write"]
+__all__ = ["OutputError", "atomic_directory", "atomic_write", "refuse_unwritable"]
 
 _WHAT_TO_DO = {
     errno.ENOSPC: "the disk is full: free some space or write elsewhere",
@@ -101,6 +101,28 @@ def atomic_directory(path: str | os.PathLike[str], *, replaces: str | None = Non
             shutil.rmtree(temporary, ignore_errors=True)
             raise
         _flush(target.parent)
+
+
+class _Probe(Exception):
+    """Leaves an atomic output without making it."""
+
+
+def refuse_unwritable(place: AbstractContextManager[Path]) -> None:
+    """Refuse a place that cannot be written before long work, not after it; nothing is written.
+
+        refuse_unwritable(atomic_directory("runs/hold", replaces="policy.yaml"))
+
+    Args:
+        place: An `atomic_write` or `atomic_directory` that has not been entered.
+
+    Raises:
+        OutputError: As the place says.
+    """
+    try:
+        with place:
+            raise _Probe
+    except _Probe:
+        pass
 
 
 def _refuse_foreign(target: Path, shown: str | os.PathLike[str], replaces: str | None) -> None:

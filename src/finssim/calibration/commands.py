@@ -18,7 +18,7 @@ from finssim.calibration.fit import Fit
 from finssim.calibration.fit_output import fit_json, print_fit
 from finssim.calibration.trial import Trial
 from finssim.calibration.vehicle_file import check_vehicle_path, write_vehicle
-from finssim.files import atomic_directory, atomic_write
+from finssim.files import atomic_directory, atomic_write, refuse_unwritable
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
 __all__ = ["calibrate_hydrodynamics", "calibrate_motor", "calibrate_thruster", "usable"]
@@ -167,32 +167,20 @@ def calibrate_hydrodynamics(
     return _finish(fit, places, command, as_json)
 
 
-class _Probe(Exception):
-    """Leaves an atomic output without making it."""
-
-
 class _Places:
     """Where the outputs go; a place that cannot be written is refused before the work, not after it."""
 
     def __init__(self, out: Path, report: Path | None = None, ranges: Path | None = None) -> None:
         self.out, self.report, self.ranges = Path(out), report, ranges
-        _probe(lambda: atomic_write(check_vehicle_path(out)))
+        refuse_unwritable(atomic_write(check_vehicle_path(out)))
         if ranges is not None:
             if Path(ranges).suffix not in (".yaml", ".yml"):
                 raise CalibrationError(f"{ranges} ends in '{Path(ranges).suffix}', expected .yaml")
-            _probe(lambda: atomic_write(ranges))
+            refuse_unwritable(atomic_write(ranges))
         if report is not None:
             from finssim.calibration.report import FIT_FILE
 
-            _probe(lambda: atomic_directory(report, replaces=FIT_FILE))
-
-
-def _probe(place: Callable[[], Any]) -> None:
-    try:
-        with place():
-            raise _Probe
-    except _Probe:
-        pass
+            refuse_unwritable(atomic_directory(report, replaces=FIT_FILE))
 
 
 def usable(trials: Sequence[Trial]) -> tuple[list[Trial], list[str]]:

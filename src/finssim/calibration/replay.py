@@ -16,6 +16,7 @@ from finssim.calibration.replay_pairs import Pair
 from finssim.calibration.replay_predictions import replay_predictions
 from finssim.calibration.replay_run import check_models, replay_pairs
 from finssim.calibration.trial import Array, Trial
+from finssim.files import atomic_directory, refuse_unwritable
 from finssim.quiet import start_warp
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.vehicle import Axis
@@ -48,7 +49,7 @@ class Replay:
     """Of the bootstrap."""
 
     @cached_property
-    def scores(self) -> dict[str, tuple[dict[str, Score], ...]]:
+    def scores(self) -> dict[str, tuple[dict[Axis, Score], ...]]:
         """Model -> for each trial, excited axis -> NRMSE over excitation and coast."""
         return {
             model: tuple({axis: score(p, model, p.response(axis)) for axis in p.axes} for p in self.pairs)
@@ -127,6 +128,10 @@ def replay(
         )
     if not trials:
         raise CalibrationError("no trial to replay: give at least one")
+    if out is not None:
+        from finssim.calibration.replay_report import REPLAY_FILE
+
+        refuse_unwritable(atomic_directory(out, replaces=REPLAY_FILE))
     pairs, left_out = replay_pairs(trials, vehicle, models, progress)
     if not pairs:
         raise CalibrationError(f"no trial could be replayed: {left_out[0]}")

@@ -21,14 +21,16 @@ from finssim.calibration.regression import regress
 from finssim.calibration.replay import Replay, replay
 from finssim.calibration.replay_metrics import RESAMPLES, SEED
 from finssim.experiments.replay_plant import ReplayPlant, load_replay_plant
-from finssim.experiments.replay_table import print_table, write_results
+from finssim.experiments.replay_table import RESULT_FILE, print_table, write_results
+from finssim.files import atomic_directory, refuse_unwritable
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.vehicles import Vehicle, load_vehicle
+from finssim.vehicles.vehicle import Axis
 
 __all__ = ["AXES", "MODELS", "PAPER_TABLE_3", "experiment_seed", "pooled", "replay_experiment", "run"]
 
-AXES = ("surge", "sway", "heave", "yaw")
+AXES: tuple[Axis, ...] = ("surge", "sway", "heave", "yaw")
 MODELS = ("calibrated", "mesh", "simplified")
 
 PAPER_TABLE_3 = MappingProxyType(
@@ -126,6 +128,7 @@ def replay_experiment(
         raise ValueError(
             f"seeds is {seeds}, repeats {repeats}: expected at least one, and an even number from 2 on"
         )
+    refuse_unwritable(atomic_directory(out, replaces=RESULT_FILE))
     start_warp()
     body, water = load_vehicle(vehicle), plant or load_replay_plant()
     done: list[SeedResult] = []
@@ -194,7 +197,7 @@ def pooled(replays: Sequence[Replay]) -> dict[str, Any]:
     Args:
         replays: One for each seed, of the same models.
     """
-    models = {}
+    models: dict[str, Any] = {}
     for model in replays[0].models:
         by_seed = [_values(one, model) for one in replays]
         axes = [axis for axis in AXES if any(len(v.get(axis, ())) for v in by_seed)]
@@ -207,7 +210,7 @@ def pooled(replays: Sequence[Replay]) -> dict[str, Any]:
             "per_seed": [one.aggregate(model).value for one in replays],
             "diverged": sum(model in pair.diverged for one in replays for pair in one.pairs),
         }
-    best = min(models, key=lambda model: models[model]["aggregate"])
+    best = min(models, key=lambda model: float(models[model]["aggregate"]))
     return {"models": models, "best": best}
 
 

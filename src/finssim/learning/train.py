@@ -12,7 +12,7 @@ from rich.console import Console
 from finssim.control.modes import action_mode
 from finssim.control.policy_description import DESCRIPTION_FILE, PolicyDescription, VehicleIdentity
 from finssim.engine.randomize import Randomization
-from finssim.files import atomic_directory
+from finssim.files import atomic_directory, refuse_unwritable
 from finssim.learning.description import observation_schema, task_record
 from finssim.quiet import start_warp
 from finssim.tasks import TASKS, Environment
@@ -23,10 +23,6 @@ __all__ = ["TrainingError", "train"]
 
 class TrainingError(ValueError):
     """A training that cannot be started."""
-
-
-class _Probe(Exception):
-    """Leaves an atomic directory without making it."""
 
 
 def train(
@@ -80,11 +76,7 @@ def train(
         raise TrainingError(f"unknown task '{task}'; available: {', '.join(TASKS)}")
     chosen = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
     randomization = Randomization(randomize) if randomize is not None else None
-    try:  # a place that cannot be written is refused before the work, not after it
-        with atomic_directory(out, replaces=DESCRIPTION_FILE):
-            raise _Probe
-    except _Probe:
-        pass
+    refuse_unwritable(atomic_directory(out, replaces=DESCRIPTION_FILE))
     start_warp()
     environment_task = TASKS[task]()
     mode = action_mode(action, chosen)
