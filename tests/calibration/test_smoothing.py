@@ -113,3 +113,19 @@ def test_spikes_are_left_out_and_steps_are_not():
     for quiet in (y, np.where(t > 4.0, 1.0, 0.0), np.zeros(400)):
         assert without_spikes(t, quiet[:, None]).all()
     np.testing.assert_allclose(smooth(t, wild[:, None], t).value, smooth(t, y[:, None], t).value, atol=0.01)
+
+
+@pytest.mark.parametrize("n", [6, 100, 30_000])
+@pytest.mark.parametrize("order", [2, 3])
+@pytest.mark.parametrize("kind", ["zero", "constant", "line", "noise"])
+def test_signals_without_shape_come_out_flat_and_straight(n, order, kind):
+    """However long and however strongly smoothed: no rounding grows, noise becomes (nearly) a line."""
+    t = np.arange(n) * 0.01
+    rng = np.random.default_rng(0)
+    y = {"zero": 0.0 * t, "constant": 0.0 * t - 3.0, "line": 0.7 * t + 2.0, "noise": rng.normal(size=n)}[kind]
+    s = smooth(t, y[:, None], t, order=order)
+    straight = np.polyval(np.polyfit(t, y, 1 if kind == "line" else 0), t)
+    tolerance = 6.0 / np.sqrt(n) if kind == "noise" and n > 6 else 3.0 if kind == "noise" else 1e-8
+    np.testing.assert_allclose(s.value[:, 0], straight, atol=tolerance)
+    if kind != "noise":
+        np.testing.assert_allclose(s.slope[:, 0], 0.7 if kind == "line" else 0.0, atol=1e-7)

@@ -1,6 +1,6 @@
 """Zero-phase smoothing of unevenly sampled signals, its strength chosen from the data.
 
-A penalised cubic B-spline (Eilers and Marx 1996), with a knot per sample, fitted to every stretch without a gap:
+A penalised cubic B-spline (Eilers and Marx 1996), with up to a knot per sample, fitted to every stretch without a gap:
 
     min Σ (y_i - f(t_i))² + λ Σ (Δᵐ c)²
 
@@ -10,6 +10,7 @@ smoother on a uniform grid, where sines diagonalise it. Nothing is assumed of th
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -27,8 +28,13 @@ FEWEST = 5
 CANDIDATES = 80
 """Values of λ that are tried."""
 
-STIFFEST = 1e11
-"""Largest λ: far above it the equations of the spline lose all digits of float64."""
+BLOCK = 500_000
+"""Numbers that are worked on at a time while trying them."""
+
+KNOT_PHASE = 0.2
+"""Most that the frequency of half loss turns from one knot to the next [rad]."""
+
+MIN_INTERVALS = 4
 
 SPIKE = 8.0
 """Robust standard deviations beyond which a sample is a spike."""
@@ -131,7 +137,7 @@ def _spectra(t: Array, y: Array, runs: list[slice], order: int) -> tuple[Array, 
         grid = np.linspace(t[run][0], t[run][-1], n)
         even = np.stack([np.interp(grid, t[run], column) for column in y[run].T], axis=-1)
         part = (np.arange(n) / (n - 1))[:, None]
-        even = even - (1.0 - part) * even[0] - part * even[-1]
+        even = even - (1.0 - part) * _first(even) - part * _first(even[::-1])
         theta = np.pi * np.arange(1, n - 1) / (n - 1)
         symbol = (2.0 + np.cos(theta)) / 3.0  # a cubic B-spline sampled at its knots
         penalties.append((2.0 * np.sin(theta / 2.0)) ** (2 * order) / symbol**2)
@@ -140,22 +146,46 @@ def _spectra(t: Array, y: Array, runs: list[slice], order: int) -> tuple[Array, 
     return np.concatenate(penalties), np.concatenate(frequencies), np.concatenate(powers)
 
 
+def _first(y: Array) -> Array:
+    """The first value without its noise, (n, c) -> (c,): of the longest line that the first samples follow.
+
+    A line through two noisy ends would be a signal of its own.
+    """
+    noise = np.median(np.abs(np.diff(y, 2, axis=0)), axis=0) / (0.6745 * np.sqrt(6.0))
+    value, following = y[0].copy(), np.ones(y.shape[1], bool)
+    k = 4
+    while k <= len(y) // 8 and following.any():
+        line = np.polyfit(np.arange(k), y[:k], 1)
+        rest = y[:k] - np.outer(np.arange(k), line[0]) - line[1]
+        fits = following & (np.sqrt(np.sum(rest**2, axis=0) / (k - 2)) <= (1.1 + np.sqrt(2.0 / k)) * noise)
+        value = np.where(fits, line[1], value)
+        following = fits if k >= 16 else following  # four samples may misfit by chance
+        k *= 2
+    return value
+
+
 def _choose(penalty: Array, omega: Array, power: Array) -> tuple[float, Array]:
     """λ, and noise, value_std, slope_std and bend_std by column (4, c)."""
     n = len(penalty)
-    candidates = np.geomspace(1e-4 / penalty.max(), min(1e1 / penalty.min(), STIFFEST), CANDIDATES)
-    lost = candidates[:, None] * penalty / (1.0 + candidates[:, None] * penalty)  # eigenvalues of 1 - H
-    likely = n * np.log(lost @ power.sum(axis=1) + 1e-300) - np.log(lost).sum(axis=1)
-    best = int(np.argmin(likely))
-    h = 1.0 - lost[best]
-    noise = np.sqrt((lost[best] ** 2 @ power) / lost[best].sum())
+    candidates = np.geomspace(1e-4 / penalty.max(), 1e1 / penalty.min(), CANDIDATES)
+    total, unlikely = power.sum(axis=1), []
+    for block in np.array_split(candidates, np.ceil(CANDIDATES * n / BLOCK)):
+        lost = block[:, None] * penalty / (1.0 + block[:, None] * penalty)  # eigenvalues of 1 - H
+        unlikely.append(n * np.log(lost @ total + 1e-300) - np.log(lost).sum(axis=1))
+    best = int(np.argmin(np.concatenate(unlikely)))
+    lost = candidates[best] * penalty / (1.0 + candidates[best] * penalty)
+    h = 1.0 - lost
+    noise = np.sqrt((lost**2 @ power) / lost.sum())
     errors = [noise * np.sqrt(np.mean(h * omega ** (2 * k))) for k in range(3)]
     return float(candidates[best]), np.stack([noise, *errors])
 
 
 def _fit(t: Array, y: Array, strength: float, order: int, at: Array) -> tuple[Array, Array]:
     """Value and slope at given times inside [t[0], t[-1]] of the penalised spline, (m, c) each."""
-    intervals = len(t) - 1
+    # What is smoothed strongly needs few knots; many would only make the equations ill-conditioned.
+    usual = len(t) - 1
+    intervals = max(MIN_INTERVALS, math.ceil(usual * min(1.0, strength ** (-0.5 / order) / KNOT_PHASE)))
+    strength *= (intervals / usual) ** (2 * order - 1)
     h = (t[-1] - t[0]) / intervals
     count = intervals + 3
     cell, weights, _ = _basis((t - t[0]) / h, intervals)
