@@ -193,6 +193,15 @@ def test_a_single_file_without_its_folder_opens(tmp_path):
     assert trial.has("u", "tau_x", "depth")
 
 
+def test_a_folder_that_lost_its_metadata_opens(tmp_path, storage):
+    """The recorder was killed before it wrote metadata.yaml."""
+    bag = written(tmp_path / "run", storage)
+    (whole,) = read_trials([bag])
+    (bag / "metadata.yaml").unlink()
+    (trial,) = read_trials([bag])
+    assert trial.sha256 == whole.sha256 and any("no metadata.yaml" in note for note in trial.notes)
+
+
 @pytest.mark.parametrize("part", [0.8, 0.5])
 @pytest.mark.parametrize("compressed", [False, True])
 def test_an_mcap_cut_off_opens_up_to_the_cut(tmp_path, part, compressed):

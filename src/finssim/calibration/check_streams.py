@@ -53,7 +53,7 @@ def stream_reports(trial: Trial) -> tuple[list[StreamReport], list[Finding]]:
     few = [name for name in trial.channels if not trial.has(name)]
     if few:
         findings.append(Finding("note", f"{', '.join(few)} hold fewer than two samples and are not used"))
-    findings += [Finding("care" if "clock" in note else "note", note) for note in trial.notes]
+    findings += [Finding("care" if "clock jumps" in note else "note", note) for note in trial.notes]
     return sorted(reports, key=lambda r: (r.group != "command", r.group)), findings
 
 

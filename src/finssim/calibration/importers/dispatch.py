@@ -10,6 +10,7 @@ from typing import Literal, get_args
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.importers.assemble import trial_of
 from finssim.calibration.importers.column_map import ColumnMap, SplitRule, read_map, split_rule
+from finssim.calibration.importers.rosbag import BAGS, bag_files, read_bag
 from finssim.calibration.importers.source_map import SourceMap
 from finssim.calibration.importers.split import split_table
 from finssim.calibration.importers.streams import Stream, merge
@@ -23,7 +24,6 @@ Format = Literal["auto", "csv", "ardupilot", "rosbag"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 
 ARDUPILOT = (".bin", ".tlog")
-BAGS = (".mcap", ".db3", ".bag")
 
 
 def import_trials(
@@ -122,8 +122,6 @@ def _groups(
             body = load_vehicle(name) if name else None
             groups.append((path.stem, read_ardusub(path, mapped.ardusub, body, pulses=pulses)))
         elif kind == "rosbag":
-            from finssim.calibration.importers.rosbag import read_bag
-
             groups.append((path.stem, read_bag(path, mapped.topics)))
         else:
             tables.append(path)
@@ -134,7 +132,7 @@ def _kind(path: Path) -> Format:
     suffix = path.suffix.lower()
     if suffix in ARDUPILOT:
         return "ardupilot"
-    if suffix in BAGS or (path.is_dir() and (path / "metadata.yaml").is_file()):
+    if bag_files(path):
         return "rosbag"
     if suffix in TABLES:
         return "csv"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,9 @@ from finssim.calibration.importers.streams import Stream
 from finssim.calibration.importers.tables import spoken, values_of
 from finssim.vehicles.part import did_you_mean
 
-__all__ = ["read_bag"]
+__all__ = ["BAGS", "bag_files", "read_bag"]
+
+BAGS = (".mcap", ".db3", ".bag")
 
 
 def read_bag(path: Path, topics: Mapping[str, SourceMap]) -> list[Stream]:
@@ -58,15 +60,29 @@ def read_bag(path: Path, topics: Mapping[str, SourceMap]) -> list[Stream]:
     return found
 
 
+def bag_files(path: Path) -> list[Path]:
+    """A bag itself, or the storage files of a folder that lost its metadata; none if it is no bag."""
+    if not path.is_dir():
+        return [path] if path.suffix.lower() in BAGS else []
+    if (path / "metadata.yaml").is_file():
+        return [path]
+    return sorted(part for part in path.iterdir() if part.suffix.lower() in (".mcap", ".db3"))
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, list[str]]]:
     from rosbags.highlevel import AnyReader, AnyReaderError
     from rosbags.typesys import Stores, get_typestore
 
     notes: list[str] = []
-    with whole_mcap(path, notes) as readable:
+    with ExitStack() as stack:
+        parts = [stack.enter_context(whole_mcap(part, notes)) for part in bag_files(path) or [path]]
+        if parts != [path] and path.is_dir():
+            notes.append(
+                f"{path.name} has no metadata.yaml, as after a crash: read from {len(parts)} files in it"
+            )
         try:
-            reader = AnyReader([readable], default_typestore=get_typestore(Stores.LATEST))
+            reader = AnyReader(parts, default_typestore=get_typestore(Stores.LATEST))
             reader.open()
         except (AnyReaderError, AssertionError, OSError) as error:
             raise CalibrationError(
