@@ -55,9 +55,9 @@ def _finssim(
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option(help="Directory of trials, vehicle, policy, results and report.")] = Path(
-        "demo"
-    ),
+    out: Annotated[
+        Path, typer.Option(help="Directory of trials, vehicle, policy, results and report.")
+    ] = Path("demo"),
     seed: Seed = 1,
     steps: Steps = None,
 ) -> None:

@@ -150,7 +150,9 @@ def _text(fit: Fit, vehicle: Vehicle) -> str:
         f'source: "95 % intervals, {record.sentence()}; vehicle {vehicle.sha256[:16]}"',
     ]
     for family in FAMILIES:
-        rows = {axis: factors[f"{family}.{axis}"] for axis in AXES if f"{family}.{axis}" in factors}
+        rows: dict[str, Factor] = {
+            axis: factors[f"{family}.{axis}"] for axis in AXES if f"{family}.{axis}" in factors
+        }
         lines += _mapping(family, "axes", rows)
     for key in ("volume", "time_constant", "delay"):
         if key in factors:

@@ -102,7 +102,7 @@ def draw_curves(curves: Sequence[Curve]) -> Iterator[Figure]:
         columns = min(2, len(part))
         rows = math.ceil(len(part) / columns)
         figure = _figure(3.9 * columns if columns > 1 else 5.4, 2.9 * rows)
-        cells = np.atleast_1d(figure.subfigures(rows, columns)).ravel()
+        cells = figure.subfigures(rows, columns, squeeze=False).ravel()
         for cell, curve in zip(cells, part, strict=False):
             _draw(cell, curve)
         yield figure

@@ -5,10 +5,10 @@ from __future__ import annotations
 import io
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import yaml
 
@@ -145,9 +145,7 @@ def commands(place: Path, name: str, seed: int) -> list[str]:
     ]
 
 
-def _trials(
-    plans: dict[Literal["fit", "held-out"], Sequence[Programme]], truth: Vehicle, seed: int
-) -> dict[str, list[Trial]]:
+def _trials(plans: Mapping[str, Sequence[Programme]], truth: Vehicle, seed: int) -> dict[str, list[Trial]]:
     """All programmes run at once; each trial's header says what it is for."""
     every = [programme for plan in plans.values() for programme in plan]
     trials = iter(simulate_programme(every, truth, noise="sensors", seed=seed))
