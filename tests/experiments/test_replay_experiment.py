@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from finssim.experiments import replay_experiment as module
 from finssim.experiments.replay_experiment import MODELS, PAPER_TABLE_3, pooled, replay_experiment
-from finssim.experiments.replay_table import markdown, rows_of
+from finssim.experiments.replay_table import markdown, print_table, tables_of
 from finssim.vehicles import load_vehicle
 
 AXES = ("sway", "yaw")
@@ -46,17 +48,24 @@ def test_the_folder_holds_the_result_a_table_a_figure_and_the_vehicle(small):
     assert json.loads((out / "replay_experiment.json").read_text()) == json.loads(json.dumps(result))
     assert (out / "envelope.png").read_bytes().startswith(b"\x89PNG")
     page = (out / "replay_experiment.md").read_text()
-    assert "0.315" in page and "its hardware" in page and "virtual plant" in page
+    assert "0.315" in page and "its vehicle in its pool" in page and "virtual plant" in page
     found = load_vehicle(out / "vehicles" / "seed_1.yaml")
     assert found.sha256 == result["fits"][0]["vehicle_sha256"]
     assert all(found.fitted_on(digest) for digest in result["fits"][0]["trials"].values())
 
 
 def test_the_papers_numbers_stand_apart_from_ours(small):
-    _, rows = rows_of(small[0])
-    theirs = [row for row in rows if row[0].strip().startswith("paper,")]
-    assert [row[1] for row in theirs] == [f"{value:.3f}" for value, _ in PAPER_TABLE_3.values()]
-    assert all(row[0].strip().split(",")[0] in ("ours", "paper") for row in rows if row[1])
+    *ours, theirs = tables_of(small[0]).values()
+    assert [row[1] for row in theirs[1]] == [f"{value:.3f}" for value, _ in PAPER_TABLE_3.values()]
+    assert all(row[0].startswith("paper,") for row in theirs[1])
+    assert all(row[0].startswith("ours,") for _, rows in ours for row in rows)
+
+
+def test_the_table_fits_a_terminal(small):
+    console = Console(width=80, record=True, file=io.StringIO())
+    print_table(small[0], console)
+    text = console.export_text()
+    assert "…" not in text and "0.315" in text and "ours, Calibrated Fossen" in text
 
 
 class _Replay:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -137,7 +137,7 @@ class Aggregate(NamedTuple):
 
 
 def aggregate(
-    scores: Sequence[Mapping[str, float | None]],
+    scores: Sequence[Mapping[Any, float | None]],
     statistic: Callable[..., Array] = np.nanmedian,
     *,
     resamples: int = RESAMPLES,

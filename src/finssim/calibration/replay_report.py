@@ -34,6 +34,7 @@ def print_replay(replay: Replay, console: Console) -> None:
             "error ahead, relative to the span; in brackets the skill against persistence", highlight=False
         )
         _print_table(console, *_ahead_table(replay))
+    console.print(f"NRMSE of {_label(replay.models[0])} by trial", highlight=False)
     _print_table(console, *_trial_table(replay))
     for sentence in _remarks(replay):
         console.print(sentence, highlight=False, markup=False)
@@ -47,7 +48,7 @@ def replay_markdown(replay: Replay) -> str:
     if replay.ahead:
         parts += ["## Error ahead", "Relative to the span; in brackets the skill against persistence."]
         parts += [_markdown(*_ahead_table(replay)), "![Error ahead](ahead.png)"]
-    parts += ["## Trials", _markdown(*_trial_table(replay))]
+    parts += [f"## Trials with {_label(replay.models[0])}", _markdown(*_trial_table(replay))]
     parts += ["\n".join(f"- {sentence}" for sentence in _remarks(replay)), DEFINITION]
     parts.append(f"Vehicle {replay.vehicle.sha256}.")
     return "\n\n".join(part for part in parts if part) + "\n"
@@ -92,20 +93,16 @@ def _axis_table(replay: Replay) -> tuple[list[str], Rows]:
     rows: Rows = []
     for kind in kinds:
         found = {m: replay.aggregate(m, in_sample=kind) for m in replay.models}
-        mark = " (in-sample)" if kind else ""
+        mark = " in-sample" if kind else ""
         for axis in AXES:
             count = sum(axis in p.axes and p.in_sample == kind for p in replay.pairs)
             if count:
                 values = [_number(found[m].by_axis.get(axis)) for m in replay.models]
-                rows.append([axis + mark, str(count), *values])
-        rows.append(
-            ["aggregate" + mark, str(len(_of(replay, kind))), *(_interval(found[m]) for m in replay.models)]
-        )
-    return ["NRMSE", "trials", *(MODEL_LABELS.get(m, m) for m in replay.models)], rows
-
-
-def _of(replay: Replay, kind: bool) -> list[str]:
-    return [p.name for p in replay.pairs if p.in_sample == kind]
+                rows.append([axis, f"{count}{mark}", *values])
+        count = sum(p.in_sample == kind for p in replay.pairs)
+        rows.append(["aggregate", f"{count}{mark}", *(_number(found[m].value) for m in replay.models)])
+        rows.append(["95 % interval", "", *(_interval(found[m]) for m in replay.models)])
+    return ["NRMSE", "trials", *(_label(m) for m in replay.models)], rows
 
 
 def _trial_table(replay: Replay) -> tuple[list[str], Rows]:
@@ -121,14 +118,13 @@ def _trial_table(replay: Replay) -> tuple[list[str], Rows]:
             verdict = classify(gates(pair, model, axis))
             kind = "in-sample" if pair.in_sample else "held-out"
             rows.append([pair.name, axis, kind, _number(one.value), *phases, verdict])
-    label = MODEL_LABELS.get(model, model)
-    return [f"trial ({label})", "axis", "", "NRMSE", "excitation", "coast", "gates"], rows
+    return ["trial", "axis", "", "NRMSE", "excitation", "coast", "gates"], rows
 
 
 def _ahead_table(replay: Replay) -> tuple[list[str], Rows]:
     first = next(iter(next(iter(replay.ahead.values())).values()))
     rows = [
-        [axis, MODEL_LABELS.get(model, model)]
+        [axis, _label(model)]
         + [
             "–" if x != x else f"{x:.3f} ({s:+.2f})" if s == s else f"{x:.3f}"
             for x, s in zip(a.nrmse, a.skill, strict=True)
@@ -155,11 +151,15 @@ def _remarks(replay: Replay) -> list[str]:
     out = [*replay.left_out]
     for model in replay.models:
         why = replay.aggregate(model).why
-        out += [f"{MODEL_LABELS.get(model, model)}: {why}"] if why else []
+        out += [f"{_label(model)}: {why}"] if why else []
     for sentence, names in found.items():
         shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
         out.append(f"{sentence} ({shown})")
     return out
+
+
+def _label(model: str) -> str:
+    return MODEL_LABELS.get(model, model)
 
 
 def _number(value: float | None) -> str:
@@ -167,13 +167,11 @@ def _number(value: float | None) -> str:
 
 
 def _interval(a: Aggregate) -> str:
-    if a.value is None or a.ci95 is None:
-        return _number(a.value)
-    return f"{a.value:.3f} [{a.ci95[0]:.3f}, {a.ci95[1]:.3f}]"
+    return "–" if a.ci95 is None else f"[{a.ci95[0]:.3f}, {a.ci95[1]:.3f}]"
 
 
 def _print_table(console: Console, heads: Sequence[str], rows: Rows) -> None:
-    table = Table(box=box.SIMPLE_HEAD)
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for k, head in enumerate(heads):
         table.add_column(head, justify="left" if k == 0 else "right", no_wrap=k == 0)
     for row in rows:

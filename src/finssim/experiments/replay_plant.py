@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,7 +96,7 @@ class ReplayPlant(_Section):
 
     def record(self, programmes: Sequence[Programme], vehicle: Vehicle, seed: int) -> Recording:
         """The true motion under some programmes, commanded as the vehicle file has it; see `record`."""
-        fields = {
+        fields: dict[str, Any] = {
             "mass": self.mass,
             "M_A": self.added_mass.matrix(),
             "form_drag": self.hull.form_drag,

@@ -18,7 +18,7 @@ from finssim.calibration.vehicle_file import write_vehicle
 from finssim.files import atomic_directory
 from finssim.vehicles import Vehicle
 
-__all__ = ["RESULT_FILE", "markdown", "print_table", "write_results"]
+__all__ = ["RESULT_FILE", "markdown", "print_table", "tables_of", "write_results"]
 
 RESULT_FILE = "replay_experiment.json"
 
@@ -32,51 +32,57 @@ LEVELS = {
 }
 
 
-def rows_of(result: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """Head and rows of the table: ours by level set and model, then the paper's."""
+def tables_of(result: Mapping[str, Any]) -> dict[str, tuple[list[str], list[list[str]]]]:
+    """Words about a table -> its head and rows: ours by set of levels, then the paper's."""
     axes = list(next(iter(result["same_levels"]["models"].values()))["by_axis"])
-    heads = ["model", "NRMSE", "95 % interval", *axes]
-    rows = []
+    out = {}
     for key, words in LEVELS.items():
-        rows.append([words, *[""] * (len(heads) - 1)])
+        rows = []
         for model, m in result[key]["models"].items():
             values = [f"{m['by_axis'][a]:.3f}" if a in m["by_axis"] else "–" for a in axes]
-            rows.append(
-                [f"  ours, {MODEL_LABELS[model]}", f"{m['aggregate']:.3f}", _range(m["ci95"]), *values]
-            )
-    rows.append(["the paper, its hardware in its pool", *[""] * (len(heads) - 1)])
-    for model, p in result["paper"].items():
-        label = f"  paper, {MODEL_LABELS[model]}"
-        rows.append([label, f"{p['aggregate']:.3f}", _range(p["ci95"]), *["–"] * len(axes)])
-    return heads, rows
+            rows.append([f"ours, {MODEL_LABELS[model]}", f"{m['aggregate']:.3f}", _range(m["ci95"]), *values])
+        out[words] = (["", "NRMSE", "95 % interval", *axes], rows)
+    theirs = [
+        [f"paper, {MODEL_LABELS[model]}", f"{p['aggregate']:.3f}", _range(p["ci95"])]
+        for model, p in result["paper"].items()
+    ]
+    return {**out, "the paper: its vehicle in its pool": (["", "NRMSE", "95 % interval"], theirs)}
 
 
 def print_table(result: Mapping[str, Any], console: Console) -> None:
     """Print it."""
     console.print(_headline(result), highlight=False)
-    heads, rows = rows_of(result)
-    table = Table(box=box.SIMPLE_HEAD, caption=NOTE, caption_justify="left")
-    for k, head in enumerate(heads):
-        table.add_column(head, justify="right" if k else "left", no_wrap=True)
-    for row in rows:
-        table.add_row(*row, style="dim" if "paper" in row[0] else None)
-    console.print(table)
+    for words, (heads, rows) in tables_of(result).items():
+        table = Table(
+            box=box.SIMPLE_HEAD,
+            padding=(0, 1, 0, 0),
+            pad_edge=False,
+            title=words,
+            title_justify="left",
+            title_style="bold",
+        )
+        for k, head in enumerate(heads):
+            table.add_column(head, justify="right" if k else "left", no_wrap=True, min_width=0 if k else 24)
+        for row in rows:
+            table.add_row(*row, style="dim" if row[0].startswith("paper") else None)
+        console.print(table)
+    console.print(NOTE, highlight=False)
 
 
 def markdown(result: Mapping[str, Any]) -> str:
     """`replay_experiment.md`."""
-    heads, rows = rows_of(result)
-    lines = [heads, ["---"] + ["--:"] * (len(heads) - 1)]
-    lines += [[f"**{r[0]}**", *r[1:]] if not r[1] else [r[0].strip(), *r[1:]] for r in rows]
-    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    parts = ["# Replay error of three hydrodynamic models", _headline(result)]
+    for words, (heads, rows) in tables_of(result).items():
+        lines = [heads, ["---"] + ["--:"] * (len(heads) - 1), *rows]
+        table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+        parts += [f"## {words[0].upper()}{words[1:]}", table]
     hashes = ", ".join(fit["vehicle_sha256"][:12] for fit in result["fits"])
     origin = result["provenance"]
     about = (
         f"Vehicle file {result['vehicle']['name']} {result['vehicle']['sha256'][:12]}; calibrated vehicles {hashes}; "
         f"seeds {', '.join(map(str, result['seeds']))}; FinsSim {origin['finssim']}, revision {origin['revision']}."
     )
-    parts = ["# Replay error of three hydrodynamic models", _headline(result), table, NOTE]
-    parts += ["![Response envelopes](envelope.png)", DEFINITION, about]
+    parts += [NOTE, "![Response envelopes](envelope.png)", DEFINITION, about]
     return "\n\n".join(parts) + "\n"
 
 
