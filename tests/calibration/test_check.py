@@ -220,7 +220,7 @@ def test_gaps_rates_and_jitter_are_measured(simulated):
     (velocity,) = [s for s in report(trial).streams if "u" in s.columns]
     assert velocity.gaps == 1 and velocity.longest_gap == pytest.approx(4.0, abs=0.05)
     assert velocity.rate == pytest.approx(50.0) and velocity.missing == pytest.approx(4.0 / 13.98, abs=0.01)
-    assert any("1 gaps, the longest of 4" in text for text in texts(trial, "care"))
+    assert any("u, v, w: a gap of 4" in text for text in texts(trial, "care"))
     jittered = replace(trial, t=trial.t + np.where(np.arange(len(trial.t)) % 2, 0.008, 0.0))
     assert [s for s in report(jittered).streams if "p" in s.columns][0].jitter == pytest.approx(0.4, abs=0.02)
 

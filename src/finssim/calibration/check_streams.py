@@ -41,15 +41,16 @@ def stream_reports(trial: Trial) -> tuple[list[StreamReport], list[Finding]]:
         findings.append(
             Finding("refused", f"lasts {trial.duration:.2g} s, expected at least {SHORTEST_TRIAL:g} s")
         )
+    said: dict[tuple[Level, str], list[str]] = {}
     for names in shared.values():
         report = _report(trial, tuple(names))
         reports.append(report)
-        findings += _sampling(report)
-        said: dict[tuple[Level, str], list[str]] = {}
+        for what in _sampling(report):
+            said.setdefault(what, []).extend(names)
         for name in names:
             for what in _values(trial, name):
                 said.setdefault(what, []).append(name)
-        findings += [Finding(level, f"{', '.join(those)}: {text}") for (level, text), those in said.items()]
+    findings += [Finding(level, f"{_shown(columns)}: {text}") for (level, text), columns in said.items()]
     few = [name for name in trial.channels if not trial.has(name)]
     if few:
         findings.append(Finding("note", f"{', '.join(few)} hold fewer than two samples and are not used"))
@@ -77,32 +78,27 @@ def _report(trial: Trial, names: tuple[str, ...]) -> StreamReport:
     )
 
 
-def _sampling(report: StreamReport) -> list[Finding]:
-    shown = ", ".join(report.columns[:4]) + (" ..." if len(report.columns) > 4 else "")
-    found = []
+def _sampling(report: StreamReport) -> list[tuple[Level, str]]:
+    """What is wrong with the times of a stream: what is said after its columns."""
+    found: list[tuple[Level, str]] = []
+    if report.gaps == 1:
+        gaps = f"a gap of {report.longest_gap:.3g} s, which no fit bridges"
+    else:
+        gaps = f"{report.gaps} gaps, the longest of {report.longest_gap:.3g} s, which no fit bridges"
     if report.gaps:
-        found.append(
-            Finding(
-                "care" if report.missing > LONGEST_MISSING else "note",
-                f"{shown}: {report.gaps} gaps, the longest of {report.longest_gap:.3g} s, which no fit bridges",
-            )
-        )
+        found.append(("care" if report.missing > LONGEST_MISSING else "note", gaps))
     elif report.missing > LONGEST_MISSING:
-        found.append(Finding("care", f"{shown}: missing in {report.missing:.0%} of the trial, at its ends"))
+        found.append(("care", f"missing in {report.missing:.0%} of the trial, at its ends"))
     if report.jitter > 0.5:
-        found.append(
-            Finding(
-                "note", f"{shown}: the time between samples varies by {report.jitter:.0%}: stamps of receipt?"
-            )
-        )
+        found.append(("note", f"the time between samples varies by {report.jitter:.0%}: stamps of receipt?"))
     if report.rate < FEW_HERTZ and report.group in ("velocity", "rates"):
-        found.append(
-            Finding(
-                "care",
-                f"{shown}: {report.rate:.2g} Hz is slow for a vehicle: only the simulation method can use it",
-            )
-        )
+        slow = f"{report.rate:.2g} Hz is slow for a vehicle: only the simulation method can use it"
+        found.append(("care", slow))
     return found
+
+
+def _shown(columns: list[str]) -> str:
+    return ", ".join(columns[:4]) + (f" and {len(columns) - 4} more" if len(columns) > 4 else "")
 
 
 def _values(trial: Trial, name: str) -> list[tuple[Level, str]]:

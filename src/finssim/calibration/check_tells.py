@@ -23,7 +23,7 @@ LEAST_TILT = np.radians(1.0)
 SHORT = 0.5
 """Time over which a change of speed is looked for [s]."""
 
-LEAST_INERTIA = 0.1
+LEAST_INERTIA = 0.05
 """Part of the strongest wrench that went into a change of speed, for the effective mass to be seen."""
 
 SLOW = 8.0
