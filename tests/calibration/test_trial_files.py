@@ -325,3 +325,36 @@ def test_the_header_on_the_page_is_read(tmp_path):
     np.testing.assert_allclose(trial.t, [-0.08, 0.0, 0.92, 1.0])
     assert trial.channels["v"][0] == -2.0
     assert trial.channels["yaw"][1] == pytest.approx(-np.pi / 2.0, rel=1e-5)
+
+
+def test_any_damage_gives_a_trial_or_one_sentence(tmp_path):
+    """Bytes flipped, cut and doubled at random: what is read has increasing times and finite or empty numbers."""
+    rng = np.random.default_rng(0)
+    names = [
+        "t",
+        *rng.permutation([*COLUMNS, "roll", "qx", "qy", "qz", "qw", "depth", "phase", "foo"])[:9].tolist(),
+    ]
+    lines = [",".join(names)]
+    for i in range(60):
+        cells = [repr(0.05 * i), *(repr(float(x)) for x in rng.normal(size=9))]
+        lines.append(
+            ",".join(cell if rng.random() > 0.1 else rng.choice(["", "nan", "inf", "x"]) for cell in cells)
+        )
+    whole = "\n".join(lines).encode() + b"\n"
+    read = 0
+    for k in range(150):
+        damaged = np.frombuffer(whole, np.uint8).copy()
+        damaged[rng.integers(0, len(whole), k % 8)] = rng.integers(0, 256, k % 8)
+        a, b = sorted(rng.integers(0, len(whole), 2))
+        text = damaged.tobytes()[: b if k % 3 else None] + (whole[a:b] if k % 5 == 0 else b"")
+        folder = csv(tmp_path / "damaged", "")
+        (folder / "data.csv").write_bytes(text)
+        try:
+            trial = load_trial(folder)
+        except CalibrationError as error:
+            assert str(error).startswith(str(folder)) and "\n" not in str(error)
+        else:
+            read += 1
+            assert np.all(np.diff(trial.t) > 0.0)
+            assert not any(np.isinf(values).any() for values in trial.channels.values())
+    assert read > 75

@@ -112,7 +112,8 @@ def drive(trial: Trial, vehicle: Vehicle) -> Drive:
     if kind == "tau":
         force = np.zeros((len(t), 6))
         force[:, [TAU.index(name) for name in columns]] = values
-        B, names = _about_origin(header, vehicle), TAU
+        B = _about_origin(header, vehicle)
+        names: tuple[str, ...] = TAU
     else:
         force = _forces(kind, values, t, trial, vehicle)
         B, names = vehicle.thruster_matrix(), vehicle.thruster_names

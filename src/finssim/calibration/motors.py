@@ -142,10 +142,9 @@ def _followed(t: Array, u: Array, at: Array, time_constant: float, slew: float) 
             now += math.copysign(slew * min(ramp, dt), way)
             dt = max(dt - ramp, 0.0)
         x[j + 1] = now = goal + (now - goal) * math.exp(-dt / time_constant)
-    j = np.searchsorted(t, at, side="right") - 1
-    before, j = j < 0, np.maximum(j, 0)
-    dt = np.where(before, 0.0, at - t[j])
-    way = u[j] - x[j]
-    ramp = np.minimum(np.maximum(np.abs(way) - slew * time_constant, 0.0) / slew, dt)
-    start = x[j] + np.sign(way) * slew * ramp
-    return np.asarray(u[j] + (start - u[j]) * np.exp(-(dt - ramp) / time_constant))
+    last = np.maximum(np.searchsorted(t, at, side="right") - 1, 0)
+    since = np.maximum(at - t[last], 0.0)
+    ways = u[last] - x[last]
+    ramps = np.minimum(np.maximum(np.abs(ways) - slew * time_constant, 0.0) / slew, since)
+    left = ways - np.sign(ways) * slew * ramps
+    return np.asarray(u[last] - left * np.exp(-(since - ramps) / time_constant))

@@ -128,4 +128,4 @@ def _phase(trial: Trial, t: Array) -> NDArray[np.str_]:
 def _valid(tau: Array, found: Velocities) -> NDArray[np.bool_]:
     known = np.isfinite(found.nu)
     counted = known.mean(axis=0) >= MOST if known.any() else np.zeros(len(NU), bool)
-    return np.isfinite(tau).all(axis=1) & known.any(axis=1) & known[:, counted].all(axis=1)
+    return np.asarray(np.isfinite(tau).all(axis=1) & known.any(axis=1) & known[:, counted].all(axis=1))

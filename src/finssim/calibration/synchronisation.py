@@ -127,7 +127,7 @@ def _offset(reference: str, fixed: Array, moved: Array) -> Offset | None:
     energy = np.nansum(x**2) * np.nansum(y**2)
     if not energy > 0.0:
         return None
-    shared, correlation = np.array([_agreement(*_overlap(x, y, k)) for k in lags]).T
+    shared, correlation = np.array([_agreement(*_overlap(x, y, int(k))) for k in lags]).T
     # The most shared motion finds the peak; the correlation of what overlaps, which the ends do not pull, refines it.
     near = np.abs(lags - lags[int(np.argmax(shared))]) <= NEAR * RATE
     best = int(np.argmax(np.where(near, correlation, -1.0)))
@@ -137,7 +137,7 @@ def _offset(reference: str, fixed: Array, moved: Array) -> Offset | None:
     bend = before - 2.0 * peak + after
     part = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
     # With y = x(t - d) + e: var d = var e / Σ x_dot², for as many independent e as e has zero crossings.
-    a, b = _overlap(x, y, lags[best])
+    a, b = _overlap(x, y, int(lags[best]))
     error = a - np.sum(a * b) / np.sum(b**2) * b
     crossings = max(1, int(np.sum(error[1:] * error[:-1] < 0.0)))
     std = np.sqrt(np.mean(error**2) / (np.mean(np.square(np.gradient(a, 1.0 / RATE, axis=0))) * crossings))

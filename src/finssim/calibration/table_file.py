@@ -219,9 +219,8 @@ def _read_parquet(path: Path) -> Table:
             or pyarrow.types.is_boolean(kind)
             or pyarrow.types.is_decimal(kind)
         ):
-            values = [] if name == "phase" else column.cast(pyarrow.float64(), safe=False)
             if name != "phase":
-                table.numbers[name] = np.array(values.to_numpy(zero_copy_only=False), dtype=float)
+                table.numbers[name] = np.array(column.cast(pyarrow.float64(), safe=False), dtype=np.float64)
         elif (
             pyarrow.types.is_string(kind)
             or pyarrow.types.is_large_string(kind)

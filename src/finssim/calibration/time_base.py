@@ -69,7 +69,7 @@ def ordered(t: Array, columns: Mapping[str, Array]) -> tuple[Array, NDArray[np.i
     if not len(back):
         return t, rows, []
     if len(back) <= max(1.0, 0.01 * len(t)):
-        jumps = [i for i in back if _collides(t, columns, i)]
+        jumps = [int(i) for i in back if _collides(t, columns, int(i))]
         if jumps:
             return _in_pieces(t, jumps)
     rows = np.argsort(t, kind="stable")

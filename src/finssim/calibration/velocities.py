@@ -111,7 +111,7 @@ def arm_velocity(omega: Array, arm: Array) -> Array:
 
 def _lacks(omega: Array, arm: Array) -> bool:
     """Whether a rate that would move a point at `arm` is unknown throughout."""
-    unknown = ~np.isfinite(omega).any(axis=0)
+    unknown = ~np.asarray(np.isfinite(omega).any(axis=0))
     return any(unknown[i] and np.delete(arm, i).any() for i in range(3))
 
 
@@ -147,7 +147,7 @@ def _origin(
         depth = _column(trial, "depth", at, 3, max_gap)
         z = replace(depth, value=-depth.value, slope=-depth.slope)
         arms[2] = _depth_at(trial, vehicle)
-    known = np.isfinite(attitude.turn).all(axis=1)
+    known = np.asarray(np.isfinite(attitude.turn).all(axis=1))
     turn = np.where(known[:, None], attitude.turn, [0.0, 0.0, 0.0, 1.0])
     value = np.stack([x.value, y.value, z.value], axis=-1)
     slope = np.stack([x.slope, y.slope, z.slope], axis=-1)
@@ -170,7 +170,7 @@ def _derived(
     nu: Array, source: list[str], flow: Array, attitude: AttitudeSignal, trial: Trial, notes: list[str]
 ) -> list[tuple[Array, str]]:
     """u, v, w from the world velocity of the origin, and the names of their sources; no name where it tells nothing."""
-    known = np.isfinite(attitude.turn).all(axis=1)
+    known = np.asarray(np.isfinite(attitude.turn).all(axis=1))
     turn = np.where(known[:, None], attitude.turn, [0.0, 0.0, 0.0, 1.0])
     horizontal = trial.has("x", "y") and attitude.heading
     vertical = bool(np.isfinite(flow[:, 2]).any())
