@@ -56,6 +56,7 @@ HOMES = {
     "matplotlib": {
         "calibration/fit_figures.py",
         "calibration/replay_figure.py",
+        "calibration/thruster_figure.py",
         "experiments/envelope.py",
         "experiments/figures.py",
         "experiments/report.py",

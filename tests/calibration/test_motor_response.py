@@ -7,11 +7,13 @@ import pytest
 
 from calibration.made_steps import RPM, held, lagged, sampled, step_log
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.excitation import programmes
 from finssim.calibration.header import Header
 from finssim.calibration.motor import fit_motor
 from finssim.calibration.motor_response import fit_response
 from finssim.calibration.motor_steps import cut_steps
 from finssim.calibration.steps import find_steps, levels
+from finssim.calibration.synthetic import simulate_programme
 from finssim.calibration.trial import Trial
 from finssim.vehicles import load_vehicle
 
@@ -180,6 +182,21 @@ def test_pulses_and_unsigned_speeds_with_lost_samples_and_spikes():
     assert fit.estimates["T2.gain"].estimate == pytest.approx(1.0, abs=0.03)
     assert any("rpm_T2 has no sign" in w for w in fit.warnings)
     assert any("stand alone far from their neighbours" in w for w in fit.warnings)
+
+
+@pytest.mark.parametrize(("name", "asked"), [("finsrov", "command"), ("bluerov2", "pwm")])
+def test_the_simulators_motors_are_recovered_from_trials_of_the_whole_vehicle(name, asked):
+    """The engine solves delay and lag by itself; its logs give back the vehicle file's numbers, here without noise."""
+    vehicle = load_vehicle(name)
+    trials = simulate_programme(programmes(["yaw"], vehicle), vehicle, inputs=(asked, "rpm"))
+    fit = fit_motor(trials[:2], vehicle)
+    for thruster in vehicle.thrusters:
+        found = fit.estimates.get(f"{thruster}.time_constant")
+        if found is not None:
+            assert found.estimate == pytest.approx(vehicle.thrusters[thruster].time_constant, rel=2e-3)
+            assert fit.estimates[f"{thruster}.gain"].estimate == pytest.approx(1.0, abs=1e-3)
+    delay = next(iter(vehicle.thrusters.values())).delay
+    assert fit.estimates["delay"].estimate == pytest.approx(delay, abs=1e-3)
 
 
 def test_a_thrust_response_serves_where_no_speed_was_measured():

@@ -83,7 +83,7 @@ def _dead_zone(found: Study, thruster: Thruster, side: str, sign: float) -> Esti
     ends = sorted((sign * low * TO_RPM, sign * high * TO_RPM))
     return Estimate(
         name=f"{found.name}.dead_rpm_{side}",
-        estimate=sign * TO_RPM * (0.5 * (low + high) if known else 0.0) + 0.0,
+        estimate=sign * TO_RPM * (0.5 * (low + high) if low > 0.0 else 0.0) + 0.0,
         ci95=(ends[0] + 0.0, ends[1] + 0.0),
         unit="rpm",
         identifiable=known,

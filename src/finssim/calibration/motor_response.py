@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.motor_steps import StepFit, StepRecord, step_fit, unit_response
+from finssim.calibration.motor_steps import StepFit, StepRecord, step_fit
 from finssim.calibration.thrust_curve import t_quantile
 
 __all__ = ["Response", "fit_response"]
@@ -87,12 +87,30 @@ def fit_response(records: Sequence[StepRecord]) -> Response:
 
 
 def _errors(record: StepRecord, delays: Array, constants: Array) -> Array:
-    """Sum of squares left by the best levels, for every pair, (len(delays), len(constants))."""
-    r = unit_response(record.t, delays[:, None, None], constants[None, :, None])
-    r = r - r.mean(axis=-1, keepdims=True)
-    y = record.y - record.y.mean()
-    ry, rr = r @ y, np.sum(r * r, axis=-1)
-    return np.asarray(y @ y - np.divide(ry**2, rr, out=np.zeros_like(rr), where=rr > 1e-12))
+    """Sum of squares left by the best levels, for every pair, (len(delays), len(constants)).
+
+    With e_k = e^(-(t_k - T_d) / τ) after the dead time, all that least squares needs are sums of e, e² and y e over the
+    samples from the first one on. They are formed once behind the longest dead time and carried back sample by sample.
+    """
+    t, y = record.t, record.y - record.y.mean()
+    n = len(t)
+    first = np.searchsorted(t, delays, side="right")
+    low, high = int(first.min()), int(first.max())
+    tail = np.exp(-(t[high:, None] - t[min(high, n - 1)]) / constants)
+    sums = np.zeros((3, high - low + 1, len(constants)))
+    sums[:, -1] = tail.sum(axis=0), (tail**2).sum(axis=0), y[high:] @ tail
+    for k in range(high - 1, low - 1, -1):
+        fall = np.exp(-(t[k + 1] - t[k]) / constants) if k + 1 < n else np.zeros_like(constants)
+        later = sums[:, k + 1 - low]
+        sums[:, k - low] = 1.0 + fall * later[0], 1.0 + fall**2 * later[1], y[k] + fall * later[2]
+    at_first = np.exp(-np.maximum(t[np.minimum(first, n - 1)] - delays, 0.0)[:, None] / constants)
+    e = at_first * sums[0, first - low]
+    ee, ye = at_first**2 * sums[1, first - low], at_first * sums[2, first - low]
+    count = (n - first)[:, None]
+    after = np.append(np.cumsum(y[::-1])[::-1], 0.0)[first][:, None]
+    r, ry = count - e, after - ye
+    rr = count - 2.0 * e + ee - r**2 / n
+    return np.asarray(y @ y - np.divide(ry**2, rr, out=np.zeros_like(rr), where=rr > 1e-12 * n))
 
 
 def _noise(record: StepRecord, delay: float, tau: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,8 @@ SHORTEST = 0.5
 """Shortest level that can settle [s]."""
 LEAST_COVERED = 0.5
 """Share of the time that levels must cover for a log to be one of levels; a slower sweep is used as it is."""
+SETTLING = 50
+"""Samples of a run after which its median no longer moves, so that a slow ramp is not one run."""
 TOLERANCE = 0.02
 """Band around a level within which a measured signal still counts as held, of its range."""
 
@@ -40,17 +43,19 @@ def levels(x: Array, tolerance: float) -> list[tuple[int, int]]:
     One stray sample does not end a run, two do.
     """
     runs, first = [], 0
-    centre = float(x[0]) if x.size else 0.0
-    for i in range(1, len(x)):
-        outside = abs(x[i] - centre) > tolerance
-        lasts = i + 1 >= len(x) or abs(x[i + 1] - centre) > tolerance
-        if outside and lasts:
+    values = x.tolist()
+    centre = values[0] if values else 0.0
+    for i in range(1, len(values)):
+        if values[i] == centre:
+            continue
+        outside = abs(values[i] - centre) > tolerance
+        if outside and (i + 1 >= len(values) or abs(values[i + 1] - centre) > tolerance):
             runs.append((first, i))
-            first, centre = i, float(x[i])
-        elif not outside and i - first < 50:
-            centre = float(np.median(x[first : i + 1]))
-    if x.size:
-        runs.append((first, len(x)))
+            first, centre = i, values[i]
+        elif not outside and i - first < SETTLING:
+            centre = statistics.median(values[first : i + 1])
+    if values:
+        runs.append((first, len(values)))
     return runs
 
 
