@@ -77,14 +77,14 @@ def write_replay(replay: Replay, out: Path) -> None:
 
 
 def _headline(replay: Replay) -> str:
-    held_out = sum(not p.in_sample for p in replay.pairs)
+    total, held_out = len(replay.pairs), sum(not p.in_sample for p in replay.pairs)
     kinds = [f"{held_out} held-out"] if held_out else []
-    if held_out < len(replay.pairs):
-        kinds.append(f"{len(replay.pairs) - held_out} IN-SAMPLE (the vehicle was fitted on them)")
+    if held_out < total:
+        kinds.append(f"{total - held_out} IN-SAMPLE (the vehicle was fitted on them)")
     rates = sorted({p.rate for p in replay.pairs})
     rate = f"{rates[0]:.4g} Hz" if len(rates) == 1 else f"{rates[0]:.4g} to {rates[-1]:.4g} Hz"
-    noun = "trial" if len(replay.pairs) == 1 else "trials"
-    return f"{replay.vehicle.name}: {' and '.join(kinds)} {noun}, compared at {rate}"
+    noun = "trial" if total == 1 else "trials"
+    return f"{replay.vehicle.name}: {total} {noun}, {' and '.join(kinds)}, compared at {rate}"
 
 
 def _axis_table(replay: Replay) -> tuple[list[str], Rows]:
