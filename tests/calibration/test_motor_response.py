@@ -148,6 +148,13 @@ def test_what_sampling_hides_is_said():
     assert not any(path.endswith("H_LF.time_constant") for path in fast.changes)
 
 
+def test_a_motor_that_does_not_follow_keeps_its_numbers():
+    trial = step_log(H_LF, "H_LF", PULSES)
+    dead = Trial(name="dead", t=trial.t, channels=trial.channels | {"rpm_H_LF": np.zeros(len(trial.t))})
+    fit = fit_motor([dead], FINSROV)
+    assert fit.changes == {} and any("rpm_H_LF does not follow the command" in w for w in fit.warnings)
+
+
 def test_several_trials_and_thrusters_are_fitted_together():
     """Thrusters without steps get their group's mean; another group keeps its number, and both are said."""
     trials = [step_log(H_LF, "H_LF", PULSES, seed=seed, tau=0.15) for seed in range(4)]

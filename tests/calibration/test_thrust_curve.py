@@ -207,6 +207,14 @@ def test_tables_that_disagree_widen_the_interval():
     assert together.c - together.half_width < 1.0e-4 < 1.15e-4 < together.c + together.half_width + 1e-6
 
 
+def test_a_handful_of_rows_is_a_table():
+    """Three rows with 2 % of noise: an interval of a fifth or so, by t of two degrees of freedom; one row has none."""
+    omega = np.array([50.0, 100.0, 150.0])
+    side = fit_side([(omega, 1.1e-4 * omega**2 * np.array([1.02, 0.98, 1.01]))])
+    assert abs(side.c - 1.1e-4) < side.half_width < 0.5 * 1.1e-4
+    assert fit_side([(omega[:1], omega[:1])]).half_width == np.inf
+
+
 def test_a_stray_row_is_left_out():
     omega = np.linspace(30.0, 280.0, 40)
     force = 1.1e-4 * omega**2

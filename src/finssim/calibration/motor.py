@@ -68,8 +68,8 @@ def fit_motor(
         changes["thrusters.*.delay"] = estimates[0].estimate
         changes |= _untested(sure, vehicle, changes, warnings)
     quality = {found.name: quality_of(found) for found in studies}
-    speeds = [s for s in (_in_speed(found, trials, vehicle) for found in sure) if s is not None]
-    loop = loop_of(speeds, vehicle, loop_rate=loop_rate)
+    speeds = [_in_speed(found, trials, vehicle) for found in sure if not found.response.hidden]
+    loop = loop_of([found for found in speeds if found is not None], vehicle, loop_rate=loop_rate)
     if loop is not None:
         estimates += loop.estimates
         quality["speed_loop"] = loop.quality

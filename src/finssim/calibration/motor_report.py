@@ -33,7 +33,7 @@ def estimates_of(found: Study, thruster: Thruster) -> list[Estimate]:
     if not sure:
         rests += ": no step follows first order plus dead time within 10 %"
     low, high = response.time_constant_interval
-    fast = response.time_constant < 0.5 * response.sample
+    fast = response.hidden
     estimates = [
         Estimate(
             name=f"{name}.time_constant",
@@ -117,7 +117,11 @@ def warnings_of(found: Study) -> list[str]:
     said = [f"{motor.trial}: {note}" for motor in found.motors for note in motor.notes]
     accepted = sum(step.accepted for step in found.response.steps)
     moved = sum(step.moved for step in found.response.steps)
-    if accepted == 0:
+    if moved == 0:
+        said.append(
+            f"{found.name}: {found.motors[0].measured} does not follow the command, the vehicle file stays"
+        )
+    elif accepted == 0:
         said.append(
             f"{found.name}: no step is within {100 * NRMSE:g} % error and overshoot of first order plus dead time "
             f"(error {100 * found.nrmse:.0f} %), the vehicle file keeps its response"

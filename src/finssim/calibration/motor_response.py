@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -37,6 +38,11 @@ class Response:
     used: tuple[int, ...]
     """Which steps the numbers rest on: the accepted ones, or all that moved where none is accepted."""
 
+    @property
+    def hidden(self) -> bool:
+        """Whether the time constant is below half a sample, where the log cannot tell it from 0."""
+        return self.time_constant < 0.5 * self.sample
+
 
 def fit_response(records: Sequence[StepRecord]) -> Response:
     """One dead time and time constant for all steps; every step has levels of its own.
@@ -58,13 +64,14 @@ def fit_response(records: Sequence[StepRecord]) -> Response:
     delays = np.linspace(0.0, min(LONGEST_DELAY, DELAY_SHARE * duration), GRID)
     constants = np.geomspace(0.1 * sample, duration, GRID)
     rough = np.array([_errors(record, delays, constants) for record in records])
-    power = np.array([max(float(np.sum((r.y - np.mean(r.y)) ** 2)), 1e-300) for r in records])
-    explained = 1.0 - rough.min(axis=(1, 2)) / power
-    moving = [i for i, share in enumerate(explained) if share > 0.5] or [int(np.argmax(explained))]
+    power = np.array([float(np.sum((r.y - np.mean(r.y)) ** 2)) for r in records])
+    explained = 1.0 - rough.min(axis=(1, 2)) / np.maximum(power, 1e-300)
+    followed = [i for i, share in enumerate(explained) if share > 0.5 and power[i] > 0.0]
+    moving = followed or [int(np.argmax(explained))]
 
     def solve(chosen: Sequence[int]) -> tuple[float, float, tuple[int, ...], list[StepFit]]:
         delay, tau = _search([records[i] for i in chosen], delays, constants)
-        fits = [step_fit(record, delay, tau, moved=i in moving) for i, record in enumerate(records)]
+        fits = [step_fit(record, delay, tau, moved=i in followed) for i, record in enumerate(records)]
         return delay, tau, tuple(i for i in chosen if fits[i].accepted), fits
 
     _, _, accepted, _ = solve(moving)
@@ -74,12 +81,13 @@ def fit_response(records: Sequence[StepRecord]) -> Response:
     half = _half_widths(
         chosen, delay, tau, 2.0 * float(delays[1]), 2.0 * float(np.log(constants[1] / constants[0]))
     )
+    ratio = math.exp(half[1]) if half[1] < 5.0 else math.inf
     blur = 0.5 * float(np.median([record.sample for record in chosen]))
     return Response(
         delay=delay,
         time_constant=tau,
         delay_interval=(max(delay - half[0] - blur, 0.0), delay + half[0] + blur),
-        time_constant_interval=(tau * float(np.exp(-half[1])), tau * float(np.exp(half[1]))),
+        time_constant_interval=(tau / ratio, tau * ratio),
         sample=sample,
         steps=tuple(fits),
         used=used,

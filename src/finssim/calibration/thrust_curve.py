@@ -28,7 +28,7 @@ class Side:
     c: float
     """T = c ω², [N s²/rad²]."""
     half_width: float
-    """Of the 95 % interval; infinite from fewer than three rows."""
+    """Of the 95 % interval; infinite from a single row."""
     r2: float
     """Share of the variance of the forces of this direction that the curve explains."""
     rmse: float
@@ -70,7 +70,7 @@ def fit_side(tables: Sequence[tuple[Array, Array]]) -> Side | None:
     per_table = tuple(_slope(*_joined(parts)) for parts in blocks if parts)
     parts = [part for of_table in blocks for part in of_table]
     leave_out = (
-        [_slope(*_joined(parts[:i] + parts[i + 1 :])) for i in range(len(parts))] if len(parts) > 2 else []
+        [_slope(*_joined(parts[:i] + parts[i + 1 :])) for i in range(len(parts))] if len(parts) > 1 else []
     )
     half_width = jackknife(np.array(leave_out)[:, None])[0] if leave_out else np.inf
     half_width = max(half_width, _autocorrelated([(square[row], force[row]) for row in rows], c))
@@ -109,11 +109,13 @@ def _slope(square: Array, force: Array) -> float:
 
 
 def _blocks(square: Array, force: Array) -> list[tuple[Array, Array]]:
-    """Neighbouring speeds in at most `BLOCKS` parts of about equal Σ ω⁴."""
+    """Neighbouring speeds in at most `BLOCKS` parts of about equal Σ ω⁴; of a short table every row."""
     if square.size == 0:
         return []
     order = np.argsort(square)
     square, force = square[order], force[order]
+    if len(square) < 2 * BLOCKS:
+        return [(square[i : i + 1], force[i : i + 1]) for i in range(len(square))]
     share = (np.cumsum(square**2) - 0.5 * square**2) / np.sum(square**2)
     label = np.minimum(share * BLOCKS, BLOCKS - 1).astype(int)
     return [(square[label == i], force[label == i]) for i in np.unique(label)]

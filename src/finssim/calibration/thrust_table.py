@@ -82,7 +82,7 @@ def read_table(
     if missing:
         raise CalibrationError(
             f"{shown}: no column of {' and none of '.join(missing)} among {', '.join(h.strip() for h in headers)}: "
-            f"name it, such as {missing[0].split()[0]}=COLUMN=UNIT"
+            f"name it, such as {missing[0].split()[0]}=COLUMN=UNIT (columns of nothing but zeros are passed over)"
         )
     values = {quantity: rows[:, source.column] * source.factor for quantity, source in sources.items()}
     return _table(Path(path).stem, values, sources, shown, neutral)

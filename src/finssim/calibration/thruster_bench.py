@@ -109,7 +109,8 @@ def bench(
         on = [table for _, table in levels] if pool_voltages else at
         esc = _esc(on, thruster, tables, shown, chosen, measured, warnings)
     if not sides and esc is None:
-        raise CalibrationError(f"{shown}: the tables hold neither a speed nor a pulse that turns the shaft")
+        said = "; ".join(warnings) or f"{shown}: no row turns the shaft"
+        raise CalibrationError(f"{said}: nothing could be fitted")
     warnings += [f"{table.name}: {note}" for table in tables for note in table.notes]
     return Bench(
         levels=tuple(levels),

@@ -35,7 +35,7 @@ def _curve(target: Target, result: Bench) -> list[Estimate]:
         side = result.sides.get(name)
         if side is None:
             continue
-        sure = math.isfinite(side.half_width) and side.c > side.half_width and side.samples >= 3
+        sure = math.isfinite(side.half_width) and side.c > side.half_width
         rows = f"{side.samples} rows, R² {side.r2:.4f}, rms {side.rmse:.2g} N"
         if math.isfinite(result.voltage):
             rows += f", {result.voltage:g} V"
