@@ -27,6 +27,9 @@ LONGEST = 1.0
 NEAR = 0.15
 """Distance from the most shared motion within which the peak is refined [s]."""
 
+BLOCKS = 10
+"""Parts of a recording, each left out in turn to see how far the offset rests on it."""
+
 LEAST = 0.6
 """Correlation below which two streams do not agree on any motion, so that nothing is said."""
 
@@ -124,39 +127,49 @@ def _offset(reference: str, fixed: Array, moved: Array) -> Offset | None:
     x, y = _centred(fixed[:, both]), _centred(moved[:, both])
     longest = min(int(LONGEST * RATE), len(x) // 3)
     lags = np.arange(-longest, longest + 1)
-    energy = np.nansum(x**2) * np.nansum(y**2)
+    edges = np.linspace(0, len(x), BLOCKS + 1).astype(int)[:-1]
+    sums = np.array([_sums(x, y, int(k), edges) for k in lags])  # (lags, blocks, xx yy xy)
+    energy = np.sqrt(np.nansum(x**2) * np.nansum(y**2))
     if not energy > 0.0:
         return None
-    shared, correlation = np.array([_agreement(*_overlap(x, y, int(k))) for k in lags]).T
     # The most shared motion finds the peak; the correlation of what overlaps, which the ends do not pull, refines it.
-    near = np.abs(lags - lags[int(np.argmax(shared))]) <= NEAR * RATE
-    best = int(np.argmax(np.where(near, correlation, -1.0)))
-    if correlation[best] < LEAST or best in (0, len(lags) - 1) or not near[best - 1] or not near[best + 1]:
+    near = np.abs(lags - lags[int(np.argmax(sums[..., 2].sum(axis=1)))]) <= NEAR * RATE
+    place, height = _peak(_correlation(sums.sum(axis=1)), near)
+    if not height >= LEAST:
         return None
+    parts = [_peak(_correlation(np.delete(sums, b, axis=1).sum(axis=1)), near)[0] for b in range(BLOCKS)]
+    spread = float(np.sqrt((BLOCKS - 1) * np.var(parts)))  # jackknife: one short event must not look certain
+    if not np.isfinite(spread):  # without one part there is no peak
+        return None
+    return Offset(reference, -float(lags[0] + place) / RATE, max(spread, 0.1) / RATE, height)
+
+
+def _peak(correlation: Array, near: NDArray[np.bool_]) -> tuple[float, float]:
+    """Place, between the samples, and height of the highest peak of the part that is near; NaN if on its edge."""
+    best = int(np.argmax(np.where(near, correlation, -2.0)))
+    if best in (0, len(near) - 1) or not (near[best - 1] and near[best + 1]):
+        return np.nan, np.nan
     before, peak, after = correlation[best - 1 : best + 2]
     bend = before - 2.0 * peak + after
-    part = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
-    # With y = x(t - d) + e: var d = var e / Σ x_dot², for as many independent e as e has zero crossings.
-    a, b = _overlap(x, y, int(lags[best]))
-    error = a - np.sum(a * b) / np.sum(b**2) * b
-    crossings = max(1, int(np.sum(error[1:] * error[:-1] < 0.0)))
-    std = np.sqrt(np.mean(error**2) / (np.mean(np.square(np.gradient(a, 1.0 / RATE, axis=0))) * crossings))
-    return Offset(reference, -float(lags[best] + part) / RATE, float(std), float(peak))
+    return best + (0.5 * (before - after) / bend if bend < 0.0 else 0.0), float(peak)
 
 
 def _centred(x: Array) -> Array:
     return np.asarray(x - np.nanmedian(x, axis=0))
 
 
-def _overlap(x: Array, y: Array, lag: int) -> tuple[Array, Array]:
-    """x(t) and y(t + lag) where both are known, 0 elsewhere."""
+def _sums(x: Array, y: Array, lag: int, edges: NDArray[np.int64]) -> Array:
+    """Sums of x², y² and x y of x(t) and y(t + lag) where both are known, by block of t, (blocks, 3)."""
     n = len(x)
-    a, b = x[max(0, -lag) : n - max(0, lag)], y[max(0, lag) : n - max(0, -lag)]
+    products = np.zeros((n, 3))
+    rows = slice(max(0, -lag), n - max(0, lag))
+    a, b = x[rows], y[max(0, lag) : n - max(0, -lag)]
     known = np.isfinite(a) & np.isfinite(b)
-    return np.where(known, a, 0.0), np.where(known, b, 0.0)
+    a, b = np.where(known, a, 0.0), np.where(known, b, 0.0)
+    products[rows] = np.stack([np.sum(a * a, axis=1), np.sum(b * b, axis=1), np.sum(a * b, axis=1)], axis=-1)
+    return np.add.reduceat(products, edges, axis=0)
 
 
-def _agreement(a: Array, b: Array) -> tuple[float, float]:
-    """Sum of products, and correlation, over all rows and columns."""
-    product, size = float(np.sum(a * b)), np.sqrt(np.sum(a**2) * np.sum(b**2))
-    return product, float(product / size) if size > 0.0 else 0.0
+def _correlation(sums: Array) -> Array:
+    """From sums of x², y² and x y, (lags, 3) -> (lags,)."""
+    return np.asarray(sums[:, 2] / np.maximum(np.sqrt(sums[:, 0] * sums[:, 1]), 1e-300))
