@@ -30,7 +30,7 @@ def simulate_axis(
     The step is implicit in the damping and central in s: of second order, stable for any stiffness.
 
     Args:
-        theta: m, d1, d2, k; m > 0.
+        theta: m, d1, d2, k for all trials (4,), or for each (4, G); m > 0.
         wrench: tau of every trial, bias and known terms already taken off, one (n_g,) each.
         step: [s]
         restart: For every trial, where velocity and s, the sine of the angle, are set anew: (index, nu, s) at the
@@ -39,7 +39,7 @@ def simulate_axis(
     Returns:
         nu and s of every trial at the samples of its wrench; NaN from where a run leaves all bounds.
     """
-    m, d1, d2, k = (float(x) for x in theta)
+    m, d1, d2, k = (np.asarray(x, float) for x in theta)
     G, n = len(wrench), max(len(w) for w in wrench)
     tau = np.zeros((n, G))
     for g, w in enumerate(wrench):
@@ -61,7 +61,7 @@ def simulate_axis(
             if i == n - 1:
                 break
             a = half * (d1 + d2 * np.abs(1.5 * v - 0.5 * previous))  # speed at mid-step, extrapolated
-            push = middle[i] - 2.0 * half * k * (x + 0.5 * step * v) if k else middle[i]
+            push = middle[i] - 2.0 * half * k * (x + 0.5 * step * v) if k.any() else middle[i]
             previous, v = v, (v * (1.0 - a) + push) / (1.0 + a)
             x = x + 0.5 * step * (previous + v)
     return [nu[: len(w), g] for g, w in enumerate(wrench)], [s[: len(w), g] for g, w in enumerate(wrench)]

@@ -78,7 +78,18 @@ def regress(
             warnings += notes
     used = {s.name for data, _ in chosen.values() for s in data.signals}
     _hydrostatics(estimates, changes, vehicle, plant, warnings)
-    warnings += _passive(trials, vehicle, estimates, changes, results, wanted, used)
+    quality = {axis: result.quality for axis, result in results.items()}
+    curves = [curve for result in results.values() for curve in result.curves]
+    quiet = _passive(trials, vehicle, wanted, estimates)
+    if quiet is not None:
+        estimates, changes, quality = (
+            quiet.estimates | estimates,
+            quiet.changes | changes,
+            quality | quiet.quality,
+        )
+        warnings += quiet.warnings
+        curves += quiet.curves
+        used |= set(quiet.trials)
     if not estimates:
         raise CalibrationError(
             f"no axis of {vehicle.name} can be fitted from these trials: "
@@ -91,10 +102,10 @@ def regress(
         vehicle=vehicle,
         estimates=estimates,
         changes=changes,
-        quality={axis: result.quality for axis, result in results.items()},
+        quality=quality,
         correlation=correlation,
         warnings=tuple(dict.fromkeys([*warnings, *sentences])),
-        curves=tuple(curve for result in results.values() for curve in result.curves),
+        curves=tuple(curves),
         trials={trial.name: trial.sha256 for trial in trials if trial.name in used},
         settings={"damping": damping, "axes": [AXES[i] for i in chosen], "seed": seed},
     )
@@ -213,13 +224,13 @@ def _correlation(chosen: dict[int, tuple[AxisData, Selection]]) -> tuple[Correla
 
 
 def _passive(
-    trials: Sequence[Trial],
-    vehicle: Vehicle,
-    estimates: dict[str, Estimate],
-    changes: dict[str, Any],
-    results: dict[str, AxisResult],
-    wanted: list[int],
-    used: set[str],
-) -> list[str]:
-    """Add what trials without thrust tell of axes that no driven trial told of."""
-    return []
+    trials: Sequence[Trial], vehicle: Vehicle, wanted: list[int], found: dict[str, Estimate]
+) -> Fit | None:
+    """What trials without thrust tell of roll, pitch and heave where no driven trial did; None without such trials."""
+    quiet = [trial for trial in trials if trial.header.passive]
+    axes = [AXES[i] for i in wanted if i in (2, 3, 4) and f"{AXES[i]}.m_eff" not in found]
+    if not quiet or not axes:
+        return None
+    from finssim.calibration.passive import passive
+
+    return passive(quiet, vehicle, axes=axes)
