@@ -10,9 +10,9 @@ import pytest
 from rich.console import Console
 
 from calibration.made_fits import SET, made_fit
-from finssim.calibration.calibrate import calibrated, concerns, kept
+from finssim.calibration.calibrate import calibrated, concerns, kept, number_in
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.fit_output import fit_json, print_fit
+from finssim.calibration.fit_output import fit_json, print_fit, state_text
 from finssim.calibration.origins import number_origins
 from finssim.calibration.vehicle_file import write_vehicle
 from finssim.vehicles import load_vehicle
@@ -150,3 +150,26 @@ def test_the_table_fits_a_hundred_columns():
     (row,) = (line for line in lines if line.strip().startswith("yaw.d2 "))
     assert "file kept" in row and "0.4776" in row
     assert "heave.d1: no speed" in text.getvalue() and math.isnan(fit.estimates["heave.d1"].ci95[1])
+
+
+def test_a_thrust_scale_is_the_note_of_what_it_multiplies():
+    """Coefficients and limits of every thruster say which scale they had."""
+    vehicle = load_vehicle("finsrov")
+    changes = {f"thrusters.{name}.c_plus": 0.97 * t.c_plus for name, t in vehicle.thrusters.items()}
+    fit = made_fit(changes=changes)
+    after = calibrated(fit)
+    note = after.origin_of("thrusters.V_LB.c_plus").note
+    assert note == "from thrust_scale 0.97 -, 95 % interval 0.95 to 0.99"
+    assert after.origin_of("thrusters.V_LB.c_minus").origin == "published"
+    assert state_text(fit.estimates["thrust_scale"], fit, after) == "written"
+
+
+def test_a_coupling_of_a_diagonal_matrix_was_zero(tmp_path):
+    """The file had nothing there, which is zero; its row is readable however long the notes are."""
+    fit = made_fit(changes={f"{SET}.linear_damping.1.5": 0.5})
+    after = calibrated(fit)
+    assert number_in(fit.vehicle, f"{SET}.linear_damping.1.5") == 0.0
+    assert number_in(after, f"{SET}.linear_damping.1.5") == 0.5
+    write_vehicle(after, tmp_path / "v.yaml")
+    assert max(map(len, (tmp_path / "v.yaml").read_text("utf-8").splitlines())) < 250
+    assert load_vehicle(tmp_path / "v.yaml").sha256 == after.sha256

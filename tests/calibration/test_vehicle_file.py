@@ -149,3 +149,25 @@ def test_numbers_of_one_source_share_it_and_keep_their_notes(tmp_path):
     write_vehicle(vehicle, tmp_path / "v.yaml")
     assert (tmp_path / "v.yaml").read_text(encoding="utf-8").count("our scale") == 1
     assert load_vehicle(tmp_path / "v.yaml").provenance == vehicle.provenance
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("name", ["finsrov", "rexrov", "lauv"])
+def test_any_mixture_of_origins_is_kept(tmp_path, name, seed):
+    """Sources and notes drawn for every number, many equal and many empty: folding loses none of them."""
+    rng = np.random.default_rng(seed)
+    vehicle = load_vehicle(name)
+    pool = [
+        Provenance(o, s, n)
+        for o in ("measured", "guessed")
+        for s in ("", "a book", "a scale")
+        for n in ("", "once", "95 % interval 1 to 2")
+    ]
+    few = [pool[i] for i in rng.choice(len(pool), 1 + seed, replace=False)]
+    origins = {path: few[rng.integers(len(few))] for path in number_origins(vehicle)}
+    tree = file_tree(vehicle)
+    mixed = vehicle.model_copy(update={"provenance": folded(tree, origins)})
+    assert number_origins(mixed) == origins
+    write_vehicle(mixed, tmp_path / "v.yaml")
+    again = load_vehicle(tmp_path / "v.yaml")
+    assert number_origins(again) == origins and again.sha256 == vehicle.sha256

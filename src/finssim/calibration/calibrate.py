@@ -18,6 +18,10 @@ from finssim.vehicles import CalibrationRecord, Provenance, Vehicle, VehicleErro
 __all__ = ["calibrated", "concerns", "estimate_at", "kept", "number_in"]
 
 
+SCALED = ("c_plus", "c_minus", "force_min", "force_max")
+"""Numbers of a thruster that `thrust_scale` multiplies."""
+
+
 def calibrated(fit: Fit) -> Vehicle:
     """The vehicle with what the fit determined; everything else keeps its number and its origin.
 
@@ -42,7 +46,7 @@ def calibrated(fit: Fit) -> Vehicle:
     changed = [tuple(path.split(".")) for path in fit.changes]
     origins = {}
     for path, whole, value in numbers(after):
-        estimate = _estimate_of(path, fit.estimates, after)
+        estimate = _estimate_of(path, fit.estimates, after) or _scale_of(path, fit.estimates)
         told = estimate is not None and estimate.identifiable and _covers(changed, path, after)
         if old_values.get(whole) == value and not told:
             origins[path] = before.origin_of(".".join(whole))
@@ -100,10 +104,10 @@ def concerns(fit: Fit, vehicle: Vehicle) -> list[str]:
 def number_in(vehicle: Vehicle, path: str) -> float | None:
     """The number at a dotted path of the vehicle file, `*` and groups by their first thruster; None where none is."""
     wanted = tuple(path.split("."))
-    for leaf, _, value in numbers(vehicle):
-        if _same_place(wanted, leaf, vehicle):
+    for leaf, whole, value in numbers(vehicle):
+        if _same_place(wanted, leaf, vehicle) or wanted == whole:
             return value
-    return None
+    return dict(leaves(vehicle.values())).get(wanted)  # a coupling of a matrix whose file gives the diagonal
 
 
 def estimate_at(path: str, fit: Fit, vehicle: Vehicle) -> Estimate | None:
@@ -180,6 +184,11 @@ def _estimate_of(leaf: Path, estimates: Mapping[str, Estimate], vehicle: Vehicle
         if estimate.path is not None and _same_place(tuple(estimate.path.split(".")), leaf, vehicle):
             return estimate
     return None
+
+
+def _scale_of(leaf: Path, estimates: Mapping[str, Estimate]) -> Estimate | None:
+    """The common scale of all thrusts, for the numbers that it multiplies."""
+    return estimates.get("thrust_scale") if leaf[0] == "thrusters" and leaf[-1] in SCALED else None
 
 
 def _note(estimate: Estimate | None, value: float) -> str:

@@ -144,6 +144,8 @@ def file_number(estimate: Estimate, vehicle: Vehicle) -> float | None:
 
 def state_text(estimate: Estimate, fit: Fit, vehicle: Vehicle) -> str:
     """What became of a parameter: `written`, `file kept`, or whether the data tell it where the file has no place."""
+    if estimate.name == "thrust_scale" and any(path.startswith("thrusters.") for path in fit.changes):
+        return "written"
     if estimate.path is None:
         return "" if estimate.identifiable else "not told"
     before, after = number_in(fit.vehicle, estimate.path), number_in(vehicle, estimate.path)

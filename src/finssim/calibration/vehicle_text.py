@@ -107,7 +107,7 @@ def _lines(
     if isinstance(node, list) and not _uniform(node, path, origins):
         yield head + unit
         for i, item in enumerate(node):
-            yield f"{pad}  - {_flow(item, (*path, str(i)), inherited, origins)}"
+            yield from _item(item, (*path, str(i)), inherited, origins, pad + "  ")
     elif isinstance(node, list) and node and isinstance(node[0], list):  # a matrix: one row on a line
         common = origins.get(next(leaves(node, path))[0])
         marks = _marks(common, inherited)
@@ -125,6 +125,19 @@ def _lines(
         yield flow + unit
 
 
+def _item(
+    node: Any, path: Path, inherited: Provenance | None, origins: Mapping[Path, Provenance], pad: str
+) -> Iterator[str]:
+    """An item of a list on one line; a row whose entries have long notes on a line for each."""
+    flow = f"{pad}- {_flow(node, path, inherited, origins)}"
+    if isinstance(node, list) and len(flow) > LONG and not _uniform(node, path, origins):
+        yield f"{pad}-"
+        for i, item in enumerate(node):
+            yield from _item(item, (*path, str(i)), inherited, origins, pad + "  ")
+    else:
+        yield flow
+
+
 def _flow(node: Any, path: Path, inherited: Provenance | None, origins: Mapping[Path, Provenance]) -> str:
     """A node on one line."""
     if isinstance(node, Mapping):
@@ -135,7 +148,8 @@ def _flow(node: Any, path: Path, inherited: Provenance | None, origins: Mapping[
         ]
         return "{" + ", ".join(parts) + "}"
     if isinstance(node, list):
-        common = _common(node, path, origins, inherited) if _uniform(node, path, origins) else inherited
+        first = next((origins.get(leaf) for leaf, _ in leaves(node, path)), None)
+        common = first if _uniform(node, path, origins) else inherited
         items = [_flow(item, (*path, str(i)), common, origins) for i, item in enumerate(node)]
         value, marks = f"[{', '.join(items)}]", _marks(common, inherited)
     else:
@@ -162,10 +176,23 @@ def _common(
     if not notes:
         return inherited
     best = max(notes, key=lambda pair: len(notes[pair]))
-    if inherited is not None and len(notes.get(inherited[:2], [])) >= len(notes[best]):
-        return inherited
-    shared = notes[best][0] if len(set(notes[best])) == 1 else ""
-    return Provenance(*best, shared)
+    note = _shared(notes[best])
+    if inherited is not None:
+        same = notes.get(inherited[:2], [])
+        if inherited[:2] == best and same.count(note) <= same.count(inherited.note):
+            return inherited
+        if inherited[:2] != best and len(same) >= len(notes[best]):
+            return inherited
+    return Provenance(*best, note)
+
+
+def _shared(notes: list[str]) -> str:
+    """The note to state for values of one origin and source: the most frequent one.
+
+    A value without a note under one needs its origin and source again, so these count double.
+    """
+    note = max(notes, key=notes.count)
+    return note if notes.count(note) > 2 * notes.count("") else ""
 
 
 def _uniform(node: list[Any], path: Path, origins: Mapping[Path, Provenance]) -> bool:

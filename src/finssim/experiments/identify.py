@@ -67,9 +67,14 @@ def rough_vehicle(truth: Vehicle) -> Vehicle:
         f"{SET}.linear_damping": [20.0, 20.0, 20.0, 1.0, 1.0, 1.0],
         f"{SET}.quadratic_damping": [50.0, 50.0, 50.0, 1.0, 1.0, 1.0],
     }
-    return truth.replace(
-        guess, Provenance("guessed", "", "the order of other small vehicles, before any trial")
-    )
+    origin = Provenance("guessed", "", "the order of other small vehicles, before any trial")
+    words = "Hydrodynamics are guesses; the rest is the catalogue's."
+    return _named(truth.replace(guess, origin), f"{truth.name} before any trial", words)
+
+
+def _named(vehicle: Vehicle, title: str, description: str) -> Vehicle:
+    """The same vehicle under words of its own."""
+    return vehicle.model_copy(update={"title": title, "description": description})
 
 
 def identify(folder: Path, name: str, *, seed: int, shown: Path | None = None) -> Identification:
@@ -103,6 +108,11 @@ def identify(folder: Path, name: str, *, seed: int, shown: Path | None = None) -
     fit = regress(recorded["fit"], rough, seed=seed)
     found = calibrated(fit)
     warnings = (*fit.warnings, *concerns(fit, found))
+    found = _named(
+        found,
+        f"{name} as identified",
+        "Hydrodynamics from simulated trials where they tell it, else guesses.",
+    )
     write_vehicle(found, folder / vehicle_file)
     vehicle = load_vehicle(folder / vehicle_file)
     place = folder if shown is None else shown
