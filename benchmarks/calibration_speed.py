@@ -1,0 +1,97 @@
+"""Wall time of calibrating four axes on 32 trials of 15 s: `python benchmarks/calibration_speed.py [--json FILE]`.
+
+Measured for both methods: the call in this process, a second time when everything is compiled, and the whole command
+`finssim calibrate hydrodynamics` in a process of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from finssim.calibration.excitation import Programme, programmes
+from finssim.calibration.regression import regress
+from finssim.calibration.simulation_fit import fit_by_simulation
+from finssim.calibration.synthetic import simulate_programme
+from finssim.calibration.trial import Trial
+from finssim.calibration.trial_files import write_trial
+from finssim.vehicles import load_vehicle
+
+AXES = "surge,sway,heave,yaw"
+DURATION = 15.0
+TRIALS = 32
+
+
+def make_trials() -> list[Trial]:
+    """32 trials: four levels on four axes in both directions, each brought to 15 s."""
+    vehicle = load_vehicle("finsrov")
+    limits = dict(zip(AXES.split(","), vehicle.wrench_limits[[0, 1, 2, 5]], strict=True))
+    levels = {axis: [share * limit for share in (0.2, 0.4, 0.6, 0.8)] for axis, limit in limits.items()}
+    plan = [_of_length(p) for p in programmes(AXES, vehicle, levels=levels)]
+    trials = simulate_programme(plan, vehicle, seed=1)
+    assert len(trials) == TRIALS
+    return trials
+
+
+def _of_length(p: Programme) -> Programme:
+    """The programme cut, or extended without thrust, to `DURATION`."""
+    n = round(DURATION * p.rate)
+    missing = max(0, n - len(p.phase))
+    return Programme(
+        name=p.name,
+        axes=p.axes,
+        rate=p.rate,
+        tau_desired=np.pad(p.tau_desired, ((0, missing), (0, 0)))[:n],
+        phase=np.pad(p.phase, (0, missing), mode="edge")[:n],
+    )
+
+
+def main() -> None:
+    """Measure, print, write JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    given = parser.parse_args()
+    trials, vehicle = make_trials(), load_vehicle("finsrov")
+    calls = {
+        "regression": lambda: regress(trials, vehicle, axes=AXES.split(",")),
+        "simulation": lambda: fit_by_simulation(trials, vehicle, axes=AXES.split(",")),
+    }
+    figures: dict[str, dict[str, float]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for trial in trials:
+            write_trial(trial, Path(folder) / "trials" / trial.name)
+        for method, call in calls.items():
+            times = []
+            for _ in range(2):
+                start = time.perf_counter()
+                call()
+                times.append(time.perf_counter() - start)
+            start = time.perf_counter()
+            words = (
+                f"calibrate hydrodynamics {folder}/trials --vehicle finsrov --axes {AXES} --method {method}"
+            )
+            words += f" --out {folder}/{method}.yaml"
+            subprocess.run(
+                [sys.executable, "-m", "finssim", *words.split()], check=True, stdout=subprocess.DEVNULL
+            )
+            figures[method] = {
+                "first_call": times[0],
+                "second_call": times[1],
+                "command": time.perf_counter() - start,
+            }
+    print(f"{TRIALS} trials of {DURATION:g} s, {AXES} [s]")
+    for method, f in figures.items():
+        print(f"  {method:<12}" + "  ".join(f"{name} {value:.2f}" for name, value in f.items()))
+    if given.json:
+        given.json.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
