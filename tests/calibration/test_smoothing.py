@@ -119,13 +119,13 @@ def test_spikes_are_left_out_and_steps_are_not():
 @pytest.mark.parametrize("order", [2, 3])
 @pytest.mark.parametrize("kind", ["zero", "constant", "line", "noise"])
 def test_signals_without_shape_come_out_flat_and_straight(n, order, kind):
-    """However long and however strongly smoothed: no rounding grows, noise becomes (nearly) a line."""
+    """However long and however strongly smoothed: no rounding grows, and noise is flat over windows of 4 s."""
     t = np.arange(n) * 0.01
     rng = np.random.default_rng(0)
     y = {"zero": 0.0 * t, "constant": 0.0 * t - 3.0, "line": 0.7 * t + 2.0, "noise": rng.normal(size=n)}[kind]
     s = smooth(t, y[:, None], t, order=order)
     straight = np.polyval(np.polyfit(t, y, 1 if kind == "line" else 0), t)
-    tolerance = 6.0 / np.sqrt(n) if kind == "noise" and n > 6 else 3.0 if kind == "noise" else 1e-8
+    tolerance = 8.0 / np.sqrt(min(n, 400)) if kind == "noise" and n > 6 else 3.0 if kind == "noise" else 1e-6
     np.testing.assert_allclose(s.value[:, 0], straight, atol=tolerance)
     if kind != "noise":
-        np.testing.assert_allclose(s.slope[:, 0], 0.7 if kind == "line" else 0.0, atol=1e-7)
+        np.testing.assert_allclose(s.slope[:, 0], 0.7 if kind == "line" else 0.0, atol=1e-6)

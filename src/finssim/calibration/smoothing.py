@@ -5,7 +5,8 @@ A penalised cubic B-spline (Eilers and Marx 1996), with up to a knot per sample,
     min Σ (y_i - f(t_i))² + λ Σ (Δᵐ c)²
 
 λ is the one under which the data are most likely (restricted maximum likelihood; Wahba 1985), with the spectrum of the
-smoother on a uniform grid, where sines diagonalise it. Nothing is assumed of the noise but that it is white.
+smoother on a uniform grid, where sines diagonalise it. It is found for windows of some seconds and goes from one to the
+next, so that a push is followed closely and the calm after it is not. Of the noise only whiteness is assumed.
 """
 
 from __future__ import annotations
@@ -25,11 +26,20 @@ Array = NDArray[np.float64]
 FEWEST = 5
 """Samples that a stretch needs; shorter ones are left out."""
 
-CANDIDATES = 80
+CANDIDATES = 48
 """Values of λ that are tried."""
 
-BLOCK = 500_000
-"""Numbers that are worked on at a time while trying them."""
+WINDOW = 200
+"""Samples of a window, half shared with the next, at least; shorter stretches have one λ."""
+
+WINDOW_TIME = 4.0
+"""Length of a window, at least [s]."""
+
+SHARE = 0.3
+"""Weight, for a sample of a window, of the mean likelihood over all windows: what a window leaves open they decide."""
+
+STIFFEST = 1e9
+"""Largest λ where it varies: beside closely followed parts the equations would lose digits far above it."""
 
 KNOT_PHASE = 0.2
 """Most that the frequency of half loss turns from one knot to the next [rad]."""
@@ -116,34 +126,43 @@ def smooth(
     runs = [run for run in stretches(t, gap) if run.stop - run.start >= FEWEST]
     if not runs:
         return Smooth(value, slope, *(np.full(c, np.nan) for _ in range(4)))
-    penalty, omega, power = _spectra(t, y, runs, order)
     shared = [slice(0, c)] if together else [slice(i, i + 1) for i in range(c)]
     figures = np.empty((4, c))
     for columns in shared:
-        strength, figures[:, columns] = _choose(penalty, omega, power[:, columns])
+        windows = [window for run in runs for window in _windows(t, run)]
+        strength, figures[:, columns] = _choose([_spectrum(t[w], y[w, columns], order) for w in windows])
+        middle = np.array([0.5 * (t[w][0] + t[w][-1]) for w in windows])
         for run in runs:
             inside = (at >= t[run][0] - 1e-6) & (at <= t[run][-1] + 1e-6)
             if inside.any():
-                f = _fit(t[run], y[run, columns], strength, order, at[inside])
+                own = (middle >= t[run][0]) & (middle <= t[run][-1])
+                f = _fit(t[run], y[run, columns], middle[own], strength[own], order, at[inside])
                 value[inside, columns], slope[inside, columns] = f
     return Smooth(value, slope, *figures)
 
 
-def _spectra(t: Array, y: Array, runs: list[slice], order: int) -> tuple[Array, Array, Array]:
-    """Penalty eigenvalue (k,), angular frequency (k,) [rad/s] and power by column (k, c) of every stretch's sines."""
-    penalties, frequencies, powers = [], [], []
-    for run in runs:
-        n = run.stop - run.start
-        grid = np.linspace(t[run][0], t[run][-1], n)
-        even = np.stack([np.interp(grid, t[run], column) for column in y[run].T], axis=-1)
-        part = (np.arange(n) / (n - 1))[:, None]
-        even = even - (1.0 - part) * _first(even) - part * _first(even[::-1])
-        theta = np.pi * np.arange(1, n - 1) / (n - 1)
-        symbol = (2.0 + np.cos(theta)) / 3.0  # a cubic B-spline sampled at its knots
-        penalties.append((2.0 * np.sin(theta / 2.0)) ** (2 * order) / symbol**2)
-        frequencies.append(theta * (n - 1) / (grid[-1] - grid[0]))
-        powers.append(dst(even[1:-1], type=1, norm="ortho", axis=0) ** 2)
-    return np.concatenate(penalties), np.concatenate(frequencies), np.concatenate(powers)
+def _windows(t: Array, run: slice) -> list[slice]:
+    """Windows of equal length that overlap by half."""
+    n = run.stop - run.start
+    whole = int(min(n / WINDOW, (t[run][-1] - t[run][0]) / WINDOW_TIME))
+    count = max(1, 2 * whole - 1)
+    width = 2 * n // (count + 1)
+    starts = np.linspace(run.start, run.stop - width, count)
+    return [slice(int(a), int(a) + width) for a in starts]
+
+
+def _spectrum(t: Array, y: Array, order: int) -> tuple[Array, Array, Array]:
+    """Penalty eigenvalue (k,), angular frequency (k,) [rad/s] and power by column (k, c) of the sines of a window."""
+    n = len(t)
+    grid = np.linspace(t[0], t[-1], n)
+    even = np.stack([np.interp(grid, t, column) for column in y.T], axis=-1)
+    part = (np.arange(n) / (n - 1))[:, None]
+    even = even - (1.0 - part) * _first(even) - part * _first(even[::-1])
+    theta = np.pi * np.arange(1, n - 1) / (n - 1)
+    symbol = (2.0 + np.cos(theta)) / 3.0  # a cubic B-spline sampled at its knots
+    penalty = (2.0 * np.sin(theta / 2.0)) ** (2 * order) / symbol**2
+    omega = theta * (n - 1) / (t[-1] - t[0])
+    return penalty, omega, dst(even[1:-1], type=1, norm="ortho", axis=0) ** 2
 
 
 def _first(y: Array) -> Array:
@@ -155,39 +174,52 @@ def _first(y: Array) -> Array:
     value, following = y[0].copy(), np.ones(y.shape[1], bool)
     k = 4
     while k <= len(y) // 8 and following.any():
-        line = np.polyfit(np.arange(k), y[:k], 1)
-        rest = y[:k] - np.outer(np.arange(k), line[0]) - line[1]
+        x = np.arange(k) - 0.5 * (k - 1)
+        mean, slope = y[:k].mean(axis=0), 12.0 * (x @ y[:k]) / (k * (k * k - 1.0))
+        rest = y[:k] - mean - x[:, None] * slope
         fits = following & (np.sqrt(np.sum(rest**2, axis=0) / (k - 2)) <= (1.1 + np.sqrt(2.0 / k)) * noise)
-        value = np.where(fits, line[1], value)
+        value = np.where(fits, mean + x[0] * slope, value)
         following = fits if k >= 16 else following  # four samples may misfit by chance
         k *= 2
     return value
 
 
-def _choose(penalty: Array, omega: Array, power: Array) -> tuple[float, Array]:
-    """λ, and noise, value_std, slope_std and bend_std by column (4, c)."""
-    n = len(penalty)
-    candidates = np.geomspace(1e-4 / penalty.max(), 1e1 / penalty.min(), CANDIDATES)
-    total, unlikely = power.sum(axis=1), []
-    for block in np.array_split(candidates, np.ceil(CANDIDATES * n / BLOCK)):
-        lost = block[:, None] * penalty / (1.0 + block[:, None] * penalty)  # eigenvalues of 1 - H
-        unlikely.append(n * np.log(lost @ total + 1e-300) - np.log(lost).sum(axis=1))
-    best = int(np.argmin(np.concatenate(unlikely)))
-    lost = candidates[best] * penalty / (1.0 + candidates[best] * penalty)
-    h = 1.0 - lost
-    noise = np.sqrt((lost**2 @ power) / lost.sum())
-    errors = [noise * np.sqrt(np.mean(h * omega ** (2 * k))) for k in range(3)]
-    return float(candidates[best]), np.stack([noise, *errors])
+def _choose(spectra: list[tuple[Array, Array, Array]]) -> tuple[Array, Array]:
+    """λ of every window (w,), and noise, value_std, slope_std and bend_std by column (4, c)."""
+    smallest, largest = min(p.min() for p, _, _ in spectra), max(p.max() for p, _, _ in spectra)
+    candidates = np.geomspace(1e-4 / largest, 1e1 / smallest, CANDIDATES)
+    unlikely, sizes = np.empty((len(spectra), CANDIDATES)), np.array([len(p) for p, _, _ in spectra])
+    for w, (penalty, _, power) in enumerate(spectra):
+        lost = candidates[:, None] * penalty / (1.0 + candidates[:, None] * penalty)  # eigenvalues of 1 - H
+        unlikely[w] = sizes[w] * np.log(lost @ power.sum(axis=1) + 1e-300) - np.log(lost).sum(axis=1)
+    mean = unlikely.sum(axis=0) / sizes.sum()
+    best = candidates[np.argmin(unlikely + SHARE * sizes[:, None] * mean, axis=1)]
+    figures = []
+    for strength, (penalty, omega, power) in zip(best, spectra, strict=True):
+        lost = strength * penalty / (1.0 + strength * penalty)
+        noise = np.sqrt((lost**2 @ power) / lost.sum())
+        figures.append(
+            [noise, *(noise * np.sqrt(np.mean((1.0 - lost) * omega ** (2 * k))) for k in range(3))]
+        )
+    squares = np.square(figures)  # (w, 4, c)
+    errors = np.sqrt(np.average(squares, axis=0, weights=sizes))
+    errors[0] = np.sqrt(np.median(squares[:, 0], axis=0))
+    return best, errors
 
 
-def _fit(t: Array, y: Array, strength: float, order: int, at: Array) -> tuple[Array, Array]:
-    """Value and slope at given times inside [t[0], t[-1]] of the penalised spline, (m, c) each."""
+def _fit(t: Array, y: Array, middle: Array, strength: Array, order: int, at: Array) -> tuple[Array, Array]:
+    """Value and slope at given times inside [t[0], t[-1]] of the penalised spline, (m, c) each; λ at `middle` (w,)."""
     # What is smoothed strongly needs few knots; many would only make the equations ill-conditioned.
     usual = len(t) - 1
-    intervals = max(MIN_INTERVALS, math.ceil(usual * min(1.0, strength ** (-0.5 / order) / KNOT_PHASE)))
-    strength *= (intervals / usual) ** (2 * order - 1)
+    intervals = max(MIN_INTERVALS, math.ceil(usual * min(1.0, strength.min() ** (-0.5 / order) / KNOT_PHASE)))
     h = (t[-1] - t[0]) / intervals
+    trend = (y[-1] - y[0]) / (t[-1] - t[0])  # taken off, for what is small has small rounding
+    line, y = y[0] + (at - t[0])[:, None] * trend, y - y[0] - (t - t[0])[:, None] * trend
     count = intervals + 3
+    if len(strength) > 1:
+        place = t[0] + h * (np.arange(count - order) + 0.5 * order - 1.0)
+        strength = np.exp(np.interp(place, middle, np.log(np.minimum(strength, STIFFEST))))
+    strength = strength * (intervals / usual) ** (2 * order - 1)
     cell, weights, _ = _basis((t - t[0]) / h, intervals)
     band = np.zeros((4, count))
     for a in range(4):
@@ -205,7 +237,7 @@ def _fit(t: Array, y: Array, strength: float, order: int, at: Array) -> tuple[Ar
     coefficients = solveh_banded(band, right, lower=True, check_finite=False)
     cell, weights, slopes = _basis((at - t[0]) / h, intervals)
     parts = coefficients[cell[:, None] + np.arange(4)]
-    return np.einsum("am,mac->mc", weights, parts), np.einsum("am,mac->mc", slopes, parts) / h
+    return line + np.einsum("am,mac->mc", weights, parts), trend + np.einsum("am,mac->mc", slopes, parts) / h
 
 
 def _basis(x: Array, intervals: int) -> tuple[NDArray[np.intp], Array, Array]:
