@@ -255,7 +255,10 @@ def run(part: str, vehicle: Vehicle, given: argparse.Namespace) -> Any:
     if part == "replay":
         out = {method: held_out(vehicle, given.axes, method) for method in ("regression", "simulation")}
         for method, report in out.items():
-            print(f"\n{vehicle.name}, held-out replay, {method}: {json.dumps(report['nrmse'], indent=1)}")
+            print(f"\n{vehicle.name}, held-out replay after {method}: NRMSE {report['aggregate']:.4f}")
+            for axis, by_trial in report["nrmse"].items():
+                scores = [x for x in by_trial.values() if x is not None]
+                print(f"  {axis:<8} mean {np.mean(scores):.4f}, worst trial {max(scores):.4f}")
         return out
     raw = raw_fits(load_vehicle("finsrov"))
     out = {"raw": coverage(raw, FOUR, given.few, "regression")}
