@@ -129,3 +129,16 @@ def test_signals_without_shape_come_out_flat_and_straight(n, order, kind):
     np.testing.assert_allclose(s.value[:, 0], straight, atol=tolerance)
     if kind != "noise":
         np.testing.assert_allclose(s.slope[:, 0], 0.7 if kind == "line" else 0.0, atol=1e-6)
+
+
+def test_a_burst_is_followed_and_the_calm_after_it_is_smooth():
+    """Three seconds of handling at 2 Hz, then a slow drift: each is smoothed as if alone."""
+    t = np.arange(2000) * 0.01
+    burst = np.where(t < 3.0, 0.3 * np.sin(12.0 * t), 0.0)
+    y = burst + 0.05 * np.sin(0.3 * t) + 0.01 * np.random.default_rng(0).normal(size=2000)
+    s = smooth(t, y[:, None], t, order=2)
+    early, late = (t > 0.2) & (t < 2.8), (t > 6.0) & (t < 19.8)
+    error = s.slope[:, 0] - np.where(t < 3.0, 3.6 * np.cos(12.0 * t), 0.0) - 0.015 * np.cos(0.3 * t)
+    assert np.std(error[early]) < 0.15 * 3.6 / np.sqrt(2.0)
+    alone = smooth(t[late], y[late, None], t[late], order=2).slope[:, 0] - 0.015 * np.cos(0.3 * t[late])
+    assert np.std(error[late]) < 2.0 * np.std(alone) + 0.002

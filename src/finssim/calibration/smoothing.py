@@ -175,12 +175,12 @@ def _first(y: Array) -> Array:
     k = 4
     while k <= len(y) // 8 and following.any():
         x = np.arange(k) - 0.5 * (k - 1)
-        mean, slope = y[:k].mean(axis=0), 12.0 * (x @ y[:k]) / (k * (k * k - 1.0))
+        mean, slope = y[:k].sum(axis=0) / k, 12.0 * (x @ y[:k]) / (k * (k * k - 1.0))
         rest = y[:k] - mean - x[:, None] * slope
         fits = following & (np.sqrt(np.sum(rest**2, axis=0) / (k - 2)) <= (1.1 + np.sqrt(2.0 / k)) * noise)
         value = np.where(fits, mean + x[0] * slope, value)
         following = fits if k >= 16 else following  # four samples may misfit by chance
-        k *= 2
+        k *= 4
     return value
 
 
