@@ -156,9 +156,11 @@ def measured_again(
             yield trials[i * len(plan) : (i + 1) * len(plan)]
 
 
-def coverage(vehicle: Vehicle, axes: str, repetitions: int, method: str, **arguments: Any) -> dict[str, Any]:
+def coverage(
+    vehicle: Vehicle, axes: str, repetitions: int, method: str, *, repeats: int = 1, **arguments: Any
+) -> dict[str, Any]:
     """Errors and coverage over repetitions of the noise, of one method."""
-    plan = programmes(axes, vehicle)
+    plan = programmes(axes, vehicle, repeats=repeats)
     recording = record(plan, vehicle, seed=1)
     guess = blind(vehicle)
     start = time.perf_counter()
@@ -223,6 +225,7 @@ def main() -> None:
     parser.add_argument("--axes", default="all", help="axes, separated by commas")
     parser.add_argument("--repetitions", type=int, default=200, help="of the noise, for the regression")
     parser.add_argument("--few", type=int, default=5, help="of the noise, for the simulation method")
+    parser.add_argument("--repeats", type=int, default=1, help="of every programme in a set of trials")
     parser.add_argument("--json", type=Path, help="file for the figures")
     given = parser.parse_args()
     if unknown := set(given.parts) - set(parts):
@@ -241,14 +244,14 @@ def run(part: str, vehicle: Vehicle, given: argparse.Namespace) -> Any:
     if part in ("coverage", "simulation"):
         method = "regression" if part == "coverage" else "simulation"
         count = given.repetitions if part == "coverage" else given.few
-        out = coverage(vehicle, given.axes, count, method)
+        out = coverage(vehicle, given.axes, count, method, repeats=given.repeats)
         print_parameters(
             f"{vehicle.name}, 50 Hz, {method}, {count} repetitions of the noise", out["parameters"]
         )
         return out
     if part == "slow":
         columns = ("u", "v", "w", "p", "q", "r")
-        arguments = {"rate": 5.0, "columns": columns, "inputs": ("wrench",)}
+        arguments = {"rate": 5.0, "columns": columns, "inputs": ("wrench",), "repeats": given.repeats}
         out = coverage(vehicle, _without_pulses(given.axes, vehicle), given.few, "simulation", **arguments)
         print_parameters(f"{vehicle.name}, 5 Hz, wrench and velocity, simulation", out["parameters"])
         return out
