@@ -173,3 +173,15 @@ def test_a_coupling_of_a_diagonal_matrix_was_zero(tmp_path):
     write_vehicle(after, tmp_path / "v.yaml")
     assert max(map(len, (tmp_path / "v.yaml").read_text("utf-8").splitlines())) < 250
     assert load_vehicle(tmp_path / "v.yaml").sha256 == after.sha256
+
+
+def test_a_part_of_the_drag_is_written_as_unsure():
+    """Linear and quadratic damping go into the file together where only their sum is told."""
+    fit = made_fit(
+        changes={f"{SET}.linear_damping.5.5": 0.4, f"{SET}.quadratic_damping.5.5": 0.1},
+    )
+    after = calibrated(fit)
+    assert after.hydrodynamic_set("calibrated").quadratic_damping[5, 5] == 0.1
+    assert state_text(fit.estimates["yaw.d2"], fit, after) == "unsure"
+    assert after.origin_of(f"{SET}.quadratic_damping.5").note == "95 % interval 0 to 9; rests on its bound"
+    assert "yaw.d2" not in kept(fit, after)

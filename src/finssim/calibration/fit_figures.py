@@ -13,6 +13,7 @@ from finssim.calibration.fit import Correlation, Curve, Estimate, Fit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from matplotlib.gridspec import SubplotSpec
 
 __all__ = ["draw_correlation", "draw_curves", "draw_estimates", "fit_pictures"]
 
@@ -101,21 +102,35 @@ def draw_curves(curves: Sequence[Curve]) -> Iterator[Figure]:
         part = drawn[start : start + PER_FIGURE]
         columns = min(2, len(part))
         rows = math.ceil(len(part) / columns)
-        figure = _figure(3.9 * columns if columns > 1 else 5.4, 2.9 * rows)
-        cells = figure.subfigures(rows, columns, squeeze=False).ravel()
-        for cell, curve in zip(cells, part, strict=False):
-            _draw(cell, curve)
+        width, height = (3.9 * columns if columns > 1 else 5.4), 2.9 * rows
+        # A fixed layout: finding the best one takes longer than drawing.
+        figure = _figure(width, height, constrained=False)
+        grid = figure.add_gridspec(
+            rows,
+            columns,
+            left=0.75 / width,
+            right=1.0 - 0.12 / width,
+            bottom=0.5 / height,
+            top=1.0 - 0.3 / height,
+            hspace=0.35,
+            wspace=0.27,
+        )
+        for i, curve in enumerate(part):
+            _draw(figure, grid[i // columns, i % columns], curve)
         yield figure
 
 
 def _png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=150, metadata={"Software": None})
+    figure.savefig(buffer, format="png", dpi=120, metadata={"Software": None})
     return buffer.getvalue()
 
 
-def _draw(cell: object, curve: Curve) -> None:
-    above, below = cell.subplots(2, 1, sharex=True, height_ratios=(3, 1))  # type: ignore[attr-defined]
+def _draw(figure: Figure, cell: SubplotSpec, curve: Curve) -> None:
+    inner = cell.subgridspec(2, 1, height_ratios=(3, 1), hspace=0.12)
+    above = figure.add_subplot(inner[0])
+    below = figure.add_subplot(inner[1], sharex=above)
+    above.tick_params(labelbottom=False)
     order = np.argsort(curve.x, kind="stable") if curve.kind == "scatter" else slice(None)
     x, measured, fitted = curve.x[order], curve.measured[order], curve.fitted[order]
     if curve.kind == "scatter":
@@ -137,10 +152,10 @@ def _draw(cell: object, curve: Curve) -> None:
         axes.spines[["top", "right"]].set_visible(False)
 
 
-def _figure(width: float, height: float) -> Figure:
+def _figure(width: float, height: float, constrained: bool = True) -> Figure:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(width, height), layout="constrained" if constrained else None)
     FigureCanvasAgg(figure)
     return figure

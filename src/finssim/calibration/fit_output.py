@@ -143,14 +143,17 @@ def file_number(estimate: Estimate, vehicle: Vehicle) -> float | None:
 
 
 def state_text(estimate: Estimate, fit: Fit, vehicle: Vehicle) -> str:
-    """What became of a parameter: `written`, `file kept`, or whether the data tell it where the file has no place."""
+    """What became of a parameter: `written`, `file kept`, or whether the data tell it where the file has no place.
+
+    `unsure`: written, though the data tell it together with another, as a part of the drag, and not alone.
+    """
     if estimate.name == "thrust_scale" and any(path.startswith("thrusters.") for path in fit.changes):
         return "written"
     if estimate.path is None:
         return "" if estimate.identifiable else "not told"
     before, after = number_in(fit.vehicle, estimate.path), number_in(vehicle, estimate.path)
     if after != before or (after is not None and estimate.identifiable and after == estimate.estimate):
-        return "written"
+        return "written" if estimate.identifiable else "unsure"
     return "file kept"
 
 

@@ -39,7 +39,8 @@ def identification_section(found: Identification) -> list[str]:
         f"<p>{escape(_lead(found))}</p>",
         html_table(HEADS, rows),
         '<p class="note">'
-        "file kept: the trials do not determine the number, and the vehicle keeps its guess. The plant is the vehicle "
+        "unsure: told together with another number and not alone, as a part of the drag. file kept: the trials do not "
+        "determine the number, and the vehicle keeps its guess. The plant is the vehicle "
         "of the catalogue, with sensor noise on everything measured; a real pool would not tell its numbers."
         "</p>",
         *(f'<p class="note">{escape(warning)}</p>' for warning in found.warnings),

@@ -32,6 +32,8 @@ __all__ = ["PLANT_FILE", "Identification", "commands", "identify", "rough_vehicl
 TRIALS, PLANT_FILE = "trials", "pool.yaml"
 SET = "hydrodynamics.calibrated"
 
+COAST = 10.0
+"""Of a dive [s]; a third of the published, to be quick."""
 HELD_OUT = {"surge": [9.0], "sway": [6.0], "heave": [9.0], "yaw": [1.0]}
 """Levels that no trial of the fit has [N, N m]."""
 
@@ -100,7 +102,10 @@ def identify(folder: Path, name: str, *, seed: int, shown: Path | None = None) -
     start_file, vehicle_file = vehicle_files(name)
     write_vehicle(rough, folder / start_file)
     rough = load_vehicle(folder / start_file)
-    plans = {"fit": programmes("all", truth), "held-out": programmes(tuple(HELD_OUT), truth, levels=HELD_OUT)}
+    plans = {
+        "fit": programmes("all", truth, coast=COAST),
+        "held-out": programmes(tuple(HELD_OUT), truth, levels=HELD_OUT, coast=COAST),
+    }
     recorded = _trials(plans, truth, seed)
     for role, trials in recorded.items():
         for trial in trials:
@@ -173,7 +178,7 @@ def _write_replay(scored: Replay, folder: Path) -> bytes:
     text = json.dumps(scored.as_json(), indent=2, allow_nan=False) + "\n"
     (folder / "replay.json").write_text(text, encoding="utf-8")
     buffer = io.BytesIO()
-    draw_response_envelopes(scored.pairs).savefig(buffer, format="png", dpi=150)
+    draw_response_envelopes(scored.pairs).savefig(buffer, format="png", dpi=120)
     (folder / "replay.png").write_bytes(buffer.getvalue())
     return buffer.getvalue()
 
