@@ -124,7 +124,7 @@ def _added_mass(
 ) -> None:  # fmt: skip
     whole = out[f"{axis}.m_eff"]
     unit, path = whole.unit, f"{SET}.added_mass.{i}.{i}"
-    sure, note = whole.identifiable, f"m_eff less the file's {rigid:.4g} {unit}, which is taken as exact"
+    sure, note = whole.identifiable, f"with the file's rigid {rigid:.4g} {unit} as exact"
     if value <= 0.0:
         sure = False
         note = f"m_eff is below the file's rigid {rigid:.4g} {unit}"

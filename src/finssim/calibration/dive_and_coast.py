@@ -19,8 +19,11 @@ Array = NDArray[np.float64]
 RISING = 0.01
 """Vertical speed from which a vehicle rises or sinks by itself [m/s] (published procedure)."""
 
-STEADY = 2.0
-"""How long it has to last [s]."""
+STEADY = 1.0
+"""How long it has to last [s]: the published 2 s, less half the width of a row's bump at each end."""
+
+LEVEL = 0.9
+"""Last over largest speed in that time; less is the end of a push, not buoyancy."""
 
 HANDS_OFF = 0.05
 """Part of the largest wrench below which thrust does not count."""
@@ -53,8 +56,9 @@ def coasts(data: AxisData) -> list[Coast]:
         for b, e in edges.reshape(-1, 2):
             t = s.t[rows.at[b:e]]
             last = t > t[-1] - STEADY
+            fading = abs(speed[e - 1]) < LEVEL * np.abs(speed[b:e][last]).max()
             same = np.sign(speed[b:e][last]) == np.sign(speed[e - 1])
-            if t[-1] - t[0] >= STEADY and same.all():
+            if t[-1] - t[0] >= STEADY and same.all() and not fading:
                 found.append(
                     Coast(
                         trial=s.name,

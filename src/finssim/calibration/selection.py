@@ -56,9 +56,10 @@ def select(data: AxisData, damping: str = "auto") -> Selection:
     terms[TERMS.index("k")] = data.restoring
     if damping in ("linear", "quadratic"):
         terms[D2 if damping == "linear" else D1] = False
-        fit = fit_axis(data, terms)
+        fit = _without_needless_smoothing(data, fit_axis(data, terms))
         return Selection(fit=fit, full=fit, dropped=(), p_value={}, interval=_interval(fit))
-    full = fit_axis(data, terms)
+    full = _without_needless_smoothing(data, fit_axis(data, terms))
+    terms = full.terms.copy()
     p_value = {name: _p_value(full, TERMS.index(name)) for name in ("d1", "d2")}
     weak = [name for name, p in p_value.items() if p > AKAIKE]
     if damping == "both" or not weak:
@@ -69,6 +70,16 @@ def select(data: AxisData, damping: str = "auto") -> Selection:
     wide, narrow = _interval(full), _interval(fit)
     hull = np.stack([np.fmin(wide[:, 0], narrow[:, 0]), np.fmax(wide[:, 1], narrow[:, 1])], axis=-1)
     return Selection(fit=fit, full=full, dropped=(dropped,), p_value=p_value, interval=hull)
+
+
+def _without_needless_smoothing(data: AxisData, fit: AxisFit) -> AxisFit:
+    """Once more without `smoothing` where the recording shows none: it costs certainty of the inertia."""
+    term = TERMS.index("smoothing")
+    if _p_value(fit, term) <= AKAIKE:
+        return fit
+    terms = fit.terms.copy()
+    terms[term] = False
+    return fit_axis(data, terms)
 
 
 def _p_value(fit: AxisFit, term: int) -> float:
