@@ -7,7 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
-from finssim.vehicles import catalogue, load_vehicle
+from finssim.vehicles import CalibrationRecord, Provenance, catalogue, load_vehicle
 from finssim.vehicles.show import print_catalogue, print_vehicle
 from vehicles.minnow import MINNOW
 
@@ -63,3 +63,17 @@ def test_a_file_of_ones_own_is_printed_like_the_catalogue(tmp_path):
     print_vehicle(load_vehicle(path), screen, tmp_path / "minnow.svg")
     assert "front_left" in printed(screen)
     assert (tmp_path / "minnow.svg").stat().st_size > 1000
+
+
+def test_a_list_of_mixed_origin_and_a_calibration_are_shown():
+    """One entry measured, the others as before: the list has the mark of its least known entry; fits are named."""
+    record = CalibrationRecord(kind="hydrodynamics", method="regression", trials={"a": "1" * 64})
+    vehicle = load_vehicle("finsrov")
+    vehicle = vehicle.replace({"body.center_of_buoyancy.2": 0.02}, Provenance("guessed"))
+    origins = {f"body.center_of_buoyancy.{i}": Provenance("measured") for i in (0, 1)}
+    kept = {key: p for key, p in vehicle.provenance.items() if key != "body.center_of_buoyancy"}
+    vehicle = vehicle.model_copy(update={"provenance": kept | origins, "calibrations": (record,)})
+    screen = console()
+    print_vehicle(vehicle, screen)
+    assert "0 0 0.02 ?" in printed(screen)
+    assert "calibrated: hydrodynamics by regression on 1 trial" in printed(screen)

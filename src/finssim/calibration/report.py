@@ -31,8 +31,8 @@ HEADS = ("parameter", "estimate", "95 % interval", "unit", "file had", "state")
 READING = (
     "The interval holds the true value in 19 of 20 such calibrations, if the model's form is right: it knows of noise "
     "and of how much trials differ, not of a wrong model. `unsure`: written, though told together with another number "
-    "and not alone. `file kept`: the trials do not determine it, and the vehicle file keeps its own. Score the result on trials that the fit has not seen with `finssim replay` before "
-    "relying on it."
+    "and not alone. `file kept`: the trials do not determine it, and the vehicle file keeps its own. Score the result "
+    "on trials that the fit has not seen with `finssim replay` before relying on it."
 )
 
 

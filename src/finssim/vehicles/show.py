@@ -15,7 +15,7 @@ from finssim.vehicles.capability import restoring, terminal_speeds, time_constan
 from finssim.vehicles.check import check_vehicle
 from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
 from finssim.vehicles.loader import catalogue, load_vehicle
-from finssim.vehicles.vehicle import AXES, Vehicle
+from finssim.vehicles.vehicle import AXES, ORIGINS, Vehicle
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -91,7 +91,11 @@ def _table(title: str, *columns: str) -> Table:
 
 
 def _mark(vehicle: Vehicle, path: str) -> str:
-    return _MARK[vehicle.origin_of(path).origin]
+    """Mark of a number, or of the least known entry of a list whose entries differ in origin."""
+    entries = [p.origin for key, p in vehicle.provenance.items() if key.startswith(f"{path}.")]
+    if not entries:
+        return _MARK[vehicle.origin_of(path).origin]
+    return _MARK[max(entries, key=ORIGINS.index)]
 
 
 def _numbers(values: Any) -> str:
