@@ -9,7 +9,8 @@ from finssim.calibration.buoyant_rise import buoyant_rise
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.free_decay import free_decay
 from finssim.calibration.header import Header
-from finssim.calibration.passive import passive, pooled
+from finssim.calibration.passive import passive
+from finssim.calibration.pooling import pooled
 from finssim.calibration.regression import regress
 from finssim.calibration.trial import Trial
 from finssim.calibration.uncertainty import intervals

@@ -19,10 +19,11 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.free_decay import BOTH, Decay, free_decay
 from finssim.calibration.plant_terms import Matrices, matrices
+from finssim.calibration.pooling import pooled, pooled_positive
 from finssim.calibration.trial import Trial
 from finssim.vehicles import AXES, Vehicle
 
-__all__ = ["passive", "pooled"]
+__all__ = ["passive"]
 
 Array = NDArray[np.float64]
 
@@ -100,34 +101,6 @@ def passive(
     )
 
 
-def pooled(values: Array, stds: Array, dof: Array) -> tuple[float, float, float]:
-    """Mean of estimates of several trials, weighted by their certainty and what they differ by beyond it.
-
-    The variance between trials is that of DerSimonian and Laird (1986).
-
-    Args:
-        values: (n,)
-        stds: (n,)
-        dof: Degrees of freedom of the standard errors, (n,).
-
-    Returns:
-        Mean and the two ends of its 95 % interval.
-    """
-    from scipy.stats import t
-
-    stds = np.maximum(stds, 1e-9 * np.abs(values) + 1e-300)
-    w = 1.0 / stds**2
-    mean = float(np.sum(w * values) / w.sum())
-    freedom = float(np.sum(np.where(np.isfinite(dof), dof, 1e6)))
-    excess = float(np.sum(w * (values - mean) ** 2)) - (len(values) - 1)
-    if len(values) > 1 and excess > 0.0:
-        between = excess / (w.sum() - np.sum(w**2) / w.sum())
-        w = 1.0 / (stds**2 + between)
-        mean, freedom = float(np.sum(w * values) / w.sum()), float(len(values) - 1)
-    half = float(t.ppf(0.975, max(freedom, 1.0)) / math.sqrt(w.sum()))
-    return mean, mean - half, mean + half
-
-
 def _decay_estimates(
     axis: str,
     decays: list[Decay],
@@ -157,8 +130,10 @@ def _decay_estimates(
 
     def estimate(name: str, unit: str, of: Any, note: str = "", path: str | None = None) -> Estimate:
         """Pool a function of x = ln w2, c1, c2 over the decays that have it."""
-        found = [(*_derived(d, of),) for d in decays]
-        value, low, high = pooled(*(np.array(column) for column in zip(*found, strict=True)))
+        values, stds, dof = (
+            np.array(column) for column in zip(*(_derived(d, of) for d in decays), strict=True)
+        )
+        value, low, high = pooled_positive(values, stds, dof)
         sure = bool(np.isfinite([low, high]).all() and 0.5 * (high - low) <= 0.5 * abs(value))
         return Estimate(
             name=f"{axis}.{name}", estimate=value, ci95=(low, high), unit=unit, identifiable=sure,
@@ -259,8 +234,8 @@ def _derived(decay: Decay, of: Any) -> tuple[float, float, float]:
 def _rise_estimates(rises: list[Rise], plant: Matrices) -> dict[str, Estimate]:
     """Pooled over the trials, on logarithms."""
     m = float(plant.M_RB[2, 2] + plant.M_A[2, 2])
-    speed = _pooled_logarithm([(r.terminal_speed, *r.terminal_ci95) for r in rises])
-    ratio = _pooled_logarithm([(r.excess_ratio, *r.excess_ci95) for r in rises])
+    speed = _pooled([(r.terminal_speed, *r.terminal_ci95) for r in rises])
+    ratio = _pooled([(r.excess_ratio, *r.excess_ci95) for r in rises])
     drag = ", ".join(f"{r.trial}: {'quadratic' if r.quadratic else 'linear'} drag" for r in rises)
     found = [
         Estimate(
@@ -277,11 +252,10 @@ def _rise_estimates(rises: list[Rise], plant: Matrices) -> dict[str, Estimate]:
     return {e.name: e for e in found}
 
 
-def _pooled_logarithm(found: list[tuple[float, float, float]]) -> tuple[float, float, float]:
-    value, low, high = np.log(np.array(found)).T
-    stds = np.maximum((high - low) / (2.0 * 1.96), 1e-9)
-    mean, below, above = np.exp(np.clip(pooled(value, stds, np.full(len(found), np.inf)), -50.0, 50.0))
-    return float(mean), float(below), float(above)
+def _pooled(found: list[tuple[float, float, float]]) -> tuple[float, float, float]:
+    """Of estimates with 95 % intervals that are symmetric on logarithms."""
+    value, low, high = np.array(found).T
+    return pooled_positive(value, value * np.log(high / low) / (2.0 * 1.96), np.full(len(found), np.inf))
 
 
 def _decay_curve(d: Decay) -> Curve:

@@ -1,0 +1,86 @@
+"""Read the release of a real BlueROV2, thrusters off, from motion capture and IMU tables.
+
+    python examples/passive_trials.py FOLDER [--picture FILE.png]
+
+FOLDER holds NAME_mocap.csv and NAME_imu.csv as in tests/data/hinsdale. The picture needs the extra "logs".
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from finssim.calibration.errors import CalibrationError
+from finssim.calibration.free_decay import Decay, free_decay
+from finssim.calibration.header import Header
+from finssim.calibration.passive import passive
+from finssim.calibration.trial import Trial
+from finssim.vehicles import load_vehicle
+
+MOCAP = ("", "x", "y", "z", "qx", "qy", "qz", "qw")
+IMU = ("", "", "", "", "", "p", "q", "r")
+
+
+def read(folder: Path, name: str) -> Trial:
+    """A trial of one pair of tables on the union of their times."""
+    tables = {
+        part: np.genfromtxt(folder / f"{name}_{part}.csv", delimiter=",", skip_header=1)
+        for part in ("mocap", "imu")
+    }
+    t = np.unique(np.concatenate([table[:, 0] for table in tables.values()]))
+    channels = {}
+    for table, columns in ((tables["mocap"], MOCAP), (tables["imu"], IMU)):
+        for j, column in enumerate(columns):
+            if column:
+                channels[column] = np.full(len(t), np.nan)
+                channels[column][np.searchsorted(t, table[:, 0])] = table[:, j]
+    return Trial(name=name, t=t, channels=channels, header=Header(passive=True))
+
+
+def draw(decays: list[Decay], path: Path) -> None:
+    """Measured and fitted rate of every decay."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 2.4 * len(decays)), layout="constrained")
+    for axes, d in zip(np.atleast_1d(figure.subplots(len(decays), 1)), decays, strict=True):
+        axes.plot(*d.rate_measured, ".", color="0.6", markersize=3, label="IMU")
+        axes.plot(d.t, d.rate, color="C0", label="fitted")
+        period = 2.0 * np.pi / np.sqrt(d.theta[0])
+        axes.set_title(
+            f"{d.trial}, {d.axis}: period {period:.2f} s, released at {d.begin:.1f} s", fontsize=10
+        )
+        axes.set_ylabel("rate [rad/s]")
+        axes.grid(alpha=0.3)
+        axes.legend(loc="upper right", fontsize=8)
+    axes.set_xlabel("time [s]")
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    """Print what the trials tell, with the file of a BlueROV2 Heavy for what they cannot."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--picture", type=Path)
+    given = parser.parse_args()
+    names = sorted(path.name.removesuffix("_mocap.csv") for path in given.folder.glob("*_mocap.csv"))
+    trials = [read(given.folder, name) for name in names]
+    fit = passive(trials, load_vehicle("bluerov2_heavy"))
+    for e in fit.estimates.values():
+        print(f"{e.name:24s} {e.estimate:9.4g} [{e.ci95[0]:.4g}, {e.ci95[1]:.4g}] {e.unit:8s} {e.note}")
+    for warning in fit.warnings:
+        print(warning)
+    if given.picture:
+        decays = []
+        for trial in trials:
+            for axis in ("roll", "pitch"):
+                try:
+                    decays.append(free_decay(trial, axis))
+                except CalibrationError:
+                    continue  # said among the warnings
+        draw(decays, given.picture)
+
+
+if __name__ == "__main__":
+    main()
