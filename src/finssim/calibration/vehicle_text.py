@@ -187,12 +187,13 @@ def _common(
 
 
 def _shared(notes: list[str]) -> str:
-    """The note to state for values of one origin and source: the most frequent one.
+    """The note to state for values of one origin and source: the most frequent one, if several values have it.
 
     A value without a note under one needs its origin and source again, so these count double.
     """
     note = max(notes, key=notes.count)
-    return note if notes.count(note) > 2 * notes.count("") else ""
+    several = len(notes) == 1 or notes.count(note) > 1
+    return note if several and notes.count(note) > 2 * notes.count("") else ""
 
 
 def _uniform(node: list[Any], path: Path, origins: Mapping[Path, Provenance]) -> bool:
