@@ -123,7 +123,22 @@ class Rollouts:
             self._force[s.steps :, i, :k] = s.force[-1]
             self._before[:, i, :k] = s.before[:1]
             self._before[memory - len(s.before) :, i, :k] = s.before
-        self._own = self._own_fields()
+        self.own = self._own_fields()
+        self._held = self._imposed()
+
+    def _imposed(self) -> list[tuple[NDArray[np.int64], NDArray[np.int64], Single]]:
+        """Axes that are imposed together, the segments that do so, and their values by (n + 1, segments, axes)."""
+        patterns: dict[tuple[int, ...], list[int]] = {}
+        for i, s in enumerate(self.segments):
+            axes = () if s.held is None else tuple(np.flatnonzero(np.isfinite(s.held).all(axis=0)).tolist())
+            if axes:
+                patterns.setdefault(axes, []).append(i)
+        n, out = int(self._lengths.max()), []
+        for axes, those in patterns.items():
+            columns = [np.asarray(self.segments[i].held)[:, axes] for i in those]
+            values = [np.pad(c, ((0, n + 1 - len(c)), (0, 0)), mode="edge") for c in columns]
+            out.append((np.array(axes), np.array(those), np.stack(values, axis=1).astype(np.float32)))
+        return out
 
     def _own_fields(self) -> dict[str, NDArray[np.float64]]:
         """Plant fields in which segments differ: how forces reach the body, and the water's density. (S, ...)"""
@@ -214,7 +229,7 @@ class Rollouts:
 
         plant = {k.removeprefix("plant."): a for k, a in given.items() if k.startswith("plant.")}
         fields = {k: np.asarray(v)[None, None] for k, v in self.nominal.items()}
-        fields |= {k: v[None] for k, v in self._own.items()} | plant
+        fields |= {k: v[None] for k, v in self.own.items()} | plant
         density = np.array([s.density for s in self.segments]) / self.vehicle.water.density
         for name in ("volume", "form_drag", "skin_drag"):
             fields[name] = fields[name] * density
@@ -241,6 +256,22 @@ class Rollouts:
         ring[...] = line
         return self._march(sim, C, out)
 
+    def _impulses(self, sim: Simulator, C: int) -> list[Single]:
+        """Change of nu for a unit change of the imposed axes by an impulse on these alone, (C, segments, 6, axes)."""
+        inverse = sim.plant.M_inv.numpy().reshape(C, len(self.segments), 6, 6)
+        out = []
+        for axes, those, _ in self._held:
+            columns = inverse[:, those][..., axes]
+            out.append(columns @ np.linalg.inv(columns[..., axes, :]))
+        return out
+
+    def _impose(self, nu: Single, impulses: list[Single], row: int) -> None:
+        """Let imposed axes move as given; what they push on the others by inertia, they do."""
+        for (axes, those, values), impulse in zip(self._held, impulses, strict=True):
+            now = nu[:, those]
+            now += (impulse @ (values[row] - now[..., axes])[..., None])[..., 0]
+            nu[:, those] = now
+
     def _march(self, sim: Simulator, C: int, out: dict[str, Single]) -> NDArray[np.bool_]:
         n, S = self._force.shape[:2]
         command = sim.command.thrust.numpy().reshape(C, S, MAX_THRUSTERS)
@@ -248,11 +279,14 @@ class Rollouts:
             name: getattr(sim.state, own).numpy().reshape(C, S, -1)
             for name, own in (("nu", "velocity"), ("position", "position"), ("quaternion", "quaternion"))
         }
+        impulses = self._impulses(sim, C)
+        self._impose(views["nu"], impulses, 0)
         for name, view in views.items():
             out[name][0] = view
         for k in range(n):
             command[...] = self._force[k]
             sim.step()
+            self._impose(views["nu"], impulses, k + 1)
             for name, view in views.items():
                 out[name][k + 1] = view
         out["position"][..., 2] -= np.array([s.sink for s in self.segments], np.float32)

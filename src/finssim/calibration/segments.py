@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,8 +24,9 @@ CHANNELS = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z",
 MEMORY = 1.0
 """Commands before a segment that are kept, for delay and lag of the motors [s]."""
 
-DEEP = -200.0
-"""Height at which a vehicle is simulated that never came near the surface, or whose depth nobody measured [m]."""
+DEEP = -30.0
+"""Added to the height of a vehicle that never came near the surface [m]: deep enough for its drift, not so deep that
+single precision would lose slow motion. Where nobody measured the depth that does not matter, and it is much deeper."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +76,8 @@ class Segment:
     """Body point whose position x, y, z are [m]."""
     depth_at: Array
     """Body point of the pressure sensor [m]."""
+    held: Array | None = None
+    """nu that is imposed at the start and after every step, (steps + 1, 6); NaN where the simulation is free."""
 
     @property
     def steps(self) -> int:
@@ -161,22 +163,9 @@ def _name(trial: Trial | Streams) -> str:
 
 
 def _stretches(s: Streams, start: float) -> list[tuple[float, float]]:
-    """Spans without gaps: of the recording and, where forces were sampled rather than held, of the forces."""
-    # A command holds until the next; a recording that stops, or a sampled force that is missing, does not.
-    clocks: Sequence[Array] = [s.trial.t] if s.drive.commanded else [s.trial.t, s.drive.t]
-    begin = max(float(clock[0]) for clock in (s.trial.t, s.drive.t)) + start
-    end = min(float(clock[-1]) for clock in clocks)
-    holes = []
-    for clock in clocks:
-        gaps = np.diff(clock)
-        wide = np.flatnonzero(gaps > max(0.5, 4.0 * float(np.median(gaps))))
-        holes += [(float(clock[i]), float(clock[i + 1])) for i in wide]
-    spans = []
-    for low, high in sorted(holes):
-        if low > begin:
-            spans.append((begin, min(low, end)))
-        begin = max(begin, high)
-    spans.append((begin, end))
+    """Spans in which the inputs are known, inside the recording."""
+    begin = float(s.trial.t[0]) + start
+    spans = [(max(float(a), begin), float(b)) for a, b in s.drive.spans]
     return [(a, b) for a, b in spans if b > a]
 
 
@@ -221,14 +210,24 @@ def _segment(s: Streams, vehicle: Vehicle, t0: float, steps: int, step: float, i
 
 def _told(d: Drive, edges: Array) -> Array:
     """What the motors are told in each step between `edges` [s], (steps, k); see `Segment.force`."""
-    if not d.commanded:
-        # An actuator without lag ramps from one value to the next: the mean over a step is that of the line.
-        return np.stack([np.interp(edges[1:], d.t, column) for column in d.force.T], axis=-1)
-    held = np.concatenate(
-        [np.zeros((1, d.force.shape[1])), np.cumsum(np.diff(d.t)[:, None] * d.force[:-1], 0)]
-    )
+    if d.commanded:
+        return _means(d, edges)
+    # An actuator without lag ramps from one value to the next, so each value is the mean around its step's end.
+    half = 0.5 * np.diff(edges)
+    return _means(d, np.concatenate([edges[:1] + half[:1], edges[1:] + half]))
+
+
+def _means(d: Drive, edges: Array) -> Array:
+    """Mean force between successive times [s], (m + 1,) -> (m, k); before and after the recording the nearest value."""
+    span = np.diff(d.t)[:, None]
+    area = span * (d.force[:-1] if d.held else 0.5 * (d.force[:-1] + d.force[1:]))
+    total = np.concatenate([np.zeros((1, d.force.shape[1])), np.cumsum(area, axis=0)])
     i = np.clip(np.searchsorted(d.t, edges, side="right") - 1, 0, len(d.t) - 1)
-    integral = held[i] + (edges - d.t[i])[:, None] * d.force[i]
+    inside = np.clip(edges, d.t[0], d.t[-1])
+    now = d.force[i] if d.held else 0.5 * (d.force[i] + d.at(inside))
+    integral = total[i] + (inside - d.t[i])[:, None] * now
+    integral += np.minimum(edges - d.t[0], 0.0)[:, None] * d.force[0]
+    integral += np.maximum(edges - d.t[-1], 0.0)[:, None] * d.force[-1]
     return np.asarray(np.diff(integral, axis=0) / np.diff(edges)[:, None])
 
 
@@ -256,7 +255,7 @@ def _sink(m: Motion, vehicle: Vehicle, a: float, b: float) -> float:
     """How far down to simulate [m]: not at all where the vehicle came near the surface."""
     rows = (m.t >= a - 1e-9) & (m.t <= b + 1e-9) & np.isfinite(m.position[:, 2])
     if not rows.any():
-        return DEEP
+        return 50.0 * DEEP
     level = np.isfinite(m.quaternion[rows]).all(axis=1, keepdims=True)
     q = np.where(level, m.quaternion[rows], [0.0, 0.0, 0.0, 1.0])
     center = m.position[rows, 2] + quat_rotate(q, vehicle.body.center_of_buoyancy)[:, 2]
