@@ -38,7 +38,10 @@ def fitted(rng, trials, *, shared=0.0, unequal=False, samples=20):
 @pytest.mark.parametrize("shared", [0.0, 0.5])
 @pytest.mark.parametrize("unequal", [False, True])
 def test_intervals_cover_the_truth(trials, shared, unequal):
-    """95 % intervals hold the truth in 90 to 99.5 % of 400 fits, for few, unequal and internally correlated trials."""
+    """95 % intervals hold the truth in at least 90 % of 400 fits, and from 6 trials on are not far too wide either.
+
+    Trials may be few, of unequal weight, and differ as a whole.
+    """
     rng = np.random.default_rng(trials)
     hits = np.zeros(3)
     for _ in range(400):
@@ -46,7 +49,7 @@ def test_intervals_cover_the_truth(trials, shared, unequal):
         ends = intervals(theta, trial_covariance(evidence))
         hits += (ends[:, 0] <= TRUTH) & (TRUTH <= ends[:, 1])
     assert (hits >= 0.88 * 400).all()  # 0.90 less 1.3 standard errors of the count
-    assert (hits <= 0.998 * 400).all()
+    assert (hits <= 0.9975 * 400).all() or trials < 6
 
 
 def test_local_covariance_is_too_narrow_when_trials_differ_and_trials_are_not():

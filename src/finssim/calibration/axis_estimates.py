@@ -186,6 +186,12 @@ def _doubts(axis: str, data: AxisData, chosen: Selection) -> list[str]:
             f"{axis}: {len(data.rows)} trial{'s' if len(data.rows) > 1 else ''}: intervals come from blocks within "
             "them; what differs from trial to trial is not in them"
         )
+    level = [s.name for s in data.signals if not np.isfinite(s.up).any()]
+    if level:
+        out.append(
+            f"{axis}: no attitude in {', '.join(level[:3])}{' and others' if len(level) > 3 else ''}: the vehicle was "
+            "taken as level, so that weight and buoyancy bend the estimates where it was not"
+        )
     unknown = sorted({j for s in data.signals for j in s.unknown})
     if unknown:
         words = ", ".join(AXES[j] for j in unknown)

@@ -112,7 +112,7 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
         if runs is None:
             break
         Z, simulated, instrumental = runs[0], runs[1], True
-        if np.all(np.abs(theta - previous) <= 1e-4 * np.abs(theta) + 1e-9):
+        if np.all(np.abs(theta - previous) <= 1e-3 * np.abs(theta) + 1e-9):
             break
     if instrumental:
         sums = moments(X[inside], Z[inside], y[inside], weight, group).of(kept)

@@ -77,10 +77,11 @@ def _whitener(normal: Array) -> tuple[Array, Array]:
 def trial_covariance(evidence: Evidence) -> Covariance:
     """Local and trial-based covariance of the estimates.
 
-    V = N⁻¹ [Σ_g A_g s_g s_gᵀ A_gᵀ] N⁻¹,  A_g = (1 - N_g N⁻¹)^-½                (Bell and McCaffrey 2002)
+    V = N⁻¹ [Σ_g A_g s_g s_gᵀ A_gᵀ] N⁻¹,  A_g = (1 - N_g N⁻¹)⁻¹                 (CR3; Bell and McCaffrey 2002)
 
-    A_g undoes the shrinking of each trial's residuals by its own leverage, exactly so when errors are independent; the
-    degrees of freedom are Satterthwaite's under the same assumption, so that few or unequal trials give wide intervals.
+    N⁻¹ A_g s_g is what leaving trial g out changes: V is the jackknife over trials. The power -½ would be exact for
+    independent errors, and too small where few trials with much weight differ as a whole, as they do. The degrees of
+    freedom are Satterthwaite's for independent errors, so that few or unequal trials give wide intervals.
 
     Args:
         evidence: Contributions of G trials; with one, `local` has to serve for all.
@@ -104,7 +105,7 @@ def trial_covariance(evidence: Evidence) -> Covariance:
     B = T.T @ N_g @ T  # leverage of each trial: the shares of the information, they add up to 1
     share, axes = np.linalg.eigh(B)
     left = 1.0 - np.clip(share, 0.0, 1.0)
-    root = np.where(left > 1e-3, 1.0 / np.sqrt(np.maximum(left, 1e-3)), 0.0)
+    root = np.where(left > 1e-3, 1.0 / np.maximum(left, 1e-3), 0.0)
     A = np.einsum("gij,gj,gkj->gik", axes, root, axes)
     errors = np.einsum("pk,gkl,gl->gp", T, A, s_g @ T)
     trials = errors.T @ errors
