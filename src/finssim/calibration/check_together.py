@@ -15,7 +15,7 @@ __all__ = ["told_by", "together"]
 LATE = 0.03
 """Offset between streams that a fit must know of [s]."""
 
-AGREE = 0.85
+AGREE = 0.7
 """Correlation of two streams below which their offset is not counted."""
 
 

@@ -50,8 +50,10 @@ class Offset(NamedTuple):
 def stream_offsets(trial: Trial, vehicle: Vehicle) -> dict[str, Offset]:
     """Offsets of streams whose motion another stream measures too.
 
-    Compared are attitude with gyro, position with velocity, depth with vertical position or velocity, and acceleration
-    with velocity and attitude, or with the attitude alone.
+    They hold together, so that all of them may be given at once: a stream is compared with others as those are once
+    their own offsets are taken off. The chain is gyro, attitude, acceleration, velocity, position, depth. An
+    accelerometer sampled with the gyro is on its clock, and tells whether the velocity is late, as a DVL's is; any
+    other is compared with velocity and attitude.
 
     Args:
         trial: The trial.
@@ -69,22 +71,41 @@ def stream_offsets(trial: Trial, vehicle: Vehicle) -> dict[str, Offset]:
     found = {"attitude": _offset("rates", omega, attitude.rates)}
     if found["attitude"] is not None:  # the others are compared through the attitude as it should be
         attitude = attitude_signal(trial, t - found["attitude"].seconds)
-    world = _on_grid(trial, ("x", "y", "z"), t, 3)[1]
     nu, nu_slope = _on_grid(trial, ("u", "v", "w"), t, 2)
-    depth = _on_grid(trial, ("depth",), t, 3)[1]
+    reference, predicted = _predicted(trial, vehicle, t, attitude.quaternion, nu, nu_slope, omega)
+    measured = _on_grid(trial, ACCELERATION, t, 2)[0]
+    if _sampled_together(trial):
+        if reference == "velocity":
+            weight = _gravity(trial, vehicle, attitude.quaternion)
+            found["velocity"] = _offset("acceleration", measured - weight, predicted - weight)
+        else:
+            found["acceleration"] = _offset(reference, predicted, measured)
+    else:
+        found["acceleration"] = _offset(reference, predicted, measured)
+    nu = _on_grid(trial, ("u", "v", "w"), t - _seconds(found.get("velocity")), 2)[0]
     through_world = quat_rotate(attitude.turn, nu)
     if not attitude.tilt:
         through_world[:, 2] = np.nan
-    vertical = world[:, 2:] if trial.has("z") else through_world[:, 2:]
-    reference, predicted = _predicted(trial, vehicle, t, attitude.quaternion, nu, nu_slope, omega)
-    measured = _on_grid(trial, ACCELERATION, t, 2)[0]
-    pairs = {
-        "position": ("velocity", through_world, world),
-        "depth": ("position" if trial.has("z") else "velocity", vertical, -depth),
-        "acceleration": (reference, predicted, measured),
-    }
-    found |= {group: _offset(reference, *signals) for group, (reference, *signals) in pairs.items()}
+    found["position"] = _offset("velocity", through_world, _on_grid(trial, ("x", "y", "z"), t, 3)[1])
+    if trial.has("z"):
+        vertical = _on_grid(trial, ("z",), t - _seconds(found["position"]), 3)[1]
+    else:
+        vertical = through_world[:, 2:]
+    depth = _on_grid(trial, ("depth",), t, 3)[1]
+    found["depth"] = _offset("position" if trial.has("z") else "velocity", vertical, -depth)
     return {group: offset for group, offset in found.items() if offset is not None}
+
+
+def _seconds(offset: Offset | None) -> float:
+    return 0.0 if offset is None else offset.seconds
+
+
+def _sampled_together(trial: Trial) -> bool:
+    """Whether accelerometer and gyro have the same times nearly everywhere: one instrument, one clock."""
+    if not trial.has("p", "q", "r", *ACCELERATION):
+        return False
+    rates, felt = np.isfinite(trial.channels["r"]), np.isfinite(trial.channels["ax"])
+    return bool(np.sum(rates & felt) >= 0.9 * np.sum(felt))
 
 
 def _on_grid(trial: Trial, columns: tuple[str, ...], t: Array, order: int) -> tuple[Array, Array]:
@@ -114,9 +135,14 @@ def _predicted(
         a = v_dot + np.cross(turning, v) + np.cross(turning_dot, r) + np.cross(turning, np.cross(turning, r))
     else:
         group, a = "attitude", np.zeros((len(t), 3))
+    return group, a + _gravity(trial, vehicle, quaternion)
+
+
+def _gravity(trial: Trial, vehicle: Vehicle, quaternion: Array) -> Array:
+    """What the accelerometer feels of gravity at an attitude, (m, 3); nothing if it was taken off before."""
     if holds_gravity(trial, vehicle.water.gravity):
-        return group, a + vehicle.water.gravity * up_in_body(quaternion)
-    return group, a
+        return np.asarray(vehicle.water.gravity * up_in_body(quaternion))
+    return np.zeros((len(quaternion), 3))
 
 
 def _offset(reference: str, fixed: Array, moved: Array) -> Offset | None:
