@@ -74,14 +74,11 @@ def stream_offsets(trial: Trial, vehicle: Vehicle) -> dict[str, Offset]:
     nu, nu_slope = _on_grid(trial, ("u", "v", "w"), t, 2)
     reference, predicted = _predicted(trial, vehicle, t, attitude.quaternion, nu, nu_slope, omega)
     measured = _on_grid(trial, ACCELERATION, t, 2)[0]
-    if _sampled_together(trial):
-        if reference == "velocity":
-            weight = _gravity(trial, vehicle, attitude.quaternion)
-            found["velocity"] = _offset("acceleration", measured - weight, predicted - weight)
-        else:
-            found["acceleration"] = _offset(reference, predicted, measured)
-    else:
+    if not _sampled_together(trial):
         found["acceleration"] = _offset(reference, predicted, measured)
+    elif reference == "velocity":
+        weight = _gravity(trial, vehicle, attitude.quaternion)
+        found["velocity"] = _offset("acceleration", measured - weight, predicted - weight)
     nu = _on_grid(trial, ("u", "v", "w"), t - _seconds(found.get("velocity")), 2)[0]
     through_world = quat_rotate(attitude.turn, nu)
     if not attitude.tilt:
