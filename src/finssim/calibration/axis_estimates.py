@@ -21,8 +21,11 @@ Array = NDArray[np.float64]
 
 M, D1, D2, BIAS, DELAY, SMOOTHING, K = range(len(TERMS))
 
-CERTAIN = 0.5
+CERTAIN = 0.2
 """Half width of an interval, as a part of the estimate, up to which a parameter counts as identifiable."""
+
+USEFUL = 0.5
+"""The same, up to which an inertia or a damping force is written to the vehicle file: better than a guess."""
 
 LARGE_DELAY = 0.02
 """Lag of the motion behind the wrench worth a warning [s]."""
@@ -134,7 +137,8 @@ def _added_mass(
         )
     elif ends[0] <= 0.0:
         sure, note = False, "not distinguishable from zero"
-    if value > 0.0 and whole.identifiable:
+    half = 0.5 * (whole.ci95[1] - whole.ci95[0])
+    if value > 0.0 and half < USEFUL * whole.estimate:
         changes[path] = float(value)
     out[f"{axis}.added_mass"] = Estimate(
         name=f"{axis}.added_mass", estimate=float(value), ci95=_pair(ends), unit=unit, identifiable=sure,
@@ -143,7 +147,7 @@ def _added_mass(
 
 
 def _damping_known(chosen: Selection, speed: float) -> bool:
-    """Whether the damping force at the highest speeds is known to `CERTAIN`."""
+    """Whether the damping force at the highest speeds is known to `USEFUL`."""
     fit = chosen.fit
     weights = np.zeros(len(TERMS))
     weights[[D1, D2]] = speed, speed**2
@@ -152,7 +156,7 @@ def _damping_known(chosen: Selection, speed: float) -> bool:
     covariance = np.where(fit.covariance.alone.any(), fit.covariance.local, fit.covariance.trials)
     with np.errstate(invalid="ignore"):
         std = np.sqrt(w @ covariance @ w)
-    return bool(np.isfinite(std) and force > 0.0 and 2.0 * std < CERTAIN * force)
+    return bool(np.isfinite(std) and force > 0.0 and 2.0 * std < USEFUL * force)
 
 
 def speed_range(data: AxisData, chosen: Selection) -> tuple[float, float]:
