@@ -223,3 +223,22 @@ def test_inputs_that_cannot_be_used_are_refused_with_what_is_missing(channels, s
     with pytest.raises(CalibrationError, match=said) as error:
         drive(trial(channels), vehicle)
     assert str(error.value).startswith("made: ") and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("rate", [5.0, 50.0])
+def test_a_wrench_that_jumps_between_exact_levels_was_held(rate):
+    """Steps set by a program act from their row on; the same steps passed through a motor, or noisy, are sampled."""
+    t = np.arange(0.0, 6.0, 1.0 / rate)
+    steps = np.where((t > 1.9) & (t < 3.9), 6.0, 0.0)
+    lagged = np.where(t > 1.9, 6.0 * (1.0 - np.exp(-(t - 1.9) / 0.5)), 0.0)
+    noisy = steps + np.random.default_rng(0).normal(0.0, 0.1, len(t))
+    vehicle = load_vehicle("finsrov")
+
+    def read(force, **header):
+        channels = {"tau_x": force, "u": np.zeros(len(t))}
+        return drive(Trial(name="a", t=t, channels=channels, header=Header(**header)), vehicle)
+
+    assert read(steps).held and any("inputs_between" in note for note in read(steps).notes)
+    assert not read(lagged).held
+    assert not read(noisy).held
+    assert not read(steps, inputs_between="linear").held

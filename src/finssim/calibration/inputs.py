@@ -97,13 +97,19 @@ def drive(trial: Trial, vehicle: Vehicle) -> Drive:
         raise CalibrationError(f"{trial.name}: {_what_is_missing(present, trial, vehicle)}")
     kind = complete[0]
     commanded = header.inputs == "commanded" or (header.inputs is None and kind not in ACTED)
-    held = commanded if header.inputs_between is None else header.inputs_between == "held"
+    columns = present[kind]
+    stepped = header.inputs_between is None and not commanded and _keeps_levels(trial, columns)
+    held = commanded or stepped if header.inputs_between is None else header.inputs_between == "held"
     notes = [
         f"{k}* is there for some thrusters only; {kind.rstrip('_')} was used"
         for k in ORDER[: ORDER.index(kind)]
         if present[k]
     ]
-    columns = present[kind]
+    if stepped:
+        notes.append(
+            f"{kind.rstrip('_')} keeps its levels exactly and jumps from row to row: read as held from each row to the "
+            "next; write 'inputs_between: linear' in trial.yaml if it was sampled while it changed"
+        )
     if kind == "tau":
         missing = [name for name in TAU if name not in columns]
         if missing:
@@ -208,6 +214,21 @@ def _what_is_missing(present: dict[str, list[str]], trial: Trial, vehicle: Vehic
         f"no input columns, expected tau_x ... tau_n or one of {prefixes} for each thruster: log what drove the "
         "vehicle, or write 'passive: true' in trial.yaml if the thrusters were off"
     )
+
+
+def _keeps_levels(trial: Trial, columns: list[str]) -> bool:
+    """Whether inputs stay exactly at levels and jump between them from row to row, as a program sets them.
+
+    What motors delivered passes through the values between, and what a sensor measured never repeats: read as held, either would
+    lead its effect by half a row.
+    """
+    jumps = alone = 0
+    for column in columns:
+        _, values = trial.series(column)
+        change = np.concatenate([[False], values[1:] != values[:-1], [False]])
+        jumps += int(change.sum())
+        alone += int((change[1:-1] & ~change[:-2] & ~change[2:]).sum())
+    return jumps >= 2 and alone >= 0.9 * jumps
 
 
 def _together(trial: Trial, columns: list[str], held: bool) -> tuple[Array, Array]:
