@@ -61,8 +61,8 @@ class Header(_Section):
     """Whether the input columns are what acted (measured, reconstructed) or what was asked for, before delay and lag.
     `None`: `rpm_*`, `force_*` and `tau_*` acted, `pwm_*` and `command_*` were asked for."""
     inputs_between: Literal["held", "linear"] | None = None
-    """What inputs did between two samples. `None`: what was asked for is held, and so is what keeps exact levels and jumps
-    from row to row; anything else that acted goes in a straight line."""
+    """What inputs did between two samples. `None`: what was asked for is held, and so is what keeps exact levels and
+    jumps from row to row; anything else that acted goes in a straight line."""
     passive: bool = False
     """Thrusters off: no input columns are needed."""
     wrench_at: Point | Literal["center_of_gravity", "origin"] | None = None

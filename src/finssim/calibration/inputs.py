@@ -219,8 +219,7 @@ def _what_is_missing(present: dict[str, list[str]], trial: Trial, vehicle: Vehic
 def _keeps_levels(trial: Trial, columns: list[str]) -> bool:
     """Whether inputs stay exactly at levels and jump between them from row to row, as a program sets them.
 
-    What motors delivered passes through the values between, and what a sensor measured never repeats: read as held, either would
-    lead its effect by half a row.
+    What motors delivered passes through the values between, and what a sensor measured never repeats.
     """
     jumps = alone = 0
     for column in columns:
