@@ -14,7 +14,7 @@ from finssim.engine.plant_arrays import twist_shift
 from finssim.vehicles import AXES, Vehicle, VehicleError
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 
-__all__ = ["TELL", "carried", "compared", "excited", "horizon", "observable", "sampling", "speeds"]
+__all__ = ["TELL", "carried", "compared", "excited", "horizon", "observable", "sampling", "speeds", "telling"]
 
 Array = NDArray[np.float64]
 
@@ -74,10 +74,21 @@ def observable(trials: Sequence[Streams]) -> tuple[str, ...]:
 def excited(trials: Sequence[Streams], vehicle: Vehicle) -> tuple[str, ...]:
     """Axes that the trials excite: those their headers name, else those that were driven, or moved while passive, and
     answered."""
-    found: set[str] = set()
-    for s in trials:
-        found |= set(s.trial.header.axis) or _moved(s, vehicle)
+    found = {axis for s in trials for axis in excites(s, vehicle)}
     return tuple(a for a in AXES if a in found and a in observable(trials))
+
+
+def telling(trials: Sequence[Streams], vehicle: Vehicle, axes: Sequence[str]) -> list[Streams]:
+    """Trials that excite one of some axes; all of them where none does.
+
+    In the others the vehicle moves on axes that are not fitted, maybe not even measured, and couplings carry that over.
+    """
+    return [s for s in trials if set(excites(s, vehicle)) & set(axes)] or list(trials)
+
+
+def excites(s: Streams, vehicle: Vehicle) -> set[str]:
+    """Axes that one trial excites: those its header names, else those that were driven, or moved while passive."""
+    return set(s.trial.header.axis) or _moved(s, vehicle)
 
 
 def _moved(s: Streams, vehicle: Vehicle) -> set[str]:
@@ -131,7 +142,7 @@ def horizon(
     vehicle: Vehicle, trials: Sequence[Streams], axes: Sequence[str], hydrodynamics: str = "calibrated"
 ) -> float:
     """Length of segments that shows steady motion and yet forgets what no model knows [s]: five of the slowest time
-    constant, at least forty samples, between 4 and 12 s."""
+    constant, at least forty samples, between 5 and 12 s."""
     chosen = vehicle.hydrodynamic_set(hydrodynamics)
     M = np.diag(vehicle.mass_matrix(hydrodynamics))
     slowest = 0.5
@@ -141,7 +152,7 @@ def horizon(
             top = speeds([s.motion for s in trials], axis)[1]
             drag = chosen.linear_damping[i, i] + chosen.quadratic_damping[i, i] * top
             slowest = max(slowest, float(M[i] / drag) if drag > 0.0 else 3.0)
-    return float(np.clip(max(5.0 * slowest, 40.0 * sampling(trials)), 4.0, 12.0))
+    return float(np.clip(max(5.0 * slowest, 40.0 * sampling(trials)), 5.0, 12.0))
 
 
 def sampling(trials: Sequence[Streams]) -> float:

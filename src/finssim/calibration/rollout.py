@@ -280,7 +280,8 @@ class Rollouts:
             for name, own in (("nu", "velocity"), ("position", "position"), ("quaternion", "quaternion"))
         }
         impulses = self._impulses(sim, C)
-        self._impose(views["nu"], impulses, 0)
+        for axes, those, values in self._held:
+            views["nu"][:, those[:, None], axes] = values[0]
         for name, view in views.items():
             out[name][0] = view
         for k in range(n):

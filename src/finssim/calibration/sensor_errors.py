@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from finssim.calibration.residuals import Residuals
 
-__all__ = ["LATEST", "STREAMS", "SensorErrors"]
+__all__ = ["LATEST", "LATE_STD", "STREAMS", "SensorErrors"]
 
 Array = NDArray[np.float64]
 
@@ -26,6 +26,9 @@ levels that were mounted askew [rad], pressure at the surface [m]."""
 
 LATEST = 0.3
 """By how much a stream may lag or lead the inputs [s]."""
+
+LATE_STD = 0.05
+"""By how much streams lag or lead, as far as one knows beforehand [s]: noisy data cannot tell a lag from inertia."""
 
 
 class SensorErrors:

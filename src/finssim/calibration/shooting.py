@@ -14,7 +14,7 @@ from finssim.calibration.parameters import LONGEST_DELAY, Parameters
 from finssim.calibration.residuals import ANGLES, Residuals
 from finssim.calibration.rollout import Rollouts
 from finssim.calibration.segments import Segment
-from finssim.calibration.sensor_errors import LATEST, SensorErrors
+from finssim.calibration.sensor_errors import LATE_STD, LATEST, STREAMS, SensorErrors
 from finssim.geometry.rotations import wrap_angle
 from finssim.vehicles import AXES
 
@@ -76,6 +76,7 @@ class Shooting:
         self.errors = SensorErrors(self.measured)
         far = np.full(len(self.errors.streams), LATEST)
         self.low, self.high = np.append(parameters.low, -far), np.append(parameters.high, far)
+        self.prior_precision = np.append(np.zeros(len(parameters.low)), 0.0 * far + LATE_STD**-2.0)
         width = (len(segments), len(self.errors.std))
         self.prior_std = np.concatenate([self.states.std, np.broadcast_to(self.errors.std, width)], axis=1)
         self.axes_of_trials = tuple(a for a in AXES if a in trial_biases)
@@ -169,6 +170,15 @@ class Shooting:
             z[up[P + b + k], :, k] += step_k
             z[down[P + b + k], :, k] -= step_k
         return Point(theta, phi, z), np.concatenate([*wide, 2.0 * push, 2.0 * self.states.steps])
+
+    def growth(self, point: Point) -> Array:
+        """Largest factor by which a small change of the initial velocity grows within each segment, (S,)."""
+        own = np.abs(self.linearise(point).own[:, :6])
+        speeds = [
+            i for i, name in enumerate(self.measured.names) if name in STREAMS["velocity"] + STREAMS["rates"]
+        ]
+        own[~np.isin(self.measured.channel, speeds)] = 0.0
+        return np.asarray(np.maximum.reduceat(own.max(axis=1), self.edges[:-1]))
 
     def grain(self, theta: Array) -> Array:
         """Differences of theta that nobody minds, (P,)."""

@@ -80,6 +80,9 @@ def evidence_of(problem: Shooting, solution: Solution) -> Evidence:
         rows = order[edges[g] : edges[g + 1]]
         weighted = slopes[rows].T * weight[rows]
         normal[g], score[g] = weighted @ slopes[rows], weighted @ linear.residual[rows]
+    # What is known of the clocks beforehand is one more witness.
+    normal = np.concatenate([normal, np.diag(problem.prior_precision)[None]])
+    score = np.concatenate([score, -(problem.prior_precision * point.theta)[None]])
     return Evidence(names=problem.names, normal=normal, score=score, unit=unit)
 
 

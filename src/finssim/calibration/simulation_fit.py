@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excited import excited, observable, speeds
+from finssim.calibration.excited import excited, observable, speeds, telling
 from finssim.calibration.fit import Fit
 from finssim.calibration.parameters import EXTRAS
 from finssim.calibration.segments import Streams, streams
@@ -64,7 +64,9 @@ def fit_by_simulation(
     prepared = [streams(trial, vehicle) for trial in trials]
     chosen, warnings = _axes(prepared, vehicle, axes)
     say = Clock(progress)
-    fit = Stages(prepared, vehicle, chosen, tuple(estimate), horizon, start, seed, say)
+    fit = Stages(
+        telling(prepared, vehicle, chosen), vehicle, chosen, tuple(estimate), horizon, start, seed, say
+    )
     kinds = dict.fromkeys(chosen, "both" if damping == "auto" else damping)
     stage = fit.first(kinds)
     wider: dict[str, tuple[float, float]] = {}

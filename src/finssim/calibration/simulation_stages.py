@@ -37,6 +37,13 @@ STEP = 0.02
 SHORT = 2.5
 """Of the segments at first [s]: over so short a time every problem is nearly linear."""
 
+GROWTH = 12.0
+"""Growth of a disturbance of the initial velocity over a segment above which its trial is cut into shorter ones.
+
+A fast vehicle without fins turns broadside by itself, and derivatives over a long run of that mean little."""
+
+HALVINGS = 2
+
 ROUGH = 3.0
 """Residual, against a twentieth of the range, from which a coarse search comes first."""
 
@@ -88,6 +95,7 @@ class Stages:
         self.prepared, self.vehicle, self.axes, self.seed, self.say = prepared, vehicle, axes, seed, say
         self.base = vehicle.replace(start.changes) if start is not None and start.changes else vehicle
         self.given, self.imposed = length, carried(prepared, axes)
+        self.shorter: dict[str, float] = {}
         self.used: list[Streams] = []
         self.segments: list[Segment] = []
         self.extras = {word for word in estimate if word in EXTRAS}
@@ -122,6 +130,15 @@ class Stages:
             return Stage(problem, rough, findings(problem, rough))
         self.cut(self.given or horizon(self.base.replace(_matrices(p, x)), self.prepared, self.axes))
         problem = self.problem(kinds, self.base, dict(zip(p.names, x, strict=True)))
+        for _ in range(0 if self.given else HALVINGS):
+            growth = problem.growth(problem.start())
+            wild = {self.used[g].trial.name for g in np.unique(problem.groups[growth > GROWTH])}
+            if not wild:
+                break
+            for name in wild:
+                self.shorter[name] = 0.5 * self.shorter.get(name, 1.0)
+            self.cut(self.length)
+            problem = self.problem(kinds, self.base, dict(zip(p.names, x, strict=True)))
         return self.finish(problem, problem.start(), 0.6)
 
     def next(self, kinds: dict[str, str], before: Stage, full: bool = False) -> Stage:
@@ -163,11 +180,7 @@ class Stages:
         """Cut the trials into segments of about a length [s]."""
         tells = {column for axis in self.axes for column in TELL[axis]}
         cut = [
-            [
-                compared(s, one.motion, self.axes)
-                for s in segments(one, self.vehicle, length=length, step=STEP)
-            ]
-            for one in self.prepared
+            [compared(s, one.motion, self.axes) for s in self._segments(one, length)] for one in self.prepared
         ]
         kept = [[s for s in stretch if tells & set(s.measured)] for stretch in cut]
         self.length = length
@@ -180,6 +193,9 @@ class Stages:
         commanded = np.array([s.commanded for s in self.segments])
         # Where every input is said to have acted, whoever asks for a lag doubts that.
         self.lagged = commanded if commanded.any() else np.ones_like(commanded)
+
+    def _segments(self, one: Streams, length: float) -> list[Segment]:
+        return segments(one, self.vehicle, length=length * self.shorter.get(one.trial.name, 1.0), step=STEP)
 
     def problem(
         self, kinds: dict[str, str], base: Vehicle, start: dict[str, float], full: bool = False
