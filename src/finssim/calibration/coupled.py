@@ -17,19 +17,26 @@ __all__ = ["Coupled"]
 
 Array = NDArray[np.float64]
 
+LARGEST = 2.0
+"""Of the entries of U off the diagonal."""
+
+LEAST_MASS = 0.05
+"""Smallest entry of Δ of the mass matrix: part of the vehicle file's inertia."""
+
 
 class Coupled:
     """Full matrices over the n free axes E; the rest R and its couplings stay as the vehicle file has them.
 
-    M_EE - M_ER M_RR⁻¹ M_RE = S L Lᵀ S      so M = M_RB + M_A is positive definite for every L with positive diagonal
-    (D1)_EE = T (L Lᵀ + Ω) T + file's part  so the symmetric part is positive semidefinite; Ω is antisymmetric
+    M_EE - M_ER M_RR⁻¹ M_RE = S U Δ Uᵀ S       so M = M_RB + M_A is positive definite where Δ > 0 is diagonal
+    (D1)_EE = T (U Δ Uᵀ + Ω) T + file's part   so its symmetric part is positive semidefinite for Δ >= 0
     (D2)_ij = c_ij d_i^⅓ d_j^⅔, |c_ij| <= 1/(n-1)
 
     The last takes energy out for every nu: with y_i = d_i^⅓ |nu_i|, the power is at least
     Σ y_i³ - Σ_ij |c_ij| y_i y_j², and y_i y_j² <= y_i³/3 + 2 y_j³/3, so each y_i³ keeps at least
     1 - Σ_j (|c_ij|/3 + 2 |c_ji|/3) >= 0 of itself.
 
-    S and T are the sizes in the vehicle file, so that the entries of L and Ω are of order one.
+    U is unit lower triangular and Ω antisymmetric, of their own in each; S and T are the sizes in the vehicle file, so
+    that all entries are of order one. Bounds on U keep M as well conditioned as single precision needs.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -43,7 +50,7 @@ class Coupled:
         self.mass_offset = rest - p.M_RB[np.ix_(E, E)]
         C = M[np.ix_(E, E)] - rest
         self.S = np.sqrt(np.diag(C))
-        self.mass_start = np.linalg.cholesky(C / np.outer(self.S, self.S))
+        self.mass_start = _factors(C / np.outer(self.S, self.S))
         D1 = p.D1[np.ix_(E, E)]
         sym = 0.5 * (p.D1 + p.D1.T)
         self.damping_offset = np.zeros((self.n, self.n))
@@ -59,7 +66,7 @@ class Coupled:
         values, vectors = np.linalg.eigh(block)
         # Away from the singular edge, where no derivative would lead back.
         block = (vectors * np.maximum(values, 0.05)) @ vectors.T
-        self.damping_start = np.linalg.cholesky(block)
+        self.damping_start = _factors(block)
         self.skew_start = 0.5 * (D1 - D1.T) / np.outer(self.T, self.T)
         self.quadratic = np.flatnonzero(has_quadratic)
         self.d2_start = np.maximum(np.diag(p.D2)[E], typical)
@@ -73,19 +80,12 @@ class Coupled:
         inf = np.inf
         for i in range(self.n):
             for j in range(i + 1):
-                low = 0.05 if i == j else -inf
-                yield "M", f"M.{self._pair(i, j)}", i, j, self.mass_start[i, j], low, inf
+                low, high = (LEAST_MASS, inf) if i == j else (-LARGEST, LARGEST)
+                yield "M", f"M.{self._pair(i, j)}", i, j, self.mass_start[i, j], low, high
         for a, i in enumerate(self.linear):
             for j in self.linear[: a + 1]:
-                yield (
-                    "L",
-                    f"D1.{self._pair(i, j)}",
-                    i,
-                    j,
-                    self.damping_start[i, j],
-                    0.0 if i == j else -inf,
-                    inf,
-                )
+                low, high = (0.0, inf) if i == j else (-LARGEST, LARGEST)
+                yield "L", f"D1.{self._pair(i, j)}", i, j, self.damping_start[i, j], low, high
                 if i != j:
                     yield "W", f"D1a.{self._pair(i, j)}", i, j, self.skew_start[i, j], -inf, inf
         for i in self.quadratic:
@@ -113,10 +113,9 @@ class Coupled:
         for column, (kind, _, i, j, *_) in enumerate(self._slots()):
             parts[kind][:, i, j] = x[:, column]
         block = np.ix_(range(W), self.E, self.E)
-        L = parts["M"]
-        M_A[block] = L @ np.swapaxes(L, 1, 2) * np.outer(self.S, self.S) + self.mass_offset
-        L, skew = parts["L"], parts["W"] - np.swapaxes(parts["W"], 1, 2)
-        D1[block] = (L @ np.swapaxes(L, 1, 2) + skew) * np.outer(self.T, self.T) + self.damping_offset
+        M_A[block] = _product(parts["M"]) * np.outer(self.S, self.S) + self.mass_offset
+        skew = parts["W"] - np.swapaxes(parts["W"], 1, 2)
+        D1[block] = (_product(parts["L"]) + skew) * np.outer(self.T, self.T) + self.damping_offset
         d = np.einsum("wii->wi", parts["d"])
         cube = np.cbrt(d)
         D2[block] = parts["c"] * cube[:, :, None] * cube[:, None, :] ** 2
@@ -139,3 +138,19 @@ class Coupled:
                 if i != j
             ]
         return out
+
+
+def _factors(A: Array) -> Array:
+    """Δ on the diagonal and U below it, of A = U Δ Uᵀ, (n, n)."""
+    L = np.linalg.cholesky(A)
+    out = L / np.diag(L)
+    np.fill_diagonal(out, np.diag(L) ** 2)
+    return np.asarray(out)
+
+
+def _product(factors: Array) -> Array:
+    """U Δ Uᵀ of many such factors, (W, n, n)."""
+    delta = np.einsum("wii->wi", factors).copy()
+    U = factors.copy()
+    np.einsum("wii->wi", U)[...] = 1.0
+    return np.asarray((U * delta[:, None, :]) @ np.swapaxes(U, 1, 2))
