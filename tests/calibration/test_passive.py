@@ -126,6 +126,17 @@ def test_rise_gives_terminal_speed_and_excess(quadratic):
     assert found.excess_ci95[0] < e < found.excess_ci95[1]
 
 
+def test_a_file_that_sinks_where_the_vehicle_rises_is_said():
+    """A rise contradicts a file that is heavier than water, whether or not the excess is known well enough to be written."""
+    t = np.arange(0.0, 20.0, 0.05)
+    w = 0.2 * (1.0 - np.exp(-np.maximum(t - 2.0, 0.0) / 2.5))
+    z = -3.0 + np.cumsum(w) * 0.05 + 0.01 * np.random.default_rng(1).normal(size=len(t))
+    rise = Trial(name="rise", t=t, channels={"depth": -z}, header=Header(passive=True))
+    sinks = VEHICLE.replace({"body.displaced_volume": 0.995 * VEHICLE.weight / 9810.0})
+    said = [w for w in passive([rise], sinks, axes=["heave"]).warnings if "the file's sinks" in w]
+    assert len(said) == 1 and "body.displaced_volume" in said[0]
+
+
 def test_pooling_trials_that_disagree_widens_the_interval():
     """Equal estimates pool to a narrower interval; estimates ten standard errors apart do not."""
     same = pooled(np.array([1.0, 1.0]), np.array([0.1, 0.1]), np.array([20.0, 20.0]))

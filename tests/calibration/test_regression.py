@@ -167,6 +167,39 @@ def test_a_file_too_heavy_is_said():
     assert any("below the rigid 25 kg" in w for w in fit.warnings)
 
 
+def test_a_motion_that_the_wrench_does_not_explain_writes_nothing():
+    """The velocity is another vehicle's: R² is low, nothing of the axis is identifiable or written, the reason is said."""
+    vehicle, some = trials("bluerov2_heavy", "heave", "yaw")
+    rng = np.random.default_rng(3)
+    foreign = []
+    for t in some:
+        wander = np.convolve(rng.normal(size=len(t.t) + 100), np.hanning(101) / 20.0, "valid")
+        foreign.append(replace(t, channels=t.channels | {"w": wander}))
+    foreign = without(foreign, "x", "y", "z", "depth", "ax", "ay", "az")
+    fit = regress(foreign, vehicle)
+    assert fit.quality["heave"]["r2"] < 0.2
+    of_heave = [e for n, e in fit.estimates.items() if n.startswith(("heave.", "buoyancy"))]
+    assert len(of_heave) >= 5
+    for estimate in of_heave:
+        assert not estimate.identifiable
+        assert "explains nothing" in estimate.note or "finds no inertia" in estimate.note
+    assert not any(".2.2" in path or path.startswith("body.") for path in fit.changes)
+    assert any(path.endswith("added_mass.5.5") for path in fit.changes)  # yaw is as good as ever
+
+
+def test_damping_is_written_as_a_pair_or_not_at_all():
+    """A dropped term is written as zero beside the one that stays; an axis whose drag is unknown keeps both."""
+    vehicle, some = trials("bluerov2_heavy", "sway", "roll")
+    changes = regress(some, vehicle).changes
+    for i in range(6):
+        pair = [
+            f"hydrodynamics.calibrated.{kind}_damping.{i}.{i}" in changes for kind in ("linear", "quadratic")
+        ]
+        assert pair[0] == pair[1]
+    assert changes["hydrodynamics.calibrated.linear_damping.1.1"] == 0.0
+    assert changes["hydrodynamics.calibrated.quadratic_damping.1.1"] > 0.0
+
+
 def test_few_trials_are_said():
     """With two trials intervals come from blocks, which is said, and still hold the truth."""
     vehicle, some = trials("bluerov2_heavy", "surge")

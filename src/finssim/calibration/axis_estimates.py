@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.calibration.axis_doubts import damping_known, doubts, quality, speed_range, worthless
 from finssim.calibration.axis_fit import TERMS, AxisData
 from finssim.calibration.fit import Curve, Estimate
 from finssim.calibration.plant_terms import Matrices
 from finssim.calibration.selection import Selection
-from finssim.calibration.uncertainty import intervals
 from finssim.vehicles import AXES
 
-__all__ = ["AxisResult", "axis_result", "speed_range"]
+__all__ = ["AxisResult", "axis_result"]
 
 Array = NDArray[np.float64]
 
@@ -25,10 +25,7 @@ CERTAIN = 0.2
 """Half width of an interval, as a part of the estimate, up to which a parameter counts as identifiable."""
 
 USEFUL = 0.5
-"""The same, up to which an inertia or a damping force is written to the vehicle file: better than a guess."""
-
-LARGE_DELAY = 0.02
-"""Lag of the motion behind the wrench worth a warning [s]."""
+"""The same, up to which an inertia is written to the vehicle file: better than a guess."""
 
 DECADE = 10.0
 
@@ -36,6 +33,11 @@ GAP = np.full(1, np.nan)
 """Between the lines of two trials."""
 
 SET = "hydrodynamics.calibrated"
+
+BIAS_NOTE = (
+    "a constant force; above zero it opposes motion in the positive direction, as damping does: tether, trim or the "
+    "offset of a sensor"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +49,8 @@ class AxisResult:
     quality: dict[str, float]
     warnings: list[str]
     curves: list[Curve] = field(default_factory=list)
+    worthless: str = ""
+    """Why nothing that was found can be believed; empty where it can."""
 
 
 def axis_result(data: AxisData, chosen: Selection, plant: Matrices) -> AxisResult:
@@ -99,7 +103,7 @@ def axis_result(data: AxisData, chosen: Selection, plant: Matrices) -> AxisResul
             )  # fmt: skip
         elif fit.terms[term]:
             add(name, term, unit_d, path)
-    if _damping_known(chosen, high):
+    if damping_known(data, chosen):
         for name, family in (("d1", "linear_damping"), ("d2", "quadratic_damping")):
             changes[f"{SET}.{family}.{i}.{i}"] = max(float(theta[D1 if name == "d1" else D2]), 0.0)
     else:
@@ -109,16 +113,22 @@ def axis_result(data: AxisData, chosen: Selection, plant: Matrices) -> AxisResul
     bias = add("bias", BIAS, "N" if linear else "N m")
     out[bias.name] = Estimate(
         name=bias.name, estimate=bias.estimate, ci95=bias.ci95, unit=bias.unit,
-        identifiable=bool(np.isfinite(bias.ci95).all()), note="on the side of the damping, at no speed",
+        identifiable=bool(np.isfinite(bias.ci95).all()), note=BIAS_NOTE,
     )  # fmt: skip
 
     if 0.0 < low and high < DECADE * low:
         warnings.append(f"{axis} damping rests on {speeds}, less than a decade")
-    warnings += _doubts(axis, data, chosen)
-    quality = _quality(data, chosen)
+    warnings += doubts(axis, data, chosen)
+    figures = quality(data, chosen)
+    reason = worthless(figures, chosen)
+    if reason:
+        out = {n: replace(e, identifiable=False, note=reason) for n, e in out.items()}
+        changes = {}
+        warnings.append(f"{axis}: {reason}; the vehicle file keeps its numbers")
     return AxisResult(
-        estimates=out, changes=changes, quality=quality, warnings=warnings, curves=_curves(data, chosen)
-    )
+        estimates=out, changes=changes, quality=figures, warnings=warnings, curves=_curves(data, chosen),
+        worthless=reason,
+    )  # fmt: skip
 
 
 def _added_mass(
@@ -144,85 +154,6 @@ def _added_mass(
         name=f"{axis}.added_mass", estimate=float(value), ci95=_pair(ends), unit=unit, identifiable=sure,
         note=note, path=path,
     )  # fmt: skip
-
-
-def _damping_known(chosen: Selection, speed: float) -> bool:
-    """Whether the damping force at the highest speeds is known to `USEFUL`."""
-    fit = chosen.fit
-    weights = np.zeros(len(TERMS))
-    weights[[D1, D2]] = speed, speed**2
-    force = float(weights @ fit.theta)
-    w = weights[fit.terms]
-    covariance = np.where(fit.covariance.alone.any(), fit.covariance.local, fit.covariance.trials)
-    with np.errstate(invalid="ignore"):
-        std = np.sqrt(w @ covariance @ w)
-    return bool(np.isfinite(std) and force > 0.0 and 2.0 * std < USEFUL * force)
-
-
-def speed_range(data: AxisData, chosen: Selection) -> tuple[float, float]:
-    """5th and 95th percentile of the speeds that damping rests on: rows whose speed stands out of its noise."""
-    speed = np.concatenate(
-        [np.abs(rows.X[used, 1]) for rows, used in zip(data.rows, chosen.fit.used, strict=True)]
-    )
-    top = float(np.percentile(speed, 95.0)) if len(speed) else 0.0
-    moving = speed[speed > 0.02 * top]
-    if len(moving) < 5:
-        return 0.0, top
-    return float(np.percentile(moving, 5.0)), top
-
-
-def _doubts(axis: str, data: AxisData, chosen: Selection) -> list[str]:
-    fit, out = chosen.fit, []
-    lag = intervals(fit.free[fit.terms], fit.covariance)[int(fit.terms[:DELAY].sum())]
-    if abs(fit.theta[DELAY]) > LARGE_DELAY and (lag[0] > 0.0 or lag[1] < 0.0):
-        out.append(
-            f"{axis}: the motion {'lags' if fit.theta[DELAY] > 0 else 'leads'} the recorded wrench by "
-            f"{abs(fit.theta[DELAY]) * 1e3:.0f} ms [{lag[0] * 1e3:.0f}, {lag[1] * 1e3:.0f}]; the fit allows for it, "
-            "but check the clocks, or the delay and lag of the motors"
-        )
-    if not fit.instrumental:
-        out.append(
-            f"{axis}: the estimate could not be simulated, so ordinary least squares was used, which noise of the "
-            "velocity biases"
-        )
-    if fit.evidence.unit == "blocks":
-        out.append(
-            f"{axis}: {len(data.rows)} trial{'s' if len(data.rows) > 1 else ''}: intervals come from blocks within "
-            "them; what differs from trial to trial is not in them"
-        )
-    level = [s.name for s in data.signals if not np.isfinite(s.up).any()]
-    if level:
-        out.append(
-            f"{axis}: no attitude in {', '.join(level[:3])}{' and others' if len(level) > 3 else ''}: the vehicle was "
-            "taken as level, so that weight and buoyancy bend the estimates where it was not"
-        )
-    unknown = sorted({j for s in data.signals for j in s.unknown})
-    if unknown:
-        words = ", ".join(AXES[j] for j in unknown)
-        out.append(f"{axis}: the velocity of {words} is unknown; couplings with it were taken as zero")
-    return out
-
-
-def _quality(data: AxisData, chosen: Selection) -> dict[str, float]:
-    fit = chosen.fit
-    y = np.concatenate([rows.y[used] for rows, used in zip(data.rows, fit.used, strict=True)])
-    p = np.concatenate([line[used] for line, used in zip(fit.fitted, fit.used, strict=True)])
-    rmse = float(np.sqrt(np.mean((y - p) ** 2)))
-    spread = float(np.percentile(y, 95.0) - np.percentile(y, 5.0))
-    low, high = speed_range(data, chosen)
-    return {
-        "r2": 1.0 - rmse**2 / max(float(np.var(y)), 1e-300),
-        "rmse": rmse,
-        "nrmse": rmse / max(spread, 1e-300),
-        "samples": float(sum(rows.samples for rows in data.rows)),
-        "rejected": float(sum(rows.rejected for rows in data.rows)),
-        "trials": float(len(data.rows)),
-        "independent": float(fit.independent),
-        "speed_low": low,
-        "speed_high": high,
-        "delay": float(fit.theta[DELAY]),
-        **{f"p_{name}": value for name, value in chosen.p_value.items()},
-    }
 
 
 def _curves(data: AxisData, chosen: Selection) -> list[Curve]:

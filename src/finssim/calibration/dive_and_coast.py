@@ -28,6 +28,12 @@ LEVEL = 0.9
 HANDS_OFF = 0.05
 """Part of the largest wrench below which thrust does not count."""
 
+USEFUL = 0.5
+"""Half width of the interval, as a part of the excess, up to which it is written to the vehicle file."""
+
+FAINT = 0.002
+"""The same as a part of the weight: what a thousandth of the volume does matters little."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Coast:
@@ -101,7 +107,11 @@ def buoyancy_estimate(data: AxisData, chosen: Selection, vehicle: Vehicle) -> tu
             "heave: the trials go one way only and never coast, so that the buoyancy excess trades off with the "
             "damping: add a dive followed by a coast"
         )
-    sure = bool(np.isfinite([low, high]).all()) and (bool(free) or both)
+    known = bool(np.isfinite([low, high]).all())
+    known = known and 0.5 * (high - low) <= max(USEFUL * abs(value), FAINT * vehicle.weight)
+    if not known:
+        note += "; not known to half its size"
+    sure = known and (bool(free) or both)
     volume = (vehicle.weight + value) / (vehicle.water.density * vehicle.water.gravity)
     return (
         Estimate(

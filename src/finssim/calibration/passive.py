@@ -83,7 +83,9 @@ def passive(
             except CalibrationError as error:
                 warnings.append(str(error))
         used |= {rise.trial for rise in rises}
-        estimates |= _rise_estimates(rises, plant) if rises else {}
+        found = _rise_estimates(rises, plant) if rises else {}
+        warnings += _contradictions(found, plant)
+        estimates |= found
         curves += [_rise_curve(rise) for rise in rises]
     if not estimates:
         raise CalibrationError(f"no trial shows a free decay or a rise: {'; '.join(warnings)}")
@@ -250,6 +252,19 @@ def _rise_estimates(rises: list[Rise], plant: Matrices) -> dict[str, Estimate]:
         ),
     ]  # fmt: skip
     return {e.name: e for e in found}
+
+
+def _contradictions(found: dict[str, Estimate], plant: Matrices) -> list[str]:
+    """A sentence where the file's excess of buoyancy, which a rise does not replace, lies outside the interval."""
+    excess = found.get("buoyancy_excess")
+    if excess is None or excess.ci95[0] <= plant.excess <= excess.ci95[1]:
+        return []
+    low, high = excess.ci95
+    sign = ": the vehicle rises, the file's sinks" if plant.excess < 0.0 < low else ""
+    return [
+        f"heave: the vehicle file's buoyancy less weight is {plant.excess:.3g} N, outside the {low:.2g} to "
+        f"{high:.2g} N of the rise{sign}: weigh the vehicle in water, or set body.displaced_volume"
+    ]
 
 
 def _pooled(found: list[tuple[float, float, float]]) -> tuple[float, float, float]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.axis_data import Prepared, axis_data, excited, prepare
+from finssim.calibration.axis_doubts import quality, worthless
 from finssim.calibration.axis_estimates import AxisResult, axis_result
 from finssim.calibration.axis_fit import TERMS, AxisData
 from finssim.calibration.degeneracy import degeneracy
@@ -74,18 +76,21 @@ def regress(
         warnings += result.warnings
         if i == 2:
             buoyancy, notes = buoyancy_estimate(data, selection, vehicle)
+            if result.worthless:
+                buoyancy = replace(buoyancy, identifiable=False, note=result.worthless)
             estimates[buoyancy.name] = buoyancy
             warnings += notes
     used = {s.name for data, _ in chosen.values() for s in data.signals}
     _hydrostatics(estimates, changes, vehicle, plant, warnings)
-    quality = {axis: result.quality for axis, result in results.items()}
+    figures = {axis: result.quality for axis, result in results.items()}
     curves = [curve for result in results.values() for curve in result.curves]
-    quiet = _passive(trials, vehicle, wanted, estimates)
+    told = [axis for axis, result in results.items() if not result.worthless]
+    quiet = _passive(trials, vehicle, [i for i in wanted if AXES[i] not in told])
     if quiet is not None:
-        estimates, changes, quality = (
-            quiet.estimates | estimates,
-            quiet.changes | changes,
-            quality | quiet.quality,
+        estimates, changes, figures = (
+            estimates | quiet.estimates,
+            changes | quiet.changes,
+            figures | quiet.quality,
         )
         warnings += quiet.warnings
         curves += quiet.curves
@@ -102,7 +107,7 @@ def regress(
         vehicle=vehicle,
         estimates=estimates,
         changes=changes,
-        quality=quality,
+        quality=figures,
         correlation=correlation,
         warnings=tuple(dict.fromkeys([*warnings, *sentences])),
         curves=tuple(curves),
@@ -158,9 +163,9 @@ def _fit_axes(
             chosen[i] = (data, select(data, damping))
         if settled:
             break
-        for i, (_, selection) in chosen.items():
+        for i, (data, selection) in chosen.items():
             m, d1, d2 = selection.fit.theta[:3]
-            if m > 0.0:
+            if not worthless(quality(data, selection), selection):
                 plant = plant.with_axis(i, m - plant.M_RB[i, i], max(d1, 0.0), max(d2, 0.0))
                 waters = [w.with_axis(i, m - w.M_RB[i, i], max(d1, 0.0), max(d2, 0.0)) for w in waters]
     return chosen, plant, warnings
@@ -223,12 +228,10 @@ def _correlation(chosen: dict[int, tuple[AxisData, Selection]]) -> tuple[Correla
     return Correlation(names=tuple(names), matrix=block_diag(*blocks)), sentences
 
 
-def _passive(
-    trials: Sequence[Trial], vehicle: Vehicle, wanted: list[int], found: dict[str, Estimate]
-) -> Fit | None:
+def _passive(trials: Sequence[Trial], vehicle: Vehicle, wanted: list[int]) -> Fit | None:
     """What trials without thrust tell of roll, pitch and heave where no driven trial did; None without such trials."""
     quiet = [trial for trial in trials if trial.header.passive]
-    axes = [AXES[i] for i in wanted if i in (2, 3, 4) and f"{AXES[i]}.m_eff" not in found]
+    axes = [AXES[i] for i in wanted if i in (2, 3, 4)]
     if not quiet or not axes:
         return None
     from finssim.calibration.passive import passive

@@ -95,6 +95,9 @@ def _p_value(fit: AxisFit, term: int) -> float:
 
 
 def _interval(fit: AxisFit) -> Array:
+    """About the free estimates, and where a bound moved them about the held ones too."""
     out = np.full((len(TERMS), 2), np.nan)
-    out[fit.terms] = intervals(fit.free[fit.terms], fit.covariance)
+    free, held = (intervals(x[fit.terms], fit.covariance) for x in (fit.free, fit.theta))
+    out[fit.terms, 0] = np.minimum(free[:, 0], held[:, 0])
+    out[fit.terms, 1] = np.maximum(free[:, 1], held[:, 1])
     return out
