@@ -127,7 +127,7 @@ def test_rise_gives_terminal_speed_and_excess(quadratic):
 
 
 def test_a_file_that_sinks_where_the_vehicle_rises_is_said():
-    """A rise contradicts a file that is heavier than water, whether or not the excess is known well enough to be written."""
+    """A rise contradicts a file heavier than water, even where the excess is known too badly to be written."""
     t = np.arange(0.0, 20.0, 0.05)
     w = 0.2 * (1.0 - np.exp(-np.maximum(t - 2.0, 0.0) / 2.5))
     z = -3.0 + np.cumsum(w) * 0.05 + 0.01 * np.random.default_rng(1).normal(size=len(t))

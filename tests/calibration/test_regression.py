@@ -11,6 +11,7 @@ from finssim.calibration.axis_fit import fit_axis
 from finssim.calibration.dive_and_coast import coasts
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.header import Header
+from finssim.calibration.instruments import Run, cut, joined, simulate_axis
 from finssim.calibration.measurement import NoiseProfile
 from finssim.calibration.plant_terms import matrices
 from finssim.calibration.regression import regress
@@ -76,6 +77,26 @@ def test_instruments_remove_the_bias_of_noisy_velocities():
     true = truth(vehicle)["heave.m_eff"]
     assert np.mean(plain) < 0.9 * true
     assert np.mean(instrumental) == pytest.approx(true, rel=0.06)
+
+
+@pytest.mark.parametrize(("model", "seconds"), [((12.0, 3.0, 20.0, 0.0), 90.0), ((0.6, 0.4, 0.8, 2.0), 45.0)])
+def test_cut_and_decimated_simulation_is_the_one_in_one_run(model, seconds):
+    """At 100 Hz in blocks of 20 s and steps of 40 ms from noisy states: within 1 % of one run at every sample."""
+    rng = np.random.default_rng(0)
+    t = np.arange(0.0, seconds, 0.01)
+    push = model[0] * np.convolve(
+        np.repeat(rng.normal(size=len(t) // 100 + 1), 100)[: len(t)], np.ones(5) / 5, "same"
+    )
+    whole = Run(0.5 * (push[1:] + push[:-1]), 0.01, 0.3, 0.0)
+    (nu,), (s,) = simulate_axis(np.array(model), [whole])
+    scale = np.std(nu)
+    noisy = nu + 0.05 * scale * rng.normal(size=len(nu))
+    pieces = cut(100.0, [(0, len(t))], noisy, s)
+    runs = [piece.run(push) for piece in pieces]
+    assert max(len(run.push) for run in runs) <= 25.0 * 22.0 + 1
+    again = joined(simulate_axis(np.array(model), runs)[0], pieces, len(t))
+    settled = t > 3.0
+    assert np.std((again - nu)[settled]) < 0.01 * scale
 
 
 def test_late_motion_is_told_from_inertia():
@@ -168,7 +189,7 @@ def test_a_file_too_heavy_is_said():
 
 
 def test_a_motion_that_the_wrench_does_not_explain_writes_nothing():
-    """The velocity is another vehicle's: R² is low, nothing of the axis is identifiable or written, the reason is said."""
+    """The velocity is another vehicle's: R² is low, and nothing of the axis is identifiable or written."""
     vehicle, some = trials("bluerov2_heavy", "heave", "yaw")
     rng = np.random.default_rng(3)
     foreign = []

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.instruments import simulate_axis
+from finssim.calibration.instruments import Piece, Run, cut, joined, simulate_axis
 from finssim.calibration.moments import evidence, moments, offset_ratio, solve
 from finssim.calibration.robust import bounded, huber_weights
 from finssim.calibration.rows import Kernel, Rows, Signals, simulated_columns
@@ -23,6 +23,9 @@ Array = NDArray[np.float64]
 
 TERMS = ("m_eff", "d1", "d2", "bias", "delay", "smoothing", "k")
 """Names of the columns; see the module for `delay` [s] and `smoothing` [s²]."""
+
+FREE_ROUNDS = 6
+"""After so many the variance of trial offsets stays, so that the rounds settle."""
 
 FEWEST_TRIALS = 4
 """With fewer, trials are cut into blocks to estimate the spread."""
@@ -96,7 +99,8 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
     weight, Z, instrumental = np.ones(inside.sum()), X, False
     simulated: list[Array] = []
     ratio, theta = 0.0, np.zeros(p)
-    for _ in range(iterations + 1):
+    pieces = [_cut(data, found, rows) for found, rows in zip(data.signals, data.rows, strict=True)]
+    for round_ in range(iterations + 1):
         sums = moments(X[inside], Z[inside], y[inside], weight, group).of(kept)
         previous = theta
         theta = np.zeros(p)
@@ -107,8 +111,9 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
         correlated = correlated_samples(
             centred * np.sqrt(weight), (np.flatnonzero(np.diff(group)) + 1).tolist()
         )
-        ratio = offset_ratio(sums, correlated) / correlated
-        runs = _simulate(data, theta)
+        if round_ < FREE_ROUNDS:
+            ratio = offset_ratio(sums, correlated) / correlated
+        runs = _simulate(data, theta, pieces)
         if runs is None:
             break
         Z, simulated, instrumental = runs[0], runs[1], True
@@ -172,25 +177,20 @@ def _blocks(group: NDArray[np.int64], correlated: float) -> NDArray[np.int64]:
     return out
 
 
-def _simulate(data: AxisData, theta: Array) -> tuple[Array, list[Array]] | None:
+def _simulate(data: AxisData, theta: Array, pieces: list[list[Piece]]) -> tuple[Array, list[Array]] | None:
     """Instruments for all rows and simulated velocities by trial; None where the estimate cannot be simulated."""
     m, d1, d2, b, delay = (float(x) for x in theta[:5])
     k = max(float(theta[6]), 0.0) if data.restoring else 0.0
     if not m > 0.0 or not np.isfinite(theta).all():
         return None
-    wrench, restart = [], []
-    for found, rows in zip(data.signals, data.rows, strict=True):
+    runs, places = list[Run](), []
+    for found, own in zip(data.signals, pieces, strict=True):
         left = np.where(np.isfinite(found.left[:, data.axis]), found.left[:, data.axis], 0.0)
-        wrench.append(np.interp(found.t - delay, found.t, left) - b * _offset(found, data.axis))
-        restart.append([(begin, *_start(found, data, begin)) for begin, _ in rows.spans])
-    model = np.array([m, max(d1, 0.0), max(d2, 0.0), k])
-    nu, s = [np.empty(0)] * len(wrench), [np.empty(0)] * len(wrench)
-    rates = np.array([found.rate for found in data.signals])
-    for rate in np.unique(rates):
-        same = np.flatnonzero(rates == rate)
-        runs = simulate_axis(model, [wrench[g] for g in same], 1.0 / rate, [restart[g] for g in same])
-        for g, v, x in zip(same, *runs, strict=True):
-            nu[g], s[g] = v, x
+        wrench = np.interp(found.t - delay, found.t, left) - b * _offset(found, data.axis)
+        places.append((slice(len(runs), len(runs) + len(own)), own, len(found.t)))
+        runs += [piece.run(wrench) for piece in own]
+    lines = simulate_axis(np.array([m, max(d1, 0.0), max(d2, 0.0), k]), runs)
+    nu, s = ([joined(line[those], own, n) for those, own, n in places] for line in lines)
     if not all(np.isfinite(v).all() for v in (*nu, *s)):
         return None
     Z = [
@@ -200,18 +200,13 @@ def _simulate(data: AxisData, theta: Array) -> tuple[Array, list[Array]] | None:
     return np.concatenate(Z), nu
 
 
+def _cut(data: AxisData, found: Signals, rows: Rows) -> list[Piece]:
+    sine = (found.up[:, 1] if data.axis == 3 else -found.up[:, 0]) if data.restoring else None
+    return cut(found.rate, rows.spans, found.nu[:, data.axis], sine)
+
+
 def _offset(found: Signals, axis: int) -> Array:
     """What the bias multiplies: 1, and in heave the vertical component of `up`."""
     if axis != 2:
         return np.ones(len(found.t))
     return np.where(np.isfinite(found.up[:, 2]), found.up[:, 2], 1.0)
-
-
-def _start(found: Signals, data: AxisData, begin: int) -> tuple[float, float]:
-    """Velocity and sine of the angle at the beginning of a stretch, from the first tenth of a second."""
-    count = max(1, round(0.1 * found.rate))
-    nu = float(np.median(found.nu[begin : begin + count, data.axis]))
-    if not data.restoring:
-        return nu, 0.0
-    up = found.up[begin : begin + count]
-    return nu, float(np.median(up[:, 1] if data.axis == 3 else -up[:, 0]))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.instruments import simulate_axis
+from finssim.calibration.instruments import Run, simulate_axis
 from finssim.calibration.trial import Trial
 from finssim.calibration.uncertainty import Evidence, correlated_samples, intervals, trial_covariance
 
@@ -126,8 +126,11 @@ def _fit(t: Array, z: Array, quadratic: bool) -> tuple[Array, Array, Array]:
         speed, e = np.exp(x[0]), np.exp(x[1])
         one, none = np.ones_like(e), np.zeros_like(e)
         theta = np.stack([one, none if quadratic else e / speed, e / speed**2 if quadratic else none, none])
-        start = [[(0, float(w), float(h))] for w, h in zip(x[2], x[3], strict=True)]
-        _, heights = simulate_axis(theta, [np.full(len(grid), value) for value in e], STEP, start)
+        runs = [
+            Run(np.full(len(grid) - 1, value), STEP, float(w), float(h))
+            for value, w, h in zip(e, x[2], x[3], strict=True)
+        ]
+        _, heights = simulate_axis(theta, runs)
         return np.stack([np.interp(t, grid, h) for h in heights], axis=1)
 
     def residual(x: Array) -> Array:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from finssim.calibration.attitude_signal import attitude_samples
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.instruments import simulate_axis
+from finssim.calibration.instruments import Run, simulate_axis
 from finssim.calibration.robust import local_outliers
 from finssim.calibration.trial import Trial
 from finssim.calibration.uncertainty import (
@@ -208,8 +208,9 @@ class _Ringdown:
         w2 = np.exp(x[0])
         push = w2 * (self.hats @ x[5:])
         theta = np.stack([np.ones_like(w2), x[1], x[2], w2])
-        restart = [[(0, float(a), float(b))] for a, b in zip(x[3], x[4], strict=True)]
-        nu, s = simulate_axis(theta, list(push.T), float(self.t[1] - self.t[0]), restart)
+        step, mean = float(self.t[1] - self.t[0]), 0.5 * (push[:-1] + push[1:])
+        runs = [Run(p, step, float(a), float(b)) for p, a, b in zip(mean.T, x[3], x[4], strict=True)]
+        nu, s = simulate_axis(theta, runs)
         return np.stack(nu, axis=1), np.stack(s, axis=1)
 
     def _errors(self, x: Array) -> Array:
