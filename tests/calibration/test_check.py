@@ -225,6 +225,15 @@ def test_gaps_rates_and_jitter_are_measured(simulated):
     assert [s for s in report(jittered).streams if "p" in s.columns][0].jitter == pytest.approx(0.4, abs=0.02)
 
 
+def test_heights_above_the_surface_are_told(simulated):
+    """Motion capture counts from the floor, and some logs count depth upwards."""
+    trial = simulated["yaw"]
+    raised = changed(trial, z=lambda z: z - z.min() + 1.0)
+    assert any(text.startswith("z: says") for text in texts(raised, "care"))
+    assert any("scale: {depth: -1}" in text for text in texts(changed(trial, depth=np.negative), "care"))
+    assert not any("above the surface" in text for text in texts(trial))
+
+
 def test_stuck_held_and_clipped_sensors_are_found(simulated):
     """A gyroscope that stops, a velocity that comes at a fifth of the rate, a rate beyond the sensor's range."""
     trial = simulated["yaw"]

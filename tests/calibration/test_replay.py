@@ -64,6 +64,15 @@ def test_a_good_model_predicts_better_than_persistence_and_a_bad_one_is_told_by_
     assert good.count[0] >= good.count[-1] > 10
 
 
+def test_heights_from_another_zero_do_not_lift_the_vehicle_out_of_the_water():
+    """Motion capture counts from the floor: a vehicle that it shows at +1 m and higher is no less submerged."""
+    kept = without(make(["heave"])[0], "depth")
+    z = kept.channels["z"]
+    raised = dataclasses.replace(kept, channels={**kept.channels, "z": z - z.min() + 1.0})
+    low, high = (replay([trial], FINSROV).aggregate("calibrated").value for trial in (kept, raised))
+    assert high == pytest.approx(low, rel=0.01)
+
+
 def test_trials_of_the_fit_are_in_sample_and_do_not_count_with_held_out_ones(surge):
     result = replay(surge, fitted_on(surge[0]))
     data = result.as_json()

@@ -138,6 +138,8 @@ def test_degenerate_responses_are_told_in_words():
     )
     assert response_span(still, "v").why == response_span(still, "w").why == "not measured"
     assert all(gate.value is None and gate.why for gate in gates(still, "calibrated", "surge").values())
+    still.measured["u"] = 0.0005 * np.sin(still.t)  # a vehicle on the bench, well measured
+    assert "at rest" in score(still, "calibrated", "u").why
     still.measured["u"] = 0.004 * np.random.default_rng(0).standard_normal(len(still.t))
     still.noise["u"] = 0.01
     assert "noise" in score(still, "calibrated", "u").why

@@ -19,6 +19,9 @@ SHORTEST_TRIAL = 1.0
 STUCK = 1.0
 """Time of equal values of a moving sensor that is suspicious [s]."""
 
+FLYING = 0.3
+"""Height above the surface that no vehicle reaches [m]: the log has another zero."""
+
 COARSE = 50.0
 """Steps of resolution that a signal must span for equal values to mean something."""
 
@@ -114,6 +117,15 @@ def _values(trial: Trial, name: str) -> list[tuple[Level, str]]:
     if _coarse(y):
         return []
     found: list[tuple[Level, str]] = []
+    if name in ("z", "depth") and (above := float(np.percentile(y if name == "z" else -y, 99.0))) > FLYING:
+        sign = "positive up ('convert: {scale: {depth: -1}}'), or " if name == "depth" else ""
+        found.append(
+            (
+                "care",
+                f"says {above:.2g} m above the surface: {sign}another zero ('convert: {{offset: {{{name}: ...}}}}')? "
+                "Models count the vehicle as submerged",
+            )
+        )
     begins = np.flatnonzero(np.concatenate([[True], np.diff(y) != 0.0]))
     lengths = np.diff(np.concatenate([begins, [len(y)]]))
     usual = float(np.median(lengths))

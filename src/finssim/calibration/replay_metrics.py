@@ -37,6 +37,10 @@ NOISE_SPAN = 2.0
 spans 3.3 from P5 to P95, and half of that or less after smoothing."""
 
 
+STILL = 0.002
+"""Spans below this are those of a vehicle at rest, whatever the noise [m/s, rad/s, rad]."""
+
+
 class Score(NamedTuple):
     """A number, or the reason why there is none."""
 
@@ -81,6 +85,8 @@ def response_span(pair: Pair, response: str) -> Score:
     width, noise = span(x), pair.noise.get(response, 0.0)
     if not width > 1e-12:
         return Score(None, "the measured response does not vary: its P5 to P95 span is zero")
+    if width < STILL:
+        return Score(None, f"the vehicle was at rest: the measured response spans {width:.2g} from P5 to P95")
     smoothed = pair.raw.get(response) is not values
     if np.isfinite(noise) and width < (NOISE_SPAN if smoothed else 2.0 * NOISE_SPAN) * noise:
         return Score(

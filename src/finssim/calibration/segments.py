@@ -28,6 +28,9 @@ DEEP = -30.0
 """Added to the height of a vehicle that never came near the surface [m]: deep enough for its drift, not so deep that
 single precision would lose slow motion. Where nobody measured the depth that does not matter, and it is much deeper."""
 
+FLIES = 0.15
+"""Height of the origin above the reach of a floating vehicle that is no height above the surface any more [m]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Segment:
@@ -252,12 +255,19 @@ def _start(m: Motion, t0: float) -> tuple[Array, Array, Array, NDArray[np.bool_]
 
 
 def _sink(m: Motion, vehicle: Vehicle, a: float, b: float) -> float:
-    """How far down to simulate [m]: not at all where the vehicle came near the surface."""
+    """How far down to simulate [m]: not at all where the vehicle came near the surface.
+
+    No vehicle flies: heights well above 0 have another zero than the surface, such as a motion capture's on the floor,
+    and then the vehicle counts as submerged.
+    """
+    reach = max(vehicle.body.surface_half_height, 0.5 * float(vehicle.body.size[2]))
+    height = m.position[np.isfinite(m.position[:, 2]), 2]
+    if len(height) and np.percentile(height, 99.0) > reach + FLIES:
+        return DEEP - float(height.max())
     rows = (m.t >= a - 1e-9) & (m.t <= b + 1e-9) & np.isfinite(m.position[:, 2])
     if not rows.any():
         return 50.0 * DEEP
     level = np.isfinite(m.quaternion[rows]).all(axis=1, keepdims=True)
     q = np.where(level, m.quaternion[rows], [0.0, 0.0, 0.0, 1.0])
     center = m.position[rows, 2] + quat_rotate(q, vehicle.body.center_of_buoyancy)[:, 2]
-    reach = max(vehicle.body.surface_half_height, 0.5 * float(vehicle.body.size[2]))
     return DEEP if float(center.max()) < -reach else 0.0
