@@ -28,6 +28,9 @@ MARGIN = 0.95
 LONGEST_DELAY = 1.0
 """[s]"""
 
+SHORTEST_LAG = 0.005
+"""Time constant below which a step of the simulation shows no lag [s]."""
+
 
 @dataclass(frozen=True)
 class Coordinate:
@@ -158,7 +161,7 @@ class Parameters:
                 Coordinate("buoyancy_excess", "N", B - weight, -0.9 * weight, 10.0 * weight, 0.02 * weight)
             ],
             "thrust_scale": [Coordinate("thrust_scale", "-", 1.0, 0.05, 20.0, 1.0)],
-            "thrust_lag": [Coordinate("thrust_lag", "s", max(tc, 0.01), 0.0, 5.0, 0.2)],
+            "thrust_lag": [Coordinate("thrust_lag", "s", max(tc, 0.02), SHORTEST_LAG, 5.0, 2.0)],
             "thrust_delay": [Coordinate("thrust_delay", "s", late, 0.0, LONGEST_DELAY, 0.2)],
             "current": [Coordinate(f"current.{a}", "m/s", 0.0, -5.0, 5.0, 0.2) for a in "xy"],
         }

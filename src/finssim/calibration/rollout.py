@@ -53,12 +53,7 @@ class Response:
 
 
 class Rollouts:
-    """Simulates segments under candidate plants.
-
-    Attributes:
-        nominal: Plant fields of the vehicle file, as `vehicle_parameters` gives them.
-        segments: In the order of every S axis.
-    """
+    """Simulates segments under candidate plants."""
 
     def __init__(
         self,

@@ -215,8 +215,11 @@ def _told(d: Drive, edges: Array) -> Array:
     """What the motors are told in each step between `edges` [s], (steps, k); see `Segment.force`."""
     if d.commanded:
         return _means(d, edges)
-    # An actuator without lag ramps from one value to the next, so each value is the mean around its step's end.
+    # An actuator without lag ramps from one value to the next: each is the value at its step's end, or the mean around
+    # it where values jump or come faster than the steps.
     half = 0.5 * np.diff(edges)
+    if not d.held and float(np.median(np.diff(d.t))) > 0.7 * float(edges[1] - edges[0]):
+        return d.at(edges[1:])
     return _means(d, np.concatenate([edges[:1] + half[:1], edges[1:] + half]))
 
 

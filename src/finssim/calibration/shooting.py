@@ -31,6 +31,9 @@ GRAIN = 0.004
 COARSE = 0.05
 """Of a channel's range: residuals of that size are small while the parameters are still far off."""
 
+EXACT_CLOCK = 1e-3
+"""How far the stream that serves as the clock may lag [s]."""
+
 FLOOR = 1e-4
 """Smallest noise of a channel, against the range it covers: below it are the simulation's own errors."""
 
@@ -77,6 +80,9 @@ class Shooting:
         far = np.full(len(self.errors.streams), LATEST)
         self.low, self.high = np.append(parameters.low, -far), np.append(parameters.high, far)
         self.prior_precision = np.append(np.zeros(len(parameters.low)), 0.0 * far + LATE_STD**-2.0)
+        if "thrust_delay" in parameters.names:
+            # A common lag of all streams is a delay of the thrust: the first stream is the clock then.
+            self.prior_precision[len(parameters.names)] = EXACT_CLOCK**-2.0
         width = (len(segments), len(self.errors.std))
         self.prior_std = np.concatenate([self.states.std, np.broadcast_to(self.errors.std, width)], axis=1)
         self.axes_of_trials = tuple(a for a in AXES if a in trial_biases)

@@ -119,7 +119,7 @@ def jacobian(p: Parameters, listed: Sequence[Quantity], x: Array) -> Array:
 
 
 def spread(
-    p: Parameters, listed: Sequence[Quantity], x: Array, found: Findings
+    p: Parameters, listed: Sequence[Quantity], x: Array, found: Findings, own_error: float
 ) -> tuple[Array, Array, Array]:
     """Values (Q,), intervals (Q, 2) and p-values of being zero (Q,)."""
     from scipy.stats import norm, t
@@ -143,7 +143,8 @@ def spread(
     std = np.sqrt(np.maximum(variance, 0.0))
     shift = J @ np.clip(found.free[:P] - x, -1e6, 1e6)
     free = np.where(one, value + shift, value)
-    half = quantile * std
+    whole = np.array([p.M_RB[q.axis, q.axis] if q.kind == "added_mass" else 0.0 for q in listed])
+    half = np.hypot(quantile * std, own_error * np.abs(value + whole))
     ends = np.stack([np.minimum(free - half, value), np.maximum(free + half, value)], axis=-1)
     # A bound of the vector is one of the quantity where they are the same up to a constant.
     offset = value - J[np.arange(len(J)), which] * x[which]
@@ -161,6 +162,7 @@ def estimates(
     found: Findings,
     *,
     axes: Sequence[str],
+    own_error: float = 0.0,
     wider: dict[str, tuple[float, float]] | None = None,
     dropped: dict[str, str] | None = None,
 ) -> tuple[dict[str, Estimate], dict[str, float]]:
@@ -171,6 +173,7 @@ def estimates(
         x: Where it ended, (P,).
         found: Evidence there.
         axes: Which to report.
+        own_error: Of the simulation itself, as a part of an estimate; intervals hold it too.
         wider: Intervals of the fuller model that this one was chosen from; both are covered.
         dropped: Quantity -> why it was left out.
 
@@ -178,7 +181,7 @@ def estimates(
         Estimates by name, and the p-value of each being zero.
     """
     listed = quantities(p, axes)
-    value, ends, p_value = spread(p, listed, x, found)
+    value, ends, p_value = spread(p, listed, x, found, own_error)
     at_low = {name for name, xi, low in zip(p.names, x, p.low, strict=True) if xi <= low}
     free = dict(zip(p.names, found.free, strict=False))
     out: dict[str, Estimate] = {}
@@ -191,7 +194,9 @@ def estimates(
         if dropped and quantity.name in dropped:
             sure, note = False, dropped[quantity.name]
         elif coordinate in at_low:
-            sure, note = False, f"held at its bound; free, it would be {free[coordinate]:.3g} {quantity.unit}"
+            sure, note = False, "held at its bound"
+            if np.isfinite(low + high):
+                note += f"; free, it would be {free[coordinate]:.3g} {quantity.unit}"
         elif quantity.kind == "added_mass" and sure and value[q] <= 0.0:
             rigid = p.M_RB[quantity.axis, quantity.axis]
             sure, note = False, f"m_eff is below the file's rigid {rigid:.4g} {quantity.unit}"

@@ -11,7 +11,8 @@ from finssim.calibration.parameters import EXTRAS
 from finssim.calibration.segments import Streams, streams
 from finssim.calibration.selection import AKAIKE, DAMPING
 from finssim.calibration.simulation_estimates import estimates
-from finssim.calibration.simulation_stages import Clock, Stages
+from finssim.calibration.simulation_report import Clock
+from finssim.calibration.simulation_stages import Stages
 from finssim.calibration.trial import Trial
 from finssim.vehicles import AXES, Vehicle
 
@@ -72,7 +73,9 @@ def fit_by_simulation(
     wider: dict[str, tuple[float, float]] = {}
     dropped: dict[str, str] = {}
     if damping == "auto" and not stage.solution.interrupted:
-        first, p_value = estimates(stage.problem.parameters, stage.x, stage.found, axes=chosen)
+        first, p_value = estimates(
+            stage.problem.parameters, stage.x, stage.found, axes=chosen, own_error=fit.own_error
+        )
         kinds, dropped = _select(kinds, p_value, prepared)
         if dropped:
             wider = {name: e.ci95 for name, e in first.items()}

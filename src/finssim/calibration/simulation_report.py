@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from finssim.calibration.segments import Streams
 from finssim.calibration.shooting import Shooting
 from finssim.calibration.simulation_evidence import Findings
 
-__all__ = ["doubts", "pictures", "quality"]
+__all__ = ["Clock", "doubts", "pictures", "quality"]
 
 Array = NDArray[np.float64]
 
@@ -163,3 +164,17 @@ def doubts(
             "from trial to trial is not in them"
         )
     return out
+
+
+class Clock:
+    """Tells progress over several stages: iteration, cost, rate and what may remain."""
+
+    def __init__(self, progress: Callable[[float, str], None] | None) -> None:
+        self.progress, self.begin, self.part, self.worlds = progress, time.perf_counter(), 0.0, 0
+
+    def __call__(self, words: str, toward: float = 1.0) -> None:
+        # How many iterations remain nobody knows; each takes a share of the rest.
+        self.part += 0.2 * max(toward - self.part, 0.0)
+        spent = time.perf_counter() - self.begin
+        if self.progress:
+            self.progress(self.part, f"{words}, {spent:.0f} s")

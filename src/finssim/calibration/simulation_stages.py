@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,19 +22,22 @@ from finssim.calibration.shooting import Shooting
 from finssim.calibration.simulation_changes import changes
 from finssim.calibration.simulation_estimates import estimates
 from finssim.calibration.simulation_evidence import Findings, findings
-from finssim.calibration.simulation_report import doubts, pictures, quality
+from finssim.calibration.simulation_report import Clock, doubts, pictures, quality
 from finssim.vehicles import Vehicle
 
-__all__ = ["Clock", "Stage", "Stages"]
+__all__ = ["Stage", "Stages"]
 
 Array = NDArray[np.float64]
-Progress = Callable[[float, str], None]
 
 STEP = 0.02
 """Of the simulation [s]."""
 
 SHORT = 2.5
 """Of the segments at first [s]: over so short a time every problem is nearly linear."""
+
+OWN_ERROR, BETWEEN = 0.003, 0.05
+"""Error of the simulation itself, as a part of an estimate; and how it grows with the time between samples of the
+inputs [1/s], for nobody recorded what happened in between."""
 
 GROWTH = 12.0
 """Growth of a disturbance of the initial velocity over a segment above which its trial is cut into shorter ones.
@@ -62,20 +64,6 @@ class Stage:
     def x(self) -> Array:
         """Where the parameters ended, (P,)."""
         return self.solution.point.theta[: len(self.problem.parameters.names)]
-
-
-class Clock:
-    """Tells progress over several stages: iteration, cost, rate and what may remain."""
-
-    def __init__(self, progress: Progress | None) -> None:
-        self.progress, self.begin, self.part, self.worlds = progress, time.perf_counter(), 0.0, 0
-
-    def __call__(self, words: str, toward: float = 1.0) -> None:
-        # How many iterations remain nobody knows; each takes a share of the rest.
-        self.part += 0.2 * max(toward - self.part, 0.0)
-        spent = time.perf_counter() - self.begin
-        if self.progress:
-            self.progress(self.part, f"{words}, {spent:.0f} s")
 
 
 class Stages:
@@ -107,6 +95,12 @@ class Stages:
         self.trial_biases = biased if "trial_bias" in estimate else []
         self.biases = [] if self.trial_biases else biased
         self.guess = {} if start is None else {name: e.estimate for name, e in start.estimates.items()}
+
+    @property
+    def own_error(self) -> float:
+        """Error of the simulation itself, as a part of an estimate."""
+        apart = [float(np.median(np.diff(s.drive.t))) for s in self.prepared if not s.drive.held]
+        return OWN_ERROR + BETWEEN * max([0.0, *(dt - STEP for dt in apart)])
 
     def first(self, kinds: dict[str, str]) -> Stage:
         """The first fit: short segments from a rough start, then segments of the length that the answer calls for."""
@@ -256,7 +250,9 @@ class Stages:
     ) -> Fit:
         """The finished fit."""
         p, x = stage.problem.parameters, stage.x
-        found, _ = estimates(p, x, stage.found, axes=self.axes, wider=wider, dropped=dropped)
+        found, _ = estimates(
+            p, x, stage.found, axes=self.axes, own_error=self.own_error, wider=wider, dropped=dropped
+        )
         top = {axis: speeds([s.motion for s in self.used], axis)[1] for axis in self.axes}
         sources = {s.drive.source for s in self.used}
         new = changes(p, x, found, stage.found, self.axes, top, scaled=sources <= {"rpm", "pwm"})
