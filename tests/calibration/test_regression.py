@@ -112,6 +112,24 @@ def test_late_motion_is_told_from_inertia():
     assert any("lags the recorded wrench by" in w for w in fit.warnings)
 
 
+def test_a_velocity_later_than_the_gyro_is_named():
+    """u is logged 120 ms late, the gyro is not: mass within 5 %, its note tells of the lag, and the cause is named."""
+    vehicle, some = trials("bluerov2_heavy", "surge", "heave", "yaw")
+    late = []
+    for t in some:
+        shifted = {n: np.interp(t.t - 0.12, t.t, c) if n in "uvw" else c for n, c in t.channels.items()}
+        late.append(replace(t, channels=shifted))
+    late = without(late, "x", "y", "z", "depth", "ax", "ay", "az")
+    fit = regress(late, vehicle)
+    assert fit.quality["surge"]["delay"] == pytest.approx(0.12, abs=0.02)
+    assert fit.estimates["surge.m_eff"].estimate == pytest.approx(truth(vehicle)["surge.m_eff"], rel=0.05)
+    low, high = fit.estimates["surge.m_eff"].ci95
+    assert low < truth(vehicle)["surge.m_eff"] < high
+    assert "lags the file's motors" in fit.estimates["surge.m_eff"].note
+    assert any("velocity seems to be logged 0.1" in w for w in fit.warnings)
+    assert not any("velocity seems" in w for w in regress(some, vehicle).warnings)
+
+
 def test_all_axes_moving_at_once():
     """A multi-sine on all axes: Coriolis terms and couplings of the file are taken off by the measured motion."""
     vehicle, some = trials("bluerov2_heavy", *AXES, kind="multisine")
@@ -206,6 +224,20 @@ def test_a_motion_that_the_wrench_does_not_explain_writes_nothing():
         assert "explains nothing" in estimate.note or "finds no inertia" in estimate.note
     assert not any(".2.2" in path or path.startswith("body.") for path in fit.changes)
     assert any(path.endswith("added_mass.5.5") for path in fit.changes)  # yaw is as good as ever
+
+
+def test_tilted_samples_are_left_out_unless_the_other_axes_are_fitted():
+    """Surge steps pitch bluerov2 to 80°: with a wrong file, surge alone is not believed."""
+    vehicle, some = trials("bluerov2", "surge", "sway", "heave", "yaw")
+    added = 0.5 * vehicle.hydrodynamics["calibrated"].added_mass
+    wrong = vehicle.replace({"hydrodynamics.calibrated.added_mass": added.tolist()})
+    alone = regress(some, wrong, axes=["surge", "yaw"])
+    assert any("surge" in w and "beyond 25°, were left out" in w for w in alone.warnings)
+    assert not alone.estimates["surge.m_eff"].identifiable
+    assert not any(".0.0" in path for path in alone.changes)
+    assert alone.estimates["yaw.m_eff"].identifiable
+    together, expected = regress(some, wrong), truth(vehicle)
+    assert together.estimates["surge.m_eff"].estimate == pytest.approx(expected["surge.m_eff"], rel=0.03)
 
 
 def test_damping_is_written_as_a_pair_or_not_at_all():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +13,13 @@ from finssim.calibration.axis_fit import AxisData, informative
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.inputs import drive
 from finssim.calibration.plant_terms import Matrices
-from finssim.calibration.rows import axis_rows, kernel, signals
+from finssim.calibration.rows import Signals, axis_rows, kernel, signals
 from finssim.calibration.signals import Motion, motion
 from finssim.calibration.trial import Trial
 from finssim.geometry.rotations import quat_inverse_rotate
 from finssim.vehicles import AXES, Vehicle
 
-__all__ = ["Prepared", "axis_data", "excited", "prepare"]
+__all__ = ["Prepared", "axis_data", "excited", "later", "prepare"]
 
 Array = NDArray[np.float64]
 
@@ -36,6 +36,14 @@ HALF_WIDTH = (0.5, 0.25)
 
 QUIET = 0.02
 """Noise of the velocity, as a part of its range, that needs no smoothing before |nu| nu is formed."""
+
+
+LARGEST_TILT = 25.0
+"""Beyond it samples of surge, sway, heave and yaw rest on the other axes [deg] (published procedure: 20)."""
+
+
+WORTH_SAYING = 0.1
+"""Share of tilted samples that were kept from which a warning says so."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,8 +94,6 @@ def _up(trial: Trial, found: Motion) -> Array:
 
 
 def _with_wrench(found: Motion, tau: Array) -> Motion:
-    from dataclasses import replace
-
     return replace(found, tau=tau)
 
 
@@ -118,7 +124,7 @@ def _span(tau: Array, vehicle: Vehicle) -> Array:
 
 
 def axis_data(
-    axis: int, prepared: Sequence[Prepared], plants: Sequence[Matrices]
+    axis: int, prepared: Sequence[Prepared], plants: Sequence[Matrices], *, keep_tilted: bool = False
 ) -> tuple[AxisData | None, list[str]]:
     """Rows of one axis from the trials that excite it.
 
@@ -126,19 +132,23 @@ def axis_data(
         axis: 0 surge to 5 yaw.
         prepared: The trials.
         plants: The vehicle in the water of each.
+        keep_tilted: Whether samples beyond `LARGEST_TILT` stay: where the axes that they depend on are fitted too.
 
     Returns:
-        None where no trial can be used; and why each of those that cannot.
+        None where no trial can be used; and sentences on what was left out.
     """
-    reasons, kept = [], []
+    said, kept, tilted = [], [], 0.0
     for one, plant in zip(prepared, plants, strict=True):
         found, name = one.motion, one.trial.name
         if not np.isfinite(found.nu[:, axis]).any():
-            reasons.append(f"{name}: no {AXES[axis]} velocity, measured or derived")
+            said.append(f"left out: {name}: no {AXES[axis]} velocity, measured or derived")
         elif axis in (3, 4) and not np.isfinite(found.quaternion).any():
-            reasons.append(f"{name}: {AXES[axis]} needs the attitude for its restoring moment")
+            said.append(f"left out: {name}: {AXES[axis]} needs the attitude for its restoring moment")
         else:
             kept.append(signals(name, found, one.up, plant, current=one.current))
+    if axis not in (3, 4):
+        kept, tilted, note = _level(kept, keep_tilted)
+        said += note
     spread = [_noise_and_range(s.nu[s.usable, axis]) for s in kept]
     largest = max((r for _, r in spread), default=0.0)
     out = []
@@ -150,19 +160,62 @@ def axis_data(
         )
         rows = axis_rows(s, axis, kernels)
         if rows is None:
-            reasons.append(f"{s.name}: no stretch of {len(kernels.phi) / s.rate:.1f} s without a gap")
+            said.append(f"left out: {s.name}: no stretch of {len(kernels.phi) / s.rate:.1f} s without a gap")
         elif informative(rows, s).sum() < FEWEST_ROWS:
-            reasons.append(f"{s.name}: hardly any wrench or motion on {AXES[axis]}")
+            said.append(f"left out: {s.name}: hardly any wrench or motion on {AXES[axis]}")
         else:
             out.append((s, rows, kernels))
     if not out:
-        return None, reasons
+        return None, said
     return AxisData(
         axis=axis,
         signals=tuple(s for s, _, _ in out),
         rows=tuple(r for _, r, _ in out),
         kernels=tuple(k for _, _, k in out),
-    ), reasons
+        tilted=tilted,
+    ), said
+
+
+def later(data: AxisData, by: float) -> AxisData:
+    """The same with the wrench put later by a time [s], as the motion was recorded; the column of `delay` has the rest.
+
+    That column alone is right to first order only, which a tenth of a second is too long for.
+    """
+    moved, rows = [], []
+    for s, own, kernels in zip(data.signals, data.rows, data.kernels, strict=True):
+        known = np.isfinite(s.left[:, data.axis])
+        left = s.left.copy()
+        if known.any():
+            line = np.interp(s.t - by, s.t[known], s.left[known, data.axis])
+            left[:, data.axis] = np.where(known, line, np.nan)
+        moved.append(replace(s, left=left))
+        rows.append(axis_rows(moved[-1], data.axis, kernels) or own)
+    return replace(data, signals=tuple(moved), rows=tuple(rows), shift=data.shift + by)
+
+
+def _level(found: list[Signals], keep: bool) -> tuple[list[Signals], float, list[str]]:
+    """Without samples at large tilt, the share of those, and a sentence where there were any.
+
+    There weight, Coriolis forces and the other axes' drag are as large as the thrust; the file knows them at best.
+    """
+    level = [~(s.up[:, 2] < np.cos(np.radians(LARGEST_TILT))) for s in found]
+    inside = [s.usable & s.wanted for s in found]
+    total = sum(int(own.sum()) for own in inside)
+    beyond = sum(int((own & ~flat).sum()) for own, flat in zip(inside, level, strict=True))
+    if not beyond:
+        return found, 0.0, []
+    share = f"{100.0 * beyond / total:.0f} %" if beyond >= 0.01 * total else "less than 1 %"
+    if keep and beyond < WORTH_SAYING * total:
+        return found, 0.0, []
+    if keep:
+        note = (
+            f"{share} of the samples are at a tilt beyond {LARGEST_TILT:.0f}°; they were kept, as the axes that they "
+            "depend on are fitted too, but the intervals are then somewhat too sure"
+        )
+        return found, 0.0, [note]
+    cut = [replace(s, usable=s.usable & flat) for s, flat in zip(found, level, strict=True)]
+    said = [f"{share} of the samples, at a tilt beyond {LARGEST_TILT:.0f}°, were left out"]
+    return cut, beyond / total, said
 
 
 def _noise_and_range(nu: Array) -> tuple[float, float]:

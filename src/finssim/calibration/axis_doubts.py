@@ -9,7 +9,7 @@ from finssim.calibration.axis_fit import TERMS, AxisData
 from finssim.calibration.selection import Selection
 from finssim.vehicles import AXES
 
-__all__ = ["damping_known", "doubts", "quality", "speed_range", "worthless"]
+__all__ = ["LARGE_DELAY", "damping_known", "doubts", "late_velocity", "quality", "speed_range", "worthless"]
 
 Array = NDArray[np.float64]
 
@@ -18,6 +18,12 @@ M, D1, D2, DELAY = (TERMS.index(name) for name in ("m_eff", "d1", "d2", "delay")
 EXPLAINED = 0.2
 """R² below which the model of an axis explains nothing: at 0 the mean of the wrench does as well."""
 
+SEPARATE = 0.05
+"""By how much velocity has to lag the rates to be named [s]."""
+
+MOST_TILTED = 0.4
+"""Share of samples at large tilt beyond which what remains is not believed: pitching fast through level."""
+
 USEFUL = 0.5
 """Half width of the interval of a damping force, as a part of it, up to which it is written: better than a guess."""
 
@@ -25,10 +31,11 @@ LARGE_DELAY = 0.02
 """Lag of the motion behind the wrench worth a warning [s]."""
 
 
-def worthless(figures: dict[str, float], chosen: Selection) -> str:
+def worthless(data: AxisData, figures: dict[str, float], chosen: Selection) -> str:
     """Why nothing that was found of an axis can be believed; empty where it can.
 
     Args:
+        data: Its trials.
         figures: `quality`.
         chosen: Its model.
     """
@@ -36,6 +43,11 @@ def worthless(figures: dict[str, float], chosen: Selection) -> str:
         return f"the model explains nothing of this axis' wrench: R² {figures['r2']:.2f}"
     if not chosen.fit.theta[M] > 0.0:
         return f"the fit finds no inertia on this axis: free, it would be {chosen.fit.free[M]:.3g}"
+    if data.tilted > MOST_TILTED:
+        return (
+            f"{100.0 * data.tilted:.0f} % of the samples are at large tilt, where the file's numbers for other axes "
+            "decide: fit surge, sway and heave together, or push less"
+        )
     return ""
 
 
@@ -104,7 +116,7 @@ def quality(data: AxisData, chosen: Selection) -> dict[str, float]:
         "independent": float(fit.independent),
         "speed_low": low,
         "speed_high": high,
-        "delay": float(fit.theta[DELAY]),
+        "delay": float(fit.theta[DELAY] + data.shift),
         **{f"p_{name}": value for name, value in chosen.p_value.items()},
     }
 
@@ -112,11 +124,11 @@ def quality(data: AxisData, chosen: Selection) -> dict[str, float]:
 def doubts(axis: str, data: AxisData, chosen: Selection) -> list[str]:
     """Sentences for the report on what may be wrong with the fit of an axis."""
     fit, out = chosen.fit, []
-    lag = chosen.interval[DELAY]
-    if abs(fit.theta[DELAY]) > LARGE_DELAY and (lag[0] > 0.0 or lag[1] < 0.0):
+    lag, value = chosen.interval[DELAY] + data.shift, fit.theta[DELAY] + data.shift
+    if abs(value) > LARGE_DELAY and (lag[0] > 0.0 or lag[1] < 0.0):
         out.append(
-            f"{axis}: the motion {'lags' if fit.theta[DELAY] > 0 else 'leads'} the recorded wrench by "
-            f"{abs(fit.theta[DELAY]) * 1e3:.0f} ms [{lag[0] * 1e3:.0f}, {lag[1] * 1e3:.0f}]; the fit allows for it, "
+            f"{axis}: the motion {'lags' if value > 0 else 'leads'} the recorded wrench by "
+            f"{abs(value) * 1e3:.0f} ms [{lag[0] * 1e3:.0f}, {lag[1] * 1e3:.0f}]; the fit allows for it, "
             "but check the clocks, or the delay and lag of the motors"
         )
     if not fit.instrumental:
@@ -140,3 +152,22 @@ def doubts(axis: str, data: AxisData, chosen: Selection) -> list[str]:
         words = ", ".join(AXES[j] for j in unknown)
         out.append(f"{axis}: the velocity of {words} is unknown; couplings with it were taken as zero")
     return out
+
+
+def late_velocity(figures: dict[str, dict[str, float]], *, explained: list[str]) -> list[str]:
+    """A sentence where surge, sway and heave lag the wrench by more than roll, pitch and yaw: two streams, two clocks.
+
+    Args:
+        figures: `quality` of every axis.
+        explained: Axes whose fit is worth something.
+    """
+    lags = [[figures[a]["delay"] for a in some if a in explained] for some in (AXES[:3], AXES[3:])]
+    if not all(lags):
+        return []
+    difference = float(np.median(lags[0]) - np.median(lags[1]))
+    if difference < SEPARATE:
+        return []
+    return [
+        f"the velocity seems to be logged {difference:.2f} s later than the gyro: look with `finssim trials check`, "
+        f"and give 'convert: {{time_offset: {{velocity: {-difference:.2f}}}}}'; the inertias become surer by it"
+    ]

@@ -34,6 +34,8 @@ GAP = np.full(1, np.nan)
 
 SET = "hydrodynamics.calibrated"
 
+LAG_NOTE = "and not a delay, the inertia may read too high: fit the motors first"
+
 BIAS_NOTE = (
     "a constant force; above zero it opposes motion in the positive direction, as damping does: tether, trim or the "
     "offset of a sensor"
@@ -89,7 +91,11 @@ def axis_result(data: AxisData, chosen: Selection, plant: Matrices) -> AxisResul
         out[found.name] = found
         return found
 
-    add("m_eff", M, "kg" if linear else "kg m²")
+    whole = add("m_eff", M, "kg" if linear else "kg m²")
+    lag = data.shift + theta[DELAY]
+    if data.shift and not fit.active[M]:
+        late = f"the motion lags the file's motors by {lag * 1e3:.0f} ms: if that is a lag of first order "
+        out[whole.name] = replace(whole, note="; ".join(filter(None, [whole.note, late + LAG_NOTE])))
     _added_mass(out, changes, warnings, axis, i, theta[M] - rigid, ends[M] - rigid, rigid)
     for name, term, family, unit_d in (
         ("d1", D1, "linear_damping", "N s/m" if linear else "N m s"),
@@ -120,7 +126,7 @@ def axis_result(data: AxisData, chosen: Selection, plant: Matrices) -> AxisResul
         warnings.append(f"{axis} damping rests on {speeds}, less than a decade")
     warnings += doubts(axis, data, chosen)
     figures = quality(data, chosen)
-    reason = worthless(figures, chosen)
+    reason = worthless(data, figures, chosen)
     if reason:
         out = {n: replace(e, identifiable=False, note=reason) for n, e in out.items()}
         changes = {}

@@ -42,6 +42,10 @@ class AxisData:
     signals: tuple[Signals, ...]
     rows: tuple[Rows, ...]
     kernels: tuple[Kernel, ...]
+    tilted: float = 0.0
+    """Share of the samples that were left out for their tilt."""
+    shift: float = 0.0
+    """Time by which the wrench was put later, beyond which `delay` is counted [s]."""
 
     @property
     def restoring(self) -> bool:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.axis_data import Prepared, axis_data, excited, prepare
-from finssim.calibration.axis_doubts import quality, worthless
+from finssim.calibration.axis_data import Prepared, axis_data, excited, later, prepare
+from finssim.calibration.axis_doubts import LARGE_DELAY, late_velocity, quality, worthless
 from finssim.calibration.axis_estimates import AxisResult, axis_result
 from finssim.calibration.axis_fit import TERMS, AxisData
 from finssim.calibration.degeneracy import degeneracy
@@ -28,6 +28,12 @@ Array = NDArray[np.float64]
 
 PASSES = 3
 """Rounds in which the couplings between axes are formed with the latest estimates."""
+
+LARGEST_SHIFT = 0.5
+"""Lag beyond which the wrench is not put later, but the trial doubted [s]."""
+
+TILTS_INTO = {0: {2}, 1: {2}, 2: {0, 1}, 5: {0, 1}}
+"""Axes whose coefficients decide an axis' motion at large tilt."""
 
 SETTLED = 2e-3
 """Change of the left side, as a part of it, below which another round is not needed."""
@@ -85,6 +91,7 @@ def regress(
     figures = {axis: result.quality for axis, result in results.items()}
     curves = [curve for result in results.values() for curve in result.curves]
     told = [axis for axis, result in results.items() if not result.worthless]
+    warnings += late_velocity(figures, explained=told)
     quiet = _passive(trials, vehicle, [i for i in wanted if AXES[i] not in told])
     if quiet is not None:
         estimates, changes, figures = (
@@ -144,28 +151,38 @@ def _fit_axes(
     plant, warnings = matrices(vehicle), list[str]()
     waters = [matrices(vehicle, one.trial.header.water.density) for one in prepared]
     active = excited(prepared, vehicle) if prepared else np.zeros((0, 6), bool)
+    fitted = {i for i in wanted if active[:, i].any()}
     chosen: dict[int, tuple[AxisData, Selection]] = {}
     for round_ in range(PASSES):
         settled, former = True, chosen
         chosen, warnings = {}, []
         for i in wanted:
             those = np.flatnonzero(active[:, i])
-            data, reasons = axis_data(i, [prepared[g] for g in those], [waters[g] for g in those])
-            warnings += [f"{AXES[i]}: left out: {reason}" for reason in reasons]
+            keep = TILTS_INTO.get(i, set()) <= fitted
+            data, said = axis_data(
+                i, [prepared[g] for g in those], [waters[g] for g in those], keep_tilted=keep
+            )
+            warnings += [f"{AXES[i]}: {sentence}" for sentence in said]
             if data is None:
                 if asked and not len(those):
                     warnings.append(f"{AXES[i]}: no trial excites it; the vehicle file keeps its numbers")
                 continue
+            if i in former and former[i][0].shift:
+                data = later(data, former[i][0].shift)
             if round_ and i in former and _same(former[i][0], data):
                 chosen[i] = (data, former[i][1])
                 continue
             settled = False
             chosen[i] = (data, select(data, damping))
+            lag = float(chosen[i][1].fit.theta[TERMS.index("delay")])
+            if not data.shift and LARGE_DELAY < abs(lag) < LARGEST_SHIFT:
+                data = later(data, lag)
+                chosen[i] = (data, select(data, damping))
         if settled:
             break
         for i, (data, selection) in chosen.items():
             m, d1, d2 = selection.fit.theta[:3]
-            if not worthless(quality(data, selection), selection):
+            if not worthless(data, quality(data, selection), selection):
                 plant = plant.with_axis(i, m - plant.M_RB[i, i], max(d1, 0.0), max(d2, 0.0))
                 waters = [w.with_axis(i, m - w.M_RB[i, i], max(d1, 0.0), max(d2, 0.0)) for w in waters]
     return chosen, plant, warnings

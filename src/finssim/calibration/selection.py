@@ -56,20 +56,26 @@ def select(data: AxisData, damping: str = "auto") -> Selection:
     terms[TERMS.index("k")] = data.restoring
     if damping in ("linear", "quadratic"):
         terms[D2 if damping == "linear" else D1] = False
-        fit = _without_needless_smoothing(data, fit_axis(data, terms))
-        return Selection(fit=fit, full=fit, dropped=(), p_value={}, interval=_interval(fit))
-    full = _without_needless_smoothing(data, fit_axis(data, terms))
+        smoothed = fit_axis(data, terms)
+        fit = _without_needless_smoothing(data, smoothed)
+        return Selection(
+            fit=fit, full=fit, dropped=(), p_value={}, interval=_with_lag(data, _interval(fit), smoothed)
+        )
+    smoothed = fit_axis(data, terms)
+    full = _without_needless_smoothing(data, smoothed)
     terms = full.terms.copy()
     p_value = {name: _p_value(full, TERMS.index(name)) for name in ("d1", "d2")}
     weak = [name for name, p in p_value.items() if p > AKAIKE]
     if damping == "both" or not weak:
-        return Selection(fit=full, full=full, dropped=(), p_value=p_value, interval=_interval(full))
+        interval = _with_lag(data, _interval(full), smoothed)
+        return Selection(fit=full, full=full, dropped=(), p_value=p_value, interval=interval)
     dropped = max(weak, key=lambda name: p_value[name])
     terms[TERMS.index(dropped)] = False
     fit = fit_axis(data, terms)
     wide, narrow = _interval(full), _interval(fit)
     hull = np.stack([np.fmin(wide[:, 0], narrow[:, 0]), np.fmax(wide[:, 1], narrow[:, 1])], axis=-1)
-    return Selection(fit=fit, full=full, dropped=(dropped,), p_value=p_value, interval=hull)
+    interval = _with_lag(data, hull, smoothed)
+    return Selection(fit=fit, full=full, dropped=(dropped,), p_value=p_value, interval=interval)
 
 
 def _without_needless_smoothing(data: AxisData, fit: AxisFit) -> AxisFit:
@@ -80,6 +86,19 @@ def _without_needless_smoothing(data: AxisData, fit: AxisFit) -> AxisFit:
     terms = fit.terms.copy()
     terms[term] = False
     return fit_axis(data, terms)
+
+
+def _with_lag(data: AxisData, interval: Array, smoothed: AxisFit) -> Array:
+    """Where the motion is late, nobody knows whether by a delay or by a lag of first order, which `smoothing` takes up.
+
+    The inertia's interval then holds both answers.
+    """
+    inertia = TERMS.index("m_eff")
+    if not data.shift or smoothed.active[inertia]:
+        return interval
+    out, other = interval.copy(), _interval(smoothed)[inertia]
+    out[inertia] = np.fmin(out[inertia, 0], other[0]), np.fmax(out[inertia, 1], other[1])
+    return out
 
 
 def _p_value(fit: AxisFit, term: int) -> float:
