@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from calibration.made_fits import SET, made_fit
-from finssim.calibration.calibrate import calibrated, concerns, kept, number_in
+from finssim.calibration.calibrate import calibrated, concerns, doubts, kept, number_in
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit_output import fit_json, print_fit, state_text
 from finssim.calibration.origins import number_origins
@@ -185,3 +185,22 @@ def test_a_part_of_the_drag_is_written_as_unsure():
     assert state_text(fit.estimates["yaw.d2"], fit, after) == "unsure"
     assert after.origin_of(f"{SET}.quadratic_damping.5").note == "95 % interval 0 to 9; rests on its bound"
     assert "yaw.d2" not in kept(fit, after)
+
+
+def test_what_holds_of_several_trials_is_said_once():
+    """Equal sentences about trials become one that names them; others stay as they are."""
+    fit = dataclasses.replace(
+        made_fit(),
+        warnings=(
+            "a: no heading",
+            "b: no heading",
+            "surge: c: left out",
+            "surge: d: left out",
+            "surge: too slow",
+        ),
+    )
+    assert doubts(fit, calibrated(fit))[:3] == [
+        "a, b: no heading",
+        "surge: c, d: left out",
+        "surge: too slow",
+    ]

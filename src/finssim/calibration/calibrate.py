@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,9 +14,9 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Estimate, Fit
 from finssim.calibration.origins import Path, file_tree, folded, leaves, numbers
 from finssim.provenance import provenance
-from finssim.vehicles import CalibrationRecord, Provenance, Vehicle, VehicleError, check_vehicle
+from finssim.vehicles import AXES, CalibrationRecord, Provenance, Vehicle, VehicleError, check_vehicle
 
-__all__ = ["calibrated", "concerns", "estimate_at", "kept", "number_in"]
+__all__ = ["calibrated", "concerns", "doubts", "estimate_at", "kept", "number_in"]
 
 
 SCALED = ("c_plus", "c_minus", "force_min", "force_max")
@@ -77,6 +78,28 @@ def kept(fit: Fit, vehicle: Vehicle) -> dict[str, float]:
         if before is not None and before == after and not estimate.identifiable:
             found[name] = before
     return found
+
+
+_OF_A_TRIAL = re.compile(rf"((?:{'|'.join(AXES)}): )?(?!(?:{'|'.join(AXES)}):)([^\s:]+): (.+)", re.DOTALL)
+
+
+def doubts(fit: Fit, vehicle: Vehicle) -> list[str]:
+    """The warnings of a fit and what speaks against its vehicle; what holds of several trials is said once.
+
+    Args:
+        fit: The fit.
+        vehicle: `calibrated(fit)`.
+    """
+    names: dict[str, list[str]] = {}
+    for sentence in fit.warnings:
+        match = _OF_A_TRIAL.fullmatch(sentence)
+        said = f"{match[1] or ''}{{}}: {match[3]}" if match else sentence
+        names.setdefault(said, []).extend([match[2]] if match else [])
+    grouped = []
+    for said, trials in names.items():
+        shown = ", ".join(trials[:3]) + (f" and {len(trials) - 3} more" if len(trials) > 3 else "")
+        grouped.append(said.replace("{}", shown, 1) if trials else said)
+    return [*grouped, *concerns(fit, vehicle)]
 
 
 def concerns(fit: Fit, vehicle: Vehicle) -> list[str]:

@@ -12,7 +12,7 @@ from typing import Any
 
 from rich.console import Console
 
-from finssim.calibration.calibrate import calibrated, concerns, kept
+from finssim.calibration.calibrate import calibrated, doubts, kept
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Fit
 from finssim.calibration.fit_output import fit_json, print_fit
@@ -243,7 +243,7 @@ def _progress() -> Iterator[Callable[..., None]]:
 def _finish(fit: Fit, places: _Places, command: str, as_json: bool) -> Vehicle:
     """Write and show; ends with KeyboardInterrupt where the fit was interrupted."""
     vehicle = calibrated(fit)
-    warnings = [*fit.warnings, *concerns(fit, vehicle)]
+    warnings = doubts(fit, vehicle)
     write_vehicle(vehicle, places.out)
     if places.report is not None:
         from finssim.calibration.report import write_report

@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from finssim.calibration.calibrate import calibrated, concerns
+from finssim.calibration.calibrate import calibrated, doubts
 from finssim.calibration.excitation import Programme, programmes
 from finssim.calibration.fit import Fit
 from finssim.calibration.regression import regress
@@ -112,7 +112,7 @@ def identify(folder: Path, name: str, *, seed: int, shown: Path | None = None) -
             write_trial(trial, folder / TRIALS / role / trial.name, format="parquet")
     fit = regress(recorded["fit"], rough, seed=seed)
     found = calibrated(fit)
-    warnings = (*fit.warnings, *concerns(fit, found))
+    warnings = tuple(doubts(fit, found))
     found = _named(
         found,
         f"{name} as identified",
