@@ -21,7 +21,8 @@ class Decays:
             np.array([1.3]), rng.normal(size=(segments // 2, 1)), rng.uniform(1, 2, (segments, 1))
         )
         self.low, self.high = np.array([low]), np.array([10.0])
-        self.prior_std, self.prior_precision = np.full((segments, 1), 100.0), np.zeros(1)
+        self.prior_std = np.full((segments, 1), 100.0)
+        self.prior_mean, self.prior_precision = np.zeros(1), np.zeros(1)
         self.judged = 1
         self.size = noise
         clean = self.predicted(Point(*(part[None] for part in self.truth)))[:, 0]

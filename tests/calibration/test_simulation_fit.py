@@ -55,11 +55,11 @@ CASES = {
     "finsrov, sensors at 50 Hz": ("finsrov", ("surge", "yaw"), {}, 0.05),
     "finsrov, wrench and velocity at 5 Hz": (
         "finsrov",
-        ("surge", "yaw"),
+        ("surge", "sway", "yaw"),
         {"rate": 5.0, "columns": ("u", "v", "w", "p", "q", "r"), "inputs": ("wrench",)},
         0.10,
     ),
-    "bluerov2, commanded thrusters": ("bluerov2", ("sway",), {"inputs": ("command",)}, 0.05),
+    "bluerov2, commanded thrusters": ("bluerov2", ("sway", "yaw"), {"inputs": ("command",)}, 0.08),
     "bluerov2_heavy, gyro and attitude": (
         "bluerov2_heavy",
         ("roll", "yaw"),

@@ -60,7 +60,7 @@ class Coupled:
         typical = 0.1 * np.diag(M)[E]
         has_linear = np.array([p.damping[a] != "quadratic" for a in p.axes])
         has_quadratic = np.array([p.damping[a] != "linear" for a in p.axes])
-        self.linear = np.flatnonzero(has_linear)
+        self.linear: list[int] = np.flatnonzero(has_linear).tolist()
         self.T = np.sqrt(np.maximum(np.diag(D1), typical))
         block = (0.5 * (D1 + D1.T) - self.damping_offset) / np.outer(self.T, self.T)
         values, vectors = np.linalg.eigh(block)
@@ -68,7 +68,7 @@ class Coupled:
         block = (vectors * np.maximum(values, 0.05)) @ vectors.T
         self.damping_start = _factors(block)
         self.skew_start = 0.5 * (D1 - D1.T) / np.outer(self.T, self.T)
-        self.quadratic = np.flatnonzero(has_quadratic)
+        self.quadratic: list[int] = np.flatnonzero(has_quadratic).tolist()
         self.d2_start = np.maximum(np.diag(p.D2)[E], typical)
         self.d2_low = 1e-4 * typical
         self.bound = 1.0 / max(len(self.quadratic) - 1, 1)
@@ -112,7 +112,7 @@ class Coupled:
         parts = {kind: np.zeros((W, n, n)) for kind in "MLWdc"}
         for column, (kind, _, i, j, *_) in enumerate(self._slots()):
             parts[kind][:, i, j] = x[:, column]
-        block = np.ix_(range(W), self.E, self.E)
+        block = np.ix_(np.arange(W), self.E, self.E)
         M_A[block] = _product(parts["M"]) * np.outer(self.S, self.S) + self.mass_offset
         skew = parts["W"] - np.swapaxes(parts["W"], 1, 2)
         D1[block] = (_product(parts["L"]) + skew) * np.outer(self.T, self.T) + self.damping_offset

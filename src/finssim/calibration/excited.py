@@ -14,7 +14,7 @@ from finssim.engine.plant_arrays import twist_shift
 from finssim.vehicles import AXES, Vehicle, VehicleError
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 
-__all__ = ["TELL", "carried", "compared", "excited", "horizon", "observable", "sampling", "speeds", "telling"]
+__all__ = ["TELL", "compared", "excited", "horizon", "observable", "sampling", "speeds", "telling"]
 
 Array = NDArray[np.float64]
 
@@ -30,9 +30,6 @@ TELL = {
 
 DRIFTING = {"x": "u", "y": "v", "yaw": "r"}
 """Integrals without a restoring force: where the rate is measured they add drift, not knowledge."""
-
-CARRIED = 3.0
-"""Range of a velocity, against the least answer, above which the momentum of an imposed axis may matter."""
 
 SEEN = 0.9
 """Part of a segment for which a velocity has to be known to be imposed."""
@@ -96,8 +93,8 @@ def _moved(s: Streams, vehicle: Vehicle) -> set[str]:
         limits = vehicle.wrench_limits
     except VehicleError:
         limits = np.zeros(6)
-    tau = s.motion.tau @ np.linalg.inv(twist_shift(vehicle.wrench_reference))
-    out = set()
+    tau = s.motion.tau @ np.linalg.inv(twist_shift(list(vehicle.wrench_reference)))
+    out: set[str] = set()
     for i, axis in enumerate(AXES):
         nu = s.motion.nu[:, i]
         noise = s.motion.noise_std[i]
@@ -124,18 +121,6 @@ def speeds(motions: Sequence[Motion], axis: str) -> tuple[float, float]:
         if len(moving)
         else (0.0, 0.0)
     )
-
-
-def carried(trials: Sequence[Streams], axes: Sequence[str]) -> tuple[str, ...]:
-    """Axes besides `axes` that are seen to move so much that their momentum may matter."""
-    out = []
-    for i, axis in enumerate(AXES):
-        ranges = [_range(s.motion.nu[:, i]) for s in trials]
-        noise = [s.motion.noise_std[i] if np.isfinite(s.motion.noise_std[i]) else 0.0 for s in trials]
-        moved = [r > max(CARRIED * ANSWER[i], 6.0 * n) for r, n in zip(ranges, noise, strict=True)]
-        if axis not in axes and any(moved):
-            out.append(axis)
-    return tuple(out)
 
 
 def horizon(

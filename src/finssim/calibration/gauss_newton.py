@@ -51,8 +51,10 @@ class Problem(Protocol):
     """Box of theta, (P,)."""
     prior_std: Array
     """Of z around zero, (S, q)."""
+    prior_mean: Array
+    """What is known of theta beforehand, (P,)."""
     prior_precision: Array
-    """Of theta around zero, one over its variance; 0 where nothing is known beforehand, (P,)."""
+    """One over its variance; 0 where nothing is known, (P,)."""
     judged: int
     """How many of theta, from the first, have to be accurate; the rest are there for their sake."""
 
@@ -94,7 +96,7 @@ def costs_of(problem: Problem, residual: Array, std: Array, z: Array, cut: float
 def cost_of(problem: Problem, residual: Array, std: Array, point: Point, cut: float = CUT) -> float:
     """Half the loss of one point with residuals (N,)."""
     own = costs_of(problem, residual[:, None], std, point.z[None], cut)
-    return float(own.sum() + 0.5 * problem.prior_precision @ point.theta**2)
+    return float(own.sum() + 0.5 * problem.prior_precision @ (point.theta - problem.prior_mean) ** 2)
 
 
 def solve(
@@ -186,7 +188,7 @@ def _best(problem: Problem, trials: Point, std: Array, cut: float) -> tuple[int,
     """Which of `DAMPINGS` serves best where every segment chooses its own z, that point, and its cost."""
     own = costs_of(problem, problem.residuals(trials), std, trials.z, cut)
     own = own.reshape(len(DAMPINGS), len(OWN_DAMPINGS), -1)
-    prior = 0.5 * trials.theta[:: len(OWN_DAMPINGS)] ** 2 @ problem.prior_precision
+    prior = 0.5 * (trials.theta[:: len(OWN_DAMPINGS)] - problem.prior_mean) ** 2 @ problem.prior_precision
     total = own.min(axis=1).sum(axis=1) + prior
     best = int(np.argmin(total))
     choice = own[best].argmin(axis=0)
@@ -201,7 +203,7 @@ def _step(problem: Problem, blocks: Blocks, point: Point, damping: float) -> tup
     normal, right, _ = eliminate(blocks)
     A, g = scatter(normal, right, problem.groups, (P, G, b))
     A[np.arange(P), np.arange(P)] += problem.prior_precision
-    g[:P] -= problem.prior_precision * point.theta
+    g[:P] -= problem.prior_precision * (point.theta - problem.prior_mean)
     scale = np.sqrt(np.maximum(np.diag(A), 1e-30 + 1e-12 * np.diag(A).max()))
     A, g = A / np.outer(scale, scale) + (damping + 1e-9) * np.eye(len(g)), g / scale
     far = np.full(G * b, np.inf)

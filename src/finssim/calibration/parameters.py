@@ -98,7 +98,7 @@ class Parameters:
                 M nu_dot + D nu + b = tau.
             hydrodynamics: Which set of coefficients.
             start: Coordinate -> where it starts, in place of the vehicle file's number.
-            imposed: Axes whose motion is given: their added mass alone is free, for its momentum turns and pushes the
+            imposed: Axes that are not fitted: their added mass alone is free, for its momentum turns and pushes the
                 others. Their coordinates come last.
 
         Raises:
@@ -121,7 +121,7 @@ class Parameters:
         self.damping, self.extras = damping, tuple(extras)
         self.biases = tuple(a for a in AXES if a in biases)
         self.r_h = np.asarray(chosen.reference_point, float)
-        self.H = twist_shift(self.r_h)
+        self.H = twist_shift(self.r_h.tolist())
         self.M_RB = np.linalg.inv(self.H).T @ vehicle.rigid_body_mass_matrix() @ np.linalg.inv(self.H)
         self.nominal = vehicle_parameters(vehicle, hydrodynamics)
         self.M_A = np.asarray(chosen.added_mass, float)

@@ -194,7 +194,7 @@ class Rollouts:
         for low, high in self._passes(C):
             part = {k: a if a.shape[0] == 1 else a[low:high] for k, a in arrays.items()}
             finite[low:high] = self._pass(high - low, part, {k: v[:, low:high] for k, v in out.items()})
-        return Response(t=self.step * np.arange(n + 1), finite=finite, **out)
+        return Response(t=np.asarray(self.step * np.arange(n + 1)), finite=finite, **out)
 
     def _passes(self, candidates: int) -> Iterator[tuple[int, int]]:
         n, S = self._force.shape[:2]

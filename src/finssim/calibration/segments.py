@@ -175,7 +175,7 @@ def _stretches(s: Streams, start: float) -> list[tuple[float, float]]:
 def _segment(s: Streams, vehicle: Vehicle, t0: float, steps: int, step: float, index: int) -> Segment:
     header, d = s.trial.header, s.drive
     memory = max(1, int(round(MEMORY / step)))
-    force = _told(d, t0 + step * np.arange(-memory, steps + 1))
+    force = _told(d, np.asarray(t0 + step * np.arange(-memory, steps + 1)))
     position, quaternion, nu, known = _start(s.motion, t0)
     measured = {}
     for column, (t, values) in s.measured.items():
@@ -244,9 +244,9 @@ def _start(m: Motion, t0: float) -> tuple[Array, Array, Array, NDArray[np.bool_]
 
     def nearest(values: Array) -> Array:
         rows = np.flatnonzero(np.isfinite(values[near]))
-        return (
-            values[near][rows[np.argmin(np.abs(m.t[near][rows] - t0))]] if len(rows) else np.float64(np.nan)
-        )
+        if not len(rows):
+            return np.asarray(np.nan)
+        return np.asarray(values[near][rows[np.argmin(np.abs(m.t[near][rows] - t0))]])
 
     nu = np.array([nearest(column) for column in m.nu.T])
     position = np.array([nearest(column) for column in m.position.T])

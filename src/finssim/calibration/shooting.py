@@ -74,12 +74,18 @@ class Shooting:
             moving_water="current.x" in parameters.names,
         )
         self.edges = self.measured.edges
-        self.judged = len(parameters.names) - len(parameters.imposed)
         self.groups = np.array([s.index for s in segments])
+        self.judged = len(parameters.names) - len(parameters.imposed)
         self.errors = SensorErrors(self.measured)
         far = np.full(len(self.errors.streams), LATEST)
         self.low, self.high = np.append(parameters.low, -far), np.append(parameters.high, far)
-        self.prior_precision = np.append(np.zeros(len(parameters.low)), 0.0 * far + LATE_STD**-2.0)
+        # Imposed axes have the file's inertia within a factor; streams tell the same time to hundredths of a second.
+        self.prior_mean = np.append(np.zeros(len(parameters.low)), 0.0 * far)
+        rows = [AXES.index(a) for a in parameters.imposed]
+        self.prior_mean[self.judged : len(parameters.low)] = np.diag(parameters.M_A)[rows]
+        imposed = np.arange(len(parameters.low)) >= self.judged
+        known = np.where(imposed, 1.0 / parameters.scale**2, 0.0)
+        self.prior_precision = np.append(known, 0.0 * far + LATE_STD**-2.0)
         if "thrust_delay" in parameters.names:
             # A common lag of all streams is a delay of the thrust: the first stream is the clock then.
             self.prior_precision[len(parameters.names)] = EXACT_CLOCK**-2.0

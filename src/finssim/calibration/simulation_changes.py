@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.calibration.axis_estimates import USEFUL
 from finssim.calibration.fit import Estimate
 from finssim.calibration.parameters import Parameters
-from finssim.calibration.simulation_estimates import CERTAIN
 from finssim.calibration.simulation_evidence import Findings
 from finssim.vehicles import AXES
 
@@ -48,7 +48,9 @@ def changes(
     written: dict[str, list[int]] = {"added_mass": [], "linear_damping": [], "quadratic_damping": []}
     for axis in axes:
         i = AXES.index(axis)
-        if found[f"{axis}.m_eff"].identifiable and found[f"{axis}.added_mass"].estimate > 0.0:
+        whole = found[f"{axis}.m_eff"]
+        half = 0.5 * (whole.ci95[1] - whole.ci95[0])
+        if half <= USEFUL * whole.estimate and found[f"{axis}.added_mass"].estimate > 0.0:
             written["added_mass"].append(i)
         if _force_known(p, x, evidence, axis, speed.get(axis, 0.0)):
             written["linear_damping"].append(i)
@@ -81,7 +83,7 @@ def changes(
 
 
 def _force_known(p: Parameters, x: Array, found: Findings, axis: str, speed: float) -> bool:
-    """Whether the damping force of an axis at a speed is known to `CERTAIN`."""
+    """Whether the damping force of an axis at a speed is known to `USEFUL`."""
     i = AXES.index(axis)
     unit = 1e-5 * np.maximum(np.abs(x), p.scale)
     points = np.concatenate([x[None], np.clip(x + np.diag(unit), p.low, p.high)])
@@ -95,4 +97,4 @@ def _force_known(p: Parameters, x: Array, found: Findings, axis: str, speed: flo
     if not np.isfinite(V).all():
         return False
     std = float(np.sqrt(max(slope[used] @ V @ slope[used], 0.0)))
-    return bool(force[0] > 0.0 and 2.0 * std < CERTAIN * force[0])
+    return bool(force[0] > 0.0 and 2.0 * std < USEFUL * force[0])

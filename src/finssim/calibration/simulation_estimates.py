@@ -8,16 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.calibration.axis_estimates import CERTAIN
 from finssim.calibration.fit import Estimate
 from finssim.calibration.parameters import Parameters
 from finssim.calibration.simulation_evidence import Findings
 
-__all__ = ["CERTAIN", "Quantity", "estimates", "quantities"]
+__all__ = ["Quantity", "estimates", "quantities"]
 
 Array = NDArray[np.float64]
-
-CERTAIN = 0.5
-"""Half width of an interval, as a part of the estimate, up to which a parameter counts as identifiable."""
 
 LAG_CERTAIN = 0.05
 """The same for a delay [s]."""
@@ -151,8 +149,9 @@ def spread(
     low = np.where(one, J[np.arange(len(J)), which] * p.low[which] + offset, -np.inf)
     ends[:, 0] = np.maximum(ends[:, 0], np.where(np.isnan(low), -np.inf, low))
     ends[~known] = [-np.inf, np.inf]
-    size = np.where(free > 0.0, free, 0.0) / np.maximum(std, 1e-300)
-    tail = np.where(np.isfinite(dof), t.sf(size, np.where(np.isfinite(dof), dof, 1.0)), norm.sf(size))
+    # Akaike's criterion compares likelihoods, hence independent errors: a term that is kept for nothing costs little.
+    alone_std = np.sqrt(np.einsum("qi,ij,qj->q", Jk, local, Jk))
+    tail = norm.sf(np.maximum(free, 0.0) / np.maximum(alone_std, 1e-300))
     return value, ends, np.where(known, 2.0 * tail, 1.0)
 
 

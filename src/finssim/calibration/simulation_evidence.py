@@ -77,12 +77,13 @@ def evidence_of(problem: Shooting, solution: Solution) -> Evidence:
     edges = np.searchsorted(group[order], np.arange(len(labels) + 1))
     normal, score = np.empty((len(labels), P, P)), np.empty((len(labels), P))
     for g in range(len(labels)):
-        rows = order[edges[g] : edges[g + 1]]
-        weighted = slopes[rows].T * weight[rows]
-        normal[g], score[g] = weighted @ slopes[rows], weighted @ linear.residual[rows]
-    # What is known of the clocks beforehand is one more witness.
+        those = order[edges[g] : edges[g + 1]]
+        weighted = slopes[those].T * weight[those]
+        normal[g], score[g] = weighted @ slopes[those], weighted @ linear.residual[those]
+    # What is known beforehand is one more witness.
     normal = np.concatenate([normal, np.diag(problem.prior_precision)[None]])
-    score = np.concatenate([score, -(problem.prior_precision * point.theta)[None]])
+    pull = problem.prior_precision * (problem.prior_mean - point.theta)
+    score = np.concatenate([score, pull[None]])
     return Evidence(names=problem.names, normal=normal, score=score, unit=unit)
 
 

@@ -13,7 +13,7 @@ from finssim.calibration.bordered import huber
 from finssim.calibration.coarse_search import coarse_search
 from finssim.calibration.degeneracy import degeneracy
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excited import TELL, carried, compared, horizon, sampling, speeds
+from finssim.calibration.excited import TELL, compared, horizon, sampling, speeds
 from finssim.calibration.fit import Fit
 from finssim.calibration.gauss_newton import Point, Solution, solve
 from finssim.calibration.parameters import EXTRAS, Parameters
@@ -82,7 +82,11 @@ class Stages:
     ) -> None:
         self.prepared, self.vehicle, self.axes, self.seed, self.say = prepared, vehicle, axes, seed, say
         self.base = vehicle.replace(start.changes) if start is not None and start.changes else vehicle
-        self.given, self.imposed = length, carried(prepared, axes)
+        self.given = length
+        # The added mass of axes that are not fitted pushes and turns the others; roll's and pitch's hardly does.
+        self.imposed = tuple(a for a in ("surge", "sway", "heave", "yaw") if a not in axes)
+        apart = [float(np.median(np.diff(s.drive.t))) for s in prepared if not s.drive.held]
+        self.own_error = OWN_ERROR + BETWEEN * max([0.0, *(dt - STEP for dt in apart)])
         self.shorter: dict[str, float] = {}
         self.used: list[Streams] = []
         self.segments: list[Segment] = []
@@ -96,14 +100,8 @@ class Stages:
         self.biases = [] if self.trial_biases else biased
         self.guess = {} if start is None else {name: e.estimate for name, e in start.estimates.items()}
 
-    @property
-    def own_error(self) -> float:
-        """Error of the simulation itself, as a part of an estimate."""
-        apart = [float(np.median(np.diff(s.drive.t))) for s in self.prepared if not s.drive.held]
-        return OWN_ERROR + BETWEEN * max([0.0, *(dt - STEP for dt in apart)])
-
     def first(self, kinds: dict[str, str]) -> Stage:
-        """The first fit: short segments from a rough start, then segments of the length that the answer calls for."""
+        """Short segments from a rough start, then segments of the length that the answer calls for."""
         short = max(SHORT, 15.0 * sampling(self.prepared))
         self.cut(min(short, self.given or short))
         problem = self.problem(kinds, self.base, self.guess)
@@ -117,8 +115,7 @@ class Stages:
                 "the simulation diverges with the vehicle file's numbers: give better ones, or shorter segments "
                 f"(now {self.length:.3g} s)"
             )
-        p = problem.parameters
-        x = rough.point.theta[: len(p.names)]
+        p, x = problem.parameters, rough.point.theta[: len(problem.parameters.names)]
         if rough.interrupted:
             problem.hold_clocks(False)
             return Stage(problem, rough, findings(problem, rough))
@@ -167,14 +164,17 @@ class Stages:
         return Stage(problem, solution, findings(problem, solution))
 
     def report(self, words: str, toward: float) -> Callable[[int, float], None]:
-        """What to call with every iteration."""
         return lambda i, rms: self.say(f"{words}: iteration {i}, residual {rms:.4g} σ", toward)
 
     def cut(self, length: float) -> None:
         """Cut the trials into segments of about a length [s]."""
         tells = {column for axis in self.axes for column in TELL[axis]}
         cut = [
-            [compared(s, one.motion, self.axes) for s in self._segments(one, length)] for one in self.prepared
+            [
+                compared(s, one.motion, self.axes)
+                for s in segments(one, self.vehicle, length=length * self._part(one), step=STEP)
+            ]
+            for one in self.prepared
         ]
         kept = [[s for s in stretch if tells & set(s.measured)] for stretch in cut]
         self.length = length
@@ -188,8 +188,8 @@ class Stages:
         # Where every input is said to have acted, whoever asks for a lag doubts that.
         self.lagged = commanded if commanded.any() else np.ones_like(commanded)
 
-    def _segments(self, one: Streams, length: float) -> list[Segment]:
-        return segments(one, self.vehicle, length=length * self.shorter.get(one.trial.name, 1.0), step=STEP)
+    def _part(self, one: Streams) -> float:
+        return self.shorter.get(one.trial.name, 1.0)
 
     def problem(
         self, kinds: dict[str, str], base: Vehicle, start: dict[str, float], full: bool = False
@@ -256,9 +256,8 @@ class Stages:
         top = {axis: speeds([s.motion for s in self.used], axis)[1] for axis in self.axes}
         sources = {s.drive.source for s in self.used}
         new = changes(p, x, found, stage.found, self.axes, top, scaled=sources <= {"rpm", "pwm"})
-        P = stage.problem.judged
-        local = stage.found.covariance.local[:P, :P]
-        correlation, sentences = degeneracy(p.names[:P], local, stage.found.free[:P])
+        P, local = stage.problem.judged, stage.found.covariance.local
+        correlation, sentences = degeneracy(p.names[:P], local[:P, :P], stage.found.free[:P])
         left_out = [one.trial.name for one in self.prepared if one not in self.used]
         warnings = [
             *warnings,
