@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from finssim.calibration.excitation import Programme, programmes
-from finssim.calibration.regression import regress
-from finssim.calibration.simulation_fit import fit_by_simulation
-from finssim.calibration.synthetic import simulate_programme
-from finssim.calibration.trial import Trial
-from finssim.calibration.trial_files import write_trial
+from finssim.calibration.excitation.programmes import Programme, programmes
+from finssim.calibration.excitation.synthetic import simulate_programme
+from finssim.calibration.regression.regress import regress
+from finssim.calibration.simulation.fit import fit_by_simulation
+from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial_files import write_trial
 from finssim.vehicles import load_vehicle
 
 AXES = "surge,sway,heave,yaw"

@@ -26,14 +26,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.excitation import Programme, programmes
+from finssim.calibration.excitation.programmes import Programme, programmes
+from finssim.calibration.excitation.recording import Recording, record
+from finssim.calibration.excitation.synthetic import simulate_programme, trials_of
 from finssim.calibration.fit import Estimate, Fit
-from finssim.calibration.recording import Recording, record
-from finssim.calibration.regression import regress
-from finssim.calibration.replay import replay
-from finssim.calibration.simulation_fit import fit_by_simulation
-from finssim.calibration.synthetic import simulate_programme, trials_of
-from finssim.calibration.trial import Trial
+from finssim.calibration.regression.regress import regress
+from finssim.calibration.replay.replay import replay
+from finssim.calibration.simulation.fit import fit_by_simulation
+from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.body import moved_to_origin
 

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.free_decay import Decay, free_decay
-from finssim.calibration.header import Header
-from finssim.calibration.passive import passive
-from finssim.calibration.trial import Trial
+from finssim.calibration.regression.free_decay import Decay, free_decay
+from finssim.calibration.regression.passive import passive
+from finssim.calibration.trials.header import Header
+from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import load_vehicle
 
 MOCAP = ("", "x", "y", "z", "qx", "qy", "qz", "qw")

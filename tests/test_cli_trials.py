@@ -5,7 +5,7 @@ import json
 import pytest
 
 from finssim import boundary
-from finssim.calibration.trial_files import load_trials
+from finssim.calibration.trials.trial_files import load_trials
 from finssim.cli import app
 from finssim.vehicles import load_vehicle
 

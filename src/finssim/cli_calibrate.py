@@ -67,7 +67,7 @@ def thruster(
     Example: finssim calibrate thruster T200-16V.csv --vehicle bluerov2 --out mine.yaml
     """
     start_warp()
-    from finssim.calibration.commands import calibrate_thruster as run
+    from finssim.calibration.output.commands import calibrate_thruster as run
 
     run(
         tables,
@@ -96,7 +96,7 @@ def motor(
     Example: finssim calibrate motor steps --vehicle mine.yaml --out mine.yaml
     """
     start_warp()
-    from finssim.calibration.commands import calibrate_motor as run
+    from finssim.calibration.output.commands import calibrate_motor as run
 
     run(trials, vehicle=vehicle, out=out, report=report, seed=seed, as_json=as_json)
 
@@ -153,7 +153,7 @@ def hydrodynamics(
     Example: finssim calibrate hydrodynamics trials/fit --vehicle mine.yaml --out fitted.yaml --report report
     """
     start_warp()
-    from finssim.calibration.commands import calibrate_hydrodynamics as run
+    from finssim.calibration.output.commands import calibrate_hydrodynamics as run
 
     run(
         trials,
@@ -197,7 +197,7 @@ def replay(
     Example: finssim replay trials/held-out --vehicle fitted.yaml --hydrodynamics calibrated --out replay
     """
     start_warp()
-    from finssim.calibration.replay import run_replay as run
+    from finssim.calibration.replay.replay import run_replay as run
 
     run(
         trials,

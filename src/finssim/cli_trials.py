@@ -44,7 +44,7 @@ def check(
 
     Example: finssim trials check trials --vehicle bluerov2
     """
-    from finssim.calibration.check import check as run
+    from finssim.calibration.check.check import check as run
 
     run(paths, vehicle=vehicle, as_json=as_json)
 
@@ -154,7 +154,7 @@ def excite(
     """
     wanted = _levels(levels)
     start_warp()
-    from finssim.calibration.excite import excite as run
+    from finssim.calibration.excitation.excite import excite as run
 
     folders = run(
         axes,

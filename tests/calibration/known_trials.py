@@ -2,11 +2,11 @@
 
 from functools import cache
 
-from finssim.calibration.excitation import programmes
-from finssim.calibration.measurement import NoiseProfile
-from finssim.calibration.plant_terms import matrices
-from finssim.calibration.recording import record
-from finssim.calibration.synthetic import trials_of
+from finssim.calibration.excitation.measurement import NoiseProfile
+from finssim.calibration.excitation.programmes import programmes
+from finssim.calibration.excitation.recording import record
+from finssim.calibration.excitation.synthetic import trials_of
+from finssim.calibration.regression.plant_terms import matrices
 from finssim.vehicles import AXES, load_vehicle
 
 NOISE = NoiseProfile(velocity_std=0.01, gyro_std=0.005, attitude_std=0.004)

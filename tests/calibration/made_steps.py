@@ -5,7 +5,7 @@ import math
 import numpy as np
 from scipy.signal import lfilter
 
-from finssim.calibration.trial import Trial
+from finssim.calibration.trials.trial import Trial
 
 RPM = math.pi / 30.0
 FINE = 2000.0

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from finssim.calibration.trial_files import load_trials
+from finssim.calibration.trials.trial_files import load_trials
 from finssim.control.policy import Policy
 from finssim.experiments import demo as demo_module
 from finssim.experiments.demo import demo

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from finssim.calibration.excitation import programmes
+from finssim.calibration.excitation.programmes import programmes
 from finssim.engine import Simulator
 from finssim.experiments.plants import PlantError
 from finssim.experiments.replay_plant import CoupledMatrix, load_replay_plant

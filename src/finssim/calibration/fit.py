@@ -22,8 +22,9 @@ class Estimate:
     """One parameter."""
 
     name: str
-    """`surge.m_eff`, `surge.added_mass`, `surge.d1`, `surge.d2`, `surge.bias`, `roll.k`, `buoyancy_excess`, `thrust_scale`,
-    `thrust_lag`, `thrust_delay`, `CC.c_plus`, ...; coupled terms `added_mass.surge.pitch`, `d1.sway.yaw`."""
+    """`surge.m_eff`, `surge.added_mass`, `surge.d1`, `surge.d2`, `surge.bias`, `roll.k`, `buoyancy_excess`,
+    `thrust_scale`, `thrust_lag`, `thrust_delay`, `CC.c_plus`, ...; coupled terms `added_mass.surge.pitch`,
+    `d1.sway.yaw`."""
     estimate: float
     ci95: tuple[float, float]
     """95 % interval; infinite or NaN ends where the data say nothing."""

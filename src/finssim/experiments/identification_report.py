@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from html import escape
 
-from finssim.calibration.calibrate import number_in
-from finssim.calibration.fit_output import interval_text, number_text, state_text
+from finssim.calibration.output.calibrate import number_in
+from finssim.calibration.output.fit_output import interval_text, number_text, state_text
 from finssim.experiments.identify import Identification
 from finssim.page import html_picture, html_table
 

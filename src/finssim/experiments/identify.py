@@ -12,17 +12,17 @@ from typing import Any
 
 import yaml
 
-from finssim.calibration.calibrate import calibrated, doubts
-from finssim.calibration.excitation import Programme, programmes
+from finssim.calibration.excitation.programmes import Programme, programmes
+from finssim.calibration.excitation.synthetic import simulate_programme
 from finssim.calibration.fit import Fit
-from finssim.calibration.regression import regress
-from finssim.calibration.replay import Replay, replay
-from finssim.calibration.replay_figure import draw_response_envelopes
-from finssim.calibration.report import write_report
-from finssim.calibration.synthetic import simulate_programme
-from finssim.calibration.trial import Trial
-from finssim.calibration.trial_files import write_trial
-from finssim.calibration.vehicle_file import write_vehicle
+from finssim.calibration.output.calibrate import calibrated, doubts
+from finssim.calibration.output.report import write_report
+from finssim.calibration.output.vehicle_file import write_vehicle
+from finssim.calibration.regression.regress import regress
+from finssim.calibration.replay.figure import draw_response_envelopes
+from finssim.calibration.replay.replay import Replay, replay
+from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial_files import write_trial
 from finssim.experiments.plants import Plant, load_plant
 from finssim.quiet import start_warp
 from finssim.vehicles import HydrodynamicSet, Provenance, Vehicle, load_vehicle

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 
-from finssim.calibration.calibrate import calibrated
-from finssim.calibration.excitation import programmes
+from finssim.calibration.excitation.programmes import programmes
 from finssim.calibration.fit import Fit
-from finssim.calibration.regression import regress
-from finssim.calibration.replay import Replay, replay
-from finssim.calibration.replay_metrics import RESAMPLES, SEED
+from finssim.calibration.output.calibrate import calibrated
+from finssim.calibration.regression.regress import regress
+from finssim.calibration.replay.metrics import RESAMPLES, SEED
+from finssim.calibration.replay.replay import Replay, replay
 from finssim.experiments.replay_plant import ReplayPlant, load_replay_plant
 from finssim.experiments.replay_table import RESULT_FILE, print_table, write_results
 from finssim.files import atomic_directory, refuse_unwritable

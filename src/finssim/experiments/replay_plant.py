@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from finssim.calibration.excitation import Programme
-from finssim.calibration.recording import Recording, record
-from finssim.calibration.synthetic import trials_of
-from finssim.calibration.trial import Trial
+from finssim.calibration.excitation.programmes import Programme
+from finssim.calibration.excitation.recording import Recording, record
+from finssim.calibration.excitation.synthetic import trials_of
+from finssim.calibration.trials.trial import Trial
 from finssim.engine import Simulator, TetherLine
 from finssim.engine.plant_arrays import twist_shift
 from finssim.experiments.plants import PlantError

@@ -11,10 +11,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from finssim.calibration.replay_figure import MODEL_LABELS, draw_response_envelopes
-from finssim.calibration.replay_json import DEFINITION
-from finssim.calibration.replay_pairs import Pair
-from finssim.calibration.vehicle_file import write_vehicle
+from finssim.calibration.output.vehicle_file import write_vehicle
+from finssim.calibration.replay.as_json import DEFINITION
+from finssim.calibration.replay.figure import MODEL_LABELS, draw_response_envelopes
+from finssim.calibration.replay.pairs import Pair
 from finssim.files import atomic_directory
 from finssim.vehicles import Vehicle
 

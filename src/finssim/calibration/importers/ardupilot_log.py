@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.trial import Array
+from finssim.calibration.trials.trial import Array
 
 __all__ = ["DATAFLASH", "Log", "read_log"]
 

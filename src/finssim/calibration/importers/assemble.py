@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from finssim.calibration.columns import NU
-from finssim.calibration.conversion import in_our_frames, tidy_quaternions
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.header import Conversion, Header
 from finssim.calibration.importers.column_map import ColumnMap
 from finssim.calibration.importers.source_map import Frame
 from finssim.calibration.importers.streams import Stream, Table
 from finssim.calibration.importers.units import GRAVITY
-from finssim.calibration.trial import PHASES, Array, Trial
+from finssim.calibration.trials.columns import NU
+from finssim.calibration.trials.conversion import in_our_frames, tidy_quaternions
+from finssim.calibration.trials.header import Conversion, Header
+from finssim.calibration.trials.trial import PHASES, Array, Trial
 from finssim.geometry.frames import FROM_FOSSEN
 from finssim.geometry.rotations import quat_from_euler, quat_inverse_rotate
 from finssim.vehicles import load_vehicle

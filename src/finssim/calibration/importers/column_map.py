@@ -8,8 +8,8 @@ from typing import Any, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.header import Header
 from finssim.calibration.importers.source_map import SourceMap
+from finssim.calibration.trials.header import Header
 from finssim.vehicles.part import Part, did_you_mean, refuse_section
 from finssim.yaml_file import read_mapping
 

@@ -15,7 +15,7 @@ from finssim.calibration.importers.source_map import SourceMap
 from finssim.calibration.importers.split import split_table
 from finssim.calibration.importers.streams import Stream, merge
 from finssim.calibration.importers.tables import TABLES, read_table
-from finssim.calibration.trial import Trial
+from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import load_vehicle
 
 __all__ = ["FORMATS", "Format", "import_trials", "read_trials"]
@@ -54,7 +54,7 @@ def import_trials(
         CalibrationError: A log or map that cannot be used; nothing is written then.
         OutputError: A folder that holds other files, or cannot be written.
     """
-    from finssim.calibration.trial_files import write_trial
+    from finssim.calibration.trials.trial_files import write_trial
 
     trials = read_trials(paths, column_map=column_map, format=format, vehicle=vehicle, split=split)
     folders = []

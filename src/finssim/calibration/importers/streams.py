@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.time_base import SAME_ROW, merged, ordered
-from finssim.calibration.trial import Array
+from finssim.calibration.trials.time_base import SAME_ROW, merged, ordered
+from finssim.calibration.trials.trial import Array
 
 __all__ = ["Stream", "Table", "in_order", "merge"]
 
@@ -65,7 +65,8 @@ def in_order(stream: Stream, *, alone: bool) -> Stream:
     """The stream with strictly increasing times.
 
     Samples without a time are left out, late ones are sorted in, of samples with one time the first is kept. Where the
-    clock was set back, the rest follows after a gap if the stream is `alone` (`finssim.calibration.time_base.ordered`).
+    clock was set back, the rest follows after a gap if the stream is `alone`
+    (`finssim.calibration.trials.time_base.ordered`).
 
     Raises:
         CalibrationError: No samples, or a clock set back in one of several streams, which cannot be aligned again.

@@ -10,14 +10,14 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration import table_file
-from finssim.calibration.columns import column_of
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.importers.assemble import in_our_axes
 from finssim.calibration.importers.source_map import ColumnSource, PhaseColumn, SourceMap, TimeColumn
 from finssim.calibration.importers.streams import Stream
 from finssim.calibration.importers.units import TIME_UNITS, factor
-from finssim.calibration.trial import Array
+from finssim.calibration.trials import table_file
+from finssim.calibration.trials.columns import column_of
+from finssim.calibration.trials.trial import Array
 from finssim.vehicles.part import did_you_mean
 
 __all__ = ["TABLES", "read_table", "spoken", "values_of"]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from finssim.calibration.columns import column_of
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.trials.columns import column_of
 from finssim.vehicles.part import did_you_mean
 
 __all__ = ["EXTRA_COLUMNS", "TIME_UNITS", "factor"]

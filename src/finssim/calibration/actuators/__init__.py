@@ -1,0 +1,1 @@
+"""Thrust curves, speed controllers, motor responses and speed loops, from benches and step logs."""

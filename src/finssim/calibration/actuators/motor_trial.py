@@ -1,0 +1,165 @@
+"""Command and response of a thruster in a trial, in the quantity on which its lag acts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.calibration.actuators.steps import Step, find_steps
+from finssim.calibration.trials.trial import Trial
+from finssim.vehicles.thruster import Thruster
+
+__all__ = ["DOMAINS", "Motor", "levels_of", "motor_of", "steps_of", "thrusters_of"]
+
+Array = NDArray[np.float64]
+
+DOMAINS = ("force", "speed")
+"""Thrust [N] and shaft speed [rad/s]."""
+
+RPM = math.pi / 30.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motor:
+    """One thruster of one trial: what was asked and what came, thrust [N] or shaft speed [rad/s]."""
+
+    trial: str
+    command_times: Array
+    command: Array
+    held: Array
+    """The command as a speed (or pulse), in which small steps are as plain as large ones."""
+    t: Array
+    response: Array
+    asked: str
+    """Column of the command."""
+    measured: str
+    """Column of the response."""
+    same_unit: bool
+    """Whether command and response are the same quantity; pulses without an ESC's law are not."""
+    notes: tuple[str, ...] = ()
+
+
+def thrusters_of(trial: Trial) -> list[str]:
+    """Names of the thrusters of which a trial has a command and a response."""
+    names = {
+        column[len(prefix) :]
+        for column in trial.channels
+        for prefix in ("rpm_", "force_")
+        if column.startswith(prefix) and not column.startswith("rpm_command_")
+    }
+    return sorted(name for name in names if _columns(trial, name) is not None)
+
+
+def motor_of(trial: Trial, name: str, thruster: Thruster, domain: str) -> Motor | None:
+    """Command and response of a thruster.
+
+    Commands, the first that is there: `rpm_command_NAME` [rpm], `command_NAME` [N], `pwm_NAME` [µs], and `force_NAME`
+    where the header says that inputs are commanded and speeds are measured. Responses: `rpm_NAME`, else `force_NAME`.
+    Thrust and speed turn into each other by the thruster's curve. A response without sign gets the command's.
+
+    Returns:
+        None where the trial has not both.
+    """
+    columns = _columns(trial, name)
+    if columns is None:
+        return None
+    asked, measured = columns
+    notes = []
+    command_times, raw = trial.series(asked)
+    same_unit, held = True, raw
+    if asked.startswith("pwm_") and thruster.esc is None:
+        command, same_unit = raw - 1500.0, False
+        notes.append("pulses were taken as they are, for the vehicle file has no 'esc' of this thruster")
+    elif asked.startswith("pwm_"):
+        command = _as(domain, thruster.shaft_speed(raw, _voltage(trial, command_times)), thruster, "speed")
+    elif asked.startswith("rpm_"):
+        command = _as(domain, raw * RPM, thruster, "speed")
+    else:
+        command, held = _as(domain, raw, thruster, "force"), thruster.speed(raw)
+    t, raw = _without_spikes(*trial.series(measured), notes, measured)
+    if np.min(command) < 0.0 < np.max(raw) and np.min(raw) > -0.02 * np.max(raw):
+        sign = _last_sign(command)
+        latest = np.clip(np.searchsorted(command_times, t, side="right") - 1, 0, len(sign) - 1)
+        raw = np.abs(raw) * sign[latest]
+        notes.append(f"{measured} has no sign, that of the command was taken")
+    from_unit = "speed" if measured.startswith("rpm_") else "force"
+    response = _as(domain, raw * RPM if from_unit == "speed" else raw, thruster, from_unit)
+    return Motor(
+        trial=trial.name,
+        command_times=command_times,
+        command=command,
+        held=held,
+        t=t,
+        response=response,
+        asked=asked,
+        measured=measured,
+        same_unit=same_unit,
+        notes=tuple(notes),
+    )
+
+
+def _columns(trial: Trial, name: str) -> tuple[str, str] | None:
+    """Columns of command and response, or None."""
+    responses = [column for column in (f"rpm_{name}", f"force_{name}") if trial.has(column)]
+    commands = [c for c in (f"rpm_command_{name}", f"command_{name}", f"pwm_{name}") if trial.has(c)]
+    if not commands and trial.header.inputs == "commanded" and len(responses) == 2:
+        commands = [responses.pop()]
+    return (commands[0], responses[0]) if commands and responses else None
+
+
+def _without_spikes(t: Array, y: Array, notes: list[str], column: str) -> tuple[Array, Array]:
+    """Samples that stand alone, far from both neighbours, left out: a lost telegram, a zero in between."""
+    if len(y) < 5:
+        return t, y
+    left, right = y[1:-1] - y[:-2], y[1:-1] - y[2:]
+    jump = np.minimum(np.abs(left), np.abs(right)) * (np.sign(left) == np.sign(right))
+    scatter = 1.4826 * float(np.median(np.abs(np.diff(y))))
+    stray = np.r_[False, jump > max(10.0 * scatter, 0.2 * float(np.ptp(y))), False]
+    if np.any(stray):
+        notes.append(
+            f"{np.count_nonzero(stray)} samples of {column} stand alone far from their neighbours, left out"
+        )
+    return t[~stray], y[~stray]
+
+
+def _voltage(trial: Trial, times: Array) -> Array | float | None:
+    if trial.has("voltage"):
+        return np.interp(times, *trial.series("voltage"))
+    return trial.header.voltage
+
+
+def _as(domain: str, values: Array, thruster: Thruster, unit: str) -> Array:
+    if domain == unit:
+        return values
+    return thruster.thrust(values) if domain == "force" else thruster.speed(values)
+
+
+def _last_sign(command: Array) -> Array:
+    """Sign of the last command that was not zero, at every sample; until the first one, the first's."""
+    sign = np.sign(command)
+    known = np.flatnonzero(sign)
+    index = np.maximum.accumulate(np.where(sign != 0.0, np.arange(len(sign)), known[0]))
+    return np.asarray(sign[index])
+
+
+def steps_of(motor: Motor) -> list[Step]:
+    """Steps of the command, with their levels in the motor's domain."""
+    steps = []
+    for step in find_steps(motor.command_times, motor.held):
+        before = int(np.searchsorted(motor.command_times, step.start))
+        after = int(np.searchsorted(motor.command_times, step.time))
+        steps.append(step._replace(before=float(motor.command[before]), after=float(motor.command[after])))
+    return steps
+
+
+def levels_of(motor: Motor) -> list[tuple[float, float]]:
+    """Held commands and the response at the end of each."""
+    found = []
+    for step in steps_of(motor):
+        rows = (motor.t >= step.end - 0.4 * (step.end - step.time)) & (motor.t <= step.end)
+        if np.any(rows):
+            found.append((step.after, float(np.mean(motor.response[rows]))))
+    return found

@@ -1,0 +1,99 @@
+"""The signs of speeds and forces in a table, and the zero of its load cell."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.calibration.actuators.table_columns import Source
+from finssim.calibration.errors import CalibrationError
+
+__all__ = ["STANDING", "check_pulses", "signed", "without_offset"]
+
+Array = NDArray[np.float64]
+
+STANDING = 0.01
+"""Share of the fastest speed below which a shaft counts as standing."""
+
+
+def without_offset(full: dict[str, Array], speed_known: bool, neutral: float, notes: list[str]) -> Array:
+    """Forces less the median reading at standstill."""
+    force = full["force"]
+    if speed_known:
+        standing = np.abs(full["speed"]) <= STANDING * np.nanmax(np.abs(full["speed"]))
+    else:
+        standing = np.abs(full["pulse"] - neutral) <= 0.02 * neutral / 3.0
+    if not np.any(standing):
+        return force
+    offset = float(np.median(force[standing]))
+    if abs(offset) < 1e-3 * np.max(np.abs(force)):
+        return force
+    notes.append(f"the load cell reads {offset:.3g} N at standstill, taken off")
+    return force - offset
+
+
+def check_pulses(pulse: Array, shown: str) -> None:
+    known = pulse[np.isfinite(pulse) & (pulse != 0.0)]
+    if known.size and (known.min() < 500.0 or known.max() > 2500.0):
+        raise CalibrationError(
+            f"{shown}: pulses run from {known.min():g} to {known.max():g} µs, expected 500 to 2500 µs: give the right "
+            "column or unit, pulse=COLUMN=UNIT"
+        )
+
+
+def signed(
+    full: dict[str, Array],
+    speed_known: bool,
+    neutral: float,
+    sources: Mapping[str, Source],
+    shown: str,
+    notes: list[str],
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Speed and force with the sign of rotation, and the rows whose sign is known."""
+    speed, force, pulse = full["speed"], full["force"], full["pulse"]
+    small = STANDING * np.max(np.abs(force))
+    sign_pulse = np.sign(pulse - neutral) if np.any(np.isfinite(pulse)) else np.zeros_like(force)
+    force_signed = bool(np.any(force > small) and np.any(force < -small))
+    if sign_pulse.any() and np.nanmin(sign_pulse) < 0 < np.nanmax(sign_pulse) and not force_signed:
+        notes.append("forces have no sign in the table, taken from the pulse")
+        force, force_signed = np.abs(force) * np.nan_to_num(sign_pulse), True
+    if not speed_known:
+        _same_way(sign_pulse, force, small, ("pulse", "force"), sources, shown)
+        return speed, force, np.ones(force.shape, bool)
+    fastest = np.max(np.abs(speed))
+    turning = np.abs(speed) > STANDING * fastest
+    if np.any(speed < -STANDING * fastest) and np.any(speed > STANDING * fastest):
+        if not force_signed and not sign_pulse.any():
+            notes.append("forces have no sign in the table, taken from the speed")
+            force = np.abs(force) * np.sign(speed)
+        _same_way(np.sign(speed) * turning, force, small, ("speed", "force"), sources, shown)
+        return speed, force, np.ones(force.shape, bool)
+    sign = np.where(
+        np.isfinite(sign_pulse) & (sign_pulse != 0.0), sign_pulse, np.sign(force) * (np.abs(force) > small)
+    )
+    if np.any(sign < 0.0):
+        notes.append("speeds have no sign in the table, taken from the pulse or the force")
+    if sign_pulse.any():
+        _same_way(sign_pulse, force, small, ("pulse", "force"), sources, shown)
+    keep = ~turning | (sign != 0.0)
+    if not keep.all():
+        notes.append(
+            f"{np.count_nonzero(~keep)} rows left out: their force is too small to tell the speed's sign"
+        )
+    return np.abs(speed) * np.where(turning, sign, 1.0), force, keep
+
+
+def _same_way(
+    sign: Array, force: Array, small: float, names: tuple[str, str], sources: Mapping[str, Source], shown: str
+) -> None:
+    """Refuse a table in which most forces point against the speed or pulse."""
+    clear = (np.abs(force) > 5.0 * small) & (np.nan_to_num(sign) != 0.0)
+    against = np.count_nonzero(np.sign(force[clear]) != sign[clear])
+    if against > 0.5 * np.count_nonzero(clear):
+        header = sources[names[1]].header if names[1] in sources else names[1]
+        raise CalibrationError(
+            f"{shown}: {names[1]} is negative where {names[0]} is positive: say which of them to turn, such as "
+            f"{names[1]}=-{header}"
+        )

@@ -1,0 +1,1 @@
+"""What trials can and cannot tell, and what is wrong with them."""

@@ -1,0 +1,253 @@
+"""Excitation programmes: the wrenches a vehicle is driven with so that its motion tells its hydrodynamics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.calibration.errors import CalibrationError
+from finssim.vehicles import AXES, Vehicle
+from finssim.vehicles.vehicle import Axis
+
+__all__ = ["KINDS", "Programme", "programmes", "which_axes"]
+
+Array = NDArray[np.float64]
+
+KINDS = ("published", "validation", "multisine")
+
+RATE = 50.0
+"""Of the commands [Hz]."""
+
+STEP_SEQUENCE = (("rest", 1.0), ("baseline", 1.0), ("excitation", 9.0), ("coast", 2.0), ("rest", 1.0))
+"""Pre-zero, baseline, hold, rest, post-zero of the published procedure, by our phase words [s]."""
+
+PULSE_SEQUENCE = (("rest", 1.0), ("baseline", 1.0), ("excitation", 0.6), ("coast", 3.0), ("rest", 1.0))
+"""A pulse and its ring-down [s]."""
+
+PUBLISHED_LEVELS: dict[Axis, tuple[float, ...]] = {
+    "surge": (6.0, 12.0, 18.0),
+    "sway": (4.5, 9.0, 13.5),
+    "heave": (4.5, 9.0, 13.5),
+    "roll": (0.18, 0.36),
+    "pitch": (0.18, 0.36),
+    "yaw": (0.6, 1.2, 1.8),
+}
+"""FinsROV's identification procedure [N, N m]."""
+
+VALIDATION_LEVELS: dict[Axis, tuple[float, ...]] = {
+    "surge": (3.0, 6.0, 9.0, 12.0, 18.0),
+    "sway": (3.0, 6.0, 9.0, 12.0, 18.0),
+    "heave": (6.0, 9.0, 10.0, 12.0),
+    "roll": (0.5, 0.8, 1.0, 1.5),
+    "pitch": (1.0, 2.0, 3.0),
+    "yaw": (1.0, 2.0, 4.0, 6.0, 8.0),
+}
+"""FinsROV's validation sweeps [N, N m]."""
+
+FINSROV_LIMITS = (18.586585, 18.068824, 25.636077, 3.791353, 2.535180, 6.947713)
+"""Wrench limits of the vehicle that the published levels are for, order of `AXES` [N, N m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Programme:
+    """What to command over time. Row k is held over [t_k, t_k + 1/rate)."""
+
+    name: str
+    """Unique among the programmes made together; good as the name of a folder."""
+    axes: tuple[Axis, ...]
+    """Axes that it excites."""
+    rate: float
+    """[Hz]"""
+    tau_desired: Array
+    """Wrench about the vehicle's `wrench_reference`, body frame [N, N m], (n, 6)."""
+    phase: NDArray[np.str_]
+    """A word of `finssim.calibration.trials.trial.PHASES` for every row, (n,)."""
+    ascent_speed: float | None = None
+    """Where given, the coast may end early: once the vehicle has risen faster than this [m/s] for `ascent_time`."""
+    ascent_time: float = 2.0
+    """[s]"""
+
+    @property
+    def t(self) -> Array:
+        """Times of the rows from 0 [s], (n,)."""
+        return np.arange(len(self.phase)) / self.rate
+
+    @property
+    def duration(self) -> float:
+        """[s]"""
+        return len(self.phase) / self.rate
+
+
+def which_axes(words: str | Sequence[str], vehicle: Vehicle) -> tuple[Axis, ...]:
+    """Axes from words.
+
+    Args:
+        words: `all`, a comma-separated list such as `surge,yaw`, or a sequence of names.
+        vehicle: Its `controlled_axes` are what `all` means.
+
+    Raises:
+        CalibrationError: A word is no axis, is given twice, or the vehicle cannot control it.
+    """
+    given = [w.strip() for w in words.split(",")] if isinstance(words, str) else list(words)
+    if given == ["all"]:
+        return vehicle.controlled_axes
+    for word in given:
+        if word not in AXES:
+            raise CalibrationError(f"unknown axis '{word}'; available: all, {', '.join(AXES)}")
+        if word not in vehicle.controlled_axes:
+            able = ", ".join(vehicle.controlled_axes)
+            raise CalibrationError(f"{vehicle.name} cannot control {word}: its thrusters control {able}")
+    if len(set(given)) < len(given) or not given:
+        raise CalibrationError(f"axes are '{','.join(given)}', expected each axis once")
+    return tuple(axis for axis in AXES if axis in given)
+
+
+def programmes(
+    axes: str | Sequence[str],
+    vehicle: Vehicle,
+    *,
+    levels: Mapping[str, Sequence[float]] | Sequence[float] | None = None,
+    kind: str = "published",
+    repeats: int = 1,
+    seed: int = 0,
+    coast: float = 30.0,
+    duration: float = 60.0,
+    band: tuple[float, float] = (0.05, 1.0),
+    room: float | None = None,
+) -> list[Programme]:
+    """Programmes that excite some axes of a vehicle, in the order in which to run them.
+
+    `published` follows FinsROV's identification procedure: on every axis and in both directions, steps of 9 s on surge,
+    sway, heave and yaw, and pulses of 0.6 s with ring-down on roll and pitch. Downward heave steps are followed by a
+    coast of up to `coast` seconds, which shows buoyancy without thrust. `validation` are the finer steps with which
+    FinsROV was validated. `multisine` drives all axes at once, for coupled fits; see `multisine`.
+
+    Levels are FinsROV's, times the ratio of this vehicle's wrench limit to FinsROV's on that axis (two digits), and
+    never above the limit. Where `room` is given, the levels of a linear axis are brought down together until the
+    strongest step, with its coast, stays within it by the damping of the vehicle's file.
+
+    Args:
+        axes: As for `which_axes`.
+        vehicle: Whose limits count.
+        levels: Magnitudes for every axis, or by axis [N, N m]; for a multi-sine the peak. Both directions are driven.
+        kind: One of `KINDS`.
+        repeats: How often every programme comes.
+        seed: Of a multi-sine's phases.
+        coast: Longest coast after a dive [s].
+        duration: Of one multi-sine [s].
+        band: Of a multi-sine [Hz].
+        room: Longest way along a linear axis [m]; no bound where not given.
+
+    Raises:
+        CalibrationError: An axis, level, kind or count that cannot be.
+    """
+    chosen = which_axes(axes, vehicle)
+    if kind not in KINDS:
+        raise CalibrationError(f"unknown kind of programme '{kind}'; available: {', '.join(KINDS)}")
+    if repeats < 1:
+        raise CalibrationError(f"repeats is {repeats}, expected at least 1")
+    if room is not None and not room > 0.0:
+        raise CalibrationError(f"room is {room:g} m, expected a length above 0 m")
+    by_axis = {axis: _levels(axis, vehicle, levels, kind) for axis in chosen}
+    if kind == "multisine":
+        from finssim.calibration.excitation.multisine import multisine
+
+        peaks = {axis: values[-1] for axis, values in by_axis.items()}
+        return [
+            multisine(peaks, vehicle, index=r + 1, seed=seed + r, duration=duration, band=band, room=room)
+            for r in range(repeats)
+        ]
+    if not (math.isfinite(coast) and coast > 0.0):
+        raise CalibrationError(f"coast is {coast} s, expected a time above 0 s")
+    out = []
+    for axis in chosen:
+        if room is not None and AXES.index(axis) < 3:
+            given = levels.get(axis) if isinstance(levels, Mapping) else levels
+            by_axis[axis] = _in_room(room, by_axis[axis], given is not None, axis, vehicle)
+        for level in by_axis[axis]:
+            for sign in (1.0, -1.0):
+                out += [_step(axis, sign * level, kind, coast, r, repeats) for r in range(repeats)]
+    return out
+
+
+def _levels(
+    axis: Axis, vehicle: Vehicle, levels: Mapping[str, Sequence[float]] | Sequence[float] | None, kind: str
+) -> tuple[float, ...]:
+    """Magnitudes for one axis, ascending."""
+    limit = float(vehicle.wrench_limits[AXES.index(axis)])
+    unit = "N" if AXES.index(axis) < 3 else "N m"
+    given = levels.get(axis) if isinstance(levels, Mapping) else levels
+    if given is None:
+        table = VALIDATION_LEVELS if kind == "validation" else PUBLISHED_LEVELS
+        scale = limit / FINSROV_LIMITS[AXES.index(axis)]
+        if kind == "multisine":
+            return (0.5 * limit,)
+        if abs(scale - 1.0) < 0.01:
+            scale = 1.0
+        return tuple(sorted({min(_two_digits(scale * x), limit) for x in table[axis]}))
+    if not given:
+        raise CalibrationError(f"levels of {axis}: none given, expected at least one in {unit}")
+    for value in given:
+        if not (math.isfinite(value) and value > 0.0):
+            raise CalibrationError(
+                f"levels of {axis}: {value:g} {unit} cannot be, expected magnitudes above 0 {unit} "
+                "(both directions are driven)"
+            )
+        if value > limit * (1.0 + 1e-6):
+            raise CalibrationError(
+                f"levels of {axis}: {value:g} {unit} is beyond {vehicle.name}'s limit of {limit:.4g} {unit}"
+            )
+    return tuple(sorted({float(x) for x in given}))
+
+
+def _in_room(
+    room: float, levels: tuple[float, ...], given: bool, axis: Axis, vehicle: Vehicle
+) -> tuple[float, ...]:
+    """Levels of a linear axis that stay within `room`; given ones are refused rather than changed."""
+    from finssim.calibration.excitation.travel import travel, within
+
+    hold, after = (np.full(round(seconds * RATE), x) for seconds, x in ((9.0, levels[-1]), (3.0, 0.0)))
+    force = np.concatenate([hold, after])
+    if not given:
+        factor = within(room, force, RATE, axis, vehicle)
+        return levels if factor == 1.0 else tuple(sorted({float(f"{factor * x:.2g}") for x in levels}))
+    way = travel(force, RATE, axis, vehicle)
+    if way > room:
+        raise CalibrationError(
+            f"levels of {axis}: {levels[-1]:g} N would take {vehicle.name} {way:.3g} m, the room is {room:g} m: "
+            "give less"
+        )
+    return levels
+
+
+def _two_digits(x: float) -> float:
+    """x rounded to two significant digits, three where it starts with 1."""
+    digits = 2 if f"{x:e}"[0] == "1" else 1
+    return float(f"{x:.{digits}e}")
+
+
+def _step(axis: Axis, level: float, kind: str, coast: float, repeat: int, repeats: int) -> Programme:
+    """One step or pulse."""
+    pulse = kind == "published" and axis in ("roll", "pitch")
+    dive = kind == "published" and axis == "heave" and level < 0.0
+    sequence = PULSE_SEQUENCE if pulse else STEP_SEQUENCE
+    if dive:
+        sequence = (*STEP_SEQUENCE[:3], ("coast", coast), STEP_SEQUENCE[4])
+    counts = [round(seconds * RATE) for _, seconds in sequence]
+    phase = np.repeat(np.array([word for word, _ in sequence]), counts)
+    tau = np.zeros((len(phase), 6))
+    tau[phase == "excitation", AXES.index(axis)] = level
+    word = "dive" if dive else ("plus" if level > 0.0 else "minus")
+    name = f"{axis}_{word}_{abs(level):.4g}" + (f"_{repeat + 1}" if repeats > 1 else "")
+    return Programme(
+        name=name,
+        axes=(axis,),
+        rate=RATE,
+        tau_desired=tau,
+        phase=phase,
+        ascent_speed=0.01 if dive else None,
+    )

@@ -1,0 +1,1 @@
+"""From a trial's streams to velocities, accelerations and attitude on one grid."""

@@ -1,0 +1,287 @@
+"""What `finssim calibrate` runs: read, say what is left out, fit, write the vehicle, report."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from finssim.calibration.errors import CalibrationError
+from finssim.calibration.fit import Fit
+from finssim.calibration.output.calibrate import calibrated, doubts, kept
+from finssim.calibration.output.fit_output import fit_json, print_fit
+from finssim.calibration.output.vehicle_file import check_vehicle_path, write_vehicle
+from finssim.calibration.trials.trial import Trial
+from finssim.files import atomic_directory, atomic_write, refuse_unwritable
+from finssim.vehicles import AXES, Vehicle, load_vehicle
+
+__all__ = ["calibrate_hydrodynamics", "calibrate_motor", "calibrate_thruster", "usable"]
+
+METHODS = ("regression", "simulation")
+ONLY_SIMULATION = "needs --method simulation"
+
+
+def calibrate_thruster(
+    tables: Sequence[Path],
+    *,
+    vehicle: str,
+    out: Path,
+    group: str | None = None,
+    voltage: float | None = None,
+    pool_voltages: bool = False,
+    report: Path | None = None,
+    seed: int = 0,
+    as_json: bool = False,
+) -> Vehicle:
+    """Fit thrust curves to tables of a bench and write the vehicle; arguments as `calibrate_hydrodynamics`.
+
+    Args:
+        group: Propeller group that all tables speak about.
+        voltage: At which the numbers shall hold [V].
+        pool_voltages: Fit all voltages together.
+    """
+    places = _Places(out, report)
+    options = {"group": group, "voltage": voltage, "pool_voltages": pool_voltages}
+    command = _command("thruster", tables, vehicle=vehicle, out=out, report=report, seed=seed, **options)
+    body = load_vehicle(vehicle)
+    from finssim.calibration.actuators.thruster import fit_thruster
+
+    fit = fit_thruster(
+        list(tables), body, group=group, voltage=voltage, pool_voltages=pool_voltages, seed=seed
+    )
+    return _finish(fit, places, command, as_json)
+
+
+def calibrate_motor(
+    trials: Sequence[Path],
+    *,
+    vehicle: str,
+    out: Path,
+    report: Path | None = None,
+    seed: int = 0,
+    as_json: bool = False,
+) -> Vehicle:
+    """Fit the motors' response to step logs and write the vehicle; arguments as `calibrate_hydrodynamics`."""
+    places = _Places(out, report)
+    command = _command("motor", trials, vehicle=vehicle, out=out, report=report, seed=seed)
+    body = load_vehicle(vehicle)
+    from finssim.calibration.actuators.motor import fit_motor
+
+    fit = fit_motor(_trials(trials), body, seed=seed)
+    return _finish(fit, places, command, as_json)
+
+
+def calibrate_hydrodynamics(
+    trials: Sequence[Path],
+    *,
+    vehicle: str,
+    out: Path,
+    axes: str | None = None,
+    method: str = "regression",
+    full: bool = False,
+    estimate: str = "",
+    damping: str = "auto",
+    horizon: float | None = None,
+    report: Path | None = None,
+    ranges: Path | None = None,
+    seed: int = 0,
+    as_json: bool = False,
+) -> Vehicle:
+    """Fit added mass and damping to trials, write the vehicle and what else is asked for.
+
+    Args:
+        trials: Trial folders, folders of them, or tables. Held-out trials among them are left out, which is said.
+        vehicle: Name or file.
+        out: Vehicle file to write.
+        axes: Separated by commas; those that the trials excite if None.
+        method: `regression` or `simulation`.
+        full: Also couplings.
+        estimate: Further parameters, separated by commas.
+        damping: auto, linear, quadratic or both.
+        horizon: Longest stretch that is simulated without a restart [s].
+        report: Directory of the report, or None.
+        ranges: Ranges file for training, or None.
+        seed: Of everything random.
+        as_json: Print one JSON object in place of the table.
+
+    Returns:
+        The calibrated vehicle.
+
+    Raises:
+        CalibrationError, VehicleError, OutputError: As they say; nothing is written then.
+        KeyboardInterrupt: After Ctrl-C, when the best until then, if there is any, has been written.
+    """
+    if method not in METHODS:
+        raise CalibrationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
+    further = tuple(name for name in (word.strip() for word in estimate.split(",")) if name)
+    if method == "regression":
+        for given, option in ((full, "--full"), (further, "--estimate"), (horizon is not None, "--horizon")):
+            if given:
+                raise CalibrationError(
+                    f"{option} {ONLY_SIMULATION}: a regression looks at one axis at a time"
+                )
+    chosen = _axes(axes)
+    places = _Places(out, report, ranges)
+    command = _command(
+        "hydrodynamics",
+        trials,
+        vehicle=vehicle,
+        axes=axes,
+        method=method,
+        full=full,
+        estimate=estimate or None,
+        damping=damping,
+        horizon=horizon,
+        out=out,
+        report=report,
+        ranges=ranges,
+        seed=seed,
+    )
+    body = load_vehicle(vehicle)
+    used = _trials(trials)
+    if method == "regression":
+        from finssim.calibration.regression.regress import regress
+
+        fit = regress(used, body, axes=chosen, damping=damping, seed=seed)
+    else:
+        from finssim.calibration.simulation.fit import fit_by_simulation
+
+        with _progress() as progress:
+            fit = fit_by_simulation(
+                used,
+                body,
+                axes=chosen,
+                full=full,
+                estimate=further,
+                damping=damping,
+                horizon=horizon,
+                seed=seed,
+                progress=progress,
+            )
+    return _finish(fit, places, command, as_json)
+
+
+class _Places:
+    """Where the outputs go; a place that cannot be written is refused before the work, not after it."""
+
+    def __init__(self, out: Path, report: Path | None = None, ranges: Path | None = None) -> None:
+        self.out, self.report, self.ranges = Path(out), report, ranges
+        refuse_unwritable(atomic_write(check_vehicle_path(out)))
+        if ranges is not None:
+            if Path(ranges).suffix not in (".yaml", ".yml"):
+                raise CalibrationError(f"{ranges} ends in '{Path(ranges).suffix}', expected .yaml")
+            refuse_unwritable(atomic_write(ranges))
+        if report is not None:
+            from finssim.calibration.output.report import FIT_FILE
+
+            refuse_unwritable(atomic_directory(report, replaces=FIT_FILE))
+
+
+def usable(trials: Sequence[Trial]) -> tuple[list[Trial], list[str]]:
+    """The trials that a fit may use, and a sentence on each of the others.
+
+    Raises:
+        CalibrationError: None is left.
+    """
+    used = [trial for trial in trials if trial.header.role != "held-out"]
+    left = [
+        f"{trial.name}: left out: its header says that it is held out, for replay"
+        for trial in trials
+        if trial.header.role == "held-out"
+    ]
+    if not used:
+        raise CalibrationError("every trial is marked held-out: a fit needs trials of role 'fit' or of none")
+    return used, left
+
+
+def _trials(paths: Sequence[Path]) -> list[Trial]:
+    """Load, and say on standard error what is left out of each trial and why."""
+    from finssim.calibration.trials.trial_files import load_trials
+
+    used, left = usable(load_trials(paths))
+    screen = Console(stderr=True)
+    for trial in used:
+        if trial.notes:
+            left.append(f"{trial.name}: {'; '.join(trial.notes)}")
+    for sentence in left:
+        screen.print(sentence, highlight=False, markup=False, soft_wrap=True)
+    return used
+
+
+def _axes(words: str | None) -> tuple[str, ...] | None:
+    if words is None or words == "all":
+        return None
+    names = [word.strip() for word in words.split(",")]
+    for name in names:
+        if name not in AXES:
+            raise CalibrationError(f"unknown axis '{name}'; available: {', '.join(AXES)}")
+    return tuple(axis for axis in AXES if axis in names)
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[..., None]]:
+    """A bar on standard error, fed with the part done and a few words."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    screen = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as bars:
+        bar = bars.add_task("fit", total=1.0)
+
+        def show(part: float, words: str = "fit") -> None:
+            bars.update(bar, completed=part, description=words)
+
+        yield show
+
+
+def _finish(fit: Fit, places: _Places, command: str, as_json: bool) -> Vehicle:
+    """Write and show; ends with KeyboardInterrupt where the fit was interrupted."""
+    vehicle = calibrated(fit)
+    warnings = doubts(fit, vehicle)
+    write_vehicle(vehicle, places.out)
+    if places.report is not None:
+        from finssim.calibration.output.report import write_report
+
+        write_report(fit, places.report, vehicle, command=command, warnings=warnings, out=places.out)
+    if places.ranges is not None:
+        from finssim.calibration.output.calibrated_ranges import write_ranges
+
+        write_ranges(fit, places.ranges, vehicle)
+    if as_json:
+        document = fit_json(fit, vehicle, out=places.out, warnings=warnings)
+        print(json.dumps(document, allow_nan=False))
+    else:
+        console = Console() if sys.stdout.isatty() else Console(width=100)
+        print_fit(fit, vehicle, console, warnings)
+        _print_places(fit, vehicle, places, console)
+    if fit.interrupted:
+        raise KeyboardInterrupt
+    return vehicle
+
+
+def _print_places(fit: Fit, vehicle: Vehicle, places: _Places, console: Console) -> None:
+    left = kept(fit, vehicle)
+    if left:
+        console.print(
+            f"not identifiable, so the file keeps its own: {', '.join(left)}", highlight=False, markup=False
+        )
+    for place in filter(None, (places.out, places.report, places.ranges)):
+        console.print(f"written: {place}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _command(kind: str, inputs: Sequence[Path], **options: Any) -> str:
+    """The command line that does this again."""
+    words = ["finssim", "calibrate", kind, *map(str, inputs)]
+    for name, value in options.items():
+        option = f"--{name.replace('_', '-')}"
+        if value is True:
+            words.append(option)
+        elif value is not None and value is not False:
+            words += [option, str(value)]
+    return shlex.join(words)

@@ -1,0 +1,1 @@
+"""Hydrodynamics axis by axis, from driven and from passive trials."""

@@ -1,0 +1,1 @@
+"""Models driven with recorded inputs, scored against what was recorded."""

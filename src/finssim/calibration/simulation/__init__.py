@@ -1,0 +1,1 @@
+"""Hydrodynamics by simulation error: candidate plants as parallel worlds."""

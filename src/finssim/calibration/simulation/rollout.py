@@ -1,0 +1,296 @@
+"""Many candidate plants over many segments at once, as parallel worlds of one simulator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from finssim.calibration.errors import CalibrationError
+from finssim.calibration.simulation.segments import Segment
+from finssim.calibration.simulation.warm_motors import warm_motors
+from finssim.engine.plant_arrays import NO_LIMIT, vehicle_parameters
+from finssim.engine.simulator import Simulator
+from finssim.engine.surroundings import Water
+from finssim.physics.types import MAX_THRUSTERS
+from finssim.vehicles import Vehicle
+
+__all__ = ["Response", "Rollouts"]
+
+Single = NDArray[np.float32]
+
+BUDGET = 300e6
+"""Memory for the worlds and responses of one pass [bytes]; more candidates take several passes."""
+
+WORLD = 6000.0
+"""Bytes of one world: plant, state, history, delay line."""
+
+LONGEST_STEP = 0.025
+"""Physics step above which a simulation step is divided [s]."""
+
+OPEN = 1.0e6
+"""Force limit of an actuator that has none [N]."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """What every candidate did on every segment; rows from a world's end, or its divergence, on are NaN."""
+
+    t: NDArray[np.float64]
+    """Since the segment's start [s], (n + 1,)."""
+    nu: Single
+    """Of the body origin, body frame [m/s, rad/s], (n + 1, C, S, 6)."""
+    position: Single
+    """Of the body origin, world frame [m], (n + 1, C, S, 3)."""
+    quaternion: Single
+    """Body to world, (n + 1, C, S, 4)."""
+    finite: NDArray[np.bool_]
+    """Whether a world came to its segment's end, (C, S)."""
+
+
+class Rollouts:
+    """Simulates segments under candidate plants."""
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        segments: Sequence[Segment],
+        *,
+        hydrodynamics: str = "calibrated",
+        integrator: str = "rk4",
+        substeps: int | None = None,
+        max_delay: float = 0.5,
+        moving_water: bool = False,
+        threads: int | None = None,
+    ) -> None:
+        """Set up.
+
+        Args:
+            vehicle: Gives every number that a candidate does not.
+            segments: All of one step; they may be of different lengths and drives.
+            hydrodynamics: Key of the vehicle's hydrodynamic sets.
+            integrator: As the simulator's.
+            substeps: Physics steps in a step; enough for `LONGEST_STEP` if None. Applied forces are linear between
+                samples with one, which is what the default step has; with more they lead by up to half a step.
+            max_delay: Longest delay that a candidate may have [s].
+            moving_water: Whether candidates bring currents.
+            threads: Of the simulator.
+
+        Raises:
+            CalibrationError: no segments, steps that differ, or a drive with more than eight channels.
+        """
+        steps = {round(s.step, 9) for s in segments}
+        if len(steps) != 1:
+            raise CalibrationError(
+                "there is nothing to simulate: no trial holds a usable stretch"
+                if not steps
+                else f"segments have steps of {sorted(steps)} s, expected one step for all"
+            )
+        wide = [s.trial for s in segments if s.B.shape[1] > MAX_THRUSTERS]
+        if wide:
+            raise CalibrationError(f"{wide[0]}: more than {MAX_THRUSTERS} input channels cannot be simulated")
+        self.vehicle, self.segments, self.hydrodynamics = vehicle, tuple(segments), hydrodynamics
+        self.step = segments[0].step
+        self.nominal = vehicle_parameters(vehicle, hydrodynamics)
+        self._moving = moving_water or any(np.any(s.current) for s in segments)
+        self._options: dict[str, Any] = {
+            "hydrodynamics": hydrodynamics,
+            "control_step": self.step,
+            "substeps": substeps or max(1, math.ceil(self.step / LONGEST_STEP - 1e-9)),
+            "integrator": integrator,
+            "max_delay": max(max_delay, float(self.nominal["delay"])),
+            "water_moves": self._moving,
+            "threads": threads,
+        }
+        self._simulators: dict[int, Simulator] = {}
+        self._lengths = np.array([s.steps for s in segments])
+        n = int(self._lengths.max())
+        self._force = np.zeros((n, len(segments), MAX_THRUSTERS), np.float32)
+        memory = max(len(s.before) for s in segments)
+        self._before = np.zeros((memory, len(segments), MAX_THRUSTERS))
+        for i, s in enumerate(segments):
+            k = s.force.shape[1]
+            self._force[: s.steps, i, :k] = s.force
+            self._force[s.steps :, i, :k] = s.force[-1]
+            self._before[:, i, :k] = s.before[:1]
+            self._before[memory - len(s.before) :, i, :k] = s.before
+        self.own = self._own_fields()
+        self._held = self._imposed()
+
+    def _imposed(self) -> list[tuple[NDArray[np.int64], NDArray[np.int64], Single]]:
+        """Axes that are imposed together, the segments that do so, and their values by (n + 1, segments, axes)."""
+        patterns: dict[tuple[int, ...], list[int]] = {}
+        for i, s in enumerate(self.segments):
+            axes = () if s.held is None else tuple(np.flatnonzero(np.isfinite(s.held).all(axis=0)).tolist())
+            if axes:
+                patterns.setdefault(axes, []).append(i)
+        n, out = int(self._lengths.max()), []
+        for axes, those in patterns.items():
+            columns = [np.asarray(self.segments[i].held)[:, axes] for i in those]
+            values = [np.pad(c, ((0, n + 1 - len(c)), (0, 0)), mode="edge") for c in columns]
+            out.append((np.array(axes), np.array(those), np.stack(values, axis=1).astype(np.float32)))
+        return out
+
+    def _own_fields(self) -> dict[str, NDArray[np.float64]]:
+        """Plant fields in which segments differ: how forces reach the body, and the water's density. (S, ...)"""
+        out: dict[str, list[Any]] = {}
+        for s in self.segments:
+            B = np.zeros((6, MAX_THRUSTERS))
+            B[:, : s.B.shape[1]] = s.B
+            field: dict[str, Any] = {"B": B}
+            names = ("force_min", "force_max", "dead_minus", "dead_plus", "time_constant", "slew")
+            lagged = s.commanded and s.thrusters
+            if lagged:
+                field |= {name: self.nominal[name] for name in (*names, "delay", "speed_lag")}
+            else:
+                # Wrenches that were asked for pass through the motors too, as if through six equal ones.
+                n = len(self.vehicle.thrusters)
+                tc = float(np.mean(self.nominal["time_constant"][:n])) if s.commanded else 0.0
+                values = (-OPEN, OPEN, 0.0, 0.0, tc, NO_LIMIT)
+                field |= {
+                    name: np.full(MAX_THRUSTERS, value) for name, value in zip(names, values, strict=True)
+                }
+                field |= {"delay": self.nominal["delay"] if s.commanded else 0.0, "speed_lag": 0}
+            for name, value in field.items():
+                out.setdefault(name, []).append(np.asarray(value, float))
+        return {name: np.stack(values) for name, values in out.items()}
+
+    def run(
+        self,
+        plant: Mapping[str, ArrayLike] | None = None,
+        *,
+        initial: Mapping[str, ArrayLike] | None = None,
+        disturbance: ArrayLike | None = None,
+        current: ArrayLike | None = None,
+        candidates: int | None = None,
+    ) -> Response:
+        """Simulate every candidate over every segment.
+
+        Args:
+            plant: Field of `VehicleParameters` -> values by (C, S, ...); either axis may be 1. Volume and mesh drag are
+                those in the vehicle file's water: a trial's own density scales them.
+            initial: `nu`, `quaternion`, `position` at the start where they are not the segments' own, (C, S, ...).
+            disturbance: Extra wrench about the body origin, body frame [N, N m], (C, S, 6).
+            current: World frame [m/s], in place of the segments' own, (C, S, 3).
+            candidates: C; the longest first axis among the arrays if None.
+
+        Returns:
+            Responses of all of them.
+        """
+        arrays = {f"plant.{k}": np.asarray(v) for k, v in (plant or {}).items()}
+        arrays |= {f"initial.{k}": np.asarray(v) for k, v in (initial or {}).items()}
+        arrays |= {k: np.asarray(v) for k, v in (("tau", disturbance), ("current", current)) if v is not None}
+        C = candidates or max([1, *(a.shape[0] for a in arrays.values())])
+        n, S = self._force.shape[:2]
+        out = {
+            name: np.empty((n + 1, C, S, width), np.float32)
+            for name, width in (("nu", 6), ("position", 3), ("quaternion", 4))
+        }
+        finite = np.ones((C, S), bool)
+        for low, high in self._passes(C):
+            part = {k: a if a.shape[0] == 1 else a[low:high] for k, a in arrays.items()}
+            finite[low:high] = self._pass(high - low, part, {k: v[:, low:high] for k, v in out.items()})
+        return Response(t=np.asarray(self.step * np.arange(n + 1)), finite=finite, **out)
+
+    def _passes(self, candidates: int) -> Iterator[tuple[int, int]]:
+        n, S = self._force.shape[:2]
+        most = max(1, int(BUDGET / (S * (WORLD + 52.0 * (n + 1)))))
+        size = math.ceil(candidates / math.ceil(candidates / most))
+        for low in range(0, candidates, size):
+            yield low, min(low + size, candidates)
+
+    def _simulator(self, candidates: int) -> Simulator:
+        if candidates not in self._simulators:
+            if len(self._simulators) > 3:
+                self._simulators.clear()
+            worlds = candidates * len(self.segments)
+            self._simulators[candidates] = Simulator(
+                self.vehicle, worlds=worlds, water=Water(), **self._options
+            )
+        return self._simulators[candidates]
+
+    def _pass(self, C: int, given: dict[str, NDArray[Any]], out: dict[str, Single]) -> NDArray[np.bool_]:
+        """One pass of candidates that fit in memory; writes their responses and tells which came to the end."""
+        sim, S = self._simulator(C), len(self.segments)
+        shape = (C, S)
+
+        def write(target: Any, values: NDArray[Any]) -> None:
+            view = target.numpy().reshape(*shape, *target.numpy().shape[target.ndim :])
+            view[...] = values
+
+        plant = {k.removeprefix("plant."): a for k, a in given.items() if k.startswith("plant.")}
+        fields = {k: np.asarray(v)[None, None] for k, v in self.nominal.items()}
+        fields |= {k: v[None] for k, v in self.own.items()} | plant
+        density = np.array([s.density for s in self.segments]) / self.vehicle.water.density
+        for name in ("volume", "form_drag", "skin_drag"):
+            fields[name] = fields[name] * density
+        for name, values in fields.items():
+            write(sim.plant.fields[name], values)
+        start = {k.removeprefix("initial."): a for k, a in given.items() if k.startswith("initial.")}
+        for name, own in (("nu", "velocity"), ("quaternion", "quaternion"), ("position", "position")):
+            values = start.get(name, np.stack([getattr(s, name) for s in self.segments])[None])
+            if name == "position":
+                sink = np.array([s.sink for s in self.segments])
+                values = values + sink[:, None] * [0.0, 0.0, 1.0]
+            write(getattr(sim.state, own), values)
+        if self._moving:
+            own_current = np.stack([s.current for s in self.segments])[None]
+            write(sim.water.current, given.get("current", own_current))
+        write(sim.command.disturbance, given.get("tau", np.zeros((1, 1, 6))))
+        sim.reset()
+        sim.refresh()
+        actuator, line = warm_motors(
+            self._before, fields, self.step, sim.substeps, slots=sim.state.commands.shape[2]
+        )
+        write(sim.state.actuator, actuator)
+        ring = sim.state.commands.numpy().reshape(C, S, -1, MAX_THRUSTERS)
+        ring[...] = line
+        return self._march(sim, C, out)
+
+    def _impulses(self, sim: Simulator, C: int) -> list[Single]:
+        """Change of nu for a unit change of the imposed axes by an impulse on these alone, (C, segments, 6, axes)."""
+        inverse = sim.plant.M_inv.numpy().reshape(C, len(self.segments), 6, 6)
+        out = []
+        for axes, those, _ in self._held:
+            columns = inverse[:, those][..., axes]
+            out.append(columns @ np.linalg.inv(columns[..., axes, :]))
+        return out
+
+    def _impose(self, nu: Single, impulses: list[Single], row: int) -> None:
+        """Let imposed axes move as given; what they push on the others by inertia, they do."""
+        for (axes, those, values), impulse in zip(self._held, impulses, strict=True):
+            now = nu[:, those]
+            now += (impulse @ (values[row] - now[..., axes])[..., None])[..., 0]
+            nu[:, those] = now
+
+    def _march(self, sim: Simulator, C: int, out: dict[str, Single]) -> NDArray[np.bool_]:
+        n, S = self._force.shape[:2]
+        command = sim.command.thrust.numpy().reshape(C, S, MAX_THRUSTERS)
+        views = {
+            name: getattr(sim.state, own).numpy().reshape(C, S, -1)
+            for name, own in (("nu", "velocity"), ("position", "position"), ("quaternion", "quaternion"))
+        }
+        impulses = self._impulses(sim, C)
+        for axes, those, values in self._held:
+            views["nu"][:, those[:, None], axes] = values[0]
+        for name, view in views.items():
+            out[name][0] = view
+        for k in range(n):
+            command[...] = self._force[k]
+            sim.step()
+            self._impose(views["nu"], impulses, k + 1)
+            for name, view in views.items():
+                out[name][k + 1] = view
+        out["position"][..., 2] -= np.array([s.sink for s in self.segments], np.float32)
+        # A frozen world has counted the step in which it broke.
+        frozen = sim.state.frozen.numpy().reshape(C, S) != 0
+        reached = np.where(frozen, sim.state.steps.numpy().reshape(C, S) - 1, n)
+        last = np.minimum(reached, self._lengths)
+        late = np.arange(n + 1)[:, None, None] > last
+        for values in out.values():
+            values[late] = np.nan
+        return np.asarray(reached >= self._lengths)

@@ -1,0 +1,1 @@
+"""Trials: recorded motion on disk and in memory, and what pushed the vehicle."""

@@ -1,0 +1,95 @@
+"""One trial: what was commanded and measured while a vehicle moved, in canonical columns."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.calibration.errors import CalibrationError
+from finssim.calibration.trials.columns import column_of
+from finssim.calibration.trials.header import Header
+
+__all__ = ["PHASES", "Array", "Trial"]
+
+Array = NDArray[np.float64]
+
+PHASES = ("baseline", "excitation", "coast", "rest")
+"""Words of the `phase` column; an empty word is none of them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """Measurements over one time base; streams of other rates leave NaN where they have no sample.
+
+    Frames and units are those of `finssim.calibration.trials.columns`; conversions that the header asks for are done.
+    """
+
+    name: str
+    """Unique among the trials used together; the folder's name."""
+    t: Array
+    """Seconds, strictly increasing, (n,)."""
+    channels: dict[str, Array] = field(default_factory=dict)
+    """Canonical column -> values, NaN where there is no sample, (n,) each."""
+    phase: NDArray[np.str_] | None = None
+    """A word of `PHASES` or "" for every row, (n,); None where the log names no phases."""
+    header: Header = field(default_factory=Header)
+    """What `trial.yaml` says."""
+    notes: tuple[str, ...] = ()
+    """What was repaired or left out while reading, one sentence each."""
+    path: Path | None = None
+    """Folder or file it was read from."""
+
+    def __post_init__(self) -> None:
+        t = self.t
+        if t.ndim != 1 or len(t) < 2 or not (np.isfinite(t).all() and (np.diff(t) > 0.0).all()):
+            raise CalibrationError(f"{self.name}: t is not at least 2 strictly increasing times in s")
+        for column, values in self.channels.items():
+            if column_of(column) is None:
+                raise CalibrationError(f"{self.name}: '{column}' is not a column of a trial")
+            if values.shape != t.shape:
+                raise CalibrationError(
+                    f"{self.name}: {column} has shape {values.shape}, expected {t.shape} like t"
+                )
+        if self.phase is not None and (self.phase.shape != t.shape or not set(self.phase) <= {*PHASES, ""}):
+            raise CalibrationError(
+                f"{self.name}: phase must hold {len(t)} words of {', '.join(PHASES)}, or empty ones"
+            )
+
+    def has(self, *columns: str) -> bool:
+        """Whether every one of these columns holds at least two finite samples."""
+        return all(c in self.channels and np.isfinite(self.channels[c]).sum() >= 2 for c in columns)
+
+    def series(self, column: str) -> tuple[Array, Array]:
+        """Times [s] and values of the finite samples of a column, (k,) each; empty where there are none."""
+        values = self.channels.get(column)
+        if values is None:
+            return np.empty(0), np.empty(0)
+        good = np.isfinite(values)
+        return self.t[good], values[good]
+
+    @property
+    def duration(self) -> float:
+        """From the first row to the last [s]."""
+        return float(self.t[-1] - self.t[0])
+
+    @cached_property
+    def sha256(self) -> str:
+        """Digest of the numbers, the phases and the parts of the header that change their meaning.
+
+        It does not depend on the trial's name, its place, its file format or its role.
+        """
+        digest = hashlib.sha256(np.ascontiguousarray(self.t).tobytes())
+        for column in sorted(self.channels):
+            digest.update(column.encode())
+            values = self.channels[column] + 0.0  # no -0.0, and one NaN: equal numbers have equal bytes
+            digest.update(np.where(np.isnan(values), np.nan, values).tobytes())
+        if self.phase is not None:
+            digest.update("\n".join(self.phase.tolist()).encode())
+        digest.update(json.dumps(self.header.meaning(), sort_keys=True).encode())
+        return digest.hexdigest()

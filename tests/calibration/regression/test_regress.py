@@ -1,0 +1,278 @@
+"""Regression axis by axis gives back what trials were simulated with, and says what it cannot know."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibration.known_trials import trials, truth
+from finssim.calibration.errors import CalibrationError
+from finssim.calibration.excitation.measurement import NoiseProfile
+from finssim.calibration.regression.axis_data import axis_data, prepare
+from finssim.calibration.regression.axis_fit import fit_axis
+from finssim.calibration.regression.dive_and_coast import coasts
+from finssim.calibration.regression.instruments import Run, cut, joined, simulate_axis
+from finssim.calibration.regression.plant_terms import matrices
+from finssim.calibration.regression.regress import regress
+from finssim.calibration.trials.header import Header
+from finssim.vehicles import AXES
+
+
+def without(some, *columns):
+    """Trials that lack these columns."""
+    return [replace(t, channels={n: c for n, c in t.channels.items() if n not in columns}) for t in some]
+
+
+@pytest.mark.parametrize(
+    ("name", "axes"),
+    [
+        ("finsrov", ("surge", "sway", "yaw")),
+        ("bluerov2", ("surge", "heave", "roll", "yaw")),
+        ("bluerov2_heavy", ("sway", "heave", "pitch", "yaw")),
+    ],
+)
+def test_identifiable_parameters_come_back(name, axes):
+    """Published steps, realistic noise, 50 Hz: what is called identifiable is within 5 %, or within 1.5 intervals."""
+    vehicle, some = trials(name, *axes)
+    fit = regress(some, vehicle)
+    expected = truth(vehicle)
+    told = {n: e for n, e in fit.estimates.items() if e.identifiable and n in expected}
+    assert {f"{axis}.m_eff" for axis in axes} <= told.keys()
+    for parameter, estimate in told.items():
+        half = 0.5 * (estimate.ci95[1] - estimate.ci95[0])
+        error = abs(estimate.estimate - expected[parameter])
+        assert error <= max(0.05 * abs(expected[parameter]), 1.5 * half), parameter
+        assert error <= 0.15 * abs(expected[parameter]), parameter
+    changed = vehicle.replace(fit.changes)
+    i = AXES.index(axes[0])
+    assert (
+        changed.hydrodynamic_set("calibrated").added_mass[i, i]
+        == fit.estimates[f"{axes[0]}.added_mass"].estimate
+    )
+    assert set(fit.trials) == {t.name for t in some}
+
+
+def test_intervals_cover_the_truth():
+    """Over 24 noise draws of six trials, 95 % intervals of mass and damping hold the truth in at least 19."""
+    names = ("surge.m_eff", "surge.d1", "surge.d2")
+    hits = np.zeros(3)
+    for seed in range(24):
+        vehicle, some = trials("bluerov2_heavy", "surge", seed=seed)
+        fit, expected = regress(some, vehicle), truth(vehicle)
+        hits += [fit.estimates[n].ci95[0] <= expected[n] <= fit.estimates[n].ci95[1] for n in names]
+    assert (hits >= 19).all()  # 22.8 expected
+
+
+def test_instruments_remove_the_bias_of_noisy_velocities():
+    """With 5 cm/s of noise least squares loses a tenth of the mass; with simulated velocities it comes back."""
+    plain, instrumental = [], []
+    for seed in range(5):
+        vehicle, some = trials("finsrov", "heave", seed=seed, noise=NoiseProfile(velocity_std=0.05))
+        prepared, _ = prepare(some, vehicle)
+        data, _ = axis_data(2, prepared, [matrices(vehicle)] * len(prepared))
+        terms = np.array([True, True, True, True, False, False, False])
+        X, y = (np.concatenate([getattr(rows, name) for rows in data.rows]) for name in "Xy")
+        plain.append(np.linalg.lstsq(X[:, :4], y, rcond=None)[0][0])
+        instrumental.append(fit_axis(data, terms).free[0])
+    true = truth(vehicle)["heave.m_eff"]
+    assert np.mean(plain) < 0.9 * true
+    assert np.mean(instrumental) == pytest.approx(true, rel=0.06)
+
+
+@pytest.mark.parametrize(("model", "seconds"), [((12.0, 3.0, 20.0, 0.0), 90.0), ((0.6, 0.4, 0.8, 2.0), 45.0)])
+def test_cut_and_decimated_simulation_is_the_one_in_one_run(model, seconds):
+    """At 100 Hz in blocks of 20 s and steps of 40 ms from noisy states: within 1 % of one run at every sample."""
+    rng = np.random.default_rng(0)
+    t = np.arange(0.0, seconds, 0.01)
+    push = model[0] * np.convolve(
+        np.repeat(rng.normal(size=len(t) // 100 + 1), 100)[: len(t)], np.ones(5) / 5, "same"
+    )
+    whole = Run(0.5 * (push[1:] + push[:-1]), 0.01, 0.3, 0.0)
+    (nu,), (s,) = simulate_axis(np.array(model), [whole])
+    scale = np.std(nu)
+    noisy = nu + 0.05 * scale * rng.normal(size=len(nu))
+    pieces = cut(100.0, [(0, len(t))], noisy, s)
+    runs = [piece.run(push) for piece in pieces]
+    assert max(len(run.push) for run in runs) <= 25.0 * 22.0 + 1
+    again = joined(simulate_axis(np.array(model), runs)[0], pieces, len(t))
+    settled = t > 3.0
+    assert np.std((again - nu)[settled]) < 0.01 * scale
+
+
+def test_late_motion_is_told_from_inertia():
+    """Velocities logged 60 ms late: the mass does not take the blame, and the lag is reported."""
+    vehicle, some = trials("bluerov2_heavy", "surge")
+    late = []
+    for t in some:
+        shifted = {n: np.interp(t.t - 0.06, t.t, c) if n in "uvwpqr" else c for n, c in t.channels.items()}
+        late.append(replace(t, channels=shifted))
+    fit = regress(late, vehicle)
+    assert fit.estimates["surge.m_eff"].estimate == pytest.approx(truth(vehicle)["surge.m_eff"], rel=0.03)
+    assert fit.quality["surge"]["delay"] == pytest.approx(0.06, abs=0.01)
+    assert any("lags the recorded wrench by" in w for w in fit.warnings)
+
+
+def test_a_velocity_later_than_the_gyro_is_named():
+    """u is logged 120 ms late, the gyro is not: mass within 5 %, its note tells of the lag, and the cause is named."""
+    vehicle, some = trials("bluerov2_heavy", "surge", "heave", "yaw")
+    late = []
+    for t in some:
+        shifted = {n: np.interp(t.t - 0.12, t.t, c) if n in "uvw" else c for n, c in t.channels.items()}
+        late.append(replace(t, channels=shifted))
+    late = without(late, "x", "y", "z", "depth", "ax", "ay", "az")
+    fit = regress(late, vehicle)
+    assert fit.quality["surge"]["delay"] == pytest.approx(0.12, abs=0.02)
+    assert fit.estimates["surge.m_eff"].estimate == pytest.approx(truth(vehicle)["surge.m_eff"], rel=0.05)
+    low, high = fit.estimates["surge.m_eff"].ci95
+    assert low < truth(vehicle)["surge.m_eff"] < high
+    assert "lags the file's motors" in fit.estimates["surge.m_eff"].note
+    assert any("velocity seems to be logged 0.1" in w for w in fit.warnings)
+    assert not any("velocity seems" in w for w in regress(some, vehicle).warnings)
+
+
+def test_all_axes_moving_at_once():
+    """A multi-sine on all axes: Coriolis terms and couplings of the file are taken off by the measured motion."""
+    vehicle, some = trials("bluerov2_heavy", *AXES, kind="multisine")
+    fit, expected = regress(some, vehicle), truth(vehicle)
+    for parameter in ("surge.m_eff", "sway.m_eff", "heave.m_eff", "yaw.m_eff"):
+        assert fit.estimates[parameter].estimate == pytest.approx(expected[parameter], rel=0.1), parameter
+
+
+def test_five_hertz_with_wrench_and_velocity_only():
+    """No attitude, no IMU, 5 Hz: mass and damping within 10 %."""
+    columns = ("u", "v", "w", "p", "q", "r")
+    vehicle, some = trials("finsrov", "surge", "yaw", rate=5.0, columns=columns, inputs=("wrench",))
+    fit, expected = regress(some, vehicle), truth(vehicle)
+    for parameter in ("surge.m_eff", "surge.d1", "yaw.m_eff", "yaw.d1", "yaw.d2"):
+        assert fit.estimates[parameter].estimate == pytest.approx(expected[parameter], rel=0.1), parameter
+
+
+def test_gyro_without_velocity_gives_the_rates_axes():
+    """Only rates and attitude are logged: yaw and roll are fitted, surge is left alone with the reason."""
+    vehicle, some = trials("bluerov2_heavy", "surge", "roll", "yaw")
+    fit = regress(without(some, "u", "v", "w", "x", "y", "z", "depth"), vehicle)
+    assert {n.partition(".")[0] for n in fit.estimates} == {"roll", "yaw"}
+    assert any(w.startswith("surge: left out") and "no surge velocity" in w for w in fit.warnings)
+    assert not any("added_mass.0" in path for path in fit.changes)
+
+
+def test_roll_without_attitude_is_left_out_with_the_reason():
+    """The restoring moment needs the angle."""
+    vehicle, some = trials("bluerov2_heavy", "roll", "yaw")
+    fit = regress(without(some, "qx", "qy", "qz", "qw"), vehicle)
+    assert "roll.m_eff" not in fit.estimates
+    assert any("roll needs the attitude" in w for w in fit.warnings)
+
+
+def test_outliers_and_a_gap_do_little():
+    """One sample in a hundred is nonsense and a second is missing: the estimates stay, and the samples are counted."""
+    vehicle, some = trials("bluerov2_heavy", "surge")
+    rng = np.random.default_rng(0)
+    bad = []
+    for t in some:
+        u = t.channels["u"].copy()
+        hit = rng.choice(len(u), len(u) // 100, replace=False)
+        u[hit] += rng.choice([-2.0, 2.0], len(hit))
+        u[200:250] = np.nan
+        bad.append(replace(t, channels=t.channels | {"u": u}))
+    fit, expected = regress(bad, vehicle), truth(vehicle)
+    assert fit.estimates["surge.m_eff"].estimate == pytest.approx(expected["surge.m_eff"], rel=0.04)
+    assert fit.estimates["surge.d2"].estimate == pytest.approx(expected["surge.d2"], rel=0.04)
+    assert fit.quality["surge"]["rejected"] >= 20
+
+
+def test_dive_and_coast_gives_the_buoyancy():
+    """The coast after a dive shows the excess by itself; where it goes in the file reproduces it."""
+    vehicle, some = trials("bluerov2", "heave")
+    fit = regress(some, vehicle)
+    excess = fit.estimates["buoyancy_excess"]
+    assert excess.identifiable
+    assert excess.estimate == pytest.approx(truth(vehicle)["buoyancy_excess"], rel=0.05)
+    changed = vehicle.replace({"body.displaced_volume": fit.changes["body.displaced_volume"]})
+    assert changed.buoyancy - changed.weight == pytest.approx(excess.estimate, rel=1e-6)
+    prepared, _ = prepare(some, vehicle)
+    data, _ = axis_data(2, prepared, [matrices(vehicle)] * len(prepared))
+    dives = [c for c in coasts(data) if "dive" in c.trial]
+    assert len(dives) >= 2 and all(c.speed > 0.01 for c in dives)
+
+
+def test_a_file_too_heavy_is_said():
+    """An effective mass below the file's rigid mass: no negative added mass is written."""
+    vehicle, some = trials("bluerov2_heavy", "surge", inputs=("wrench",))
+    heavy = vehicle.replace({"body.mass": 25.0, "body.displaced_volume": 0.0249})
+    fit = regress(some, heavy)
+    assert not fit.estimates["surge.added_mass"].identifiable
+    assert not any("added_mass" in path for path in fit.changes)
+    assert any("below the rigid 25 kg" in w for w in fit.warnings)
+
+
+def test_a_motion_that_the_wrench_does_not_explain_writes_nothing():
+    """The velocity is another vehicle's: R² is low, and nothing of the axis is identifiable or written."""
+    vehicle, some = trials("bluerov2_heavy", "heave", "yaw")
+    rng = np.random.default_rng(3)
+    foreign = []
+    for t in some:
+        wander = np.convolve(rng.normal(size=len(t.t) + 100), np.hanning(101) / 20.0, "valid")
+        foreign.append(replace(t, channels=t.channels | {"w": wander}))
+    foreign = without(foreign, "x", "y", "z", "depth", "ax", "ay", "az")
+    fit = regress(foreign, vehicle)
+    assert fit.quality["heave"]["r2"] < 0.2
+    of_heave = [e for n, e in fit.estimates.items() if n.startswith(("heave.", "buoyancy"))]
+    assert len(of_heave) >= 5
+    for estimate in of_heave:
+        assert not estimate.identifiable
+        assert "explains nothing" in estimate.note or "finds no inertia" in estimate.note
+    assert not any(".2.2" in path or path.startswith("body.") for path in fit.changes)
+    assert any(path.endswith("added_mass.5.5") for path in fit.changes)  # yaw is as good as ever
+
+
+def test_tilted_samples_are_left_out_unless_the_other_axes_are_fitted():
+    """Surge steps pitch bluerov2 to 80°: with a wrong file, surge alone is not believed."""
+    vehicle, some = trials("bluerov2", "surge", "sway", "heave", "yaw")
+    added = 0.5 * vehicle.hydrodynamics["calibrated"].added_mass
+    wrong = vehicle.replace({"hydrodynamics.calibrated.added_mass": added.tolist()})
+    alone = regress(some, wrong, axes=["surge", "yaw"])
+    assert any("surge" in w and "beyond 25°, were left out" in w for w in alone.warnings)
+    assert not alone.estimates["surge.m_eff"].identifiable
+    assert not any(".0.0" in path for path in alone.changes)
+    assert alone.estimates["yaw.m_eff"].identifiable
+    together, expected = regress(some, wrong), truth(vehicle)
+    assert together.estimates["surge.m_eff"].estimate == pytest.approx(expected["surge.m_eff"], rel=0.03)
+
+
+def test_damping_is_written_as_a_pair_or_not_at_all():
+    """A dropped term is written as zero beside the one that stays; an axis whose drag is unknown keeps both."""
+    vehicle, some = trials("bluerov2_heavy", "sway", "roll")
+    changes = regress(some, vehicle).changes
+    for i in range(6):
+        pair = [
+            f"hydrodynamics.calibrated.{kind}_damping.{i}.{i}" in changes for kind in ("linear", "quadratic")
+        ]
+        assert pair[0] == pair[1]
+    assert changes["hydrodynamics.calibrated.linear_damping.1.1"] == 0.0
+    assert changes["hydrodynamics.calibrated.quadratic_damping.1.1"] > 0.0
+
+
+def test_few_trials_are_said():
+    """With two trials intervals come from blocks, which is said, and still hold the truth."""
+    vehicle, some = trials("bluerov2_heavy", "surge")
+    fit, expected = regress(some[-2:], vehicle), truth(vehicle)
+    assert any("blocks" in w for w in fit.warnings)
+    low, high = fit.estimates["surge.m_eff"].ci95
+    assert low - 0.2 < expected["surge.m_eff"] < high + 0.2
+
+
+def test_refusals_say_what_to_do():
+    """Held-out trials, unknown axes, no trials and no excitation."""
+    vehicle, some = trials("bluerov2_heavy", "surge")
+    held = replace(some[0], header=Header(**(some[0].header.model_dump() | {"role": "held-out"})))
+    with pytest.raises(CalibrationError, match="held out"):
+        regress([held, *some[1:]], vehicle)
+    with pytest.raises(CalibrationError, match="unknown axis 'forward'"):
+        regress(some, vehicle, axes=["forward"])
+    with pytest.raises(CalibrationError, match="no trials"):
+        regress([], vehicle)
+    with pytest.raises(CalibrationError, match="no trial excites it"):
+        regress(some, vehicle, axes=["sway"])
+    with pytest.raises(CalibrationError, match="two trials are called"):
+        regress([some[0], some[0]], vehicle)
