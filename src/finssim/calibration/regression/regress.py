@@ -19,6 +19,7 @@ from finssim.calibration.regression.axis_fit import TERMS, AxisData
 from finssim.calibration.regression.dive_and_coast import buoyancy_estimate
 from finssim.calibration.regression.plant_terms import Matrices, matrices
 from finssim.calibration.regression.selection import DAMPING, Selection, select
+from finssim.calibration.trials.fittable import require_axes, require_fittable
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import AXES, Vehicle
 
@@ -67,7 +68,7 @@ def regress(
     wanted = _wanted(axes)
     if damping not in DAMPING:
         raise CalibrationError(f"unknown damping '{damping}'; available: {', '.join(DAMPING)}")
-    _check(trials)
+    require_fittable(trials)
     driven = [trial for trial in trials if not trial.header.passive]
     prepared, warnings = prepare(driven, vehicle)
     chosen, plant, more = _fit_axes(prepared, vehicle, wanted, axes is not None, damping)
@@ -124,24 +125,8 @@ def regress(
 
 
 def _wanted(axes: Sequence[str] | None) -> list[int]:
-    for axis in axes or ():
-        if axis not in AXES:
-            raise CalibrationError(f"unknown axis '{axis}'; available: {', '.join(AXES)}")
+    require_axes(axes)
     return [i for i, axis in enumerate(AXES) if axes is None or axis in axes]
-
-
-def _check(trials: Sequence[Trial]) -> None:
-    if not trials:
-        raise CalibrationError("no trials were given, expected at least one to fit")
-    names = [trial.name for trial in trials]
-    twice = {name for name in names if names.count(name) > 1}
-    if twice:
-        raise CalibrationError(f"two trials are called '{min(twice)}', expected a name for each: rename one")
-    for trial in trials:
-        if trial.header.role == "held-out":
-            raise CalibrationError(
-                f"{trial.name}: its header says that it is held out: fit on other trials and replay this one"
-            )
 
 
 def _fit_axes(

@@ -13,6 +13,7 @@ from finssim.calibration.simulation.parameters import EXTRAS
 from finssim.calibration.simulation.report import Clock
 from finssim.calibration.simulation.segments import Streams, streams
 from finssim.calibration.simulation.stages import Stages
+from finssim.calibration.trials.fittable import require_axes, require_fittable
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import AXES, Vehicle
 
@@ -88,20 +89,8 @@ def fit_by_simulation(
 def _check(
     trials: Sequence[Trial], axes: Sequence[str] | None, damping: str, estimate: Sequence[str]
 ) -> None:
-    if not trials:
-        raise CalibrationError("no trials were given, expected at least one to fit")
-    names = [trial.name for trial in trials]
-    twice = {name for name in names if names.count(name) > 1}
-    if twice:
-        raise CalibrationError(f"two trials are called '{min(twice)}', expected a name for each: rename one")
-    for trial in trials:
-        if trial.header.role == "held-out":
-            raise CalibrationError(
-                f"{trial.name}: its header says that it is held out: fit on other trials and replay this one"
-            )
-    for axis in axes or ():
-        if axis not in AXES:
-            raise CalibrationError(f"unknown axis '{axis}'; available: {', '.join(AXES)}")
+    require_fittable(trials)
+    require_axes(axes)
     if damping not in DAMPING:
         raise CalibrationError(f"unknown damping '{damping}'; available: {', '.join(DAMPING)}")
     for word in estimate:
