@@ -22,6 +22,9 @@ from finssim.vehicles import load_vehicle
 MOCAP = ("", "x", "y", "z", "qx", "qy", "qz", "qw")
 IMU = ("", "", "", "", "", "p", "q", "r")
 
+HINSDALE = Path(__file__).parents[1] / "tests" / "data" / "hinsdale"
+"""Recordings of a BlueROV2 that was let go by hand."""
+
 
 def read(folder: Path, name: str) -> Trial:
     """A trial of one pair of tables on the union of their times."""
@@ -61,7 +64,7 @@ def draw(decays: list[Decay], path: Path) -> None:
 def main() -> None:
     """Print what the trials tell, with the file of a BlueROV2 Heavy for what they cannot."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folder", type=Path, nargs="?", default=HINSDALE)
     parser.add_argument("--picture", type=Path)
     given = parser.parse_args()
     names = sorted(path.name.removesuffix("_mocap.csv") for path in given.folder.glob("*_mocap.csv"))
