@@ -6,28 +6,22 @@ follow from one number of the vehicle file, which every estimate names.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.regression.buoyant_rise import Rise, buoyant_rise
+from finssim.calibration.regression.decay_estimates import decay_result
 from finssim.calibration.regression.free_decay import BOTH, Decay, free_decay
 from finssim.calibration.regression.plant_terms import Matrices, matrices
-from finssim.calibration.regression.pooling import pooled, pooled_positive
+from finssim.calibration.regression.pooling import pooled_positive
 from finssim.calibration.trials.trial import Trial
-from finssim.vehicles import AXES, Vehicle
+from finssim.vehicles import Vehicle
 
 __all__ = ["passive"]
-
-Array = NDArray[np.float64]
-
-SET = "hydrodynamics.calibrated"
 
 
 def passive(
@@ -54,39 +48,23 @@ def passive(
     quality: dict[str, dict[str, float]] = {}
     warnings, curves, used = list[str](), list[Curve](), set[str]()
     for axis in ("roll", "pitch"):
-        if axes is not None and axis not in axes:
-            continue
-        decays, swinging = [], []
-        for trial in trials:
-            try:
-                decays.append(free_decay(trial, axis))
-                swinging.append(trial)
-            except CalibrationError as error:
-                warnings.append(str(error))
+        decays = _decays(trials, axis, warnings) if axes is None or axis in axes else []
         if not decays:
             continue
-        if len({d.terms for d in decays}) > 1:  # one vehicle, one kind of damping
-            decays = [free_decay(trial, axis, terms=BOTH) for trial in swinging]
-        used |= {d.trial for d in decays}
-        estimates |= _decay_estimates(axis, decays, plant, assume, changes, warnings)
-        quality[axis] = {
-            "r2": float(np.mean([d.r2 for d in decays])),
-            "trials": float(len(decays)),
-            "seconds": float(sum(d.end - d.begin for d in decays)),
-        }
+        found = decay_result(axis, decays, plant, assume)
+        estimates |= {e.name: e for e in found.estimates}
+        changes |= found.changes
+        warnings += found.warnings
+        quality[axis] = _decay_quality(decays)
         curves += [_decay_curve(d) for d in decays]
-    if axes is None or "heave" in axes:
-        rises = []
-        for trial in trials:
-            try:
-                rises.append(buoyant_rise(trial))
-            except CalibrationError as error:
-                warnings.append(str(error))
-        used |= {rise.trial for rise in rises}
-        found = _rise_estimates(rises, plant) if rises else {}
-        warnings += _contradictions(found, plant)
-        estimates |= found
+        used |= {d.trial for d in decays}
+    rises = _rises(trials, warnings) if axes is None or "heave" in axes else []
+    if rises:
+        risen = _rise_estimates(rises, plant)
+        estimates |= risen
+        warnings += _contradictions(risen, plant)
         curves += [_rise_curve(rise) for rise in rises]
+        used |= {rise.trial for rise in rises}
     if not estimates:
         raise CalibrationError(f"no trial shows a free decay or a rise: {'; '.join(warnings)}")
     return Fit(
@@ -103,134 +81,37 @@ def passive(
     )
 
 
-def _decay_estimates(
-    axis: str,
-    decays: list[Decay],
-    plant: Matrices,
-    assume: str,
-    changes: dict[str, Any],
-    warnings: list[str],
-) -> dict[str, Estimate]:
-    i = AXES.index(axis)
-    k, m = float(plant.arm[2]), float(plant.M_RB[i, i] + plant.M_A[i, i])
-    if assume == "restoring" and k <= 0.0:
-        raise CalibrationError(
-            f"{axis}: the vehicle file has a stiffness of {k:.4g} N m/rad, expected one above 0: give the centres of "
-            "gravity and buoyancy, or assume the inertia"
-        )
-    said = (
-        f"with the file's k = {k:.4g} N m/rad"
-        if assume == "restoring"
-        else f"with the file's inertia {m:.4g} kg m²"
-    )
-    swings = sorted(d.swing for d in decays)
-    swing = (
-        f"swings of {swings[0]:.2g}-{swings[-1]:.2g} rad/s"
-        if len(decays) > 1
-        else f"a swing of {swings[0]:.2g} rad/s"
-    )
-
-    def estimate(name: str, unit: str, of: Any, note: str = "", path: str | None = None) -> Estimate:
-        """Pool a function of x = ln w2, c1, c2 over the decays that have it."""
-        values, stds, dof = (
-            np.array(column) for column in zip(*(_derived(d, of) for d in decays), strict=True)
-        )
-        value, low, high = pooled_positive(values, stds, dof)
-        sure = bool(np.isfinite([low, high]).all() and 0.5 * (high - low) <= 0.5 * abs(value))
-        return Estimate(
-            name=f"{axis}.{name}", estimate=value, ci95=(low, high), unit=unit, identifiable=sure,
-            note=note if sure or note else "not known to half its size", path=path,
-        )  # fmt: skip
-
-    def inertia(x: Array, _: Decay) -> float:
-        return k / math.exp(x[0]) if assume == "restoring" else m
-
-    def ratio(x: Array, d: Decay) -> float:
-        # A quadratic term counts as the linear one that takes the same energy out of the largest swing.
-        return float((x[1] + 8.0 / (3.0 * math.pi) * x[2] * d.swing) / (2.0 * math.exp(0.5 * x[0])))
-
-    damping: dict[str, float] = {}
-    linear, quadratic = (any(d.terms[j] for d in decays) for j in (0, 1))
-    out = [
-        estimate("natural_frequency", "rad/s", lambda x, _: math.exp(0.5 * x[0])),
-        estimate("damping_ratio", "-", ratio, f"at {swing}"),
-        estimate("m_eff", "kg m²", inertia, said),
-    ]
-    for name, j, family, unit, there in (
-        ("d1", 1, "linear_damping", "N m s", linear),
-        ("d2", 2, "quadratic_damping", "N m s²", quadratic),
-    ):
-        path = f"{SET}.{family}.{i}.{i}"
-        if there:
-            some = [d for d in decays if d.terms[j - 1]]
-            found = [_derived(d, lambda x, d, j=j: x[j] * inertia(x, d)) for d in some]
-            value, low, high = pooled(*(np.array(column) for column in zip(*found, strict=True)))
-            sure = bool(low > 0.0)
-            out.append(
-                Estimate(
-                    name=f"{axis}.{name}", estimate=value, ci95=(low, high), unit=unit, identifiable=sure,
-                    note=said, path=path,
-                )
-            )  # fmt: skip
-            damping[path] = max(value, 0.0)
-        else:
-            out.append(
-                Estimate(
-                    name=f"{axis}.{name}", estimate=0.0, ci95=(math.nan, math.nan), unit=unit, identifiable=False,
-                    note=f"{swing} need it not", path=path,
-                )
-            )  # fmt: skip
-            damping[path] = 0.0
-    if out[1].identifiable and out[2].identifiable:
-        changes.update(damping)
-    if assume == "inertia":
-        out[2] = replace(out[2], identifiable=False)
-    if assume == "restoring":
-        whole = out[2]
-        rigid = float(plant.M_RB[i, i])
-        positive = whole.estimate > rigid
-        out.insert(
-            3,
-            Estimate(
-                name=f"{axis}.added_mass", estimate=whole.estimate - rigid,
-                ci95=(whole.ci95[0] - rigid, whole.ci95[1] - rigid), unit="kg m²",
-                identifiable=whole.identifiable and whole.ci95[0] > rigid, note=said, path=f"{SET}.added_mass.{i}.{i}",
-            ),
-        )  # fmt: skip
-        if positive and whole.identifiable:
-            changes[f"{SET}.added_mass.{i}.{i}"] = whole.estimate - rigid
-        elif not positive:
-            warnings.append(
-                f"{axis}: {said} the inertia is {whole.estimate:.4g} kg m², below the file's rigid {rigid:.4g} kg m²: "
-                "check the centres of gravity and buoyancy, or the inertia"
-            )
-    else:
-        out.append(
-            estimate("k", "N m/rad", lambda x, _: m * math.exp(x[0]), said, "body.center_of_buoyancy.2")
-        )
-    for d in decays:
-        if d.drift:
-            warnings.append(
-                f"{d.trial}: the equilibrium of {axis} moved during the decay; straight pieces follow it"
-            )
-    return {e.name: e for e in out}
+def _decays(trials: Sequence[Trial], axis: str, warnings: list[str]) -> list[Decay]:
+    """Those of one axis, all with the same kind of damping; why a trial shows none becomes a warning."""
+    decays, swinging = [], []
+    for trial in trials:
+        try:
+            decays.append(free_decay(trial, axis))
+            swinging.append(trial)
+        except CalibrationError as error:
+            warnings.append(str(error))
+    if len({d.terms for d in decays}) > 1:  # one vehicle, one kind of damping
+        decays = [free_decay(trial, axis, terms=BOTH) for trial in swinging]
+    return decays
 
 
-def _derived(decay: Decay, of: Any) -> tuple[float, float, float]:
-    """A function of x = ln w2, c1, c2 and the decay with its standard error and degrees of freedom."""
-    x = np.array([math.log(decay.theta[0]), decay.theta[1], decay.theta[2]])
-    free = np.array([True, *decay.terms])
-    slope = np.zeros(3)
-    for j in np.flatnonzero(free):
-        h = 1e-6 * max(1.0, abs(x[j]))
-        step = np.zeros(3)
-        step[j] = h
-        slope[j] = (of(x + step, decay) - of(x - step, decay)) / (2.0 * h)
-    C = decay.covariance
-    matrix = np.where(C.alone.any(), C.local, C.trials)
-    variance = float(slope[free] @ matrix @ slope[free])
-    dof = float(np.min(C.dof[np.isfinite(C.dof)], initial=np.inf))
-    return float(of(x, decay)), math.sqrt(max(variance, 0.0)), dof
+def _decay_quality(decays: Sequence[Decay]) -> dict[str, float]:
+    return {
+        "r2": float(np.mean([d.r2 for d in decays])),
+        "trials": float(len(decays)),
+        "seconds": float(sum(d.end - d.begin for d in decays)),
+    }
+
+
+def _rises(trials: Sequence[Trial], warnings: list[str]) -> list[Rise]:
+    """Why a trial shows none becomes a warning."""
+    rises = []
+    for trial in trials:
+        try:
+            rises.append(buoyant_rise(trial))
+        except CalibrationError as error:
+            warnings.append(str(error))
+    return rises
 
 
 def _rise_estimates(rises: list[Rise], plant: Matrices) -> dict[str, Estimate]:
