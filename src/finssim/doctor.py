@@ -52,7 +52,13 @@ EXTRAS = {
     ),
     "view": Extra({"matplotlib": "matplotlib"}, "draw pictures of vehicles and figures of evaluations"),
     "mujoco": Extra({"mujoco": "mujoco"}, "measure speed as a ratio to MuJoCo's"),
-    "vision": Extra({"opencv-python-headless": "cv2"}, "nothing yet: kept for localization by camera"),
+    "vision": Extra(
+        {"opencv-python-headless": "cv2", "pupil-apriltags": "pupil_apriltags", "matplotlib": "matplotlib"},
+        "detect tags, calibrate cameras and pools from pictures, locate a vehicle from pictures or video",
+    ),
+    "render": Extra(
+        {"mitsuba": "mitsuba"}, "render the localization experiment with Mitsuba instead of our own"
+    ),
     "ros2": Extra({"cyclonedds": "cyclonedds", "rosbags": "rosbags"}, "nothing yet: kept for ROS 2"),
     "hardware": Extra({"pyserial": "serial"}, "nothing yet: kept for the link to a vehicle"),
 }
