@@ -1,7 +1,7 @@
 """The one reader of YAML files written by hand: a mapping, or one sentence that says what is wrong with the file."""
 
 import re
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,12 @@ _Loader.add_implicit_resolver(
 
 
 def read_mapping(
-    path: Path, refuse: type[Exception], *, such_as: str, shown: str | None = None
+    path: Path,
+    refuse: type[Exception],
+    *,
+    such_as: str,
+    shown: str | None = None,
+    cleaned: Callable[[str], str] = str,
 ) -> dict[Any, Any]:
     """The mapping that a YAML file holds.
 
@@ -52,13 +57,14 @@ def read_mapping(
         refuse: Class of the error, made from one sentence.
         such_as: An example of what the file should hold, for that sentence.
         shown: How the sentence calls the file; its path where not given.
+        cleaned: Makes standard YAML of the text of a dialect.
 
     Raises:
         refuse: The file is missing or unreadable, not text, malformed, or holds no mapping.
     """
     name = str(path) if shown is None else shown
     try:
-        tree = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
+        tree = yaml.load(cleaned(path.read_text(encoding="utf-8")), Loader=_Loader)
     except OSError as error:
         raise refuse(f"{name}: cannot be read: {error.strerror or error}") from None
     except (UnicodeDecodeError, yaml.reader.ReaderError):
