@@ -15,7 +15,7 @@ from finssim.calibration.regression.plant_terms import Matrices
 from finssim.calibration.regression.selection import Selection
 from finssim.vehicles import AXES
 
-__all__ = ["AxisResult", "axis_result"]
+__all__ = ["BIAS_NOTE", "CERTAIN", "AxisResult", "axis_result"]
 
 Array = NDArray[np.float64]
 
@@ -63,103 +63,142 @@ def axis_result(data: AxisData, chosen: Selection, plant: Matrices) -> AxisResul
         chosen: The model and its intervals.
         plant: For the rigid part of the inertia.
     """
-    i, axis, fit = data.axis, AXES[data.axis], chosen.fit
-    linear = i < 3
+    axis = AXES[data.axis]
     low, high = speed_range(data, chosen)
-    unit = "m/s" if linear else "rad/s"
-    speeds = f"speeds of {low:.2g}-{high:.2g} {unit}"
-    rigid = float(plant.M_RB[i, i])
-    theta, ends = fit.theta, chosen.interval
-    out: dict[str, Estimate] = {}
-    changes: dict[str, Any] = {}
-    warnings = []
-
-    def add(name: str, term: int, unit: str, path: str | None = None, *, shift: float = 0.0) -> Estimate:
-        value, (lower, upper) = theta[term] - shift, ends[term] - shift
-        note, sure = "", bool(np.isfinite([lower, upper]).all())
-        if fit.active[term]:
-            note, sure = f"held at its bound 0; free, it would be {fit.free[term]:.3g}", False
-            warnings.append(
-                f"{axis}.{name} rests on its bound: free, it would be {fit.free[term]:.3g} {unit}"
-            )
-        elif sure and 0.5 * (upper - lower) > CERTAIN * abs(theta[term]):
-            note, sure = f"known to no better than {_percent(upper - lower, theta[term])}", False
-        found = Estimate(
-            name=f"{axis}.{name}", estimate=float(value), ci95=(float(lower), float(upper)), unit=unit,
-            identifiable=sure, note=note, path=path,
-        )  # fmt: skip
-        out[found.name] = found
-        return found
-
-    whole = add("m_eff", M, "kg" if linear else "kg m²")
-    lag = data.shift + theta[DELAY]
-    if data.shift and not fit.active[M]:
-        late = f"the motion lags the file's motors by {lag * 1e3:.0f} ms: if that is a lag of first order "
-        out[whole.name] = replace(whole, note="; ".join(filter(None, [whole.note, late + LAG_NOTE])))
-    _added_mass(out, changes, warnings, axis, i, theta[M] - rigid, ends[M] - rigid, rigid)
-    for name, term, family, unit_d in (
-        ("d1", D1, "linear_damping", "N s/m" if linear else "N m s"),
-        ("d2", D2, "quadratic_damping", "N s²/m²" if linear else "N m s²"),
-    ):
-        path = f"{SET}.{family}.{i}.{i}"
-        if name in chosen.dropped:
-            out[f"{axis}.{name}"] = Estimate(
-                name=f"{axis}.{name}", estimate=0.0, ci95=_pair(ends[term]), unit=unit_d, identifiable=False,
-                note=f"not distinguishable from zero at {speeds}", path=path,
-            )  # fmt: skip
-        elif fit.terms[term]:
-            add(name, term, unit_d, path)
-    if damping_known(data, chosen):
-        for name, family in (("d1", "linear_damping"), ("d2", "quadratic_damping")):
-            changes[f"{SET}.{family}.{i}.{i}"] = max(float(theta[D1 if name == "d1" else D2]), 0.0)
-    else:
-        warnings.append(f"{axis}: damping is not determined by {speeds}; the vehicle file keeps its numbers")
+    speeds = f"speeds of {low:.2g}-{high:.2g} {'m/s' if data.axis < 3 else 'rad/s'}"
+    draft = _Draft(data=data, chosen=chosen)
+    draft.inertia()
+    draft.added_mass(float(plant.M_RB[data.axis, data.axis]))
+    draft.damping(speeds)
     if data.restoring:
-        add("k", K, "N m/rad", "body.center_of_buoyancy.2")
-    bias = add("bias", BIAS, "N" if linear else "N m")
-    out[bias.name] = Estimate(
-        name=bias.name, estimate=bias.estimate, ci95=bias.ci95, unit=bias.unit,
-        identifiable=bool(np.isfinite(bias.ci95).all()), note=BIAS_NOTE,
-    )  # fmt: skip
-
+        draft.add("k", K, "N m/rad", "body.center_of_buoyancy.2")
+    draft.bias()
     if 0.0 < low and high < DECADE * low:
-        warnings.append(f"{axis} damping rests on {speeds}, less than a decade")
-    warnings += doubts(axis, data, chosen)
+        draft.warnings.append(f"{axis} damping rests on {speeds}, less than a decade")
+    draft.warnings += doubts(axis, data, chosen)
     figures = quality(data, chosen)
     reason = worthless(data, figures, chosen)
     if reason:
-        out = {n: replace(e, identifiable=False, note=reason) for n, e in out.items()}
-        changes = {}
-        warnings.append(f"{axis}: {reason}; the vehicle file keeps its numbers")
+        draft.believe_nothing(reason)
     return AxisResult(
-        estimates=out, changes=changes, quality=figures, warnings=warnings, curves=_curves(data, chosen),
-        worthless=reason,
+        estimates=draft.estimates, changes=draft.changes, quality=figures, warnings=draft.warnings,
+        curves=_curves(data, chosen), worthless=reason,
     )  # fmt: skip
 
 
-def _added_mass(
-    out: dict[str, Estimate], changes: dict[str, Any], warnings: list[str], axis: str, i: int, value: float,
-    ends: Array, rigid: float,
-) -> None:  # fmt: skip
-    whole = out[f"{axis}.m_eff"]
-    unit, path = whole.unit, f"{SET}.added_mass.{i}.{i}"
-    sure, note = whole.identifiable, f"with the file's rigid {rigid:.4g} {unit} as exact"
-    if value <= 0.0:
-        sure = False
-        note = f"m_eff is below the file's rigid {rigid:.4g} {unit}"
-        warnings.append(
-            f"{axis}: an effective inertia of {whole.estimate:.4g} {unit} is below the rigid {rigid:.4g} {unit} of the "
-            "vehicle file, so that added mass would be negative: check the thrust and the file's mass or inertia"
+@dataclass(kw_only=True)
+class _Draft:
+    """What is found of one axis, term by term."""
+
+    data: AxisData
+    chosen: Selection
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    changes: dict[str, Any] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def axis(self) -> str:
+        """By name."""
+        return AXES[self.data.axis]
+
+    def unit(self, translation: str, rotation: str) -> str:
+        """That of the axis."""
+        return translation if self.data.axis < 3 else rotation
+
+    def path(self, family: str) -> str:
+        """Of the axis' own entry in a matrix of the vehicle file."""
+        return f"{SET}.{family}.{self.data.axis}.{self.data.axis}"
+
+    def add(self, name: str, term: int, unit: str, path: str | None = None) -> Estimate:
+        """Take the estimate of a term, and a warning where it rests on its bound."""
+        fit = self.chosen.fit
+        value, (lower, upper) = fit.theta[term], self.chosen.interval[term]
+        note, sure = "", bool(np.isfinite([lower, upper]).all())
+        if fit.active[term]:
+            note, sure = f"held at its bound 0; free, it would be {fit.free[term]:.3g}", False
+            self.warnings.append(
+                f"{self.axis}.{name} rests on its bound: free, it would be {fit.free[term]:.3g} {unit}"
+            )
+        elif sure and 0.5 * (upper - lower) > CERTAIN * abs(value):
+            note, sure = f"known to no better than {_percent(upper - lower, value)}", False
+        found = Estimate(
+            name=f"{self.axis}.{name}", estimate=float(value), ci95=(float(lower), float(upper)), unit=unit,
+            identifiable=sure, note=note, path=path,
+        )  # fmt: skip
+        self.estimates[found.name] = found
+        return found
+
+    def inertia(self) -> None:
+        """m_eff, and in its note a lag that may be part of it."""
+        whole = self.add("m_eff", M, self.unit("kg", "kg m²"))
+        lag = self.data.shift + self.chosen.fit.theta[DELAY]
+        if self.data.shift and not self.chosen.fit.active[M]:
+            late = (
+                f"the motion lags the file's motors by {lag * 1e3:.0f} ms: if that is a lag of first order "
+            )
+            note = "; ".join(filter(None, [whole.note, late + LAG_NOTE]))
+            self.estimates[whole.name] = replace(whole, note=note)
+
+    def added_mass(self, rigid: float) -> None:
+        """m_eff less the rigid part."""
+        whole = self.estimates[f"{self.axis}.m_eff"]
+        value, ends = float(self.chosen.fit.theta[M] - rigid), self.chosen.interval[M] - rigid
+        unit, path = whole.unit, self.path("added_mass")
+        sure, note = whole.identifiable, f"with the file's rigid {rigid:.4g} {unit} as exact"
+        if value <= 0.0:
+            sure = False
+            note = f"m_eff is below the file's rigid {rigid:.4g} {unit}"
+            self.warnings.append(
+                f"{self.axis}: an effective inertia of {whole.estimate:.4g} {unit} is below the rigid {rigid:.4g} "
+                f"{unit} of the vehicle file, so that added mass would be negative: check the thrust and the file's "
+                "mass or inertia"
+            )
+        elif ends[0] <= 0.0:
+            sure, note = False, "not distinguishable from zero"
+        half = 0.5 * (whole.ci95[1] - whole.ci95[0])
+        if value > 0.0 and half < USEFUL * whole.estimate:
+            self.changes[path] = value
+        name = f"{self.axis}.added_mass"
+        self.estimates[name] = Estimate(
+            name=name, estimate=value, ci95=_pair(ends), unit=unit, identifiable=sure, note=note, path=path
         )
-    elif ends[0] <= 0.0:
-        sure, note = False, "not distinguishable from zero"
-    half = 0.5 * (whole.ci95[1] - whole.ci95[0])
-    if value > 0.0 and half < USEFUL * whole.estimate:
-        changes[path] = float(value)
-    out[f"{axis}.added_mass"] = Estimate(
-        name=f"{axis}.added_mass", estimate=float(value), ci95=_pair(ends), unit=unit, identifiable=sure,
-        note=note, path=path,
-    )  # fmt: skip
+
+    def damping(self, speeds: str) -> None:
+        """d1 and d2; both go to the vehicle file or neither."""
+        theta = self.chosen.fit.theta
+        for name, term, family, unit in (
+            ("d1", D1, "linear_damping", self.unit("N s/m", "N m s")),
+            ("d2", D2, "quadratic_damping", self.unit("N s²/m²", "N m s²")),
+        ):
+            if name in self.chosen.dropped:
+                whole = f"{self.axis}.{name}"
+                self.estimates[whole] = Estimate(
+                    name=whole, estimate=0.0, ci95=_pair(self.chosen.interval[term]), unit=unit, identifiable=False,
+                    note=f"not distinguishable from zero at {speeds}", path=self.path(family),
+                )  # fmt: skip
+            elif self.chosen.fit.terms[term]:
+                self.add(name, term, unit, self.path(family))
+        if damping_known(self.data, self.chosen):
+            self.changes[self.path("linear_damping")] = max(float(theta[D1]), 0.0)
+            self.changes[self.path("quadratic_damping")] = max(float(theta[D2]), 0.0)
+        else:
+            self.warnings.append(
+                f"{self.axis}: damping is not determined by {speeds}; the vehicle file keeps its numbers"
+            )
+
+    def bias(self) -> None:
+        """b, identifiable wherever it has an interval, for it may well be zero."""
+        found = self.add("bias", BIAS, self.unit("N", "N m"))
+        sure = bool(np.isfinite(found.ci95).all())
+        self.estimates[found.name] = replace(found, identifiable=sure, note=BIAS_NOTE)
+
+    def believe_nothing(self, reason: str) -> None:
+        """Leave the numbers as they are, call none of them identifiable and write none."""
+        self.estimates = {
+            name: replace(e, identifiable=False, note=reason) for name, e in self.estimates.items()
+        }
+        self.changes = {}
+        self.warnings.append(f"{self.axis}: {reason}; the vehicle file keeps its numbers")
 
 
 def _curves(data: AxisData, chosen: Selection) -> list[Curve]:
