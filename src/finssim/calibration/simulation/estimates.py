@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.fit import Estimate
-from finssim.calibration.regression.axis_estimates import CERTAIN
+from finssim.calibration.regression.axis_estimates import BIAS_NOTE, CERTAIN
 from finssim.calibration.simulation.evidence import Findings
 from finssim.calibration.simulation.parameters import Parameters
 
@@ -217,7 +217,7 @@ def _verdict(quantity: Quantity, value: float, low: float, high: float) -> tuple
     if not np.isfinite(half):
         return False, "the trials say nothing of it"
     if quantity.kind in ("bias", "buoyancy_excess", "coupling", "current.x", "current.y"):
-        return True, {"bias": "on the side of the damping, at no speed"}.get(quantity.kind, "")
+        return True, BIAS_NOTE if quantity.kind == "bias" else ""
     if quantity.kind == "thrust_delay":
         return half <= LAG_CERTAIN, "" if half <= LAG_CERTAIN else f"known to no better than ±{half:.2g} s"
     if half > CERTAIN * abs(value):
