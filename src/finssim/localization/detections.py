@@ -1,0 +1,258 @@
+"""Tags found in pictures, and the CSV file that keeps them.
+
+One row per tag: `time,image,tag,u0,v0,u1,v1,u2,v2,u3,v3,margin,hamming,family`. Time in seconds, corners in pixels with
+integers at pixel centres, in the order top-left, top-right, bottom-right, bottom-left of the printed black border. A
+picture without tags is a row whose cells after `image` are empty.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.files import atomic_write
+from finssim.localization.errors import LocalizationError
+
+__all__ = ["Detection", "Frame", "most_certain", "read_detections", "write_detections"]
+
+Array = npt.NDArray[np.float64]
+
+COLUMNS = (
+    "time",
+    "image",
+    "tag",
+    *(f"{axis}{i}" for i in range(4) for axis in "uv"),
+    "margin",
+    "hamming",
+    "family",
+)
+
+_OTHER_NAMES = {
+    "time": ("t", "time_s", "timestamp", "stamp", "seconds"),
+    "image": ("file", "filename", "picture", "frame", "image_name", "img"),
+    "tag": ("id", "tag_id", "tagid", "marker", "marker_id"),
+    "margin": ("decision_margin", "score"),
+    "hamming": ("errors",),
+    "family": ("tag_family",),
+}
+_CORNER = re.compile(r"(?:corner|c|p|pt|point)?_?(?:(\d)_?([uvxy])|([uvxy])_?(\d))(?:_?px)?")
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """One tag in one picture."""
+
+    tag: int
+    """Its id within the family."""
+    corners: Array
+    """Pixels (u, v), integers at pixel centres, (4, 2): top-left, top-right, bottom-right, bottom-left as printed."""
+    margin: float = math.nan
+    """Contrast with which its bits were read [grey levels]: higher is surer; NaN where nobody said."""
+    hamming: int = 0
+    """Bits that were corrected."""
+    family: str = ""
+    """Such as `tag25h9`; empty where nobody said."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What was found in one picture."""
+
+    time: float
+    """Time stamp of the picture [s]; NaN where it has none."""
+    image: str
+    """Its name; empty where it has none."""
+    detections: tuple[Detection, ...]
+    """As found: an id may be there twice."""
+
+
+def most_certain(detections: Iterable[Detection]) -> list[Detection]:
+    """One detection of each family and id: that with the fewest corrected bits, then the greatest margin."""
+    best: dict[tuple[str, int], Detection] = {}
+    for found in detections:
+        rival = best.setdefault((found.family, found.tag), found)
+        if (found.hamming, -_known(found.margin)) < (rival.hamming, -_known(rival.margin)):
+            best[found.family, found.tag] = found
+    return list(best.values())
+
+
+def write_detections(frames: Iterable[Frame], path: str | Path) -> None:
+    """Write a detections file; every number reads back bit for bit.
+
+    Args:
+        frames: In the order in which they are written.
+        path: The file (.csv).
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        for frame in frames:
+            head = [_cell(frame.time), frame.image]
+            for found in frame.detections:
+                pixels = [_cell(x) for x in np.asarray(found.corners, float).ravel().tolist()]
+                writer.writerow([*head, found.tag, *pixels, _cell(found.margin), found.hamming, found.family])
+            if not frame.detections:
+                writer.writerow(head + [""] * (len(COLUMNS) - 2))
+
+
+def read_detections(path: str | Path, notes: list[str] | None = None) -> list[Frame]:
+    """Read a detections file.
+
+    Columns may stand in any order and be called as others call them (`id`, `tag_id`; `x0`, `corner0_u`, `c0_x`; corners
+    may count from 1), others are left aside; cells are separated by commas, semicolons or tabs, lines that begin with #
+    are comments. Rows of one picture belong together by image and time, whichever is there; without either, the file
+    is one picture. A file that a crash cut short opens up to the cut.
+
+    Args:
+        path: The file.
+        notes: Takes one sentence for each thing that was left out.
+
+    Returns:
+        Pictures in the order in which the file first names them.
+
+    Raises:
+        LocalizationError: Unreadable, without the tag or corner columns, or with a cell that is no number; names file
+            and line.
+    """
+    lines, unfinished = _lines(Path(path))
+    if not lines:
+        raise LocalizationError(f"{path}: no line of column names: expected one such as {','.join(COLUMNS)}")
+    delimiter = max(",;\t", key=lines[0][1].count)
+    header = _split(lines[0][1], delimiter)
+    columns = _columns(header, str(path))
+    if unfinished and len(lines) > 1:
+        whole = len(_split(lines[-1][1], delimiter)) >= len(header) and tuple(header) != COLUMNS
+        what = "may be cut" if whole else "is cut short and was left out"
+        _note(notes, f"{path}: line {lines[-1][0]}, the last, has no end: it {what}")
+        lines = lines if whole else lines[:-1]
+    pictures: dict[tuple[str, str], tuple[float, str, list[Detection]]] = {}
+    for number, line in lines[1:]:
+        row = _row(_split(line, delimiter), columns, len(header), f"{path}: line {number}")
+        if delimiter != ",":
+            row.cells = {name: cell.replace(",", ".") for name, cell in row.cells.items()}
+        key = row.cells.get("image", ""), row.cells.get("time", "")
+        if key not in pictures:
+            pictures[key] = (row.number("time") if key[1] else math.nan, key[0], [])
+        if not row.blank:
+            pictures[key][2].append(row.detection())
+    return [Frame(time, image, tuple(found)) for time, image, found in pictures.values()]
+
+
+@dataclass
+class _Row:
+    """One line of the file by our column names."""
+
+    cells: dict[str, str]
+    where: str
+
+    @property
+    def blank(self) -> bool:
+        """Whether it only says that the picture holds no tag."""
+        return not any(cell for name, cell in self.cells.items() if name not in ("time", "image"))
+
+    def number(self, name: str) -> float:
+        """A finite number."""
+        cell = self.cells[name]
+        try:
+            value = float(cell)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise LocalizationError(
+                f"{self.where}: {name} is '{cell[:40]}', expected a finite number: correct or remove the line"
+            )
+        return value
+
+    def whole(self, name: str, default: int | None = None) -> int:
+        """A whole number that is not negative."""
+        if default is not None and not self.cells.get(name):
+            return default
+        value = self.number(name)
+        if value != int(value) or value < 0:
+            raise LocalizationError(
+                f"{self.where}: {name} is {self.cells[name]}, expected a whole number from 0"
+            )
+        return int(value)
+
+    def detection(self) -> Detection:
+        """The tag it tells of."""
+        pixels = [self.number(f"{axis}{i}") for i in range(4) for axis in "uv"]
+        return Detection(
+            tag=self.whole("tag"),
+            corners=np.array(pixels).reshape(4, 2),
+            margin=self.number("margin") if self.cells.get("margin") else math.nan,
+            hamming=self.whole("hamming", 0),
+            family=self.cells.get("family", ""),
+        )
+
+
+def _lines(path: Path) -> tuple[list[tuple[int, str]], bool]:
+    """Numbered lines that hold something, and whether the last one lacks its end."""
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise LocalizationError(f"{path}: cannot be read: {error.strerror or error}") from None
+    whole = raw.split(b"\0", 1)[0]  # a crash leaves zeros where the file system had made room
+    text = whole.decode("utf-8-sig", errors="replace")
+    numbered = enumerate(text.splitlines(), start=1)
+    lines = [(number, line) for number, line in numbered if line.strip() and not line.startswith("#")]
+    return lines, not text.endswith(("\n", "\r"))
+
+
+def _split(line: str, delimiter: str) -> list[str]:
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter))]
+
+
+def _row(cells: list[str], columns: Mapping[str, int], width: int, where: str) -> _Row:
+    if len(cells) < width or any(cells[width:]):
+        raise LocalizationError(
+            f"{where}: {len(cells)} cells, expected the {width} of the column names: correct or remove the line"
+        )
+    return _Row({name: cells[i] for name, i in columns.items()}, where)
+
+
+def _columns(header: list[str], where: str) -> dict[str, int]:
+    """Our column name -> its place in the file."""
+    spoken = [re.sub(r"[\s\-.\[\]()]+", "_", name.lower()).strip("_") for name in header]
+    known = {other: name for name, others in _OTHER_NAMES.items() for other in (name, *others)}
+    found = [(known.get(name) or "", _CORNER.fullmatch(name)) for name in spoken]
+    numbers = [int(match[1] or match[4]) for _, match in found if match]
+    first = min(numbers, default=0)  # corners may count from 1
+    columns: dict[str, int] = {}
+    for place, (name, match) in enumerate(found):
+        if match:
+            axis = (match[2] or match[3]).translate(str.maketrans("xy", "uv"))
+            name = f"{axis}{int(match[1] or match[4]) - first}"
+        if name in columns:
+            raise LocalizationError(f"{where}: '{header[place]}' is a second column of {name}: remove one")
+        if name:
+            columns[name] = place
+    missing = [name for name in COLUMNS[2:11] if name not in columns]
+    if missing:
+        raise LocalizationError(
+            f"{where}: no column '{missing[0]}' among {', '.join(header)[:200]}: expected {','.join(COLUMNS)}"
+        )
+    return columns
+
+
+def _known(margin: float) -> float:
+    return -math.inf if math.isnan(margin) else margin
+
+
+def _cell(value: float) -> str:
+    return "" if math.isnan(value) else repr(float(value))
+
+
+def _note(notes: list[str] | None, sentence: str) -> None:
+    if notes is not None:
+        notes.append(sentence)
