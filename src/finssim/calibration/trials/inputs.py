@@ -8,21 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.trials.columns import INPUT_PREFIXES, TAU
+from finssim.calibration.trials.columns import TAU
 from finssim.calibration.trials.header import Header
+from finssim.calibration.trials.input_columns import ORDER, first_complete, input_columns
 from finssim.calibration.trials.motors import delivered, thruster_motors, wrench_motors
 from finssim.calibration.trials.trial import Trial
 from finssim.geometry.rotations import skew
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.vehicles import Vehicle
-from finssim.vehicles.part import did_you_mean
 
 __all__ = ["Drive", "applied_wrench", "drive", "widest_step"]
 
 Array = NDArray[np.float64]
-
-ORDER = ("rpm_", "force_", "tau", "pwm_", "command_")
-"""Inputs from the one that tells most of what acted to the one that tells least."""
 
 ACTED = ("rpm_", "force_", "tau")
 """Inputs that are what acted, unless the header says otherwise."""
@@ -73,56 +70,14 @@ def drive(trial: Trial, vehicle: Vehicle) -> Drive:
         CalibrationError: No inputs, a thruster that the vehicle has not, some thrusters missing, or pulse widths
             without a speed controller in the vehicle file.
     """
-    header = trial.header
-    if header.passive:
-        zero = np.zeros((len(trial.t), 6))
-        return Drive(
-            t=trial.t,
-            force=zero,
-            B=np.eye(6),
-            names=TAU,
-            commanded=False,
-            thrusters=False,
-            held=False,
-            spans=_spans(trial.t),
-            source="passive",
-        )
-    present = {kind: _columns(trial, vehicle, kind) for kind in ORDER}
-    complete = [
-        kind
-        for kind in ORDER
-        if present[kind] and (kind == "tau" or len(present[kind]) == len(vehicle.thrusters))
-    ]
-    if not complete:
-        raise CalibrationError(f"{trial.name}: {_what_is_missing(present, trial, vehicle)}")
-    kind = complete[0]
-    commanded = header.inputs == "commanded" or (header.inputs is None and kind not in ACTED)
+    if trial.header.passive:
+        return _undriven(trial)
+    present = input_columns(trial, vehicle)
+    kind = first_complete(present, trial, vehicle)
     columns = present[kind]
-    stepped = header.inputs_between is None and not commanded and _keeps_levels(trial, columns)
-    held = commanded or stepped if header.inputs_between is None else header.inputs_between == "held"
-    notes = [
-        f"{k}* is there for some thrusters only; {kind.rstrip('_')} was used"
-        for k in ORDER[: ORDER.index(kind)]
-        if present[k]
-    ]
-    if stepped:
-        notes.append(
-            f"{kind.rstrip('_')} keeps its levels exactly and jumps from row to row: read as held from each row to the "
-            "next; write 'inputs_between: linear' in trial.yaml if it was sampled while it changed"
-        )
-    if kind == "tau":
-        missing = [name for name in TAU if name not in columns]
-        if missing:
-            notes.append(f"no column {', '.join(missing)}: taken as zero")
+    commanded, held, stepped = _between(trial, kind, columns)
     t, values = _together(trial, columns, held)
-    if kind == "tau":
-        force = np.zeros((len(t), 6))
-        force[:, [TAU.index(name) for name in columns]] = values
-        B = _about_origin(header, vehicle)
-        names: tuple[str, ...] = TAU
-    else:
-        force = _forces(kind, values, t, trial, vehicle)
-        B, names = vehicle.thruster_matrix(), vehicle.thruster_names
+    force, B, names = _channels(trial, vehicle, kind, columns, t, values)
     if len(names) > MAX_THRUSTERS:
         if commanded:
             raise CalibrationError(
@@ -134,14 +89,70 @@ def drive(trial: Trial, vehicle: Vehicle) -> Drive:
         t=t,
         force=force,
         B=B,
-        names=tuple(names),
+        names=names,
         commanded=commanded,
         thrusters=names is not TAU,
         held=held,
         spans=_held_spans(t, trial.t) if held else _spans(t),
         source=kind.rstrip("_"),
-        notes=tuple(notes),
+        notes=_notes(kind, present, stepped),
     )
+
+
+def _undriven(trial: Trial) -> Drive:
+    """No wrench at any time, as in a passive trial."""
+    return Drive(
+        t=trial.t,
+        force=np.zeros((len(trial.t), 6)),
+        B=np.eye(6),
+        names=TAU,
+        commanded=False,
+        thrusters=False,
+        held=False,
+        spans=_spans(trial.t),
+        source="passive",
+    )
+
+
+def _between(trial: Trial, kind: str, columns: list[str]) -> tuple[bool, bool, bool]:
+    """Whether inputs were commanded, hold from row to row, and are seen to hold though the header does not say."""
+    header = trial.header
+    commanded = header.inputs == "commanded" or (header.inputs is None and kind not in ACTED)
+    if header.inputs_between is not None:
+        return commanded, header.inputs_between == "held", False
+    stepped = not commanded and _keeps_levels(trial, columns)
+    return commanded, commanded or stepped, stepped
+
+
+def _channels(
+    trial: Trial, vehicle: Vehicle, kind: str, columns: list[str], t: Array, values: Array
+) -> tuple[Array, Array, tuple[str, ...]]:
+    """Forces (n, k), their map to the wrench about the body origin (6, k), and names."""
+    if kind != "tau":
+        force = _forces(kind, values, t, trial, vehicle)
+        return force, vehicle.thruster_matrix(), vehicle.thruster_names
+    wrench = np.zeros((len(t), 6))
+    wrench[:, [TAU.index(name) for name in columns]] = values
+    return wrench, _about_origin(trial.header, vehicle), TAU
+
+
+def _notes(kind: str, present: dict[str, list[str]], stepped: bool) -> tuple[str, ...]:
+    """What was assumed."""
+    source = kind.rstrip("_")
+    notes = [
+        f"{k}* is there for some thrusters only; {source} was used"
+        for k in ORDER[: ORDER.index(kind)]
+        if present[k]
+    ]
+    if stepped:
+        notes.append(
+            f"{source} keeps its levels exactly and jumps from row to row: read as held from each row to the next; "
+            "write 'inputs_between: linear' in trial.yaml if it was sampled while it changed"
+        )
+    missing = [name for name in TAU if name not in present[kind]] if kind == "tau" else []
+    if missing:
+        notes.append(f"no column {', '.join(missing)}: taken as zero")
+    return tuple(notes)
 
 
 def applied_wrench(drive: Drive, vehicle: Vehicle, t: Array) -> Array:
@@ -184,36 +195,6 @@ def _spans(t: Array) -> Array:
 def _held_spans(t: Array, recording: Array) -> Array:
     """A command holds until the next, but not through a gap of the whole recording, where nobody knows of commands."""
     return _spans(recording[recording >= t[0]])
-
-
-def _columns(trial: Trial, vehicle: Vehicle, kind: str) -> list[str]:
-    """Input columns of one kind that hold numbers, in canonical order."""
-    if kind == "tau":
-        return [name for name in TAU if trial.has(name)]
-    names = {c.removeprefix(kind): c for c in trial.channels if c.startswith(kind)}
-    for name, column in names.items():
-        if name not in vehicle.thrusters:
-            meant = next((own for own in vehicle.thrusters if own.lower() == name.lower()), name)
-            raise CalibrationError(
-                f"{trial.name}: {column}: {vehicle.name} has no thruster '{name}'"
-                f"{did_you_mean(meant, list(vehicle.thrusters))} it has {', '.join(vehicle.thrusters)}"
-            )
-    return [names[name] for name in vehicle.thrusters if name in names and trial.has(names[name])]
-
-
-def _what_is_missing(present: dict[str, list[str]], trial: Trial, vehicle: Vehicle) -> str:
-    for kind in ORDER:
-        if present[kind]:
-            missing = [f"{kind}{n}" for n in vehicle.thrusters if f"{kind}{n}" not in present[kind]]
-            return (
-                f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing, expected a column for each of "
-                f"the {len(vehicle.thrusters)} thrusters of {vehicle.name}: give zeros for a thruster that never ran"
-            )
-    prefixes = ", ".join(f"{prefix}NAME" for prefix in INPUT_PREFIXES)
-    return (
-        f"no input columns, expected tau_x ... tau_n or one of {prefixes} for each thruster: log what drove the "
-        "vehicle, or write 'passive: true' in trial.yaml if the thrusters were off"
-    )
 
 
 def _keeps_levels(trial: Trial, columns: list[str]) -> bool:
