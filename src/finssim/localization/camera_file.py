@@ -1,0 +1,241 @@
+"""Camera files: a lens with its record, ours or as OpenCV, ROS, Kalibr and plain lists of numbers write it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from finssim.files import atomic_write
+from finssim.geometry.optics import Lens, OpticsError
+from finssim.localization.errors import LocalizationError
+from finssim.localization.fields import Fields
+from finssim.yaml_file import read_mapping
+
+__all__ = ["CameraFile", "lens_from", "lens_values", "load_camera", "write_camera"]
+
+_SECTIONS = ("lens", "camera", "intrinsics", "cam0")
+"""Where foreign files keep a camera, if not at the top."""
+_WIDTH = ("image_width", "width", "img_width")
+_HEIGHT = ("image_height", "height", "img_height")
+_SIZE = ("image_size", "resolution", "img_size", "size")
+_MATRIX = ("camera_matrix", "K", "mtx", "intrinsic_matrix", "cameraMatrix", "intrinsics", "camera_intrinsics")
+_DISTORTION = (
+    "distortion_coefficients",
+    "distortion_coeffs",
+    "dist_coeffs",
+    "distCoeffs",
+    "dist_coefs",
+    "distortion",
+    "dist",
+    "D",
+)
+_MODEL = ("distortion_model", "model", "lens_model", "camera_model", "projection_model")
+_FISHEYE = ("fisheye", "equidistant", "equi", "kannala_brandt4", "kb4")
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """What a camera file holds."""
+
+    lens: Lens
+    record: Mapping[str, Any] = field(default_factory=dict)
+    """How it was found: estimates, intervals, provenance; empty for a foreign file."""
+
+
+def load_camera(path: str | Path) -> CameraFile:
+    """Read a camera file.
+
+    Ours (`lens:`), OpenCV's FileStorage YAML, ROS's `camera_info` YAML, Kalibr's camchain, JSON or YAML with
+    `camera_matrix` (or K) and distortion under one of their usual names, and our pool files.
+
+    Raises:
+        LocalizationError: Unreadable, or without image size or focal length; names the file and what to write.
+    """
+    path = Path(path)
+    tree = read_mapping(
+        path, LocalizationError, such_as="lens: {width: 1280, height: 720, fx: 541}", cleaned=_standard
+    )
+    top = tree.get("camera")
+    if isinstance(top, Mapping) and isinstance(top.get("lens"), Mapping):  # a pool file
+        return CameraFile(lens_from(top["lens"], f"{path}: camera: lens"))
+    if isinstance(tree.get("lens"), Mapping):
+        record = tree.get("calibration")
+        return CameraFile(
+            lens_from(tree["lens"], f"{path}: lens"), record if isinstance(record, Mapping) else {}
+        )
+    return CameraFile(_foreign(tree, str(path)))
+
+
+def write_camera(path: str | Path, lens: Lens, record: Mapping[str, Any]) -> None:
+    """Write a camera file.
+
+    Args:
+        path: The file (.yaml).
+        lens: The lens.
+        record: How it was found, as plain values.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    head = "# Camera. Pixels: integer coordinates are pixel centres, u to the right, v down; lengths in pixels.\n"
+    body = yaml.safe_dump(
+        {"lens": lens_values(lens), "calibration": dict(record)}, sort_keys=False, width=110
+    )
+    with atomic_write(path) as temporary:
+        temporary.write_text(head + body, encoding="utf-8")
+
+
+def lens_values(lens: Lens) -> dict[str, Any]:
+    """A lens as plain values, ready for YAML."""
+    return {
+        "model": lens.model,
+        "width": lens.width,
+        "height": lens.height,
+        "fx": float(lens.fx),
+        "fy": float(lens.fy),
+        "cx": float(lens.cx),
+        "cy": float(lens.cy),
+        "distortion": [float(x) for x in lens.distortion],
+    }
+
+
+def lens_from(values: Mapping[Any, Any], where: str) -> Lens:
+    """The lens of a `lens:` section.
+
+    Args:
+        values: The section.
+        where: File and section, as messages call it.
+
+    Raises:
+        LocalizationError: A key is missing, unknown, or refused by the lens.
+    """
+    fields = Fields(values, where)
+    fx = fields.number("fx")
+    arguments = {
+        "width": int(fields.number("width")),
+        "height": int(fields.number("height")),
+        "fx": fx,
+        "fy": fields.number("fy", fx),
+        "cx": fields.number("cx"),
+        "cy": fields.number("cy"),
+        "model": fields.word("model", "plumb_bob"),
+        "distortion": fields.numbers("distortion", None, ()),
+    }
+    fields.finish()
+    return _lens(arguments, where)
+
+
+def _lens(arguments: dict[str, Any], where: str) -> Lens:
+    try:
+        return Lens(**arguments)
+    except OpticsError as error:
+        raise LocalizationError(f"{where}: {error}") from None
+
+
+def _standard(text: str) -> str:
+    """OpenCV's dialect as YAML: its version line and its tags away."""
+    text = re.sub(r"\A\ufeff?%YAML[: ]1\.0[^\n]*\n", "", text)
+    return re.sub(r"!!opencv-[\w-]+", "", text)
+
+
+def _foreign(tree: Mapping[str, Any], where: str) -> Lens:
+    """The lens in other people's words."""
+    for key in _SECTIONS:
+        inner = tree.get(key)
+        if isinstance(inner, Mapping) and _first(inner, (*_MATRIX, "fx")) is not None:
+            return _foreign({**{k: v for k, v in tree.items() if k != key}, **inner}, f"{where}: {key}")
+    width, height = _size(tree, where)
+    fx, fy, cx, cy = _focal(tree, where)
+    distortion = _distortion(tree, where)
+    word = next((str(tree[key]).lower() for key in _MODEL if isinstance(tree.get(key), str)), "")
+    return _lens(
+        {
+            "width": width,
+            "height": height,
+            "fx": fx,
+            "fy": fy,
+            "cx": cx,
+            "cy": cy,
+            "model": _model(tree, word, distortion, where),
+            "distortion": distortion,
+        },
+        where,
+    )
+
+
+def _first(tree: Mapping[str, Any], names: tuple[str, ...]) -> Any:
+    return next((tree[name] for name in names if tree.get(name) is not None), None)
+
+
+def _flat(value: Any, where: str) -> tuple[float, ...]:
+    """Numbers of a list, of nested lists, or of OpenCV's and ROS's {rows, cols, data}."""
+    if isinstance(value, Mapping):
+        value = value.get("data")
+    if isinstance(value, (list, tuple)):
+        return tuple(x for item in value for x in _flat(item, where))
+    return Fields({"it": value}, where).numbers("it", None, ()) if value is None else (_number(value, where),)
+
+
+def _number(value: Any, where: str) -> float:
+    return Fields({"a coefficient": value}, where).number("a coefficient")
+
+
+def _size(tree: Mapping[str, Any], where: str) -> tuple[int, int]:
+    size = _first(tree, _SIZE)
+    width, height = _first(tree, _WIDTH), _first(tree, _HEIGHT)
+    if width is None and size is not None:
+        width, height = _flat(size, where)[:2]
+    if width is None or height is None:
+        raise LocalizationError(
+            f"{where}: the size of the image is missing: add image_width and image_height"
+        )
+    return int(_number(width, where)), int(_number(height, where))
+
+
+def _focal(tree: Mapping[str, Any], where: str) -> tuple[float, float, float, float]:
+    value = _first(tree, _MATRIX)
+    if value is None and tree.get("fx") is not None:
+        fields = Fields(tree, where)
+        fx = fields.number("fx")
+        return fx, fields.number("fy", fx), fields.number("cx"), fields.number("cy")
+    numbers = _flat(value, where)
+    if len(numbers) == 4:
+        return numbers[0], numbers[1], numbers[2], numbers[3]
+    if len(numbers) == 9:
+        if abs(numbers[1]) > 1e-6 * abs(numbers[0]):
+            raise LocalizationError(
+                f"{where}: the camera matrix has a skew of {numbers[1]:.4g} px, expected 0: calibrate without skew"
+            )
+        return numbers[0], numbers[4], numbers[2], numbers[5]
+    raise LocalizationError(
+        f"{where}: no camera matrix found: give fx, fy, cx, cy [px], or camera_matrix with 9 numbers"
+    )
+
+
+def _distortion(tree: Mapping[str, Any], where: str) -> tuple[float, ...]:
+    value = _first(tree, _DISTORTION)
+    if value is not None:
+        return _flat(value, where)
+    names = [name for name in ("k1", "k2", "p1", "p2", "k3", "k4") if tree.get(name) is not None]
+    if "p1" not in names and ("k3" in names or "k4" in names):
+        return tuple(_number(tree.get(name, 0.0), where) for name in ("k1", "k2", "k3", "k4"))
+    return tuple(
+        _number(tree.get(name, 0.0), where) for name in ("k1", "k2", "p1", "p2", "k3")[: 5 if names else 0]
+    )
+
+
+def _model(tree: Mapping[str, Any], word: str, distortion: tuple[float, ...], where: str) -> str:
+    fisheye = any(tree.get(key) is True for key in ("fisheye", "is_fisheye")) or word in _FISHEYE
+    four_radial = "p1" not in tree and tree.get("k4") is not None and not _first(tree, _DISTORTION)
+    if fisheye or four_radial:
+        return "fisheye"
+    if word.startswith("rational") or len(distortion) == 8:
+        return "rational"
+    if len(distortion) > 8 and not any(distortion[8:]):
+        raise LocalizationError(f"{where}: {len(distortion)} distortion coefficients: keep the first 8")
+    return "plumb_bob"
