@@ -1,0 +1,32 @@
+"""What a fixed camera above a pool sees: tags, tiles and bodies through a flat or rippling surface."""
+
+from finssim.sensors.overhead_camera.neighbourhood import Rectangle
+from finssim.sensors.overhead_camera.render import OverheadCamera, render
+from finssim.sensors.overhead_camera.scene import (
+    Basin,
+    Body,
+    Lamp,
+    Light,
+    Pose,
+    Ripples,
+    Scene,
+    Sensor,
+    TagInScene,
+    Water,
+)
+
+__all__ = [
+    "Basin",
+    "Body",
+    "Lamp",
+    "Light",
+    "OverheadCamera",
+    "Pose",
+    "Rectangle",
+    "Ripples",
+    "Scene",
+    "Sensor",
+    "TagInScene",
+    "Water",
+    "render",
+]

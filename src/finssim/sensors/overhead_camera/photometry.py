@@ -1,0 +1,117 @@
+"""What happens to light on its way to a number: reflection and loss in water, then charge, noise and digits."""
+# mypy: ignore-errors
+
+import warp as wp
+
+
+@wp.func
+def fresnel(cos_near: float, cos_far: float, n_near: float, n_far: float) -> float:
+    """Reflectance of a smooth dielectric surface for unpolarised light (Fresnel).
+
+    R = (r_s² + r_p²) / 2;   at normal incidence ((n1 - n2) / (n1 + n2))².
+
+    Args:
+        cos_near: Cosine of the angle of incidence.
+        cos_far: Cosine of the angle of refraction.
+        n_near: Index on the side of incidence.
+        n_far: Index on the other side.
+    """
+    r_s = (n_near * cos_near - n_far * cos_far) / (n_near * cos_near + n_far * cos_far)
+    r_p = (n_far * cos_near - n_near * cos_far) / (n_far * cos_near + n_near * cos_far)
+    return 0.5 * (r_s * r_s + r_p * r_p)
+
+
+@wp.func
+def refracted(ray: wp.vec3, normal: wp.vec3, ratio: float) -> wp.vec3:
+    """Direction after refraction (paper, eq. 9), or zero for total reflection.
+
+    Args:
+        ray: Unit direction of the incident ray.
+        normal: Unit normal against it.
+        ratio: Index on its side over the index on the other, η.
+    """
+    c = -wp.dot(normal, ray)
+    kappa = 1.0 - ratio * ratio * (1.0 - c * c)
+    if kappa <= 0.0:
+        return wp.vec3(0.0)
+    return ratio * ray + (ratio * c - wp.sqrt(kappa)) * normal
+
+
+@wp.func
+def through_water(radiance: wp.vec3, attenuation: wp.vec3, veil: wp.vec3, path: float) -> wp.vec3:
+    """Radiance after a way through water (Beer-Lambert, with veiling light).
+
+    L = L0 exp(-c s) + B (1 - exp(-c s))
+
+    Args:
+        radiance: L0 at the start, (red, green, blue).
+        attenuation: c [1/m].
+        veil: B, radiance of water without end.
+        path: s [m].
+    """
+    out = wp.vec3()
+    for i in range(3):
+        kept = wp.exp(-attenuation[i] * path)
+        out[i] = radiance[i] * kept + veil[i] * (1.0 - kept)
+    return out
+
+
+@wp.func
+def digitised_charge(
+    charge: float, noise: float, read_noise: float, full_well: float, gamma: float
+) -> wp.uint8:
+    """The number a pixel reports, 0 to 255.
+
+    Args:
+        charge: Mean charge [electrons].
+        noise: A standard normal number, or zero.
+        read_noise: Standard deviation of reading out [electrons].
+        full_well: Charge at full scale [electrons].
+        gamma: Exponent of the encoding.
+
+    Note:
+        Shot noise, of variance `charge` (photon transfer), is normal here instead of Poisson: alike above 20 electrons.
+    """
+    measured = charge + noise * wp.sqrt(charge + read_noise * read_noise)
+    level = wp.clamp(measured / full_well, 0.0, 1.0)
+    if gamma != 1.0:
+        level = wp.pow(level, 1.0 / gamma)
+    return wp.uint8(wp.floor(255.0 * level + 0.5))
+
+
+@wp.kernel(enable_backward=False)
+def digitise(
+    radiance: wp.array2d(dtype=wp.vec3),
+    first_row: int,
+    first_column: int,
+    gain: float,
+    full_well: float,
+    read_noise: float,
+    gamma: float,
+    noisy: bool,
+    key: int,
+    image: wp.array3d(dtype=wp.uint8),
+):
+    """Numbers of a rectangle of the image from its radiance; noise depends on the key and the pixel alone."""
+    i, j = wp.tid()
+    row = first_row + i
+    column = first_column + j
+    colour = radiance[i, j]
+    if image.shape[2] == 1:
+        grey = 0.299 * colour[0] + 0.587 * colour[1] + 0.114 * colour[2]
+        colour = wp.vec3(grey, grey, grey)
+    state = wp.rand_init(key, row * image.shape[1] + column)
+    for c in range(image.shape[2]):
+        noise = float(0.0)
+        if noisy:
+            noise = wp.randn(state)
+        charge = wp.max(gain * colour[c], 0.0) * full_well
+        image[row, column, c] = digitised_charge(charge, noise, read_noise, full_well, gamma)
+
+
+def noise_key(seed: int, time: float) -> int:
+    """A 31-bit key of a picture's noise, from the seed and the time to the microsecond."""
+    mixed = (seed * 0x9E3779B97F4A7C15 + round(time * 1e6) * 0xC2B2AE3D27D4EB4F + 0x165667B19E3779F9) % 2**64
+    for shift in (30, 27):
+        mixed = (mixed ^ (mixed >> shift)) * 0xBF58476D1CE4E5B9 % 2**64
+    return int((mixed ^ (mixed >> 31)) & 0x7FFFFFFF) % (2**31 - 1)

@@ -1,0 +1,256 @@
+"""The ray caster: one thread per pixel follows its rays from the camera through the surface to what they meet.
+
+Everything is in the surface frame, in single precision: with the camera's foot as origin, coordinates of a few metres
+keep 0.001 px.
+"""
+# mypy: ignore-errors
+
+import warp as wp
+
+from finssim.sensors.overhead_camera.materials import (
+    NOTHING,
+    BasinData,
+    BodyData,
+    Surfel,
+    TagData,
+    meet_basin,
+    meet_body,
+    meet_tag,
+    on_deck,
+)
+from finssim.sensors.overhead_camera.photometry import fresnel, refracted, through_water
+from finssim.sensors.overhead_camera.surface import (
+    Patch,
+    Wave,
+    distance_to,
+    normal_of,
+    surface_at,
+    surface_hit,
+)
+
+
+@wp.struct
+class LampData:
+    """A bright rectangle parallel to the surface."""
+
+    centre: wp.vec3  # [m]
+    half: wp.vec2  # half lengths [m]
+    radiance: float
+
+
+@wp.struct
+class SceneData:
+    """All that rays can meet, surface frame."""
+
+    camera_height: float  # above the still surface [m]
+    index_near: float
+    index_far: float
+    layer_thickness: wp.array(dtype=float)  # of the window, from the camera [m]
+    layer_index: wp.array(dtype=float)
+    waves: wp.array(dtype=Wave)
+    caustics: float
+    attenuation: wp.vec3  # [1/m]
+    veil: wp.vec3
+    sky: float
+    lamps: wp.array(dtype=LampData)
+    basin: BasinData
+    tags: wp.array(dtype=TagData)
+    cells: wp.array(dtype=wp.uint8)
+    bodies: wp.array(dtype=BodyData)
+    shutter: float  # [s]
+    spot: float  # [px]
+
+
+@wp.struct
+class Refraction:
+    """A ray after the surface."""
+
+    origin: wp.vec3  # [m]
+    ray: wp.vec3  # unit direction; zero after total reflection
+    transmitted: float  # share of the light
+
+
+@wp.func
+def meet_things(
+    scene: SceneData, origin: wp.vec3, ray: wp.vec3, t: float, angle: float, travelled: float
+) -> Surfel:
+    """The first tag or body on a ray. Arguments as of `meet_tag`."""
+    first = Surfel()
+    first.distance = NOTHING
+    for i in range(scene.tags.shape[0]):
+        hit = meet_tag(scene.cells, scene.tags[i], origin, ray, t, angle, travelled)
+        if hit.distance < first.distance:
+            first = hit
+    for i in range(scene.bodies.shape[0]):
+        hit = meet_body(scene.bodies[i], origin, ray, t)
+        if hit.distance < first.distance:
+            first = hit
+    return first
+
+
+@wp.func
+def enter_water(scene: SceneData, origin: wp.vec3, ray: wp.vec3, normal: wp.vec3) -> Refraction:
+    """A ray through the surface, or through the layers of a window, by Snell's and Fresnel's laws.
+
+    Args:
+        scene: Holds indices and layers.
+        origin: On the near face [m].
+        ray: Unit direction in air.
+        normal: Unit normal of the face towards the camera.
+    """
+    out = Refraction()
+    out.origin = origin
+    out.ray = ray
+    out.transmitted = 1.0
+    index = scene.index_near
+    for i in range(scene.layer_index.shape[0] + 1):
+        if i > 0:
+            thickness = scene.layer_thickness[i - 1]
+            out.origin += (-thickness / wp.dot(out.ray, normal)) * out.ray
+        following = scene.index_far
+        if i < scene.layer_index.shape[0]:
+            following = scene.layer_index[i]
+        bent = refracted(out.ray, normal, index / following)
+        if wp.dot(bent, bent) == 0.0:
+            out.ray = bent
+            out.transmitted = 0.0
+            return out
+        cos_in = -wp.dot(out.ray, normal)
+        out.transmitted *= 1.0 - fresnel(cos_in, -wp.dot(bent, normal), index, following)
+        out.ray = bent
+        index = following
+    return out
+
+
+@wp.func
+def mirrored(scene: SceneData, origin: wp.vec3, ray: wp.vec3, normal: wp.vec3) -> float:
+    """Radiance of sky or lamp in the direction in which the surface reflects a ray."""
+    up = ray - 2.0 * wp.dot(ray, normal) * normal
+    for i in range(scene.lamps.shape[0]):
+        lamp = scene.lamps[i]
+        s = (lamp.centre[2] - origin[2]) / wp.max(up[2], 1.0e-6)
+        x = origin[0] + s * up[0] - lamp.centre[0]
+        y = origin[1] + s * up[1] - lamp.centre[1]
+        if s > 0.0 and wp.abs(x) < lamp.half[0] and wp.abs(y) < lamp.half[1]:
+            return lamp.radiance
+    return scene.sky
+
+
+@wp.func
+def focused(scene: SceneData, at: wp.vec3) -> float:
+    """Light that ripples gather on a point in the water, relative to a flat surface.
+
+    To first order in the slope, light from straight above falls with 1 - (1 - n1/n2) depth ∇²h; its mean is 1.
+    """
+    above = surface_at(scene.waves, at[0], at[1])
+    bend = 1.0 - scene.index_near / scene.index_far
+    return wp.max(1.0 + scene.caustics * bend * at[2] * (above.hxx + above.hyy), 0.0)
+
+
+@wp.func
+def under_water(
+    scene: SceneData, origin: wp.vec3, ray: wp.vec3, t: float, angle: float, travelled: float, things: bool
+) -> wp.vec3:
+    """Radiance that reaches the surface from below.
+
+    Args:
+        scene: What is there.
+        origin: Where the ray starts [m].
+        ray: Its unit direction.
+        t: Time as a fraction of the exposure.
+        angle: Width of the ray's share of the pixel per distance, in the water [rad].
+        travelled: Distance before that counts for that width [m].
+        things: Whether tags and bodies may be near.
+    """
+    p = scene.basin.R_bs * (origin - scene.basin.origin)
+    hit = meet_basin(scene.basin, p, scene.basin.R_bs * ray, angle, travelled)
+    if things:
+        thing = meet_things(scene, origin, ray, t, angle, travelled)
+        if thing.distance < hit.distance:
+            hit = thing
+    radiance = hit.radiance
+    if scene.caustics > 0.0:
+        radiance *= focused(scene, origin + hit.distance * ray)
+    return through_water(radiance, scene.attenuation, scene.veil, hit.distance)
+
+
+@wp.func
+def radiance_along(
+    scene: SceneData, patch: Patch, ray: wp.vec3, t: float, angle: float, things: bool
+) -> wp.vec3:
+    """Radiance that the camera receives from one direction at one moment.
+
+    Args:
+        scene: What is there.
+        patch: The surface around the pixel.
+        ray: Unit direction from the camera.
+        t: Time as a fraction of the exposure.
+        angle: Width of the ray's share of the pixel [rad].
+        things: Whether tags and bodies may be near.
+    """
+    eye = wp.vec3(0.0, 0.0, scene.camera_height)
+    after = (t - 0.5) * scene.shutter
+    reach = distance_to(patch, scene.camera_height, ray, after)
+    surface = eye + reach * ray
+    basin_point = scene.basin.R_bs * (surface - scene.basin.origin)
+    in_air = Surfel()
+    in_air.distance = NOTHING
+    if things:
+        in_air = meet_things(scene, eye, ray, t, angle, 0.0)
+    if in_air.distance < reach:
+        return in_air.radiance
+    if on_deck(scene.basin, basin_point):
+        return scene.basin.deck_colour
+    normal = normal_of(patch, surface[0], surface[1], after)
+    bent = enter_water(scene, surface, ray, normal)
+    glare = (1.0 - bent.transmitted) * mirrored(scene, surface, ray, normal)
+    below = wp.vec3(0.0)
+    if bent.transmitted > 0.0:
+        ratio = scene.index_near / scene.index_far
+        below = under_water(scene, bent.origin, bent.ray, t, ratio * angle, reach / ratio, things)
+    return bent.transmitted * below + wp.vec3(glare, glare, glare)
+
+
+@wp.kernel(enable_backward=False)
+def cast(
+    scene: SceneData,
+    corner_rays: wp.array2d(dtype=wp.vec3),
+    samples: wp.array2d(dtype=wp.uint8),
+    first_row: int,
+    first_column: int,
+    radiance: wp.array2d(dtype=wp.vec3),
+):
+    """Mean radiance of the pixels of a rectangle.
+
+    Args:
+        scene: What is there.
+        corner_rays: Directions through the pixels' corners, zero where the lens sees nothing.
+        samples: Rays along each axis of each pixel; 0 for one ray that passes by all tags and bodies.
+        first_row: Of the rectangle.
+        first_column: Of the rectangle.
+        radiance: Result over the rectangle.
+    """
+    i, j = wp.tid()
+    row = first_row + i
+    column = first_column + j
+    a = corner_rays[row, column]
+    b = corner_rays[row, column + 1]
+    c = corner_rays[row + 1, column]
+    d = corner_rays[row + 1, column + 1]
+    middle = 0.25 * (a + b + c + d)
+    lowest = wp.max(wp.max(a[2], b[2]), wp.max(c[2], d[2]))
+    total = wp.vec3(0.0)
+    # Above the horizon, and outside the lens: dark. A grazing ray hits the water too far away to matter.
+    if lowest < -1.0e-3:
+        n = wp.max(int(samples[row, column]), 1)
+        patch = surface_hit(scene.waves, scene.camera_height, wp.normalize(middle))
+        angle = wp.sqrt(wp.length(wp.cross(b - a, c - a))) * scene.spot / float(n)
+        for k in range(n * n):
+            u = 0.5 + ((float(k % n) + 0.5) / float(n) - 0.5) * scene.spot
+            v = 0.5 + ((float(k // n) + 0.5) / float(n) - 0.5) * scene.spot
+            ray = wp.normalize((1.0 - v) * ((1.0 - u) * a + u * b) + v * ((1.0 - u) * c + u * d))
+            # A fixed order that spreads the moments of each row and column of rays over the whole exposure.
+            t = (float((k * (n + 1)) % (n * n)) + 0.5) / float(n * n)
+            total += radiance_along(scene, patch, ray, t, angle, samples[row, column] > wp.uint8(0))
+        total = total / float(n * n)
+    radiance[i, j] = total
