@@ -12,7 +12,7 @@ from finssim.vehicles.part import Part
 class CalibrationRecord(Part):
     """One entry of `calibrations` in a vehicle file; no clock time is in it, so that equal fits write equal files."""
 
-    kind: Literal["thruster", "motor", "hydrodynamics"]
+    kind: Literal["thruster", "motor", "hydrodynamics", "mounts"]
     """What was calibrated."""
     method: str
     """Estimator, such as `regression` or `simulation`."""
@@ -32,6 +32,6 @@ class CalibrationRecord(Part):
     def sentence(self) -> str:
         """`hydrodynamics by regression on 24 trials`, for lists and notes."""
         count = len(self.trials)
-        noun = "table" if self.kind == "thruster" else "trial"
+        noun = {"thruster": "table", "mounts": "recording"}.get(self.kind, "trial")
         words = f"{self.kind} by {self.method} on {count} {noun}{'' if count == 1 else 's'}"
         return f"{words} (interrupted)" if self.interrupted else words
