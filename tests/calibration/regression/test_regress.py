@@ -27,8 +27,8 @@ def without(some, *columns):
     ("name", "axes"),
     [
         ("finsrov", ("surge", "sway", "yaw")),
-        ("bluerov2", ("surge", "heave", "roll", "yaw")),
-        ("bluerov2_heavy", ("sway", "heave", "pitch", "yaw")),
+        ("bluerov2", ("heave", "roll", "yaw")),
+        ("bluerov2_heavy", ("surge", "sway", "heave", "pitch", "yaw")),
     ],
 )
 def test_identifiable_parameters_come_back(name, axes):
@@ -114,7 +114,7 @@ def test_late_motion_is_told_from_inertia():
 
 def test_a_velocity_later_than_the_gyro_is_named():
     """u is logged 120 ms late, the gyro is not: mass within 5 %, its note tells of the lag, and the cause is named."""
-    vehicle, some = trials("bluerov2_heavy", "surge", "heave", "yaw")
+    vehicle, some = trials("bluerov2_heavy", "surge", "sway", "heave", "yaw")
     late = []
     for t in some:
         shifted = {n: np.interp(t.t - 0.12, t.t, c) if n in "uvw" else c for n, c in t.channels.items()}
@@ -238,6 +238,22 @@ def test_tilted_samples_are_left_out_unless_the_other_axes_are_fitted():
     assert alone.estimates["yaw.m_eff"].identifiable
     together, expected = regress(some, wrong), truth(vehicle)
     assert together.estimates["surge.m_eff"].estimate == pytest.approx(expected["surge.m_eff"], rel=0.03)
+
+
+def test_a_vehicle_that_turns_over_needs_trials_of_sway_too():
+    """bluerov2 turned over by surge steps also sways: from surge and heave alone, nothing of surge is believed."""
+    vehicle, some = trials("bluerov2", "surge", "heave")
+    added = 0.5 * vehicle.hydrodynamics["calibrated"].added_mass
+    wrong = vehicle.replace({"hydrodynamics.calibrated.added_mass": added.tolist()})
+    fit, expected = regress(some, wrong), truth(vehicle)
+    of_surge = [e for name, e in fit.estimates.items() if name.startswith("surge.")]
+    assert of_surge
+    for estimate in of_surge:
+        assert not estimate.identifiable
+        assert "fit surge, sway and heave together" in estimate.note
+    assert not any(".0.0" in path for path in fit.changes)
+    assert fit.estimates["heave.m_eff"].identifiable
+    assert fit.estimates["heave.m_eff"].estimate == pytest.approx(expected["heave.m_eff"], rel=0.03)
 
 
 def test_damping_is_written_as_a_pair_or_not_at_all():

@@ -33,8 +33,8 @@ PASSES = 3
 LARGEST_SHIFT = 0.5
 """Lag beyond which the wrench is not put later, but the trial doubted [s]."""
 
-TILTS_INTO = {0: {2}, 1: {2}, 2: {0, 1}, 5: {0, 1}}
-"""Axes whose coefficients decide an axis' motion at large tilt."""
+TILTS_INTO = {0: {1, 2}, 1: {0, 2}, 2: {0, 1}, 5: {0, 1}}
+"""Axes whose coefficients decide an axis' motion at large tilt: what surge turns over sways too."""
 
 SETTLED = 2e-3
 """Change of the left side, as a part of it, below which another round is not needed."""
