@@ -68,7 +68,7 @@ HOMES = {
     "cyclonedds": set(),
     "rclpy": set(),
     "viser": set(),
-    "mitsuba": set(),
+    "mitsuba": {"experiments/mitsuba_renderer.py"},
 }
 """Library -> the files that may import it, each of which does."""
 
