@@ -60,11 +60,11 @@ def refract(camera: Camera, interface: Interface, points_p: Array) -> Refraction
     depth = -along - (height + thickness)
     right_side = (depth >= _ON_THE_FACE) & (height >= 0.0)
     stack = solve_stack(
-        np.sum(across * across, axis=-1),
-        [max(height, 0.0), *(layer.thickness for layer in interface.window), np.maximum(depth, 0.0)],
+        np.einsum("...i,...i", across, across),
+        [height, *(layer.thickness for layer in interface.window), depth],
         [interface.index_near, *(layer.index for layer in interface.window), interface.index_far],
     )
-    slope = stack.slope(0)
+    slope = stack.near_slope
     return Refraction(across, height, stack, slope, slope[..., None] * across - n, right_side)
 
 

@@ -24,6 +24,10 @@ Complex = npt.NDArray[np.complex128]
 _WIDEST = np.radians(89.9)
 """Half angle up to which a lens that maps onto a plane is looked at: it never reaches 90 degrees."""
 
+_STEPS = 40
+_CLOSE = 2e-8
+"""A Newton step this small is the last one: the error after it is its square."""
+
 
 class RadialTangential:
     """A perspective lens with distortion k1, k2, p1, p2[, k3[, k4, k5, k6]]; none means a pinhole."""
@@ -46,16 +50,16 @@ class RadialTangential:
     def jacobian(self, points_c: Array) -> Array:
         """Derivative of `project` with respect to the point [1/m], (..., 2, 3)."""
         z = _plane(points_c)
-        A, B = self._slopes(z)
+        _, A, B = self._evaluate(z)
         # dz = (dX + i dY - z dZ) / Z; columns of df = A dz + B conj(dz).
         inverse = 1.0 / points_c[..., 2]
-        columns = [(A + B) * inverse, 1j * (A - B) * inverse, -(A * z + B * np.conj(z)) * inverse]
+        columns = [(A + B) * inverse, 1j * (A - B) * inverse, -(A * z + B * z.conj()) * inverse]
         return np.stack([_pairs(column) for column in columns], axis=-1)
 
     def parameter_jacobian(self, points_c: Array) -> Array:
         """Derivative of `project` with respect to the coefficients that were given, (..., 2, k)."""
         z = _plane(points_c)
-        s = np.real(z * np.conj(z))
+        s = (z * z.conj()).real
         R, _, denominator = self._radial(s)
         one = z / denominator
         power = [s, s * s, s * s * s]
@@ -71,7 +75,7 @@ class RadialTangential:
         """Unit rays (..., 3) of distorted coordinates (..., 2), and which of them have one, (...)."""
         z, ok = self._undistort(_complex(image))
         out = np.empty((*z.shape, 3))
-        out[..., 2] = 1.0 / np.sqrt(1.0 + np.real(z * np.conj(z)))
+        out[..., 2] = 1.0 / np.sqrt(1.0 + (z * z.conj()).real)
         out[..., :2] = _pairs(z * out[..., 2])
         return out, ok
 
@@ -123,36 +127,44 @@ class RadialTangential:
             return image, np.isfinite(image)
         radius, ratio, reach = self._table
         length = np.abs(image)
-        # What no ray can reach is NaN from the start, so that nobody waits for it.
-        image = np.where(length <= reach, image, np.nan)
-        z = image * np.interp(length, radius, ratio)
-        limit = self.fold
-        for _ in range(40):
-            A, B = self._slopes(z)
-            error = image - self._distort(z)
-            step = (A * error - B * np.conj(error)) / (A * A - np.real(B * np.conj(B)))
+        if reach < np.inf:  # what no ray can reach is NaN from the start, so that nobody waits for it
+            image = np.where(length <= reach, image, np.nan)
+        shrink = np.interp(length, radius, ratio)
+        z = image * shrink
+        if self._P:
+            z = z - shrink * (2.0 * self._P * (z * z.conj()).real + self._P.conjugate() * (z * z))
+        for _ in range(_STEPS):
+            f, A, B = self._evaluate(z)
+            error = image - f
+            step = (A * error - B * error.conj()) / (A * A - (B * B.conj()).real)
             z = z + step
-            if not (np.abs(step) > 1e-9 * (1.0 + np.abs(z))).any():  # the next one would be below rounding
+            size = np.abs(step)
+            if not (size > _CLOSE).any():  # the next step would be below rounding
                 break
-        ok = np.abs(z) < limit
-        ok &= np.abs(image - self._distort(z)) <= 1e-12 * (1.0 + length)
-        return z, ok
+        return z, (np.abs(z) < self.fold) & (size <= _CLOSE)
 
     def _distort(self, z: Complex) -> Complex:
-        s = np.real(z * np.conj(z))
-        R, _, _ = self._radial(s)
+        """f(z)."""
+        s = (z * z.conj()).real
+        k1, k2, k3 = self._numerator
+        R = 1.0 + s * (k1 + s * (k2 + s * k3 if k3 else k2))
+        if any(self._denominator):
+            k4, k5, k6 = self._denominator
+            R = R / (1.0 + s * (k4 + s * (k5 + s * k6)))
         if not self._P:
             return np.asarray(z * R)
-        return np.asarray(z * R + (2.0 * self._P) * s + np.conj(self._P) * (z * z))
+        return np.asarray(z * R + (2.0 * self._P) * s + self._P.conjugate() * (z * z))
 
-    def _slopes(self, z: Complex) -> tuple[Array, Complex]:
-        """A and B of df = A dz + B conj(dz)."""
-        s = np.real(z * np.conj(z))
+    def _evaluate(self, z: Complex) -> tuple[Complex, Array, Complex]:
+        """f(z), and A and B of df = A dz + B conj(dz)."""
+        s, z2 = (z * z.conj()).real, z * z
         R, slope, _ = self._radial(s)
-        A, B = R + s * slope, z * z * slope
+        f, A, B = z * R, R + s * slope, z2 * slope
         if self._P:
-            A, B = A + 4.0 * np.real(np.conj(self._P) * z), B + 2.0 * self._P * z
-        return A, B
+            turned = self._P.conjugate() * z
+            f = f + (2.0 * self._P) * s + turned * z
+            A, B = A + 4.0 * turned.real, B + (2.0 * self._P) * z
+        return f, A, B
 
     def _radial(self, s: Array) -> tuple[Array, Array, Array | float]:
         """R(s), dR/ds and the denominator of R."""

@@ -34,5 +34,5 @@ class Status(IntEnum):
 
 def count_rejections(status: npt.ArrayLike) -> dict[str, int]:
     """How often each reason but OK occurs, by name; reasons that do not occur are left out."""
-    counts = np.bincount(np.ravel(np.asarray(status)), minlength=len(Status))
+    counts = np.bincount(np.ravel(np.asarray(status, int)), minlength=len(Status))
     return {Status(i).name: int(n) for i, n in enumerate(counts) if n and i != Status.OK}

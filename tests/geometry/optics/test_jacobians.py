@@ -1,0 +1,158 @@
+"""Derivatives against central differences, for every lens and every interface."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from finssim.geometry.optics import (
+    Camera,
+    Interface,
+    OpticsError,
+    back_project,
+    back_project_jacobian,
+    plane_jacobian,
+    project,
+    projection_jacobians,
+)
+from finssim.geometry.rotations import quat_from_rotvec, quat_multiply
+from geometry.optics.scenes import INTERFACES, LENSES, camera, points
+
+every_lens = pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES.keys())
+every_interface = pytest.mark.parametrize("interface", INTERFACES.values(), ids=INTERFACES.keys())
+
+STEP = 1e-5
+# A central difference errs by STEP² third derivatives/6 (pixels per m³, below 1e5 here) and 1e-13 px/STEP.
+TOLERANCE = {"rtol": 1e-6, "atol": 1e-5}
+
+
+def differences(pixels, count):
+    """d pixels(x)/dx at 0 for x of `count` numbers, (..., 2, count)."""
+    steps = STEP * np.eye(count)
+    return np.stack([(pixels(d) - pixels(-d)) / (2.0 * STEP) for d in steps], axis=-1)
+
+
+def inner_points(interface):
+    """Points at least 5 cm behind the far face, where differences have room."""
+    return points(interface, 40) - 0.05 * interface.normal
+
+
+@every_interface
+@every_lens
+def test_derivatives_of_a_pixel(lens, interface):
+    """With respect to the point, the camera's pose, the plane, the index and the lens."""
+    eye, there = camera(lens, interface), inner_points(interface)
+    found = projection_jacobians(eye, interface, there)
+
+    def moved(d):
+        turned = quat_multiply(quat_from_rotvec(d[3:]), eye.orientation)
+        return project(Camera(lens, eye.position + d[:3], turned), interface, there).pixels
+
+    def tilted(d):
+        e1, e2 = interface.tangents()
+        normal = interface.normal + d[0] * e1 + d[1] * e2
+        other = replace(interface, normal=normal / np.linalg.norm(normal), offset=interface.offset + d[2])
+        return project(eye, other, there).pixels
+
+    def denser(d):
+        return project(eye, replace(interface, index_far=interface.index_far + d[0]), there).pixels
+
+    expected = {
+        "point": differences(lambda d: project(eye, interface, there + d).pixels, 3),
+        "pose": differences(moved, 6),
+        "interface": differences(tilted, 3),
+    }
+    for name, numbers in expected.items():
+        np.testing.assert_allclose(getattr(found, name), numbers, **TOLERANCE, err_msg=name)
+    np.testing.assert_allclose(found.index, differences(denser, 1)[..., 0], **TOLERANCE)
+    direction = lens.rays(project(eye, interface, there).pixels)[0]
+    np.testing.assert_allclose(found.lens, lens.parameter_jacobian(direction), rtol=1e-9, atol=1e-9)
+
+
+@every_lens
+@pytest.mark.parametrize("name", ["surface", "tilted 20 degrees", "window", "z down"])
+def test_derivatives_of_a_point(lens, name):
+    """d(x, y)/d(u, v) and d(x, y)/dz of back-projection onto a height."""
+    interface = INTERFACES[name]
+    eye, there = camera(lens, interface), inner_points(interface)
+    pixels, z = project(eye, interface, there).pixels, there[:, 2]
+    by_pixel, by_z = back_project_jacobian(eye, interface, pixels, z)
+    if name == "window":  # a wall: only rays that are steep against the horizon
+        steep = np.abs(back_project(eye, interface, pixels).direction[:, 2]) > 0.2
+        pixels, z, by_pixel, by_z = pixels[steep], z[steep], by_pixel[steep], by_z[steep]
+
+    def hit(p, h):
+        return back_project(eye, interface, p).at_z(h)[0][..., :2]
+
+    e = 1e-3
+    columns = [(hit(pixels + d, z) - hit(pixels - d, z)) / (2 * e) for d in e * np.eye(2)]
+    np.testing.assert_allclose(by_pixel, np.stack(columns, -1), rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(
+        by_z, (hit(pixels, z + STEP) - hit(pixels, z - STEP)) / (2 * STEP), rtol=1e-6, atol=1e-8
+    )
+
+
+@every_interface
+def test_derivatives_on_a_plane_of_any_orientation(interface):
+    """How a point on a slanting plane moves with the pixel and with a shift of the plane along its normal."""
+    eye, there = camera(LENSES["plumb_bob"], interface), inner_points(interface)
+    normal = np.array([0.3, -0.2, 0.1]) + 2.0 * interface.normal
+    unit = normal / np.linalg.norm(normal)
+    pixels, offset = project(eye, interface, there).pixels, -(there @ normal)
+    whole = plane_jacobian(eye, interface, there, normal)
+    length = np.linalg.norm(normal)
+
+    def hit(p, shift):
+        return back_project(eye, interface, p).at_plane(unit, offset / length - shift)[0]
+
+    e = 1e-3
+    columns = [(hit(pixels + d, 0.0) - hit(pixels - d, 0.0)) / (2 * e) for d in e * np.eye(2)]
+    np.testing.assert_allclose(whole[..., :2], np.stack(columns, -1), rtol=1e-5, atol=1e-9)
+    by_shift = (hit(pixels, STEP) - hit(pixels, -STEP)) / (2 * STEP)
+    np.testing.assert_allclose(whole[..., 2], by_shift, rtol=1e-6, atol=1e-8)
+    with pytest.raises(OpticsError, match="expected a direction"):
+        plane_jacobian(eye, interface, there, (0.0, 0.0, 0.0))
+
+
+@every_interface
+@every_lens
+def test_straight_below_the_camera_nothing_is_singular(lens, interface):
+    """At rho = 0 all derivatives are finite and those beside it tend to them; so they do 1 nm below the face."""
+    eye = camera(lens, interface)
+    e1, _ = interface.tangents()
+    for depth in (0.5, 1e-9):
+        below = (
+            eye.position - (interface.distance(eye.position) + interface.thickness + depth) * interface.normal
+        )
+        at = projection_jacobians(eye, interface, below)
+        beside = projection_jacobians(eye, interface, below + 1e-7 * e1)
+        for name in ("point", "pose", "interface", "index", "lens"):
+            assert np.isfinite(getattr(at, name)).all()
+            np.testing.assert_allclose(getattr(at, name), getattr(beside, name), atol=5e-3, err_msg=name)
+
+
+def test_straight_down_the_derivative_is_that_of_the_apparent_depth():
+    """Under a camera that looks straight down, du/dx = f/(h + d n_air/n_water), the paraxial limit."""
+    interface = Interface.water(0.0)
+    eye = Camera(LENSES["pinhole"], (0.0, 0.0, 1.2), (1.0, 0.0, 0.0, 0.0))
+    jacobian = projection_jacobians(eye, interface, (0.0, 0.0, -0.8)).point
+    f = LENSES["pinhole"].fx / (1.2 + 0.8 * 1.0003 / 1.333)
+    assert jacobian[0, 0] == pytest.approx(f, rel=1e-12)
+
+
+def test_moving_everything_together_moves_nothing():
+    """Shift point, camera and plane alike: the derivatives of the pixel cancel."""
+    interface = INTERFACES["tilted 20 degrees"]
+    eye, there = camera(LENSES["plumb_bob"], interface), inner_points(interface)
+    found = projection_jacobians(eye, interface, there)
+    # A shift by s changes b by -n . s.
+    plane = -found.interface[..., 2:] * interface.normal
+    np.testing.assert_allclose(found.point + found.pose[..., :3] + plane, 0.0, atol=1e-9)
+
+
+def test_a_point_that_is_not_seen_has_no_derivative():
+    """Above the surface, the derivatives of back-projection are NaN, not numbers."""
+    interface = INTERFACES["surface"]
+    eye = camera(LENSES["pinhole"], interface)
+    by_pixel, by_z = back_project_jacobian(eye, interface, [640.0, 360.0], 2.0)
+    assert np.isnan(by_pixel).all() and np.isnan(by_z).all()
