@@ -1,0 +1,257 @@
+"""Pictures and videos as a stream of gray pictures with names and times; what cannot be read is told and left out."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.files import atomic_write
+from finssim.localization.errors import LocalizationError
+
+__all__ = ["PICTURE_FILES", "VIDEO_FILES", "pictures", "read_picture", "write_picture"]
+
+Image = npt.NDArray[np.uint8]
+Timed = tuple[float, str, Image]
+
+PICTURE_FILES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
+VIDEO_FILES = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
+
+_UNITS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
+"""Digits of a clock's count since 1970 -> seconds that one of it lasts."""
+
+
+def pictures(
+    sources: Path | str | Sequence[Path | str],
+    *,
+    times: Path | str | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> Iterator[Timed]:
+    """Time stamp [s], name and gray picture (h, w) of everything in the sources, one after the other.
+
+    A folder gives its pictures in natural order (2 before 10), or its videos where it holds no pictures. The time of a
+    picture is that in `times`; else that in its name, where a number with a decimal point is seconds and a count of 10,
+    13, 16 or 19 digits is seconds, milli-, micro- or nanoseconds since 1970; else NaN. Pictures of a video have its own
+    time stamps and are called `video.mp4#0`, `video.mp4#1`, ... Pixels stay as the camera wrote them: a note in the
+    file on how to turn the picture is not followed, so that all pictures of a camera share one pixel frame.
+
+    Args:
+        sources: Pictures, folders or videos.
+        times: CSV file with the columns `image` and `time` [s].
+        tell: Takes one sentence for each file that is left out and one with their number; None: standard error.
+
+    Raises:
+        LocalizationError: A source is not there or of unknown kind, no picture can be read, or `times` misses one.
+    """
+    given = [sources] if isinstance(sources, (str, Path)) else list(sources)
+    files = [file for source in given for file in _files(Path(source))]
+    clock = None if times is None else _read_times(Path(times))
+    names = _names(files)
+    if clock is not None:
+        for file, name in names.items():
+            if file.suffix.lower() in PICTURE_FILES and name not in clock and file.name not in clock:
+                raise LocalizationError(f"{times}: no time of {name}: add a line with it or leave it out")
+    return _stream(files, names, clock or {}, tell or _say)
+
+
+def read_picture(path: Path) -> Image:
+    """One gray picture, (h, w).
+
+    Raises:
+        LocalizationError: It cannot be read, is cut short or is no picture.
+    """
+    import cv2
+
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise LocalizationError(f"{path}: cannot be read: {error.strerror or error}") from None
+    if not raw:
+        raise LocalizationError(f"{path}: the file is empty")
+    if _cut_short(raw):
+        raise LocalizationError(f"{path}: the picture is cut short")
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        image = cv2.imdecode(np.frombuffer(raw, np.uint8), flags)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise LocalizationError(f"{path}: is no picture that can be read")
+    return np.asarray(image, np.uint8)
+
+
+def write_picture(image: npt.NDArray[np.uint8], path: Path | str) -> None:
+    """Write a picture, gray (h, w) or red-green-blue (h, w, 3), in the format of the path's suffix.
+
+    Raises:
+        LocalizationError: Unknown suffix.
+        OutputError: The file cannot be written.
+    """
+    import cv2
+
+    suffix = Path(path).suffix.lower()
+    if suffix not in PICTURE_FILES:
+        raise LocalizationError(f"{path}: expected a name that ends in {', '.join(PICTURE_FILES)}")
+    ordered = image[..., ::-1] if image.ndim == 3 else image
+    _, encoded = cv2.imencode(suffix, np.ascontiguousarray(ordered))
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(encoded.tobytes())
+
+
+def _say(sentence: str) -> None:
+    print(sentence, file=sys.stderr)
+
+
+def _files(source: Path) -> list[Path]:
+    """The files of one source."""
+    if source.is_dir():
+        inside = sorted(
+            (p for p in source.iterdir() if p.is_file() and not p.name.startswith(".")), key=_natural
+        )
+        for kinds in (PICTURE_FILES, VIDEO_FILES):
+            chosen = [p for p in inside if p.suffix.lower() in kinds]
+            if chosen:
+                return chosen
+        raise LocalizationError(f"{source}: the folder holds no pictures ({', '.join(PICTURE_FILES)})")
+    if not source.exists():
+        raise LocalizationError(f"{source}: there is no such file or folder")
+    if source.suffix.lower() not in PICTURE_FILES + VIDEO_FILES:
+        raise LocalizationError(
+            f"{source}: expected a picture ({', '.join(PICTURE_FILES)}), a video ({', '.join(VIDEO_FILES)}) "
+            "or a folder of them"
+        )
+    return [source]
+
+
+def _natural(path: Path) -> list[tuple[int, int, str]]:
+    """Sorting key in which numbers count as numbers."""
+    parts = re.findall(r"\d+|\D+", path.name.lower())
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
+
+
+def _names(files: Sequence[Path]) -> dict[Path, str]:
+    """What each file is called: its own name, with its folders where two have the same."""
+    often = Counter(file.name for file in files)
+    return {file: file.name if often[file.name] == 1 else file.as_posix() for file in files}
+
+
+def _stream(
+    files: Sequence[Path],
+    names: Mapping[Path, str],
+    clock: Mapping[str, float],
+    tell: Callable[[str], None],
+) -> Iterator[Timed]:
+    left_out, given = 0, 0
+    first = ""
+    for file in files:
+        try:
+            for picture in _of_file(file, names[file], clock, tell):
+                given += 1
+                yield picture
+        except LocalizationError as error:
+            left_out += 1
+            first = first or str(error)
+            tell(f"{error}: left out")
+    if not given:
+        raise LocalizationError(f"none of {len(files)} files can be read; the first: {first}")
+    if left_out:
+        tell(f"{left_out} of {len(files)} files were left out")
+
+
+def _of_file(
+    file: Path, name: str, clock: Mapping[str, float], tell: Callable[[str], None]
+) -> Iterator[Timed]:
+    if file.suffix.lower() in VIDEO_FILES:
+        yield from _of_video(file, name, tell)
+        return
+    time = clock.get(name, clock.get(file.name, math.nan))
+    yield (_time_in(file.stem) if math.isnan(time) else time), name, read_picture(file)
+
+
+def _of_video(file: Path, name: str, tell: Callable[[str], None]) -> Iterator[Timed]:
+    import cv2
+
+    video = cv2.VideoCapture(str(file))
+    try:
+        rate = float(video.get(cv2.CAP_PROP_FPS))
+        announced = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+        count, last = 0, -math.inf
+        while True:
+            there, image = video.read()
+            if not there:
+                break
+            time = 1e-3 * float(video.get(cv2.CAP_PROP_POS_MSEC))
+            if time <= last:  # a container without time stamps
+                time = last + (1.0 / rate if rate > 0.0 else math.nan)
+            last = time
+            gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+            yield time, f"{name}#{count}", np.asarray(gray, np.uint8)
+            count += 1
+    finally:
+        video.release()
+    if count == 0:
+        raise LocalizationError(f"{file}: is no video that can be read")
+    if 0 < count < announced:
+        tell(f"{file}: the video is cut short: {count} of {announced} pictures were read")
+
+
+def _time_in(stem: str) -> float:
+    """Time stamp that a file's name carries [s], NaN where it carries none."""
+    decimal = re.findall(r"(?<![\d.])\d+\.\d+(?![\d.])", stem)
+    if len(decimal) == 1:
+        return float(decimal[0])
+    for digits in re.findall(r"\d+", stem):
+        seconds = int(digits) * _UNITS.get(len(digits), math.nan)
+        if 1e9 <= seconds < 3e9:  # 2001 to 2065
+            return float(seconds)
+    return math.nan
+
+
+def _read_times(path: Path) -> dict[str, float]:
+    """Name -> time [s] of a CSV file with the columns image and time."""
+    try:
+        rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+    except (OSError, UnicodeDecodeError) as error:
+        raise LocalizationError(f"{path}: cannot be read: {error}") from None
+    header = [cell.strip().lower() for cell in rows[0]] if rows else []
+    image = next((i for i, cell in enumerate(header) if cell in ("image", "file", "filename", "name")), None)
+    time = next((i for i, cell in enumerate(header) if cell in ("time", "t", "timestamp", "time_s")), None)
+    if image is None or time is None:
+        raise LocalizationError(f"{path}: expected a first line 'image,time'")
+    times = {}
+    for number, row in enumerate(rows[1:], start=2):
+        if not row:
+            continue
+        try:
+            value = float(row[time])
+            times[row[image].strip()] = value
+        except (ValueError, IndexError):
+            value = math.nan
+        if not math.isfinite(value):
+            raise LocalizationError(f"{path}: line {number}: expected the name of a picture and its time [s]")
+    return times
+
+
+def _cut_short(raw: bytes) -> bool:
+    """Whether a PNG or JPEG file lacks its end; decoders would fill the rest with gray."""
+    if raw.startswith(b"\x89PNG"):
+        return b"IEND" not in raw
+    if not raw.startswith(b"\xff\xd8"):
+        return False
+    at = 2
+    while raw[at : at + 2] not in (
+        b"\xff\xda",
+        b"",
+    ):  # over the segments, which may hold a small picture of their own
+        if raw[at] != 0xFF or at + 4 > len(raw):
+            return True
+        filled = raw[at + 1] == 0xFF  # a byte that only fills
+        at += 1 if filled else 2 + int.from_bytes(raw[at + 2 : at + 4], "big")
+    return raw.find(b"\xff\xd9", at) < 0
