@@ -58,7 +58,10 @@ def body_rates(t, h=1e-4):
 
 def specific_force(t, lever, h=1e-2):
     """At a body point, body frame [m/s²], (..., 3)."""
-    point = lambda s: position(s) + quat_rotate(attitude(s), np.asarray(lever, float))
+
+    def point(s):
+        return position(s) + quat_rotate(attitude(s), np.asarray(lever, float))
+
     a = (point(t + h) - 2.0 * point(t) + point(t - h)) / h**2
     return quat_rotate(quat_conjugate(attitude(t)), a + np.array([0.0, 0.0, GRAVITY]))
 

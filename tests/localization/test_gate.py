@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.localization.gate import Gate, due, judge, remember
+from finssim.localization.gate import Gate, GateMemory, due, judge, remember
 
 
 @pytest.mark.parametrize("dimension", [1, 2, 3])
@@ -23,11 +23,11 @@ def test_nine_for_all_is_two_different_gates():
     assert np.mean(draws.sum(axis=1) > Gate(fixed=9.0).limit(2)) == pytest.approx(0.0111, abs=0.0006)
 
 
-def refused(gate, values, period=0.1, variance=1e-4):
-    """Verdicts on far measurements of those values."""
-    suspects, verdicts, R = None, [], variance * np.eye(len(values[0]))
+def refused(gate, values, period=0.1, variance=1e-4, support=5):
+    """Verdicts on far measurements of those values, of a state that so many others have supported."""
+    memory, verdicts, R = GateMemory(support), [], variance * np.eye(len(values[0]))
     for k, value in enumerate(values):
-        verdict, suspects = judge(gate, suspects, k * period, np.asarray(value, float), R, 1e6, 0.3)
+        verdict, memory = judge(gate, memory, k * period, np.asarray(value, float), R, 1e6, 0.3)
         verdicts.append(verdict)
     return verdicts
 
@@ -69,4 +69,12 @@ def test_an_accepted_measurement_clears_the_memory():
     gate, R = Gate(), np.eye(1)
     suspects = remember(None, 0.0, np.ones(1), R, 0.3, gate)
     assert not due(suspects, gate)
-    assert judge(gate, suspects, 0.1, np.ones(1), R, 0.5, 0.3) == ("accepted", None)
+    verdict, memory = judge(gate, GateMemory(5, suspects), 0.1, np.ones(1), R, 0.5, 0.3)
+    assert (verdict, memory) == ("accepted", GateMemory(5))
+
+
+def test_a_first_measurement_is_outvoted_by_the_next_two():
+    """A state started from an outlier is taken over by two that agree, and then stays where five have supported it."""
+    assert refused(Gate(), [(5.0, 1.0)] * 2, support=1) == ["gate", "reacquired"]
+    assert refused(Gate(), [(5.0, 1.0)] * 4, support=3) == ["gate"] * 3 + ["reacquired"]
+    assert refused(Gate(reacquire_after=np.inf), [(5.0, 1.0)] * 9, support=1) == ["gate"] * 9

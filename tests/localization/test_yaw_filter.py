@@ -42,7 +42,7 @@ def test_yaw_rate_is_the_derivative_of_yaw_on_a_tilting_path():
 
 
 def test_a_left_turn_raises_yaw():
-    """Level and turning left (r > 0), yaw grows; on its right side (roll 90 degrees) nose-down pitching turns it left."""
+    """Level and turning left (r > 0), yaw grows; rolled by 90 degrees, nose-down pitching does so."""
     assert yaw_rate(0.0, 0.2, 0.0, 0.0) == pytest.approx(0.2)
     assert yaw_rate(0.2, 0.0, np.pi / 2, 0.0) == pytest.approx(0.2)
 

@@ -15,18 +15,17 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.geometry.rotations import quat_from_rotvec, quat_multiply, quat_to_matrix, skew
+from finssim.localization.position_filter import Motion, process_noise, transition
 
 __all__ = [
     "ErrorStateNoise",
     "InertialState",
-    "capped",
     "correct",
     "depth_model",
+    "drift",
     "error_innovation",
     "position_model",
     "predict",
-    "restarted",
-    "turned",
     "yaw_model",
 ]
 
@@ -101,6 +100,25 @@ def predict(
         q=q / np.linalg.norm(q, axis=-1, keepdims=True),
         covariance=0.5 * (covariance + np.swapaxes(covariance, -1, -2)),
     )
+
+
+def drift(state: InertialState, dt: float, motion: Motion, turning: float) -> InertialState:
+    """The state a time later without the IMU: it moves as the position filter has it, and may turn any way.
+
+    Args:
+        state: Before.
+        dt: Time that passes [s].
+        motion: How the vehicle may move.
+        turning: Noise density of its rates [rad/s/√Hz].
+    """
+    F = np.eye(15)
+    F[:6, :6] = transition(dt, motion)
+    Q = np.zeros((15, 15))
+    Q[:6, :6] = process_noise(dt, motion)
+    Q[A, A] = turning**2 * dt * np.eye(3)
+    moved = np.concatenate([state.p, state.v], axis=-1) @ F[:6, :6].T
+    covariance = F @ state.covariance @ F.T + Q
+    return replace(state, p=moved[..., :3], v=moved[..., 3:], covariance=covariance)
 
 
 def _noise(dt: float, noise: ErrorStateNoise) -> Array:
@@ -208,52 +226,3 @@ def correct(state: InertialState, residual: Array, H: Array, R: Array, gain: Arr
         state.accel_bias + d[..., B],
         0.5 * (covariance + np.swapaxes(covariance, -1, -2)),
     )
-
-
-def restarted(
-    state: InertialState, axes: list[int], value: Array, R: Array, speed_std: float
-) -> InertialState:
-    """Forget position and velocity of some axes, 0 to 2, and start them at a measurement; one state, no batch.
-
-    Args:
-        state: Before.
-        axes: Position axes to restart.
-        value: Their positions [m], (n,).
-        R: Covariance of `value` [m²], (n, n).
-        speed_std: Standard deviation of the velocity per axis [m/s].
-    """
-    rows = axes + [axis + 3 for axis in axes]
-    p, v, covariance = state.p.copy(), state.v.copy(), state.covariance.copy()
-    covariance[rows, :] = 0.0
-    covariance[:, rows] = 0.0
-    p[axes], v[axes] = value, 0.0
-    covariance[np.ix_(axes, axes)] = R
-    covariance[rows[len(axes) :], rows[len(axes) :]] = speed_std**2
-    return replace(state, p=p, v=v, covariance=covariance)
-
-
-def turned(state: InertialState, angle: float, variance: float) -> InertialState:
-    """Turn the attitude about the pool's z by `angle` [rad], and forget what was known of it; one state, no batch."""
-    covariance = state.covariance.copy()
-    covariance[8, :] = 0.0
-    covariance[:, 8] = 0.0
-    covariance[8, 8] = variance
-    return replace(
-        state, q=quat_multiply(quat_from_rotvec(np.array([0.0, 0.0, angle])), state.q), covariance=covariance
-    )
-
-
-def capped(state: InertialState, variance: float, tilt: float) -> InertialState:
-    """The state with bounded doubt: rows and columns beyond are scaled down together; one state, no batch.
-
-    Args:
-        state: Before.
-        variance: Largest of a position [m²].
-        tilt: Largest standard deviation of roll and pitch [rad].
-    """
-    d = np.diagonal(state.covariance)
-    limit = np.array([variance] * 3 + [np.inf] * 3 + [tilt**2] * 2 + [10.0] + [np.inf] * 6)
-    if np.all(d <= limit):
-        return state
-    scale = np.sqrt(np.minimum(1.0, limit / np.maximum(d, 1e-300)))
-    return replace(state, covariance=state.covariance * scale[:, None] * scale[None, :])

@@ -81,9 +81,7 @@ class Estimator:
         """
         reason = refusal(sample) or self._clock(sample) or self._timeline.refusal(sample)
         if reason is not None:
-            self._count(sample.stream, reason, 1)
-            self._reason = f"{sample.stream}: {reason}"
-            return reason
+            return self.refuse(sample.stream, reason)
         gone, now = self._timeline.insert(sample, self._apply)
         self._tally(gone, -1)
         self._tally(now, +1)
@@ -94,6 +92,12 @@ class Estimator:
             if not outcome.used:
                 self._reason = f"{outcome.stream}: {outcome.verdict}"
         return now[0][0].verdict
+
+    def refuse(self, stream: str, reason: str) -> str:
+        """Count what never became a sample, such as a picture without tags; returns the reason."""
+        self._count(stream, reason, 1)
+        self._reason = f"{stream}: {reason}"
+        return reason
 
     def estimate(self, time: float | None = None) -> Estimate:
         """The state at a time [s]: predicted beyond the newest sample, which is the default.

@@ -12,13 +12,13 @@ import numpy.typing as npt
 from finssim.localization import position_filter, yaw_filter
 from finssim.localization.attitude import Tilt, TiltGains, follow, roll_pitch, tilt_from, up_of
 from finssim.localization.fuse_settings import Settings, Site
-from finssim.localization.gate import Suspects, judge
+from finssim.localization.gate import GateMemory, judge
 from finssim.localization.health import Estimate, Outcome
 from finssim.localization.position_filter import Motion, PositionState
 from finssim.localization.streams import DepthSample, ImuSample, VisionSample
 from finssim.localization.yaw_filter import YawNoise, YawState, yaw_rate
 
-__all__ = ["ConstantVelocity", "Track"]
+__all__ = ["ConstantVelocity", "Track", "motion_of", "vision_covariance"]
 
 Array = npt.NDArray[np.float64]
 
@@ -50,7 +50,7 @@ class Track:
     """Time of the latest vision yaw that was believed [s]."""
     depth_time: float | None = None
     imu_time: float | None = None
-    suspects: tuple[Suspects | None, Suspects | None, Suspects | None] = (None, None, None)
+    gates: tuple[GateMemory, GateMemory, GateMemory] = (GateMemory(), GateMemory(), GateMemory())
     """Memories of the gates of position, yaw and depth."""
 
 
@@ -66,7 +66,7 @@ class ConstantVelocity:
         self.settings, self.site = settings, site
         self._port = np.array(site.depth_port)
         self._H_depth = np.array([[*site.up, 0.0, 0.0, 0.0]])
-        self._motions = {(xy, z): _motion(settings, xy, z) for xy in (False, True) for z in (False, True)}
+        self._motions = {(xy, z): motion_of(settings, xy, z) for xy in (False, True) for z in (False, True)}
 
     def start(self) -> Track:
         """The state before any sample: nothing is known."""
@@ -96,12 +96,9 @@ class ConstantVelocity:
         z = np.array([-sample.depth - site.offset - lever])
         R = np.array([[s.depth_std**2]])
         found = position_filter.innovation(track.position, self._H_depth, z, R)
-        if track.depth_time is None:
-            verdict, suspects = "initialized", None
-        else:
-            verdict, suspects = judge(
-                s.gate, track.suspects[2], sample.time, z, R, float(found.mahalanobis), s.speed_std
-            )
+        verdict, memory = judge(
+            s.gate, track.gates[2], sample.time, z, R, float(found.mahalanobis), s.speed_std
+        )
         if verdict == "accepted":
             position = position_filter.correct(track.position, found, self._H_depth, R)
         elif verdict == "gate":
@@ -111,7 +108,7 @@ class ConstantVelocity:
             height = (z - site.up[0] * x - site.up[1] * y) / site.up[2]
             position = position_filter.restarted(track.position, [2], height, R, s.speed_std)
         then = track.depth_time if verdict == "gate" else sample.time
-        track = replace(track, position=position, depth_time=then, suspects=(*track.suspects[:2], suspects))
+        track = replace(track, position=position, depth_time=then, gates=(*track.gates[:2], memory))
         return track, (Outcome("depth", verdict, float(found.mahalanobis), 1),)
 
     def vision(self, track: Track, sample: VisionSample) -> tuple[Track, tuple[Outcome, ...]]:
@@ -154,12 +151,9 @@ class ConstantVelocity:
     def _fixed(self, track: Track, sample: VisionSample, R: Array) -> tuple[Track, Outcome]:
         s, z = self.settings, np.array(sample.position)
         found = position_filter.innovation(track.position, _H_VISION, z, R)
-        if track.vision_time is None:
-            verdict, suspects = "initialized", None
-        else:
-            verdict, suspects = judge(
-                s.gate, track.suspects[0], sample.time, z, R, float(found.mahalanobis), s.speed_std
-            )
+        verdict, memory = judge(
+            s.gate, track.gates[0], sample.time, z, R, float(found.mahalanobis), s.speed_std
+        )
         if verdict == "accepted":
             position = position_filter.correct(track.position, found, _H_VISION, R)
         elif verdict == "gate":
@@ -167,20 +161,15 @@ class ConstantVelocity:
         else:
             position = position_filter.restarted(track.position, [0, 1], z, R, s.speed_std)
         then = track.vision_time if verdict == "gate" else sample.time
-        track = replace(track, position=position, vision_time=then, suspects=(suspects, *track.suspects[1:]))
+        track = replace(track, position=position, vision_time=then, gates=(memory, *track.gates[1:]))
         return track, Outcome("vision", verdict, float(found.mahalanobis), 2)
 
     def _turned(self, track: Track, sample: VisionSample, variance: float) -> tuple[Track, Outcome]:
         s = self.settings
         found = yaw_filter.innovation(track.yaw, sample.yaw or 0.0, variance)
-        if track.yaw_seen is None:
-            verdict, suspects = "initialized", None
-        else:
-            # Flipped yaws agree with one another as distances from the prediction, which turns with the vehicle.
-            apart, R = np.array([float(found.residual)]), np.array([[variance]])
-            verdict, suspects = judge(
-                s.gate, track.suspects[1], sample.time, apart, R, float(found.mahalanobis), 0.05
-            )
+        # Flipped yaws agree with one another as distances from the prediction, which turns with the vehicle.
+        apart, R = np.array([float(found.residual)]), np.array([[variance]])
+        verdict, memory = judge(s.gate, track.gates[1], sample.time, apart, R, float(found.mahalanobis), 0.05)
         if verdict == "accepted":
             yaw = yaw_filter.correct(track.yaw, found, variance)
         elif verdict == "gate":
@@ -188,8 +177,8 @@ class ConstantVelocity:
         else:
             yaw = yaw_filter.restarted(track.yaw, sample.yaw or 0.0, variance, s.bias_std)
         then = track.yaw_seen if verdict == "gate" else sample.time
-        memory = (track.suspects[0], suspects, track.suspects[2])
-        track = replace(track, yaw=yaw, yaw_seen=then, suspects=memory)
+        gates = (track.gates[0], memory, track.gates[2])
+        track = replace(track, yaw=yaw, yaw_seen=then, gates=gates)
         return track, Outcome("yaw", verdict, float(found.mahalanobis), 1)
 
     def _tilted(self, track: Track, sample: ImuSample, dt: float) -> Track:
@@ -259,7 +248,7 @@ def vision_covariance(sample: VisionSample, settings: Settings) -> Array:
     return np.array(sample.covariance) + floor
 
 
-def _motion(settings: Settings, xy_slows: bool, z_slows: bool) -> Motion:
+def motion_of(settings: Settings, xy_slows: bool, z_slows: bool) -> Motion:
     """The motion model where the axes without news slow down to rest, give or take `speed_std`."""
     slows = (xy_slows, xy_slows, z_slows)
     rate, own = settings.decay, settings.motion

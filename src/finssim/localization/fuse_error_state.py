@@ -15,12 +15,18 @@ from finssim.geometry.rotations import (
     quat_to_matrix,
     wrap_angle,
 )
-from finssim.localization import error_state
+from finssim.localization import error_state, fuse_restart
 from finssim.localization.attitude import roll_pitch
 from finssim.localization.error_state import ErrorStateNoise, InertialState
-from finssim.localization.fuse_constant_velocity import GYRO_HOLD, ConstantVelocity, Track, vision_covariance
+from finssim.localization.fuse_constant_velocity import (
+    GYRO_HOLD,
+    ConstantVelocity,
+    Track,
+    motion_of,
+    vision_covariance,
+)
 from finssim.localization.fuse_settings import Settings, Site, turn_to_pool
-from finssim.localization.gate import Suspects, judge
+from finssim.localization.gate import GateMemory, judge
 from finssim.localization.health import Estimate, Outcome
 from finssim.localization.streams import DepthSample, ImuSample, VisionSample
 
@@ -47,7 +53,7 @@ class InertialTrack:
     vision_time: float | None = None
     depth_time: float | None = None
     imu_time: float | None = None
-    suspects: tuple[Suspects | None, Suspects | None, Suspects | None] = (None, None, None)
+    gates: tuple[GateMemory, GateMemory, GateMemory] = (GateMemory(), GateMemory(), GateMemory())
     roll: float = 0.0
     pitch: float = 0.0
 
@@ -69,9 +75,7 @@ class ErrorState:
         self._noise = ErrorStateNoise(
             settings.gyro.rate, settings.accel_noise, settings.gyro.bias_walk, settings.accel_bias_walk
         )
-        self._blind = replace(
-            self._noise, gyro=settings.blind_rate, accel=math.sqrt(max(settings.motion.density))
-        )
+        self._drifts = {slow: motion_of(settings, slow, False) for slow in (False, True)}
 
     def start(self) -> InertialTrack:
         """The state before any sample: nothing is known."""
@@ -106,17 +110,17 @@ class ErrorState:
         height, H = error_state.depth_model(track.inertial, self._port, self._up, self.site.offset)
         residual, R = -sample.depth - height, np.array([[s.depth_std**2]])
         distance, gain = error_state.error_innovation(track.inertial, residual, H, R)
-        verdict, suspects = judge(
-            s.gate, track.suspects[2], sample.time, residual, R, float(distance), s.speed_std
+        verdict, memory = judge(
+            s.gate, track.gates[2], sample.time, residual, R, float(distance), s.speed_std
         )
         state = track.inertial
         if verdict == "accepted":
             state = error_state.correct(state, residual, H, R, gain)
         elif verdict == "reacquired":
-            state = error_state.restarted(state, [2], state.p[2:] + residual / self._up[2], R, s.speed_std)
+            state = fuse_restart.restarted(state, [2], state.p[2:] + residual / self._up[2], R, s.speed_std)
         then = track.depth_time if verdict == "gate" else sample.time
-        memory = (*track.suspects[:2], suspects)
-        track = self._kept(replace(track, inertial=state, depth_time=then, suspects=memory))
+        gates = (*track.gates[:2], memory)
+        track = self._kept(replace(track, inertial=state, depth_time=then, gates=gates))
         return track, (Outcome("depth", verdict, float(distance), 1),)
 
     def vision(self, track: InertialTrack, sample: VisionSample) -> tuple[InertialTrack, tuple[Outcome, ...]]:
@@ -185,7 +189,7 @@ class ErrorState:
         state = InertialState(
             known.x[:3] - R @ self._body, known.x[3:], q, np.zeros(3), np.zeros(3), covariance
         )
-        track = replace(track, inertial=state, time=time, vision_time=before.vision_time)
+        track = replace(track, inertial=state, time=time, vision_time=before.vision_time, gates=before.gates)
         return self._kept(replace(track, depth_time=before.depth_time))
 
     def _fixed(self, track: InertialTrack, sample: VisionSample, R: Array) -> tuple[InertialTrack, Outcome]:
@@ -195,15 +199,13 @@ class ErrorState:
         seen = np.array(sample.position)
         residual, H = seen - position[:2], H[:2]
         distance, gain = error_state.error_innovation(state, residual, H, R)
-        verdict, suspects = judge(
-            s.gate, track.suspects[0], sample.time, seen, R, float(distance), s.speed_std
-        )
+        verdict, memory = judge(s.gate, track.gates[0], sample.time, seen, R, float(distance), s.speed_std)
         if verdict == "accepted":
             state = error_state.correct(state, residual, H, R, gain)
         elif verdict == "reacquired":
-            state = error_state.restarted(state, [0, 1], state.p[:2] + residual, R, s.speed_std)
+            state = fuse_restart.restarted(state, [0, 1], state.p[:2] + residual, R, s.speed_std)
         then = track.vision_time if verdict == "gate" else sample.time
-        track = replace(track, inertial=state, vision_time=then, suspects=(suspects, *track.suspects[1:]))
+        track = replace(track, inertial=state, vision_time=then, gates=(memory, *track.gates[1:]))
         return track, Outcome("vision", verdict, float(distance), 2)
 
     def _turned(self, track: InertialTrack, sample: VisionSample, R: Array) -> tuple[InertialTrack, Outcome]:
@@ -212,12 +214,12 @@ class ErrorState:
         yaw, H = error_state.yaw_model(state)
         residual = wrap_angle(np.array([sample.yaw]) - yaw)
         distance, gain = error_state.error_innovation(state, residual, H, R)
-        verdict, suspects = judge(s.gate, track.suspects[1], sample.time, residual, R, float(distance), 0.05)
+        verdict, memory = judge(s.gate, track.gates[1], sample.time, residual, R, float(distance), 0.05)
         if verdict == "accepted":
             state = error_state.correct(state, residual, H, R, gain)
         elif verdict == "reacquired":
-            state = error_state.turned(state, float(residual[0]), float(R[0, 0]))
-        track = replace(track, inertial=state, suspects=(track.suspects[0], suspects, track.suspects[2]))
+            state = fuse_restart.turned(state, float(residual[0]), float(R[0, 0]))
+        track = replace(track, inertial=state, gates=(track.gates[0], memory, track.gates[2]))
         return track, Outcome("yaw", verdict, float(distance), 1)
 
     def _until(self, track: InertialTrack, time: float) -> InertialTrack:
@@ -236,29 +238,31 @@ class ErrorState:
             state = self._step(state, track, until - then, blind=middle > heard, age=age)
             then = until
         return self._kept(
-            replace(track, inertial=error_state.capped(state, s.largest_variance, TILT_CAP), time=time)
+            replace(track, inertial=fuse_restart.capped(state, s.largest_variance, TILT_CAP), time=time)
         )
 
     def _step(
         self, state: InertialState, track: InertialTrack, dt: float, *, blind: bool, age: float
     ) -> InertialState:
-        s = self.settings
+        s, lost = self.settings, age > self.settings.hold
+        if lost:
+            state = fuse_restart.stopped(state, [0, 1])
         if blind or track.force is None:
-            rest = state.accel_bias - quat_to_matrix(state.q).T @ self._gravity
-            after = error_state.predict(state, state.gyro_bias, rest, dt, self._blind, self._gravity)
-        else:
-            after = error_state.predict(
-                state, np.array(track.omega), np.array(track.force), dt, self._noise, self._gravity
-            )
+            return error_state.drift(state, dt, self._drifts[age > s.coast], s.blind_rate)
+        omega, force = np.array(track.omega), np.array(track.force)
+        after = error_state.predict(state, omega, force, dt, self._noise, self._gravity)
         if age <= s.coast:
             return after
+        if (
+            lost
+        ):  # the place is no longer told by the accelerometer, only that the vehicle may be anywhere near
+            walk = 2.0 * s.speed_std**2 / s.decay * dt
+            after = fuse_restart.parted(replace(after, p=np.append(state.p[:2], after.p[2])), [0, 1], walk)
         H = np.eye(15)[3:5]
         R = np.eye(2) * s.speed_std**2 / (s.decay * dt)
         residual = -after.v[:2]
-        after = error_state.correct(
-            after, residual, H, R, error_state.error_innovation(after, residual, H, R)[1]
-        )
-        return replace(after, p=np.append(state.p[:2], after.p[2])) if age > s.hold else after
+        gain = error_state.error_innovation(after, residual, H, R)[1]
+        return error_state.correct(after, residual, H, R, gain)
 
     def _kept(self, track: InertialTrack) -> InertialTrack:
         """The track with roll and pitch read from its attitude."""

@@ -169,7 +169,7 @@ def settings_of(vehicle: Vehicle, profile: str = "default") -> Settings:
             accel_bias_std=max(imu.accel_bias_initial, settings.accel_bias_std),
         )
     if depth is not None:
-        settings = replace(settings, depth_std=max(depth.noise_std, 0.5 * settings.depth_std))
+        settings = replace(settings, depth_std=max(depth.noise_std, settings.depth_std))
     return settings
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtri
 
-__all__ = ["Gate", "Suspects", "due", "judge", "remember"]
+__all__ = ["Gate", "GateMemory", "Suspects", "due", "judge", "remember"]
 
 Array = npt.NDArray[np.float64]
 
@@ -102,20 +102,32 @@ def due(suspects: Suspects, gate: Gate) -> bool:
     return long and suspects.hits >= gate.reacquire_samples
 
 
+@dataclass(frozen=True)
+class GateMemory:
+    """All that a gate remembers."""
+
+    support: int = 0
+    """Measurements believed since the state was last started from one; counted up to `reacquire_samples`."""
+    suspects: Suspects | None = None
+
+
 def judge(
     gate: Gate,
-    suspects: Suspects | None,
+    memory: GateMemory,
     time: float,
     value: Array,
     covariance: Array,
     distance: float,
     drift: float,
-) -> tuple[str, Suspects | None]:
+) -> tuple[str, GateMemory]:
     """Whether a measurement is believed, and the gate's memory after it.
+
+    A state that was started from one measurement is no surer than that one: until `reacquire_samples` others have
+    supported it, a run takes over as soon as it outnumbers its support.
 
     Args:
         gate: The gate.
-        suspects: Its memory.
+        memory: What it remembers; support 0 where there is no state yet.
         time: Of the measurement [s].
         value: What is compared among refused measurements, (n,).
         covariance: Of `value`, (n, n).
@@ -123,9 +135,15 @@ def judge(
         drift: How fast `value` may change [units/s].
 
     Returns:
-        `accepted`, `gate` where it is refused, or `reacquired` where it ends a run that takes over; and the memory.
+        `initialized` for the first, `accepted`, `gate` where it is refused, or `reacquired` where it ends a run that
+        takes over; and the memory.
     """
+    if memory.support == 0:
+        return "initialized", GateMemory(1)
     if distance <= gate.limit(len(value)):
-        return "accepted", None
-    suspects = remember(suspects, time, value, covariance, drift, gate)
-    return ("reacquired", None) if due(suspects, gate) else ("gate", suspects)
+        return "accepted", GateMemory(min(memory.support + 1, gate.reacquire_samples))
+    suspects = remember(memory.suspects, time, value, covariance, drift, gate)
+    outvoted = memory.support < gate.reacquire_samples and suspects.hits > memory.support
+    if due(suspects, gate) or (outvoted and math.isfinite(gate.reacquire_after)):
+        return "reacquired", GateMemory(min(suspects.hits, gate.reacquire_samples))
+    return "gate", GateMemory(memory.support, suspects)

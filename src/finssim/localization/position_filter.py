@@ -18,6 +18,7 @@ __all__ = [
     "predict",
     "process_noise",
     "restarted",
+    "transition",
 ]
 
 Array = npt.NDArray[np.float64]

@@ -1,0 +1,94 @@
+"""Reading the tables of a log: columns of numbers by name, empty cells as NaN."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.localization.errors import LocalizationError
+
+__all__ = ["StreamTable", "read_stream_table"]
+
+Array = npt.NDArray[np.float64]
+
+TIME = ("t", "time", "time_s", "timestamp", "stamp", "seconds")
+EMPTY = ("", "nan", "none", "null", "na", "n/a", "-")
+
+
+@dataclass
+class StreamTable:
+    """One table of a log."""
+
+    name: str
+    """As messages call it."""
+    t: Array
+    """Times, (n,), as they stand in the file [s]."""
+    numbers: dict[str, Array]
+    """Column, in lower case -> values, (n,)."""
+    words: dict[str, list[str]]
+    """Columns that hold words."""
+    notes: list[str] = field(default_factory=list)
+
+    def has(self, *names: str) -> bool:
+        """Whether all these columns hold a number somewhere."""
+        return all(name in self.numbers and np.isfinite(self.numbers[name]).any() for name in names)
+
+    def columns(self, *names: str) -> Array:
+        """Columns side by side, (n, len(names))."""
+        return np.stack([self.numbers[name] for name in names], axis=-1)
+
+
+def read_stream_table(path: Path) -> StreamTable:
+    """The columns of a CSV file with a line of names; separated by commas, semicolons or tabs; # begins a comment.
+
+    A last line that a crash cut short is left out, and so are others of the wrong length.
+
+    Raises:
+        LocalizationError: Unreadable, without names, without a column of times, or without rows.
+    """
+    try:
+        text = path.read_bytes().split(b"\0", 1)[0].decode("utf-8-sig", errors="replace")
+    except OSError as error:
+        raise LocalizationError(f"{path}: cannot be read: {error.strerror or error}") from None
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    delimiter = max(",;\t", key=lines[0].count) if lines else ","
+    rows = list(csv.reader(lines, delimiter=delimiter))
+    names = [name.strip().lower() for name in rows[0]] if rows else []
+    time = next((name for name in TIME if name in names), None)
+    if time is None or len(set(names)) < len(names):
+        raise LocalizationError(
+            f"{path}: expected a line of different column names with t, such as t,depth; found "
+            f"'{','.join(names)[:60]}'"
+        )
+    whole = [row for row in rows[1:] if len(row) == len(names)]
+    table = StreamTable(str(path), np.empty(0), {}, {})
+    if len(whole) < len(rows) - 1:
+        table.notes.append(
+            f"{path.name}: {len(rows) - 1 - len(whole)} rows have not {len(names)} cells and were left out"
+        )
+    if not whole:
+        raise LocalizationError(f"{path}: holds no rows: give a table with samples")
+    for name, cells in zip(names, zip(*whole, strict=True), strict=True):
+        values = [_number(cell, decimal_comma=delimiter != ",") for cell in cells]
+        if all(math.isnan(v) for v in values) and any(c.strip().lower() not in EMPTY for c in cells):
+            table.words[name] = [cell.strip() for cell in cells]
+        else:
+            table.numbers[name] = np.array(values, float)
+    if time not in table.numbers:
+        raise LocalizationError(f"{path}: column '{time}' holds no numbers: write times in seconds")
+    table.t = table.numbers.pop(time)
+    return table
+
+
+def _number(cell: str, *, decimal_comma: bool) -> float:
+    """The number in a cell; NaN where there is none. Infinities stay: the estimator refuses and counts them."""
+    cell = cell.strip().replace(",", ".") if decimal_comma else cell.strip()
+    try:
+        return float(cell)
+    except ValueError:
+        return {"true": 1.0, "yes": 1.0, "false": 0.0, "no": 0.0}.get(cell.lower(), math.nan)
