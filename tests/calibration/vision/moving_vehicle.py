@@ -13,10 +13,10 @@ from finssim.geometry.optics import Camera, Interface, Lens, project
 from finssim.geometry.rotations import (
     quat_conjugate,
     quat_from_euler,
+    quat_from_rotvec,
     quat_inverse_rotate,
     quat_multiply,
     quat_rotate,
-    quat_to_euler,
     quat_to_matrix,
     quat_to_rotvec,
 )
@@ -118,7 +118,7 @@ def write_log(
     gyro_bias=(0.01, -0.006, 0.004),
     clock=0.0,
 ):
-    """A log folder: detections, an IMU of 50 Hz in its own axes (its attitude is the body's), depth of 10 Hz."""
+    """A log folder: detections, an IMU of 50 Hz in its own axes, depth of 10 Hz."""
     folder.mkdir(exist_ok=True)
     frames = [
         Frame(
@@ -136,15 +136,14 @@ def write_log(
     # A rate over the step ahead belongs to its middle.
     sensor = quat_inverse_rotate(np.array(imu_orientation), rate) + np.array(gyro_bias)
     force = quat_inverse_rotate(np.array(imu_orientation), 9.81 * fine.up)
-    columns = {
-        "t": t + 0.01 - clock,
-        **dict(zip("pqr", (sensor + 0.003 * rng.standard_normal(sensor.shape)).T, strict=True)),
-    }
-    columns |= dict(zip(("ax", "ay", "az"), (force + 0.02 * rng.standard_normal(force.shape)).T, strict=True))
-    if attitude:
-        later = moved.at(t + 0.01)
-        roll, pitch, _ = quat_to_euler(later.quaternion)
-        columns |= {"roll": roll + 0.004 * rng.standard_normal(len(t)), "pitch": pitch}
+    columns = {"t": t + 0.01 - clock}
+    for name, values, std in (("gyro", sensor, 0.003), ("accel", force, 0.02)):
+        noisy = values + std * rng.standard_normal(values.shape)
+        columns |= {f"{name}_{axis}": noisy[:, i] for i, axis in enumerate("xyz")}
+    if attitude:  # of the sensor, as what is in its axes is
+        wobble = quat_from_rotvec(0.004 * rng.standard_normal((len(t), 3)))
+        q = quat_multiply(moved.at(t + 0.01).quaternion, quat_multiply(wobble, imu_orientation))
+        columns |= {f"q{axis}": q[:, i] for i, axis in enumerate("xyzw")}
     pd.DataFrame(columns).to_csv(folder / "imu.csv", index=False, float_format="%.6f")
     slow = moved.at(np.arange(moved.t[0], moved.t[-1], 0.1))
     reading = depth_scale * slow.depth() + depth_offset + 0.004 * rng.standard_normal(len(slow.t))

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Estimate
 from finssim.calibration.uncertainty import Evidence, intervals, trial_covariance
+from finssim.calibration.vision.imu_estimates import imu_advice, imu_estimates
 from finssim.calibration.vision.turns import Attitude, Gyro, TurnPairs, turn_pairs
 from finssim.geometry.rotations import (
     matrix_to_quat,
@@ -39,9 +40,6 @@ LEAST_CORRELATION = 0.6
 BLOCKS = 12
 TUKEY = 4.685
 ROUNDS = 12
-UNSURE = math.radians(5.0)
-"""Half width of the 95 % interval of an angle beyond which it does not count as identified."""
-
 FEWEST = 20
 NUDGE = 0.005
 """Step of the derivative with respect to the time offset [s]."""
@@ -184,7 +182,7 @@ def _refined(
     covariance = trial_covariance(evidence)
     turn = quat_to_rotvec(quat_multiply(q, quat_conjugate(start)))
     theta = np.concatenate([turn, bias, [offset]])[:used]
-    estimates = _estimates(theta, intervals(theta, covariance))
+    estimates = imu_estimates(theta, intervals(theta, covariance))
     std, tied = covariance.std[:3], covariance.local[:3, :3]
     ratio = std / np.sqrt(np.diagonal(tied)) if np.isfinite(tied).all() else np.full(3, np.inf)
     kept = weight > 0.0
@@ -198,7 +196,7 @@ def _refined(
         rejected=int(np.sum(good & ~kept)),
         windows=int(good.sum()),
         correlation=correlation,
-        advice=_advice(estimates, float(np.mean(~kept[good]))),
+        advice=imu_advice(estimates, float(np.mean(~kept[good]))),
     )
 
 
@@ -228,60 +226,6 @@ def _evidence(names: tuple[str, ...], J: Array, residual: Array, weight: Array) 
     normal = [np.einsum("n,nki,nkj->ij", weight[b], J[b], J[b]) for b in blocks]
     score = [np.einsum("n,nki,nk->i", weight[b], J[b], residual[b]) for b in blocks]
     return Evidence(names=names, normal=np.array(normal), score=np.array(score), unit="blocks")
-
-
-def _estimates(theta: Array, ends: Array) -> dict[str, Estimate]:
-    found = {}
-    for i, axis in enumerate("xyz"):
-        half = 0.5 * (ends[i, 1] - ends[i, 0])
-        sure = bool(half < UNSURE)
-        note = (
-            "" if sure else f"the vehicle hardly turns about any axis but {axis}: this angle keeps the file's"
-        )
-        low, high = np.degrees(ends[i])
-        found[f"imu.turn_{axis}"] = Estimate(
-            name=f"imu.turn_{axis}",
-            estimate=float(np.degrees(theta[i])),
-            ci95=(float(low), float(high)),
-            unit="deg",
-            identifiable=sure,
-            note=note,
-        )
-    for i, axis in enumerate("xyz", start=3):
-        name = f"imu.gyro_bias_{axis}"
-        ci = (float(ends[i, 0]), float(ends[i, 1]))
-        found[name] = Estimate(
-            name=name,
-            estimate=float(theta[i]),
-            ci95=ci,
-            unit="rad/s",
-            identifiable=bool(np.isfinite(ci).all()),
-        )
-    if len(theta) > 6:
-        ci = (float(ends[6, 0]), float(ends[6, 1]))
-        found["imu.time_offset"] = Estimate(
-            name="imu.time_offset",
-            estimate=float(theta[6]),
-            ci95=ci,
-            unit="s",
-            identifiable=bool(ci[1] - ci[0] < 0.2),
-        )
-    return found
-
-
-def _advice(estimates: dict[str, Estimate], rejected: float) -> tuple[str, ...]:
-    sentences = []
-    unsure = [axis for axis in "xyz" if not estimates[f"imu.turn_{axis}"].identifiable]
-    if unsure:
-        sentences.append(
-            f"the motion does not tell how the IMU is turned about body {' and '.join(unsure)}: rock the "
-            "vehicle about at least two axes, by 10 degrees and more"
-        )
-    if rejected > 0.1:
-        sentences.append(
-            f"{100.0 * rejected:.0f} % of the windows disagree and have no weight: look at the attitude"
-        )
-    return tuple(sentences)
 
 
 def turn_residual(

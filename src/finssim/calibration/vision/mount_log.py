@@ -4,29 +4,29 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.trials.table_file import read_table
 from finssim.calibration.vision.mount_model import Moment
 from finssim.calibration.vision.turns import Gyro
 from finssim.geometry.rotations import quat_inverse_rotate
 from finssim.localization.attitude import TiltGains, follow, in_body_axes, tilt_from, up_of
 from finssim.localization.detections import most_certain, read_detections
+from finssim.localization.fuse_table import StreamTable, read_stream_table
 from finssim.localization.pool import Pool
 from finssim.vehicles import Vehicle
 
-__all__ = ["MountLog", "read_mount_log"]
+__all__ = ["MountLog", "Stream", "read_mount_log"]
 
 Array = NDArray[np.float64]
 
 DETECTIONS, IMU, DEPTH = "detections.csv", "imu.csv", "depth.csv"
-TIMES = ("t", "time", "time_s", "timestamp")
 RATE, FORCE = ("p", "q", "r"), ("ax", "ay", "az")
+SENSOR_RATE, SENSOR_FORCE = ("gyro_x", "gyro_y", "gyro_z"), ("accel_x", "accel_y", "accel_z")
 QUATERNION = ("qx", "qy", "qz", "qw")
 LONGEST_AGE = 0.3
 """A sensor is asked at an exposure only between two samples that are no further apart [s]."""
@@ -36,24 +36,67 @@ SETTLING = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
+class Stream:
+    """Samples of one sensor."""
+
+    t: Array
+    """Increasing [s], (m,)."""
+    values: Array
+    """(m, c)"""
+
+    def at(self, time: float) -> Array | None:
+        """Linear between samples, (c,); None where there is none or the next two are too far apart."""
+        k = int(np.searchsorted(self.t, time, side="right"))
+        if not 0 < k < len(self.t) or self.t[k] - self.t[k - 1] > LONGEST_AGE:
+            return None
+        part = (time - self.t[k - 1]) / (self.t[k] - self.t[k - 1])
+        return np.asarray((1.0 - part) * self.values[k - 1] + part * self.values[k])
+
+
+@dataclass(frozen=True, kw_only=True)
 class MountLog:
     """What a folder holds."""
 
-    moments: tuple[Moment, ...]
+    pictures: tuple[tuple[float, Mapping[int, Array]], ...]
+    """Time of the exposure [s] and tag -> pixels of its corners (4, 2), in order of time."""
+    up: Stream | None
+    """Direction of up in body axes."""
     gyro: Gyro | None
     """In the sensor's own axes."""
+    depth: Stream | None
+    """[m]"""
     sha256: str
     """Of the files read."""
     notes: tuple[str, ...]
     """What was left out or is missing, one sentence each."""
 
+    def moments(self, imu_offset: float = 0.0) -> tuple[Moment, ...]:
+        """The pictures with tilt and depth at their time.
+
+        Args:
+            imu_offset: To be added to the IMU's times [s].
+        """
+        found = []
+        for time, corners in self.pictures:
+            up = None if self.up is None else self.up.at(time - imu_offset)
+            depth = None if self.depth is None else self.depth.at(time)
+            found.append(
+                Moment(
+                    time=time,
+                    corners=corners,
+                    up=None if up is None else up / np.linalg.norm(up),
+                    depth=None if depth is None else float(depth[0]),
+                )
+            )
+        return tuple(found)
+
 
 def read_mount_log(folder: str | Path, pool: Pool, vehicle: Vehicle) -> MountLog:
     """Read `detections.csv`, and of `imu.csv` and `depth.csv` what is there.
 
-    Times are of one clock; a picture's is its stamp, from which the pool's latency is taken. The IMU's rates and forces
-    are in its own axes and are turned into the body by `sensors.imu.orientation`; roll and pitch, or a quaternion, are
-    the body's. Where the unit reports no attitude, the tilt is made from gyro and accelerometer.
+    Times are of one clock; a picture's is its stamp, from which the pool's latency is taken. As for `finssim fuse`, the
+    IMU's `p q r`, `ax ay az` and attitude are the body's, with its mount in the vehicle file; `gyro_x ...` and
+    `accel_x ...` are in its own axes, and so is then the attitude. Without an attitude the tilt is made from both.
 
     Raises:
         CalibrationError, LocalizationError: A file is missing or cannot be used.
@@ -68,120 +111,114 @@ def read_mount_log(folder: str | Path, pool: Pool, vehicle: Vehicle) -> MountLog
     time = np.array([frame.time for frame in frames]) - pool.latency
     if not np.isfinite(time).all():
         raise CalibrationError(f"{folder / DETECTIONS}: pictures without a time: add a column 'time' [s]")
-    up, gyro = _imu(folder / IMU, vehicle, time, notes)
-    depth = _depth(folder / DEPTH, time, notes)
-    order = np.argsort(time, kind="stable")
-    moments = tuple(
-        Moment(
-            time=float(time[i]),
-            corners={
-                found.tag: np.asarray(found.corners, float) for found in most_certain(frames[i].detections)
-            },
-            up=up[i] if np.isfinite(up[i]).all() else None,
-            depth=float(depth[i]) if np.isfinite(depth[i]) else None,
-        )
-        for i in order
+    up, gyro = _imu(folder / IMU, vehicle, notes)
+    pictures = tuple(
+        (float(time[i]), {d.tag: np.asarray(d.corners, float) for d in most_certain(frames[i].detections)})
+        for i in np.argsort(time, kind="stable")
     )
-    return MountLog(moments=moments, gyro=gyro, sha256=_digest(folder), notes=tuple(notes))
+    return MountLog(
+        pictures=pictures,
+        up=up,
+        gyro=gyro,
+        depth=_depth(folder / DEPTH, notes),
+        sha256=_digest(folder),
+        notes=tuple(notes),
+    )
 
 
-def _imu(path: Path, vehicle: Vehicle, time: Array, notes: list[str]) -> tuple[Array, Gyro | None]:
-    """Up in body axes at the pictures (n, 3), NaN where unknown, and the gyro."""
-    unknown = np.full((len(time), 3), np.nan)
+def _imu(path: Path, vehicle: Vehicle, notes: list[str]) -> tuple[Stream | None, Gyro | None]:
+    """Up in body axes, and the gyro in its own."""
     if not path.is_file():
         notes.append(f"no {IMU}: how tags sit in the body is not told, only how they sit to one another")
-        return unknown, None
-    t, columns = _columns(path, notes)
-    mount = vehicle.sensors.imu
-    orientation = np.array([0.0, 0.0, 0.0, 1.0]) if mount is None else np.asarray(mount.orientation)
-    rate, force = _stack(columns, RATE), _stack(columns, FORCE)
+        return None, None
+    table = read_stream_table(path)
+    notes.extend(table.notes)
+    mount = np.array([0.0, 0.0, 0.0, 1.0])
+    if vehicle.sensors.imu is not None:
+        mount = np.asarray(vehicle.sensors.imu.orientation)
+    own = table.has(*SENSOR_RATE) and not table.has(*RATE)
+    rate = _columns(table, SENSOR_RATE if own else RATE)
+    force = _columns(table, SENSOR_FORCE if own else FORCE)
     gyro = None
-    if rate is not None:
+    if rate is not None and np.isfinite(rate).all(axis=1).sum() > 2:
         good = np.isfinite(rate).all(axis=1)
-        gyro = Gyro(t=t[good], rate=rate[good]) if good.sum() > 2 else None
-    if "roll" in columns and "pitch" in columns:
-        up = up_of(columns["roll"], columns["pitch"])
-    elif (quaternion := _stack(columns, QUATERNION)) is not None:
-        length = np.linalg.norm(quaternion, axis=1, keepdims=True)
-        up = quat_inverse_rotate(
-            quaternion / np.where(length > 0.5, length, np.nan), np.array([0.0, 0.0, 1.0])
-        )
+        clean = _stream(table.t[good], rate[good] if own else quat_inverse_rotate(mount, rate[good]))
+        gyro = Gyro(t=clean.t, rate=clean.values)
+    up = _up(table)
+    if up is not None:
+        up = in_body_axes(up, mount) if own else up
     elif rate is not None and force is not None:
-        up = _tilt(
-            t, in_body_axes(rate, orientation), in_body_axes(force, orientation), vehicle.water.gravity
-        )
+        turned = (in_body_axes(x, mount) if own else x for x in (rate, force))
+        up = _tilt(table.t, *turned, vehicle.water.gravity)
         notes.append(f"{IMU} holds no attitude: roll and pitch are made from gyro and accelerometer")
     else:
-        notes.append(
-            f"{IMU} holds neither roll and pitch, a quaternion, nor p q r with ax ay az: no tilt is known"
-        )
-        return unknown, gyro
+        notes.append(f"{IMU} holds neither an attitude nor rates with accelerations: no tilt is known")
+        return None, gyro
     good = np.isfinite(up).all(axis=1)
-    return _at(time, t[good], up[good]), gyro
+    return _stream(table.t[good], up[good]), gyro
+
+
+def _up(table: StreamTable) -> Array | None:
+    """Up in the axes whose attitude the table holds, (m, 3)."""
+    if table.has(*QUATERNION):
+        q = table.columns(*QUATERNION)
+        length = np.linalg.norm(q, axis=1, keepdims=True)
+        return quat_inverse_rotate(q / np.where(length > 0.5, length, np.nan), np.array([0.0, 0.0, 1.0]))
+    if table.has("roll", "pitch"):
+        return up_of(table.numbers["roll"], table.numbers["pitch"])
+    return None
+
+
+def _columns(table: StreamTable, names: tuple[str, ...]) -> Array | None:
+    return table.columns(*names) if table.has(*names) else None
 
 
 def _tilt(t: Array, omega: Array, force: Array, gravity: float) -> Array:
-    """Up from gyro and accelerometer, (m, 3); NaN until the filter has settled and after a gap."""
-    up = np.full((len(t), 3), np.nan)
+    """Up from gyro and accelerometer, (m, 3); NaN until the filter has settled and after a gap.
+
+    It runs twice: the first time learns the gyro's bias, with which the second starts.
+    """
     gains = TiltGains(gravity=gravity)
+    _, learnt = _filtered(t, omega, force, gains, np.zeros(3))
+    return _filtered(t, omega, force, gains, learnt)[0]
+
+
+def _filtered(t: Array, omega: Array, force: Array, gains: TiltGains, bias: Array) -> tuple[Array, Array]:
+    """Up (m, 3), and the bias at the end."""
+    up = np.full((len(t), 3), np.nan)
     tilt, since, last = None, 0.0, 0.0
-    for i in range(len(t)):
-        if not np.isfinite(omega[i]).all():
-            continue
+    for i in np.flatnonzero(np.isfinite(omega).all(axis=1)):
         if tilt is None or t[i] - last > gains.longest_gap:
             if not np.isfinite(force[i]).all():
                 continue
-            tilt, since = tilt_from(force[i]), t[i]
+            tilt, since = replace(tilt_from(force[i]), bias=bias), t[i]
         else:
             tilt = follow(tilt, omega[i], force[i], t[i] - last, gains)
         last = t[i]
         if t[i] - since >= SETTLING:
             up[i] = tilt.up
-    return up
+    return up, bias if tilt is None else tilt.bias
 
 
-def _depth(path: Path, time: Array, notes: list[str]) -> Array:
+def _depth(path: Path, notes: list[str]) -> Stream | None:
     if not path.is_file():
         notes.append(f"no {DEPTH}: heights over the pressure port are not told")
-        return np.full(len(time), np.nan)
-    t, columns = _columns(path, notes)
-    if "depth" not in columns:
+        return None
+    table = read_stream_table(path)
+    notes.extend(table.notes)
+    if not table.has("depth"):
         raise CalibrationError(
             f"{path}: no column 'depth': add the depth of the pressure port [m], positive down"
         )
-    good = np.isfinite(columns["depth"])
-    return _at(time, t[good], columns["depth"][good][:, None])[:, 0]
+    depth = table.numbers["depth"]
+    good = np.isfinite(depth)
+    return _stream(table.t[good], depth[good][:, None])
 
 
-def _columns(path: Path, notes: list[str]) -> tuple[Array, Mapping[str, Array]]:
-    """Times in order, once each, and the columns by lower-case name."""
-    table = read_table(path)
-    notes.extend(f"{path.name}: {note}" for note in table.notes)
-    columns = {name.strip().lower(): values for name, values in table.numbers.items()}
-    name = next((name for name in TIMES if name in columns), None)
-    if name is None:
-        raise CalibrationError(f"{path}: no column of times: call it t [s]")
-    t = columns[name]
-    order = np.argsort(t, kind="stable")
-    order = order[np.isfinite(t[order])]
-    keep = order[np.concatenate([np.diff(t[order]) > 0.0, [True]])] if len(order) else order
-    return t[keep], {key: values[keep] for key, values in columns.items()}
-
-
-def _stack(columns: Mapping[str, Array], names: tuple[str, ...]) -> Array | None:
-    return np.stack([columns[name] for name in names], axis=-1) if all(n in columns for n in names) else None
-
-
-def _at(time: Array, t: Array, values: Array) -> Array:
-    """Linear between samples, NaN where the next two are too far apart, (n, c)."""
-    found = np.full((len(time), values.shape[1]), np.nan)
-    if len(t) < 2:
-        return found
-    k = np.clip(np.searchsorted(t, time, side="right"), 1, len(t) - 1)
-    near = (time >= t[0]) & (time <= t[-1]) & (t[k] - t[k - 1] <= LONGEST_AGE)
-    part = ((time - t[k - 1]) / (t[k] - t[k - 1]))[:, None]
-    found[near] = ((1.0 - part) * values[k - 1] + part * values[k])[near]
-    return found
+def _stream(t: Array, values: Array) -> Stream:
+    """In order of time, once each."""
+    times, first = np.unique(t, return_index=True)
+    return Stream(t=times, values=values[first])
 
 
 def _digest(folder: Path) -> str:

@@ -19,7 +19,17 @@ from finssim.geometry.optics import project, projection_jacobians
 from finssim.geometry.rotations import quat_from_rotvec, quat_to_matrix, skew
 from finssim.localization.pool import Pool
 
-__all__ = ["Moment", "MountState", "Noise", "Pose", "Rig", "moment_block", "moment_residuals", "moved"]
+__all__ = [
+    "Moment",
+    "MountState",
+    "Noise",
+    "Pose",
+    "Rig",
+    "corner_points",
+    "moment_blocks",
+    "moved",
+    "residuals",
+]
 
 Array = NDArray[np.float64]
 
@@ -143,45 +153,60 @@ def moved(state: MountState, shared: Array, own: Sequence[Array]) -> MountState:
     )
 
 
-def moment_residuals(
-    rig: Rig, state: MountState, i: int, moment: Moment, noise: Noise
-) -> tuple[Array, Array]:
-    """Corners' residuals [px], (n, 4, 2), and the other whitened residuals (m,); NaN for a corner out of sight."""
-    pose = state.poses[i]
-    points = np.array([pose.at(state.mount(tag, rig.reference).at(rig.corners_t)) for tag in moment.corners])
-    seen = np.array(list(moment.corners.values()))
-    predicted = project(rig.pool.camera, rig.pool.interface, points).pixels
-    rest = [residual for _, _, residual in _others(rig, state, pose, moment, noise)]
-    return seen - predicted, np.concatenate([*rest, np.zeros(0)])
+def corner_points(rig: Rig, state: MountState, moments: Sequence[Moment]) -> Array:
+    """Corners of all tags of all moments in the pool, tags in each moment's order, (n, 4, 3)."""
+    mounts = {
+        tag: state.mount(tag, rig.reference).at(rig.corners_t) for tag in (rig.reference, *state.others)
+    }
+    return np.array(
+        [pose.at(mounts[tag]) for pose, m in zip(state.poses, moments, strict=True) for tag in m.corners]
+    )
 
 
-def moment_block(rig: Rig, state: MountState, i: int, moment: Moment, noise: Noise) -> Block:
-    """Weighted normal equations of one moment, shared unknowns in the order of `MountState.names`."""
-    pose, count = state.poses[i], len(state.names)
-    shared, own, residual = [], [], []
-    corner_px, _ = moment_residuals(rig, state, i, moment, noise)
-    distance = np.linalg.norm(corner_px, axis=-1) / noise.pixel
+def residuals(
+    rig: Rig, state: MountState, moments: Sequence[Moment], noise: Noise
+) -> tuple[Array, NDArray[np.int64], list[Array]]:
+    """Measured less predicted corners [px] (n, 4, 2), NaN out of sight, their moments (n,), and the whitened rest."""
+    seen = np.array([pixels for m in moments for pixels in m.corners.values()])
+    owner = np.repeat(np.arange(len(moments)), [len(m.corners) for m in moments])
+    predicted = project(rig.pool.camera, rig.pool.interface, corner_points(rig, state, moments)).pixels
+    rest = [
+        np.concatenate([*(r for _, _, r in _others(rig, state, pose, m, noise)), np.zeros(0)])
+        for pose, m in zip(state.poses, moments, strict=True)
+    ]
+    return seen - predicted, owner, rest
+
+
+def moment_blocks(rig: Rig, state: MountState, moments: Sequence[Moment], noise: Noise) -> list[Block]:
+    """Weighted normal equations of every moment, shared unknowns in the order of `MountState.names`."""
+    pixels, _, _ = residuals(rig, state, moments, noise)
+    J = projection_jacobians(rig.pool.camera, rig.pool.interface, corner_points(rig, state, moments)).point
+    distance = np.linalg.norm(pixels, axis=-1) / noise.pixel
     root = np.sqrt(np.minimum(1.0, HUBER / np.maximum(distance, 1e-9)))[..., None] / noise.pixel
-    keys = list(state.others)
-    for k, tag in enumerate(moment.corners):
-        A, B = _corner_rows(rig, state, pose, tag, keys)
-        shared.append((root[k][..., None] * A).reshape(-1, count))
-        own.append((root[k][..., None] * B).reshape(-1, 6))
-        residual.append((root[k] * corner_px[k]).ravel())
-    for A, B, r in _others(rig, state, pose, moment, noise):
-        shared.append(A)
-        own.append(B)
-        residual.append(r)
-    return block_of(np.concatenate(shared), np.concatenate(own), np.concatenate(residual))
+    keys, count, k, blocks = list(state.others), len(state.names), 0, []
+    for pose, moment in zip(state.poses, moments, strict=True):
+        shared, own, residual = [], [], []
+        for tag in moment.corners:
+            A, B = _corner_rows(rig, state, pose, tag, keys, J[k])
+            shared.append((root[k][..., None] * A).reshape(-1, count))
+            own.append((root[k][..., None] * B).reshape(-1, 6))
+            residual.append((root[k] * pixels[k]).ravel())
+            k += 1
+        for A, B, r in _others(rig, state, pose, moment, noise):
+            shared.append(A)
+            own.append(B)
+            residual.append(r)
+        blocks.append(block_of(np.concatenate(shared), np.concatenate(own), np.concatenate(residual)))
+    return blocks
 
 
 def _corner_rows(
-    rig: Rig, state: MountState, pose: Pose, tag: int, keys: Sequence[int]
+    rig: Rig, state: MountState, pose: Pose, tag: int, keys: Sequence[int], J: Array
 ) -> tuple[Array, Array]:
-    """Derivatives of a tag's pixels with respect to the shared unknowns (4, 2, P) and the pose (4, 2, 6)."""
+    """Derivatives of a tag's pixels with respect to the shared unknowns (4, 2, P) and the pose (4, 2, 6), from those
+    with respect to its corners in the pool, J (4, 2, 3)."""
     in_reference = rig.corners_t if tag == rig.reference else state.others[tag].at(rig.corners_t)
     in_body = state.reference.at(in_reference)
-    J = projection_jacobians(rig.pool.camera, rig.pool.interface, pose.at(in_body)).point
     own = np.concatenate([-J @ skew(in_body @ pose.R.T), J], axis=-1)
     A = np.zeros((4, 2, len(state.names)))
     J_b = J @ pose.R

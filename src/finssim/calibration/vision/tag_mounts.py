@@ -11,21 +11,20 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.uncertainty import Covariance, intervals, trial_covariance
-from finssim.calibration.vision.arrow import Block, arrow_evidence, arrow_step
+from finssim.calibration.vision.arrow import arrow_evidence
 from finssim.calibration.vision.imu_mounting import rotation_between
 from finssim.calibration.vision.mount_model import (
-    HUBER,
     Moment,
     MountState,
     Noise,
     Pose,
     Rig,
-    moment_block,
-    moment_residuals,
-    moved,
+    moment_blocks,
+    residuals,
 )
+from finssim.calibration.vision.mount_solver import as_before, change, minimise, restricted
 from finssim.calibration.vision.mount_start import start_state
-from finssim.geometry.rotations import matrix_to_quat, quat_to_matrix, quat_to_rotvec
+from finssim.geometry.rotations import quat_rotate, quat_to_matrix
 
 __all__ = ["MOST_MOMENTS", "MountFit", "fit_mounts", "reference_tag"]
 
@@ -35,7 +34,6 @@ MOST_MOMENTS = 150
 """Moments that are used, spread over the recording; more tell the same."""
 
 FEWEST_MOMENTS = 8
-STEPS = 60
 BLOCKS = 12
 UNSURE_ANGLE = math.radians(3.0)
 """Half width of the 95 % interval of an angle beyond which it does not count as told."""
@@ -45,6 +43,9 @@ UNSURE_LENGTH = 0.02
 
 TURNED = math.radians(25.0)
 """Disagreement about up beyond which a mount is taken as turned, and not as inexact."""
+
+BETTER = 0.6
+"""Share of the disagreement that such a turn must leave, at most: noise alone always finds some turn."""
 
 FAR = 6.0
 """Times the usual residual for a moment to be left out."""
@@ -141,25 +142,24 @@ def fit_mounts(
     state, used, left_out = _without_far(rig, state, used, sigma)
     wanted = _wanted(rig, state, used, estimate)
     free = _hopeful(rig, state, used, sigma, wanted)
+    state = as_before(state, origin, [name for name in wanted if name not in free])
     while True:
-        state = _minimise(rig, state, used, sigma, free)
-        blocks = [_restricted(moment_block(rig, state, i, m, sigma), state, free) for i, m in enumerate(used)]
+        state = minimise(rig, state, used, sigma, free)
+        blocks = [restricted(block, state, free) for block in moment_blocks(rig, state, used, sigma)]
         covariance = trial_covariance(arrow_evidence(blocks, free, "blocks", BLOCKS))
         worst = _least_told(free, intervals(np.zeros(len(free)), covariance)[:, 1])
         if worst is None:
             break
         free = tuple(name for name in free if name != worst)
-        state = _as_before(state, origin, [name for name in wanted if name not in free])
-    corner = np.concatenate(
-        [moment_residuals(rig, state, i, m, sigma)[0].reshape(-1, 2) for i, m in enumerate(used)]
-    )
+        state = as_before(state, origin, [name for name in wanted if name not in free])
+    corner, _, _ = residuals(rig, state, used, sigma)
     return MountFit(
         state=state,
         rig=rig,
         moments=tuple(used),
         free=free,
         frozen=tuple(name for name in wanted if name not in free),
-        theta=_change(origin, state, free),
+        theta=change(origin, state, free),
         covariance=covariance,
         rms=float(np.sqrt(np.nanmean(np.sum(corner**2, axis=-1)))),
         left_out=left_out,
@@ -188,61 +188,13 @@ def _wanted(rig: Rig, state: MountState, moments: Sequence[Moment], estimate: st
     return (*wanted, *others, *centre)
 
 
-def _restricted(block: Block, state: MountState, free: Sequence[str]) -> Block:
-    index = [state.names.index(name) for name in free]
-    return Block(block.aa[np.ix_(index, index)], block.ab[index], block.bb, block.a[index], block.b)
-
-
-def _cost(rig: Rig, state: MountState, moments: Sequence[Moment], noise: Noise) -> float:
-    total = 0.0
-    for i, moment in enumerate(moments):
-        corner, rest = moment_residuals(rig, state, i, moment, noise)
-        r = np.linalg.norm(corner, axis=-1) / noise.pixel
-        total += float(np.sum(np.where(r <= HUBER, r**2, HUBER * (2.0 * r - HUBER))) + np.sum(rest**2))
-    return total if math.isfinite(total) else math.inf
-
-
-def _minimise(
-    rig: Rig,
-    state: MountState,
-    moments: Sequence[Moment],
-    noise: Noise,
-    free: Sequence[str],
-    steps: int = STEPS,
-) -> MountState:
-    index = [state.names.index(name) for name in free]
-    damping, cost, failures = 1e-3, _cost(rig, state, moments, noise), 0
-    for _ in range(steps):
-        blocks = [
-            _restricted(moment_block(rig, state, i, m, noise), state, free) for i, m in enumerate(moments)
-        ]
-        step, own = arrow_step(blocks, damping)
-        shared = np.zeros(len(state.names))
-        shared[index] = step
-        candidate = moved(state, shared, own)
-        after = _cost(rig, candidate, moments, noise)
-        if after < cost:
-            done = cost - after < 1e-7 * cost
-            state, cost, failures, damping = candidate, after, 0, max(0.1 * damping, 1e-9)
-            if done:
-                break
-        else:
-            damping, failures = 10.0 * damping, failures + 1
-            if failures > 8:
-                break
-    return state
-
-
 def _without_far(
     rig: Rig, state: MountState, moments: Sequence[Moment], noise: Noise
 ) -> tuple[MountState, list[Moment], int]:
     """Moments whose best corner is far off even alone, as a wrongly read tag's, go."""
-    far = np.array(
-        [
-            np.median(np.linalg.norm(moment_residuals(rig, state, i, m, noise)[0], axis=-1))
-            for i, m in enumerate(moments)
-        ]
-    )
+    corner, owner, _ = residuals(rig, state, moments, noise)
+    distance = np.linalg.norm(corner, axis=-1)
+    far = np.array([np.median(distance[owner == i]) for i in range(len(moments))])
     usual = float(np.nanmedian(far))
     keep = np.isfinite(far) & (far <= max(FAR * usual, 3.0 * noise.pixel))
     state = replace(state, poses=[pose for pose, ok in zip(state.poses, keep, strict=True) if ok])
@@ -262,9 +214,9 @@ def _hopeful(
     rig: Rig, state: MountState, moments: Sequence[Moment], noise: Noise, free: tuple[str, ...]
 ) -> tuple[str, ...]:
     """Without what the geometry alone rules out: least squares would wander along it."""
-    blocks = [moment_block(rig, state, i, m, noise) for i, m in enumerate(moments)]
+    blocks = moment_blocks(rig, state, moments, noise)
     while True:
-        some = [_restricted(block, state, free) for block in blocks]
+        some = [restricted(block, state, free) for block in blocks]
         local = trial_covariance(arrow_evidence(some, free, "blocks", 1)).local
         worst = _least_told(free, 1.96 * np.sqrt(np.diagonal(local)))
         if worst is None:
@@ -282,15 +234,16 @@ def _by_vision(
     """
     blind = [replace(moment, up=None) for moment in moments]
     others = tuple(name for name in state.names if name.partition(".")[0].isdigit())
-    state = _minimise(rig, state, blind, noise, others, steps=15)
+    state = minimise(rig, state, blind, noise, others, steps=15)
     known = [i for i, moment in enumerate(moments) if moment.up is not None]
     if not known:
         return state
     seen = np.array([state.poses[i].R.T @ rig.pool.interface.normal for i in known])
     felt = np.array([moments[i].up for i in known])
     q = rotation_between(felt, seen, np.ones(len(known)), (0.0, 0.0, 0.0, 1.0))
-    if 2.0 * math.acos(min(1.0, abs(float(q[3])))) < TURNED:
-        return _minimise(rig, state, moments, noise, ())
+    better = np.sum((felt - quat_rotate(q, seen)) ** 2) < BETTER * np.sum((felt - seen) ** 2)
+    if 2.0 * math.acos(min(1.0, abs(float(q[3])))) < TURNED or not better:
+        return minimise(rig, state, moments, noise, ())
     turn = Pose(quat_to_matrix(q), np.zeros(3))
     if estimate == "sensors":
         state = replace(state, imu_turn=turn.R.T.copy())
@@ -298,27 +251,4 @@ def _by_vision(
         mount = Pose(turn.R @ state.reference.R, state.reference.t)
         back = state.reference.then(mount.inverse)
         state = replace(state, reference=mount, poses=[pose.then(back) for pose in state.poses])
-    return _minimise(rig, state, moments, noise, ())
-
-
-def _as_before(state: MountState, origin: MountState, frozen: Sequence[str]) -> MountState:
-    """With unknowns of the start put back, those of the reference tag, the IMU and the depth."""
-    change = np.zeros(len(state.names))
-    for name, total in zip(frozen, _change(origin, state, frozen), strict=True):
-        change[state.names.index(name)] = -total
-    return moved(state, change, [np.zeros(6)] * len(state.poses))
-
-
-def _change(before: MountState, after: MountState, free: Sequence[str]) -> Array:
-    """Total step of each free unknown from one state to the other."""
-
-    def turn(a: Array, b: Array) -> Array:
-        return np.asarray(quat_to_rotvec(matrix_to_quat(b @ a.T)))
-
-    total = [turn(before.reference.R, after.reference.R), after.reference.t - before.reference.t]
-    for tag, pose in before.others.items():
-        total += [turn(pose.R, after.others[tag].R), after.others[tag].t - pose.t]
-    total += [turn(before.imu_turn, after.imu_turn), np.array([after.depth_offset - before.depth_offset])]
-    total.append(after.centre - before.centre)
-    every = np.concatenate(total)
-    return every[[before.names.index(name) for name in free]]
+    return minimise(rig, state, moments, noise, ())
