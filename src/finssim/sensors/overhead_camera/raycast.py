@@ -211,6 +211,23 @@ def radiance_along(
     return bent.transmitted * below + wp.vec3(glare, glare, glare)
 
 
+@wp.func
+def moment(i: int, j: int, n: int, start: float) -> float:
+    """When a ray of a pixel is sent, as a fraction of the exposure.
+
+    Each of n² equal parts of the exposure gets one ray; the rays of a row, and of a column, are spread over all of it.
+
+    Args:
+        i: Column of the ray in its pixel.
+        j: Row of the ray.
+        n: Rays per row and column.
+        start: The pixel's own number in [0, 1): what the pattern gets wrong must not be the same along an edge.
+    """
+    part = n * ((i + j) % n) + (i * (n // 3) + j * (n // 3 + 1)) % n
+    t = (float(part) + 0.5) / float(n * n) + start
+    return t - wp.floor(t)
+
+
 @wp.kernel(enable_backward=False)
 def cast(
     scene: SceneData,
@@ -245,12 +262,12 @@ def cast(
         n = wp.max(int(samples[row, column]), 1)
         patch = surface_hit(scene.waves, scene.camera_height, wp.normalize(middle))
         angle = wp.sqrt(wp.length(wp.cross(b - a, c - a))) * scene.spot / float(n)
+        start = wp.randf(wp.rand_init(row, column))
         for k in range(n * n):
             u = 0.5 + ((float(k % n) + 0.5) / float(n) - 0.5) * scene.spot
             v = 0.5 + ((float(k // n) + 0.5) / float(n) - 0.5) * scene.spot
             ray = wp.normalize((1.0 - v) * ((1.0 - u) * a + u * b) + v * ((1.0 - u) * c + u * d))
-            # A fixed order that spreads the moments of each row and column of rays over the whole exposure.
-            t = (float((k * (n + 1)) % (n * n)) + 0.5) / float(n * n)
+            t = moment(k % n, k // n, n, start)
             total += radiance_along(scene, patch, ray, t, angle, samples[row, column] > wp.uint8(0))
         total = total / float(n * n)
     radiance[i, j] = total
