@@ -1,4 +1,4 @@
-"""What happens to an error state besides prediction and correction: restarts, stops, bounds of doubt. One state each."""
+"""What happens to an error state besides prediction and correction: restarts, stops, bounds. One state each."""
 
 from __future__ import annotations
 
