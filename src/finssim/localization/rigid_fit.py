@@ -26,7 +26,7 @@ class RigidFit:
     inverse: Array
     """Inverse of the weighted J'J [m², rad² per px²], (3, 3)."""
     weighted_J: Array
-    """w J, (n, 2, 3)."""
+    """The curvature of rho times J, (n, 2, 3)."""
     A: Array
     """[px/m], (n, 2, 2)."""
     missed: Array
@@ -149,15 +149,18 @@ def _evaluate(xi: tuple[float, float, float], Q: Array, points: Array, A: Array,
     miss, J = in_pixels[:, :, 0], in_pixels[:, :, 1:]
     squares = np.einsum("ij,ij->i", miss, miss)
     missed = np.sqrt(squares)
+    flat = J.reshape(-1, 3)
     if missed.max() <= huber:
-        cost, weighted = float(squares.sum()), J
-    else:
-        far = missed > huber
-        weight = np.where(far, huber / np.maximum(missed, huber), 1.0)
-        cost = float(np.where(far, huber * (2.0 * missed - huber), squares).sum())
-        weighted = weight[:, None, None] * J
-    flat = weighted.reshape(-1, 3)
-    return _State(cost, flat.T @ J.reshape(-1, 3), flat.T @ miss.ravel(), weighted, missed)
+        return _State(float(squares.sum()), flat.T @ flat, flat.T @ miss.ravel(), J, missed)
+    far = missed > huber
+    weight = np.where(far, huber / np.maximum(missed, huber), 1.0)
+    cost = float(np.where(far, huber * (2.0 * missed - huber), squares).sum())
+    # Where rho grows linearly it curves across the miss only; with weights alone the steps would shrink but slowly.
+    towards = np.where(far, 1.0 / np.maximum(missed, huber), 0.0)[:, None] * miss
+    across = J - towards[:, :, None] * np.einsum("ij,ijk->ik", towards, J)[:, None, :]
+    weighted = weight[:, None, None] * across
+    g = flat.T @ (weight[:, None] * miss).ravel()
+    return _State(cost, weighted.reshape(-1, 3).T @ flat, g, weighted, missed)
 
 
 _UNIT = np.eye(2)
