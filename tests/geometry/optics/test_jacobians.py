@@ -65,6 +65,7 @@ def test_derivatives_of_a_pixel(lens, interface):
     for name, numbers in expected.items():
         np.testing.assert_allclose(getattr(found, name), numbers, **TOLERANCE, err_msg=name)
     np.testing.assert_allclose(found.index, differences(denser, 1)[..., 0], **TOLERANCE)
+    np.testing.assert_array_equal(found.projection.pixels, project(eye, interface, there).pixels)
     direction = lens.rays(project(eye, interface, there).pixels)[0]
     np.testing.assert_allclose(found.lens, lens.parameter_jacobian(direction), rtol=1e-9, atol=1e-9)
 

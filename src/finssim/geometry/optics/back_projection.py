@@ -117,7 +117,7 @@ def back_project(camera: Camera, interface: Interface, pixels: npt.ArrayLike) ->
         origin = camera.position + reach[..., None] * along - depth * n
         worst = np.minimum(worst, kappa)
         good = (cosine > PARALLEL_COSINE) & (worst > 0.0)
-        if height > 0.0 and good.all():
+        if height >= 0.0 and good.all():
             return WaterRays(origin, direction, np.zeros(cosine.shape, np.int8))
         status = _rejected(seen, cosine, worst, height)
     bad = status != 0
@@ -127,6 +127,6 @@ def back_project(camera: Camera, interface: Interface, pixels: npt.ArrayLike) ->
 
 def _rejected(seen: npt.NDArray[np.bool_], cosine: Array, kappa: Array, height: float) -> StatusArray:
     status = np.where(kappa > 0.0, np.int8(Status.OK), np.int8(Status.TOTAL_REFLECTION))
-    status = np.where((cosine < 0.0) | (height <= 0.0), np.int8(Status.AWAY), status)
+    status = np.where((cosine < 0.0) | (height < 0.0), np.int8(Status.AWAY), status)
     status = np.where(np.abs(cosine) <= PARALLEL_COSINE, np.int8(Status.PARALLEL), status)
     return np.asarray(np.where(seen, status, np.int8(Status.NO_RAY)), np.int8)

@@ -12,7 +12,7 @@ from finssim.geometry.optics.interface import Interface
 from finssim.geometry.optics.snell import Stack, solve_stack
 from finssim.geometry.optics.status import Status, StatusArray
 
-__all__ = ["Projection", "Refraction", "project", "refract"]
+__all__ = ["Projection", "Refraction", "project", "refract", "seen_at"]
 
 Array = npt.NDArray[np.float64]
 
@@ -79,9 +79,13 @@ def project(camera: Camera, interface: Interface, points_p: npt.ArrayLike) -> Pr
     Returns:
         Pixels with a status each: WRONG_SIDE, BEHIND_CAMERA and NO_RAY have none, OUTSIDE_IMAGE has.
     """
-    points = np.asarray(points_p, float)
     with np.errstate(all="ignore"):
-        found = refract(camera, interface, points)
+        return seen_at(camera, refract(camera, interface, np.asarray(points_p, float)))
+
+
+def seen_at(camera: Camera, found: Refraction) -> Projection:
+    """Pixels of rays that are already found."""
+    with np.errstate(all="ignore"):
         surface = camera.position + found.height * found.direction
         direction_c = found.direction @ camera.R_pc
         pixels, seen = camera.lens.project(direction_c)

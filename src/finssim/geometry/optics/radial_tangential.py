@@ -53,8 +53,10 @@ class RadialTangential:
         _, A, B = self._evaluate(z)
         # dz = (dX + i dY - z dZ) / Z; columns of df = A dz + B conj(dz).
         inverse = 1.0 / points_c[..., 2]
-        columns = [(A + B) * inverse, 1j * (A - B) * inverse, -(A * z + B * z.conj()) * inverse]
-        return np.stack([_pairs(column) for column in columns], axis=-1)
+        columns = np.empty((3, *z.shape), complex)
+        columns[0], columns[1] = (A + B) * inverse, (1j * inverse) * (A - B)
+        columns[2] = -inverse * (A * z + B * z.conj())
+        return np.moveaxis(columns.view(float).reshape(3, *z.shape, 2), 0, -1)
 
     def parameter_jacobian(self, points_c: Array) -> Array:
         """Derivative of `project` with respect to the coefficients that were given, (..., 2, k)."""

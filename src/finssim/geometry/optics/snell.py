@@ -55,21 +55,20 @@ class Stack:
         With P = sin(theta_i) n_i/r, the same in all layers, c_i = n_i cos(theta_i): k_i = P/c_i and
         sum t_i k_i = 1.
         """
-        n_least = min(self.index)
-        omega = np.sqrt(1.0 + self.r2 * self.g**2)
-        P = n_least * self.g / omega
-        c = [n_least * self._s(n) / omega for n in self.index]
-        by_P = sum(t * n**2 / x**3 for t, n, x in zip(self.thickness, self.index, c, strict=True))
-        by_r2 = 0.5 * P**3 * sum(t / x**3 for t, x in zip(self.thickness, c, strict=True))
-        own = self.index[0] ** 2 / c[0] ** 3
-        towards = -own / by_P
-        far = self.index[-1]
+        omega = np.sqrt(1.0 + self.r2 * self.g * self.g)
+        P = self.g * (min(self.index) / omega)
+        c = [self._s(n) * (min(self.index) / omega) for n in self.index]
+        thin = [t / (x * x * x) for t, x in zip(self.thickness, c, strict=True)]  # t_i/c_i³
+        by_P = sum(t * n**2 for t, n in zip(thin, self.index, strict=True))
+        half = 0.5 * P * P * P
+        steep = 1.0 / (c[0] * c[0] * c[0])
+        towards = -(self.index[0] ** 2) * steep / by_P
         return StackDerivatives(
             k=self.near_slope,
-            by_r2=0.5 * P**3 / c[0] ** 3 + towards * by_r2,
+            by_r2=half * (steep + towards * sum(thin)),
             by_near=towards * P / c[0],
             by_far=towards * P / c[-1],
-            by_far_index=-towards * self.thickness[-1] * P * far / c[-1] ** 3,
+            by_far_index=-towards * thin[-1] * P * self.index[-1],
         )
 
 
