@@ -106,13 +106,6 @@ def _place(
 def _conflicts(fit: Refined, surface: bool, settings: Settings) -> list[str]:
     """Where the pixels pull an estimate far from what was known."""
     found, prior, model = [], fit.prior, fit.model
-    if settings.known_depth:
-        pull = (model.depth - prior.depth) / prior.depth_std
-        if abs(pull) > 3.0:
-            found.append(
-                f"the pixels put the plane {1000 * (model.depth - prior.depth):+.0f} mm from where it was measured, "
-                f"{abs(pull):.1f} times the error given: check the tape, the survey's zero, and the camera file"
-            )
     if np.isfinite(prior.index_std):
         pull = (model.interface.index_far - settings.index) / prior.index_std
         if abs(pull) > 3.0:

@@ -18,15 +18,15 @@ from finssim.calibration.vision.pool_noise import Noise, Whitener
 from finssim.calibration.vision.pool_refine import Refined, refine
 from finssim.calibration.vision.pool_search import UP, Found, prior_of, search, shifted_settings
 from finssim.calibration.vision.pool_settings import Settings, active_names, lens_std
-from finssim.calibration.vision.pool_solver import residuals, solve
+from finssim.calibration.vision.pool_solver import Prior, residuals, solve
 from finssim.geometry.optics import Lens
 
 __all__ = ["PoolFit", "calibrate_pool"]
 
 Array = NDArray[np.float64]
 
-TILT_DOUBT = 13.8
-"""Fall of chi² for two degrees of freedom that a level surface would reach once in a thousand surveys."""
+DOUBT = 13.8
+"""Fall of chi² that letting a right prior go reaches less than once in a thousand surveys (two degrees of freedom)."""
 
 LENS_STEPS = ((), ("focal", "center"), ("focal", "center", "distortion"))
 """What the lens gives up where held-out points get better by it."""
@@ -110,7 +110,7 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
     found = search(here, extended_lens(lens), told)
     notes = list(seen.notes)
     fit = _best_lens(here, found, told, notes)
-    fit = _released(here, found, told, fit, notes)
+    fit = _released(here, told, fit, notes)
     pinhole = _pinhole(here, found, told, fit)
     normal = UP if found.surface else fit.model.interface.normal
     parts = [held_out(f, here, settings.folds, settings.seed, normal) for f in (fit, pinhole)]
@@ -132,7 +132,10 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
         pinhole_held_out=parts[1],
         lens_fitted=_lens_groups(fit.active),
         notes=tuple(notes),
-        advice=tuple(advice(fit, here, found.surface, told, table, found.minima)),
+        advice=(
+            *_contradicted(here, told, fit),
+            *advice(fit, here, found.surface, told, table, found.minima),
+        ),
         minima=found.minima,
     )
 
@@ -193,19 +196,12 @@ def _lens_groups(active: NDArray[np.bool_]) -> tuple[str, ...]:
     return tuple(group for group, name in named.items() if active[NAMES.index(name)])
 
 
-def _released(here: Observations, found: Found, told: Settings, fit: Refined, notes: list[str]) -> Refined:
+def _released(here: Observations, told: Settings, fit: Refined, notes: list[str]) -> Refined:
     """Let the surface tilt freely where the pixels contradict a level one and nobody set how level it is."""
     if not np.isfinite(fit.prior.tilt_std) or told.tilt_sigma is not None or not fit.active[6]:
         return fit
-    loose = replace(fit.prior, tilt_std=np.inf)
-    known = told.pixel_sigma is not None
-    try:
-        free = refine(fit.model, here, fit.active, loose, _first_noise(told), pixel_known=known)
-    except (CalibrationError, np.linalg.LinAlgError):
-        return fit
-    rows = here.subset(free.used)
-    held = solve(free.model, rows, free.whiten, fit.active, fit.prior)
-    if 2.0 * (held.cost - free.solution.cost) < TILT_DOUBT:
+    free = _without(here, told, fit, replace(fit.prior, tilt_std=np.inf))
+    if free is None:
         return fit
     assert fit.prior.normal is not None
     lean = float(np.degrees(np.arccos(np.clip(free.model.interface.normal @ fit.prior.normal, -1.0, 1.0))))
@@ -215,6 +211,32 @@ def _released(here: Observations, found: Found, told: Settings, fit: Refined, no
         "file is off"
     )
     return free
+
+
+def _contradicted(here: Observations, told: Settings, fit: Refined) -> list[str]:
+    """A sentence where the pixels by themselves put the plane elsewhere than it was measured."""
+    if not told.known_depth or not fit.active[NAMES.index("depth")]:
+        return []
+    free = _without(here, told, fit, replace(fit.prior, depth_std=np.inf))
+    if free is None:
+        return []
+    by = 1000.0 * (free.model.depth - fit.prior.depth)
+    where = "nearer to" if by > 0.0 else "further from"
+    return [
+        f"the pixels by themselves put the plane {abs(by):.0f} mm {where} the camera than it was measured, "
+        "which its error does not explain: check the tape, the survey's zero, the window and the camera file"
+    ]
+
+
+def _without(here: Observations, told: Settings, fit: Refined, loose: Prior) -> Refined | None:
+    """The fit with a prior loosened, where the pixels contradict that prior; else None."""
+    try:
+        known = told.pixel_sigma is not None
+        free = refine(fit.model, here, fit.active, loose, _first_noise(told), pixel_known=known)
+    except (CalibrationError, np.linalg.LinAlgError):
+        return None
+    held = solve(free.model, here.subset(free.used), free.whiten, fit.active, fit.prior)
+    return free if 2.0 * (held.cost - free.solution.cost) > DOUBT else None
 
 
 def _pinhole(here: Observations, found: Found, told: Settings, fit: Refined) -> Refined:

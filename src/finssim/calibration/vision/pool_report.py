@@ -21,9 +21,9 @@ HEADS = ("parameter", "estimate", "95 % interval", "unit", "note")
 
 READING = (
     "The interval holds the true value in 19 of 20 such calibrations, if what was given beforehand (index, tape, "
-    "level, camera file) is as exact as it was said to be. A note says where the pixels do not tell a number and what it "
-    "rests on instead. Judge the result by the error at points held out, in the depth where it will be used. Arrows "
-    "that swirl or grow outwards tell of a wrong lens, window or water height; arrows of any direction are noise."
+    "level, camera file) is as exact as it was said to be. A note says where the pixels do not tell a number and what "
+    "it rests on instead. Judge the result by the error at points held out, in the depth where it will be used. "
+    "Arrows that swirl or grow outwards tell of a wrong lens, window or water height; others are noise."
 )
 
 

@@ -176,8 +176,9 @@ def read_table(path: str | Path, *, unit: str | None = None) -> Table:
     said = next((m[1].lower() for _, line in lines if (m := _UNIT_COMMENT.match(line))), None)
     comments = [line for _, line in lines if line.startswith(("#", "%", "//"))]
     lines = [(i, line) for i, line in lines if not line.startswith(("#", "%", "//"))]
-    if lines and comments and _is_numeric(lines[0][1]):  # the header itself is behind a comment sign
-        lines.insert(0, (0, comments[-1].lstrip("#%/ ")))
+    if lines and comments and _known(lines[0][1]) < 2:  # the header itself may be behind a comment sign
+        head = max((line.lstrip("#%/ ") for line in comments), key=_known)
+        lines = [(0, head), *lines] if _known(head) >= 2 else lines
     if not lines or _is_numeric(lines[0][1]):
         raise CalibrationError(
             f"{path}: the first line is no header: name the columns, such as id,x,y,z or u,v,x,y,z"
@@ -256,6 +257,11 @@ def _splitter(head: str):  # type: ignore[no-untyped-def]
         if mark in head:
             return lambda line: [cell.strip() for cell in next(csv.reader([line], delimiter=mark))]
     return str.split
+
+
+def _known(head: str) -> int:
+    """How many columns of a line of names mean something here."""
+    return sum(bool(_column(word)[0]) for word in _splitter(head)(head))
 
 
 def _number(word: str) -> float | None:
