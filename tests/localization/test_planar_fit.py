@@ -122,7 +122,7 @@ def test_a_corner_far_off_is_left_out_and_counted():
 
 
 def test_a_corner_a_little_off_does_little():
-    """A corner 3 px astray, too little to be left out, moves the result less than a third of what it would unweighted."""
+    """A corner 3 px astray, too little to be left out, moves the result a third of what it would unweighted."""
     position, angles = np.array([0.5, 0.3, 0.4]), np.array([0.0, 0.1, -2.0])
     change = np.zeros((2, 4, 2))
     change[0, 0] = [3.0, 0.0]
@@ -165,7 +165,7 @@ def test_a_tag_of_another_size_is_refused():
     ("z", "roll", "medium"), [(-0.06, 0.0, "air"), (-0.16, 0.0, "water"), (-0.1, 0.3, "both")]
 )
 def test_the_surface_may_lie_below_across_or_above_the_tags(z, roll, medium):
-    """Corners in the air are seen along straight rays, corners in the water along bent ones, each as its height says."""
+    """Corners in the air are seen along straight rays, corners in the water along bent ones, as heights say."""
     for name in ("level water", "tilted water"):
         height = float(POOLS[name].interface.height(0.5, -0.3))
         position, angles = np.array([0.5, -0.3, height + z]), np.array([roll, 0.02, 0.3])

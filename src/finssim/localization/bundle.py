@@ -32,7 +32,7 @@ def refractive_bundle(
     pool: Pool,
     tags_b: Mapping[int, Array],
     constraints: Constraints | None,
-    pixel_std: float = 0.3,
+    pixel_std: float = 0.5,
 ) -> Measurement:
     """Measure all six degrees of freedom by the reprojection error through the water.
 

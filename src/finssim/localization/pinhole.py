@@ -27,7 +27,7 @@ def pinhole(
     pool: Pool,
     tags_b: Mapping[int, Array],
     constraints: Constraints | None,
-    pixel_std: float = 0.3,
+    pixel_std: float = 0.5,
 ) -> Measurement:
     """Measure all six degrees of freedom with straight rays (perspective-n-point), as if there were no water.
 
@@ -56,7 +56,7 @@ def pinhole_depth(
     pool: Pool,
     tags_b: Mapping[int, Array],
     constraints: Constraints | None,
-    pixel_std: float = 0.3,
+    pixel_std: float = 0.5,
 ) -> Measurement:
     """Measure x, y and yaw at a known height and tilt with straight rays, as if there were no water.
 

@@ -38,7 +38,7 @@ def planar_fit(
     pool: Pool,
     tags_b: Mapping[int, Array],
     constraints: Constraints | None,
-    pixel_std: float = 0.3,
+    pixel_std: float = 0.5,
     *,
     straight: bool = False,
 ) -> Measurement:
@@ -63,11 +63,11 @@ def planar_fit(
         The measurement, with the covariance that pixels, height and tilt give it; or why there is none.
     """
     method = "pinhole-depth" if straight else "refractive"
-    if constraints is None:
-        return refused(method, "height and tilt are not known: give a depth")
     pairs = correspondences(detections, tags_b)
     if not pairs.tags:
         return refused(method, pairs.why_too_few, pairs.rejected)
+    if constraints is None:
+        return refused(method, "height and tilt are not known: give a depth", pairs.rejected, tags=pairs.tags)
     up = np.asarray(constraints.up, float)
     R_pg = _LEVEL if constraints.up == (0.0, 0.0, 1.0) else axes_of_up(up / np.linalg.norm(up))
     level = pairs.points_b @ tilt_matrix(constraints.roll, constraints.pitch).T
