@@ -125,15 +125,23 @@ def test_the_fit_finds_its_way_from_a_coarse_start(family):
     assert spread.max() < 0.01
 
 
-def test_the_fit_does_not_settle_on_nothing():
-    """Noise, a flat picture and a place half outside of it give no fit, or one without correlation."""
+def test_where_there_is_no_tag_the_fit_says_so():
+    """Noise and a flat picture have no correlation with it; half outside of the picture, or no ring, is no fit."""
     ring = pose_corners(30.0, centre=(40.0, 40.0))
     noise = np.random.default_rng(0).integers(0, 255, (80, 80)).astype(np.uint8)
     flat = np.full((80, 80), 100, np.uint8)
     for picture in (noise, flat):
-        fit = fit_tag(picture, "tag25h9", 3, ring)
-        assert fit is None or fit.correlation < 0.5
-    assert fit_tag(flat, "tag25h9", 3, ring + 30.0) is None
+        assert fit_tag(picture, "tag25h9", 3, ring).correlation < 0.5
+    for corners in (ring + 30.0, ring + 500.0, ring - 500.0, ring[::-1], np.zeros((4, 2))):
+        assert fit_tag(flat, "tag25h9", 3, corners) is None
+
+
+def test_another_tag_in_its_place_has_less_correlation():
+    """What a wrong id would get: too little to be reported."""
+    ring = pose_corners(40.0, centre=(50.0, 50.0), turn=0.4)
+    picture = draw((100, 100), {3: ring}, family="tag25h9", blur=0.6, noise=1.0)
+    assert fit_tag(picture, "tag25h9", 3, ring).correlation > 0.99
+    assert max(fit_tag(picture, "tag25h9", tag, ring).correlation for tag in range(4, 35)) < 0.9
 
 
 @pytest.mark.parametrize("library", LIBRARIES)
@@ -237,7 +245,7 @@ def test_photographs_agree_with_the_published_corners(name):
     assert len(plain) == len(published)
     assert np.median(np.abs(plain)) < 0.01
     fits = {library: detector("tag36h11", library=library).detect(picture) for library in LIBRARIES}
-    for library, share in {"apriltag": 1.0, "opencv": 0.75}.items():
+    for library, share in {"apriltag": 1.0, "opencv": 0.8}.items():
         assert {d.tag for d in fits[library]} == {0}
         apart = matched(fits[library], published)
         assert len(apart) >= share * len(published)

@@ -23,7 +23,7 @@ Image = npt.NDArray[np.uint8]
 Region = tuple[int, int, int, int]
 """Part of a picture: left, top, right, bottom [px], right and bottom just outside."""
 
-LEAST_CORRELATION = 0.8
+LEAST_CORRELATION = 0.7
 """Of a picture with the tag that a library says is there; below it there is none."""
 
 

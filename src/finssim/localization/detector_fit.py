@@ -7,7 +7,7 @@ gain, offset, two slopes across the tag, and the blur. Blur widens an edge to bo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -76,37 +76,61 @@ def fit_tag(image: Gray, family: str, tag: int, corners: Array) -> Fit | None:
         corners: Where it was found, within about a third of a cell, pixels, (4, 2).
 
     Returns:
-        None where the fit does not settle near there, or part of the tag lies outside the picture.
+        The fit; where it does not settle near there the given corners, with the correlation that they have. None where
+        part of the tag lies outside the picture, or the corners are no convex ring.
     """
+    if not _convex(corners):
+        return None
     cell = _cell(corners, family)
+    patch, shift = _patch(image, corners, cell, smooth=(BLURS[0] * cell) ** 2 - LENS_BLUR**2)
     blur = _nearest(LENS_BLUR / cell)
     pattern = _pattern(family, tag, blur)
-    patch, corner = _patch(image, corners, cell, smooth=(BLURS[0] * cell) ** 2 - LENS_BLUR**2)
-    H = _from_square(corners - corner)
-    start = here = corners - corner
-    limit = 1.0 + 0.5 * cell
-    switched = False
+    given = _sample(patch, _through(_from_square(corners - shift), pattern.points))
+    if given is None:
+        return None
+    fit, wider = _settle(pattern, patch, corners - shift, limit=1.0 + 0.5 * cell)
+    better = _nearest(blur + wider)
+    if fit is not None and better != blur:  # the picture is sharper or softer than was assumed
+        fit = _settle(_pattern(family, tag, better), patch, fit.corners, limit=1.0 + 0.5 * cell)[0] or fit
+    if fit is None:
+        return Fit(corners, _correlation(pattern.values, given), float(np.ptp(given)))
+    return replace(fit, corners=fit.corners + shift)
+
+
+def _settle(pattern: _Pattern, patch: Array, start: Array, limit: float) -> tuple[Fit | None, float]:
+    """The fit of a pattern from a start, and by how much the picture's blur is wider [cells].
+
+    None where it moves a corner by more than the limit [px], or out of the patch, or does not come to rest.
+    """
+    H = _from_square(start)
+    here = start
     for _ in range(STEPS):
         seen = _sample(patch, _through(H, pattern.points))
         if seen is None:
-            return None
+            break
         solution = pattern.solver @ seen
-        if not solution[12] > 0.0:
-            return None
-        H = H @ np.linalg.inv(np.eye(3) + np.append(solution[:8] / solution[12], 0.0).reshape(3, 3))
+        gain = float(solution[12])
+        if not gain > 0.0 or np.abs(solution[:8]).max() > 0.3 * gain:
+            break
+        H = H @ np.linalg.inv(np.eye(3) + np.append(solution[:8] / gain, 0.0).reshape(3, 3))
         before, here = here, _through(H, _SQUARE)
         if not np.abs(here - start).max() < limit:
-            return None
+            break
         if np.abs(here - before).max() < SETTLED:
-            better = _nearest(blur + float(solution[11] / solution[12]))
-            if better != blur and not switched:
-                blur, switched = better, True
-                pattern = _pattern(family, tag, blur)
-                continue
-            left = seen - pattern.columns @ solution
-            correlation = float(np.sqrt(max(1.0 - left.var() / max(seen.var(), 1e-12), 0.0)))
-            return Fit(here + corner, correlation, float(solution[12]))
-    return None
+            return Fit(here, _correlation(pattern.columns @ solution, seen), gain), float(solution[11]) / gain
+    return None, 0.0
+
+
+def _correlation(a: Array, b: Array) -> float:
+    a, b = a - a.mean(), b - b.mean()
+    return float(a @ b) / max(float(np.sqrt((a @ a) * (b @ b))), 1e-12)
+
+
+def _convex(corners: Array) -> bool:
+    """Whether the corners run clockwise in the picture (v down) around a convex ring."""
+    side = np.roll(corners, -1, axis=0) - corners
+    after = np.roll(side, -1, axis=0)
+    return bool(np.all(side[:, 0] * after[:, 1] - side[:, 1] * after[:, 0] > 1.0))
 
 
 def _cell(corners: Array, family: str) -> float:

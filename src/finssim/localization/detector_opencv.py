@@ -80,6 +80,8 @@ def _library(family: str, refine: str) -> Any:
     import cv2
 
     settings = cv2.aruco.DetectorParameters()
+    # With OpenCV's 0.125 the outline of a plate with a narrow white margin counts as its tag's, and hides it.
+    settings.minMarkerDistanceRate = 0.05
     settings.cornerRefinementMethod = getattr(cv2.aruco, REFINEMENTS[refine][0])
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, family_named(family).opencv))
     return cv2.aruco.ArucoDetector(dictionary, settings)
