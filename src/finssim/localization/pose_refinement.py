@@ -18,7 +18,7 @@ Array = npt.NDArray[np.float64]
 See = Callable[[Array], tuple[Array, Array, npt.NDArray[np.bool_]]]
 """Points, pool frame (n, 3) -> pixels (n, 2), derivatives by the point (n, 2, 3), and which are seen (n,)."""
 
-_STILL = 1e-12
+_STILL = 1e-10
 """A step that changes the misses by less than the root of this [px²] is the last."""
 
 
