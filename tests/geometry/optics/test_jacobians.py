@@ -157,3 +157,33 @@ def test_a_point_that_is_not_seen_has_no_derivative():
     eye = camera(LENSES["pinhole"], interface)
     by_pixel, by_z = back_project_jacobian(eye, interface, [640.0, 360.0], 2.0)
     assert np.isnan(by_pixel).all() and np.isnan(by_z).all()
+
+
+@pytest.mark.parametrize("name", ["surface", "from the water", "window"])
+def test_derivatives_on_the_far_face_are_those_just_behind_it(name):
+    """For points on the face itself, the derivative inwards equals a one-sided difference of second order."""
+    interface = INTERFACES[name]
+    eye, there = camera(LENSES["plumb_bob"], interface), points(interface, 20, spread=0.6)
+    there = there - (interface.distance(there) + interface.thickness)[:, None] * interface.normal
+    e = 1e-6
+    at, once, twice = (project(eye, interface, there - k * e * interface.normal).pixels for k in (0, 1, 2))
+    inwards = -projection_jacobians(eye, interface, there).point @ interface.normal
+    np.testing.assert_allclose(inwards, (-1.5 * at + 2.0 * once - 0.5 * twice) / e, atol=1e-5)
+
+
+@pytest.mark.parametrize("height", [1e-3, 1e-6, 1e-9, 1e-12, 0.0])
+def test_derivatives_of_a_camera_that_touches_the_water(height):
+    """Inside and outside of Snell's window, down to no height at all."""
+    interface = Interface.water(0.0)
+    eye = camera(LENSES["wide"], interface, height)
+    there = eye.position + np.array([[0.3, 0.0, -0.5], [3.0, 0.0, -1.0], [0.0, 0.0, -1.0]])
+    found, e = projection_jacobians(eye, interface, there), 1e-7
+    steps = e * np.eye(3)
+    numeric = [
+        project(eye, interface, there + d).pixels - project(eye, interface, there - d).pixels for d in steps
+    ]
+    np.testing.assert_allclose(
+        found.point, np.stack(numeric, -1) / (2 * e), atol=1e-4
+    )  # 1e-12 px of rounding / e
+    for name in ("pose", "interface", "index", "lens"):
+        assert np.isfinite(getattr(found, name)).all()

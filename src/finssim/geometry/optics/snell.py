@@ -24,7 +24,7 @@ __all__ = ["Stack", "StackDerivatives", "solve_stack"]
 Array = npt.NDArray[np.float64]
 
 _STEPS = 100
-THINNEST = 1e-15
+_THINNEST = 1e-15
 """Least thickness of a layer [m]: with none at all a grazing ray would have no angle."""
 
 
@@ -94,7 +94,7 @@ def solve_stack(r2: Array, thickness: Sequence[Array | float], index: list[float
         index: Refractive index of each layer.
     """
     least = min(index)
-    layers = [max(t, THINNEST) if isinstance(t, float) else np.maximum(t, THINNEST) for t in thickness]
+    layers = [max(t, _THINNEST) if isinstance(t, float) else np.maximum(t, _THINNEST) for t in thickness]
     square = [(n / least) ** 2 for n in index]
     thin = sum(t for t, a2 in zip(layers, square, strict=True) if a2 == 1.0)
     denser = [(t, a2, (a2 - 1.0) * r2) for t, a2 in zip(layers, square, strict=True) if a2 != 1.0]
