@@ -174,7 +174,10 @@ def _gain(scene: Scene, pose: Pose) -> float:
 
 
 def _tag(mi: Any, tag: TagInScene, name: str, gain: float) -> dict[str, Any]:
-    """The bitmap, and a tenth of a millimetre behind it the white board whose rim is the margin."""
+    """The bitmap 0.1 mm above the tag's plane, half-way to it the white board whose rim is the margin.
+
+    So both are seen where the tag lies on a wall or a body.
+    """
     R = quat_to_matrix(tag.pose.orientation)
     print_half, board = 0.5 * tag.cell * len(tag.bitmap), tag.half_size
     reflectance = np.where(np.asarray(tag.bitmap, bool), tag.white, tag.black)
@@ -182,12 +185,12 @@ def _tag(mi: Any, tag: TagInScene, name: str, gain: float) -> dict[str, Any]:
     return {
         name: {
             "type": "rectangle",
-            "to_world": _matrix(mi, R, origin, [print_half, print_half, 1.0]),
+            "to_world": _matrix(mi, R, origin + 1e-4 * R[:, 2], [print_half, print_half, 1.0]),
             **_glowing(mi, reflectance, gain),
         },
         f"{name}_board": {
             "type": "rectangle",
-            "to_world": _matrix(mi, R, origin - 1e-4 * R[:, 2], [board, board, 1.0]),
+            "to_world": _matrix(mi, R, origin + 5e-5 * R[:, 2], [board, board, 1.0]),
             **_glowing(mi, tag.white, gain),
         },
     }

@@ -97,6 +97,15 @@ def test_what_is_nearer_hides_what_is_behind(pool, square):
     assert pictures["over"][centre].min() > 0.4
 
 
+def test_a_tag_lies_on_the_face_it_is_stuck_to(pool, square):
+    """A tag in the very plane of the floor, or of a box's top, is seen whole."""
+    tag = square(0.1, 0.0, z=0.0, yaw=0.0)
+    box = Body(size=(1.2, 1.2, 0.2), colour=(0.5, 0.5, 0.5), pose=Pose(position=(0.1, 0.0, 0.3)))
+    raised = square(0.1, 0.0, z=0.4, yaw=0.0)
+    for scene in (pool(tags=(tag,)), pool(tags=(raised,), bodies=(box,))):
+        assert OverheadCamera(scene).radiance()[110:130, 150:170].max() < 0.1
+
+
 def test_the_print_reads_as_printed(pool, camera_at):
     """Row 0 of the bitmap is at the tag's +y and column 0 at its -x: an L keeps its shape seen from above."""
     bitmap = np.zeros((4, 4), bool)

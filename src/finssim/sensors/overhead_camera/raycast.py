@@ -28,6 +28,12 @@ from finssim.sensors.overhead_camera.surface import (
     surface_hit,
 )
 
+ON_TOP = wp.constant(1.0e-3)
+"""A tag this little behind a wall or a body's face lies on it: stuck-on tags are given the same height [m]."""
+
+HORIZON = wp.constant(-1.0e-3)
+"""Rays that go down no steeper than this are left dark, as is what the lens does not see (zero)."""
+
 
 @wp.struct
 class LampData:
@@ -83,7 +89,7 @@ def meet_things(
             first = hit
     for i in range(scene.bodies.shape[0]):
         hit = meet_body(scene.bodies[i], origin, ray, t)
-        if hit.distance < first.distance:
+        if hit.distance + ON_TOP < first.distance:
             first = hit
     return first
 
@@ -166,7 +172,7 @@ def under_water(
     hit = meet_basin(scene.basin, p, scene.basin.R_bs * ray, angle, travelled)
     if things:
         thing = meet_things(scene, origin, ray, t, angle, travelled)
-        if thing.distance < hit.distance:
+        if thing.distance < hit.distance + ON_TOP:
             hit = thing
     radiance = hit.radiance
     if scene.caustics > 0.0:
@@ -228,6 +234,35 @@ def moment(i: int, j: int, n: int, start: float) -> float:
     return t - wp.floor(t)
 
 
+@wp.func
+def pixel(
+    scene: SceneData,
+    patch: Patch,
+    corner_rays: wp.array2d(dtype=wp.vec3),
+    samples: wp.array2d(dtype=wp.uint8),
+    row: int,
+    column: int,
+) -> wp.vec3:
+    """Mean radiance of a pixel. Arguments as of `cast`, with the surface around it."""
+    a = corner_rays[row, column]
+    b = corner_rays[row, column + 1]
+    c = corner_rays[row + 1, column]
+    d = corner_rays[row + 1, column + 1]
+    total = wp.vec3(0.0)
+    if wp.max(wp.max(a[2], b[2]), wp.max(c[2], d[2])) > HORIZON:
+        return total
+    n = wp.max(int(samples[row, column]), 1)
+    angle = wp.sqrt(wp.length(wp.cross(b - a, c - a))) * scene.spot / float(n)
+    start = wp.randf(wp.rand_init(row, column))
+    for k in range(n * n):
+        u = 0.5 + ((float(k % n) + 0.5) / float(n) - 0.5) * scene.spot
+        v = 0.5 + ((float(k // n) + 0.5) / float(n) - 0.5) * scene.spot
+        ray = wp.normalize((1.0 - v) * ((1.0 - u) * a + u * b) + v * ((1.0 - u) * c + u * d))
+        t = moment(k % n, k // n, n, start)
+        total += radiance_along(scene, patch, ray, t, angle, samples[row, column] > wp.uint8(0))
+    return total / float(n * n)
+
+
 @wp.kernel(enable_backward=False)
 def cast(
     scene: SceneData,
@@ -237,7 +272,8 @@ def cast(
     first_column: int,
     radiance: wp.array2d(dtype=wp.vec3),
 ):
-    """Mean radiance of the pixels of a rectangle.
+    """Mean radiance of the pixels of a rectangle; a thread takes a block of 2 x 2, whose rays share the surface's
+    Taylor series. Blocks start at even rows and columns, whatever the rectangle.
 
     Args:
         scene: What is there.
@@ -248,26 +284,17 @@ def cast(
         radiance: Result over the rectangle.
     """
     i, j = wp.tid()
-    row = first_row + i
-    column = first_column + j
-    a = corner_rays[row, column]
-    b = corner_rays[row, column + 1]
-    c = corner_rays[row + 1, column]
-    d = corner_rays[row + 1, column + 1]
-    middle = 0.25 * (a + b + c + d)
-    lowest = wp.max(wp.max(a[2], b[2]), wp.max(c[2], d[2]))
-    total = wp.vec3(0.0)
-    # Above the horizon, and outside the lens: dark. A grazing ray hits the water too far away to matter.
-    if lowest < -1.0e-3:
-        n = wp.max(int(samples[row, column]), 1)
-        patch = surface_hit(scene.waves, scene.camera_height, wp.normalize(middle))
-        angle = wp.sqrt(wp.length(wp.cross(b - a, c - a))) * scene.spot / float(n)
-        start = wp.randf(wp.rand_init(row, column))
-        for k in range(n * n):
-            u = 0.5 + ((float(k % n) + 0.5) / float(n) - 0.5) * scene.spot
-            v = 0.5 + ((float(k // n) + 0.5) / float(n) - 0.5) * scene.spot
-            ray = wp.normalize((1.0 - v) * ((1.0 - u) * a + u * b) + v * ((1.0 - u) * c + u * d))
-            t = moment(k % n, k // n, n, start)
-            total += radiance_along(scene, patch, ray, t, angle, samples[row, column] > wp.uint8(0))
-        total = total / float(n * n)
-    radiance[i, j] = total
+    row = 2 * (first_row // 2 + i)
+    column = 2 * (first_column // 2 + j)
+    middle = corner_rays[row + 1, column + 1]
+    patch = Patch()
+    if middle[2] < HORIZON:
+        patch = surface_hit(scene.waves, scene.camera_height, middle)
+    for k in range(4):
+        y = row + k // 2 - first_row
+        x = column + k % 2 - first_column
+        if y >= 0 and y < radiance.shape[0] and x >= 0 and x < radiance.shape[1]:
+            colour = wp.vec3(0.0)
+            if middle[2] < HORIZON:
+                colour = pixel(scene, patch, corner_rays, samples, first_row + y, first_column + x)
+            radiance[y, x] = colour

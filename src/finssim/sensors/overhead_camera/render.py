@@ -133,7 +133,8 @@ class OverheadCamera:
         shape = (r.bottom - r.top, r.right - r.left)
         radiance = wp.empty(shape, dtype=wp.vec3, device=self.device)
         inputs = [self._data, self._rays, samples, r.top, r.left, radiance]
-        wp.launch(cast, dim=shape, inputs=inputs, device=self.device)
+        blocks = ((r.bottom + 1) // 2 - r.top // 2, (r.right + 1) // 2 - r.left // 2)
+        wp.launch(cast, dim=blocks, inputs=inputs, device=self.device)
         return radiance
 
     def _picture(
