@@ -122,15 +122,16 @@ def board_found(images: Iterable[tuple[str, NDArray[np.uint8]]], square: float) 
     """The common chessboard that most of some pictures show.
 
     Args:
-        images: Names and gray pictures; those after the first eight are not looked at.
+        images: Names and gray pictures; those after the first five are not looked at.
         square: Edge of a square [m].
 
     Raises:
         CalibrationError: None is seen.
     """
-    some = [image for _, image in zip(range(8), (picture for _, picture in images), strict=False)]
+    some = [image for _, image in zip(range(5), (picture for _, picture in images), strict=False)]
     seen = {size: sum(_chessboard(image, *size) is not None for image in some) for size in COMMON_SIZES}
-    best = max(seen, key=lambda size: seen[size])
+    # A board shows smaller ones too: of those seen as often the largest is meant.
+    best = max(seen, key=lambda size: (seen[size], size[0] * size[1]))
     if not seen[best]:
         tried = ", ".join(f"{c}x{r}" for c, r in COMMON_SIZES)
         raise CalibrationError(

@@ -9,8 +9,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
 from finssim.calibration.errors import CalibrationError
@@ -29,7 +27,8 @@ from finssim.localization.pictures import pictures
 
 __all__ = ["run"]
 
-Picture = tuple[str, NDArray[np.uint8]]
+OF_A_VIDEO = 15
+"""Of a video every so many pictures are looked at: its neighbours show the same view."""
 
 
 def run(
@@ -130,6 +129,9 @@ def _views(images: Sequence[Path], board: Board, screen: Console) -> tuple[list[
     without: list[str] = []
     try:
         for _, name, image in pictures(images):
+            _, is_video, number = name.partition("#")
+            if is_video and int(number) % OF_A_VIDEO:
+                continue
             seen = see_board(image, board)
             if seen is None:
                 without.append(name)

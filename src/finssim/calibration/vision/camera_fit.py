@@ -34,6 +34,9 @@ OUTLIER = 2.0
 SPREAD = 4.0
 """Robust standard deviations of the logarithm of the views' residuals."""
 
+NONSENSE = 0.003
+"""Residual of the usual picture, in widths of the image, with which nothing can be right."""
+
 MOST_LEFT_OUT = 0.25
 FOLDS = 8
 
@@ -121,6 +124,7 @@ def calibrate_camera(
     _check(views, model)
     told(0.0, "focal length")
     bundle = adjust(views, start(views, model))
+    _refuse_nonsense(bundle, views)
     told(0.4, "outliers")
     used, bundle = _without_outliers(views, bundle)
     some = [view for view, keep in zip(views, used, strict=True) if keep]
@@ -169,6 +173,15 @@ def _check(views: Sequence[BoardView], model: str) -> None:
         raise CalibrationError(
             f"pictures of several sizes: most are {usual[0]}x{usual[1]}, but not {', '.join(others[:6])}: "
             "give pictures of one camera in one mode"
+        )
+
+
+def _refuse_nonsense(bundle: Bundle, views: Sequence[BoardView]) -> None:
+    usual, limit = float(np.median(bundle.rms)), max(1.0, NONSENSE * views[0].width)
+    if usual > limit and not bundle.interrupted:
+        raise CalibrationError(
+            f"corners miss their places by {usual:.1f} px in the usual picture, expected below {limit:.1f} px: no lens "
+            "explains them: count the board's corners again, and see that it is flat and that the model suits the lens"
         )
 
 
