@@ -102,7 +102,9 @@ def run(
     )
     locator = Locator(site, body, known, method=method, pixel_std=pixel_std, family=family)
     surveyed = None if truth is None else load_truth(truth, longest_gap)
-    seeing = Seeing(locator.family, library, refine, gamma, None if times is None else Path(times))
+    seeing = Seeing(
+        locator.family, locator.tags, library, refine, gamma, None if times is None else Path(times)
+    )
     notes: list[str] = []
     frames, count = frames_of(paths, site.camera.lens, seeing, notes)
     found = _measure(frames, count, locator)

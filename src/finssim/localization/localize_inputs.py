@@ -21,6 +21,8 @@ class Seeing:
     """How tags are found in pictures; see `detector`."""
 
     family: str
+    tags: tuple[int, ...] = ()
+    """Those looked for in videos, near where they were a picture before."""
     library: str | None = None
     refine: str = "fit"
     gamma: float = 1.0
@@ -66,15 +68,23 @@ def _seen(
 ) -> Iterator[Frame]:
     from finssim.localization.detector import detector
     from finssim.localization.pictures import pictures
+    from finssim.localization.region import RegionTracker
 
     find = detector(seeing.family, library=seeing.library, refine=seeing.refine, gamma=seeing.gamma)
+    film, tracker = "", None
     for time, name, image in pictures(list(inputs), times=seeing.times, tell=notes.append):
         if image.shape != (lens.height, lens.width):
             raise LocalizationError(
                 f"{name}: {image.shape[1]} x {image.shape[0]} pixels, expected {lens.width} x {lens.height} as the "
                 "pool file's lens: calibrate at the size at which you record"
             )
-        yield Frame(time, name, tuple(find.detect(image)))
+        of_film, number, _ = name.rpartition("#")
+        if not number:  # a picture for itself
+            yield Frame(time, name, tuple(find.detect(image)))
+            continue
+        if tracker is None or of_film != film:
+            film, tracker = of_film, RegionTracker(find, seeing.tags or None)
+        yield Frame(time, name, tuple(tracker.detect(image, time)))
 
 
 def _count(inputs: Sequence[Path]) -> int | None:

@@ -62,6 +62,11 @@ class Locator:
         self._pool, self._method, self._pixel_std = pool, method, pixel_std
         self._tags_b = tag_corners_b(vehicle.tags)
 
+    @property
+    def tags(self) -> tuple[int, ...]:
+        """Ids of the vehicle's tags."""
+        return tuple(self._tags_b)
+
     def locate(self, frame: Frame) -> Measurement:
         """The pose in one picture, or why there is none."""
         seen = [found for found in frame.detections if _name(found.family) in ("", self.family)]
