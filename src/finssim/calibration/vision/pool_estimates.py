@@ -28,7 +28,11 @@ AT_BOUND = 0.01
 """Distance from the plane, over the whole distance, below which camera or points lie on it."""
 
 _STEPS = np.array(
-    [1e-5] * 3 + [1e-6] * 2 + [1e-6] + [1e-6] * 2 + [1e-5, 1e-5, 1e-6, 1e-3, 1e-3, 1e-6, 1e-6, 1e-7, 1e-7]
+    [1e-5] * 3
+    + [1e-6] * 2
+    + [1e-6]
+    + [1e-6] * 2
+    + [1e-5, 1e-5, 1e-6, 1e-3, 1e-3, 1e-6, 1e-6, 1e-7, 1e-7, 1e-7]
 )
 
 
@@ -41,7 +45,7 @@ def estimates(fit: Refined, surface: bool, settings: Settings, centre: Array) ->
         settings: Options, in the same frame.
         centre: The middle of the points in the survey's frame [m].
     """
-    columns = _columns(surface, centre)
+    columns = _columns(surface, centre, len(fit.model.camera.lens.distortion))
     width = float(student.ppf(0.975, fit.dof))
     table: dict[str, Estimate] = {}
     for name, (unit, tell) in columns.items():
@@ -68,7 +72,7 @@ def correlation(fit: Refined) -> Correlation:
     return Correlation(names=tuple(NAMES[i] for i in free), matrix=V / np.outer(std, std))
 
 
-def _columns(surface: bool, centre: Array) -> dict[str, tuple[str, Callable[[PoolModel], float]]]:
+def _columns(surface: bool, centre: Array, terms: int) -> dict[str, tuple[str, Callable[[PoolModel], float]]]:
     def euler(model: PoolModel, axis: int) -> float:
         return float(np.degrees(quat_to_euler(np.asarray(model.camera.orientation))[axis]))
 
@@ -95,7 +99,7 @@ def _columns(surface: bool, centre: Array) -> dict[str, tuple[str, Callable[[Poo
     columns["focal"] = ("px", lambda m: float(m.camera.lens.fx))
     columns["center_x"] = ("px", lambda m: float(m.camera.lens.cx))
     columns["center_y"] = ("px", lambda m: float(m.camera.lens.cy))
-    for k, name in enumerate(LENS_NAMES[3:]):
+    for k, name in enumerate(LENS_NAMES[3 : 3 + terms]):
         columns[name] = ("1", lambda m, k=k: float(m.camera.lens.distortion[k]))
     return columns
 

@@ -28,6 +28,12 @@ Array = NDArray[np.float64]
 DOUBT = 13.8
 """Fall of chi² that letting a right prior go reaches less than once in a thousand surveys (two degrees of freedom)."""
 
+LEVEL = np.radians(3.0)
+"""A plane of any direction that is found this near to level is a water surface [rad]."""
+
+MOST_LEAN = np.radians(8.0)
+"""A surface tilted further from the survey's z than this is none [rad]."""
+
 LENS_STEPS = ((), ("focal", "center"), ("focal", "center", "distortion"))
 """What the lens gives up where held-out points get better by it."""
 
@@ -110,6 +116,9 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
     found = search(here, extended_lens(lens), told)
     notes = list(seen.notes)
     fit = _best_lens(here, found, told, notes)
+    if not found.surface and settings.interface == "auto" and settings.plane is None and _level(fit):
+        found, notes = replace(found, surface=True), list(seen.notes)
+        fit = _best_lens(here, found, told, notes)
     fit = _released(here, told, fit, notes)
     pinhole = _pinhole(here, found, told, fit)
     normal = UP if found.surface else fit.model.interface.normal
@@ -151,7 +160,7 @@ def _first_noise(settings: Settings) -> Noise:
 def _refined(
     here: Observations, model: PoolModel, found: Found, told: Settings, active: NDArray[np.bool_]
 ) -> Refined:
-    start = replace(model, interface=replace(model.interface, index_far=told.index))
+    start = replace(found.model, interface=replace(found.model.interface, index_far=told.index))
     prior = prior_of(model, start, told, found.surface, lens_std(told, model.camera.lens.width))
     return refine(model, here, active, prior, _first_noise(told), pixel_known=told.pixel_sigma is not None)
 
@@ -201,9 +210,9 @@ def _released(here: Observations, told: Settings, fit: Refined, notes: list[str]
     if not np.isfinite(fit.prior.tilt_std) or told.tilt_sigma is not None or not fit.active[6]:
         return fit
     free = _without(here, told, fit, replace(fit.prior, tilt_std=np.inf))
-    if free is None:
-        return fit
     assert fit.prior.normal is not None
+    if free is None or not _leans(free, fit.prior.normal):
+        return fit
     lean = float(np.degrees(np.arccos(np.clip(free.model.interface.normal @ fit.prior.normal, -1.0, 1.0))))
     notes.append(
         f"the pixels contradict a plane along the survey's axis and want it {lean:.2f} degrees tilted: its "
@@ -211,6 +220,18 @@ def _released(here: Observations, told: Settings, fit: Refined, notes: list[str]
         "file is off"
     )
     return free
+
+
+def _level(fit: Refined) -> bool:
+    """Whether a plane of free direction came out as level as a water surface is."""
+    return bool(abs(float(fit.model.interface.normal[2])) > np.cos(LEVEL))
+
+
+def _leans(free: Refined, normal: Array) -> bool:
+    """Whether the tilt is small enough to be one, and told by the pixels rather than free to go anywhere."""
+    lean = float(np.arccos(np.clip(free.model.interface.normal @ normal, -1.0, 1.0)))
+    error = float(np.sqrt(max(free.covariance[k, k] for k in (6, 7))))
+    return lean < MOST_LEAN and error < lean / 3.0
 
 
 def _contradicted(here: Observations, told: Settings, fit: Refined) -> list[str]:
@@ -243,7 +264,7 @@ def _pinhole(here: Observations, found: Found, told: Settings, fit: Refined) -> 
     """Straight lines fitted to the same rows, as plain calibrations do."""
     model = replace(found.pinhole, camera=replace(found.pinhole.camera, lens=fit.model.camera.lens))
     active = fit.active & np.array([name in NAMES[:6] or name in NAMES[10:] for name in NAMES])
-    prior = replace(fit.prior, normal=None, depth=np.nan, depth_std=np.inf, index_std=np.inf, start=model)
+    prior = replace(fit.prior, normal=None, depth=np.nan, depth_std=np.inf, index_std=np.inf)
     part = here.subset(fit.used)
     alike = Noise(pixel=1.0, survey=1e-7, survey_yaw=1e-7)
     end = solve(model, part, Whitener(np.zeros((len(part), 2, 3)), part, alike), active, prior).model
@@ -251,5 +272,13 @@ def _pinhole(here: Observations, found: Found, told: Settings, fit: Refined) -> 
     whiten = Whitener(end.jacobians(part.points, part.dry)[1], part, alike)
     solution = solve(end, part, whiten, active, prior)
     return Refined(
-        solution.model, alike, fit.used, whiten, active, prior, np.zeros((17, 17)), solution, fit.dof
+        solution.model,
+        alike,
+        fit.used,
+        whiten,
+        active,
+        prior,
+        np.zeros((len(NAMES), len(NAMES))),
+        solution,
+        fit.dof,
     )

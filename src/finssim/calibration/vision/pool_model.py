@@ -16,13 +16,22 @@ __all__ = ["LENS_NAMES", "NAMES", "POSE_NAMES", "PoolModel", "extended_lens"]
 Array = NDArray[np.float64]
 
 POSE_NAMES = ("camera_x", "camera_y", "camera_z", "rotation_x", "rotation_y", "rotation_z")
-LENS_NAMES = ("focal", "center_x", "center_y", "distortion_1", "distortion_2", "distortion_3", "distortion_4")
+LENS_NAMES = (
+    "focal",
+    "center_x",
+    "center_y",
+    "distortion_1",
+    "distortion_2",
+    "distortion_3",
+    "distortion_4",
+    "distortion_5",
+)
 NAMES = (*POSE_NAMES, "tilt_x", "tilt_y", "depth", "index", *LENS_NAMES)
 """Order of every vector of parameters: camera centre [m], rotation by pool axes [rad], tilt of the plane about the
 reference point [rad], distance of the plane from the reference point [m], index beyond it, logarithm of the focal
-length, optical centre [px], first four coefficients of distortion as the lens lists them."""
+length, optical centre [px], first five coefficients of distortion as the lens lists them."""
 
-_LENGTHS = {"plumb_bob": 4, "rational": 8, "fisheye": 4}
+_LENGTHS = {"plumb_bob": 5, "rational": 8, "fisheye": 4}
 
 
 def extended_lens(lens: Lens) -> Lens:
@@ -76,7 +85,7 @@ class PoolModel:
         return pixels
 
     def jacobians(self, points: Array, dry: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Derivatives of `predict`: by the parameters in the order of `NAMES` (N, 2, 17), by the point (N, 2, 3)."""
+        """Derivatives of `predict`: by the parameters in the order of `NAMES` (N, 2, 18), by the point (N, 2, 3)."""
         J, J_point = np.zeros((len(points), 2, len(NAMES))), np.zeros((len(points), 2, 3))
         wet = ~dry if self.refractive else np.zeros(len(points), bool)
         if wet.any():
@@ -89,7 +98,7 @@ class PoolModel:
         return J, J_point
 
     def moved(self, step: Array) -> PoolModel:
-        """The model a small step away, (17,) in the order of `NAMES`."""
+        """The model a small step away, (18,) in the order of `NAMES`."""
         camera, plane = self.camera, self.interface
         turn = quat_to_matrix(quat_from_rotvec(step[3:6]))
         orientation = matrix_to_quat(turn @ np.asarray(camera.R_pc))
@@ -118,11 +127,11 @@ class PoolModel:
         return np.asarray((points - self.camera.position) @ np.asarray(self.camera.R_pc))
 
     def _lens_columns(self, of_lens: Array) -> Array:
-        """Derivatives by fx fy cx cy and distortion as those by log focal, centre and distortion, (N, 2, 7)."""
+        """Derivatives by fx fy cx cy and distortion as those by log focal, centre and distortion, (N, 2, 8)."""
         lens = self.camera.lens
         focal = of_lens[..., 0] * lens.fx + of_lens[..., 1] * lens.fy
-        known = of_lens[..., 4:8]
-        zeros = np.zeros((*known.shape[:-1], 4 - known.shape[-1]))
+        known = of_lens[..., 4:9]
+        zeros = np.zeros((*known.shape[:-1], 5 - known.shape[-1]))
         return np.concatenate([focal[..., None], of_lens[..., 2:4], known, zeros], axis=-1)
 
     def _direct_jacobians(self, points: Array) -> tuple[Array, Array]:
@@ -139,7 +148,7 @@ def _lens_moved(lens: Lens, step: Array) -> Lens:
         return lens
     factor = float(np.exp(step[0]))
     terms = list(lens.distortion)
-    for i, change in enumerate(step[3:7]):
+    for i, change in enumerate(step[3:8]):
         if i < len(terms):
             terms[i] += float(change)
     return replace(

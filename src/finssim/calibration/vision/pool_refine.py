@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.vision.observations import Observations
-from finssim.calibration.vision.pool_model import PoolModel
+from finssim.calibration.vision.pool_model import NAMES, PoolModel
 from finssim.calibration.vision.pool_noise import Noise, Whitener, estimate_noise
 from finssim.calibration.vision.pool_solver import Prior, Solution, normal_equations, residuals, solve
 from finssim.calibration.vision.pool_start import RobustPixels
@@ -39,10 +39,10 @@ class Refined:
     whiten: Whitener
     """Of the rows used."""
     active: NDArray[np.bool_]
-    """Parameters fitted, (17,)."""
+    """Parameters fitted, (18,)."""
     prior: Prior
     covariance: Array
-    """Of all parameters, zero where held, (17, 17)."""
+    """Of all parameters, zero where held, (18, 18)."""
     solution: Solution
     dof: float
     """Rows of residuals less parameters."""
@@ -62,7 +62,7 @@ def refine(
     Args:
         model: From the search.
         seen: All rows.
-        active: Parameters to fit, (17,).
+        active: Parameters to fit, (18,).
         prior: What is known beforehand.
         noise: What is believed of the errors.
         pixel_known: The pixel's error is given.
@@ -150,6 +150,6 @@ def _covariance(
     scale = np.sqrt(np.maximum(np.diagonal(N), 1e-300))
     values, vectors = np.linalg.eigh(N / np.outer(scale, scale))
     half = vectors / np.sqrt(np.maximum(values, 1e-14)) / scale[:, None]
-    covariance = np.zeros((17, 17))
+    covariance = np.zeros((len(NAMES), len(NAMES)))
     covariance[np.ix_(free, free)] = half @ half.T
     return covariance

@@ -64,7 +64,7 @@ def search(seen: Observations, lens: Lens, settings: Settings) -> Found:
             "no place of the plane between camera and points explains the pixels: check the water height, its sign and "
             "the interface"
         )
-    chosen = _choose(runs, settings)
+    chosen = _choose(runs, len(seen))
     minima = tuple(
         (value / max(chosen[0], 1e-9), model.clearance)
         for value, model, surface in sorted(runs, key=lambda run: run[0])
@@ -179,7 +179,7 @@ def _descend(
     start = model
     for count, names in zip(counts, (NAMES[:6], NAMES[:9]), strict=True):
         whiten = RobustPixels(model, seen)
-        prior = prior_of(model, start, settings, surface, (np.inf,) * 7)
+        prior = prior_of(model, start, settings, surface, (np.inf,) * 8)
         active = np.array([name in names for name in NAMES])
         end = solve(model, seen, whiten, active, prior, iterations=count, tolerance=1e-7)
         if not np.isfinite(end.cost):
@@ -202,14 +202,15 @@ def _refuse_wrong_side(pinhole: PoolModel, settings: Settings, surface: bool) ->
         )
 
 
-def _choose(runs: list[tuple[float, PoolModel, bool]], settings: Settings) -> tuple[float, PoolModel, bool]:
+def _choose(runs: list[tuple[float, PoolModel, bool]], count: int) -> tuple[float, PoolModel, bool]:
     """The best run; a level surface wherever it does as well as a wall."""
     best = min(runs, key=lambda run: run[0])
     surfaces = [run for run in runs if run[2]]
     if surfaces and not best[2]:
         level = min(surfaces, key=lambda run: run[0])
         upright = abs(float(best[1].interface.normal[2])) > np.cos(np.radians(5.0))
-        if level[0] <= SAME * best[0] + 0.02 or upright:
+        freedom = np.sqrt(max(1.0, 2.0 * count - 7.0) / max(1.0, 2.0 * count - 9.0))  # two more parameters
+        if level[0] <= SAME * freedom * best[0] + 0.02 or upright:
             return level
     return best
 

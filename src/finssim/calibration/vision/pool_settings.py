@@ -27,7 +27,7 @@ FITTED = {
 }
 """What may be fitted -> its parameters."""
 
-LENS_STD = (0.05, 0.03, 0.03, 0.15, 0.15, 0.02, 0.02)
+LENS_STD = (0.05, 0.03, 0.03, 0.15, 0.15, 0.02, 0.02, 0.1)
 """How far a camera file that is only roughly right may be off: log focal, centre in widths of the image, distortion."""
 
 
@@ -106,7 +106,7 @@ class Settings:
 
 
 def active_names(settings: Settings, extra: tuple[str, ...] = ()) -> NDArray[np.bool_]:
-    """Which of `NAMES` are fitted, (17,)."""
+    """Which of `NAMES` are fitted, (18,)."""
     groups = list(settings.fit or ("pose", "height", "tilt", "index")) + list(extra)
     if settings.focal_sigma > 0.0:
         groups.append("focal")

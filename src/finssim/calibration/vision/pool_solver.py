@@ -35,11 +35,11 @@ class Prior:
     start: PoolModel
     """Holds index and lens that `index_std` and `lens_std` are about."""
     index_std: float = np.inf
-    lens_std: tuple[float, ...] = (np.inf,) * 7
+    lens_std: tuple[float, ...] = (np.inf,) * 8
     """Of log focal, centre [px], distortion."""
 
     def rows(self, model: PoolModel) -> tuple[Array, Array]:
-        """Residuals (M,) of the priors, each over its standard deviation, and their derivatives (M, 17)."""
+        """Residuals (M,) of the priors, each over its standard deviation, and their derivatives (M, 18)."""
         r: list[float] = []
         J: list[Array] = []
 
@@ -82,9 +82,9 @@ class Solution:
 
 
 def lens_values(model: PoolModel) -> list[float]:
-    """Log focal length, centre and four coefficients of distortion of the model's lens."""
+    """Log focal length, centre and five coefficients of distortion of the model's lens."""
     lens = model.camera.lens
-    terms = (*lens.distortion, 0.0, 0.0, 0.0, 0.0)[:4]
+    terms = (*lens.distortion, *([0.0] * 5))[:5]
     return [float(np.log(lens.fx)), lens.cx, lens.cy, *terms]
 
 
@@ -111,7 +111,7 @@ def solve(
         start: Where to begin.
         seen: The rows.
         whiten: Turns residuals (N, 2) and derivatives (N, 2, P) into independent rows of unit variance.
-        active: Which of `NAMES` move, (17,).
+        active: Which of `NAMES` move, (18,).
         prior: Of those and of the others.
         iterations: At most.
         tolerance: Relative change of the cost at which the search ends.
