@@ -4,8 +4,8 @@ Parts:
     accuracy  every library and refinement on drawn tags whose corners are known: share found, bias, error
     speed     processor time on pictures of 1280x720 with two tags: the whole picture, and regions around the tags
 
-Drawn are tags of 20 to 45 px at random places, turns and tilts, blurred, with noise of 2.5 gray levels and a white margin of
-0.78 cells. Run alone, with OMP_NUM_THREADS=1.
+Drawn are tags of 20 to 45 px at random places, turns and tilts, blurred, with noise of 2.5 gray levels and a white
+margin of 0.78 cells. Run alone, with OMP_NUM_THREADS=1.
 """
 
 from __future__ import annotations
