@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from finssim.geometry.rotations import quat_to_matrix
 from finssim.sensors.overhead_camera.materials import BasinData, BodyData, TagData
-from finssim.sensors.overhead_camera.raycast import LampData, SceneData
 from finssim.sensors.overhead_camera.scene import Basin, Body, Light, Pose, Scene, TagInScene
+from finssim.sensors.overhead_camera.scene_data import LampData, SceneData
 from finssim.sensors.overhead_camera.surface import Wave, Waves, pack_waves
 from finssim.sensors.overhead_camera.view import SurfaceFrame
 

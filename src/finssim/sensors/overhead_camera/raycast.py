@@ -1,4 +1,4 @@
-"""The ray caster: one thread per pixel follows its rays from the camera through the surface to what they meet.
+"""The ray caster: each thread follows the rays of four pixels from the camera through the surface to what they meet.
 
 Everything is in the surface frame, in single precision: with the camera's foot as origin, coordinates of a few metres
 keep 0.001 px.
@@ -9,19 +9,16 @@ import warp as wp
 
 from finssim.sensors.overhead_camera.materials import (
     NOTHING,
-    BasinData,
-    BodyData,
     Surfel,
-    TagData,
     meet_basin,
     meet_body,
     meet_tag,
     on_deck,
 )
 from finssim.sensors.overhead_camera.photometry import fresnel, refracted, through_water
+from finssim.sensors.overhead_camera.scene_data import SceneData
 from finssim.sensors.overhead_camera.surface import (
     Patch,
-    Wave,
     distance_to,
     normal_of,
     surface_at,
@@ -33,38 +30,6 @@ ON_TOP = wp.constant(1.0e-3)
 
 HORIZON = wp.constant(-1.0e-3)
 """Rays that go down no steeper than this are left dark, as is what the lens does not see (zero)."""
-
-
-@wp.struct
-class LampData:
-    """A bright rectangle parallel to the surface."""
-
-    centre: wp.vec3  # [m]
-    half: wp.vec2  # half lengths [m]
-    radiance: float
-
-
-@wp.struct
-class SceneData:
-    """All that rays can meet, surface frame."""
-
-    camera_height: float  # above the still surface [m]
-    index_near: float
-    index_far: float
-    layer_thickness: wp.array(dtype=float)  # of the window, from the camera [m]
-    layer_index: wp.array(dtype=float)
-    waves: wp.array(dtype=Wave)
-    caustics: float
-    attenuation: wp.vec3  # [1/m]
-    veil: wp.vec3
-    sky: float
-    lamps: wp.array(dtype=LampData)
-    basin: BasinData
-    tags: wp.array(dtype=TagData)
-    cells: wp.array(dtype=wp.uint8)
-    bodies: wp.array(dtype=BodyData)
-    shutter: float  # [s]
-    spot: float  # [px]
 
 
 @wp.struct

@@ -198,7 +198,7 @@ class Sensor:
     noise: bool = True
     """Shot and read noise."""
     gamma: float = 1.0
-    """Numbers are (charge)^(1/gamma): 1 for linear, 2.2 for video. It moves the edges of dark tags outwards in."""
+    """Numbers are (charge)^(1/gamma): 1 for linear, 2.2 for video, where dark tags look smaller."""
     spot: float = 1.0
     """Width of the square from which a pixel gathers light [px]: 1 for perfect optics, 1.5 to 2 for a cheap lens."""
     colour: bool = False
