@@ -19,7 +19,10 @@ from finssim.localization.fuse import fuse, run
 from finssim.localization.fuse_log import load_log
 from finssim.localization.fuse_output import COLUMNS
 from finssim.localization.fuse_settings import site_of
+from finssim.localization.localize_output import write_rows as write_localized
+from finssim.localization.measurement import Constraints
 from finssim.localization.pool import load_pool
+from finssim.localization.pose import METHODS
 from finssim.localization.tags import tag_corners_b
 from finssim.vehicles import load_vehicle
 from localization.known_streams import SITE, Noise, attitude, position, streams, yaw
@@ -213,6 +216,30 @@ def test_detections_become_fixes_with_depth_and_tilt_of_their_exposure(tmp_path,
     assert summary["accepted"]["vision"] > 0.9 * len(frames)
     assert summary["errors"]["fresh"]["p95_horizontal"] < 0.03
     assert summary["errors"]["fresh"]["rms_yaw"] < math.radians(1.0)
+
+
+def test_the_table_of_localize_is_read_with_its_covariances_and_refusals(tmp_path, pool):
+    """What `finssim localize` writes: a full covariance for each fix, and refused pictures counted by their reason."""
+    site, items = load_pool(pool), samples(3.0)
+    folder = write_log(tmp_path / "log", items)
+    pictures, constraints = write_pictures(folder, items, site), Constraints(z_b=0.0)
+    found = []
+    for k, frame in enumerate(pictures):
+        s = next(s for s in items if s.stream == "vision" and abs(s.time + site.latency - frame.time) < 1e-9)
+        roll, pitch, _ = quat_to_euler(attitude(s.time))
+        known = replace(constraints, z_b=float(position(s.time)[2]), roll=float(roll), pitch=float(pitch))
+        tags = frame.detections if k % 5 else ()
+        found.append((frame, METHODS["refractive"](tags, site, tag_corners_b(FINSROV.tags), known, 0.2)))
+    (folder / "detections.csv").unlink()
+    write_localized(found, folder / "vision.csv")
+    log = load_log(folder, FINSROV, latency=site.latency)
+    fixes = [s for s in log.samples if s.stream == "vision"]
+    located = [m for _, m in found if m.ok]
+    for fix, m in zip(fixes, located, strict=True):
+        np.testing.assert_allclose(fix.covariance, m.covariance, rtol=1e-6, atol=1e-15)
+    summary = fuse(log, site, FINSROV).summary
+    assert sum(summary["refused"]["vision"].values()) >= len(found) - len(located) >= len(found) // 5
+    assert summary["errors"]["fresh"]["p95_horizontal"] < 0.03
 
 
 def hinsdale(folder, trial, every=1.0):

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.rotations import quat_from_rotvec, quat_inverse_rotate, quat_rotate
+from finssim.geometry.rotations import quat_rotate
+from finssim.localization.fuse_turns import matrix_of, skew, turn_of
 
 __all__ = ["Tilt", "TiltGains", "follow", "in_body_axes", "roll_pitch", "tilt_from", "up_of"]
 
@@ -91,13 +92,12 @@ def follow(tilt: Tilt, omega: npt.ArrayLike, accel: npt.ArrayLike, dt: float, ga
         gains: How quickly the accelerometer is believed.
     """
     accel = np.asarray(accel, float)
-    force = np.linalg.norm(accel, axis=-1, keepdims=True)
+    force = np.sqrt(np.sum(accel * accel, axis=-1, keepdims=True))
     known = np.isfinite(force) & (force > 1e-6)
     weight = np.where(known, np.exp(-0.5 * ((force - gains.gravity) / gains.tolerance) ** 2), 0.0)
     up_measured = np.where(known, accel / np.where(known, force, 1.0), tilt.up)
-    error = weight * np.cross(up_measured, tilt.up)
+    error = weight * (skew(up_measured) @ tilt.up[..., None])[..., 0]
     turn = np.asarray(omega, float) - tilt.bias + gains.proportional * error
-    up = quat_inverse_rotate(quat_from_rotvec(turn * dt), tilt.up)
-    return Tilt(
-        up / np.linalg.norm(up, axis=-1, keepdims=True), np.asarray(tilt.bias - gains.integral * error * dt)
-    )
+    up = (matrix_of(turn_of(-dt * turn)) @ tilt.up[..., None])[..., 0]
+    length = np.sqrt(np.sum(up * up, axis=-1, keepdims=True))
+    return Tilt(up / length, np.asarray(tilt.bias - gains.integral * error * dt))

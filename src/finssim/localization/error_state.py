@@ -10,11 +10,12 @@ Nominal state: position and velocity of the IMU in the pool frame, attitude, gyr
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.rotations import quat_from_rotvec, quat_multiply, quat_to_matrix, skew
+from finssim.localization.fuse_turns import matrix_of, product, skew, turn_of
 from finssim.localization.position_filter import Motion, process_noise, transition
 
 __all__ = [
@@ -33,6 +34,7 @@ Array = npt.NDArray[np.float64]
 
 P, V, A, G, B = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
 """Where δp, δv, δθ, δb_g and δb_a stand in the error state."""
+_I15 = np.eye(15)
 
 
 @dataclass(frozen=True)
@@ -81,17 +83,16 @@ def predict(
         gravity: Pool frame [m/s²], (3,): downwards.
     """
     turn = (omega - state.gyro_bias) * dt
-    R = quat_to_matrix(quat_multiply(state.q, quat_from_rotvec(0.5 * turn)))
+    R = matrix_of(product(state.q, turn_of(0.5 * turn)))
     pushed = (R @ (force - state.accel_bias)[..., None])[..., 0]
     a = pushed + gravity
-    q = quat_multiply(state.q, quat_from_rotvec(turn))
-    F = np.zeros((*turn.shape[:-1], 15, 15))
-    F[..., range(15), range(15)] = 1.0
-    F[..., range(3), range(3, 6)] = dt
-    S = skew(pushed)
-    F[..., V, A], F[..., P, A] = -dt * S, -0.5 * dt**2 * S
-    F[..., V, B], F[..., P, B] = -dt * R, -0.5 * dt**2 * R
-    F[..., A, G] = -dt * R
+    q = product(state.q, turn_of(turn))
+    F = np.tile(_I15, (*turn.shape[:-1], 1, 1))
+    F[..., P, V] = dt * _I15[:3, :3]
+    S, turned = dt * skew(pushed), dt * R
+    F[..., V, A], F[..., P, A] = -S, (-0.5 * dt) * S
+    F[..., V, B], F[..., P, B] = -turned, (-0.5 * dt) * turned
+    F[..., A, G] = -turned
     covariance = F @ state.covariance @ np.swapaxes(F, -1, -2) + _noise(dt, noise)
     return replace(
         state,
@@ -123,15 +124,20 @@ def drift(state: InertialState, dt: float, motion: Motion, turning: float) -> In
 
 def _noise(dt: float, noise: ErrorStateNoise) -> Array:
     """Covariance that one step adds, (15, 15): the same in every direction, so that no axes need to turn."""
-    Q = np.zeros((15, 15))
+    first, second, third = _noise_powers(noise)
+    return dt * first + (0.5 * dt**2) * second + (dt**3 / 3.0) * third
+
+
+@lru_cache(maxsize=8)
+def _noise_powers(noise: ErrorStateNoise) -> tuple[Array, Array, Array]:
+    """What goes with dt, dt²/2 and dt³/3 in the noise of a step, (15, 15) each."""
+    first, second, third = np.zeros((3, 15, 15))
     i = np.arange(3)
-    Q[i, i] = noise.accel**2 * dt**3 / 3.0
-    Q[i, i + 3] = Q[i + 3, i] = noise.accel**2 * dt**2 / 2.0
-    Q[i + 3, i + 3] = noise.accel**2 * dt
-    Q[i + 6, i + 6] = noise.gyro**2 * dt
-    Q[i + 9, i + 9] = noise.gyro_walk**2 * dt
-    Q[i + 12, i + 12] = noise.accel_walk**2 * dt
-    return Q
+    third[i, i] = second[i, i + 3] = second[i + 3, i] = first[i + 3, i + 3] = noise.accel**2
+    first[i + 6, i + 6] = noise.gyro**2
+    first[i + 9, i + 9] = noise.gyro_walk**2
+    first[i + 12, i + 12] = noise.accel_walk**2
+    return first, second, third
 
 
 def position_model(state: InertialState, lever: Array) -> tuple[Array, Array]:
@@ -144,7 +150,7 @@ def position_model(state: InertialState, lever: Array) -> tuple[Array, Array]:
     Returns:
         Position, pool frame [m], (..., 3), and its Jacobian, (..., 3, 15).
     """
-    arm = (quat_to_matrix(state.q) @ lever[:, None])[..., 0]
+    arm = (matrix_of(state.q) @ lever[:, None])[..., 0]
     H = np.zeros((*arm.shape[:-1], 3, 15))
     H[..., range(3), range(3)] = 1.0
     H[..., A] = -skew(arm)
@@ -175,7 +181,7 @@ def yaw_model(state: InertialState) -> tuple[Array, Array]:
     Returns:
         Yaw [rad], (..., 1), and its Jacobian, (..., 1, 15).
     """
-    c = quat_to_matrix(state.q)[..., :, 0]
+    c = matrix_of(state.q)[..., :, 0]
     level = c[..., 0] ** 2 + c[..., 1] ** 2
     H = np.zeros((*c.shape[:-1], 1, 15))
     H[..., 0, 6] = -c[..., 2] * c[..., 0] / level
@@ -214,10 +220,10 @@ def correct(state: InertialState, residual: Array, H: Array, R: Array, gain: Arr
         gain: As `error_innovation` gives it.
     """
     d = (gain @ residual[..., None])[..., 0]
-    kept = np.eye(15) - gain @ H
+    kept = _I15 - gain @ H
     covariance = kept @ state.covariance @ np.swapaxes(kept, -1, -2)
     covariance = covariance + gain @ R @ np.swapaxes(gain, -1, -2)
-    q = quat_multiply(quat_from_rotvec(d[..., A]), state.q)
+    q = product(turn_of(d[..., A]), state.q)
     return InertialState(
         state.p + d[..., P],
         state.v + d[..., V],

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from finssim.localization.detections import Frame
 from finssim.localization.errors import LocalizationError
 from finssim.localization.estimator import Estimator
 from finssim.localization.fuse_detections import Fixes
-from finssim.localization.fuse_log import Log, load_log
+from finssim.localization.fuse_log import Log, NoFix, load_log
 from finssim.localization.fuse_output import row_of, summary_lines, summary_of, write_rows
 from finssim.localization.fuse_settings import settings_of, site_of
 from finssim.localization.pool import Pool, load_pool
@@ -24,6 +24,8 @@ from finssim.localization.streams import Sample
 from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["Run", "fuse", "run"]
+
+Delivery: TypeAlias = "Sample | Frame | NoFix"
 
 FASTEST = 1000.0
 """Highest rate of the output [Hz]."""
@@ -133,7 +135,10 @@ def fuse(
     return found
 
 
-def _take(item: Sample | Frame, estimator: Estimator, fixes: Fixes | None) -> None:
+def _take(item: Delivery, estimator: Estimator, fixes: Fixes | None) -> None:
+    if isinstance(item, NoFix):
+        estimator.refuse("vision", item.reason)
+        return
     if isinstance(item, Frame):
         assert fixes is not None
         fix = fixes.fix(item, estimator)
@@ -144,16 +149,17 @@ def _take(item: Sample | Frame, estimator: Estimator, fixes: Fixes | None) -> No
     estimator.add(item)
 
 
-def _deliveries(log: Log) -> list[tuple[float, Sample | Frame]]:
+def _deliveries(log: Log) -> list[tuple[float, Delivery]]:
     """Samples and pictures in the order of their arrival; those without a time stay with their neighbour.
 
     Raises:
         LocalizationError: There is none with a time, or they span too long.
     """
-    found: list[tuple[float, Sample | Frame]] = [
+    found: list[tuple[float, Delivery]] = [
         (s.arrival if s.arrival is not None else s.time, s) for s in log.samples
     ]
     found += [(frame.time, frame) for frame in log.frames]
+    found += [(item.time, item) for item in log.missed]
     times = [t for t, _ in found if math.isfinite(t)]
     if not times:
         raise LocalizationError("the log holds no sample with a time: nothing to fuse")
@@ -161,8 +167,8 @@ def _deliveries(log: Log) -> list[tuple[float, Sample | Frame]]:
 
 
 def _by_row(
-    deliveries: Sequence[tuple[float, Sample | Frame]], rate: float
-) -> Iterator[tuple[float, list[Sample | Frame]]]:
+    deliveries: Sequence[tuple[float, Delivery]], rate: float
+) -> Iterator[tuple[float, list[Delivery]]]:
     """Times of the rows, and what arrives between the one before and each.
 
     Raises:

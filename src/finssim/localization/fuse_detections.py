@@ -10,6 +10,7 @@ from finssim.localization.attitude import up_of
 from finssim.localization.detections import Frame
 from finssim.localization.errors import LocalizationError
 from finssim.localization.estimator import Estimator
+from finssim.localization.fuse_log import counted
 from finssim.localization.measurement import Constraints
 from finssim.localization.pool import Pool
 from finssim.localization.pose import METHODS, NEEDS_DEPTH
@@ -62,7 +63,7 @@ class Fixes:
             return "no depth or tilt"
         found = METHODS[self._method](frame.detections, self._pool, self._tags, constraints, self._pixel_std)
         if not found.ok:
-            return found.reason or "no pose"
+            return counted(found.reason)
         R = np.asarray(found.covariance, float)
         rows = tuple((float(row[0]), float(row[1]), float(row[2])) for row in 0.5 * (R + R.T))
         return VisionSample(time, (found.x, found.y), found.yaw, rows, frame.time)

@@ -12,7 +12,6 @@ from finssim.geometry.rotations import (
     matrix_to_quat,
     quat_from_euler,
     quat_multiply,
-    quat_to_matrix,
     wrap_angle,
 )
 from finssim.localization import error_state, fuse_restart
@@ -26,6 +25,7 @@ from finssim.localization.fuse_constant_velocity import (
     vision_covariance,
 )
 from finssim.localization.fuse_settings import Settings, Site, turn_to_pool
+from finssim.localization.fuse_turns import matrix_of
 from finssim.localization.gate import GateMemory, judge
 from finssim.localization.health import Estimate, Outcome
 from finssim.localization.streams import DepthSample, ImuSample, VisionSample
@@ -147,7 +147,7 @@ class ErrorState:
         if old:
             x[3:5] = 0.0
         yaw, H = error_state.yaw_model(state)
-        rates = quat_to_matrix(state.q) @ (np.array(track.omega) - state.gyro_bias)
+        rates = matrix_of(state.q) @ (np.array(track.omega) - state.gyro_bias)
         return Estimate(
             time=time,
             x=x,
@@ -165,7 +165,7 @@ class ErrorState:
     def _to_body(self, state: InertialState, omega: Array) -> tuple[Array, Array]:
         """Jacobian (6, 15) of the body origin's position and velocity, and their values (6,)."""
         position, H = error_state.position_model(state, self._body)
-        R = quat_to_matrix(state.q)
+        R = matrix_of(state.q)
         swing = R @ np.cross(omega - state.gyro_bias, self._body)
         T = np.zeros((6, 15))
         T[:3] = H
@@ -180,7 +180,7 @@ class ErrorState:
         known = self._before.estimate(before, time)
         level = quat_from_euler(known.roll, known.pitch, known.yaw)
         from_level = turn_to_pool(self.site)
-        R = from_level @ quat_to_matrix(level)
+        R = from_level @ matrix_of(level)
         q = quat_multiply(matrix_to_quat(from_level), level)
         covariance = np.zeros((15, 15))
         covariance[:6, :6] = known.P
@@ -267,7 +267,7 @@ class ErrorState:
     def _kept(self, track: InertialTrack) -> InertialTrack:
         """The track with roll and pitch read from its attitude."""
         assert track.inertial is not None
-        roll, pitch = roll_pitch(self._up @ quat_to_matrix(track.inertial.q))
+        roll, pitch = roll_pitch(self._up @ matrix_of(track.inertial.q))
         return replace(track, roll=float(roll), pitch=float(pitch))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from finssim.localization.fuse_table import StreamTable, read_stream_table
 from finssim.localization.streams import DepthSample, ImuSample, Sample, VisionSample
 from finssim.vehicles import Vehicle
 
-__all__ = ["Log", "load_log"]
+__all__ = ["Log", "NoFix", "counted", "load_log"]
 
 Array = npt.NDArray[np.float64]
 
@@ -28,6 +29,15 @@ HELD = 0.5
 """A stream of whose rows more than this share repeat the one before was written into a faster table."""
 
 
+@dataclass(frozen=True)
+class NoFix:
+    """A picture in which the vehicle was not located."""
+
+    time: float
+    """Stamp of the picture [s]."""
+    reason: str
+
+
 @dataclass
 class Log:
     """What a log holds."""
@@ -36,6 +46,8 @@ class Log:
     """In the order of their arrival."""
     frames: list[Frame] = field(default_factory=list)
     """Pictures with tags, in the order of their stamps, where the log has no fixes."""
+    missed: list[NoFix] = field(default_factory=list)
+    """Pictures that `finssim localize` refused."""
     truth: StreamTable | None = None
     """Where the vehicle really was: t, x, y, z [m], yaw [rad], pool frame."""
     notes: list[str] = field(default_factory=list)
@@ -171,8 +183,10 @@ def _vision(
     xy = table.columns("x", "y")
     yaw = _angle(table, "yaw")
     usable = ~np.isnan(xy).any(axis=1)
-    if "ok" in table.numbers:
-        usable &= table.numbers["ok"] != 0.0
+    if "status" in table.words:
+        usable &= np.array([word.lower() == "ok" for word in table.words["status"]])
+        reasons = table.words.get("reason", ["refused"] * len(usable))
+        log.missed += [NoFix(float(table.t[k]), counted(reasons[k])) for k in np.flatnonzero(~usable)]
     rows = _thinned(np.flatnonzero(usable), np.column_stack([xy, yaw]), "vision", log)
     covariance = _covariance(table)
     arrival = _arrival(table, 0.0)
@@ -197,11 +211,16 @@ def _covariance(table: StreamTable) -> Array:
     none = np.full(len(table.t), math.radians(180.0))  # a fix without yaw does not use its variance
     std_yaw = _angle(table, "std_yaw")
     std = np.column_stack([table.columns("std_x", "std_y"), np.where(np.isnan(std_yaw), none, std_yaw)])
-    correlation = np.tile(np.eye(3), (len(table.t), 1, 1))
-    for i, j, name in ((0, 1, "corr_xy"), (0, 2, "corr_xyaw"), (1, 2, "corr_yyaw")):
+    R = std[:, :, None] ** 2 * np.eye(3)
+    for i, j, name in ((0, 1, "cov_xy"), (0, 2, "cov_xyaw"), (1, 2, "cov_yyaw")):
         if table.has(name):
-            correlation[:, i, j] = correlation[:, j, i] = table.numbers[name]
-    return np.asarray(correlation * std[:, :, None] * std[:, None, :])
+            R[:, i, j] = R[:, j, i] = table.numbers[name]
+    return R
+
+
+def counted(reason: str) -> str:
+    """A reason without its particulars, for counting."""
+    return re.split(r"[:(]", reason, maxsplit=1)[0].strip() or "refused"
 
 
 def _angle(table: StreamTable, name: str) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -72,8 +73,14 @@ class Innovation:
     """Of the Kalman filter, (..., 6, m)."""
 
 
+_I6 = np.eye(6)
+_SHIFT = np.eye(6, k=3)
+
+
 def transition(dt: float, motion: Motion) -> Array:
     """Matrix A of one step, (6, 6): [I, dt I; 0, I] where nothing decays (paper, eq. 14)."""
+    if not any(motion.decay):
+        return _I6 + dt * _SHIFT
     rate = np.array(motion.decay)
     A = np.eye(6)
     kept = np.exp(-rate * dt)
@@ -85,6 +92,9 @@ def transition(dt: float, motion: Motion) -> Array:
 
 def process_noise(dt: float, motion: Motion) -> Array:
     """Covariance Q that one step adds, (6, 6); see `Motion`."""
+    if not any(motion.decay):
+        first, second, third = _noise_powers(motion)
+        return dt * first + (0.5 * dt**2) * second + (dt**3 / 3.0) * third
     q, rate = np.array(motion.density), np.array(motion.decay)
     slow = rate * dt < 1e-4  # below it the closed form loses digits that the series keeps
     l = np.where(slow, 1.0, rate)
@@ -100,6 +110,17 @@ def process_noise(dt: float, motion: Motion) -> Array:
     Q[i, j] = Q[j, i] = q * pv
     Q[j, j] = q * vv
     return Q
+
+
+@lru_cache(maxsize=16)
+def _noise_powers(motion: Motion) -> tuple[Array, Array, Array]:
+    """What goes with dt, dt²/2 and dt³/3 in the noise of a step where nothing decays, (6, 6) each."""
+    first, second, third = np.zeros((3, 6, 6))
+    i, j = [0, 1, 2], [3, 4, 5]
+    first[i, i], first[j, j] = motion.walk, motion.density
+    if motion.integrated:
+        second[i, j] = second[j, i] = third[i, i] = motion.density
+    return first, second, third
 
 
 def predict(state: PositionState, dt: float, motion: Motion) -> PositionState:
@@ -139,7 +160,7 @@ def correct(state: PositionState, found: Innovation, H: Array, R: Array) -> Posi
     x <- x + K ρ,  P <- (I - K H) P (I - K H)' + K R K'
     """
     K = found.gain
-    kept = np.eye(6) - K @ H
+    kept = _I6 - K @ H
     Kt, keptt = np.swapaxes(K, -1, -2), np.swapaxes(kept, -1, -2)
     P = kept @ state.P @ keptt + K @ R @ Kt
     x = state.x + (K @ found.residual[..., None])[..., 0]
