@@ -73,7 +73,7 @@ def test_a_known_height_pushes_the_error_outwards():
     pool, level = POOLS["level water"], np.zeros(3)
     one = {15: TAGS[15] - TAGS[15].mean(axis=0)}
     position = ABOVE.position + [0.8, 0.0, -1.5]
-    found = pinhole_depth(seen(pool, position, level, one), pool, one, known(position, level), 2.0)
+    found = pinhole_depth(seen(pool, position, level, one), pool, one, known(position, level), 0.3)
     sine = np.sin(np.arctan2(0.8, 1.5))
     above, below = ABOVE.position[2] - 0.96, 0.96 - position[2]
     for _ in range(100):  # the angle at which the ray leaves the camera
@@ -82,3 +82,12 @@ def test_a_known_height_pushes_the_error_outwards():
         sine *= 0.8 / (above * tan_air + below * tan_water)
     assert found.x - position[0] == pytest.approx(below * (tan_air - tan_water), rel=0.02)
     assert abs(found.y - position[1]) < 0.002
+
+
+def test_the_baseline_answers_where_refraction_is_strong():
+    """At the rim, where leaving the water out costs 10 cm, the baseline says so by its error, not by a refusal."""
+    pool, level = POOLS["level water"], np.zeros(3)
+    for position in ([1.0, -0.5, 0.4], [-1.1, 0.4, 0.2], [0.8, 0.3, 0.1]):
+        found = pinhole_depth(seen(pool, np.array(position), level), pool, TAGS, known(position, level), 0.3)
+        assert found.ok, found.reason
+        assert 0.05 < np.hypot(*(found.position - position)[:2]) < 0.3

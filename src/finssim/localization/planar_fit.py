@@ -26,6 +26,8 @@ FEWEST = 3
 """Corners without which there is no measurement."""
 WORST = 4.0
 """A corner that misses its place by more than this [px], and by more than 8 standard deviations, is an outlier."""
+WORST_WITHOUT_WATER = 40.0
+"""The same where the water is left out, which alone may cost many pixels."""
 _LEVEL = np.eye(3)
 _SUSPECTS = (
     "look at the tag's id, edge and mount, the depth, the tilt and the pool file",
@@ -72,7 +74,8 @@ def planar_fit(
     R_pg = _LEVEL if constraints.up == (0.0, 0.0, 1.0) else axes_of_up(up / np.linalg.norm(up))
     level = pairs.points_b @ tilt_matrix(constraints.roll, constraints.pitch).T
     seen = corner_points(pool, R_pg, pairs.pixels, constraints.z_b + level[:, 2], straight=straight)
-    solved = _solve(seen, level, pixel_std, len(pairs.tags))
+    limit = max(WORST_WITHOUT_WATER if straight else WORST, 8.0 * pixel_std)
+    solved = _solve(seen, level, pixel_std, limit, len(pairs.tags))
     rejected = {**pairs.rejected, **solved.rejected}
     fit = solved.fit
     if fit is None:
@@ -101,7 +104,7 @@ class _Solved:
     reason: str = ""
 
 
-def _solve(seen: CornerPoints, level: Array, pixel_std: float, tags: int) -> _Solved:
+def _solve(seen: CornerPoints, level: Array, pixel_std: float, limit: float, tags: int) -> _Solved:
     """Fit the corners that have a point, once more without those that miss by far."""
     used = seen.status == 0
     rejected = {} if used.all() else _reasons(seen)
@@ -110,7 +113,6 @@ def _solve(seen: CornerPoints, level: Array, pixel_std: float, tags: int) -> _So
         return _Solved(
             None, used, rejected, f"fewer than {FEWEST} corners have a ray to their height ({words})"
         )
-    limit = max(WORST, 8.0 * pixel_std)
     fit = _fit(seen, level, used, pixel_std)
     if fit is not None and fit.missed.max() > limit:
         far = fit.missed > limit
