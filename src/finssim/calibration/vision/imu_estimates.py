@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from finssim.calibration.fit import Estimate
 
-__all__ = ["imu_advice", "imu_estimates"]
+__all__ = ["UNSURE", "imu_advice", "imu_estimates"]
 
 Array = NDArray[np.float64]
 

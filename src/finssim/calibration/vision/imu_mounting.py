@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Estimate
-from finssim.calibration.uncertainty import Evidence, intervals, trial_covariance
-from finssim.calibration.vision.imu_estimates import imu_advice, imu_estimates
+from finssim.calibration.uncertainty import Covariance, Evidence, intervals, trial_covariance
+from finssim.calibration.vision.imu_estimates import UNSURE, imu_advice, imu_estimates
 from finssim.calibration.vision.turns import Attitude, Gyro, TurnPairs, turn_pairs
 from finssim.geometry.rotations import (
     matrix_to_quat,
@@ -180,6 +180,7 @@ def _refined(
     used = 7 if free_offset else 6
     evidence = _evidence(names[:used], J[good][..., :used], residual[good], weight[good] / sigma**2)
     covariance = trial_covariance(evidence)
+    q = _kept_where_untold(q, start, covariance)
     turn = quat_to_rotvec(quat_multiply(q, quat_conjugate(start)))
     theta = np.concatenate([turn, bias, [offset]])[:used]
     estimates = imu_estimates(theta, intervals(theta, covariance))
@@ -198,6 +199,20 @@ def _refined(
         correlation=correlation,
         advice=imu_advice(estimates, float(np.mean(~kept[good]))),
     )
+
+
+def _kept_where_untold(q: Array, start: Array, covariance: Covariance) -> Array:
+    """The mounting, turned back as near to the start as it goes about the axes that the motion does not tell."""
+    ratio = covariance.std[:3] ** 2 / np.maximum(np.diagonal(covariance.local)[:3], 1e-300)
+    if not np.isfinite(covariance.local[:3, :3]).all():
+        return start
+    variances, axes = np.linalg.eigh(covariance.local[:3, :3])
+    for variance, axis in zip(variances, axes.T, strict=True):
+        if 1.96 * math.sqrt(variance * max(1.0, float(axis**2 @ ratio))) > UNSURE:
+            away = quat_multiply(q, quat_conjugate(start))
+            back = -2.0 * math.atan2(float(axis @ away[:3]), float(away[3]))
+            q = quat_multiply(quat_from_rotvec(back * axis), q)
+    return q
 
 
 def _linearised(
