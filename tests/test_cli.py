@@ -35,6 +35,14 @@ COMMANDS = [
     "replay",
     "experiment",
     "experiment replay",
+    "experiment localization",
+    "calibrate camera",
+    "calibrate pool",
+    "calibrate mounts",
+    "localize",
+    "fuse",
+    "project",
+    "backproject",
 ]
 
 

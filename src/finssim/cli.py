@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from finssim import __version__, boundary, cli_calibrate, cli_trials
+from finssim import __version__, boundary, cli_calibrate, cli_localization, cli_trials, cli_vision
 from finssim.cli_options import Device, Hydrodynamics, Json, Seed, Steps, Vehicle
 from finssim.quiet import start_warp
 
@@ -16,7 +16,7 @@ __all__ = ["app", "main"]
 
 app = typer.Typer(
     name="finssim",
-    help="Identify underwater vehicles from logs, simulate them, train controllers, and check all of it.",
+    help="Identify and locate underwater vehicles, simulate them, train controllers, and check all of it.",
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -29,6 +29,14 @@ app.command()(cli_trials.excite)
 app.add_typer(cli_calibrate.calibrate_app, name="calibrate")
 app.command()(cli_calibrate.replay)
 app.add_typer(cli_calibrate.experiment_app, name="experiment")
+cli_calibrate.calibrate_app.command()(cli_vision.camera)
+cli_calibrate.calibrate_app.command()(cli_vision.pool)
+cli_calibrate.calibrate_app.command()(cli_vision.mounts)
+cli_calibrate.experiment_app.command("localization")(cli_vision.experiment_localization)
+app.command()(cli_localization.localize)
+app.command()(cli_localization.fuse)
+app.command()(cli_localization.project)
+app.command()(cli_localization.backproject)
 
 PICTURES = (".png", ".svg", ".pdf")
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-__all__ = ["Device", "Hydrodynamics", "Json", "Seed", "Steps", "Vehicle"]
+__all__ = ["Device", "Hydrodynamics", "Json", "PixelStd", "Pool", "Seed", "Steps", "Vehicle"]
 
 Vehicle = Annotated[
     str, typer.Option(help="Vehicle of the catalogue, or the path of a vehicle file.", metavar="NAME|FILE")
@@ -26,3 +27,7 @@ Steps = Annotated[
 ]
 Device = Annotated[str, typer.Option(help="Where to compute: cpu or cuda.", metavar="DEVICE")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
+Pool = Annotated[
+    Path, typer.Option(help="Pool file: camera, water plane and frames (.yaml).", metavar="FILE")
+]
+PixelStd = Annotated[float, typer.Option(help="Error of a detected corner, per axis [px].")]
