@@ -43,19 +43,22 @@ def render_with_mitsuba(
         scene: Its sensor turns Mitsuba's radiance into numbers.
         time: Middle of the exposure [s].
         seed: Of Mitsuba and of the noise.
-        region: (left, top, right, bottom) in pixels; None for the whole picture, which takes a minute.
+        region: (left, top, right, bottom) in pixels, or several; None for the whole picture, which takes minutes.
         rays: Per pixel of Mitsuba's picture, which has 4 for one of ours.
 
     Raises:
         SensorError: Something in the scene moves.
     """
     sensor, lens = scene.sensor, scene.camera.lens
-    r = Rectangle(*(region or (0, 0, lens.width, lens.height))).clipped(lens.width, lens.height)
-    radiance = wp.array(radiance_by_mitsuba(scene, r, time=time, seed=seed, rays=rays), dtype=wp.vec3)
     image = wp.zeros((lens.height, lens.width, 3 if sensor.colour else 1), dtype=wp.uint8, device="cpu")
     levels = [sensor.gain, sensor.full_well, sensor.read_noise, sensor.gamma, sensor.noise]
-    inputs = [radiance, r.top, r.left, *levels, noise_key(seed, time), image]
-    wp.launch(digitise, dim=radiance.shape, inputs=inputs, device="cpu")
+    whole = (0, 0, lens.width, lens.height)
+    for rectangle in np.atleast_2d(whole if region is None else region).tolist():
+        r = Rectangle(*rectangle).clipped(lens.width, lens.height)
+        radiance = radiance_by_mitsuba(scene, r, time=time, seed=seed, rays=rays)
+        light: wp.array[Any] = wp.array(radiance, dtype=wp.vec3, device="cpu")
+        inputs = [light, r.top, r.left, *levels, noise_key(seed, time), image]
+        wp.launch(digitise, dim=light.shape, inputs=inputs, device="cpu")
     return np.asarray(image.numpy() if sensor.colour else image.numpy()[..., 0])
 
 

@@ -10,6 +10,7 @@ import pytest
 from finssim.geometry.optics import Camera, Interface, Layer, Lens, project
 from finssim.localization.detector import detector
 from finssim.localization.families import bitmap
+from finssim.sensors import SensorError
 from finssim.sensors.overhead_camera import Body, OverheadCamera, Pose, Ripples, Sensor, TagInScene
 
 pytest.importorskip("mitsuba")
@@ -59,7 +60,7 @@ def test_corners_agree_with_mitsuba(pool, water, distortion):
     camera = OverheadCamera(scene)
     (rectangle,) = camera.neighbourhood()
     ours = detected(camera.render(time=0.4), rectangle)
-    referee = detected(render_with_mitsuba(scene, time=0.4, region=rectangle, rays=9), rectangle)
+    referee = detected(render_with_mitsuba(scene, time=0.4, region=[rectangle], rays=9), rectangle)
     assert np.linalg.norm(ours - referee, axis=1).max() < 0.3
     tag = scene.tags[0]
     straight = replace(scene.interface, index_near=1.0, index_far=1.0, window=())
@@ -82,3 +83,16 @@ def test_brightness_agrees_with_mitsuba(pool):
     for share in (0.1, 0.5, 0.9):  # quantiles: edges pixels differ by noise, plains must not
         assert abs(np.quantile(ours, share) - np.quantile(referee, share)) <= 2.0
     assert abs((ours - referee).mean()) < 1.0
+
+
+def test_mitsuba_draws_several_regions_and_nothing_else(pool):
+    """Each rectangle is drawn where it belongs; the rest stays zero, and what moves is refused."""
+    scene = scene_of(pool, WATER["level"])
+    regions = [(900, 500, 904, 503), (10, 20, 13, 26)]
+    image = render_with_mitsuba(scene, region=regions, rays=4)
+    for left, top, right, bottom in regions:
+        assert (image[top:bottom, left:right] > 100).all()
+    assert (image > 0).sum() == 4 * 3 + 3 * 6
+    moving = replace(scene.tags[0], end=Pose(position=(1.0, 0.0, 0.1)))
+    with pytest.raises(SensorError, match="at rest"):
+        render_with_mitsuba(replace(scene, tags=(moving,)), region=regions[0])
