@@ -95,7 +95,9 @@ def _place(
             f"{height.ci95[1]:.3f}): positions at the depths surveyed are right all the same, at other depths they are "
             "not to be trusted"
         )
-    if fit.active[NAMES.index("focal")] and levels < 0.05 * whole and not told:
+    focal = table["focal"]
+    loose = focal.ci95[1] - focal.ci95[0] > 0.02 * focal.estimate
+    if fit.active[NAMES.index("focal")] and loose and levels < 0.05 * whole:
         found.append(
             "the focal length was fitted to points of one depth: it and the camera's height stand for each other; "
             "calibrate the camera by itself (finssim calibrate camera)"

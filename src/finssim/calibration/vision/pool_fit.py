@@ -120,6 +120,11 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
         found, notes = replace(found, surface=True), list(seen.notes)
         fit = _best_lens(here, found, told, notes)
     fit = _released(here, told, fit, notes)
+    if found.surface and fit.model.interface.normal[2] < 0.0:
+        notes.append(
+            "the camera is on the -z side: the survey's z points down (or a flat survey is left-handed, which its "
+            "points cannot tell); heights and --z of other commands are meant in that frame"
+        )
     pinhole = _pinhole(here, found, told, fit)
     normal = UP if found.surface else fit.model.interface.normal
     parts = [held_out(f, here, settings.folds, settings.seed, normal) for f in (fit, pinhole)]

@@ -18,6 +18,10 @@ __all__ = ["HeldOut", "error_vectors", "held_out", "rms"]
 Array = NDArray[np.float64]
 
 
+FEW = 4
+"""Locations below which single rows are held out instead: a target or two have no parts to leave out."""
+
+
 @dataclass(frozen=True)
 class HeldOut:
     """Errors of K rows, each from a fit without its location."""
@@ -59,17 +63,18 @@ def held_out(fit: Refined, seen: Observations, folds: int, seed: int, normal: Ar
         normal: Of the planes, one through each point, on which pixels are back-projected, (3,).
     """
     used = np.flatnonzero(fit.used)
-    names = np.unique(seen.location[used])
+    place = seen.location if len(np.unique(seen.location[used])) >= FEW else np.arange(len(seen))
+    names = np.unique(place[used])
     folds = min(folds, len(names))
     if folds < 2:
         return None
-    part = np.empty(len(seen.locations), int)
+    part = np.empty(int(place.max()) + 1, int)
     part[np.random.default_rng(seed).permutation(names)] = np.arange(len(names)) % folds
     pixels, points, rows = [], [], []
     for k in range(folds):
         inside = np.zeros(len(seen), bool)
-        inside[used] = part[seen.location[used]] != k
-        outside = used[part[seen.location[used]] == k]
+        inside[used] = part[place[used]] != k
+        outside = used[part[place[used]] == k]
         if 2 * inside.sum() < 8 or len(np.unique(seen.points[inside].round(6), axis=0)) < 4:
             return None
         model = refit(fit, seen, inside)

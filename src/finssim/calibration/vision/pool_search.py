@@ -52,7 +52,8 @@ def search(seen: Observations, lens: Lens, settings: Settings) -> Found:
     if mirror_is_better(seen, lens, poses[0].cost):
         raise CalibrationError(
             "the survey's frame is left-handed: its mirror image fits clearly better; negate one axis (usually y or z) "
-            "in the survey and in everything that uses its frame"
+            "in the survey and in everything that uses its frame (or the pixels are mirrored: u and v exchanged, v "
+            "counted upwards)"
         )
     near = [p.model for p in poses[:3] if p.cost < 3.0 * poses[0].cost + 0.5]
     runs: list[tuple[float, PoolModel, bool]] = []

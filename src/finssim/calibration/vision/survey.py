@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.vision.survey_grid import grid_points
 from finssim.calibration.vision.survey_table import Row, Table, read_table
 from finssim.geometry.rotations import quat_from_euler, quat_rotate
 from finssim.localization.tags import corners
@@ -66,7 +67,7 @@ def read_survey(
     gives a row its own standard error, `dry` marks what is above the water, `group` ties points to one target.
 
     Args:
-        path: CSV file.
+        path: CSV file, or YAML of a grid of tags (`survey_grid.grid_points`).
         unit: Of lengths where the file says none.
         edge: Of all tags [m] where the table has no such column.
         z: Height of all points [m] where the table has no such column.
@@ -74,6 +75,10 @@ def read_survey(
     Raises:
         CalibrationError: A column or number is missing, or an id has two positions; names the line.
     """
+    if Path(path).suffix.lower() in (".yaml", ".yml"):
+        tags, sigma = grid_points(path)
+        placed = {tag: Placed(f"tag {tag}", at, sigma, is_tag=True) for tag, at in tags.items()}
+        return Survey(str(path), tags=placed)
     table = read_table(path, unit=unit)
     _need(table, z)
     notes: list[str] = []
