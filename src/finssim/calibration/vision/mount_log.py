@@ -63,6 +63,8 @@ class MountLog:
     """Direction of up in body axes."""
     gyro: Gyro | None
     """In the sensor's own axes."""
+    turning: Stream | None
+    """Angular rate about the vertical, by gyro and `up` [rad/s]."""
     depth: Stream | None
     """[m]"""
     sha256: str
@@ -120,6 +122,7 @@ def read_mount_log(folder: str | Path, pool: Pool, vehicle: Vehicle) -> MountLog
         pictures=pictures,
         up=up,
         gyro=gyro,
+        turning=_turning(up, gyro, vehicle),
         depth=_depth(folder / DEPTH, notes),
         sha256=_digest(folder),
         notes=tuple(notes),
@@ -156,6 +159,19 @@ def _imu(path: Path, vehicle: Vehicle, notes: list[str]) -> tuple[Stream | None,
         return None, gyro
     good = np.isfinite(up).all(axis=1)
     return _stream(table.t[good], up[good]), gyro
+
+
+def _turning(up: Stream | None, gyro: Gyro | None, vehicle: Vehicle) -> Stream | None:
+    if up is None or gyro is None or len(up.t) < 2:
+        return None
+    mount = np.array([0.0, 0.0, 0.0, 1.0])
+    if vehicle.sensors.imu is not None:
+        mount = np.asarray(vehicle.sensors.imu.orientation)
+    within = (gyro.t >= up.t[0]) & (gyro.t <= up.t[-1])
+    t = gyro.t[within]
+    up_s = quat_inverse_rotate(mount, up.values)
+    rate = sum(gyro.rate[within, i] * np.interp(t, up.t, up_s[:, i]) for i in range(3))
+    return Stream(t=t, values=np.asarray(rate)[:, None]) if len(t) > 2 else None
 
 
 def _up(table: StreamTable) -> Array | None:

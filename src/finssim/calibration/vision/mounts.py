@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Estimate, Fit
+from finssim.calibration.vision.imu_clock import imu_clock
 from finssim.calibration.vision.imu_mounting import ImuMounting, fit_imu_mounting
 from finssim.calibration.vision.mount_estimates import (
     distance_std,
@@ -90,7 +91,8 @@ def calibrate_mounts(
         centre=None if centre is None else np.asarray(centre, float),
     )
     clock = _clock(rig, mounts, blind, log)
-    offset = clock.estimate if clock is not None and clock.identifiable else 0.0
+    sure = clock is not None and clock.identifiable and not clock.ci95[0] <= 0.0 <= clock.ci95[1]
+    offset = clock.estimate if clock is not None and sure else 0.0
     found = fit_mounts(rig, mounts, log.moments(offset), estimate=estimate)
     imu = _imu(found, log, vehicle, offset)
     pressure = _pressure(rig, found, mounts) if estimate == "sensors" else None
@@ -110,14 +112,10 @@ def _window(attitude: Attitude) -> float:
 def _clock(rig: Rig, mounts: Mapping[int, Pose], moments: Sequence[Moment], log: MountLog) -> Estimate | None:
     """What is to be added to the IMU's times, by turns that the pixels alone tell: tilts by the IMU agree with its gyro
     whatever its clock does."""
-    if log.gyro is None:
+    if log.turning is None:
         return None
     alone = fit_mounts(rig, mounts, [replace(m, up=None, depth=None) for m in moments], estimate="sensors")
-    attitude = _attitude(alone)
-    try:
-        return fit_imu_mounting(attitude, log.gyro, window=_window(attitude)).estimates["imu.time_offset"]
-    except CalibrationError:
-        return None
+    return imu_clock(_attitude(alone), rig.pool.interface.normal, log.turning.t, log.turning.values[:, 0])
 
 
 def _imu(
