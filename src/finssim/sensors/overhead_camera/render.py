@@ -107,10 +107,8 @@ class OverheadCamera:
         self, tags: Sequence[TagInScene] | None = None, bodies: Sequence[Body] | None = None
     ) -> list[Rectangle]:
         """The rectangles that `region="tags"` draws."""
-        tags, bodies = (
-            self.scene.tags if tags is None else tags,
-            self.scene.bodies if bodies is None else bodies,
-        )
+        tags = self.scene.tags if tags is None else tags
+        bodies = self.scene.bodies if bodies is None else bodies
         return merged(self._rectangles(_moving(tags, bodies)))
 
     def _rectangles(self, things: Sequence[Thing]) -> list[Rectangle]:
