@@ -136,6 +136,13 @@ def with_flips(samples, share, rng):
     ]
 
 
+def shuffled(samples, longest, share, rng):
+    """Every sample up to `longest` seconds late, and some of them twice, in the order of their arrival."""
+    late = [replace(s, arrival=s.time + rng.uniform(0.0, longest)) for s in samples]
+    late += [replace(s, arrival=s.time + longest) for s in late if rng.random() < share]
+    return sorted(late, key=lambda s: s.arrival)
+
+
 def run(estimator, samples, times):
     """Feed samples as they arrive, and ask at the times: estimates."""
     estimates, k = [], 0

@@ -17,6 +17,7 @@ from localization.known_streams import (
     SITE,
     position,
     run,
+    shuffled,
     slope,
     streams,
     with_flips,
@@ -68,20 +69,19 @@ def test_shuffled_delivery_ends_in_the_same_state(mode, seed):
     rng = np.random.default_rng(seed)
     samples = with_flips(with_outliers(streams(6.0, seed=seed), 0.05, rng), 0.05, rng)
     samples = sorted(samples, key=lambda s: s.time)
-    late = [replace(s, arrival=s.time + rng.uniform(0.0, 0.2)) for s in samples]
-    late += [replace(s, arrival=s.time + 0.2) for s in late if rng.random() < 0.1]
-    ordered, shuffled = estimator(mode), estimator(mode)
+    late = shuffled(samples, 0.2, 0.1, rng)
+    ordered, other = estimator(mode), estimator(mode)
     for s in samples:
         ordered.add(s)
-    for s in sorted(late, key=lambda s: s.arrival):
-        shuffled.add(s)
-    a, b = ordered.estimate(6.1), shuffled.estimate(6.1)
+    for s in late:
+        other.add(s)
+    a, b = ordered.estimate(6.1), other.estimate(6.1)
     np.testing.assert_allclose(b.x, a.x, rtol=0, atol=1e-9)
     np.testing.assert_allclose(b.P, a.P, rtol=0, atol=1e-9)
     assert b.yaw == pytest.approx(a.yaw, abs=1e-9)
-    twice = {stream: verdicts.pop("duplicate", 0) for stream, verdicts in shuffled.counts.items()}
+    twice = {stream: verdicts.pop("duplicate", 0) for stream, verdicts in other.counts.items()}
     assert sum(twice.values()) == len(late) - len(samples)
-    for stream, verdicts in shuffled.counts.items():
+    for stream, verdicts in other.counts.items():
         verdicts.pop("duplicate", None)
         assert verdicts == ordered.counts[stream]
 

@@ -4,7 +4,6 @@ import csv
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,9 +24,9 @@ from finssim.localization.pool import load_pool
 from finssim.localization.pose import METHODS
 from finssim.localization.tags import tag_corners_b
 from finssim.vehicles import load_vehicle
+from localization.hinsdale_log import hinsdale, write_table
 from localization.known_streams import SITE, Noise, attitude, position, streams, yaw
 
-HINSDALE = Path(__file__).resolve().parents[1] / "data" / "hinsdale"
 POOL = """
 camera:
   lens: {width: 1280, height: 720, fx: 400, cx: 640, cy: 360}
@@ -37,13 +36,6 @@ camera:
 interface: {height: 1.0}
 """
 FINSROV = load_vehicle("finsrov")
-
-
-def write_table(path, names, rows):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        csv.writer(file).writerows([names, *rows])
-    return path
 
 
 @pytest.fixture
@@ -206,12 +198,13 @@ def write_pictures(folder, items, site):
     return frames
 
 
-def test_detections_become_fixes_with_depth_and_tilt_of_their_exposure(tmp_path, pool):
+@pytest.mark.parametrize("mode", list(MODELS))
+def test_detections_become_fixes_with_depth_and_tilt_of_their_exposure(tmp_path, pool, mode):
     """Corners alone, through refracting water: the path to 2 cm, each fix as uncertain as it says."""
     site, items = load_pool(pool), samples(6.0)
     folder = write_log(tmp_path / "log", items)
     frames = write_pictures(folder, items, site)
-    found = fuse(load_log(folder, FINSROV, latency=site.latency), site, FINSROV, pixel_std=0.2)
+    found = fuse(load_log(folder, FINSROV, latency=site.latency), site, FINSROV, pixel_std=0.2, mode=mode)
     summary = found.summary
     assert summary["accepted"]["vision"] > 0.9 * len(frames)
     assert summary["errors"]["fresh"]["p95_horizontal"] < 0.03
@@ -240,32 +233,6 @@ def test_the_table_of_localize_is_read_with_its_covariances_and_refusals(tmp_pat
     summary = fuse(log, site, FINSROV).summary
     assert sum(summary["refused"]["vision"].values()) >= len(found) - len(located) >= len(found) // 5
     assert summary["errors"]["fresh"]["p95_horizontal"] < 0.03
-
-
-def hinsdale(folder, trial, every=1.0):
-    """Gyro and tilt of a trial as its IMU, mocap as truth, and mocap once in `every` seconds as the camera."""
-    read = {
-        n: np.genfromtxt(HINSDALE / f"{trial}_{n}.csv", delimiter=",", names=True) for n in ("imu", "mocap")
-    }
-    imu, mocap = read["imu"], read["mocap"]
-    q = np.stack([imu[f"{c}_ori"] for c in "xyzw"], -1)
-    roll, pitch, _ = quat_to_euler(q)
-    rates = [imu[f"{c}_angvel"] for c in "xyz"]
-    write_table(
-        folder / "imu.csv",
-        ("t", "p", "q", "r", "roll", "pitch", "arrival"),
-        np.column_stack([imu["time_secs"], *rates, roll, pitch, imu["time_secs"]]).tolist(),
-    )
-    t, heading = mocap["time_secs"], quat_to_euler(np.stack([mocap[f"{c}_ori"] for c in "xyzw"], -1))[2]
-    pose = np.column_stack([t, mocap["x_pose"], mocap["y_pose"], heading])
-    write_table(folder / "truth.csv", ("t", "x", "y", "yaw"), pose.tolist())
-    rows = np.searchsorted(t, np.arange(t[0], t[-1], every)) if every else np.arange(len(t))
-    stds = np.tile([0.01, 0.01, math.radians(0.6)], (len(rows), 1))
-    seen = np.column_stack([pose[rows], stds, t[rows]])
-    write_table(
-        folder / "vision.csv", ("t", "x", "y", "yaw", "std_x", "std_y", "std_yaw", "arrival"), seen.tolist()
-    )
-    return folder, t, heading
 
 
 def still_pool(pool):

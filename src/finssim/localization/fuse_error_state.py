@@ -88,7 +88,13 @@ class ErrorState:
         if track.inertial is None:
             before, outcomes = self._before.imu(track.before, sample)
             track = replace(
-                track, before=before, omega=sample.omega, force=sample.force, imu_time=sample.time
+                track,
+                before=before,
+                omega=sample.omega,
+                force=sample.force,
+                imu_time=sample.time,
+                roll=before.roll,
+                pitch=before.pitch,
             )
             return self._begun(track, sample.time), outcomes
         heard = track.imu_time is not None and sample.time - track.imu_time <= GYRO_HOLD

@@ -107,7 +107,7 @@ class Timeline(Generic[S]):
         return gone, outcomes
 
     def _forget(self) -> None:
-        """Drop what is older than the horizon, all but the newest such sample of each stream for interpolation."""
+        """Drop what is older than the horizon; the state after it stays."""
         k = bisect.bisect_left(self._keys, (self.head - self.horizon, 0))
         if k < 32:  # in batches: a list loses its front at the cost of its length
             return
