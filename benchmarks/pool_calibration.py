@@ -93,7 +93,8 @@ def _tank(
     wall = Interface(np.array([0.0, -1.0, 0.0]), 0.0, index_far=index, window=glass)
     points = rng.uniform((-0.3, 0.03, 0.0), (0.3, 0.35, 0.4), (4000, 3))
     seen = _seen(points[:, None, :], 0.0005, 0.0, rng, camera, wall, case.locations)
-    known = (0.0, -1.0, 0.0, TAPE * rng.standard_normal()) if case.plane else None
+    lean = 1e-3 * rng.standard_normal(2)
+    known = (float(lean[0]), -1.0, float(lean[1]), TAPE * rng.standard_normal()) if case.plane else None
     settings = Settings(
         interface="wall", plane=known, water_height_sigma=TAPE, tilt_sigma=1e-3 if case.plane else None,
         window=glass, survey_sigma=0.0005, fit=FIT,

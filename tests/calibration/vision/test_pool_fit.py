@@ -8,23 +8,17 @@ import pytest
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.vision.pool_fit import calibrate_pool
 from finssim.calibration.vision.pool_settings import Settings
-from finssim.geometry.optics import Interface, Lens, project
+from finssim.geometry.optics import Interface, project
 
 from .surveyed_pools import (
     FISHEYE,
     FLOOR,
-    GLASS,
     PLUMB_BOB,
     RATIONAL,
     SOLID,
-    TANK,
-    before_tank,
-    carried,
-    looking,
     observations,
     overhead,
     survey,
-    wall,
 )
 
 WATER = Interface.water(1.0)
@@ -83,42 +77,6 @@ def test_intervals_hold_the_truth():
     assert inside >= 40
 
 
-@pytest.mark.parametrize("window", [(), GLASS], ids=["bare", "glass"])
-@pytest.mark.parametrize("degrees", [0.0, 20.0, 40.0])
-def test_points_behind_a_wall(degrees, window):
-    """A vertical wall at any angle to the camera, its plane unknown: held-out points to about a millimetre."""
-    camera, plane = before_tank(degrees), wall(window=window)
-    seen = survey(camera, plane, TANK, 60, pixel=0.25, error=0.0005)
-    fit = calibrate_pool(seen, camera.lens, Settings(fit=FIT, window=window, survey_sigma=0.0005))
-    table = fit.estimates
-    assert not fit.surface
-    assert table["camera_distance"].ci95[0] < clearance(camera, plane) < table["camera_distance"].ci95[1]
-    assert tilt_error(fit, plane) < 2.5
-    assert fit.held_out.as_json()["rms_cm"] < 0.12
-    assert fit.held_out.as_json()["rms_cm"] < 0.5 * fit.pinhole_held_out.as_json()["rms_cm"]
-
-
-def test_a_wall_in_the_frame_of_a_target():
-    """Any frame will do: that of a target that lies askew in the water."""
-    camera, plane = before_tank(30.0), wall(window=GLASS)
-    camera, plane, seen = carried(camera, plane, survey(camera, plane, TANK, 60, pixel=0.25, error=0.0005))
-    told = Settings(fit=FIT, window=GLASS, survey_sigma=0.0005, interface="wall")
-    fit = calibrate_pool(seen, camera.lens, told)
-    assert tilt_error(fit, plane) < 2.5
-    assert np.linalg.norm(fit.model.camera.position - camera.position) < 0.03
-
-
-def test_a_surveyed_plane_makes_a_wall_exact():
-    camera, plane = before_tank(20.0), wall(window=GLASS)
-    seen = survey(camera, plane, TANK, 60, pixel=0.25, error=0.0005)
-    told = Settings(
-        fit=FIT, window=GLASS, survey_sigma=0.0005, plane=(0.0, 1.0, 0.0, 0.0), water_height_sigma=0.001
-    )
-    fit = calibrate_pool(seen, camera.lens, told)
-    assert np.linalg.norm(fit.model.camera.position - camera.position) < 0.004
-    assert tilt_error(fit, plane) < 0.5
-
-
 def test_z_down_is_a_frame_like_any_other():
     """x forward, y right, z down: the water lies at negative z."""
     camera, seen = overhead(), survey(overhead(), WATER, FLOOR, 60)
@@ -143,87 +101,6 @@ def test_a_left_handed_floor_contradicts_its_tape():
         calibrate_pool(mirrored, PLUMB_BOB, Settings(fit=FIT, water_height=1.0))
     depth = calibrate_pool(mirrored, PLUMB_BOB, Settings(fit=FIT, water_depth=1.0))
     assert depth.held_out.as_json()["rms_cm"] < 0.5
-
-
-@pytest.mark.parametrize("box", [FLOOR, SOLID], ids=["floor", "solid"])
-def test_wrong_rows_are_named_and_left_out(box):
-    """Two pairs exchanged and one point 20 cm off: those five and no other."""
-    seen = survey(overhead(), WATER, box, 40)
-    points = seen.points.copy()
-    points[[3, 11, 20, 30]] = points[[11, 3, 30, 20]]
-    points[7, 0] += 0.2
-    fit = calibrate_pool(replace(seen, points=points), PLUMB_BOB, Settings(fit=FIT, water_height=1.0))
-    assert set(fit.outliers) == {"p3", "p7", "p11", "p20", "p30"}
-    assert fit.model.camera.position[2] == pytest.approx(2.2, abs=0.01)
-
-
-def test_a_rough_camera_file_is_found_out():
-    """A focal length 3 % off and no distortion: the lens is fitted here, and said to be."""
-    rough = Lens(1280, 720, 557.0, 557.0, 640.0, 360.0, "plumb_bob", ())
-    seen = survey(overhead(), WATER, SOLID, 80)
-    fit = calibrate_pool(seen, rough, Settings(water_height=1.0))
-    assert "focal" in fit.lens_fitted
-    assert any("camera file does not fit" in note for note in fit.notes)
-    assert fit.held_out.as_json()["rms_cm"] < 0.6
-    held = calibrate_pool(seen, rough, Settings(fit=FIT, water_height=1.0))
-    assert held.held_out.as_json()["rms_cm"] > 2.0 * fit.held_out.as_json()["rms_cm"]
-
-
-def test_a_good_camera_file_is_left_alone():
-    seen = survey(overhead(), WATER, FLOOR, 60)
-    assert calibrate_pool(seen, PLUMB_BOB, Settings(water_height=1.0)).lens_fitted == ()
-
-
-def test_points_near_the_axis_tell_no_height():
-    """Seen from above, water only brings the floor nearer: the height is said to be unknown, and the map is right."""
-    seen = survey(overhead(), WATER, ((-0.2, -0.4, 0.0), (0.2, 0.0, 1e-12)), 40)
-    fit = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, interface="surface"))
-    assert not fit.estimates["camera_height"].identifiable
-    assert any("not separable" in sentence and "--water-height" in sentence for sentence in fit.advice)
-    assert fit.held_out.as_json()["rms_cm"] < 0.5
-    low, high = fit.estimates["camera_height"].ci95
-    assert low < 1.2 < high
-
-
-def test_a_sloping_floor_taken_for_level_is_noticed():
-    """The water 1.2 degrees from the survey's level: the level is given up, and that is said."""
-    water = Interface.water(1.0, tilt_x=0.02)
-    camera = looking((-2.5, 0.0, 2.5), (0.0, 0.0, 0.0), PLUMB_BOB, (0.0, 0.0, 1.0))
-    seen = survey(camera, water, ((-2.0, -1.5, 0.0), (2.0, 1.5, 0.5)), 80, error=0.001)
-    told = Settings(fit=FIT, water_height=1.0, water_height_sigma=0.02, survey_sigma=0.001)
-    fit = calibrate_pool(seen, PLUMB_BOB, told)
-    assert any("tilted" in note for note in fit.notes)
-    assert tilt_error(fit, water) < 0.5
-
-
-def test_a_wrong_tape_is_contradicted():
-    seen = survey(overhead(), WATER, SOLID, 80)
-    fit = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, water_height=1.3, water_height_sigma=0.005))
-    assert any("than it was measured" in sentence for sentence in fit.advice)
-
-
-def test_dry_points_help():
-    """Markers above the water fix the camera: the water's height is told half as exactly again as without."""
-    camera = overhead()
-    wet = survey(camera, WATER, FLOOR, 40)
-    points = np.random.default_rng(2).uniform((-0.8, -0.4, 1.02), (0.8, 0.3, 1.3), (12, 3))
-    optical = (points - camera.position) @ camera.R_pc
-    pixels, ok = camera.lens.project(optical)
-    assert ok.all()
-    both = replace(
-        wet,
-        pixels=np.concatenate([wet.pixels, pixels]),
-        points=np.concatenate([wet.points, points]),
-        location=np.arange(52),
-        names=(*wet.names, *(f"d{i}" for i in range(12))),
-        locations=(*wet.locations, *(f"d{i}" for i in range(12))),
-        sigma=np.full(52, np.nan),
-        arm=np.zeros((52, 3)),
-        dry=np.arange(52) >= 40,
-    )
-    told = Settings(fit=FIT, interface="surface")
-    half = [np.ptp(calibrate_pool(s, PLUMB_BOB, told).estimates["water_height"].ci95) for s in (wet, both)]
-    assert half[1] < half[0] / 1.5
 
 
 @pytest.mark.parametrize(
