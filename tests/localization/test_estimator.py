@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 
 from finssim.geometry.rotations import wrap_angle
+from finssim.localization import position_filter
+from finssim.localization.attitude import up_of
 from finssim.localization.errors import LocalizationError
 from finssim.localization.estimator import MODELS, Estimator
+from finssim.localization.fuse_constant_velocity import vision_covariance
 from finssim.localization.fuse_settings import Settings
+from finssim.localization.position_filter import PositionState
 from finssim.localization.streams import DepthSample, ImuSample, VisionSample
 from localization.known_streams import (
     QUIET,
@@ -60,6 +64,56 @@ def test_tilt_is_found_where_the_imu_does_not_tell_it(mode):
     found = run(estimator(mode), streams(15.0, tilt=False), times)
     assert rms(np.array([x.roll for x in found]) - 0.06 * np.sin(1.3 * times)) < math.radians(1.0)
     assert rms(np.array([x.pitch for x in found]) - 0.05 * np.sin(1.1 * times + 0.5)) < math.radians(1.0)
+
+
+def test_the_estimator_is_its_filters():
+    """Position and covariance are those of predict and update by hand, and what holds of the filters holds of it."""
+    e, s = estimator(), Settings()
+    up, state, then = np.array([[*SITE.up, 0.0, 0.0, 0.0]]), None, 0.0
+    samples = sorted(streams(3.0, seed=2), key=lambda s: s.time)
+    for sample in samples:
+        e.add(sample)
+    first = next(x for x in samples if x.stream == "vision")
+    for x in (x for x in samples if x.stream != "imu" and x.time >= first.time):
+        if state is None:  # the first fix, after one depth
+            depth = next(y for y in samples if y.stream == "depth")
+            state = by_hand_start(depth, first, s)
+        else:
+            state = position_filter.predict(state, x.time - then, s.motion)
+            state = by_hand(state, x, s, up)
+        then = x.time
+    found = e.estimate(then)
+    np.testing.assert_allclose(found.x, state.x, atol=1e-10)
+    np.testing.assert_allclose(found.P, state.P, atol=1e-12)
+
+
+def tilt_before(time):
+    """Roll and pitch of the IMU's sample before a time."""
+    t = np.floor(time * 100.0 + 1e-6) / 100.0
+    return 0.06 * np.sin(1.3 * t), 0.05 * np.sin(1.1 * t + 0.5)
+
+
+def height_of(sample):
+    """Height of the body that a depth tells."""
+    return -sample.depth - SITE.offset - float(up_of(*tilt_before(sample.time)) @ np.array(SITE.depth_port))
+
+
+def by_hand_start(depth, fix, s):
+    """The state after one depth and the first fix."""
+    P = np.diag([0.0, 0.0, s.depth_std**2] + [s.speed_std**2] * 3)
+    state = PositionState(np.array([0.0, 0.0, height_of(depth), 0.0, 0.0, 0.0]), P)
+    state = position_filter.predict(state, fix.time - depth.time, s.motion)
+    R = vision_covariance(fix, s)[:2, :2]
+    return position_filter.restarted(state, [0, 1], np.array(fix.position), R, s.speed_std)
+
+
+def by_hand(state, sample, s, up):
+    """The state after a depth or a fix."""
+    if sample.stream == "depth":
+        H, z, R = up, np.array([height_of(sample)]), np.array([[s.depth_std**2]])
+    else:
+        H, z, R = np.eye(6)[:2], np.array(sample.position), vision_covariance(sample, s)[:2, :2]
+    return position_filter.correct(state, position_filter.innovation(state, H, z, R), H, R)
 
 
 @both
@@ -387,6 +441,18 @@ def test_acceleration_helps_where_the_camera_is_silent():
     times = np.concatenate([np.arange(s, s + 1.5, 1 / 60) for s in (5.0, 10.0, 15.0)])
     found = {mode: rms(errors(run(estimator(mode), samples, times), times)[:, :2]).max() for mode in MODELS}
     assert found["error-state"] < 0.5 * found["constant-velocity"]
+
+
+@both
+def test_times_since_1970_are_as_good(mode):
+    """Stamps of 1.7e9 s, which a double resolves to 0.2 microseconds, change nothing that matters."""
+    e, other = estimator(mode), estimator(mode)
+    for s in streams(4.0, seed=3):
+        e.add(s)
+        other.add(replace(s, time=s.time + 1.7e9, arrival=s.arrival + 1.7e9))
+    a, b = e.estimate(4.0), other.estimate(4.0 + 1.7e9)
+    np.testing.assert_allclose(b.x, a.x, atol=1e-5)
+    assert e.counts == other.counts
 
 
 def test_an_unknown_mode_is_refused_with_the_names():

@@ -24,10 +24,11 @@ from finssim.localization.fuse_constant_velocity import (
     motion_of,
     vision_covariance,
 )
-from finssim.localization.fuse_settings import Settings, Site, turn_to_pool
+from finssim.localization.fuse_settings import Settings, Site
 from finssim.localization.fuse_turns import matrix_of
 from finssim.localization.gate import GateMemory, judge
 from finssim.localization.health import Estimate, Outcome
+from finssim.localization.measurement import axes_of_up
 from finssim.localization.streams import DepthSample, ImuSample, VisionSample
 
 __all__ = ["ErrorState", "InertialTrack"]
@@ -185,7 +186,7 @@ class ErrorState:
             return track
         known = self._before.estimate(before, time)
         level = quat_from_euler(known.roll, known.pitch, known.yaw)
-        from_level = turn_to_pool(self.site)
+        from_level = axes_of_up(self.site.up)
         R = from_level @ matrix_of(level)
         q = quat_multiply(matrix_to_quat(from_level), level)
         covariance = np.zeros((15, 15))

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.rotations import quat_to_matrix
 from finssim.localization.errors import LocalizationError
 from finssim.localization.gate import Gate
 from finssim.localization.pool import Pool
@@ -171,13 +170,6 @@ def settings_of(vehicle: Vehicle, profile: str = "default") -> Settings:
     if depth is not None:
         settings = replace(settings, depth_std=max(depth.noise_std, settings.depth_std))
     return settings
-
-
-def turn_to_pool(site: Site) -> Array:
-    """Axes with z along the site's up, nearly the pool's, to pool axes, (3, 3): the smallest turn of z to up."""
-    x, y, z = site.up
-    axis = np.array([-y, x, 0.0])
-    return quat_to_matrix(np.append(axis, 1.0 + z) / math.sqrt(2.0 * (1.0 + z)))
 
 
 def _three(values: npt.ArrayLike) -> tuple[float, float, float]:
