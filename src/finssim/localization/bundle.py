@@ -15,7 +15,7 @@ from finssim.localization.measurement import Constraints, Measurement, axes_of_u
 from finssim.localization.pinhole import pinhole_poses
 from finssim.localization.planar_fit import WORST
 from finssim.localization.pool import Pool
-from finssim.localization.pose_choice import choose, measured, minima_from
+from finssim.localization.pose_choice import Choice, choose, measured, minima_from
 from finssim.localization.pose_refinement import RefinedPose, See
 from finssim.localization.pose_start import mirrored
 
@@ -25,6 +25,8 @@ Array = npt.NDArray[np.float64]
 
 SURE = 9.0
 """A second attitude counts as excluded when its chi² is larger by this."""
+NEAR = math.radians(30.0)
+"""Two attitudes within this angle are one measurement, whose covariance spans both."""
 
 
 def refractive_bundle(
@@ -38,7 +40,7 @@ def refractive_bundle(
 
     Starts are the poses that a pinhole camera would see, moved to their true depth, the same mirrored at the line of
     sight, and upright; the minima that they lead to are compared. A picture that two attitudes explain equally well is
-    refused as ambiguous, unless the roll and pitch of `constraints` decide.
+    refused as ambiguous, unless they are near to each other, or the roll and pitch of `constraints` decide.
 
     Args:
         detections: Tags of one picture.
@@ -54,25 +56,26 @@ def refractive_bundle(
     minima = minima_from(_through_water(pool), pairs, _starts(pairs, pool, pixel_std), 2.5 * pixel_std)
     if not minima:
         return refused(method, "the corners show no pose in the water", pairs.rejected, tags=pairs.tags)
-    best, gap = choose(minima, constraints, pixel_std)
-    reason = _doubt(best, gap, minima, pixel_std)
+    choice = choose(minima, constraints, pixel_std)
+    reason = _doubt(choice, pixel_std)
     if reason:
         return refused(method, reason, pairs.rejected, tags=pairs.tags)
-    return measured(method, best, pairs, pixel_std)
+    return measured(method, choice, pairs, pixel_std)
 
 
-def _doubt(best: RefinedPose, gap: float, minima: list[RefinedPose], pixel_std: float) -> str:
+def _doubt(choice: Choice, pixel_std: float) -> str:
     """Why the best pose is not to be believed; empty where it is."""
+    best, second = choice.best, choice.second
     if not best.converged:
         return f"did not converge in {best.iterations} steps"
     limit = max(WORST, 8.0 * pixel_std)
     far, count = int((best.missed > limit).sum()), len(best.missed)
     if 4 * far > count:
         return f"residual too large: {far} of {count} corners miss by more than {limit:.1f} px"
-    if gap < SURE:
-        first, second = (math.degrees(math.acos(min(1.0, abs(pose.rotation[2, 2])))) for pose in minima[:2])
+    if second is not None and choice.gap < SURE and choice.turned > NEAR:
+        one, other = (math.degrees(math.acos(min(1.0, abs(a.rotation[2, 2])))) for a in (best, second))
         return (
-            f"ambiguous: attitudes tilted by {first:.0f} and {second:.0f} degrees explain the corners equally well: "
+            f"ambiguous: attitudes tilted by {one:.0f} and {other:.0f} degrees explain the corners equally well: "
             "give roll and pitch, or a depth for the refractive method"
         )
     return ""

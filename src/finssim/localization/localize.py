@@ -20,10 +20,10 @@ from finssim.localization.localize_known import known_of
 from finssim.localization.localize_output import Row, summary_lines, summary_of, write_rows
 from finssim.localization.localize_truth import load_truth
 from finssim.localization.locator import Locator
-from finssim.localization.pool import load_pool
+from finssim.localization.pool import Pool, load_pool
 from finssim.localization.pose import NEEDS_DEPTH
 from finssim.provenance import provenance
-from finssim.vehicles import load_vehicle
+from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["Run", "run"]
 
@@ -109,25 +109,21 @@ def run(
     frames, count = frames_of(paths, site.camera.lens, seeing, notes)
     found = _measure(frames, count, locator)
     write_rows(found.rows, out)
-    found.summary = {"method": method, **summary_of(found.rows)}
-    if surveyed is not None:
-        found.summary["truth"] = surveyed.figures(found.rows, site.latency)
-    found.summary["assumed"] = list(known.assumed) if method in NEEDS_DEPTH else []
+    found.summary = {
+        "method": method,
+        **summary_of(found.rows),
+        **({} if surveyed is None else {"truth": surveyed.figures(found.rows, site.latency)}),
+        "assumed": list(known.assumed) if method in NEEDS_DEPTH else [],
+        "notes": notes,
+        "out": str(out),
+        "interrupted": found.interrupted,
+    }
     if as_json:
-        given = {"depth": None if depth is None else str(depth), "imu": None if imu is None else str(imu)}
-        document = {
-            **found.summary,
-            "out": str(out),
-            "interrupted": found.interrupted,
-            "notes": notes,
-            "pool": {"file": str(pool), "sha256": site.sha256},
-            "vehicle": {"name": body.name, "sha256": body.sha256},
-            "settings": {**given, "pixel_std": pixel_std, **known.settings},
-            "provenance": provenance(),
-        }
-        print(json.dumps(document, allow_nan=False))
+        sources = {"depth": None if depth is None else str(depth), "imu": None if imu is None else str(imu)}
+        settings = {**sources, "pixel_std": pixel_std, **known.settings}
+        print(json.dumps(_document(found.summary, site, str(pool), body, settings), allow_nan=False))
     else:
-        _print(found, notes, out)
+        _print(found.summary)
     if found.interrupted:
         raise KeyboardInterrupt
     return found
@@ -155,10 +151,23 @@ def _measure(frames: Iterator[Frame], count: int | None, locator: Locator) -> Ru
     return found
 
 
-def _print(found: Run, notes: list[str], out: Path) -> None:
+def _document(
+    summary: dict[str, Any], pool: Pool, file: str, vehicle: Vehicle, settings: dict[str, Any]
+) -> dict[str, Any]:
+    """The summary with what it rests on."""
+    return {
+        **summary,
+        "pool": {"file": file, "sha256": pool.sha256},
+        "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
+        "settings": settings,
+        "provenance": provenance(),
+    }
+
+
+def _print(summary: dict[str, Any]) -> None:
     console = Console() if sys.stdout.isatty() else Console(width=120)
-    lines = [f"note: {note}" for note in notes]
-    lines += [f"assumed: {sentence}" for sentence in found.summary["assumed"]]
-    lines += [*summary_lines(found.summary), f"written: {out}"]
+    lines = [f"note: {note}" for note in summary["notes"]]
+    lines += [f"assumed: {sentence}" for sentence in summary["assumed"]]
+    lines += [*summary_lines(summary), f"written: {summary['out']}"]
     for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)

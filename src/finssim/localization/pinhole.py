@@ -48,7 +48,7 @@ def pinhole(
     minima = pinhole_poses(pairs, pool.camera, pixel_std)
     if not minima:
         return refused(method, "the corners show no pose", pairs.rejected, tags=pairs.tags)
-    return measured(method, choose(minima, constraints, pixel_std)[0], pairs, pixel_std)
+    return measured(method, choose(minima, constraints, pixel_std), pairs, pixel_std)
 
 
 def pinhole_depth(

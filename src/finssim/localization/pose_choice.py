@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from finssim.geometry.rotations import matrix_to_quat, quat_to_rotvec
 from finssim.localization.correspondences import Correspondences
 from finssim.localization.measurement import Constraints, Measurement, axes_of_up, tilt_matrix
 from finssim.localization.pose_refinement import RefinedPose, See, refine_pose
 
-__all__ = ["choose", "measured", "minima_from"]
+__all__ = ["Choice", "choose", "measured", "minima_from"]
 
 Array = npt.NDArray[np.float64]
 
@@ -41,10 +44,37 @@ def minima_from(
     return _distinct(refine_pose(see, points, pixels, a.position, a.rotation, huber) for a in begun[:4])
 
 
-def choose(
-    minima: list[RefinedPose], constraints: Constraints | None, pixel_std: float
-) -> tuple[RefinedPose, float]:
-    """The best of the minima, and by how much chi² the next one is worse (infinite where there is none).
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The best of several minima."""
+
+    best: RefinedPose
+    second: RefinedPose | None
+    gap: float
+    """By how much chi² the second is worse; infinite where there is none."""
+
+    @property
+    def turned(self) -> float:
+        """Angle between the two attitudes [rad]."""
+        return 0.0 if self.second is None else _angle(self.best.rotation, self.second.rotation)
+
+    def covariance(self, pixel_std: float) -> Array:
+        """Of position and a turn about pool axes, (6, 6): that of the best, and the chance that it is the second.
+
+        P = w1 P1 + w2 (P2 + d d'), w2/w1 = exp(-gap/2), with d from the best to the second.
+        """
+        P = self.best.covariance(pixel_std)
+        if self.second is None or self.gap > 50.0:
+            return P
+        share = 1.0 / (1.0 + math.exp(0.5 * self.gap))
+        turn = quat_to_rotvec(matrix_to_quat(self.second.rotation @ self.best.rotation.T))
+        d = np.concatenate([self.second.position - self.best.position, turn])
+        other = self.second.covariance(pixel_std) + np.outer(d, d)
+        return np.asarray((1.0 - share) * P + share * other)
+
+
+def choose(minima: list[RefinedPose], constraints: Constraints | None, pixel_std: float) -> Choice:
+    """The best of the minima and the next one.
 
     Args:
         minima: Not empty.
@@ -59,13 +89,15 @@ def choose(
             chi2 += float(_lean(pose, constraints) ** 2) / max(constraints.tilt_std, np.radians(3.0)) ** 2
         scored.append(chi2)
     order = np.argsort(scored, kind="stable")
-    gap = float(scored[order[1]] - scored[order[0]]) if len(minima) > 1 else np.inf
-    return minima[int(order[0])], gap
+    if len(minima) == 1:
+        return Choice(minima[0], None, math.inf)
+    first, second = int(order[0]), int(order[1])
+    return Choice(minima[first], minima[second], float(scored[second] - scored[first]))
 
 
-def measured(method: str, pose: RefinedPose, pairs: Correspondences, pixel_std: float) -> Measurement:
-    """The measurement that a pose is."""
-    whole = pose.covariance(pixel_std)
+def measured(method: str, choice: Choice, pairs: Correspondences, pixel_std: float) -> Measurement:
+    """The measurement that the best pose is."""
+    pose, whole = choice.best, choice.covariance(pixel_std)
     rows = np.zeros((3, 6))
     rows[0, 0] = rows[1, 1] = 1.0
     rows[2, 3:] = pose.yaw_by_turn
@@ -95,5 +127,10 @@ def _lean(pose: RefinedPose, constraints: Constraints) -> float:
 
 
 def _apart(a: RefinedPose, b: RefinedPose) -> bool:
-    turned = float(np.arccos(np.clip(0.5 * (np.trace(a.rotation.T @ b.rotation) - 1.0), -1.0, 1.0)))
-    return turned > 0.01 or float(np.linalg.norm(a.position - b.position)) > 0.005
+    far = float(np.linalg.norm(a.position - b.position)) > 0.005
+    return far or _angle(a.rotation, b.rotation) > 0.01
+
+
+def _angle(a: Array, b: Array) -> float:
+    """Angle between two attitudes [rad]."""
+    return float(np.arccos(np.clip(0.5 * (np.trace(a.T @ b) - 1.0), -1.0, 1.0)))

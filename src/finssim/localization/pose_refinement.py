@@ -19,7 +19,9 @@ See = Callable[[Array], tuple[Array, Array, npt.NDArray[np.bool_]]]
 """Points, pool frame (n, 3) -> pixels (n, 2), derivatives by the point (n, 2, 3), and which are seen (n,)."""
 
 _STILL = 1e-10
-"""A step that changes the misses by less than the root of this [px²] is the last."""
+"""A step that lowers the cost by less than this [px²] is the last,"""
+_STILL_SHARE = 1e-6
+"""or by less than this share of it: a thousandth of the misses, and of a standard deviation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +75,8 @@ def refine_pose(
 ) -> RefinedPose | None:
     """Levenberg and Marquardt's method on the reprojection error, with analytic Jacobians and Huber's rho.
 
+    The damping follows Nielsen (1999), "Damping parameter in Marquardt's method".
+
     Args:
         see: Where points appear.
         points_b: Body frame [m], (n, 3).
@@ -88,19 +92,22 @@ def refine_pose(
     now = _evaluate(see, points_b, pixels, position, rotation, huber)
     if now is None:
         return None
-    damping, converged, steps = 1e-3, False, 0
+    damping, growth, converged, steps = 1e-3, 2.0, False, 0
     while steps < most_steps and not converged and damping < 1e12:
         steps += 1
-        scale = np.maximum(np.diagonal(now.H), 1e-12)
-        step = np.linalg.solve(now.H + damping * np.diag(scale), -now.g)
-        converged = bool(-(step @ now.g) < _STILL)
+        D = damping * np.maximum(np.diagonal(now.H), 1e-12)
+        step = np.linalg.solve(now.H + np.diag(D), -now.g)
+        promised = float(-(step @ now.g) + step @ (D * step))
+        converged = promised < max(_STILL, _STILL_SHARE * now.cost)
         turn = quat_to_matrix(quat_from_rotvec(step[3:]))
         then = _evaluate(see, points_b, pixels, position + step[:3], turn @ rotation, huber)
-        if then is not None and then.cost <= now.cost * (1.0 + 1e-15):
+        gain = -1.0 if then is None else (now.cost - then.cost) / max(promised, 1e-300)
+        if then is not None and gain >= 0.0:
             position, rotation, now = position + step[:3], turn @ rotation, then
-            damping = max(0.1 * damping, 1e-12)
+            # Nielsen's rule: the damping stays where steps keep half of what they promise, in flat valleys.
+            damping, growth = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-12), 2.0
         else:
-            damping *= 10.0
+            damping, growth = damping * growth, 2.0 * growth
     return RefinedPose(position, rotation, now.cost, now.missed, now.H, steps, converged)
 
 
