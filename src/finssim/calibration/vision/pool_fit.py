@@ -25,13 +25,13 @@ __all__ = ["PoolFit", "calibrate_pool"]
 
 Array = NDArray[np.float64]
 
-DOUBT = 13.8
-"""Fall of chi² that letting a right prior go reaches less than once in a thousand surveys (two degrees of freedom)."""
+DOUBT = 20.0
+"""Fall of chi² above which a prior counts as contradicted: by chance once in 20000 surveys, more in very poor ones."""
 
 LEVEL = np.radians(3.0)
 """A plane of any direction that is found this near to level is a water surface [rad]."""
 
-MOST_LEAN = np.radians(8.0)
+MOST_LEAN = np.radians(5.0)
 """A surface tilted further from the survey's z than this is none [rad]."""
 
 LENS_STEPS = ((), ("focal", "center"), ("focal", "center", "distortion"))
