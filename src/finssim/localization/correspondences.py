@@ -85,7 +85,7 @@ def _clockwise(corners: Array) -> bool:
     if np.shape(corners) != (4, 2):
         return False
     (a, b), (c, d), (e, f), (g, h) = np.asarray(corners, float).tolist()
-    return (
+    return bool(
         (c - a) * (f - d) - (d - b) * (e - c) > SMALLEST
         and (e - c) * (h - f) - (f - d) * (g - e) > SMALLEST
         and (g - e) * (b - h) - (h - f) * (a - g) > SMALLEST
