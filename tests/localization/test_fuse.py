@@ -22,6 +22,7 @@ from finssim.localization.localize_output import write_rows as write_localized
 from finssim.localization.measurement import Constraints
 from finssim.localization.pool import load_pool
 from finssim.localization.pose import METHODS
+from finssim.localization.streams import refusal
 from finssim.localization.tags import tag_corners_b
 from finssim.vehicles import load_vehicle
 from localization.hinsdale_log import hinsdale, write_table
@@ -331,6 +332,7 @@ def test_logs_that_cannot_be_used_are_refused_in_a_sentence(tmp_path, pool, writ
         ({"rate": 0.0}, "rate is 0 Hz"),
         ({"mode": "ekf"}, "available: constant-velocity, error-state"),
         ({"profile": "best"}, "available: default, published"),
+        ({"method": "best"}, "available: refractive"),
         ({"imu_axes": "mine"}, "available: body, sensor"),
     ],
 )
@@ -339,6 +341,29 @@ def test_wrong_words_are_refused(tmp_path, pool, options, sentence):
     log = write_log(tmp_path / "log", samples(0.5))
     with pytest.raises(LocalizationError, match=sentence):
         run(log, pool=pool, vehicle="finsrov", out=tmp_path / "out.csv", **options)
+
+
+def test_a_log_of_the_camera_alone_gives_place_and_heading(tmp_path, pool):
+    """Without IMU and depth nothing is refused, what is missing is said, and the state is never ready."""
+    folder = write_log(tmp_path / "log", samples(4.0))
+    (folder / "imu.csv").unlink()
+    (folder / "depth.csv").unlink()
+    site = load_pool(pool)
+    log = load_log(folder, FINSROV, latency=site.latency)
+    assert [note.split(":")[0] for note in log.notes] == ["no IMU samples", "no depth samples"]
+    summary = fuse(log, site, FINSROV).summary
+    assert summary["errors"]["fresh"]["p95_horizontal"] < 0.04
+    assert summary["errors"]["fresh"]["rms_yaw"] < math.radians(2.0)
+    assert summary["ready"] == 0.0
+
+
+@pytest.mark.parametrize("std", [0.0, -0.01])
+def test_a_fix_that_is_exact_or_better_is_refused(tmp_path, std):
+    """A deviation of zero or below is no deviation."""
+    names = ("t", "x", "y", "yaw", "std_x", "std_y", "std_yaw")
+    path = write_table(tmp_path / "log" / "vision.csv", names, [(0, 1, 1, 0, std, 0.1, 0.1)])
+    (fix,) = load_log(path.parent, FINSROV).samples
+    assert refusal(fix) == "covariance not positive"
 
 
 def test_acceleration_without_gravity_is_no_specific_force(tmp_path, pool):

@@ -15,7 +15,7 @@ from finssim.files import atomic_write, refuse_unwritable
 from finssim.localization.detections import Frame
 from finssim.localization.errors import LocalizationError
 from finssim.localization.estimator import Estimator
-from finssim.localization.fuse_detections import Fixes
+from finssim.localization.fuse_detections import Fixes, check_method
 from finssim.localization.fuse_log import Log, NoFix, load_log
 from finssim.localization.fuse_output import row_of, summary_lines, summary_of, write_rows
 from finssim.localization.fuse_settings import settings_of, site_of
@@ -114,6 +114,7 @@ def fuse(
     """
     if not 0.0 < rate <= FASTEST:
         raise LocalizationError(f"rate is {rate:g} Hz, expected above 0 and up to {FASTEST:g}")
+    check_method(method)
     estimator = Estimator(settings_of(vehicle, profile), site_of(pool, vehicle), mode=mode)
     if mode == "error-state" and not any(getattr(s, "force", None) for s in log.samples):
         raise LocalizationError(

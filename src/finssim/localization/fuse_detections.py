@@ -18,7 +18,17 @@ from finssim.localization.streams import VisionSample
 from finssim.localization.tags import tag_corners_b
 from finssim.vehicles import Vehicle
 
-__all__ = ["Fixes"]
+__all__ = ["Fixes", "check_method"]
+
+
+def check_method(method: str) -> None:
+    """Refuse a word that is no name of `METHODS`.
+
+    Raises:
+        LocalizationError: It is none; the sentence lists them.
+    """
+    if method not in METHODS:
+        raise LocalizationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
 
 
 class Fixes:
@@ -37,8 +47,7 @@ class Fixes:
         Raises:
             LocalizationError: Unknown method, or a vehicle without tags.
         """
-        if method not in METHODS:
-            raise LocalizationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
+        check_method(method)
         if vehicle.tags is None:
             raise LocalizationError(
                 "the vehicle file has no tags: add a section tags: with family, edge and mounts"

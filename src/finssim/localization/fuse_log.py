@@ -91,6 +91,8 @@ def load_log(path: str | Path, vehicle: Vehicle, *, latency: float = 0.0, imu_ax
             raise LocalizationError(f"{table.name}: expected the columns {_EXPECTED[name]}")
         log.samples += readers[name](table, vehicle, log, latency=latency, imu_axes=imu_axes)
     log.notes += list(dict.fromkeys(note for table in tables.values() for note in table.notes))
+    here = {sample.stream for sample in log.samples} | ({"vision"} if log.frames else set())
+    log.notes += [note for stream, note in _MISSING.items() if stream not in here]
     log.samples.sort(key=lambda sample: sample.arrival if sample.arrival is not None else sample.time)
     return log
 
@@ -100,6 +102,13 @@ _EXPECTED = {
     "imu": "t, p, q, r (body axes) or gyro_x, gyro_y, gyro_z (the sensor's)",
     "depth": "t, depth",
     "vision": "t or time, x, y and yaw",
+}
+
+
+_MISSING = {
+    "imu": "no IMU samples: the heading is the camera's alone, the vehicle counts as level, and is never ready",
+    "depth": "no depth samples: height stays unknown, and the vehicle is never ready",
+    "vision": "no fixes and no detections: place and heading stay unknown",
 }
 
 
@@ -205,13 +214,12 @@ def _vision(
 
 def _covariance(table: StreamTable) -> Array:
     """Covariance of x, y and yaw in each row, (n, 3, 3); NaN where the row has none."""
-    R = np.full((len(table.t), 3, 3), np.nan)
     if not table.has("std_x", "std_y"):
-        return R
+        return np.full((len(table.t), 3, 3), np.nan)
     none = np.full(len(table.t), math.radians(180.0))  # a fix without yaw does not use its variance
     std_yaw = _angle(table, "std_yaw")
     std = np.column_stack([table.columns("std_x", "std_y"), np.where(np.isnan(std_yaw), none, std_yaw)])
-    R = std[:, :, None] ** 2 * np.eye(3)
+    R: Array = (std * np.abs(std))[:, :, None] * np.eye(3)  # a negative deviation stays no covariance
     for i, j, name in ((0, 1, "cov_xy"), (0, 2, "cov_xyaw"), (1, 2, "cov_yyaw")):
         if table.has(name):
             R[:, i, j] = R[:, j, i] = table.numbers[name]
