@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from calibration.vision.moving_vehicle import motion
 
+from calibration.vision.moving_vehicle import motion
 from finssim.calibration.vision.imu_clock import imu_clock
 from finssim.calibration.vision.turns import Attitude
 from finssim.geometry.rotations import quat_conjugate, quat_from_rotvec, quat_multiply, quat_to_rotvec

@@ -33,6 +33,7 @@ QUALITY = {
     "r2": "R²",
     "nrmse": "NRMSE",
     "rmse": "RMSE",
+    "rmse_held_out": "held out",
     "trials": "trials",
     "samples": "samples",
     "rejected": "rejected",

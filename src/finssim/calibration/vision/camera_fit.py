@@ -216,7 +216,7 @@ def _held_out(views: Sequence[BoardView], bundle: Bundle, seed: int) -> float:
     for k in range(folds):
         rest = [i for i in range(len(views)) if fold[i] != k]
         lens = adjust([views[i] for i in rest], bundle.lens, [bundle.poses[i] for i in rest]).lens
-        for i in np.flatnonzero(fold == k):
+        for i in np.flatnonzero(fold == k).tolist():
             pose = board_pose(lens, views[i].points, views[i].pixels, bundle.poses[i])
             if pose is not None:
                 residual, _ = pose_residuals(lens, pose, views[i].points, views[i].pixels)

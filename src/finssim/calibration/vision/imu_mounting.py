@@ -146,7 +146,9 @@ def _time_offset(pairs: TurnPairs, gyro: Gyro) -> tuple[float, float]:
         if len(body) < FEWEST:
             continue
         seen, felt = np.linalg.norm(body, axis=1), np.linalg.norm(sensor, axis=1)
-        together = float(np.corrcoef(np.minimum(seen, 1.5 * felt.max()), felt)[0, 1])  # flips must not decide
+        with np.errstate(invalid="ignore"):  # a gyro that stands still correlates with nothing
+            capped = np.minimum(seen, 1.5 * felt.max())  # flips must not decide
+            together = float(np.corrcoef(capped, felt)[0, 1])
         if together > highest:
             best, highest = float(offset), together
     if highest < LEAST_CORRELATION:

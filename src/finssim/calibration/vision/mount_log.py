@@ -151,8 +151,8 @@ def _imu(path: Path, vehicle: Vehicle, notes: list[str]) -> tuple[Stream | None,
     if up is not None:
         up = in_body_axes(up, mount) if own else up
     elif rate is not None and force is not None:
-        turned = (in_body_axes(x, mount) if own else x for x in (rate, force))
-        up = _tilt(table.t, *turned, vehicle.water.gravity)
+        omega, felt = (in_body_axes(x, mount) if own else x for x in (rate, force))
+        up = _tilt(table.t, omega, felt, vehicle.water.gravity)
         notes.append(f"{IMU} holds no attitude: roll and pitch are made from gyro and accelerometer")
     else:
         notes.append(f"{IMU} holds neither an attitude nor rates with accelerations: no tilt is known")

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.fit import Estimate, Fit
+from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.vision.imu_clock import imu_clock
-from finssim.calibration.vision.imu_mounting import ImuMounting, fit_imu_mounting
+from finssim.calibration.vision.imu_mounting import ImuMounting, fit_imu_mounting, turn_residual
 from finssim.calibration.vision.mount_estimates import (
     distance_std,
     imu_orientation,
@@ -22,7 +22,7 @@ from finssim.calibration.vision.mount_estimates import (
     tag_estimates,
 )
 from finssim.calibration.vision.mount_log import MountLog
-from finssim.calibration.vision.mount_model import Moment, Pose, Rig
+from finssim.calibration.vision.mount_model import Moment, Noise, Pose, Rig, residuals
 from finssim.calibration.vision.pressure_offset import DepthFit, fit_depth
 from finssim.calibration.vision.tag_mounts import MountFit, fit_mounts, reference_tag
 from finssim.calibration.vision.turns import Attitude
@@ -131,6 +131,57 @@ def _imu(
         return error
 
 
+def _turns_held_out(found: MountFit, log: MountLog, imu: ImuMounting) -> float:
+    """Disagreement of the second half's turns with the mounting of the first, robust rms [rad]; NaN if it is short."""
+    whole = _attitude(found)
+    half, window = len(whole.t) // 2, _window(whole)
+    first = Attitude(t=whole.t[:half], quaternion=whole.quaternion[:half])
+    second = Attitude(t=whole.t[half:], quaternion=whole.quaternion[half:])
+    try:
+        fit = fit_imu_mounting(
+            first,
+            log.gyro,
+            start=imu.orientation,
+            window=window,
+            time_offset=imu.time_offset,  # type: ignore[arg-type]
+        )
+    except CalibrationError:
+        return math.nan
+    return turn_residual(fit, second, log.gyro, window=window)  # type: ignore[arg-type]
+
+
+def _curves(found: MountFit) -> tuple[Curve, ...]:
+    """For the report: first corners, tilt and depth as measured and as the fit has them, over time."""
+    rig, state, moments = found.rig, found.state, found.moments
+    t = np.array([moment.time for moment in moments])
+    poses, n, b = state.poses, rig.pool.interface.normal, rig.pool.interface.offset
+    pixels, owner, _ = residuals(rig, state, moments, Noise())
+    tags = np.array([tag for moment in moments for tag in moment.corners])
+    seen = np.array([corner for moment in moments for corner in moment.corners.values()])
+    curves = []
+    for tag in np.unique(tags):
+        of = tags == tag
+        for i, axis in enumerate("uv"):
+            measured = seen[of, 0, i]
+            title = f"tag {tag}, top-left corner"
+            fitted = measured - pixels[of, 0, i]
+            curves.append(_curve(title, f"{axis} [px]", t[owner[of]], measured, fitted))
+    felt = np.array([np.full(3, math.nan) if m.up is None else state.imu_turn @ m.up for m in moments])
+    up = np.array([pose.R.T @ n for pose in poses])
+    for i, axis in enumerate("xy"):
+        if np.isfinite(felt[:, i]).any():
+            curves.append(_curve("tilt by the IMU", f"up along body {axis} [-]", t, felt[:, i], up[:, i]))
+    depth = np.array([math.nan if m.depth is None else m.depth for m in moments])
+    if np.isfinite(depth).any():
+        known = np.array([-(n @ pose.at(rig.port) + b) + state.depth_offset for pose in poses])
+        curves.append(_curve("pressure port", "depth [m]", t, depth, known))
+    return tuple(curves)
+
+
+def _curve(title: str, label: str, t: Array, measured: Array, fitted: Array) -> Curve:
+    return Curve(title=title, x_label="time [s]", y_label=label, x=t, measured=measured, fitted=fitted)
+
+
 def _pressure(rig: Rig, found: MountFit, mounts: Mapping[int, Pose]) -> DepthFit | None:
     """Depths by the pixels alone, with the mounts found, against what the sensor said."""
     if not any(moment.depth is not None for moment in found.moments):
@@ -183,6 +234,7 @@ def _fit(
     quality = {
         "corners [px]": {
             "rmse": found.rms,
+            "rmse_held_out": found.held_out_rms,
             "samples": float(len(found.moments)),
             "rejected": float(found.left_out),
         }
@@ -190,6 +242,7 @@ def _fit(
     if isinstance(imu, ImuMounting):
         quality["turns of the gyro [deg]"] = {
             "rmse": math.degrees(imu.residual),
+            "rmse_held_out": math.degrees(_turns_held_out(found, log, imu)),
             "samples": float(imu.windows),
             "rejected": float(imu.rejected),
         }
@@ -203,6 +256,7 @@ def _fit(
         changes=changes,
         quality=quality,
         warnings=tuple(warnings),
+        curves=_curves(found),
         trials={name: log.sha256},
         settings={**settings, "reference_tag": found.rig.reference},
     )

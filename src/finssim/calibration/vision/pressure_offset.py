@@ -129,7 +129,7 @@ def _estimates(offset: float, wide: float, scale: float, half: float, told: bool
         "depth.scale": Estimate(
             name="depth.scale",
             estimate=scale,
-            ci95=(scale - half, scale + half),
+            ci95=(float(scale - half), float(scale + half)),
             unit="-",
             identifiable=told,
             note="" if told else "the depths span too little: taken as 1",

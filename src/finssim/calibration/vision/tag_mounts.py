@@ -69,6 +69,8 @@ class MountFit:
     """Of `free`."""
     rms: float
     """Root of the mean squared distance of corners [px]."""
+    held_out_rms: float
+    """The same for moments whose pose alone was fitted, to mounts from other moments [px]."""
     left_out: int
     """Moments left out as far off."""
 
@@ -162,8 +164,27 @@ def fit_mounts(
         theta=change(origin, state, free),
         covariance=covariance,
         rms=float(np.sqrt(np.nanmean(np.sum(corner**2, axis=-1)))),
+        held_out_rms=_held_out(rig, state, used, sigma, free),
         left_out=left_out,
     )
+
+
+def _held_out(
+    rig: Rig, state: MountState, moments: Sequence[Moment], noise: Noise, free: tuple[str, ...]
+) -> float:
+    """Mounts from every other sixth of the recording, tried on the sixths between, and the other way round."""
+    part = np.arange(len(moments)) * 6 // len(moments) % 2
+    squares = []
+    for fold in (0, 1):
+        fitted, tried = np.flatnonzero(part == fold).tolist(), np.flatnonzero(part != fold).tolist()
+        some = replace(state, poses=[state.poses[i] for i in fitted])
+        mounts = minimise(rig, some, [moments[i] for i in fitted], noise, free, steps=10)
+        rest = [moments[i] for i in tried]
+        test = minimise(
+            rig, replace(mounts, poses=[state.poses[i] for i in tried]), rest, noise, (), steps=10
+        )
+        squares.append(np.sum(residuals(rig, test, rest, noise)[0] ** 2, axis=-1).ravel())
+    return float(np.sqrt(np.nanmean(np.concatenate(squares))))
 
 
 def _spread(moments: Sequence[Moment]) -> list[Moment]:
