@@ -105,3 +105,16 @@ def test_dry_points_help():
     told = Settings(fit=FIT, interface="surface")
     half = [np.ptp(calibrate_pool(s, PLUMB_BOB, told).estimates["water_height"].ci95) for s in (wet, both)]
     assert half[1] < half[0] / 1.5
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.4])
+def test_a_guessed_focal_length_is_enough(factor):
+    """Points at many depths give the focal length back within 2 % from a guess 30 or 40 % off."""
+    guess = Lens(1280, 720, 541.0 * factor, 541.0 * factor, 640.0, 360.0, "plumb_bob", ())
+    seen = survey(overhead(), WATER, SOLID, 80)
+    fit = calibrate_pool(seen, guess, Settings(water_height=1.0, focal_sigma=0.3))
+    assert fit.model.camera.lens.fx == pytest.approx(540.93, rel=0.02)
+    assert np.linalg.norm(fit.model.camera.position - overhead().position) < 0.03
+    assert fit.held_out.as_json()["rms_cm"] < 0.5
+    unsaid = calibrate_pool(seen, guess, Settings(water_height=1.0))
+    assert any("--focal-sigma" in sentence for sentence in unsaid.advice)
