@@ -135,6 +135,7 @@ class _Rows:
         self._names: list[str] = []
         self._images: list[str] = []
         self._seen: set[tuple[object, ...]] = set()
+        self._points: dict[tuple[object, ...], Placed] = {}
 
     def add(self, image: str, name: str, placed: Placed, corner: int, pixel: Array) -> None:
         key = (image, id(placed), corner, float(pixel[0]), float(pixel[1]))
@@ -150,12 +151,10 @@ class _Rows:
     def add_combined(self, row: Row, z: float | None) -> None:
         point = np.array([row.numbers["x"], row.numbers["y"], z], float)
         name = row.words.get("id") or row.words.get("tag") or f"line {row.line}"
-        same = next(
-            (p for p, _ in self._placed if p.name == name and np.array_equal(p.points[0], point)), None
-        )
         dry = row.words.get("dry", "").lower() in ("1", "1.0", "true", "yes", "y", "dry")
         sigma = row.numbers.get("sigma", float("nan"))
-        placed = same or Placed(name, point[None], sigma, dry=dry, group=row.words.get("group", ""))
+        new = Placed(name, point[None], sigma, dry=dry, group=row.words.get("group", ""))
+        placed = self._points.setdefault((name, *point.tolist()), new)
         pixel = np.array([row.numbers["u"], row.numbers["v"]])
         self.add(row.words.get("image", ""), name, placed, 0, pixel)
 

@@ -120,8 +120,8 @@ def _conflicts(fit: Refined, surface: bool, settings: Settings) -> list[str]:
     if fit.active[focal] and abs(pull) > 2.0:
         found.append(
             f"the focal length came out {100.0 * (np.exp(pull * prior.lens_std[0]) - 1.0):+.0f} % from the camera "
-            f"file's, further than was expected ({100.0 * prior.lens_std[0]:.1f} %): give --focal-sigma 0.3 if the file is a "
-            "guess"
+            f"file's, further than was expected ({100.0 * prior.lens_std[0]:.1f} %): give --focal-sigma 0.3 if "
+            "the file is a guess"
         )
     if np.isfinite(prior.tilt_std) and prior.normal is not None:
         lean = float(np.arccos(np.clip(model.interface.normal @ prior.normal, -1.0, 1.0)))

@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 
 UP = np.array([0.0, 0.0, 1.0])
 SURFACE_TILT, PLANE_TILT = np.radians(0.2), np.radians(0.5)
+ENOUGH = 500
+"""Rows from which the search begins; the fit takes all."""
+
 ANYWHERE = 0.5
 """Depth of the water over the distance of the camera, where nobody measured it, and the standard deviation of that: so
 weak that it only decides where the pixels say nothing."""
@@ -48,6 +51,9 @@ def search(seen: Observations, lens: Lens, settings: Settings) -> Found:
     Raises:
         CalibrationError: No pose explains the pixels, the survey is left-handed, or contradicts what was measured.
     """
+    if len(seen) > ENOUGH:
+        kept = np.random.default_rng(settings.seed).choice(len(seen), ENOUGH, replace=False)
+        seen = seen.subset(np.sort(kept))
     poses = pinhole_poses(seen, lens, settings.seed)
     if mirror_is_better(seen, lens, poses[0].cost):
         raise CalibrationError(

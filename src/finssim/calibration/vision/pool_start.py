@@ -191,7 +191,7 @@ def _refined(R_pc: Array, C: Array, seen: Observations, lens: Lens) -> Solution 
     """The straight-line pose nearby that suits the pixels best, judged by a scale common to all."""
     camera = Camera(lens, C, matrix_to_quat(R_pc))
     plane = Interface(np.array([0.0, 0.0, 1.0]), 0.0)
-    model = PoolModel(camera, plane, seen.points.mean(axis=0), refractive=False)
+    model = PoolModel(camera, plane, seen.points[~seen.dry].mean(axis=0), refractive=False)
     active = np.array([name in NAMES[:6] for name in NAMES])
     for count in (10, 30):
         whiten = RobustPixels(model, seen)
