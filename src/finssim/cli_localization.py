@@ -36,7 +36,10 @@ def localize(
     ] = None,
     method: Annotated[
         str,
-        typer.Option(help="refractive, refractive-6dof, pinhole-depth or pinhole.", metavar="METHOD"),
+        typer.Option(
+            help="refractive, refractive-weighted, refractive-6dof, pinhole-depth or pinhole.",
+            metavar="METHOD",
+        ),
     ] = "refractive",
     family: Annotated[
         str | None,
@@ -126,7 +129,8 @@ def fuse(
     method: Annotated[
         str,
         typer.Option(
-            help="How detections become fixes: refractive, refractive-6dof, pinhole-depth or pinhole.",
+            help="How detections become fixes: refractive, refractive-weighted, refractive-6dof, "
+            "pinhole-depth or pinhole.",
             metavar="METHOD",
         ),
     ] = "refractive",

@@ -11,7 +11,7 @@ from finssim.localization.detections import Detection
 from finssim.localization.pose import METHODS, NEEDS_DEPTH
 from localization.seen_vehicle import LENS, POOLS, TAGS, known, moved, pose, rotation, seen
 
-REFRACTIVE = ("refractive", "refractive-6dof")
+REFRACTIVE = ("refractive", "refractive-weighted", "refractive-6dof")
 PINHOLE = tuple(name for name in METHODS if name not in REFRACTIVE)
 
 

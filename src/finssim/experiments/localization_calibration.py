@@ -16,6 +16,7 @@ from finssim.calibration.vision.pool_settings import Settings
 from finssim.calibration.vision.survey import read_survey
 from finssim.experiments.localization_campaign import TAG, Campaign
 from finssim.experiments.localization_pictures import Picture
+from finssim.experiments.localization_scores import LEAST_PIXEL_STD
 from finssim.geometry.optics import Interface
 from finssim.localization.detections import Frame, write_detections
 from finssim.localization.pool import Pool
@@ -38,6 +39,11 @@ class Calibrated:
     survey: list[Row]
     """Where the tag was said to lie in each of them."""
 
+    @property
+    def pixel_std(self) -> float:
+        """Standard deviation of a corner per axis, ripples included, as the residuals tell it [px]."""
+        return max(self.fit.noise.pixel, LEAST_PIXEL_STD)
+
 
 def calibrate(campaign: Campaign, seen: Sequence[Picture]) -> Calibrated:
     """Calibrate on the visits chosen for it; the truth is not looked at.
@@ -54,6 +60,7 @@ def calibrate(campaign: Campaign, seen: Sequence[Picture]) -> Calibrated:
         water_height=campaign.water_read,
         water_height_sigma=max(campaign.conditions.tape, 5e-4),
         survey_sigma=max(campaign.conditions.survey, 1e-4),
+        focal_sigma=campaign.conditions.lens / campaign.lens.fx,
         seed=campaign.seed,
     )
     fit = calibrate_pool(_observed(frames, rows), campaign.lens, settings)

@@ -65,7 +65,9 @@ CONDITIONS: Mapping[str, Conditions] = MappingProxyType(
     {
         "published": Conditions(),
         "flat": Conditions(ripples=0.0),
-        "quiet": Conditions(depth=0.0, tilt=0.0, survey=0.0, heading=0.0, lens=0.0, tape=0.0, ripples=0.0),
+        "quiet": Conditions(
+            depth=0.0, tilt=0.0, survey=0.0, heading=0.0, lens=0.0, tape=0.0, level=0.0, ripples=0.0
+        ),
     }
 )
 """`published`: every error; `flat`: every error but ripples; `quiet`: noise of the pictures alone."""

@@ -16,7 +16,7 @@ from rich.progress import Progress
 from finssim.experiments.localization_calibration import Calibrated, calibrate
 from finssim.experiments.localization_campaign import CONDITIONS, Campaign, draw_campaign, lifted
 from finssim.experiments.localization_pictures import RENDERERS, Picture, pictures
-from finssim.experiments.localization_scores import Scores, locate, pooled, sensitivity
+from finssim.experiments.localization_scores import Scores, locate, pooled, rmse_cm, sensitivity
 from finssim.experiments.localization_table import RESULT_FILE, print_table, write_results
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.provenance import provenance
@@ -30,6 +30,7 @@ PAPER_TABLE_2 = MappingProxyType({"pinhole": (5.74, 11.41), "refractive": (0.73,
 METHODS_SHOWN = MappingProxyType(
     {
         "refractive": ("refractive", "refractive"),
+        "refractive-weighted": ("refractive-weighted", "refractive"),
         "refractive-6dof": ("refractive-6dof", "refractive"),
         "pinhole-depth": ("pinhole-depth", "pinhole"),
         "pinhole": ("pinhole", "pinhole"),
@@ -105,7 +106,7 @@ def localization_experiment(
     """Draw the published test, calibrate on one half of its places, locate the tag at the other half.
 
     Every seed draws the places' survey errors, readings, camera file, plumb line, ripples and noise anew. Ctrl-C keeps
-    the seeds that are finished.
+    the seeds that are finished, or of the first what there is.
 
     Args:
         renderer: `own`, `mitsuba`, or `geometry` (corners by exact projection and white noise, without pictures).
@@ -152,6 +153,8 @@ def localization_experiment(
         if not done["published"]:
             raise
         interrupted = True
+        finished = max(len(higher), 1)
+        done = {name: runs[:finished] for name, runs in done.items()}
     first = done["published"][0]
     result = {
         "experiment": "localization",
@@ -171,6 +174,7 @@ def localization_experiment(
             {"lifted": {m: pooled([scores[m] for scores in higher]) for m in METHODS_SHOWN}} if higher else {}
         ),
         "lift_m": LIFT,
+        "pixel_std_px": [one.found.pixel_std for one in done["published"]],
         "calibration": [_errors(one) for one in done["published"]],
         "sensitivity": swept,
         "paper": {m: {"rmse_cm": r, "p95_cm": p} for m, (r, p) in PAPER_TABLE_2.items()},
@@ -200,7 +204,9 @@ def _lifted(one: SeedResult, renderer: str) -> dict[str, Scores]:
 
 def _swept(one: SeedResult, renderer: str, size: Mapping[str, Any]) -> dict[str, Any]:
     """Sensitivities: to depth, tilt and index on the same pictures, to ripples on new ones."""
-    swept: dict[str, Any] = dict(sensitivity(one.campaign, one.seen, one.found.refractive))
+    swept: dict[str, Any] = dict(
+        sensitivity(one.campaign, one.seen, one.found.refractive, one.found.pixel_std)
+    )
     if renderer == "geometry":  # it has no ripples
         return swept
     held_out = np.flatnonzero(~one.campaign.calibrates)
@@ -214,8 +220,14 @@ def _swept(one: SeedResult, renderer: str, size: Mapping[str, Any]) -> dict[str,
             visits=visits,
             calibrates=np.zeros(len(visits), bool),
         )
-        scores = locate(campaign, list(pictures(campaign, renderer)), one.found.refractive, "refractive")
-        swept["ripples"].append([slope, 100.0 * scores.rmse])
+        scores = locate(
+            campaign,
+            list(pictures(campaign, renderer)),
+            one.found.refractive,
+            "refractive",
+            pixel_std=one.found.pixel_std,
+        )
+        swept["ripples"].append([slope, rmse_cm(scores)])
     return swept
 
 

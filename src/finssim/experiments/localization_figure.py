@@ -78,7 +78,7 @@ def draw_sensitivity(sensitivity: Mapping[str, Any], path: Path) -> None:
         1, len(shown), figsize=(3.1 * len(shown), 3.0), sharey=True, layout="constrained"
     )
     for axis, name in zip(np.atleast_1d(axes), shown, strict=True):
-        axis.plot(*np.array(sensitivity[name]).T, "o-", color=REFRACTIVE, markersize=4)
+        axis.plot(*np.array(sensitivity[name], float).T, "o-", color=REFRACTIVE, markersize=4)
         axis.set(xlabel=labels[name], ylim=(0.0, None))
         axis.grid(alpha=0.3)
     np.atleast_1d(axes)[0].set_ylabel("RMSE [cm]")

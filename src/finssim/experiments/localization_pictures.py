@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.experiments.localization_campaign import TAG, WATER_HEIGHT, Campaign, Visit
-from finssim.geometry.optics import project
+from finssim.geometry.optics import Projection, Status, project
 from finssim.geometry.rotations import matrix_to_quat
 from finssim.localization.detections import Detection
 from finssim.localization.families import bitmap
@@ -20,8 +20,6 @@ from finssim.localization.tags import corners
 from finssim.sensors.overhead_camera import Basin, OverheadCamera, Pose, Ripples, Scene, TagInScene
 
 __all__ = ["RENDERERS", "Picture", "pictures", "scene_of"]
-
-Array = NDArray[np.float64]
 
 (TAG_ID,) = TAG.mounts
 MARGIN = 0.011
@@ -96,8 +94,8 @@ def tag_of(visit: Visit) -> TagInScene:
 
 
 def region_of(campaign: Campaign, visit: Visit) -> tuple[int, int, int, int]:
-    """Left, top, right and bottom of the pixels around the surveyed place of the tag."""
-    seen = _corner_pixels(campaign, visit)
+    """Left, top, right and bottom of the pixels around the tag."""
+    seen = _seen(campaign, visit).pixels
     lens = campaign.truth.camera.lens
     low, high = np.floor(seen.min(0)) - SURROUND, np.ceil(seen.max(0)) + SURROUND + 1
     left, top = np.maximum(low, 0).astype(int).tolist()
@@ -105,17 +103,20 @@ def region_of(campaign: Campaign, visit: Visit) -> tuple[int, int, int, int]:
     return left, top, right, bottom
 
 
-def _corner_pixels(campaign: Campaign, visit: Visit) -> Array:
+def _seen(campaign: Campaign, visit: Visit) -> Projection:
     points = visit.position + corners(TAG.edge) @ visit.R_pb.T
-    return project(campaign.truth.camera, campaign.truth.interface, points).pixels
+    return project(campaign.truth.camera, campaign.truth.interface, points)
 
 
 def _geometry(campaign: Campaign) -> Look:
     """Exact projection with white noise: no picture, no ripples."""
 
     def look(visit: Visit, time: float, seed: int) -> Detection | None:
+        seen = _seen(campaign, visit)
+        if (seen.status != Status.OK).any():
+            return None
         noise = np.random.default_rng(seed).normal(0.0, CORNER_NOISE, (4, 2))
-        return Detection(TAG_ID, _corner_pixels(campaign, visit) + noise, family=TAG.family)
+        return Detection(TAG_ID, seen.pixels + noise, family=TAG.family)
 
     return look
 

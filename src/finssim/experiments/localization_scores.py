@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,7 +16,7 @@ from finssim.localization.pool import Pool
 from finssim.localization.pose import METHODS, Constraints
 from finssim.localization.tags import tag_corners_b
 
-__all__ = ["Scores", "locate", "pooled", "sensitivity"]
+__all__ = ["Scores", "locate", "pooled", "rmse_cm", "sensitivity"]
 
 Array = NDArray[np.float64]
 
@@ -23,7 +24,8 @@ RESAMPLES = 2000
 SEED = 20260903
 Z_STD = 0.01
 TILT_STD = float(np.radians(0.5))
-PIXEL_STD = 0.2
+LEAST_PIXEL_STD = 0.05
+"""What a detector's corners are off at best, per axis [px]."""
 
 TAGS_B = tag_corners_b(TAG)
 
@@ -45,8 +47,8 @@ class Scores:
 
     @property
     def rmse(self) -> float:
-        """Horizontal error against the surveyed places [m]."""
-        return float(np.sqrt(np.mean(np.sum(self.surveyed**2, 1))))
+        """Horizontal error against the surveyed places [m]; NaN where nothing was located."""
+        return float(np.sqrt(np.mean(np.sum(self.surveyed**2, 1)))) if len(self.visits) else math.nan
 
 
 def locate(
@@ -55,6 +57,7 @@ def locate(
     pool: Pool,
     method: str,
     *,
+    pixel_std: float = LEAST_PIXEL_STD,
     depth_offset: float = 0.0,
 ) -> Scores:
     """Locate the tag in every picture of the held-out visits and average over each visit.
@@ -64,6 +67,7 @@ def locate(
         seen: Its pictures.
         pool: As calibrated.
         method: Key of `finssim.localization.pose.METHODS`.
+        pixel_std: Standard deviation of a corner, as the calibration found it [px].
         depth_offset: Added to the depth reading [m].
     """
     found: dict[int, list[tuple[float, float]]] = {}
@@ -74,7 +78,7 @@ def locate(
             continue
         pictures += 1
         visit = campaign.visits[picture.visit]
-        place, reason = _one(picture, visit, pool, method, depth_offset)
+        place, reason = _one(picture, visit, pool, method, pixel_std, depth_offset)
         if place is None:
             kind = reason.partition(":")[0]
             reasons[kind] = reasons.get(kind, 0) + 1
@@ -89,7 +93,7 @@ def locate(
 
 
 def _one(
-    picture: Picture, visit: Visit, pool: Pool, method: str, depth_offset: float
+    picture: Picture, visit: Visit, pool: Pool, method: str, pixel_std: float, depth_offset: float
 ) -> tuple[tuple[float, float] | None, str]:
     if picture.detection is None:
         return None, "tag not detected"
@@ -102,7 +106,7 @@ def _one(
         tilt_std=TILT_STD,
         up=tuple(water.normal.tolist()),
     )
-    measured = METHODS[method]((picture.detection,), pool, TAGS_B, given, PIXEL_STD)
+    measured = METHODS[method]((picture.detection,), pool, TAGS_B, given, pixel_std)
     return ((measured.x, measured.y), "") if measured.ok else (None, measured.reason)
 
 
@@ -113,28 +117,30 @@ def pooled(scores: Sequence[Scores]) -> dict[str, Any]:
         scores: One for each seed.
 
     Returns:
-        Centimetres, as the paper's table has them.
+        Centimetres, as the paper's table has them; None where nothing was located.
     """
-    errors = [np.linalg.norm(100.0 * s.surveyed, axis=1) for s in scores]
-    true = [np.linalg.norm(100.0 * s.true, axis=1) for s in scores]
+    scored = [s for s in scores if len(s.visits)]
+    errors = [np.linalg.norm(100.0 * s.surveyed, axis=1) for s in scored]
+    true = [np.linalg.norm(100.0 * s.true, axis=1) for s in scored]
     random = np.random.default_rng(SEED)
     drawn = []
-    for _ in range(RESAMPLES):
+    for _ in range(RESAMPLES if scored else 0):
         chosen = random.integers(len(errors), size=len(errors))
         again = [errors[k][random.integers(len(errors[k]), size=len(errors[k]))] for k in chosen]
         drawn.append(_figures(np.concatenate(again)))
-    rmse, p95 = _figures(np.concatenate(errors))
-    low, high = np.percentile(drawn, [2.5, 97.5], axis=0)
-    true_rmse, true_p95 = _figures(np.concatenate(true))
+    nothing: tuple[None, None] = (None, None)
+    rmse, p95 = _figures(np.concatenate(errors)) if scored else nothing
+    true_rmse, true_p95 = _figures(np.concatenate(true)) if scored else nothing
+    low, high = np.percentile(drawn, [2.5, 97.5], axis=0).tolist() if scored else (nothing, nothing)
     reasons: dict[str, int] = {}
     for s in scores:
         for reason, count in s.reasons.items():
             reasons[reason] = reasons.get(reason, 0) + count
     return {
         "rmse_cm": rmse,
-        "rmse_ci95_cm": [float(low[0]), float(high[0])],
+        "rmse_ci95_cm": [low[0], high[0]],
         "p95_cm": p95,
-        "p95_ci95_cm": [float(low[1]), float(high[1])],
+        "p95_ci95_cm": [low[1], high[1]],
         "rmse_to_truth_cm": true_rmse,
         "p95_to_truth_cm": true_p95,
         "visits": sum(len(e) for e in errors),
@@ -148,20 +154,29 @@ def _figures(errors: Array) -> tuple[float, float]:
     return float(np.sqrt(np.mean(errors**2))), float(np.percentile(errors, 95))
 
 
+def rmse_cm(scores: Scores) -> float | None:
+    """Horizontal error against the surveyed places [cm]; None where nothing was located."""
+    return 100.0 * scores.rmse if len(scores.visits) else None
+
+
 DEPTHS = (-0.05, -0.02, -0.01, 0.0, 0.01, 0.02, 0.05)
 TILTS = tuple(np.radians([0.0, 0.1, 0.2, 0.5, 1.0]).tolist())
 INDICES = (-0.02, -0.01, -0.005, 0.0, 0.005, 0.01, 0.02)
 
 
-def sensitivity(campaign: Campaign, seen: Sequence[Picture], pool: Pool) -> dict[str, list[list[float]]]:
+def sensitivity(
+    campaign: Campaign, seen: Sequence[Picture], pool: Pool, pixel_std: float = LEAST_PIXEL_STD
+) -> dict[str, list[list[float | None]]]:
     """RMSE of the refractive method with one thing wrong on purpose.
 
     Returns:
-        `depth_cm`, `tilt_deg` and `index` -> pairs of the error put in and the RMSE [cm] that comes out.
+        `depth_cm`, `tilt_deg` and `index` -> pairs of the error put in and the RMSE [cm] that comes out, None where
+        nothing was located.
     """
 
-    def rmse(changed: Pool, depth_offset: float = 0.0) -> float:
-        return 100.0 * locate(campaign, seen, changed, "refractive", depth_offset=depth_offset).rmse
+    def rmse(changed: Pool, depth_offset: float = 0.0) -> float | None:
+        given = {"pixel_std": pixel_std, "depth_offset": depth_offset}
+        return rmse_cm(locate(campaign, seen, changed, "refractive", **given))
 
     water = pool.interface
     return {

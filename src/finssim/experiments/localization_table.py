@@ -35,6 +35,7 @@ WORDS = {
     "quiet": "noise of the pictures alone",
     "lifted": "every error, and the tag higher than the calibration saw it",
     "refractive": "refractive",
+    "refractive-weighted": "refractive, weighted",
     "refractive-6dof": "refractive, 6 DOF",
     "pinhole-depth": "pinhole with depth",
     "pinhole": "pinhole PnP",
@@ -52,9 +53,9 @@ def rows_of(result: Mapping[str, Any]) -> dict[str, list[list[str]]]:
             rows.append(
                 [
                     WORDS[method],
-                    f"{m['rmse_cm']:.2f}",
+                    _figure(m["rmse_cm"]),
                     _range(m["rmse_ci95_cm"]),
-                    f"{m['p95_cm']:.2f}",
+                    _figure(m["p95_cm"]),
                     _range(m["p95_ci95_cm"]),
                     f"{m['located']}/{m['pictures']}",
                 ]
@@ -91,7 +92,9 @@ def markdown(result: Mapping[str, Any]) -> str:
         lines = [HEADS, ["---"] + ["--:"] * (len(HEADS) - 1), *rows]
         table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
         parts += [f"## {words[0].upper()}{words[1:]}", table]
-    parts += [NOTE, "![Error map](error_map.png)", "![Sensitivity](sensitivity.png)"]
+    parts += [NOTE, "![Error map](error_map.png)"]
+    if result["sensitivity"]:  # an interruption may come before it
+        parts.append("![Sensitivity](sensitivity.png)")
     parts += ["## What the calibrations got wrong", _calibrations(result)]
     origin = result["provenance"]
     parts.append(f"FinsSim {origin['finssim']}, revision {origin['revision']}, seeds {result['seeds']}.")
@@ -113,7 +116,8 @@ def write_results(
     with atomic_directory(out, replaces=RESULT_FILE) as folder:
         (folder / "localization.md").write_text(markdown(result), encoding="utf-8")
         draw_error_map(campaign, scores["pinhole"], scores["refractive"], folder / "error_map.png")
-        draw_sensitivity(result["sensitivity"], folder / "sensitivity.png")
+        if result["sensitivity"]:
+            draw_sensitivity(result["sensitivity"], folder / "sensitivity.png")
         write_camera(folder / "camera.yaml", campaign.lens, {})
         write_pool(found.refractive, folder / "pool.yaml")
         write_pool(found.pinhole, folder / "pool_pinhole.yaml")
@@ -141,6 +145,8 @@ def _gain(result: Mapping[str, Any]) -> str:
     sentences = []
     for rival, words in rivals.items():
         m = result["results"]["published"]
+        if not (m["refractive"]["located"] and m[rival]["located"]):
+            continue
         less = [100.0 * (1.0 - m["refractive"][key] / m[rival][key]) for key in ("rmse_cm", "p95_cm")]
         sentences.append(f"Refractive below {words}: RMSE {less[0]:.1f} %, P95 {less[1]:.1f} %.")
     return " ".join(sentences)
@@ -155,5 +161,10 @@ def _calibrations(result: Mapping[str, Any]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def _range(interval: list[float]) -> str:
-    return f"[{interval[0]:.2f}, {interval[1]:.2f}]"
+def _figure(value: float | None) -> str:
+    return "none" if value is None else f"{value:.2f}"
+
+
+def _range(interval: list[float | None]) -> str:
+    low, high = interval
+    return "" if low is None or high is None else f"[{low:.2f}, {high:.2f}]"

@@ -19,7 +19,7 @@ from finssim.localization.pose_choice import Choice, choose, measured, minima_fr
 from finssim.localization.pose_refinement import RefinedPose, See
 from finssim.localization.pose_start import mirrored
 
-__all__ = ["refractive_bundle"]
+__all__ = ["refractive_bundle", "through_water"]
 
 Array = npt.NDArray[np.float64]
 
@@ -53,7 +53,7 @@ def refractive_bundle(
     pairs = correspondences(detections, tags_b)
     if not pairs.tags:
         return refused(method, pairs.why_too_few, pairs.rejected)
-    minima = minima_from(_through_water(pool), pairs, _starts(pairs, pool, pixel_std), 2.5 * pixel_std)
+    minima = minima_from(through_water(pool), pairs, _starts(pairs, pool, pixel_std), 2.5 * pixel_std)
     if not minima:
         return refused(method, "the corners show no pose in the water", pairs.rejected, tags=pairs.tags)
     choice = choose(minima, constraints, pixel_std)
@@ -127,8 +127,8 @@ def _deepened(seen: RefinedPose, pairs: Correspondences, pool: Pool) -> tuple[Ar
     return np.asarray(middle_p - R @ middle_b), np.asarray(R)
 
 
-def _through_water(pool: Pool) -> See:
-    """Where points appear, bent at the interface, or straight where they are on the camera's side of it."""
+def through_water(pool: Pool) -> See:
+    """What tells where points appear: bent at the interface, or straight where they are on the camera's side of it."""
     camera, interface = pool.camera, pool.interface
 
     def see(points_p: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:

@@ -14,6 +14,7 @@ from finssim.localization.measurement import Constraints, Measurement
 from finssim.localization.pinhole import pinhole, pinhole_depth
 from finssim.localization.planar_fit import planar_fit
 from finssim.localization.pool import Pool
+from finssim.localization.weighted_fit import weighted_fit
 
 __all__ = ["METHODS", "NEEDS_DEPTH", "Constraints", "Measurement", "Method"]
 
@@ -43,9 +44,10 @@ class Method(Protocol):
 
 METHODS: dict[str, Method] = {
     "refractive": planar_fit,
+    "refractive-weighted": weighted_fit,
     "pinhole": pinhole,
     "pinhole-depth": pinhole_depth,
     "refractive-6dof": refractive_bundle,
 }
-NEEDS_DEPTH = frozenset({"refractive", "pinhole-depth"})
+NEEDS_DEPTH = frozenset({"refractive", "refractive-weighted", "pinhole-depth"})
 """Methods that refuse to work without constraints."""
