@@ -125,6 +125,39 @@ def test_the_fit_finds_its_way_from_a_coarse_start(family):
     assert spread.max() < 0.01
 
 
+def glare(light, u, v, at):
+    """A bright spot of the size of a cell."""
+    return light + 100.0 * np.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / 50.0)
+
+
+def finger(light, u, v, at):
+    """Something gray of 7 by 7 px on the tag."""
+    return np.where((abs(u - at[0]) < 4) & (abs(v - at[1]) < 4), 90.0, light)
+
+
+def caustic(light, u, v, at):
+    """A bright line across the tag."""
+    return light + 60.0 * (abs(0.6 * (u - at[0]) + 0.8 * (v - at[1])) < 1.0)
+
+
+def shadow(light, u, v, at):
+    """The edge of a shadow across the tag."""
+    return light * np.where(0.6 * (u - at[0]) + 0.8 * (v - at[1]) > 0.0, 0.7, 1.0)
+
+
+@pytest.mark.parametrize(("disturb", "rms"), [(glare, 0.25), (finger, 0.12), (caustic, 0.15), (shadow, 0.25)])
+def test_uneven_light_and_covered_cells_move_corners_little(disturb, rms):
+    """Local contrast counts, not gray, and cells that do not fit lose their weight: a fraction of a pixel is left."""
+    rng = np.random.default_rng(4)
+    missed = []
+    for tag, ring, picture in pictures("tag25h9", 36.0, 16, 3, blur=0.7, noise=2.5):
+        v, u = np.mgrid[: picture.shape[0], : picture.shape[1]]
+        place = ring.mean(axis=0) + rng.uniform(-15.0, 15.0, 2)
+        disturbed = np.clip(disturb(picture.astype(float), u, v, place), 0, 255).astype(np.uint8)
+        missed.append(fit_tag(disturbed, "tag25h9", tag, ring).corners - ring)
+    assert np.sqrt(np.mean(np.square(missed))) < rms
+
+
 def test_where_there_is_no_tag_the_fit_says_so():
     """Noise and a flat picture have no correlation with it; half outside of the picture, or no ring, is no fit."""
     ring = pose_corners(30.0, centre=(40.0, 40.0))

@@ -2,41 +2,36 @@
 
 The cells of a decoded tag are known, so each of their edges, inner ones too, tells where the tag lies. A homography is
 fitted by Gauss-Newton (inverse compositional, so that its Jacobian is computed once) together with what the light did:
-gain, offset, two slopes across the tag, and the blur. Blur widens an edge to both sides alike and moves no corner.
+gain, offset, two slopes across the tag, and the blur. Blur widens an edge to both sides alike and moves no corner. Then
+the same in local contrast, which glare and shadows change little, with less weight where something hides the tag.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
-from scipy.special import ndtr
 
-from finssim.localization.families import bitmap, family_named
+from finssim.localization.detector_pattern import BLURS, Pattern, nearest_blur, pattern_of
+from finssim.localization.families import family_named
 
 __all__ = ["Fit", "fit_tag"]
 
 Array = npt.NDArray[np.float64]
 Gray = npt.NDArray[Any]
 
-REACH = 0.1
-"""White around the black border that is looked at [cells]. Little: many prints have less margin than the one cell that
-is asked for, and the blur brings in what lies beyond."""
-REACH_OF_DATA = -0.4
-"""The same where data cells lie at the outside of the tag and anything may lie beside them [cells]."""
-SAMPLES = 5
-"""Along a cell, each way."""
-BLURS = np.array([0.2, 0.24, 0.29, 0.35, 0.42, 0.5])
-"""Blurs of the pattern to choose from, standard deviation [cells]."""
 LENS_BLUR = 0.7
 """Assumed before the fit, pixel area and interpolation included, standard deviation [px]."""
 STEPS = 15
-SETTLED = 1e-3
+SETTLED = 2e-3
 """Movement of a corner below which the fit ends [px]."""
+COARSE = 0.05
+"""The same for the first part of the fit."""
+SMALLEST_RESIDUAL = 0.02
+"""Misfit that is always taken for noise, share of the contrast."""
 _SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 
 
@@ -50,20 +45,6 @@ class Fit:
     """Of the picture with the pattern: 1 is perfect, a tag that is not there has little."""
     contrast: float
     """White minus black [gray levels]."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Pattern:
-    """A tag as it should look, at n points of its own plane."""
-
-    points: Array
-    """x right, y down from the top left of the measured square, in edges; (n, 2)."""
-    values: Array
-    """0 black to 1 white, blurred; (n,)."""
-    columns: Array
-    """Derivatives of the gray by 8 parameters of a homography, 3 of the light, blur and gain, (n, 13)."""
-    solver: Array
-    """Their pseudo-inverse, (13, n)."""
 
 
 def fit_tag(image: Gray, family: str, tag: int, corners: Array) -> Fit | None:
@@ -83,42 +64,90 @@ def fit_tag(image: Gray, family: str, tag: int, corners: Array) -> Fit | None:
         return None
     cell = _cell(corners, family)
     patch, shift = _patch(image, corners, cell, smooth=(BLURS[0] * cell) ** 2 - LENS_BLUR**2)
-    blur = _nearest(LENS_BLUR / cell)
-    pattern = _pattern(family, tag, blur)
+    blur = nearest_blur(LENS_BLUR / cell)
+    pattern = pattern_of(family, tag, blur)
     given = _sample(patch, _through(_from_square(corners - shift), pattern.points))
     if given is None:
         return None
-    fit, wider = _settle(pattern, patch, corners - shift, limit=1.0 + 0.5 * cell)
-    better = _nearest(blur + wider)
-    if fit is not None and better != blur:  # the picture is sharper or softer than was assumed
-        fit = _settle(_pattern(family, tag, better), patch, fit.corners, limit=1.0 + 0.5 * cell)[0] or fit
-    if fit is None:
+    limit = 1.0 + 0.5 * cell
+    coarse = _settle(pattern, patch, corners - shift, limit, plain=True)
+    found = coarse
+    if coarse is not None:
+        pattern = pattern_of(
+            family, tag, nearest_blur(blur + coarse.wider)
+        )  # sharper or softer than was assumed
+        found = _settle(pattern, patch, coarse.corners, limit) or coarse
+        weights = _weights_of(found.left, found.gain) if found is not coarse else None
+        if weights is not None:
+            found = _settle(pattern, patch, found.corners, limit, solver=_solver(pattern, weights)) or found
+    if coarse is None or found is None:
         return Fit(corners, _correlation(pattern.values, given), float(np.ptp(given)))
-    return replace(fit, corners=fit.corners + shift)
+    return Fit(found.corners + shift, found.correlation, coarse.gain)
 
 
-def _settle(pattern: _Pattern, patch: Array, start: Array, limit: float) -> tuple[Fit | None, float]:
-    """The fit of a pattern from a start, and by how much the picture's blur is wider [cells].
+@dataclass(frozen=True, eq=False)
+class _Settled:
+    """Where a pattern came to rest on the patch."""
+
+    corners: Array
+    """(4, 2)."""
+    gain: float
+    """White minus black, in gray levels or in shares of the local contrast."""
+    wider: float
+    """By how much the picture's blur is wider than the pattern's [cells]."""
+    left: Array
+    """What the pattern does not explain, in the same unit, (n,)."""
+    correlation: float
+
+
+def _settle(
+    pattern: Pattern,
+    patch: Array,
+    start: Array,
+    limit: float,
+    *,
+    plain: bool = False,
+    solver: Array | None = None,
+) -> _Settled | None:
+    """Gauss-Newton from a start; `plain` comes from farther, in gray as it is, and ends sooner.
 
     None where it moves a corner by more than the limit [px], or out of the patch, or does not come to rest.
     """
+    solver = pattern.plain if plain else pattern.solver if solver is None else solver
     H = _from_square(start)
     here = start
     for _ in range(STEPS):
         seen = _sample(patch, _through(H, pattern.points))
         if seen is None:
-            break
-        solution = pattern.solver @ seen
-        gain = float(solution[12])
+            return None
+        seen = seen if plain else pattern.even(seen)
+        solution = solver @ seen
+        gain = float(solution[-1])
         if not gain > 0.0 or np.abs(solution[:8]).max() > 0.3 * gain:
-            break
+            return None
         H = H @ np.linalg.inv(np.eye(3) + np.append(solution[:8] / gain, 0.0).reshape(3, 3))
         before, here = here, _through(H, _SQUARE)
         if not np.abs(here - start).max() < limit:
-            break
-        if np.abs(here - before).max() < SETTLED:
-            return Fit(here, _correlation(pattern.columns @ solution, seen), gain), float(solution[11]) / gain
-    return None, 0.0
+            return None
+        if np.abs(here - before).max() < (COARSE if plain else SETTLED):
+            told = pattern.values if plain else pattern.columns @ solution
+            return _Settled(here, gain, float(solution[-2]) / gain, seen - told, _correlation(told, seen))
+    return None
+
+
+def _weights_of(left: Array, gain: float) -> Array | None:
+    """Weights of the points, small where glare, a shadow's edge or a finger hides the tag; None if nothing does."""
+    scale = max(1.48 * float(np.median(np.abs(left))), SMALLEST_RESIDUAL * gain)
+    far = (left / (3.0 * scale)) ** 2
+    if np.mean(far > 1.0) < 0.01:
+        return None
+    return np.asarray(1.0 / (1.0 + far) ** 2)
+
+
+def _solver(pattern: Pattern, weights: Array) -> Array:
+    """Weighted pseudo-inverse, (10, n)."""
+    weighted = pattern.columns * weights[:, None]
+    return np.asarray(np.linalg.solve(weighted.T @ pattern.columns, weighted.T))
 
 
 def _correlation(a: Array, b: Array) -> float:
@@ -137,41 +166,6 @@ def _cell(corners: Array, family: str) -> float:
     """Mean side of a cell [px]."""
     sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     return float(sides.mean()) / family_named(family).border
-
-
-def _nearest(blur: float) -> float:
-    """The blur of a pattern that comes nearest."""
-    return float(BLURS[np.abs(BLURS - blur).argmin()])
-
-
-@lru_cache(maxsize=256)
-def _pattern(family: str, tag: int, blur: float) -> _Pattern:
-    """The pattern of a tag with a blur [cells]."""
-    kind = family_named(family)
-    reach = REACH_OF_DATA if kind.outside else REACH
-    low, high = -kind.outside - reach, kind.border + kind.outside + reach
-    places = np.linspace(low, high, round((high - low) * SAMPLES) + 1)
-    weight, slope, widening = _weights(places, kind.outside, kind.cells, blur)
-    cells = np.pad(bitmap(family, tag).astype(float), 3, constant_values=1.0)
-    n = kind.border
-    values = (weight @ cells @ weight.T).ravel()
-    along_x = (weight @ cells @ slope.T).ravel() * n
-    along_y = (slope @ cells @ weight.T).ravel() * n
-    blurred = (weight @ cells @ widening.T + widening @ cells @ weight.T).ravel()
-    y, x = (z.ravel() / n for z in np.meshgrid(places, places, indexing="ij"))
-    radial = x * along_x + y * along_y
-    motion = [x * along_x, y * along_x, along_x, x * along_y, y * along_y, along_y, -x * radial, -y * radial]
-    columns = np.column_stack([*motion, np.ones_like(x), x - 0.5, y - 0.5, blurred, values])
-    return _Pattern(np.column_stack([x, y]), values, columns, np.linalg.pinv(columns))
-
-
-def _weights(places: Array, outside: int, cells: int, blur: float) -> tuple[Array, Array, Array]:
-    """Share of every cell in the gray at the places along one axis, and its derivatives by place and blur."""
-    edges = np.arange(-outside - 3, cells - outside + 4)
-    z = (places[:, None] - edges) / blur
-    bell = np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
-    share = -np.diff(ndtr(z), axis=1)
-    return share, -np.diff(bell, axis=1) / blur, np.diff(z * bell, axis=1) / blur
 
 
 def _patch(image: Gray, corners: Array, cell: float, smooth: float) -> tuple[Array, Array]:
