@@ -149,5 +149,8 @@ def _numbers(fit: Refined, seen: Observations) -> list[str]:
             f"({1000 * fit.noise.survey * fit.noise.scale:.1f} mm): measure again, or give --survey-sigma"
         )
     if not fit.used.all():
-        found.append(f"{int((~fit.used).sum())} rows were left out as wrong: check their ids and coordinates")
+        wrong = int((~fit.used).sum())
+        found.append(
+            f"{wrong} row{'s were' if wrong > 1 else ' was'} left out as wrong: check ids and coordinates"
+        )
     return found
