@@ -73,9 +73,8 @@ def fit_tag(image: Gray, family: str, tag: int, corners: Array) -> Fit | None:
     coarse = _settle(pattern, patch, corners - shift, limit, plain=True)
     found = coarse
     if coarse is not None:
-        pattern = pattern_of(
-            family, tag, nearest_blur(blur + coarse.wider)
-        )  # sharper or softer than was assumed
+        seen_blur = nearest_blur(blur + coarse.wider)  # sharper or softer than was assumed
+        pattern = pattern_of(family, tag, seen_blur)
         found = _settle(pattern, patch, coarse.corners, limit) or coarse
         weights = _weights_of(found.left, found.gain) if found is not coarse else None
         if weights is not None:
