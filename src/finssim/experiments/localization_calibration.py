@@ -12,6 +12,7 @@ import numpy as np
 
 from finssim.calibration.vision.observations import Observations, observe
 from finssim.calibration.vision.pool_fit import PoolFit, calibrate_pool
+from finssim.calibration.vision.pool_record import pool_record
 from finssim.calibration.vision.pool_settings import Settings
 from finssim.calibration.vision.survey import read_survey
 from finssim.experiments.localization_campaign import TAG, Campaign
@@ -67,7 +68,11 @@ def calibrate(campaign: Campaign, seen: Sequence[Picture]) -> Calibrated:
     level = Interface.water(campaign.water_read, n_air=1.0, n_water=1.0)
     straight = fit.pinhole.model.shifted(fit.seen.points.mean(axis=0))  # it was fitted about their middle
     return Calibrated(
-        Pool(fit.model.camera, fit.model.interface), Pool(straight.camera, level), fit, frames, rows
+        Pool(fit.model.camera, fit.model.interface, record=pool_record(fit, {})),
+        Pool(straight.camera, level),
+        fit,
+        frames,
+        rows,
     )
 
 

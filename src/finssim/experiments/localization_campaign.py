@@ -141,7 +141,7 @@ def draw_campaign(
     truth = published_pool(
         tilt_x=random.normal(0.0, conditions.level), tilt_y=random.normal(0.0, conditions.level)
     )
-    shift = random.normal(0.0, conditions.lens, 3)
+    shift = random.normal(0.0, conditions.lens, 3).tolist()
     true_lens = truth.camera.lens
     lens = replace(
         true_lens,

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -11,16 +10,15 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import Progress
 
 from finssim.experiments.localization_calibration import Calibrated, calibrate
 from finssim.experiments.localization_campaign import CONDITIONS, Campaign, draw_campaign, lifted
 from finssim.experiments.localization_pictures import RENDERERS, Picture, pictures
 from finssim.experiments.localization_scores import Scores, locate, pooled, rmse_cm, sensitivity
 from finssim.experiments.localization_table import RESULT_FILE, print_table, write_results
+from finssim.experiments.running import Say, run_experiment
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.provenance import provenance
-from finssim.quiet import start_warp
 
 __all__ = ["METHODS_SHOWN", "PAPER_TABLE_2", "SeedResult", "localization_experiment", "run"]
 
@@ -45,8 +43,6 @@ LIFT = 0.4
 RIPPLES = (0.0, 0.005, 0.01, 0.02, 0.04)
 RIPPLE_VISITS = 40
 RIPPLE_IMAGES = 4
-
-Say = Callable[[float, str], None]
 
 
 @dataclass(frozen=True)
@@ -73,24 +69,14 @@ def run(
 
     Arguments as for `localization_experiment`; console is where the table goes, standard output if None.
     """
-    start_warp()
-    screen = Console(stderr=True)
-    with Progress(console=screen, transient=True, disable=not screen.is_terminal) as progress:
-        bar = progress.add_task("localization experiment", total=1.0)
-        result = localization_experiment(
-            renderer=renderer,
-            seeds=seeds,
-            out=out,
-            seed=seed,
-            progress=lambda part, what: progress.update(bar, completed=part, description=what),
-        )
-    if as_json:
-        print(json.dumps(result, allow_nan=False))
-        return result
-    console = console or Console()
-    print_table(result, console)
-    console.print(f"written: {out}", highlight=False, soft_wrap=True)
-    return result
+    return run_experiment(
+        "localization experiment",
+        lambda say: localization_experiment(renderer=renderer, seeds=seeds, out=out, seed=seed, progress=say),
+        print_table,
+        out=out,
+        as_json=as_json,
+        console=console,
+    )
 
 
 def localization_experiment(
@@ -133,16 +119,57 @@ def localization_experiment(
         size["locations"] = locations
     if images is not None:
         size["images"] = images
-    say = progress or (lambda part, what: None)
+    found = _drawn(seeds, seed, renderer, size, progress or (lambda part, what: None))
+    first = found.done["published"][0]
+    result = {
+        "experiment": "localization",
+        "renderer": renderer,
+        "seeds": [one.campaign.seed for one in found.done["published"]],
+        "seeds_asked_for": seeds,
+        "interrupted": found.interrupted,
+        "places": len(first.campaign.visits),
+        "pictures_per_seed": sum(visit.images for visit in first.campaign.visits),
+        "conditions": {name: vars(CONDITIONS[name]) for name in CONDITIONS},
+        "results": found.results(),
+        "lift_m": LIFT,
+        "pixel_std_px": [one.found.pixel_std for one in found.done["published"]],
+        "calibration": [_errors(one) for one in found.done["published"]],
+        "sensitivity": found.swept,
+        "paper": {m: {"rmse_cm": r, "p95_cm": p} for m, (r, p) in PAPER_TABLE_2.items()},
+        "provenance": provenance(),
+    }
+    write_results(result, out, first.campaign, first.found, first.scores)
+    return result
+
+
+@dataclass(frozen=True)
+class _Findings:
+    done: Mapping[str, list[SeedResult]]
+    """By conditions."""
+    higher: list[dict[str, Scores]]
+    """The tag lifted, by seed and method."""
+    swept: Mapping[str, Any]
+    interrupted: bool
+
+    def results(self) -> dict[str, Any]:
+        """Conditions -> method -> figures over all seeds."""
+        scores = {name: [one.scores for one in runs] for name, runs in self.done.items()}
+        return {
+            name: {method: pooled([one[method] for one in runs]) for method in METHODS_SHOWN}
+            for name, runs in (scores | {"lifted": self.higher}).items()
+            if runs
+        }
+
+
+def _drawn(seeds: int, seed: int, renderer: str, size: Mapping[str, Any], say: Say) -> _Findings:
+    """All seeds, or after Ctrl-C those that are finished, of the first what there is."""
     done: dict[str, list[SeedResult]] = {name: [] for name in CONDITIONS}
     higher: list[dict[str, Scores]] = []
     swept: dict[str, Any] = {}
-    interrupted = False
     try:
         for k in range(seeds):
             for j, name in enumerate(CONDITIONS):
-                share = (k + j / len(CONDITIONS)) / seeds
-                say(share, f"seed {seed + k}, {name} conditions")
+                say((k + j / len(CONDITIONS)) / seeds, f"seed {seed + k}, {name} conditions")
                 done[name].append(_one(name, seed + k, renderer, size))
             say((k + 0.8) / seeds, f"seed {seed + k}, another depth")
             higher.append(_lifted(done["published"][k], renderer))
@@ -152,36 +179,9 @@ def localization_experiment(
     except KeyboardInterrupt:
         if not done["published"]:
             raise
-        interrupted = True
         finished = max(len(higher), 1)
-        done = {name: runs[:finished] for name, runs in done.items()}
-    first = done["published"][0]
-    result = {
-        "experiment": "localization",
-        "renderer": renderer,
-        "seeds": [one.campaign.seed for one in done["published"]],
-        "seeds_asked_for": seeds,
-        "interrupted": interrupted,
-        "places": len(first.campaign.visits),
-        "pictures_per_seed": sum(visit.images for visit in first.campaign.visits),
-        "conditions": {name: vars(CONDITIONS[name]) for name in CONDITIONS},
-        "results": {
-            name: {method: pooled([one.scores[method] for one in runs]) for method in METHODS_SHOWN}
-            for name, runs in done.items()
-            if runs
-        }
-        | (
-            {"lifted": {m: pooled([scores[m] for scores in higher]) for m in METHODS_SHOWN}} if higher else {}
-        ),
-        "lift_m": LIFT,
-        "pixel_std_px": [one.found.pixel_std for one in done["published"]],
-        "calibration": [_errors(one) for one in done["published"]],
-        "sensitivity": swept,
-        "paper": {m: {"rmse_cm": r, "p95_cm": p} for m, (r, p) in PAPER_TABLE_2.items()},
-        "provenance": provenance(),
-    }
-    write_results(result, out, first.campaign, first.found, first.scores)
-    return result
+        return _Findings({name: runs[:finished] for name, runs in done.items()}, higher, swept, True)
+    return _Findings(done, higher, swept, False)
 
 
 def _one(name: str, seed: int, renderer: str, size: Mapping[str, Any]) -> SeedResult:

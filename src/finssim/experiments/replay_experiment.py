@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -12,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import Progress
 
 from finssim.calibration.excitation.programmes import programmes
 from finssim.calibration.fit import Fit
@@ -22,6 +20,7 @@ from finssim.calibration.replay.metrics import RESAMPLES, SEED
 from finssim.calibration.replay.replay import Replay, replay
 from finssim.experiments.replay_plant import ReplayPlant, load_replay_plant
 from finssim.experiments.replay_table import RESULT_FILE, print_table, write_results
+from finssim.experiments.running import Say, run_experiment
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
@@ -72,24 +71,14 @@ def run(
 
     Arguments as for `replay_experiment`; console is where the table goes, standard output if None.
     """
-    start_warp()
-    screen = Console(stderr=True)
-    with Progress(console=screen, transient=True, disable=not screen.is_terminal) as progress:
-        bar = progress.add_task("replay experiment", total=1.0)
-        result = replay_experiment(
-            seeds=seeds,
-            out=out,
-            seed=seed,
-            vehicle=vehicle,
-            progress=lambda part, what: progress.update(bar, completed=part, description=what),
-        )
-    if as_json:
-        print(json.dumps(result, allow_nan=False))
-        return result
-    console = console or Console()
-    print_table(result, console)
-    console.print(f"written: {out}", highlight=False, soft_wrap=True)
-    return result
+    return run_experiment(
+        "replay experiment",
+        lambda say: replay_experiment(seeds=seeds, out=out, seed=seed, vehicle=vehicle, progress=say),
+        print_table,
+        out=out,
+        as_json=as_json,
+        console=console,
+    )
 
 
 def replay_experiment(
@@ -101,7 +90,7 @@ def replay_experiment(
     plant: ReplayPlant | None = None,
     repeats: int = REPEATS,
     axes: Sequence[str] = AXES,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Say | None = None,
 ) -> dict[str, Any]:
     """Trials from the hidden plant, identification on half of them, three models replayed on the other half.
 
@@ -172,7 +161,7 @@ def experiment_seed(
     seed: int,
     repeats: int = REPEATS,
     axes: Sequence[str] = AXES,
-    say: Callable[[float, str], None] = lambda part, what: None,
+    say: Say = lambda part, what: None,
 ) -> SeedResult:
     """One seed of the experiment; arguments as for `replay_experiment`, `say` is told the share that is done."""
     say(0.0, "trials")
@@ -249,7 +238,7 @@ def _fit(one: SeedResult) -> dict[str, Any]:
     }
 
 
-def _part(progress: Callable[[float, str], None] | None, k: int, seeds: int) -> Callable[[float, str], None]:
+def _part(progress: Say | None, k: int, seeds: int) -> Say:
     """Progress of one of several seeds."""
 
     def say(part: float, what: str) -> None:
