@@ -114,6 +114,16 @@ def test_replace_makes_a_new_vehicle_and_leaves_the_old():
     assert vehicle.replace({}) == vehicle
 
 
+def test_replace_reaches_tags_by_their_number():
+    """The ids of tags are numbers in the file and words in a dotted path."""
+    vehicle = load_vehicle("finsrov")
+    moved = vehicle.replace({"tags.mounts.15.position": [0.08, 0.0, 0.10]})
+    assert moved.tags.mounts[15].position.tolist() == [0.08, 0.0, 0.10]
+    assert moved.tags.mounts[16] == vehicle.tags.mounts[16]
+    with pytest.raises(VehicleError, match="no '17'; there are 15, 16"):
+        vehicle.replace({"tags.mounts.17.position": [0.0, 0.0, 0.0]})
+
+
 def test_replace_reaches_single_elements():
     vehicle = load_vehicle("finsrov").replace({"hydrodynamics.calibrated.linear_damping.3.3": 2.5})
     chosen = vehicle.hydrodynamic_set("calibrated")

@@ -217,12 +217,13 @@ def _set(tree: Any, path: list[str], value: Any, shown: str, done: tuple[str, ..
         index: Any = int(key)
     elif isinstance(tree, dict):
         if key == "*":
-            return [full for name in tree for full in _set(tree, [name, *rest], value, shown, done)]
-        index = key
-        if rest and key not in tree:
+            return [full for name in tree for full in _set(tree, [str(name), *rest], value, shown, done)]
+        names = {str(name): name for name in tree}  # ids of tags are numbers
+        index = names.get(key, key)
+        if rest and key not in names:
             raise VehicleError(
-                f"{shown}: {'.'.join(done) or 'top level'}: no '{key}'{did_you_mean(key, list(tree))} "
-                f"there are {', '.join(tree)}"
+                f"{shown}: {'.'.join(done) or 'top level'}: no '{key}'{did_you_mean(key, list(names))} "
+                f"there are {', '.join(names)}"
             )
     else:
         raise VehicleError(f"{shown}: {'.'.join(done)} is a value, it has no '{key}'")
