@@ -45,12 +45,16 @@ class Fixes:
             pixel_std: Standard deviation of a corner [px].
 
         Raises:
-            LocalizationError: Unknown method, or a vehicle without tags.
+            LocalizationError: Unknown method, a vehicle without tags, or no error at all.
         """
         check_method(method)
         if vehicle.tags is None:
             raise LocalizationError(
                 "the vehicle file has no tags: add a section tags: with family, edge and mounts"
+            )
+        if not (math.isfinite(pixel_std) and pixel_std > 0.0):
+            raise LocalizationError(
+                f"pixel_std is {pixel_std}, expected the error of a corner in pixels, such as 0.3"
             )
         self._pool, self._method, self._pixel_std = pool, method, pixel_std
         self._tags = tag_corners_b(vehicle.tags)
