@@ -284,3 +284,19 @@ def test_the_command_refuses_in_a_sentence(capsys, tmp_path, monkeypatch, words,
     (line,) = filter(None, capsys.readouterr().err.splitlines())
     assert line.startswith("finssim: ") and sentence in line
     assert list(tmp_path.iterdir()) == []
+
+
+def test_methods_are_told_the_noise_that_the_calibration_found(monkeypatch):
+    """Every method gets the standard deviation of a corner from the residuals of the same conditions."""
+    from finssim.experiments import localization_experiment as experiment
+
+    told = []
+    locate = experiment.locate
+    monkeypatch.setattr(
+        experiment,
+        "locate",
+        lambda *words, **named: told.append(named["pixel_std"]) or locate(*words, **named),
+    )
+    one = experiment._one("published", 1, "geometry", {"locations": (5, 4), "images": 40})
+    assert len(told) == len(experiment.METHODS_SHOWN)
+    assert set(told) == {one.found.pixel_std} and one.found.pixel_std > 0.1

@@ -3,15 +3,19 @@
 import json
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
-from finssim.experiments import localization_pictures
+from finssim.experiments import localization_pictures, localization_scores
 from finssim.experiments.localization_campaign import CONDITIONS, draw_campaign
 from finssim.experiments.localization_pictures import pictures
-from finssim.experiments.localization_scores import Scores, locate, pooled, sensitivity
+from finssim.experiments.localization_scores import Scores, pooled
 
+PIXEL_STD = 0.2
+locate = partial(localization_scores.locate, pixel_std=PIXEL_STD)
+sensitivity = partial(localization_scores.sensitivity, pixel_std=PIXEL_STD)
 SMALL = {"locations": (6, 4), "images": 48}
 
 

@@ -193,7 +193,10 @@ def _one(name: str, seed: int, renderer: str, size: Mapping[str, Any]) -> SeedRe
 
 def _scored(campaign: Campaign, seen: Sequence[Picture], found: Calibrated) -> dict[str, Scores]:
     pools = {"refractive": found.refractive, "pinhole": found.pinhole}
-    return {row: locate(campaign, seen, pools[kind], method) for row, (method, kind) in METHODS_SHOWN.items()}
+    return {
+        row: locate(campaign, seen, pools[kind], method, pixel_std=found.pixel_std)
+        for row, (method, kind) in METHODS_SHOWN.items()
+    }
 
 
 def _lifted(one: SeedResult, renderer: str) -> dict[str, Scores]:

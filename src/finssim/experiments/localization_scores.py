@@ -57,7 +57,7 @@ def locate(
     pool: Pool,
     method: str,
     *,
-    pixel_std: float = LEAST_PIXEL_STD,
+    pixel_std: float,
     depth_offset: float = 0.0,
 ) -> Scores:
     """Locate the tag in every picture of the held-out visits and average over each visit.
@@ -165,7 +165,7 @@ INDICES = (-0.02, -0.01, -0.005, 0.0, 0.005, 0.01, 0.02)
 
 
 def sensitivity(
-    campaign: Campaign, seen: Sequence[Picture], pool: Pool, pixel_std: float = LEAST_PIXEL_STD
+    campaign: Campaign, seen: Sequence[Picture], pool: Pool, pixel_std: float
 ) -> dict[str, list[list[float | None]]]:
     """RMSE of the refractive method with one thing wrong on purpose.
 
