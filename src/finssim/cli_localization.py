@@ -56,7 +56,7 @@ def localize(
             help="Table with columns image, time [s], where names of pictures hold none.", metavar="FILE"
         ),
     ] = None,
-    pixel_std: PixelStd = 0.5,
+    pixel_std: PixelStd = None,
     shared_pixel_std: Annotated[
         float, typer.Option(help="Error that all corners of a picture share, per axis [px]: waves.")
     ] = 0.0,
@@ -134,7 +134,7 @@ def fuse(
             metavar="METHOD",
         ),
     ] = "refractive",
-    pixel_std: PixelStd = 0.5,
+    pixel_std: PixelStd = None,
     imu_axes: Annotated[
         str | None,
         typer.Option(

@@ -30,4 +30,9 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instea
 Pool = Annotated[
     Path, typer.Option(help="Pool file: camera, water plane and frames (.yaml).", metavar="FILE")
 ]
-PixelStd = Annotated[float, typer.Option(help="Error of a detected corner, per axis [px].")]
+PixelStd = Annotated[
+    float | None,
+    typer.Option(
+        help="Error of a detected corner, per axis [px]; what the pool's calibration found, else 0.5, if not given."
+    ),
+]

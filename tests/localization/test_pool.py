@@ -94,6 +94,15 @@ def test_the_lens_may_stand_in_a_file_of_its_own(tmp_path):
     assert load_pool(path).camera.lens.fx == 541.0
 
 
+@pytest.mark.parametrize(
+    ("record", "expected"),
+    [({}, 0.5), ({"residual": {"pixel_sigma": 0.83}}, 0.83), ({"residual": {"pixel_sigma": 0.001}}, 0.05)],
+)
+def test_the_noise_of_a_corner_is_what_the_calibration_found(record, expected):
+    """From its residuals, but never below what a detector can do; half a pixel where nobody knows."""
+    assert pool(record=record).pixel_std == expected
+
+
 REFUSED = {
     "no camera": ("interface: {height: 1}\n", "camera: lens is missing"),
     "no plane": (HEAD, "interface: normal is missing"),

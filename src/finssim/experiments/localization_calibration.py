@@ -17,7 +17,6 @@ from finssim.calibration.vision.pool_settings import Settings
 from finssim.calibration.vision.survey import read_survey
 from finssim.experiments.localization_campaign import TAG, Campaign
 from finssim.experiments.localization_pictures import Picture
-from finssim.experiments.localization_scores import LEAST_PIXEL_STD
 from finssim.geometry.optics import Interface
 from finssim.localization.detections import Frame, write_detections
 from finssim.localization.pool import Pool
@@ -43,7 +42,7 @@ class Calibrated:
     @property
     def pixel_std(self) -> float:
         """Standard deviation of a corner per axis, ripples included, as the residuals tell it [px]."""
-        return max(self.fit.noise.pixel, LEAST_PIXEL_STD)
+        return self.refractive.pixel_std
 
 
 def calibrate(campaign: Campaign, seen: Sequence[Picture]) -> Calibrated:

@@ -24,8 +24,6 @@ RESAMPLES = 2000
 SEED = 20260903
 Z_STD = 0.01
 TILT_STD = float(np.radians(0.5))
-LEAST_PIXEL_STD = 0.05
-"""What a detector's corners are off at best, per axis [px]."""
 
 TAGS_B = tag_corners_b(TAG)
 

@@ -53,7 +53,7 @@ def run(
     mode: str = "constant-velocity",
     profile: str = "default",
     method: str = "refractive",
-    pixel_std: float = 0.5,
+    pixel_std: float | None = None,
     imu_axes: str | None = None,
     as_json: bool = False,
 ) -> Run:
@@ -68,7 +68,7 @@ def run(
         mode: `constant-velocity` or `error-state`.
         profile: `default` or `published` settings.
         method: How fixes are made of detections.
-        pixel_std: Standard deviation of a detected corner [px].
+        pixel_std: Standard deviation of a detected corner [px]; None: what the pool file says.
         imu_axes: `body`, `sensor`, or None for what the columns' names say.
         as_json: Print one JSON object in place of the summary.
 
@@ -81,6 +81,7 @@ def run(
     refuse_unwritable(atomic_write(out))
     site, body = load_pool(pool), load_vehicle(str(vehicle))
     read = load_log(log, body, latency=site.latency, imu_axes=imu_axes)
+    pixel_std = site.pixel_std if pixel_std is None else pixel_std
     found = fuse(read, site, body, rate=rate, mode=mode, profile=profile, method=method, pixel_std=pixel_std)
     write_rows(found.rows, out)
     if as_json:

@@ -52,7 +52,7 @@ def run(
     refine: str = "fit",
     gamma: float = 1.0,
     times: str | Path | None = None,
-    pixel_std: float = 0.5,
+    pixel_std: float | None = None,
     shared_pixel_std: float = 0.0,
     depth_std: float | None = None,
     tilt_std_deg: float | None = None,
@@ -75,7 +75,7 @@ def run(
         refine: How corners are placed, see `detector`.
         gamma: Encoding of the pictures, see `detector`.
         times: File with columns image, time [s], for pictures whose names hold no time.
-        pixel_std: Standard deviation of a corner, per axis [px].
+        pixel_std: Standard deviation of a corner, per axis [px]; None: what the pool file says.
         shared_pixel_std: Error that all corners of a picture share, per axis [px].
         depth_std: Of the depth [m]; None: that of the vehicle file.
         tilt_std_deg: Of roll and pitch [degrees]; None: 0.5 with an IMU, 2 without.
@@ -100,6 +100,7 @@ def run(
         shared_pixel_std=shared_pixel_std,
         longest_gap=longest_gap,
     )
+    pixel_std = site.pixel_std if pixel_std is None else pixel_std
     locator = Locator(site, body, known, method=method, pixel_std=pixel_std, family=family)
     surveyed = None if truth is None else load_truth(truth, longest_gap)
     seeing = Seeing(

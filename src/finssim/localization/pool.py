@@ -26,6 +26,10 @@ __all__ = ["Pool", "load_pool", "write_pool"]
 Array = npt.NDArray[np.float64]
 
 FORMAT = 1
+SUREST_PIXEL = 0.05
+"""A corner is believed no more than this [px], however small the residuals were."""
+USUAL_PIXEL = 0.5
+"""Of a corner where no calibration says [px]."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +71,13 @@ class Pool:
         R, t = T[:3, :3], T[:3, 3].copy()
         T[:3, :3], T[:3, 3] = R.T.copy(), -R.T @ t
         return T
+
+    @property
+    def pixel_std(self) -> float:
+        """Standard deviation of a corner, per axis [px]: what the calibration's residuals told, otherwise 0.5."""
+        residual = self.record.get("residual")
+        found = residual.get("pixel_sigma") if isinstance(residual, Mapping) else None
+        return max(float(found), SUREST_PIXEL) if isinstance(found, (int, float)) else USUAL_PIXEL
 
     @property
     def sha256(self) -> str:
