@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -139,6 +140,10 @@ def pool(
             help="Relative error of the camera file's focal length; what the file says if not given."
         ),
     ] = None,
+    center_sigma: Annotated[
+        float | None,
+        typer.Option(help="Error of its optical centre [px]; what the file says if not given."),
+    ] = None,
     pixel_sigma: Annotated[
         float | None, typer.Option(help="Error of a pixel [px]; from the residuals if not given.")
     ] = None,
@@ -183,6 +188,7 @@ def pool(
         tilt_sigma=tilt_sigma,
         fit=fit,
         focal_sigma=focal_sigma,
+        center_sigma=center_sigma,
         pixel_sigma=pixel_sigma,
         survey_sigma=survey_sigma,
         survey_yaw_sigma=survey_yaw_sigma,
@@ -246,7 +252,7 @@ def _three(text: str) -> tuple[float, ...]:
         numbers = tuple(float(word) for word in text.split(","))
     except ValueError:
         numbers = ()
-    if len(numbers) != 3:
+    if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
         raise typer.BadParameter(f"--turns-about is '{text}', expected three lengths such as 0,0,-0.08")
     return numbers
 

@@ -88,7 +88,7 @@ def run(
     record = {**camera_record(fit), "without_board": without}
     write_camera(out, fit.lens, record)
     if report is not None:
-        command = _command(images, out, board, square, charuco, marker, dictionary, model)
+        command = _command(images, out, board, square, charuco, marker, dictionary, model, seed)
         write_camera_report(fit, report, command=command)
     _show(fit, out, report, as_json)
     if fit.interrupted:
@@ -173,6 +173,7 @@ def _command(
     marker: float | None,
     dictionary: str,
     model: str,
+    seed: int,
 ) -> str:
     """The command line that does this again."""
     words = [
@@ -190,4 +191,4 @@ def _command(
         words += [] if marker is None else ["--marker", f"{marker:g}"]
     elif board is not None:
         words += ["--board", board]
-    return shlex.join([*words, "--model", model])
+    return shlex.join([*words, "--model", model, "--seed", str(seed)])

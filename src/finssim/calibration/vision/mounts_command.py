@@ -78,6 +78,7 @@ def run(
             "--out",
             str(out),
         ]
+        words += ["--estimate", estimate, "--seed", str(seed)]
         words += [] if turns_about is None else ["--turns-about", ",".join(f"{x:g}" for x in turns_about)]
         write_report(fit, report, after, command=shlex.join(words), warnings=warnings, out=out)
     if as_json:

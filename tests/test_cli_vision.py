@@ -1,0 +1,544 @@
+"""`finssim calibrate camera`, `pool` and `mounts`, as a person types them: every option, every refusal."""
+
+import json
+
+import numpy as np
+import pytest
+
+from calibration.vision.board_views import PHOTOGRAPHS
+from calibration.vision.moving_vehicle import MOUNTS, POOL, PORT, motion, write_log
+from calibration.vision.surveyed_pools import FLOOR, PLUMB_BOB, SOLID, overhead, survey
+from finssim import boundary
+from finssim.calibration.output.vehicle_file import write_vehicle
+from finssim.cli import app
+from finssim.geometry.optics import Interface, Layer
+from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
+from finssim.localization.camera_file import load_camera, write_camera
+from finssim.localization.families import bitmap
+from finssim.localization.pictures import read_picture, write_picture
+from finssim.localization.pool import load_pool, write_pool
+from finssim.sensors.overhead_camera import Basin, OverheadCamera, Pose, Scene, Sensor, TagInScene
+from finssim.vehicles import Provenance, load_vehicle
+
+PARAMETER = {"estimate", "ci95", "unit", "identifiable", "note"}
+
+
+def finssim(*words):
+    """Run a command here and now; returns its exit status."""
+    return boundary.run(app, [str(word) for word in words])
+
+
+def found_by(capsys, *words):
+    """The one JSON object that a command prints."""
+    capsys.readouterr()
+    assert finssim(*words, "--json") == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def refusal(capsys, *words):
+    """The one sentence with which a command refuses its input; notes on what it left out may stand before it."""
+    capsys.readouterr()
+    assert finssim(*words) == 2
+    out, err = capsys.readouterr()
+    lines = list(filter(None, err.splitlines()))
+    assert sum(line.startswith("finssim: ") for line in lines) == 1 and "Traceback" not in err and out == ""
+    return lines[-1].removeprefix("finssim: ")
+
+
+def refused(capsys, folder, words, sentence):
+    """A refusal holds the sentence, and nothing is written."""
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    assert sentence in refusal(capsys, *words)
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+
+
+def width(found, name):
+    """Width of a parameter's interval."""
+    low, high = found["parameters"][name]["ci95"]
+    return high - low
+
+
+# ---- calibrate camera
+
+SOME = [PHOTOGRAPHS / f"left{i:02d}.jpg" for i in (1, 3, 5, 6, 8)]
+CAMERA = ["calibrate", "camera", *SOME, "--out", "camera.yaml"]
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """An empty folder to work in."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(scope="session")
+def charuco(tmp_path_factory):
+    """Pictures of a ChArUco board of 7x5 squares, markers of DICT_4X4_50, by a lens of 600 px."""
+    cv2 = pytest.importorskip("cv2")
+    folder, rng = tmp_path_factory.mktemp("charuco"), np.random.default_rng(1)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    board = cv2.aruco.CharucoBoard((7, 5), 0.03, 0.02, dictionary).generateImage((1400, 1000))
+    K = np.array([[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]])
+    to_metres = np.array([[0.00015, 0.0, 0.000075], [0.0, 0.00015, 0.000075], [0.0, 0.0, 1.0]])
+    for i in range(6):
+        R = quat_to_matrix(quat_from_euler(*rng.uniform(-0.5, 0.5, 2), rng.uniform(-0.3, 0.3)))
+        t = np.array([*rng.uniform(-0.03, 0.03, 2), 0.32]) - R @ [0.105, 0.075, 0.0]
+        H = K @ np.column_stack([R[:, 0], R[:, 1], t]) @ to_metres
+        image = cv2.warpPerspective(board, H, (640, 480), flags=cv2.INTER_AREA, borderValue=170)
+        write_picture(cv2.GaussianBlur(image, (0, 0), 0.7), folder / f"{i}.png")
+    return folder
+
+
+def test_camera_as_json_and_as_a_file(place, capsys):
+    """One object with the keys of the contract; the file holds the same lens, and beside it stands nothing else."""
+    found = found_by(capsys, *CAMERA, "--board", "9x6", "--report", "report")
+    assert found.keys() >= {
+        *("kind", "parameters", "per_view", "rms_px", "held_out_rms_px", "views", "left_out", "advice"),
+        *("error95_px", "empty_edges", "correlation", "settings", "interrupted", "out", "provenance"),
+    }
+    assert found["kind"] == "camera" and found["out"] == "camera.yaml"
+    assert all(parameter.keys() == PARAMETER for parameter in found["parameters"].values())
+    lens = load_camera("camera.yaml").lens
+    assert lens.fx == pytest.approx(found["parameters"]["fx"]["estimate"], rel=1e-6)
+    assert lens.fx == pytest.approx(536.0, rel=0.02) and lens.model == "plumb_bob"
+    assert {path.name for path in place.iterdir()} == {"camera.yaml", "report"}
+    assert "finssim calibrate camera" in (place / "report" / "report.html").read_text("utf-8")
+
+
+def test_camera_finds_the_board_by_itself_and_says_so(place, capsys):
+    """Without --board; as a table. The pictures are small, for every common size is tried."""
+    for path in SOME[:4]:
+        write_picture(np.ascontiguousarray(read_picture(path)[::2, ::2]), place / f"{path.stem}.png")
+    assert finssim("calibrate", "camera", place, "--out", "camera.yaml") == 0
+    out, err = capsys.readouterr()
+    assert "found a chessboard of 9x6 inner corners" in err and "written: camera.yaml" in out
+    assert "fx" in out and "95 % interval" in out
+
+
+@pytest.mark.parametrize("model", ["plumb_bob", "rational", "fisheye"])
+def test_camera_fits_the_lens_that_it_is_told(place, capsys, model):
+    found = found_by(capsys, *CAMERA, "--board", "9x6", "--model", model)
+    assert load_camera("camera.yaml").lens.model == found["settings"]["model"] == model
+
+
+def test_camera_takes_square_and_seed(place, capsys):
+    """The square goes into the record; the seed decides which pictures are held out together, and no more. The report
+    gives the command that does it again."""
+    words = ["calibrate", "camera", *sorted(PHOTOGRAPHS.glob("*.jpg"))]
+    words += ["--board", "9x6", "--out", "camera.yaml"]
+    plain = found_by(capsys, *words)
+    other = found_by(capsys, *words, "--square", "0.05", "--seed", "3", "--report", "report")
+    assert (plain["settings"]["square"], other["settings"]["square"]) == (0.025, 0.05)
+    assert "squares of 50 mm" in other["settings"]["board"]
+    assert other["held_out_rms_px"] != plain["held_out_rms_px"]
+    assert other["parameters"]["fx"]["estimate"] == pytest.approx(
+        plain["parameters"]["fx"]["estimate"], rel=1e-6
+    )
+    page = (place / "report" / "report.html").read_text("utf-8")
+    assert "--square 0.05" in page and "--board 9x6" in page and "--seed 3" in page
+
+
+def test_camera_reads_a_charuco_board(place, charuco, capsys):
+    """Its size, its squares, its markers and their dictionary are what the options say."""
+    words = ["calibrate", "camera", charuco, "--out", "camera.yaml", "--charuco", "7x5", "--square", "0.03"]
+    found = found_by(capsys, *words, "--dictionary", "DICT_4X4_50", "--marker", "0.02")
+    assert found["views"] == 6
+    assert load_camera("camera.yaml").lens.fx == pytest.approx(600.0, rel=0.02)
+    assert "7x5 squares, markers of 20 mm" in found["settings"]["board"]
+    found = found_by(capsys, *words, "--dictionary", "dict_4x4_50")
+    assert "markers of 22.5 mm" in found["settings"]["board"]
+    (place / "camera.yaml").unlink()
+    refused(capsys, place, words, "none of 6 pictures shows")
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ([*CAMERA, "--board", "nine"], "--board is 'nine', expected columns x rows such as 9x6"),
+        ([*CAMERA, "--board", "5x4"], "count the board's corners again"),
+        ([*CAMERA, "--board", "2x2"], "the board has 2x2 corners, expected at least 3"),
+        ([*CAMERA, "--board", "9x6", "--charuco", "7x5"], "--board and --charuco are both given"),
+        ([*CAMERA, "--charuco", "seven"], "--charuco is 'seven'"),
+        ([*CAMERA, "--charuco", "7x5", "--marker", "0.05"], "the marker is 0.05 m"),
+        ([*CAMERA, "--charuco", "7x5", "--dictionary", "DICT_9"], "unknown dictionary 'DICT_9'"),
+        ([*CAMERA, "--board", "9x6", "--square", "0"], "the square is 0 m"),
+        ([*CAMERA, "--board", "9x6", "--square", "wide"], "Invalid value for '--square'"),
+        ([*CAMERA, "--model", "pinhole"], "unknown lens model 'pinhole'; available: plumb_bob, rational, fisheye"),
+        ([*CAMERA, "--seed", "-1"], "Invalid value for '--seed'"),
+        ([*CAMERA[:-1], "camera.txt"], "camera.txt ends in '.txt', expected .yaml"),
+        ([*CAMERA[:-1], "/proc/x/camera.yaml"], "write elsewhere"),
+        ([*CAMERA, "--report", "/proc/x/report"], "write elsewhere"),
+        ([*CAMERA, "--report", PHOTOGRAPHS], "already holds files"),
+        (["calibrate", "camera", "nowhere.png", "--out", "c.yaml"], "nowhere.png: there is no such file"),
+        (["calibrate", "camera", ".", "--out", "c.yaml"], "the folder holds no pictures"),
+        (["calibrate", "camera", "--out", "c.yaml"], "Missing argument 'IMAGE"),
+        (["calibrate", "camera", *SOME], "Missing option '--out'"),
+    ],
+)  # fmt: skip
+def test_camera_refuses_in_a_sentence(place, capsys, words, sentence):
+    """And nothing is written."""
+    refused(capsys, place, words, sentence)
+
+
+# ---- calibrate pool
+
+
+def combined(path, seen, names="id,u,v,x,y,z", scale=1.0):
+    """A table of pixels with points."""
+    lines = [names]
+    for name, (u, v), point in zip(seen.names, seen.pixels, scale * seen.points, strict=True):
+        cells = dict(zip("xyz", point, strict=True)) | {"id": name, "u": u, "v": v}
+        lines.append(",".join(str(cells[column]) for column in names.split(",")))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+@pytest.fixture(scope="session")
+def pool_files(tmp_path_factory):
+    """A solid survey of 24 points, one of a floor, and a picture of tags on that floor, all below 1 m of water."""
+    folder = tmp_path_factory.mktemp("surveyed")
+    write_camera(folder / "camera.yaml", PLUMB_BOB, {})
+    water = Interface.water(1.0)
+    solid, floor = (survey(overhead(), water, box, 24, seed=2) for box in (SOLID, FLOOR))
+    combined(folder / "points.csv", solid)
+    combined(folder / "millimetres.csv", solid, scale=1000.0)
+    combined(folder / "floor.csv", floor, "id,u,v,x,y")
+    combined(folder / "pixels.csv", solid, "id,u,v")
+    combined(folder / "survey.csv", solid, "id,x,y,z")
+    (folder / "bad.csv").write_text("id,u,v,x,y,z\na,600,300,0,0,0\nb,600,low,0,0,0\n")
+    (folder / "thesis").mkdir()
+    (folder / "thesis" / "thesis.tex").touch()
+    return folder
+
+
+TAG_EDGE = 0.16
+
+
+@pytest.fixture(scope="session")
+def tag_files(pool_files):
+    """The floor's tags, with 4 mm of survey error, in one picture drawn through the water."""
+    pytest.importorskip("pupil_apriltags")
+    rng, tags, rows = np.random.default_rng(5), [], ["tag,x,y,z,yaw_deg"]
+    for i, (x, y) in enumerate((x, y) for x in (-1.2, -0.4, 0.5, 1.3) for y in (-0.7, 0.0, 0.6)):
+        yaw = rng.uniform(-np.pi, np.pi)
+        q = tuple(quat_from_euler(0.0, 0.0, yaw).tolist())
+        tags.append(
+            TagInScene(
+                bitmap=bitmap("tag36h11", i).astype(bool),
+                edge=TAG_EDGE,
+                margin=0.03,
+                pose=Pose(position=(x, y, 0.0), orientation=q),
+            )
+        )
+        off = 0.004 * rng.standard_normal(2)
+        rows.append(f"{i},{x + off[0]},{y + off[1]},0,{np.degrees(yaw) + rng.normal()}")
+    basin = Basin(lower=(-2.0, -1.0, -0.02), upper=(2.0, 1.0, 1.1))
+    scene = Scene(
+        camera=overhead(), interface=Interface.water(1.0), basin=basin, tags=tuple(tags), sensor=Sensor()
+    )
+    write_picture(OverheadCamera(scene).render(seed=1), pool_files / "tags.png")
+    (pool_files / "tags.csv").write_text("\n".join(rows) + "\n")
+    return pool_files
+
+
+@pytest.fixture
+def surveyed(pool_files, tmp_path, monkeypatch):
+    """The folder of the surveys to work in; what is written goes to another."""
+    monkeypatch.chdir(pool_files)
+    return tmp_path
+
+
+WITH = ["--camera", "camera.yaml"]
+SURFACE = ["--interface", "surface", "--fit", "pose,height,tilt,index", "--folds", "2"]
+TAPE = ["--water-height", "1.0"]
+
+
+def pool_by(capsys, out, *words, inputs=("points.csv",), surface=SURFACE):
+    """What `finssim calibrate pool` finds, and the pool that it writes."""
+    found = found_by(capsys, "calibrate", "pool", *inputs, *WITH, *surface, "--out", out / "p.yaml", *words)
+    return found, load_pool(out / "p.yaml")
+
+
+@pytest.fixture(scope="session")
+def plain(pool_files):
+    """The same without any option, for comparison."""
+    import contextlib
+    import io
+
+    text = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(text):
+        patch.chdir(pool_files)
+        words = ["calibrate", "pool", "points.csv", *WITH, *SURFACE, *TAPE, "--out", "plain.yaml", "--json"]
+        assert finssim(*words) == 0
+    return json.loads(text.getvalue()), load_pool(pool_files / "plain.yaml")
+
+
+def test_pool_as_json_and_as_a_file(surveyed, plain):
+    """The keys of the contract; near the truth; what was known beforehand is in the file's record."""
+    found, pool = plain
+    assert found.keys() >= {
+        *("kind", "interface", "parameters", "residual", "held_out", "pinhole", "lens_fitted", "outliers"),
+        *("other_minima", "correlation", "notes", "advice", "settings", "inputs", "out", "provenance"),
+    }
+    assert found["kind"] == "pool" and found["interface"] == "surface" and found["out"] == "plain.yaml"
+    assert all(parameter.keys() == PARAMETER for parameter in found["parameters"].values())
+    assert np.linalg.norm(pool.camera.position - overhead().position) < 0.02
+    assert pool.interface.height(0.0, 0.0) == pytest.approx(1.0, abs=0.01)
+    assert pool.record["settings"]["water_height"] == 1.0 and pool.latency == 0.0
+
+
+def test_pool_as_a_table_with_a_report(surveyed, capsys):
+    """Without any option but those that it needs: what was found, where it was written, and a command to do it again
+    that does it again."""
+    import shlex
+
+    words = ["calibrate", "pool", "points.csv", *WITH, "--out", surveyed / "p.yaml", "--seed", "4"]
+    assert finssim(*words, "--report", surveyed / "report", "--latency", "0.05") == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "camera before a water surface, from 24 surveyed places" in out and "camera_height" in out
+    assert "held out (5 parts)" in out and f"written: {surveyed / 'report'}" in out
+    page = (surveyed / "report" / "report.md").read_text(encoding="utf-8")
+    (again,) = {line.strip("` ") for line in page.splitlines() if line.strip("` ").startswith("finssim ")}
+    first = load_pool(surveyed / "p.yaml")
+    (surveyed / "p.yaml").unlink()
+    assert finssim(*shlex.split(again)[1:]) == 0
+    assert load_pool(surveyed / "p.yaml").sha256 == first.sha256 and first.latency == 0.05
+
+
+def test_pool_matches_a_survey_with_pixels(surveyed, plain, capsys):
+    """Two tables with --surveyed give what one gives."""
+    _, pool = pool_by(capsys, surveyed, *TAPE, "--surveyed", "survey.csv", inputs=("pixels.csv",))
+    assert pool.sha256 == plain[1].sha256
+
+
+def test_pool_reads_lengths_in_the_unit(surveyed, plain, capsys):
+    """Millimetres without a word of it spread over kilometres and are refused; with --unit they are the same survey."""
+    words = ["calibrate", "pool", "millimetres.csv", *WITH, *SURFACE, *TAPE, "--out", surveyed / "p.yaml"]
+    refused(capsys, surveyed, words, "give --unit")
+    _, pool = pool_by(capsys, surveyed, *TAPE, "--unit", "mm", inputs=("millimetres.csv",))
+    np.testing.assert_allclose(pool.camera.position, plain[1].camera.position, atol=1e-6)
+
+
+def test_pool_takes_the_height_of_a_floor(surveyed, capsys):
+    """A table without z: refused without --z; another height of the floor moves the camera with it."""
+    words = ["calibrate", "pool", "floor.csv", *WITH, *SURFACE, "--out", surveyed / "p.yaml"]
+    refused(capsys, surveyed, words, "no column 'z'")
+    heights = []
+    for z in (0.0, 0.5):
+        _, pool = pool_by(capsys, surveyed, "--z", z, "--water-height", 1.0 + z, inputs=("floor.csv",))
+        heights.append(pool.camera.position[2])
+    assert heights[1] - heights[0] == pytest.approx(0.5, abs=1e-4)
+
+
+OPTIONS = {
+    "interface": (["--interface", "wall"], lambda a, b, p: a["interface"] == "wall"),
+    "plane": (["--plane", "0,0,1,-1.02"], lambda a, b, p: abs(p.interface.height(0, 0) - 1.02) < 0.01),
+    "window": (["--window", "0.02:1.49"], lambda a, b, p: p.interface.window == (Layer(0.02, 1.49),)),
+    "two windows": (
+        ["--window", "0.02:1.49", "--window", "0.01:1.52"],
+        lambda a, b, p: p.interface.window == (Layer(0.02, 1.49), Layer(0.01, 1.52)),
+    ),
+    "water-height": (
+        ["--water-height", "1.03", "--water-height-sigma", "0.0005"],
+        lambda a, b, p: abs(a["parameters"]["water_height"]["estimate"] - 1.03) < 0.005,
+    ),
+    "water-depth": (
+        ["--water-depth", "0.5", "--water-height-sigma", "0.0005"],
+        lambda a, b, p: a["settings"]["water_depth"] == 0.5
+        and abs(a["parameters"]["water_height"]["estimate"] - b["parameters"]["water_height"]["estimate"]) > 0.1,
+    ),
+    "water-height-sigma": (
+        [*TAPE, "--water-height-sigma", "0.0005"],
+        lambda a, b, p: 3.0 * width(a, "water_height") < width(b, "water_height"),
+    ),
+    "index": (
+        [*TAPE, "--index", "1.34", "--fit", "pose,height,tilt"],
+        lambda a, b, p: p.interface.index_far == 1.34 and a["settings"]["index_sigma"] == 0.0,
+    ),
+    "index-sigma": ([*TAPE, "--index-sigma", "0.03"], lambda a, b, p: width(a, "index") > 1.5 * width(b, "index")),
+    "tilt-sigma": ([*TAPE, "--tilt-sigma", "0.01"], lambda a, b, p: width(a, "tilt_x") < 0.5 * width(b, "tilt_x")),
+    "fit": ([*TAPE, "--fit", "pose,height"], lambda a, b, p: a["parameters"]["tilt_x"]["note"] == "as given"),
+    "focal-sigma": ([*TAPE, "--focal-sigma", "0.01"], lambda a, b, p: width(a, "focal") > width(b, "focal") == 0.0),
+    "pixel-sigma": ([*TAPE, "--pixel-sigma", "1.5"], lambda a, b, p: a["residual"]["pixel_sigma"] == 1.5),
+    "survey-sigma": (
+        [*TAPE, "--survey-sigma", "0.0002"],
+        lambda a, b, p: a["residual"]["survey_sigma_mm"] < 0.5,
+    ),
+    "latency": ([*TAPE, "--latency", "0.04"], lambda a, b, p: p.latency == 0.04),
+    "folds": ([*TAPE, "--folds", "4"], lambda a, b, p: a["held_out"]["folds"] == 4 != b["held_out"]["folds"]),
+    "seed": ([*TAPE, "--seed", "7"], lambda a, b, p: a["held_out"]["rms_px"] != b["held_out"]["rms_px"]),
+}  # fmt: skip
+"""Option -> words, and what is then otherwise than without: JSON now, JSON without, pool now."""
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_pool_does_what_each_option_says(surveyed, plain, capsys, name):
+    """The result is otherwise in the way that the option names."""
+    words, told = OPTIONS[name]
+    found, pool = pool_by(capsys, surveyed, *words)
+    assert told(found, plain[0], pool)
+    assert not told(plain[0], plain[0], plain[1])
+
+
+def test_pool_finds_the_tags_of_a_picture(surveyed, tag_files, capsys):
+    """Of the family that --family says, with the edge that --edge says: camera and water within 1.5 cm."""
+    words = ["--surveyed", "tags.csv", *TAPE]
+    given = {"inputs": ("tags.png",)}
+    found, pool = pool_by(capsys, surveyed, *words, "--family", "tag36h11", "--edge", TAG_EDGE, **given)
+    assert found["residual"]["points"] == 48 and found["residual"]["locations"] == 12
+    assert np.linalg.norm(pool.camera.position - overhead().position) < 0.02
+    yaw = ["--survey-yaw-sigma", "4", "--family", "tag36h11", "--edge", TAG_EDGE]
+    other, _ = pool_by(capsys, surveyed, *words, *yaw, **given)
+    assert other["parameters"]["camera_x"] != found["parameters"]["camera_x"]
+    assert other["settings"]["survey_yaw_sigma"] == pytest.approx(np.radians(4.0))
+    command = ["calibrate", "pool", "tags.png", *words, *WITH, "--out", surveyed / "q.yaml"]
+    refused(capsys, surveyed, [*command, "--family", "tag36h11"], "a tag without its edge")
+    refused(capsys, surveyed, [*command, "--family", "16h5", "--edge", TAG_EDGE], "tags.png")
+    refused(capsys, surveyed, [*command, "--family", "99h9", "--edge", TAG_EDGE], "unknown tag family '99h9'")
+
+
+POOL_WORDS = ["calibrate", "pool", "points.csv", *WITH, "--out", "OUT"]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ([*POOL_WORDS, "--interface", "glass"], "unknown interface 'glass'; available: auto, surface, wall"),
+        ([*POOL_WORDS, "--plane", "0,1"], "plane is '0,1', expected n_x,n_y,n_z,b"),
+        ([*POOL_WORDS, "--plane", "0,0,0,1"], "expected a direction"),
+        ([*POOL_WORDS, "--window", "thick"], "window is 'thick', expected THICKNESS:INDEX"),
+        ([*POOL_WORDS, "--window", "-1:1.5"], "window is '-1:1.5'"),
+        ([*POOL_WORDS, "--water-height", "-1"], "other side"),
+        ([*POOL_WORDS, "--water-height", "1", "--water-depth", "1"], "given twice"),
+        ([*POOL_WORDS, "--index", "5"], "index is 5, expected a number from 1 to 2.5"),
+        ([*POOL_WORDS, "--fit", "pose,colour"], "unknown 'colour' to fit; available: pose"),
+        ([*POOL_WORDS, "--fit", "height"], "fit leaves the pose out"),
+        ([*POOL_WORDS, "--fit", "pose"], "give --water-height"),
+        ([*POOL_WORDS, "--pixel-sigma", "0"], "pixel sigma is 0"),
+        ([*POOL_WORDS, "--survey-sigma", "-1"], "survey sigma is -1"),
+        ([*POOL_WORDS, "--unit", "mile"], "mile"),
+        ([*POOL_WORDS, "--folds", "1"], "Invalid value for '--folds'"),
+        ([*POOL_WORDS, "--seed", "-1"], "Invalid value for '--seed'"),
+        ([*POOL_WORDS, "--surveyed", "nowhere.csv"], "nowhere.csv"),
+        ([*POOL_WORDS, "--camera", "nowhere.yaml"], "nowhere.yaml"),
+        ([*POOL_WORDS, "--camera", "points.csv"], "points.csv"),
+        ([*POOL_WORDS[:-1], "p.txt"], "p.txt ends in '.txt', expected .yaml"),
+        ([*POOL_WORDS[:-1], "/proc/x/p.yaml"], "write elsewhere"),
+        ([*POOL_WORDS, "--report", "/proc/x/r"], "write elsewhere"),
+        ([*POOL_WORDS, "--report", "thesis"], "already holds files"),
+        (["calibrate", "pool", "nowhere.csv", *POOL_WORDS[3:]], "nowhere.csv: no such file"),
+        (["calibrate", "pool", "pixels.csv", *POOL_WORDS[3:]], "no column 'x'"),
+        (["calibrate", "pool", "bad.csv", *POOL_WORDS[3:]], "bad.csv"),
+        (["calibrate", "pool", "points.csv", "--out", "OUT"], "Missing option '--camera'"),
+        (["calibrate", "pool", "points.csv", *WITH], "Missing option '--out'"),
+        (["calibrate", "pool", *POOL_WORDS[3:]], "Missing argument 'INPUT"),
+    ],
+)  # fmt: skip
+def test_pool_refuses_in_a_sentence(surveyed, pool_files, capsys, words, sentence):
+    """And nothing is written, neither where the inputs are."""
+    given = [surveyed / "p.yaml" if word == "OUT" else word for word in words]
+    before = sorted(pool_files.rglob("*"))
+    refused(capsys, surveyed, given, sentence)
+    assert sorted(pool_files.rglob("*")) == before
+
+
+# ---- calibrate mounts
+
+
+@pytest.fixture(scope="session")
+def mount_files(tmp_path_factory):
+    """A pool, a FinsROV with its port where it is, and two logs: one wandering, one that turns on the spot."""
+    folder = tmp_path_factory.mktemp("mounts")
+    write_pool(POOL, folder / "pool.yaml")
+    vehicle = load_vehicle("finsrov").replace(
+        {"sensors.depth.position": PORT.tolist()}, Provenance("measured")
+    )
+    write_vehicle(vehicle, folder / "vehicle.yaml")
+    write_log(folder / "log", motion(seconds=16.0, rate=3.0), np.random.default_rng(1))
+    still = motion(seconds=16.0, rate=3.0, travel=0.0, tilt=0.02, heave=0.0)
+    write_log(folder / "spin", still, np.random.default_rng(2))
+    (folder / "empty").mkdir()
+    (folder / "thesis").mkdir()
+    (folder / "thesis" / "thesis.tex").touch()
+    return folder
+
+
+@pytest.fixture
+def mounting(mount_files, tmp_path, monkeypatch):
+    """The folder of the logs to work in; what is written goes to another."""
+    monkeypatch.chdir(mount_files)
+    return tmp_path
+
+
+MOUNT = ["calibrate", "mounts", "log", "--pool", "pool.yaml", "--vehicle", "vehicle.yaml", "--out"]
+SPIN = [word if word != "log" else "spin" for word in MOUNT]
+
+
+def test_mounts_as_json_and_as_a_vehicle(mounting, capsys):
+    """The keys of the contract; the tags' heights and distance as they are, in the vehicle file."""
+    found = found_by(capsys, *MOUNT, mounting / "v.yaml", "--seed", "9", "--report", mounting / "report")
+    assert found.keys() >= {
+        *("kind", "method", "vehicle", "parameters", "quality", "correlation", "warnings", "trials"),
+        *("settings", "out", "provenance"),
+    }
+    assert (
+        found["kind"] == "mounts"
+        and found["settings"]["estimate"] == "tags"
+        and found["settings"]["seed"] == 9
+    )
+    assert all(parameter.keys() == PARAMETER for parameter in found["parameters"].values())
+    tags = load_vehicle(mounting / "v.yaml").tags.mounts
+    apart = np.linalg.norm(np.asarray(tags[15].position) - np.asarray(tags[16].position))
+    assert apart == pytest.approx(np.linalg.norm(MOUNTS[15].t - MOUNTS[16].t), abs=0.005)
+    assert "finssim calibrate mounts log" in (mounting / "report" / "report.md").read_text("utf-8")
+
+
+def test_mounts_estimates_what_it_is_told(mounting, capsys):
+    """`sensors` finds how the IMU sits and leaves the tag seen most where it is; the report's command says so."""
+    words = ["--estimate", "sensors", "--report", mounting / "report"]
+    found = found_by(capsys, *MOUNT, mounting / "v.yaml", *words)
+    assert "--estimate sensors" in (mounting / "report" / "report.md").read_text("utf-8")
+    assert found["settings"]["estimate"] == "sensors" and "depth.offset" in found["parameters"]
+    before, after = load_vehicle("vehicle.yaml"), load_vehicle(mounting / "v.yaml")
+    kept = found["settings"]["reference_tag"]
+    np.testing.assert_allclose(after.tags.mounts[kept].position, before.tags.mounts[kept].position, atol=1e-9)
+
+
+@pytest.mark.parametrize("centre", [(0.0, 0.0), (0.05, -0.02)])
+def test_mounts_takes_the_point_about_which_the_vehicle_turns(mounting, capsys, centre):
+    """It is the body point beside which the tags are then found; as a table, with where it was written."""
+    words = ["--turns-about", f"{centre[0]},{centre[1]},0"]
+    assert finssim(*SPIN, mounting / "v.yaml", *words) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "tags.15.x" in out and f"written: {mounting / 'v.yaml'}" in out
+    for tag, truth in MOUNTS.items():
+        where = np.asarray(load_vehicle(mounting / "v.yaml").tags.mounts[tag].position)
+        np.testing.assert_allclose(where[:2], truth.t[:2] + centre, atol=0.004)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ([*MOUNT, "OUT", "--estimate", "camera"], "unknown estimate 'camera'; available: tags, sensors"),
+        ([*MOUNT, "OUT", "--turns-about", "0,0"], "--turns-about is '0,0', expected three lengths"),
+        ([*MOUNT, "OUT", "--turns-about", "a,b,c"], "--turns-about is 'a,b,c', expected three lengths"),
+        ([*MOUNT, "OUT", "--turns-about", "0,0,nan"], "--turns-about is '0,0,nan', expected three lengths"),
+        ([*MOUNT, "OUT", "--vehicle", "bluerov2"], "has no tags"),
+        ([*MOUNT, "OUT", "--vehicle", "finrov"], "did you mean 'finsrov'"),
+        ([*MOUNT, "OUT", "--pool", "nowhere.yaml"], "nowhere.yaml"),
+        ([*MOUNT, "OUT", "--report", "thesis"], "already holds files"),
+        ([*MOUNT, "OUT", "--report", "/proc/x/r"], "write elsewhere"),
+        ([*MOUNT, "OUT", "--seed", "-1"], "Invalid value for '--seed'"),
+        ([*MOUNT, "v.json"], "v.json ends in '.json', expected .yaml"),
+        ([*MOUNT, "/proc/x/v.yaml"], "write elsewhere"),
+        (["calibrate", "mounts", "empty", *MOUNT[3:], "OUT"], "empty: no detections.csv in it"),
+        (["calibrate", "mounts", "nowhere", *MOUNT[3:], "OUT"], "nowhere: no detections.csv in it"),
+        (["calibrate", "mounts", *MOUNT[3:], "OUT"], "Missing argument 'LOG'"),
+        (MOUNT[:-1], "Missing option '--out'"),
+    ],
+)  # fmt: skip
+def test_mounts_refuses_in_a_sentence(mounting, mount_files, capsys, words, sentence):
+    """And nothing is written, neither where the log is."""
+    given = [mounting / "v.yaml" if word == "OUT" else word for word in words]
+    before = sorted(mount_files.rglob("*"))
+    refused(capsys, mounting, given, sentence)
+    assert sorted(mount_files.rglob("*")) == before
