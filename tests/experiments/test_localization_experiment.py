@@ -113,7 +113,15 @@ def test_a_user_can_calibrate_the_same_pool_again(done, tmp_path, capsys):
     settings = pool.record["settings"]
     words = ["calibrate", "pool", out / "detections.csv", "--surveyed", out / "survey.csv"]
     words += ["--camera", out / "camera.yaml", "--out", tmp_path / "again.yaml"]
-    for name in ("interface", "water_height", "water_height_sigma", "survey_sigma", "focal_sigma", "seed"):
+    for name in (
+        "interface",
+        "water_height",
+        "water_height_sigma",
+        "survey_sigma",
+        "focal_sigma",
+        "center_sigma",
+        "seed",
+    ):
         words += [f"--{name.replace('_', '-')}", repr(settings[name]).strip("'")]
     assert boundary.run(app, [str(word) for word in words]) == 0
     assert load_pool(tmp_path / "again.yaml").sha256 == pool.sha256

@@ -61,6 +61,7 @@ def calibrate(campaign: Campaign, seen: Sequence[Picture]) -> Calibrated:
         water_height_sigma=max(campaign.conditions.tape, 5e-4),
         survey_sigma=max(campaign.conditions.survey, 1e-4),
         focal_sigma=campaign.conditions.lens / campaign.lens.fx,
+        center_sigma=campaign.conditions.lens,
         seed=campaign.seed,
     )
     fit = calibrate_pool(_observed(frames, rows), campaign.lens, settings)

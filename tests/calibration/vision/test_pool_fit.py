@@ -138,3 +138,36 @@ def test_equal_seeds_give_equal_fits():
 def test_senseless_options_are_refused(options, words):
     with pytest.raises(CalibrationError, match=words):
         Settings(**options)
+
+
+def test_intervals_allow_for_a_lens_that_is_not_sure():
+    """Focal length off by 0.3 % and centre by 4 px: told so, the camera's place errs as its intervals say (95 % of the
+    squares of normalised errors below 1.96²); taken for exact, far more."""
+    camera, random = overhead(), np.random.default_rng(3)
+    squares = {"told": [], "not told": []}
+    for seed in range(12):
+        seen = survey(camera, WATER, FLOOR, 60, seed, pixel=0.25, error=0.002)
+        focal, x, y = random.normal(0.0, [0.003, 4.0, 4.0])
+        given = replace(
+            PLUMB_BOB,
+            fx=PLUMB_BOB.fx * (1.0 + focal),
+            fy=PLUMB_BOB.fy * (1.0 + focal),
+            cx=PLUMB_BOB.cx + x,
+            cy=PLUMB_BOB.cy + y,
+        )
+        for name, sigma in (("told", (0.003, 4.0)), ("not told", (0.0, 0.0))):
+            told = Settings(
+                fit=FIT,
+                water_height=1.0,
+                water_height_sigma=0.002,
+                interface="surface",
+                focal_sigma=sigma[0],
+                center_sigma=sigma[1],
+            )
+            fit = calibrate_pool(seen, given, told)
+            for axis, name_ in enumerate(("camera_x", "camera_y", "camera_z")):
+                estimate = fit.estimates[name_]
+                std = (estimate.ci95[1] - estimate.ci95[0]) / 3.92
+                squares[name].append(((estimate.estimate - camera.position[axis]) / std) ** 2)
+    assert np.mean(squares["told"]) < 1.9  # 99.9 % quantile of chi² with 36 degrees of freedom, over 36
+    assert np.mean(squares["not told"]) > 3.0

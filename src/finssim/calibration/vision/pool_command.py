@@ -44,6 +44,7 @@ def run(
     tilt_sigma: float | None = None,
     fit: str | None = None,
     focal_sigma: float | None = None,
+    center_sigma: float | None = None,
     pixel_sigma: float | None = None,
     survey_sigma: float = 0.002,
     survey_yaw_sigma: float = 0.5,
@@ -75,6 +76,7 @@ def run(
         tilt_sigma: Standard error of the plane's direction [degrees]; see `Settings`.
         fit: What is fitted, separated by commas, of pose, height, tilt, index, focal, center, distortion.
         focal_sigma: Relative standard error of the camera file's focal length; the file's own if None.
+        center_sigma: Standard error of its optical centre [px]; the file's own if None.
         pixel_sigma: Standard error of a pixel [px]; from the residuals if None.
         survey_sigma: Standard error of a surveyed coordinate [m].
         survey_yaw_sigma: Of a tag's direction [degrees].
@@ -98,6 +100,7 @@ def run(
     file = load_camera(camera)
     if index_sigma is None:
         index_sigma = Settings.index_sigma if index == Settings.index or _names(fit, "index") else 0.0
+    remembered = _lens_sigma(file)
     settings = Settings(
         interface=interface,
         plane=_plane(plane),
@@ -109,7 +112,8 @@ def run(
         index_sigma=index_sigma,
         tilt_sigma=None if tilt_sigma is None else math.radians(tilt_sigma),
         fit=_groups(fit),
-        focal_sigma=_focal_sigma(file) if focal_sigma is None else focal_sigma,
+        focal_sigma=remembered[0] if focal_sigma is None else focal_sigma,
+        center_sigma=remembered[1] if center_sigma is None else center_sigma,
         pixel_sigma=pixel_sigma,
         survey_sigma=survey_sigma,
         survey_yaw_sigma=math.radians(survey_yaw_sigma),
@@ -181,17 +185,20 @@ def _refuse_outside(seen: Observations, file: CameraFile) -> None:
         )
 
 
-def _focal_sigma(file: CameraFile) -> float:
-    """Relative standard error that the camera file remembers, 0 where it does not."""
+def _lens_sigma(file: CameraFile) -> tuple[float, float]:
+    """Standard errors that the camera file remembers: of the focal length, relative, and of the centre [px]; or 0."""
+    fx, cx, cy = (_remembered(file, name) for name in ("fx", "cx", "cy"))
+    return fx / file.lens.fx, max(cx, cy)
+
+
+def _remembered(file: CameraFile, name: str) -> float:
     estimates = file.record.get("estimates")
-    fx = estimates.get("fx") if isinstance(estimates, Mapping) else None
-    if not isinstance(fx, Mapping):
-        return 0.0
+    found = estimates.get(name) if isinstance(estimates, Mapping) else None
     try:
-        low, high = (float(x) for x in fx["ci95"])
-        return max(0.0, (high - low) / 3.92 / float(fx["estimate"]))
+        low, high = (float(x) for x in found["ci95"])  # type: ignore[index]
     except (KeyError, TypeError, ValueError):
         return 0.0
+    return max(0.0, (high - low) / 3.92)
 
 
 def _groups(text: str | None) -> tuple[str, ...] | None:

@@ -59,6 +59,8 @@ class Settings:
     """Of `FITTED`; None: pose, height, tilt and index, and the lens where held-out points get better by it."""
     focal_sigma: float = 0.0
     """Of the camera file's focal length, relative; 0 holds it unless `fit` names it."""
+    center_sigma: float = 0.0
+    """Of the camera file's optical centre along each axis [px]; 0 holds it unless `fit` names it."""
     pixel_sigma: float | None = None
     """Of a pixel [px]; None: from the residuals."""
     survey_sigma: float = 0.002
@@ -92,6 +94,8 @@ class Settings:
             )
         _positive("index", self.index, 1.0, 2.5)
         _positive("survey sigma", self.survey_sigma, 0.0, 1.0)
+        _positive("focal sigma", self.focal_sigma, 0.0, 10.0)
+        _positive("center sigma", self.center_sigma, 0.0, 1e4)
         if self.pixel_sigma is not None:
             _positive("pixel sigma", self.pixel_sigma, 1e-3, 100.0)
         if self.folds < 2:
@@ -110,6 +114,8 @@ def active_names(settings: Settings, extra: tuple[str, ...] = ()) -> NDArray[np.
     groups = list(settings.fit or ("pose", "height", "tilt", "index")) + list(extra)
     if settings.focal_sigma > 0.0:
         groups.append("focal")
+    if settings.center_sigma > 0.0:
+        groups.append("center")
     names = {name for group in groups for name in FITTED[group]}
     if settings.index_sigma <= 0.0:
         names -= {"index"}
@@ -125,6 +131,8 @@ def lens_std(settings: Settings, width: int) -> tuple[float, ...]:
     focal, x, y, *distortion = LENS_STD
     if settings.focal_sigma > 0.0:
         focal = settings.focal_sigma
+    if settings.center_sigma > 0.0:
+        return (focal, settings.center_sigma, settings.center_sigma, *distortion)
     return (focal, x * width, y * width, *distortion)
 
 
