@@ -43,6 +43,23 @@ def test_a_pool_file_gives_held_out_points_back(pool):
     assert found.record["parameters"]["camera_height"]["ci95"][0] < 1.2
 
 
+def test_the_lens_is_as_sure_as_its_file_remembers(pool):
+    """The intervals of `calibrate camera` become standard errors of focal length and centre; options go before them."""
+    fx, cx = PLUMB_BOB.fx, PLUMB_BOB.cx
+    ends = {"fx": [fx - 1.96, fx + 1.96], "cx": [cx - 3.92, cx + 3.92], "cy": [0.0, 0.0]}
+    record = {
+        "estimates": {
+            name: {"estimate": sum(ci) / 2.0, "ci95": ci, "unit": "px"} for name, ci in ends.items()
+        }
+    }
+    write_camera(pool / "camera.yaml", PLUMB_BOB, record)
+    files = {"camera": pool / "camera.yaml", "out": pool / "pool.yaml", "water_height": 1.0}
+    told = run([pool / "points.csv"], **files).settings
+    assert told.focal_sigma == pytest.approx(1.0 / fx) and told.center_sigma == pytest.approx(2.0)
+    said = run([pool / "points.csv"], **files, focal_sigma=0.01, center_sigma=5.0).settings
+    assert (said.focal_sigma, said.center_sigma) == (0.01, 5.0)
+
+
 def test_json_holds_what_was_promised(pool, capsys):
     run([pool / "points.csv"], camera=pool / "camera.yaml", out=pool / "pool.yaml", as_json=True)
     said = json.loads(capsys.readouterr().out)
