@@ -96,6 +96,7 @@ def run(
         CalibrationError, LocalizationError, OutputError: As they say; nothing is written then.
     """
     given = {k: v for k, v in locals().items() if k not in ("inputs", "out", "as_json", "report", "camera")}
+    _refuse_numbers(given)
     _refuse_places(out, report)
     file = load_camera(camera)
     if index_sigma is None:
@@ -141,6 +142,12 @@ def run(
         for place in filter(None, (out, report)):
             console.print(f"written: {place}", highlight=False, markup=False, soft_wrap=True)
     return found
+
+
+def _refuse_numbers(given: Mapping[str, Any]) -> None:
+    for name, value in given.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise CalibrationError(f"--{name.replace('_', '-')} is {value}, expected a finite number")
 
 
 def _refuse_places(out: Path, report: Path | None) -> None:

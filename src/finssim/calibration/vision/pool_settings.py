@@ -93,7 +93,11 @@ class Settings:
                 "fit leaves the height out and none is given: add height, or give --water-height"
             )
         _positive("index", self.index, 1.0, 2.5)
+        _positive("index sigma", self.index_sigma, 0.0, 1.0)
+        _positive("tilt sigma [deg]", math.degrees(self.tilt_sigma or 0.0), 0.0, 180.0)
+        _positive("water height sigma", self.water_height_sigma, 0.0, 10.0)
         _positive("survey sigma", self.survey_sigma, 0.0, 1.0)
+        _positive("survey yaw sigma [deg]", math.degrees(self.survey_yaw_sigma), 0.0, 180.0)
         _positive("focal sigma", self.focal_sigma, 0.0, 10.0)
         _positive("center sigma", self.center_sigma, 0.0, 1e4)
         if self.pixel_sigma is not None:
