@@ -1,0 +1,121 @@
+"""Locate a moving vehicle through rippling water: pictures, detections, poses, fusion, and how far each is off.
+
+    python examples/through_the_water.py
+
+An overhead camera looks at FinsROV on an ellipse, 0.45 m deep. Its tags are drawn as the camera sees them, found in
+each picture, located by refraction with a pressure sensor and an IMU of ordinary quality, and fused. Needs the extra
+"vision".
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.geometry.optics import Camera, Interface, Lens
+from finssim.geometry.rotations import (
+    matrix_to_quat,
+    quat_from_euler,
+    quat_multiply,
+    quat_to_matrix,
+    wrap_angle,
+)
+from finssim.localization.detector import detector
+from finssim.localization.estimator import Estimator
+from finssim.localization.families import bitmap
+from finssim.localization.fuse_settings import site_of
+from finssim.localization.pool import Pool
+from finssim.localization.pose import METHODS, Constraints
+from finssim.localization.region import RegionTracker
+from finssim.localization.streams import DepthSample, ImuSample, VisionSample
+from finssim.localization.tags import tag_corners_b
+from finssim.quiet import start_warp
+from finssim.sensors.overhead_camera import Basin, OverheadCamera, Pose, Ripples, Scene, TagInScene
+from finssim.vehicles import load_vehicle
+
+DURATION, PERIOD = 8.0, 24.0
+"""Of the run and of one round [s]."""
+Z, TURN = -0.45, 2.0 * math.pi / PERIOD
+
+
+def motion(t: float) -> tuple[NDArray[np.float64], float, float, float]:
+    """Position (z = 0 on the surface) [m], roll, pitch, yaw [rad]: along an ellipse, nose forward, rocking a little."""
+    x, y = 0.9 * math.cos(TURN * t), 0.5 * math.sin(TURN * t)
+    yaw = math.atan2(0.5 * math.cos(TURN * t), -0.9 * math.sin(TURN * t))
+    return np.array([x, y, Z]), 0.05 * math.sin(3.0 * t), 0.04 * math.cos(2.3 * t), yaw
+
+
+def main() -> None:
+    """Run it."""
+    start_warp()
+    random = np.random.default_rng(1)
+    vehicle = load_vehicle("finsrov")
+    tags_b = tag_corners_b(vehicle.tags)
+    lens = Lens(
+        1280, 720, 540.93, 540.93, 682.23, 348.61, "plumb_bob", (0.0294, -0.0598, 0.0009, 0.0018, 0.0126)
+    )
+    pool = Pool(Camera(lens, [0.0, 0.0, 1.2], [1.0, 0.0, 0.0, 0.0]), Interface.water(0.0))
+    scene = Scene(
+        camera=pool.camera,
+        interface=pool.interface,
+        basin=Basin(lower=(-2.0, -1.0, -1.0), upper=(2.0, 1.0, 0.1)),
+        ripples=Ripples(rms_slope=0.01, seed=2),
+    )
+    overhead, tracker = OverheadCamera(scene), RegionTracker(detector(vehicle.tags.family), tags_b)
+    estimator = Estimator(site=site_of(pool, vehicle))
+
+    def tag(number: int, position: NDArray[np.float64], q: NDArray[np.float64]) -> TagInScene:
+        mount = vehicle.tags.mounts[number]
+        at = position + quat_to_matrix(q) @ mount.position
+        pose = Pose(
+            position=tuple(at.tolist()), orientation=tuple(quat_multiply(q, mount.orientation).tolist())
+        )
+        return TagInScene(
+            bitmap=bitmap(vehicle.tags.family, number), edge=vehicle.tags.edge, pose=pose, margin=0.014
+        )
+
+    errors: dict[str, list[tuple[float, float]]] = {"fixes": [], "fused": []}
+    port = np.asarray(vehicle.sensors.depth.position)
+    step = 0.01
+    for k in range(round(DURATION / step)):
+        t = k * step
+        position, roll, pitch, yaw = motion(t)
+        q = quat_from_euler(roll, pitch, yaw)
+        R, after = quat_to_matrix(q), quat_to_matrix(quat_from_euler(*motion(t + step)[1:]))
+        q_step = matrix_to_quat(R.T @ after)
+        rate = 2.0 * q_step[:3] / step + random.normal(0.0, 0.01, 3)
+        tilt = (roll + random.normal(0.0, 0.009), pitch + random.normal(0.0, 0.009))  # 0.5 degrees
+        estimator.add(ImuSample(t, tuple(rate.tolist()), tilt=tilt))
+        depth = -float((position + R @ port)[2]) + random.normal(0.0, 0.01)
+        if k % 5 == 0:
+            estimator.add(DepthSample(t, depth))
+        if k % 10 == 0:  # ten pictures a second
+            drawn = [tag(number, position, q) for number in tags_b]
+            seen = tracker.detect(overhead.render(tags=drawn, time=t, seed=k, region="tags"), t)
+            height = -depth - float((R @ port)[2])
+            known = Constraints(z_b=height, z_std=0.01, roll=tilt[0], pitch=tilt[1], port=tuple(port))
+            found = METHODS["refractive"](seen, pool, tags_b, known, 0.8)
+            if found.ok:
+                covariance = tuple(tuple(row) for row in found.covariance.tolist())
+                estimator.add(VisionSample(t, (found.x, found.y), found.yaw, covariance))
+                errors["fixes"].append(off(found.x, found.y, found.yaw, position, yaw))
+            if t > 1.0:
+                now = estimator.estimate(t)
+                errors["fused"].append(off(now.x[0], now.x[1], now.yaw, position, yaw))
+    for name, values in errors.items():
+        distance, turn = np.sqrt(np.mean(np.square(values), axis=0))
+        print(
+            f"{name}: {len(values)} times, {100.0 * distance:.2f} cm and {math.degrees(turn):.2f} degrees rms"
+        )
+    print(f"searched {100.0 * tracker.counts.share:.1f} % of the pixels; {estimator.counts['vision']}")
+
+
+def off(x: float, y: float, heading: float, position: NDArray[np.float64], yaw: float) -> tuple[float, float]:
+    """Horizontal distance [m] and turn [rad] from the truth."""
+    return math.hypot(x - position[0], y - position[1]), float(wrap_angle(heading - yaw))
+
+
+if __name__ == "__main__":
+    main()
