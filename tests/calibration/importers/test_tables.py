@@ -60,7 +60,7 @@ def test_the_shipped_map_reads_the_recordings_of_a_drifting_vehicle(tmp_path):
     map_file = tmp_path / "hinsdale.yaml"
     map_file.write_text(shipped_map("hinsdale.yaml"), encoding="utf-8")
     folders = import_trials(sorted(HINSDALE.glob("*.csv")), out=tmp_path / "trials", column_map=map_file)
-    assert [folder.name for folder in folders] == ["baseline2", "traj005-1", "traj_alt_009-0"]
+    assert [folder.name for folder in folders] == ["baseline2", "traj005-1", "traj026-0", "traj_alt_009-0"]
     for folder in folders:
         trial = load_trial(folder)
         assert trial.header.passive and trial.header.vehicle == "bluerov2_heavy"
