@@ -1,4 +1,7 @@
-"""Least squares for camera and plane: Levenberg-Marquardt with analytic derivatives, robust where asked."""
+"""Least squares for camera and plane: Levenberg-Marquardt with analytic derivatives, robust where asked.
+
+A plane cannot pass a point in the water nor the camera. A step that would lead there slides along this bound.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +10,23 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from finssim.calibration.vision.observations import Observations
 from finssim.calibration.vision.pool_model import NAMES, PoolModel
 
-__all__ = ["LOST", "Prior", "Solution", "residuals", "solve"]
+__all__ = ["LOST", "Prior", "Solution", "clearances", "residuals", "solve"]
 
 Array = NDArray[np.float64]
 
 LOST = 500.0
 """Residual that stands for a point the model cannot see at all [px]."""
+
+NEARER = 0.1
+"""Part of its distance from a point or the camera that one step must leave the plane."""
+
+MOST_BOUNDS = 60
+"""Points looked at in one step, those that the plane comes nearest to."""
 
 Whitening = Callable[[Array], Array]
 
@@ -121,12 +131,13 @@ def solve(
     damping, free = 1e-3, np.flatnonzero(active)
     for iteration in range(iterations):
         N, g = normal_equations(model, seen, whiten, free, prior)
+        bounds = _bounds(model, seen, free)
         scale = np.sqrt(np.maximum(np.diagonal(N), 1e-300))
         H, b = N / np.outer(scale, scale), g / scale
         while True:
             step = np.zeros(len(NAMES))
-            step[free] = np.linalg.solve(H + damping * np.eye(len(free)), b) / scale
-            trial = _tried(model, step)
+            step[free] = _sliding(H + damping * np.eye(len(free)), b, scale, bounds) / scale
+            trial = _tried(model, step, seen, 8 in free)
             new = np.inf if trial is None else _cost(trial, seen, whiten, prior)
             if new <= cost:
                 break
@@ -162,11 +173,69 @@ def _cost(model: PoolModel, seen: Observations, whiten: Whitening, prior: Prior)
     return 0.5 * float(e @ e + r @ r)
 
 
-def _tried(model: PoolModel, step: Array) -> PoolModel | None:
-    """The model a step away, or None where the step leads out of all sense."""
+def clearances(model: PoolModel, points: Array) -> Array:
+    """Distances of points from the far side of the plane and its window, on their own side positive, (N,) [m]."""
+    return model.depth - (points - model.reference) @ model.interface.normal - model.interface.thickness
+
+
+def _bounds(model: PoolModel, seen: Observations, free: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Clearances of the points in the water and of the camera (M,), and their derivatives by the parameters (M, P)."""
+    if not model.refractive:
+        return np.zeros(0), np.zeros((0, len(free)))
+    wet, n = seen.points[~seen.dry], model.interface.normal
+    distance = clearances(model, wet)
+    wet, distance = wet[distance > 0.0], distance[distance > 0.0]
+    rows = np.zeros((len(wet) + 1, len(NAMES)))
+    rows[:-1, 6:8] = -(wet - model.reference) @ model.tangents.T
+    rows[:-1, 8] = 1.0
+    rows[-1, :3] = n
+    rows[-1, 6:8] = model.tangents @ (model.camera.position - model.reference)
+    rows[-1, 8] = -1.0
+    return np.append(distance, model.clearance), rows[:, free]
+
+
+def _sliding(H: Array, b: Array, scale: Array, bounds: tuple[Array, Array]) -> Array:
+    """The least of x H x / 2 - b x among steps that leave every clearance a tenth of what it is.
+
+    A problem of least distance, solved by non-negative least squares (Lawson and Hanson, Solving Least Squares
+    Problems, ch. 23).
+    """
+    x = np.linalg.solve(H, b)
+    distance, rows = bounds
+    left = distance + (rows / scale) @ x
+    if np.all(left >= NEARER * distance):
+        return x
+    near = np.argsort(left / np.maximum(distance, 1e-300))[:MOST_BOUNDS]
+    values, vectors = np.linalg.eigh(H)
+    root = vectors / np.sqrt(np.maximum(values, 1e-14))
+    G = (rows[near] / scale) @ root
+    length = np.maximum(np.linalg.norm(G, axis=1), 1e-300)
+    h = (NEARER * distance[near] - left[near]) / length
+    size = float(np.abs(h).max())
+    E = np.concatenate([(G / length[:, None]).T, h[None] / size])
+    try:
+        weight, off = nnls(E, np.append(np.zeros(len(x)), 1.0))
+    except RuntimeError:
+        return x
+    r = E @ weight - np.append(np.zeros(len(x)), 1.0)
+    return x if off < 1e-9 else np.asarray(x - root @ r[:-1] / r[-1] * size)
+
+
+def _tried(model: PoolModel, step: Array, seen: Observations, movable: bool) -> PoolModel | None:
+    """The model a step away, or None where the step leads out of all sense.
+
+    What a turn of the plane takes from a clearance beyond first order is given back by its depth where that may move.
+    """
     if not np.isfinite(step).all() or np.abs(step[3:8]).max() > 1.0 or abs(step[10]) > 0.5:
         return None
     try:
-        return model.moved(step)
+        trial = model.moved(step)
+        if model.refractive and movable:
+            before = clearances(model, seen.points)
+            held = (before > 0.0) & ~seen.dry
+            short = 0.5 * NEARER * before - clearances(trial, seen.points)
+            if held.any() and (back := float(short[held].max())) > 0.0:
+                trial = model.moved(step + back * (np.arange(len(NAMES)) == 8))
+        return trial
     except ValueError:
         return None
