@@ -179,7 +179,12 @@ def read_table(path: str | Path, *, unit: str | None = None) -> Table:
     if lines and comments and _known(lines[0][1]) < 2:  # the header itself may be behind a comment sign
         head = max((line.lstrip("#%/ ") for line in comments), key=_known)
         lines = [(0, head), *lines] if _known(head) >= 2 else lines
-    if not lines or _is_numeric(lines[0][1]):
+    if not lines:
+        what = "holds nothing but comments" if comments else "is empty"
+        raise CalibrationError(
+            f"{path}: the file {what}: expected a line of names, such as id,x,y,z, and rows"
+        )
+    if _is_numeric(lines[0][1]):
         raise CalibrationError(
             f"{path}: the first line is no header: name the columns, such as id,x,y,z or u,v,x,y,z"
         )
@@ -224,7 +229,10 @@ def _check(path: str, row: Row) -> None:
             and _number(word) is None
             and word.lower() not in ("none", "null", "na", "n/a", "-")
         ):
-            raise CalibrationError(f"{path}: line {row.line}: {name} is '{word}', expected a number")
+            raise CalibrationError(
+                f"{path}: line {row.line}: {name} is '{word}', expected a number: the whole file is refused; correct "
+                "the cell, or empty it to have the row left out"
+            )
 
 
 def _column(word: str) -> tuple[str, str]:
