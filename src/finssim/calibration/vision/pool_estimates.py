@@ -65,11 +65,24 @@ def estimates(fit: Refined, surface: bool, settings: Settings, centre: Array) ->
 
 
 def correlation(fit: Refined) -> Correlation:
-    """Of the errors of the fitted parameters."""
-    free = np.flatnonzero(fit.active)
-    V = fit.covariance[np.ix_(free, free)]
+    """Of the errors of what the table of estimates holds, under its names; what was not fitted is left out."""
+    columns = _columns(_is_surface(fit), np.zeros(3), len(fit.model.camera.lens.distortion))
+    gradients = {name: _gradient(fit.model, tell, fit.active) for name, (_, tell) in columns.items()}
+    G = np.stack([g for g in gradients.values() if _moves(g)])
+    names = tuple(name for name, g in gradients.items() if _moves(g))
+    V = G @ fit.covariance @ G.T
     std = np.sqrt(np.maximum(np.diagonal(V), 1e-300))
-    return Correlation(names=tuple(NAMES[i] for i in free), matrix=V / np.outer(std, std))
+    return Correlation(names=names, matrix=np.clip(V / np.outer(std, std), -1.0, 1.0))
+
+
+def _is_surface(fit: Refined) -> bool:
+    """Whether the plane was searched for along the survey's z; a wall has a normal of its own, or none beforehand."""
+    normal = fit.prior.normal
+    return normal is not None and bool(abs(normal[2]) > 0.9)
+
+
+def _moves(gradient: Array) -> bool:
+    return bool((np.abs(gradient) > 1e-12).any())
 
 
 def _columns(surface: bool, centre: Array, terms: int) -> dict[str, tuple[str, Callable[[PoolModel], float]]]:
@@ -115,7 +128,7 @@ def _gradient(model: PoolModel, tell: Callable[[PoolModel], float], active: NDAr
 
 def _judged(name: str, std: float, gradient: Array, fit: Refined, settings: Settings) -> tuple[bool, str]:
     """Whether the pictures tell it, and a word on what it rests on."""
-    if not (np.abs(gradient[fit.active]) > 1e-12).any():
+    if not _moves(gradient):
         return False, "as given"
     model, prior = fit.model, fit.prior
     whole = model.clearance + max(model.depth, 0.0)

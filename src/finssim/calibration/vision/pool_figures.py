@@ -43,7 +43,7 @@ def _map(fit: PoolFit) -> Figure:
     axes = figure.subplots()
     axis = _across(fit)
     at, error = fit.seen.points @ axis.T, 1000.0 * fit.error @ axis.T
-    _arrows(axes, at, error, fit.used, "mm", 1.0)
+    _arrows(axes, at, error, fit.used, "mm", 1000.0)
     foot = axis @ np.asarray(fit.model.camera.position)
     axes.plot(*foot, "^", color="black", markersize=8, label="camera")
     axes.set_aspect("equal")
@@ -68,15 +68,16 @@ def _picture(fit: PoolFit) -> Figure:
     return figure
 
 
-def _arrows(axes: Axes, at: Array, vectors: Array, used: NDArray[np.bool_], unit: str, width: float) -> None:
+def _arrows(axes: Axes, at: Array, vectors: Array, used: NDArray[np.bool_], unit: str, per: float) -> None:
+    """Points and enlarged arrows; `per` of the arrows' unit make one of the axes'."""
     good = used & np.isfinite(vectors).all(axis=1)
     size = float(np.percentile(np.linalg.norm(vectors[good], axis=1), 95)) if good.any() else 1.0
-    span = float(np.ptp(at, axis=0).max()) * ARROW * width
+    span = float(np.ptp(at, axis=0).max()) * ARROW
     scale = max(size, 1e-12) / max(span, 1e-12)
     axes.plot(*at[good].T, ".", color=GRAY, markersize=3)
     axes.quiver(
         *at[good].T, *vectors[good].T, angles="xy", scale_units="xy", scale=scale, width=0.0022, color=BLUE,
-        label=f"longest of 95 %: {size:.2g} {unit}",
+        label=f"longest of 95 %: {size:.2g} {unit}, enlarged {per / scale:.2g} times",
     )  # fmt: skip
     if not good.all():
         axes.plot(*at[~good].T, "x", color=ORANGE, markersize=6, label="left out")
