@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from finssim.calibration.errors import CalibrationError
+from finssim.calibration.vision.pool_doubts import doubted
 from finssim.calibration.vision.pool_fit import calibrate_pool
 from finssim.calibration.vision.pool_settings import Settings
 from finssim.geometry.optics import Interface, Lens
@@ -13,9 +15,14 @@ from .surveyed_pools import (
     FLOOR,
     PLUMB_BOB,
     SOLID,
+    TANK,
+    TANK_LENS,
+    before_tank,
     looking,
+    observations,
     overhead,
     survey,
+    wall,
 )
 
 WATER = Interface.water(1.0)
@@ -118,3 +125,109 @@ def test_a_guessed_focal_length_is_enough(factor):
     assert fit.held_out.as_json()["rms_cm"] < 0.5
     unsaid = calibrate_pool(seen, guess, Settings(water_height=1.0))
     assert any("--focal-sigma" in sentence for sentence in unsaid.advice)
+
+
+def rim(camera, count=8):
+    """Marks above the water as `survey` gives those under it, seen in straight lines."""
+    rng = np.random.default_rng(2)
+    points = rng.uniform((-0.8, -0.4, 1.02), (0.8, 0.3, 1.3), (count, 3))
+    pixels, ok = camera.lens.project((points - camera.position) @ camera.R_pc)
+    assert ok.all()
+    return points, pixels + 0.25 * rng.standard_normal((count, 2))
+
+
+def test_marks_above_the_water_are_told_from_wrong_rows():
+    """Eight marks on the rim whose flag was forgotten, and one mark under water that is 20 cm off."""
+    wet = survey(overhead(), WATER, FLOOR, 40)
+    points, pixels = rim(overhead())
+    wrong = wet.points.copy()
+    wrong[7, 0] += 0.2
+    seen = observations(np.concatenate([wrong, points]), np.concatenate([wet.pixels, pixels]))
+    fit = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, water_height=1.0))
+    (dry,) = (sentence for sentence in fit.advice if "mark them dry" in sentence)
+    assert all(f"p{i}" in dry for i in range(40, 48)) and "p7" not in dry
+    assert any(sentence.startswith("1 more row was left out as wrong") for sentence in fit.advice)
+
+
+def test_points_without_water_are_noticed():
+    """Pixels of points in air, calibrated as a tank: straight lines foretell them better, and that comes first."""
+    camera = before_tank(30.0)
+    points = survey(camera, wall(), TANK, 60, error=0.0).points
+    pixels, _ = camera.lens.project((points - camera.position) @ camera.R_pc)
+    pixels = pixels + 0.25 * np.random.default_rng(1).standard_normal(pixels.shape)
+    told = Settings(fit=FIT, plane=(0.0, 1.0, 0.0, 0.0), index_sigma=0.0, survey_sigma=0.0005)
+    fit = doubted(calibrate_pool(observations(points, pixels), TANK_LENS, told))
+    assert "straight lines meet held-out points better" in fit.advice[0]
+
+
+@pytest.mark.parametrize("box", [FLOOR, SOLID], ids=["floor", "solid"])
+def test_points_in_water_raise_no_doubt(box):
+    fit = calibrate_pool(survey(overhead(), WATER, box, 60), PLUMB_BOB, Settings(fit=FIT, water_height=1.0))
+    assert doubted(fit).advice == fit.advice and doubted(fit).notes == fit.notes
+
+
+@pytest.mark.parametrize(("option", "value"), [("water_height", 100.0), ("water_depth", 100.0)])
+def test_centimetres_for_metres_are_refused(option, value):
+    seen = survey(overhead(), WATER, FLOOR, 40)
+    fit = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, **{option: value}))
+    with pytest.raises(
+        CalibrationError, match=f"--{option.replace('_', '-')} 100 puts the plane 100 m.*unit"
+    ):
+        doubted(fit)
+
+
+@pytest.mark.parametrize(("pixels", "refused"), [(4.0, False), (30.0, True)])
+def test_a_camera_on_the_plane_with_large_residuals_is_doubted(pixels, refused):
+    """A sound calibration moved on to its plane: 4 px are doubted, 30 px refused, and 0.3 px are a camera at a
+    window."""
+    fit = calibrate_pool(survey(overhead(), WATER, FLOOR, 40), PLUMB_BOB, Settings(fit=FIT, water_height=1.0))
+    plane = replace(
+        fit.model.interface, offset=-float(fit.model.interface.normal @ fit.model.camera.position)
+    )
+    touching = replace(fit, model=replace(fit.model, interface=plane))
+    assert doubted(touching).advice == fit.advice
+    poor = replace(touching, residual=np.full_like(fit.residual, pixels / np.sqrt(2.0)))
+    if refused:
+        with pytest.raises(CalibrationError, match="on the plane itself"):
+            doubted(poor)
+    else:
+        assert "on the plane itself" in doubted(poor).advice[0]
+
+
+def test_a_flat_left_handed_survey_is_warned_of():
+    """Its y negated, a floor could as well have z down; the water's height or a second depth tells the two apart."""
+    turn = np.array([1.0, -1.0, 1.0])
+    left = survey(overhead(), WATER, FLOOR, 40)
+    left = replace(left, points=left.points * turn)
+    told = Settings(fit=FIT, interface="surface")
+    assert "left-handed" in doubted(calibrate_pool(left, PLUMB_BOB, told)).advice[0]
+    with pytest.raises(CalibrationError, match="other side"):
+        calibrate_pool(left, PLUMB_BOB, replace(told, water_height=1.0))
+    down = calibrate_pool(left, PLUMB_BOB, replace(told, water_height=-1.0))
+    assert doubted(down).advice == down.advice
+    solid = survey(overhead(), WATER, SOLID, 40)
+    down = calibrate_pool(replace(solid, points=solid.points * turn * [1, 1, -1]), PLUMB_BOB, told)
+    assert doubted(down).advice == down.advice
+
+
+@pytest.mark.parametrize("factor", [0.94, 0.96])
+def test_a_lens_that_misfits_before_a_known_wall_may_be_fitted(factor):
+    """Wall and index known, the lens not: index or wall gives way, and the advice says how to free the lens."""
+    rough = replace(TANK_LENS, fx=TANK_LENS.fx * factor, fy=TANK_LENS.fy * factor)
+    seen = survey(before_tank(30.0), wall(), TANK, 60, error=0.0005)
+    told = Settings(fit=FIT, plane=(0.0, 1.0, 0.0, 0.0), survey_sigma=0.0005)
+    fit = calibrate_pool(seen, rough, told)
+    assert any("the pixels want" in sentence and "index,focal,center" in sentence for sentence in fit.advice)
+
+
+@pytest.mark.parametrize("plane", [None, (0.0, 1.0, 0.0, 0.0)], ids=["surface", "wall"])
+def test_correlations_bear_the_names_of_the_table(plane):
+    if plane is None:
+        seen, lens = survey(overhead(), WATER, SOLID, 40), PLUMB_BOB
+    else:
+        seen, lens = survey(before_tank(30.0), wall(), TANK, 40, error=0.0005), TANK_LENS
+    fit = calibrate_pool(seen, lens, Settings(fit=FIT, plane=plane))
+    fitted = [name for name, estimate in fit.estimates.items() if estimate.note != "as given"]
+    assert list(fit.correlation.names) == fitted
+    np.testing.assert_allclose(np.diagonal(fit.correlation.matrix), 1.0)
+    np.testing.assert_allclose(fit.correlation.matrix, fit.correlation.matrix.T, atol=1e-12)

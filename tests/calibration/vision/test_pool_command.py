@@ -1,6 +1,7 @@
 """The command writes a pool file that gives the points back, says what it found, and refuses without writing."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -121,7 +122,9 @@ def test_equal_inputs_write_equal_files(pool):
         ({"plane": "0,1"}, "expected n_x,n_y,n_z,b"),
         ({"window": ["thick"]}, "expected THICKNESS:INDEX"),
         ({"inputs": "nowhere.csv"}, "no such file"),
+        ({"window": ["10:1.52"]}, "window is 10 m thick.*metres"),
         ({"water_height": -1.0}, "other side"),
+        ({"water_height": 100.0}, "--water-height 100 puts the plane 100 m from the points.*unit"),
         ({"fit": "pose,colour"}, "unknown 'colour'"),
     ],
 )
@@ -142,3 +145,32 @@ def test_pixels_of_another_resolution_are_refused(pool):
 def test_a_folder_of_other_things_is_no_report(pool):
     with pytest.raises(OutputError, match="already holds files"):
         run([pool / "points.csv"], camera=pool / "camera.yaml", out=pool / "pool.yaml", report=pool)
+
+
+def test_parts_of_the_picture_are_no_pixels(pool):
+    seen = survey(overhead(), WATER, FLOOR, 40)
+    table(pool / "parts.csv", replace(seen, pixels=seen.pixels / [PLUMB_BOB.width, PLUMB_BOB.height]))
+    with pytest.raises(CalibrationError, match="spread over 0.* px in all.*multiply"):
+        run([pool / "parts.csv"], camera=pool / "camera.yaml", out=pool / "pool.yaml")
+    assert not (pool / "pool.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"focal_sigma": 0.003}, {"focal_sigma": 0.0}, {"fit": "pose,height,focal"}]
+)
+def test_a_lens_taken_as_exact_is_said(pool, capsys, options):
+    """As a note in the table and among the advice in JSON, unless somebody told its errors or it is fitted."""
+    files = {"camera": pool / "camera.yaml", "out": pool / "pool.yaml", "water_height": 1.0}
+    run([pool / "points.csv"], **files, **options)
+    assert ("- the lens is taken as exact" in capsys.readouterr().out) == (not options)
+    run([pool / "points.csv"], **files, **options, as_json=True)
+    said = json.loads(capsys.readouterr().out)
+    assert any("--focal-sigma 0.003" in sentence for sentence in said["advice"]) == (not options)
+
+
+def test_the_surveys_part_of_the_held_out_error_is_said(pool, capsys):
+    """2 mm for each of two coordinates make 2.8 mm, times how much worse than said the survey seems."""
+    fit = run([pool / "points.csv"], camera=pool / "camera.yaml", out=pool / "pool.yaml", water_height=1.0)
+    told = 0.2 * np.sqrt(2.0) * fit.noise.scale
+    assert load_pool(pool / "pool.yaml").record["held_out"]["survey_cm"] == pytest.approx(told)
+    assert f"survey's own error {told:.2f} cm" in " ".join(capsys.readouterr().out.split())

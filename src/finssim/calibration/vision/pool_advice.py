@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from finssim.calibration.fit import Estimate
 from finssim.calibration.vision.observations import Observations
@@ -22,6 +23,17 @@ NARROW = np.radians(20.0)
 
 ONE_DEPTH = 0.02
 """Spread of depths, over the distance to the camera, below which they count as one."""
+
+SAME_PLACE = 0.005
+"""Two places of the plane nearer than this are one [m]."""
+
+CERTAIN = 0.999
+"""Share of the marks above the water that are taken for such."""
+
+MOST_NAMES = 12
+"""Rows that a sentence names."""
+
+WHOLE_LENS = "--fit pose,height,tilt,index,focal,center,distortion"
 
 
 def advice(
@@ -43,9 +55,13 @@ def advice(
         minima: Other places where the search came to rest.
     """
     found = [*_place(fit, seen, surface, settings, table), *_conflicts(fit, surface, settings)]
-    found += _numbers(fit, seen)
-    close = [clearance for ratio, clearance in minima if ratio < 1.1]
+    found += [*_numbers(fit, seen), *_left_out(fit, seen, surface)]
     place = table["camera_height" if surface else "camera_distance"]
+    close = [
+        clearance
+        for ratio, clearance in minima
+        if ratio < 1.1 and abs(clearance - place.estimate) > SAME_PLACE
+    ]
     if close and not place.identifiable:
         found.append(
             f"another place of the plane fits about as well (camera {close[0]:.2f} m from it instead of "
@@ -108,14 +124,16 @@ def _place(
 def _conflicts(fit: Refined, surface: bool, settings: Settings) -> list[str]:
     """Where the pixels pull an estimate far from what was known."""
     found, prior, model = [], fit.prior, fit.model
+    focal = NAMES.index("focal")
+    place = "water's height" if surface else "plane's place"
+    lens = "" if fit.active[focal] else f"; or let the lens be fitted ({WHOLE_LENS})"
     if np.isfinite(prior.index_std):
         pull = (model.interface.index_far - settings.index) / prior.index_std
         if abs(pull) > 3.0:
             found.append(
                 f"the pixels want an index of {model.interface.index_far:.4f} in place of {settings.index:g}, "
-                f"{abs(pull):.1f} times the error given: check the window, the water's height and the camera file"
+                f"{abs(pull):.1f} times the error given: check the window, the {place} and the camera file{lens}"
             )
-    focal = NAMES.index("focal")
     pull = np.log(model.camera.lens.fx / prior.start.camera.lens.fx) / prior.lens_std[0]
     if fit.active[focal] and abs(pull) > 2.0:
         found.append(
@@ -128,7 +146,7 @@ def _conflicts(fit: Refined, surface: bool, settings: Settings) -> list[str]:
         if lean > 3.0 * prior.tilt_std:
             found.append(
                 f"the pixels want the plane {np.degrees(lean):.2f} degrees tilted: the survey's axis may not be "
-                "plumb; raise --tilt-sigma or level the survey"
+                f"plumb; raise --tilt-sigma or level the survey{lens}"
             )
     return found
 
@@ -141,16 +159,54 @@ def _numbers(fit: Refined, seen: Observations) -> list[str]:
     if fit.noise.pixel > 1.5:
         found.append(
             f"residuals of {fit.noise.pixel:.1f} px are larger than corners are usually found (0.1 to 0.5 px): check "
-            "the camera file, or let the lens be fitted (--fit pose,height,tilt,index,focal,center,distortion)"
+            f"the camera file, or let the lens be fitted ({WHOLE_LENS})"
         )
     if fit.noise.scale > 2.0:
         found.append(
             f"the survey seems {fit.noise.scale:.1f} times less exact than said "
             f"({1000 * fit.noise.survey * fit.noise.scale:.1f} mm): measure again, or give --survey-sigma"
         )
-    if not fit.used.all():
-        wrong = int((~fit.used).sum())
+    return found
+
+
+def _left_out(fit: Refined, seen: Observations, surface: bool) -> list[str]:
+    """Rows that were left out: marks above the water that nobody called dry, and others."""
+    above = _above(fit, seen)
+    wrong = int((~fit.used & ~above).sum())
+    found = []
+    if above.any():
+        names = [seen.names[i] for i in np.flatnonzero(above)]
+        where = "above the water found" if surface else "on the camera's side of the plane found"
+        one = len(names) == 1
         found.append(
-            f"{wrong} row{'s were' if wrong > 1 else ' was'} left out as wrong: check ids and coordinates"
+            f"{', '.join(names[:MOST_NAMES])}{', ...' if len(names) > MOST_NAMES else ''} "
+            f"{'lies' if one else 'lie'} {where}, and straight lines meet {'it' if one else 'them'}: mark "
+            f"{'it' if one else 'them'} dry (a column dry with yes), which makes the camera's place surer"
+        )
+    if wrong:
+        found.append(
+            f"{wrong} {'more ' if above.any() else ''}row{'s were' if wrong > 1 else ' was'} left out as wrong: check "
+            "ids and coordinates"
         )
     return found
+
+
+def _above(fit: Refined, seen: Observations) -> NDArray[np.bool_]:
+    """Rows left out that lie on the camera's side of the plane and are met by straight lines, as far as the pose is
+    told, (N,)."""
+    model, noise = fit.model, fit.noise
+    side = seen.points @ model.interface.normal + model.interface.offset > 0.0
+    rows = np.flatnonzero(~fit.used & ~seen.dry & side)
+    found = np.zeros(len(seen), bool)
+    if not len(rows):
+        return found
+    points, dry = seen.points[rows], np.ones(len(rows), bool)
+    r = seen.pixels[rows] - model.predict(points, dry)
+    J, J_point = model.jacobians(points, dry)
+    sigma = noise.scale * np.where(np.isfinite(seen.sigma[rows]), seen.sigma[rows], noise.survey)
+    V = J @ fit.covariance @ J.transpose(0, 2, 1) + noise.pixel**2 * np.eye(2)
+    V = V + J_point @ J_point.transpose(0, 2, 1) * sigma[:, None, None] ** 2
+    ok = np.isfinite(r).all(axis=1) & np.isfinite(V).all(axis=(1, 2))
+    d2 = np.einsum("ni,nij,nj->n", r[ok], np.linalg.inv(V[ok]), r[ok])
+    found[rows[ok]] = d2 < float(chi2.ppf(CERTAIN, 2))
+    return found if 2 * found.sum() > len(rows) else np.zeros(len(seen), bool)  # some are met by chance

@@ -10,10 +10,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.vision.observations import Observations, observe, observe_combined
+from finssim.calibration.vision.pool_doubts import doubted
 from finssim.calibration.vision.pool_fit import PoolFit, calibrate_pool
 from finssim.calibration.vision.pool_record import file_hashes, pool_json, pool_record, print_pool
 from finssim.calibration.vision.pool_settings import Settings
@@ -24,6 +26,9 @@ from finssim.localization.camera_file import CameraFile, load_camera
 from finssim.localization.pool import Pool, write_pool
 
 __all__ = ["run"]
+
+LEAST_SPREAD = 5.0
+"""Largest width of all pixels that are refused: numbers from 0 to 1 are no pixels [px]."""
 
 
 def run(
@@ -122,8 +127,9 @@ def run(
         seed=seed,
     )
     seen = _observations(inputs, surveyed, unit=unit, z=z, edge=edge, family=family)
-    _refuse_outside(seen, file)
-    found = calibrate_pool(seen, file.lens, settings)
+    _refuse_pixels(seen, file)
+    lens_told = focal_sigma is not None or center_sigma is not None or any(remembered)
+    found = doubted(calibrate_pool(seen, file.lens, settings), lens_told=lens_told)
     files = [*map(Path, inputs), *([] if surveyed is None else [Path(surveyed)]), Path(camera)]
     hashes = file_hashes(files)
     model = found.model
@@ -182,8 +188,15 @@ def _observations(
     return observe(paths, read_survey(surveyed, unit=unit, edge=edge, z=z), family=family)
 
 
-def _refuse_outside(seen: Observations, file: CameraFile) -> None:
-    """Refuse pixels that another size of picture must have had."""
+def _refuse_pixels(seen: Observations, file: CameraFile) -> None:
+    """Refuse pixels that another size of picture must have had, and what are none."""
+    spread = float(np.ptp(seen.pixels, axis=0).max())
+    if len(seen) > 1 and 0.0 < spread < LEAST_SPREAD:
+        raise CalibrationError(
+            f"the pixels spread over {spread:.3g} px in all: expected pixels, u from 0 to {file.lens.width - 1} and v "
+            f"from 0 to {file.lens.height - 1}, not parts of the picture's size or coordinates on a plane before the "
+            "lens: multiply them by the size"
+        )
     outside = ~file.lens.inside(seen.pixels)
     if outside.mean() > 0.2:
         raise CalibrationError(

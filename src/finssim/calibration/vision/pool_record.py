@@ -14,6 +14,7 @@ from rich import box
 from rich.table import Table
 
 from finssim.calibration.fit import Estimate
+from finssim.calibration.vision.pool_doubts import EXACT_LENS
 from finssim.calibration.vision.pool_fit import PoolFit
 from finssim.calibration.vision.pool_held_out import rms
 from finssim.provenance import provenance
@@ -45,7 +46,7 @@ def pool_json(
         "interface": "surface" if fit.surface else "wall",
         "parameters": {name: estimate.as_json() for name, estimate in fit.estimates.items()},
         "residual": _finite(fit.residual_json()),
-        "held_out": None if fit.held_out is None else _finite(fit.held_out.as_json()),
+        "held_out": _held_out(fit),
         "pinhole": {
             "rms_px": _number(rms(fit.pinhole_residual[fit.used])),
             "held_out": None if fit.pinhole_held_out is None else _finite(fit.pinhole_held_out.as_json()),
@@ -59,8 +60,8 @@ def pool_json(
             "names": list(fit.correlation.names),
             "matrix": [[_number(round(float(x), 4)) for x in row] for row in fit.correlation.matrix],
         },
-        "notes": list(fit.notes),
-        "advice": list(fit.advice),
+        "notes": [note for note in fit.notes if note != EXACT_LENS],
+        "advice": [*fit.advice, *(note for note in fit.notes if note == EXACT_LENS)],
         "settings": _settings(fit),
         "inputs": dict(inputs or {}),
         "out": None if out is None else str(out),
@@ -114,7 +115,9 @@ def summary(fit: PoolFit) -> list[str]:
     if fit.held_out is None:
         found.append("too few points to hold any out: the error at other points is not known")
     else:
-        found.append(f"held out ({fit.held_out.folds} parts): {_figures(fit.held_out.as_json())}")
+        share = _survey_share(fit)
+        of_it = f"; of it the survey's own error {share:.2f} cm" if math.isfinite(share) else ""
+        found.append(f"held out ({fit.held_out.folds} parts): {_figures(fit.held_out.as_json())}{of_it}")
     if fit.pinhole_held_out is not None:
         found.append(f"straight lines, held out: {_figures(fit.pinhole_held_out.as_json())}")
     if fit.outliers:
@@ -136,6 +139,25 @@ def _figures(of: Mapping[str, float | int | None]) -> str:
     if of["rms_cm"] is not None:
         text += f", in the water {of['rms_cm']:.2f} cm rms, 95 % within {of['p95_cm']:.2f} cm"
     return text
+
+
+def _held_out(fit: PoolFit) -> dict[str, float | int | None] | None:
+    if fit.held_out is None:
+        return None
+    return _finite({**fit.held_out.as_json(), "survey_cm": _survey_share(fit)})
+
+
+def _survey_share(fit: PoolFit) -> float:
+    """Root mean square of the survey's own error across the planes of the points held out [cm].
+
+    Two coordinates of each place, and the turn of tags; it is in the held-out error, and not one of the calibration.
+    """
+    if fit.held_out is None or not len(fit.held_out.rows):
+        return math.nan
+    seen, noise = fit.seen.subset(fit.held_out.rows), fit.noise
+    sigma = np.where(np.isfinite(seen.sigma), seen.sigma, noise.survey)
+    turn = noise.survey_yaw**2 * np.sum(seen.arm**2, axis=1)
+    return 100.0 * noise.scale * float(np.sqrt(np.mean(2.0 * sigma**2 + turn)))
 
 
 def _settings(fit: PoolFit) -> dict[str, Any]:

@@ -31,6 +31,10 @@ LENS_STD = (0.05, 0.03, 0.03, 0.15, 0.15, 0.02, 0.02, 0.1)
 """How far a camera file that is only roughly right may be off: log focal, centre in widths of the image, distortion."""
 
 
+THICKEST = 0.5
+"""Thickness of a window beyond which another unit than metres is meant [m]."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     """Options; standard deviations are of what is known before the pictures."""
@@ -92,6 +96,12 @@ class Settings:
             raise CalibrationError(
                 "fit leaves the height out and none is given: add height, or give --water-height"
             )
+        for layer in self.window:
+            if layer.thickness > THICKEST:
+                raise CalibrationError(
+                    f"window is {layer.thickness:g} m thick, expected at most {THICKEST:g}: thickness is in metres, "
+                    "10 mm of glass are 0.010:1.52"
+                )
         _positive("index", self.index, 1.0, 2.5)
         _positive("index sigma", self.index_sigma, 0.0, 1.0)
         _positive("tilt sigma [deg]", math.degrees(self.tilt_sigma or 0.0), 0.0, 180.0)
