@@ -17,7 +17,7 @@ INK, PINHOLE, REFRACTIVE = "#222222", "#c0392b", "#1f6fb2"
 
 
 def draw_error_map(campaign: Campaign, pinhole: Scores, refractive: Scores, path: Path) -> None:
-    """Arrows from every held-out place to where each method puts it, ten times their length for the refractive one.
+    """Arrows from every held-out place to where each method puts it, longer than true as the titles say.
 
     Args:
         campaign: What lay where.
@@ -32,7 +32,7 @@ def draw_error_map(campaign: Campaign, pinhole: Scores, refractive: Scores, path
 
     places = np.array([visit.nominal[:2] for visit in campaign.visits])
     figure, axes = plt.subplots(1, 2, figsize=(12.0, 4.2), sharey=True, layout="constrained")
-    panels = (("pinhole PnP", pinhole, 1.0, PINHOLE), ("refractive", refractive, 10.0, REFRACTIVE))
+    panels = (("pinhole PnP", pinhole, 3.0, PINHOLE), ("refractive", refractive, 10.0, REFRACTIVE))
     for axis, (title, scores, scale, colour) in zip(axes, panels, strict=True):
         axis.plot(*places[campaign.calibrates].T, "+", color="0.7", markersize=5, label="calibrated here")
         at = places[scores.visits]
@@ -46,7 +46,7 @@ def draw_error_map(campaign: Campaign, pinhole: Scores, refractive: Scores, path
             width=0.003,
             color=colour,
         )
-        times = "" if scale == 1.0 else f", arrows {scale:.0f} times as long"
+        times = f", arrows {scale:.0f} times as long"
         axis.set_title(f"{title}: RMSE {100.0 * scores.rmse:.2f} cm{times}")
         axis.set(aspect="equal", xlabel="x [m]", xlim=(-REACH[0] - 0.3, REACH[0] + 0.3))
     axes[0].set_ylabel("y [m]")
