@@ -149,6 +149,25 @@ def test_marks_above_the_water_are_told_from_wrong_rows():
     assert any(sentence.startswith("1 more row was left out as wrong") for sentence in fit.advice)
 
 
+@pytest.mark.parametrize("height", [1.05, 1.3])
+@pytest.mark.parametrize("asked", [FIT, None], ids=["lens held", "lens free"])
+def test_marks_over_which_the_water_was_put_are_noticed(height, asked):
+    """The same marks where nobody measured the water: it is found above some, or the lens is bent, and that is said."""
+    wet = survey(overhead(), WATER, FLOOR, 40)
+    points, pixels = rim(overhead())
+    points[:, 2], told = height, Settings(interface="surface", fit=asked)
+    optical = (points - overhead().position) @ overhead().R_pc
+    pixels = overhead().lens.project(optical)[0]
+    seen = observations(np.concatenate([wet.points, points]), np.concatenate([wet.pixels, pixels]))
+    fit = doubted(calibrate_pool(seen, PLUMB_BOB, told), PLUMB_BOB)
+    dry = next(sentence for sentence in fit.advice if "mark them dry" in sentence)
+    assert all(f"p{i}" in dry for i in range(40, 48))
+    dried = replace(seen, dry=np.arange(48) >= 40)
+    assert not any(
+        "mark them dry" in s for s in doubted(calibrate_pool(dried, PLUMB_BOB, told), PLUMB_BOB).advice
+    )
+
+
 def test_points_without_water_are_noticed():
     """Pixels of points in air, calibrated as a tank: straight lines foretell them better, and that comes first."""
     camera = before_tank(30.0)
@@ -156,14 +175,14 @@ def test_points_without_water_are_noticed():
     pixels, _ = camera.lens.project((points - camera.position) @ camera.R_pc)
     pixels = pixels + 0.25 * np.random.default_rng(1).standard_normal(pixels.shape)
     told = Settings(fit=FIT, plane=(0.0, 1.0, 0.0, 0.0), index_sigma=0.0, survey_sigma=0.0005)
-    fit = doubted(calibrate_pool(observations(points, pixels), TANK_LENS, told))
+    fit = doubted(calibrate_pool(observations(points, pixels), TANK_LENS, told), TANK_LENS)
     assert "straight lines meet held-out points better" in fit.advice[0]
 
 
 @pytest.mark.parametrize("box", [FLOOR, SOLID], ids=["floor", "solid"])
 def test_points_in_water_raise_no_doubt(box):
     fit = calibrate_pool(survey(overhead(), WATER, box, 60), PLUMB_BOB, Settings(fit=FIT, water_height=1.0))
-    assert doubted(fit).advice == fit.advice and doubted(fit).notes == fit.notes
+    assert doubted(fit, PLUMB_BOB).advice == fit.advice and doubted(fit, PLUMB_BOB).notes == fit.notes
 
 
 @pytest.mark.parametrize(("option", "value"), [("water_height", 100.0), ("water_depth", 100.0)])
@@ -173,7 +192,7 @@ def test_centimetres_for_metres_are_refused(option, value):
     with pytest.raises(
         CalibrationError, match=f"--{option.replace('_', '-')} 100 puts the plane 100 m.*unit"
     ):
-        doubted(fit)
+        doubted(fit, PLUMB_BOB)
 
 
 @pytest.mark.parametrize(("pixels", "refused"), [(4.0, False), (30.0, True)])
@@ -185,13 +204,13 @@ def test_a_camera_on_the_plane_with_large_residuals_is_doubted(pixels, refused):
         fit.model.interface, offset=-float(fit.model.interface.normal @ fit.model.camera.position)
     )
     touching = replace(fit, model=replace(fit.model, interface=plane))
-    assert doubted(touching).advice == fit.advice
+    assert doubted(touching, PLUMB_BOB).advice == fit.advice
     poor = replace(touching, residual=np.full_like(fit.residual, pixels / np.sqrt(2.0)))
     if refused:
         with pytest.raises(CalibrationError, match="on the plane itself"):
-            doubted(poor)
+            doubted(poor, PLUMB_BOB)
     else:
-        assert "on the plane itself" in doubted(poor).advice[0]
+        assert "on the plane itself" in doubted(poor, PLUMB_BOB).advice[0]
 
 
 def test_a_flat_left_handed_survey_is_warned_of():
@@ -200,14 +219,14 @@ def test_a_flat_left_handed_survey_is_warned_of():
     left = survey(overhead(), WATER, FLOOR, 40)
     left = replace(left, points=left.points * turn)
     told = Settings(fit=FIT, interface="surface")
-    assert "left-handed" in doubted(calibrate_pool(left, PLUMB_BOB, told)).advice[0]
+    assert "left-handed" in doubted(calibrate_pool(left, PLUMB_BOB, told), PLUMB_BOB).advice[0]
     with pytest.raises(CalibrationError, match="other side"):
         calibrate_pool(left, PLUMB_BOB, replace(told, water_height=1.0))
     down = calibrate_pool(left, PLUMB_BOB, replace(told, water_height=-1.0))
-    assert doubted(down).advice == down.advice
+    assert doubted(down, PLUMB_BOB).advice == down.advice
     solid = survey(overhead(), WATER, SOLID, 40)
     down = calibrate_pool(replace(solid, points=solid.points * turn * [1, 1, -1]), PLUMB_BOB, told)
-    assert doubted(down).advice == down.advice
+    assert doubted(down, PLUMB_BOB).advice == down.advice
 
 
 @pytest.mark.parametrize("factor", [0.94, 0.96])

@@ -129,7 +129,7 @@ def run(
     seen = _observations(inputs, surveyed, unit=unit, z=z, edge=edge, family=family)
     _refuse_pixels(seen, file)
     lens_told = focal_sigma is not None or center_sigma is not None or any(remembered)
-    found = doubted(calibrate_pool(seen, file.lens, settings), lens_told=lens_told)
+    found = doubted(calibrate_pool(seen, file.lens, settings), file.lens, lens_told=lens_told)
     files = [*map(Path, inputs), *([] if surveyed is None else [Path(surveyed)]), Path(camera)]
     hashes = file_hashes(files)
     model = found.model

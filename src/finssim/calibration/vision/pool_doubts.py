@@ -5,10 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.vision.pool_fit import PoolFit
+from finssim.calibration.vision.observations import Observations
+from finssim.calibration.vision.pool_fit import PoolFit, calibrate_pool
 from finssim.calibration.vision.pool_held_out import rms
+from finssim.calibration.vision.pool_solver import clearances
+from finssim.geometry.optics import Lens
 
 __all__ = ["EXACT_LENS", "doubted"]
 
@@ -30,6 +34,18 @@ TOO_DEEP = 1.5
 FLAT = 0.02
 """Thickness of the points, over their lesser width, below which their mirror image cannot be told from them."""
 
+AGAINST = 0.002
+"""Clearance of a point from the plane below which the plane ends against it [m]."""
+
+MOST_ABOVE = 0.4
+"""Share of the points that may be marks above the water."""
+
+MET = 4.0, 3.0
+"""Residual of straight lines that meets a mark: so many residuals of the rest, and so many pixels more."""
+
+MOST_NAMES = 12
+"""Marks that a sentence names."""
+
 EXACT_LENS = (
     "the lens is taken as exact, because neither the camera file nor the options tell its errors: if its focal length "
     "or centre is off, the intervals of the camera's place are too narrow; a lens that was calibrated is usually known "
@@ -38,11 +54,12 @@ EXACT_LENS = (
 """A note, not an alarm: what the intervals of most camera files rest on."""
 
 
-def doubted(fit: PoolFit, *, lens_told: bool = True) -> PoolFit:
+def doubted(fit: PoolFit, lens: Lens, *, lens_told: bool = True) -> PoolFit:
     """The calibration with what speaks against it put before its advice.
 
     Args:
         fit: The calibration.
+        lens: That it began with.
         lens_told: Somebody said how sure the lens is.
 
     Raises:
@@ -50,7 +67,7 @@ def doubted(fit: PoolFit, *, lens_told: bool = True) -> PoolFit:
     """
     _refuse_depth(fit)
     _refuse_touching(fit)
-    found = [*_straight(fit), *_touching(fit), *_handed(fit)]
+    found = [*_straight(fit), *_touching(fit), *_unmarked(fit, lens), *_handed(fit)]
     exact = [] if lens_told or "focal" in fit.lens_fitted else [EXACT_LENS]
     return replace(fit, advice=(*found, *fit.advice), notes=(*fit.notes, *exact))
 
@@ -118,6 +135,50 @@ def _straight(fit: PoolFit) -> list[str]:
         "there is probably no water between camera and points, or the index, the window or the place given for the "
         "plane is wrong; do not use this pool file under water"
     ]
+
+
+def _unmarked(fit: PoolFit, lens: Lens) -> list[str]:
+    """Marks above the water that nobody called dry, for which the plane was put over them, or the lens bent."""
+    seen, rows = fit.seen, _highest(fit)
+    if not rows.any():
+        return []
+    try:
+        other = calibrate_pool(seen.subset(~rows), lens, fit.settings)
+    except (CalibrationError, np.linalg.LinAlgError):
+        return []
+    marks = seen.subset(rows)
+    above = clearances(other.model, marks.points) + other.model.interface.thickness < 0.0
+    if not (above & _met(other, marks)).all():
+        return []
+    listed = ", ".join(marks.names[:MOST_NAMES]) + (", ..." if len(marks) > MOST_NAMES else "")
+    return [
+        f"without {listed}, the plane is found {other.model.clearance:.2f} m from the camera in place of "
+        f"{fit.model.clearance:.2f} m, beyond them, and straight lines meet them: mark them dry (a column dry with "
+        "yes); do not use this pool file"
+    ]
+
+
+def _highest(fit: PoolFit) -> NDArray[np.bool_]:
+    """Points nearest to the plane, down to the widest gap between heights, (N,).
+
+    None of them where nothing is odd: the plane ends against no point, and the lens gave up nothing.
+    """
+    seen, model = fit.seen, fit.model
+    distance = np.where(seen.dry, np.inf, clearances(model, seen.points))
+    bent = fit.settings.fit is None and bool(fit.lens_fitted)
+    order = np.sort(distance[~seen.dry])
+    most = int(MOST_ABOVE * len(order))
+    if most < 1 or not (bent or float(distance[fit.used].min()) < AGAINST):
+        return np.zeros(len(seen), bool)
+    gap = int(np.argmax(np.diff(order[: most + 1])))
+    return np.asarray(distance <= order[gap])
+
+
+def _met(fit: PoolFit, marks: Observations) -> NDArray[np.bool_]:
+    """Which marks the camera sees where straight lines say, (K,)."""
+    off = marks.pixels - fit.model.predict(marks.points, np.ones(len(marks), bool))
+    times, more = MET
+    return np.asarray(np.linalg.norm(off, axis=1) < times * rms(fit.residual[fit.used]) + more)
 
 
 def _handed(fit: PoolFit) -> list[str]:
