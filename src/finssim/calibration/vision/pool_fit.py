@@ -15,7 +15,7 @@ from finssim.calibration.vision.pool_estimates import correlation, estimates
 from finssim.calibration.vision.pool_held_out import HeldOut, error_vectors, held_out, rms
 from finssim.calibration.vision.pool_model import NAMES, PoolModel, extended_lens
 from finssim.calibration.vision.pool_noise import Noise, Whitener
-from finssim.calibration.vision.pool_refine import Refined, refine
+from finssim.calibration.vision.pool_refine import Refined, refine, touched, touching_advice
 from finssim.calibration.vision.pool_search import UP, Found, prior_of, search, shifted_settings
 from finssim.calibration.vision.pool_settings import Settings, active_names, lens_std
 from finssim.calibration.vision.pool_solver import Prior, residuals, solve
@@ -69,6 +69,8 @@ class PoolFit:
     advice: tuple[str, ...]
     minima: tuple[tuple[float, float], ...]
     """Other places where the search came to rest: residual over that of the best, clearance of the camera [m]."""
+    touching: tuple[str, ...]
+    """Places of the survey, or the camera, that the plane came to rest against: it can pass neither."""
 
     @property
     def outliers(self) -> list[str]:
@@ -129,6 +131,7 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
     normal = UP if found.surface else fit.model.interface.normal
     parts = [held_out(f, here, settings.folds, settings.seed, normal) for f in (fit, pinhole)]
     table = estimates(fit, found.surface, told, centre)
+    touching = touched(fit, here)
     return PoolFit(
         model=fit.model.shifted(centre),
         surface=found.surface,
@@ -147,10 +150,12 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
         lens_fitted=_lens_groups(fit.active),
         notes=tuple(notes),
         advice=(
+            *touching_advice(touching),
             *_contradicted(here, told, fit),
             *advice(fit, here, found.surface, told, table, found.minima),
         ),
         minima=found.minima,
+        touching=touching,
     )
 
 

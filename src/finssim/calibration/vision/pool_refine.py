@@ -12,10 +12,17 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.vision.observations import Observations
 from finssim.calibration.vision.pool_model import NAMES, PoolModel
 from finssim.calibration.vision.pool_noise import Noise, Whitener, estimate_noise
-from finssim.calibration.vision.pool_solver import Prior, Solution, normal_equations, residuals, solve
+from finssim.calibration.vision.pool_solver import (
+    Prior,
+    Solution,
+    clearances,
+    normal_equations,
+    residuals,
+    solve,
+)
 from finssim.calibration.vision.pool_start import RobustPixels
 
-__all__ = ["Refined", "refine", "refit"]
+__all__ = ["Refined", "refine", "refit", "touched", "touching_advice"]
 
 Array = NDArray[np.float64]
 
@@ -26,6 +33,14 @@ MOST_WRONG = 0.4
 """Share of wrong rows beyond which nothing is believed."""
 
 ROUNDS = 6
+
+TOUCHING = 0.0001
+"""Distance of the plane from a point or the camera, below which the one keeps the other from moving on [m]."""
+
+PRESSED = 9.0
+"""Fall of chi² that a plane held by a point or the camera would gain beyond it, from which that is no chance."""
+
+CAMERA = "the camera"
 
 
 @dataclass(frozen=True)
@@ -109,6 +124,41 @@ def refit(start: Refined, seen: Observations, rows: NDArray[np.bool_]) -> PoolMo
     part = seen.subset(rows)
     whiten = Whitener(start.model.jacobians(part.points, part.dry)[1], part, start.noise)
     return solve(start.model, part, whiten, start.active, start.prior).model
+
+
+def touched(fit: Refined, seen: Observations) -> tuple[str, ...]:
+    """Points used, and the camera, that the plane and its window have come to rest against although the pixels want it
+    further on; the nearest first.
+
+    Args:
+        fit: Of these rows.
+        seen: All rows.
+    """
+    wet = fit.used & ~seen.dry
+    distance = np.where(wet, clearances(fit.model, seen.points), np.inf)
+    near = [i for i in np.argsort(distance) if distance[i] < TOUCHING]
+    if not near and fit.model.clearance >= TOUCHING:
+        return ()
+    N, g = normal_equations(
+        fit.model, seen.subset(fit.used), fit.whiten, np.flatnonzero(fit.active), fit.prior
+    )
+    scale = np.sqrt(np.maximum(np.diagonal(N), 1e-300))
+    if float((g / scale) @ np.linalg.lstsq(N / np.outer(scale, scale), g / scale, rcond=1e-9)[0]) < PRESSED:
+        return ()
+    names = dict.fromkeys(seen.locations[seen.location[i]] for i in near)
+    return (*((CAMERA,) if fit.model.clearance < TOUCHING else ()), *names)
+
+
+def touching_advice(names: tuple[str, ...]) -> list[str]:
+    """A sentence where the plane came to rest against the points or the camera, by the names of `touched`."""
+    if not names:
+        return []
+    listed = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+    return [
+        f"the plane ends against {listed}, which it cannot pass: where nothing touches it in truth, the pixels want it "
+        "further on than it can be; check the coordinates of what it touches, the thickness of the window, the index "
+        "and the camera file"
+    ]
 
 
 def _plausible(model: PoolModel, seen: Observations, noise: Noise) -> NDArray[np.bool_]:

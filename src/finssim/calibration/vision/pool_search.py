@@ -210,13 +210,14 @@ def _refuse_wrong_side(pinhole: PoolModel, settings: Settings, surface: bool) ->
 
 
 def _choose(runs: list[tuple[float, PoolModel, bool]], count: int) -> tuple[float, PoolModel, bool]:
-    """The best run; a level surface wherever it does as well as a wall."""
+    """The best run; a level surface wherever it does as well as a wall, or the points are too few to tell."""
     best = min(runs, key=lambda run: run[0])
     surfaces = [run for run in runs if run[2]]
     if surfaces and not best[2]:
         level = min(surfaces, key=lambda run: run[0])
         upright = abs(float(best[1].interface.normal[2])) > np.cos(np.radians(5.0))
-        freedom = np.sqrt(max(1.0, 2.0 * count - 7.0) / max(1.0, 2.0 * count - 9.0))  # two more parameters
+        spare = 2.0 * count - 9.0  # a wall's parameters are nine, two more than a surface's
+        freedom = np.sqrt((spare + 2.0) / spare) if spare > 0.0 else np.inf
         if level[0] <= SAME * freedom * best[0] + 0.02 or upright:
             return level
     return best

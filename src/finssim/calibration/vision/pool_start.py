@@ -26,6 +26,9 @@ SHARES = (0.1, 0.3, 0.55, 0.8, 1.0, 1.2)
 """Depth of the water as a part of the straight-line distance between camera and points: the camera is on the surface
 at 1.33."""
 
+REACHED = (1.0, 0.75)
+"""Parts of the points that the plane begins before: all, or not the highest, which may be wrong or above the water."""
+
 
 class RobustPixels:
     """Whitening of rows one by one with Huber's weights, from residuals at one model."""
@@ -228,11 +231,12 @@ def plane_starts(
     for direction in normals:
         apparent = float(direction @ (camera.position - reference))
         normal, apparent = (direction, apparent) if apparent > 0.0 else (-direction, -apparent)
-        least = float(((wet - reference) @ normal).max()) + plane.thickness
+        heights = (wet - reference) @ normal
+        leasts = [float(np.quantile(heights, share)) + plane.thickness for share in REACHED]
         depths = (
             [depth]
             if np.isfinite(depth)
-            else sorted({max(s * apparent, 1.02 * least + 1e-4) for s in SHARES})
+            else sorted({max(s * apparent, 1.02 * least + 1e-4) for s in SHARES for least in leasts})
         )
         for d in depths:
             ratio = plane.index_near / plane.index_far
