@@ -8,7 +8,7 @@ import pytest
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.vision.pool_fit import calibrate_pool
 from finssim.calibration.vision.pool_settings import Settings
-from finssim.geometry.optics import Interface, project
+from finssim.geometry.optics import Camera, Interface, project
 
 from .surveyed_pools import (
     FISHEYE,
@@ -171,3 +171,18 @@ def test_intervals_allow_for_a_lens_that_is_not_sure():
                 squares[name].append(((estimate.estimate - camera.position[axis]) / std) ** 2)
     assert np.mean(squares["told"]) < 1.9  # 99.9 % quantile of chi² with 36 degrees of freedom, over 36
     assert np.mean(squares["not told"]) > 3.0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_flat_floor_with_two_dry_marks_is_not_taken_for_left_handed(seed):
+    """Straight lines may fit the mirror image of such a survey better than the survey; bent ones fit the survey."""
+    random = np.random.default_rng(seed)
+    camera = Camera(PLUMB_BOB, [1.0, -1.6, 5.3], [1.0, 0.0, 0.0, 0.0])
+    floor = np.column_stack([random.uniform(-1.7, 3.2, 10), random.uniform(-3.1, 0.2, 10), np.zeros(10)])
+    marks = np.array([[0.7, -3.1, 2.46], [2.0, -2.5, 2.46]])
+    straight = camera.lens.project((marks - camera.position) @ camera.R_pc)[0]
+    pixels = np.concatenate([project(camera, Interface.water(2.29), floor).pixels, straight])
+    seen = observations(np.concatenate([floor, marks]), pixels + random.normal(0.0, 1.0, (12, 2)))
+    seen = replace(seen, dry=np.arange(12) >= 10)
+    fit = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, water_height=2.29, survey_sigma=0.01))
+    assert np.linalg.norm(fit.model.camera.position - camera.position) < 0.2

@@ -13,7 +13,7 @@ from finssim.calibration.vision.observations import Observations
 from finssim.calibration.vision.pool_model import NAMES, PoolModel
 from finssim.calibration.vision.pool_settings import Settings
 from finssim.calibration.vision.pool_solver import Prior, residuals, solve
-from finssim.calibration.vision.pool_start import RobustPixels, mirror_is_better, pinhole_poses, plane_starts
+from finssim.calibration.vision.pool_start import RobustPixels, pinhole_poses, plane_starts
 from finssim.geometry.optics import Interface, Lens
 
 __all__ = ["UP", "Found", "prior_of", "search", "shifted_settings"]
@@ -28,6 +28,9 @@ ENOUGH = 500
 ANYWHERE = 0.5
 """Depth of the water over the distance of the camera, where nobody measured it, and the standard deviation of that: so
 weak that it only decides where the pixels say nothing."""
+
+MIRRORED = 0.6
+"""Residual of the mirror image over that of the best model, below which the survey's frame is left-handed."""
 
 SAME = 1.15
 """A surface that fits within this factor of a wall is taken for a surface."""
@@ -55,17 +58,13 @@ def search(seen: Observations, lens: Lens, settings: Settings) -> Found:
         kept = np.random.default_rng(settings.seed).choice(len(seen), ENOUGH, replace=False)
         seen = seen.subset(np.sort(kept))
     poses = pinhole_poses(seen, lens, settings.seed)
-    if mirror_is_better(seen, lens, poses[0].cost):
-        raise CalibrationError(
-            "the survey's frame is left-handed: its mirror image fits clearly better; negate one axis (usually y or z) "
-            "in the survey and in everything that uses its frame (or the pixels are mirrored: u and v exchanged, v "
-            "counted upwards)"
-        )
     near = [p.model for p in poses[:3] if p.cost < 3.0 * poses[0].cost + 0.5]
     runs: list[tuple[float, PoolModel, bool]] = []
     for surface, normals in _families(near[0], seen, settings):
         best = _family(near, normals, seen, settings, surface)
         runs += [(value, model, surface) for value, model in best]
+    # Bent rays come first: straight ones may fit the mirror image of a good survey better than the survey.
+    _refuse_left_handed(seen, lens, min([_score(near[0], seen), *(run[0] for run in runs)]))
     if not runs:
         raise CalibrationError(
             "no place of the plane between camera and points explains the pixels: check the water height, its sign and "
@@ -195,17 +194,33 @@ def _descend(
     return model
 
 
+def _refuse_left_handed(seen: Observations, lens: Lens, best: float) -> None:
+    """Refuse a survey whose mirror image, in straight lines, fits clearly better than the best model of it.
+
+    A plane of points can always be mirrored, and says nothing.
+    """
+    values = np.linalg.svd(seen.points - seen.points.mean(axis=0), compute_uv=False)
+    if values[2] < 0.02 * values[1]:
+        return
+    mirrored = replace(seen, points=seen.points * np.array([1.0, 1.0, -1.0]))
+    if _score(pinhole_poses(mirrored, lens)[0].model, mirrored) < MIRRORED * best:
+        raise CalibrationError(
+            "the survey's frame is left-handed: its mirror image fits clearly better; negate one axis (usually y or z) "
+            "in the survey and in everything that uses its frame (or the pixels are mirrored: u and v exchanged, v "
+            "counted upwards)"
+        )
+
+
 def _refuse_wrong_side(pinhole: PoolModel, settings: Settings, surface: bool) -> None:
     _, depth = known_plane(pinhole, settings, surface)
     if np.isfinite(depth) and depth <= 0.0:
         sense = "below" if pinhole.camera.position[2] < pinhole.reference[2] else "above"
-        height = settings.water_height
-        where = "the plane given" if height is None else f"the water at z = {height:g} m"
+        where = "the plane given" if settings.water_height is None else "the water's height given"
         raise CalibrationError(
-            f"the pixels put the camera at z {sense} the points, and {where} is on the other side of them: the "
-            f"survey's z points {'down' if sense == 'below' else 'up'}, or its x and y make it left-handed (seen "
-            "from the camera, y must lie to the left of x where z is up); give the water's height with the other sign, "
-            "or negate y in the survey"
+            f"the pixels put the camera at z {sense} the points, and {where} is {-depth:.3g} m on the other side of "
+            f"them: the survey's z points {'down' if sense == 'below' else 'up'}, or its x and y make it left-handed "
+            "(seen from the camera, y must lie to the left of x where z is up); give the water's height with the other "
+            "sign, or negate y in the survey"
         )
 
 

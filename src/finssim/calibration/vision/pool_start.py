@@ -15,7 +15,7 @@ from finssim.calibration.vision.pool_solver import Prior, Solution, residuals, s
 from finssim.geometry.optics import Camera, Interface, Lens
 from finssim.geometry.rotations import matrix_to_quat
 
-__all__ = ["RobustPixels", "mirror_is_better", "pinhole_poses", "plane_starts"]
+__all__ = ["RobustPixels", "pinhole_poses", "plane_starts"]
 
 Array = NDArray[np.float64]
 
@@ -245,20 +245,3 @@ def plane_starts(
                 position = position + normal * (d + 0.05 * apparent - float(normal @ (position - reference)))
             here = replace(plane, normal=normal, offset=-float(normal @ reference) - d)
             yield replace(pinhole, camera=replace(camera, position=position), interface=here, refractive=True)
-
-
-def mirror_is_better(seen: Observations, lens: Lens, cost: float) -> bool:
-    """Whether points mirrored in z fit clearly better than as they are: the survey's frame is left-handed.
-
-    A plane of points can always be mirrored, and says nothing.
-
-    Args:
-        seen: The rows.
-        lens: Of the camera.
-        cost: Of the best straight-line pose for the points as they are.
-    """
-    values = np.linalg.svd(seen.points - seen.points.mean(axis=0), compute_uv=False)
-    if values[2] < 0.02 * values[1]:
-        return False
-    mirrored = replace(seen, points=seen.points * np.array([1.0, 1.0, -1.0]))
-    return pinhole_poses(mirrored, lens)[0].cost < 0.4 * cost
