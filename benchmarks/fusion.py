@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from finssim.localization.estimator import MODELS, Estimator
-from finssim.localization.streams import DepthSample, ImuSample, Sample, VisionSample
+from finssim.localization.fusion.estimator import MODELS, Estimator
+from finssim.localization.fusion.streams import DepthSample, ImuSample, Sample, VisionSample
 
 DURATION = 60.0
 LATENCY = 0.06

@@ -15,16 +15,16 @@ from pathlib import Path
 import numpy as np
 
 from finssim.geometry.rotations import wrap_angle
-from finssim.localization.estimator import MODELS, Estimator
-from finssim.localization.fuse import fuse
-from finssim.localization.fuse_log import load_log
-from finssim.localization.fuse_settings import Settings
+from finssim.localization.fusion.estimator import MODELS, Estimator
+from finssim.localization.fusion.fuse import fuse
+from finssim.localization.fusion.fuse_log import load_log
+from finssim.localization.fusion.fuse_settings import Settings
 from finssim.localization.pool import load_pool
 from finssim.vehicles import load_vehicle
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from localization.hinsdale_log import CLEAN, clock_offset, hinsdale
-from localization.known_streams import (
+from localization.fusion.hinsdale_log import CLEAN, clock_offset, hinsdale
+from localization.fusion.known_streams import (
     SITE,
     position,
     run,

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from finssim.geometry.optics import Camera, Interface, Lens
-from finssim.localization.families import bitmap
+from finssim.localization.detection.families import bitmap
 from finssim.sensors.overhead_camera import (
     Basin,
     Body,

@@ -22,15 +22,15 @@ from finssim.geometry.rotations import (
     quat_to_matrix,
     wrap_angle,
 )
-from finssim.localization.detector import detector
-from finssim.localization.estimator import Estimator
-from finssim.localization.families import bitmap
-from finssim.localization.fuse_settings import site_of
+from finssim.localization.detection.detector import detector
+from finssim.localization.detection.families import bitmap
+from finssim.localization.detection.region import RegionTracker
+from finssim.localization.detection.tags import tag_corners_b
+from finssim.localization.fusion.estimator import Estimator
+from finssim.localization.fusion.fuse_settings import site_of
+from finssim.localization.fusion.streams import DepthSample, ImuSample, VisionSample
 from finssim.localization.pool import Pool
-from finssim.localization.pose import METHODS, Constraints
-from finssim.localization.region import RegionTracker
-from finssim.localization.streams import DepthSample, ImuSample, VisionSample
-from finssim.localization.tags import tag_corners_b
+from finssim.localization.poses.methods import METHODS, Constraints
 from finssim.quiet import start_warp
 from finssim.sensors.overhead_camera import Basin, OverheadCamera, Pose, Ripples, Scene, TagInScene
 from finssim.vehicles import load_vehicle

@@ -20,15 +20,15 @@ from finssim.geometry.rotations import (
     quat_to_matrix,
     wrap_angle,
 )
-from finssim.localization.detections import Detection, Frame, write_detections
-from finssim.localization.families import bitmap
-from finssim.localization.pictures import write_picture
+from finssim.localization.detection.detections import Detection, Frame, write_detections
+from finssim.localization.detection.families import bitmap
+from finssim.localization.detection.pictures import write_picture
+from finssim.localization.detection.tags import tag_corners_b
 from finssim.localization.pool import load_pool, write_pool
-from finssim.localization.pose import METHODS, NEEDS_DEPTH
-from finssim.localization.tags import tag_corners_b
+from finssim.localization.poses.methods import METHODS, NEEDS_DEPTH
 from finssim.sensors.overhead_camera import Basin, OverheadCamera, Pose, Scene, Sensor, TagInScene
 from finssim.vehicles import load_vehicle
-from localization.known_streams import SITE, attitude, position, streams
+from localization.fusion.known_streams import SITE, attitude, position, streams
 
 FINSROV = load_vehicle("finsrov")
 POOL = """
@@ -675,8 +675,8 @@ def test_points_that_cannot_be_used_are_refused_in_a_sentence(points, capsys, wo
 @pytest.mark.parametrize("command", ["localize", "fuse"])
 def test_an_interruption_keeps_the_rows_so_far(files, tmp_path, capsys, monkeypatch, command):
     """Control-C ends with 130 and a sentence; the table holds what was done."""
-    from finssim.localization.estimator import Estimator
-    from finssim.localization.locator import Locator
+    from finssim.localization.fusion.estimator import Estimator
+    from finssim.localization.locate.locator import Locator
 
     calls = []
 

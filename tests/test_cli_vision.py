@@ -5,17 +5,17 @@ import json
 import numpy as np
 import pytest
 
-from calibration.vision.board_views import PHOTOGRAPHS
-from calibration.vision.moving_vehicle import MOUNTS, POOL, PORT, motion, write_log
-from calibration.vision.surveyed_pools import FLOOR, PLUMB_BOB, SOLID, overhead, survey
+from calibration.vision.camera.board_views import PHOTOGRAPHS
+from calibration.vision.mounts.moving_vehicle import MOUNTS, POOL, PORT, motion, write_log
+from calibration.vision.pool.surveyed_pools import FLOOR, PLUMB_BOB, SOLID, overhead, survey
 from finssim import boundary
 from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.cli import app
 from finssim.geometry.optics import Interface, Layer
 from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
 from finssim.localization.camera_file import load_camera, write_camera
-from finssim.localization.families import bitmap
-from finssim.localization.pictures import read_picture, write_picture
+from finssim.localization.detection.families import bitmap
+from finssim.localization.detection.pictures import read_picture, write_picture
 from finssim.localization.pool import load_pool, write_pool
 from finssim.sensors.overhead_camera import Basin, OverheadCamera, Pose, Scene, Sensor, TagInScene
 from finssim.vehicles import Provenance, load_vehicle

@@ -80,7 +80,7 @@ def localize(
 
     Example: finssim localize video.mp4 --pool pool.yaml --vehicle finsrov --depth depth.csv --out poses.csv
     """
-    from finssim.localization.localize import run
+    from finssim.localization.locate.localize import run
 
     run(
         inputs,
@@ -148,7 +148,7 @@ def fuse(
 
     Example: finssim fuse log --pool pool.yaml --vehicle finsrov --out fused.csv
     """
-    from finssim.localization.fuse import run
+    from finssim.localization.fusion.fuse import run
 
     run(
         log,
@@ -182,7 +182,7 @@ def project(
 
     Example: finssim project points.csv --pool pool.yaml
     """
-    from finssim.localization.points import run_project
+    from finssim.localization.locate.points import run_project
 
     run_project(points, pool=pool, out=out, as_json=as_json)
 
@@ -213,6 +213,6 @@ def backproject(
 
     Example: finssim backproject pixels.csv --pool pool.yaml --z 0
     """
-    from finssim.localization.points import run_backproject
+    from finssim.localization.locate.points import run_backproject
 
     run_backproject(pixels, pool=pool, z=z, plane=plane, pixel_std=pixel_std, out=out, as_json=as_json)

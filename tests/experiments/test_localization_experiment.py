@@ -16,7 +16,7 @@ from finssim.experiments.localization_experiment import METHODS_SHOWN, PAPER_TAB
 from finssim.experiments.localization_pictures import Picture
 from finssim.files import OutputError
 from finssim.localization.camera_file import load_camera
-from finssim.localization.detections import read_detections
+from finssim.localization.detection.detections import read_detections
 from finssim.localization.pool import load_pool
 
 TINY = {"locations": (4, 3), "images": 12}

@@ -9,7 +9,7 @@ from finssim.experiments import localization_pictures as module
 from finssim.experiments.localization_campaign import CONDITIONS, TAG, draw_campaign, lifted
 from finssim.experiments.localization_pictures import RENDERERS, pictures
 from finssim.geometry.optics import project
-from finssim.localization.tags import corners
+from finssim.localization.detection.tags import corners
 
 SMALL = {"locations": (5, 4), "images": 20}
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from finssim.localization.families import bitmap, family_named
-from finssim.localization.tags import corners
+from finssim.localization.detection.families import bitmap, family_named
+from finssim.localization.detection.tags import corners
 
 WHITE, BLACK = 210.0, 40.0
 

@@ -10,15 +10,15 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from finssim.calibration.vision.observations import Observations, observe
-from finssim.calibration.vision.pool_fit import PoolFit, calibrate_pool
-from finssim.calibration.vision.pool_record import pool_record
-from finssim.calibration.vision.pool_settings import Settings
-from finssim.calibration.vision.survey import read_survey
+from finssim.calibration.vision.pool.observations import Observations, observe
+from finssim.calibration.vision.pool.pool_fit import PoolFit, calibrate_pool
+from finssim.calibration.vision.pool.pool_record import pool_record
+from finssim.calibration.vision.pool.pool_settings import Settings
+from finssim.calibration.vision.pool.survey import read_survey
 from finssim.experiments.localization_campaign import TAG, Campaign
 from finssim.experiments.localization_pictures import Picture
 from finssim.geometry.optics import Interface
-from finssim.localization.detections import Frame, write_detections
+from finssim.localization.detection.detections import Frame, write_detections
 from finssim.localization.pool import Pool
 
 __all__ = ["Calibrated", "calibrate", "survey_rows", "write_survey"]

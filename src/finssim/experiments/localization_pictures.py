@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from finssim.experiments.localization_campaign import TAG, WATER_HEIGHT, Campaign, Visit
 from finssim.geometry.optics import Projection, Status, project
 from finssim.geometry.rotations import matrix_to_quat
-from finssim.localization.detections import Detection
-from finssim.localization.families import bitmap
-from finssim.localization.tags import corners
+from finssim.localization.detection.detections import Detection
+from finssim.localization.detection.families import bitmap
+from finssim.localization.detection.tags import corners
 from finssim.sensors.overhead_camera import Basin, OverheadCamera, Pose, Ripples, Scene, TagInScene
 
 __all__ = ["RENDERERS", "Picture", "pictures", "scene_of"]
@@ -123,7 +123,7 @@ def _geometry(campaign: Campaign) -> Look:
 
 def _rendered(campaign: Campaign, *, renderer: str) -> Look:
     """A picture, and what the default detector finds in it."""
-    from finssim.localization.detector import detector
+    from finssim.localization.detection.detector import detector
 
     draw = _draw_own(campaign) if renderer == "own" else _draw_mitsuba(campaign)
     find = detector(TAG.family)

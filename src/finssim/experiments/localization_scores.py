@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from finssim.experiments.localization_campaign import TAG, Campaign, Visit
 from finssim.experiments.localization_pictures import Picture
+from finssim.localization.detection.tags import tag_corners_b
 from finssim.localization.pool import Pool
-from finssim.localization.pose import METHODS, Constraints
-from finssim.localization.tags import tag_corners_b
+from finssim.localization.poses.methods import METHODS, Constraints
 
 __all__ = ["Scores", "locate", "pooled", "rmse_cm", "sensitivity"]
 
@@ -64,7 +64,7 @@ def locate(
         campaign: What lay where.
         seen: Its pictures.
         pool: As calibrated.
-        method: Key of `finssim.localization.pose.METHODS`.
+        method: Key of `finssim.localization.poses.methods.METHODS`.
         pixel_std: Standard deviation of a corner, as the calibration found it [px].
         depth_offset: Added to the depth reading [m].
     """

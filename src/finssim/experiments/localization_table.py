@@ -17,7 +17,7 @@ from finssim.experiments.localization_figure import draw_error_map, draw_sensiti
 from finssim.experiments.localization_scores import Scores
 from finssim.files import atomic_directory
 from finssim.localization.camera_file import write_camera
-from finssim.localization.detections import write_detections
+from finssim.localization.detection.detections import write_detections
 from finssim.localization.pool import write_pool
 
 __all__ = ["RESULT_FILE", "markdown", "print_table", "write_results"]

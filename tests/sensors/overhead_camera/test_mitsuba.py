@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from finssim.geometry.optics import Camera, Interface, Layer, Lens, project
-from finssim.localization.detector import detector
-from finssim.localization.families import bitmap
+from finssim.localization.detection.detector import detector
+from finssim.localization.detection.families import bitmap
 from finssim.sensors import SensorError
 from finssim.sensors.overhead_camera import Body, OverheadCamera, Pose, Ripples, Sensor, TagInScene
 

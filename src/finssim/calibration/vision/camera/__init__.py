@@ -1,0 +1,1 @@
+"""The lens, from pictures of a board."""

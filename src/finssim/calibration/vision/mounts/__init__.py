@@ -1,0 +1,1 @@
+"""Where tags, IMU and pressure port sit on the vehicle, from its motion."""

@@ -1,0 +1,1 @@
+"""Camera pose and water plane, from surveyed points."""

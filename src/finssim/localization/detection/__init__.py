@@ -1,0 +1,1 @@
+"""Tags in pictures: families, detectors, regions, and files of what was found."""

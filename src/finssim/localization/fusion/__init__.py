@@ -1,0 +1,1 @@
+"""Position, velocity and heading from camera, depth and inertia."""

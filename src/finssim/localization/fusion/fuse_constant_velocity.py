@@ -1,0 +1,268 @@
+"""The paper's fusion: constant velocity for the position, the gyro for yaw (eq. 14 and 15), each behind its gates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.localization.fusion import position_filter, yaw_filter
+from finssim.localization.fusion.attitude import Tilt, TiltGains, follow, roll_pitch, tilt_from, up_of
+from finssim.localization.fusion.fuse_settings import Settings, Site
+from finssim.localization.fusion.gate import GateMemory, judge
+from finssim.localization.fusion.health import Estimate, Outcome
+from finssim.localization.fusion.position_filter import Motion, PositionState
+from finssim.localization.fusion.streams import DepthSample, ImuSample, VisionSample
+from finssim.localization.fusion.yaw_filter import YawNoise, YawState, yaw_rate
+
+__all__ = ["ConstantVelocity", "Track", "motion_of", "vision_covariance"]
+
+Array = npt.NDArray[np.float64]
+
+GYRO_HOLD = 0.3
+"""The last rate of the gyro is held this long where samples are missing [s]."""
+YAW_CAP = 10.0
+"""Doubt of yaw does not grow beyond this variance [rad²]: far past a full circle."""
+STEEPEST = math.radians(80.0)
+"""Pitch beyond which the gyro tells no yaw rate."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """All that the filters know; nothing else remembers."""
+
+    position: PositionState
+    yaw: YawState
+    position_time: float = math.nan
+    """Time of `position` [s]. Both advance only when they are asked for: the gyro does not move the position."""
+    yaw_time: float = math.nan
+    rate: float | None = None
+    """Latest yaw rate [rad/s]."""
+    roll: float = 0.0
+    pitch: float = 0.0
+    tilt: Tilt | None = None
+    """Of the filter for logs without an orientation."""
+    vision_time: float | None = None
+    yaw_seen: float | None = None
+    """Time of the latest vision yaw that was believed [s]."""
+    depth_time: float | None = None
+    imu_time: float | None = None
+    gates: tuple[GateMemory, GateMemory, GateMemory] = (GateMemory(), GateMemory(), GateMemory())
+    """Memories of the gates of position, yaw and depth."""
+
+
+class ConstantVelocity:
+    """Filters of one vehicle: pure functions of `Track`, with settings and site fixed."""
+
+    def __init__(self, settings: Settings, site: Site) -> None:
+        """
+        Args:
+            settings: What can be tuned.
+            site: What of pool and vehicle is needed.
+        """
+        self.settings, self.site = settings, site
+        self._port = np.array(site.depth_port)
+        self._H_depth = np.array([[*site.up, 0.0, 0.0, 0.0]])
+        self._motions = {(xy, z): motion_of(settings, xy, z) for xy in (False, True) for z in (False, True)}
+
+    def start(self) -> Track:
+        """The state before any sample: nothing is known."""
+        s = self.settings
+        P = np.diag([s.largest_variance] * 3 + [s.speed_std**2] * 3)
+        yaw = YawState(np.array(0.0), np.array(0.0), np.diag([YAW_CAP, s.bias_std**2]))
+        return Track(PositionState(np.zeros(6), P), yaw)
+
+    def imu(self, track: Track, sample: ImuSample) -> tuple[Track, tuple[Outcome, ...]]:
+        """Take in a rate: tilt, and yaw up to its time."""
+        dt = math.inf if track.imu_time is None else sample.time - track.imu_time
+        track = self._tilted(track, sample, dt)
+        steep = abs(track.pitch) > STEEPEST
+        rate = None if steep else float(yaw_rate(sample.omega[1], sample.omega[2], track.roll, track.pitch))
+        yaw = self._yaw_at(track, sample.time)
+        if track.rate is not None and rate is not None and dt <= GYRO_HOLD:
+            # Up to here the older rate was held; half the difference makes a trapezium of the step.
+            yaw = replace(yaw, yaw=yaw.yaw + 0.5 * (rate - track.rate) * dt)
+        track = replace(track, yaw=yaw, yaw_time=sample.time, rate=rate, imu_time=sample.time)
+        return track, (Outcome("imu", "steep" if steep else "accepted"),)
+
+    def depth(self, track: Track, sample: DepthSample) -> tuple[Track, tuple[Outcome, ...]]:
+        """Take in a depth: up . p + offset + lever = -depth."""
+        s, site = self.settings, self.site
+        track = self._positioned(track, sample.time)
+        lever = float(up_of(track.roll, track.pitch) @ self._port)
+        z = np.array([-sample.depth - site.offset - lever])
+        R = np.array([[s.depth_std**2]])
+        found = position_filter.innovation(track.position, self._H_depth, z, R)
+        verdict, memory = judge(
+            s.gate, track.gates[2], sample.time, z, R, float(found.mahalanobis), s.speed_std
+        )
+        if verdict == "accepted":
+            position = position_filter.correct(track.position, found, self._H_depth, R)
+        elif verdict == "gate":
+            position = track.position
+        else:
+            x, y = track.position.x[:2]
+            height = (z - site.up[0] * x - site.up[1] * y) / site.up[2]
+            position = position_filter.restarted(track.position, [2], height, R, s.speed_std)
+        then = track.depth_time if verdict == "gate" else sample.time
+        track = replace(track, position=position, depth_time=then, gates=(*track.gates[:2], memory))
+        return track, (Outcome("depth", verdict, float(found.mahalanobis), 1),)
+
+    def vision(self, track: Track, sample: VisionSample) -> tuple[Track, tuple[Outcome, ...]]:
+        """Take in a fix of the camera: x and y, and yaw if it has one."""
+        R = vision_covariance(sample, self.settings)
+        track = replace(self._positioned(track, sample.time), yaw=self._yaw_at(track, sample.time))
+        track = replace(track, yaw_time=_later(track.yaw_time, sample.time))
+        track, seen = self._fixed(track, sample, R[:2, :2])
+        if sample.yaw is None:
+            return track, (seen,)
+        track, turned = self._turned(track, sample, float(R[2, 2]))
+        return track, (seen, turned)
+
+    def estimate(self, track: Track, time: float) -> Estimate:
+        """The state at a time, not before its own; what is not known yet is NaN."""
+        position, yaw = self._positioned(track, time).position, self._yaw_at(track, time)
+        x, P = position.x.copy(), position.P.copy()
+        unknown = ([0, 1, 3, 4] if track.vision_time is None else []) + (
+            [2, 5] if track.depth_time is None else []
+        )
+        x[unknown] = math.nan
+        P[unknown, :] = math.nan
+        P[:, unknown] = math.nan
+        seen = track.yaw_seen is not None
+        silent = track.rate is None or track.imu_time is None or time - track.imu_time > GYRO_HOLD
+        return Estimate(
+            time=time,
+            x=x,
+            P=P,
+            yaw=float(yaw.yaw) if seen else math.nan,
+            yaw_variance=float(yaw.P[0, 0]) if seen else math.nan,
+            yaw_rate=math.nan if silent else float(track.rate or 0.0) - float(yaw.bias),
+            roll=track.roll if track.imu_time is not None else math.nan,
+            pitch=track.pitch if track.imu_time is not None else math.nan,
+            vision_time=track.vision_time,
+            depth_time=track.depth_time,
+            imu_time=track.imu_time,
+        )
+
+    def _fixed(self, track: Track, sample: VisionSample, R: Array) -> tuple[Track, Outcome]:
+        s, z = self.settings, np.array(sample.position)
+        found = position_filter.innovation(track.position, _H_VISION, z, R)
+        verdict, memory = judge(
+            s.gate, track.gates[0], sample.time, z, R, float(found.mahalanobis), s.speed_std
+        )
+        if verdict == "accepted":
+            position = position_filter.correct(track.position, found, _H_VISION, R)
+        elif verdict == "gate":
+            position = track.position
+        else:
+            position = position_filter.restarted(track.position, [0, 1], z, R, s.speed_std)
+        then = track.vision_time if verdict == "gate" else sample.time
+        track = replace(track, position=position, vision_time=then, gates=(memory, *track.gates[1:]))
+        return track, Outcome("vision", verdict, float(found.mahalanobis), 2)
+
+    def _turned(self, track: Track, sample: VisionSample, variance: float) -> tuple[Track, Outcome]:
+        s = self.settings
+        found = yaw_filter.innovation(track.yaw, sample.yaw or 0.0, variance)
+        # Flipped yaws agree with one another as distances from the prediction, which turns with the vehicle.
+        apart, R = np.array([float(found.residual)]), np.array([[variance]])
+        verdict, memory = judge(s.gate, track.gates[1], sample.time, apart, R, float(found.mahalanobis), 0.05)
+        if verdict == "accepted":
+            yaw = yaw_filter.correct(track.yaw, found, variance)
+        elif verdict == "gate":
+            yaw = track.yaw
+        else:
+            yaw = yaw_filter.restarted(track.yaw, sample.yaw or 0.0, variance, s.bias_std)
+        then = track.yaw_seen if verdict == "gate" else sample.time
+        gates = (track.gates[0], memory, track.gates[2])
+        track = replace(track, yaw=yaw, yaw_seen=then, gates=gates)
+        return track, Outcome("yaw", verdict, float(found.mahalanobis), 1)
+
+    def _tilted(self, track: Track, sample: ImuSample, dt: float) -> Track:
+        """Roll and pitch after a sample: the unit's own, else those of gyro and accelerometer."""
+        if sample.tilt is not None:
+            return replace(track, roll=sample.tilt[0], pitch=sample.tilt[1], tilt=None)
+        force = np.full(3, math.nan) if sample.force is None else np.array(sample.force)
+        gains = TiltGains(gravity=self.site.gravity)
+        if track.tilt is not None and dt <= gains.longest_gap:
+            tilt = follow(track.tilt, np.array(sample.omega), force, dt, gains)
+        elif sample.force is not None and float(np.linalg.norm(force)) > 1.0:
+            tilt = tilt_from(force)
+        else:
+            return track
+        roll, pitch = roll_pitch(tilt.up)
+        return replace(track, roll=float(roll), pitch=float(pitch), tilt=tilt)
+
+    def _positioned(self, track: Track, time: float) -> Track:
+        """The track with its position at a time; axes without news slow down, then stand still."""
+        s, then = self.settings, track.position_time
+        if math.isnan(then) or time <= then:
+            return replace(track, position_time=_later(then, time))
+        position = track.position
+        cuts = [
+            t + limit
+            for t in (track.vision_time, track.depth_time)
+            if t is not None
+            for limit in (s.coast, s.hold)
+        ]
+        for until in _steps(then, time, cuts):
+            middle = 0.5 * (then + until)
+            old = [math.inf if t is None else middle - t for t in (track.vision_time, track.depth_time)]
+            still = ([0, 1] if old[0] > s.hold else []) + ([2] if old[1] > s.hold else [])
+            if still:
+                position = position_filter.frozen(position, still)
+            motion = self._motions[old[0] > s.coast, old[1] > s.coast]
+            position = position_filter.predict(position, until - then, motion)
+            then = until
+        position = position_filter.capped(position, s.largest_variance)
+        return replace(track, position=position, position_time=time)
+
+    def _yaw_at(self, track: Track, time: float) -> YawState:
+        """Yaw at a time: the latest rate held, and none where the gyro has been silent for too long."""
+        s, then = self.settings, track.yaw_time
+        if math.isnan(then) or time <= then:
+            return track.yaw
+        yaw = track.yaw
+        heard = -math.inf if track.imu_time is None or track.rate is None else track.imu_time + GYRO_HOLD
+        for until in _steps(then, time, [heard]):
+            if until <= heard + 1e-12 and track.rate is not None:
+                yaw = yaw_filter.predict(yaw, track.rate, until - then, s.gyro)
+            else:
+                noise = YawNoise(rate=s.blind_rate, bias_walk=s.gyro.bias_walk)
+                yaw = yaw_filter.predict(yaw, float(yaw.bias), until - then, noise)
+            then = until
+        return yaw_filter.capped(yaw, YAW_CAP) if yaw.P[0, 0] > YAW_CAP else yaw
+
+
+_H_VISION = np.eye(6)[:2]
+
+
+def vision_covariance(sample: VisionSample, settings: Settings) -> Array:
+    """Covariance of x, y and yaw that a fix is given, (3, 3)."""
+    floor = np.diag([settings.vision_floor[0] ** 2] * 2 + [settings.vision_floor[1] ** 2])
+    if sample.covariance is None or settings.vision_fixed:
+        return np.diag([settings.vision_std[0] ** 2] * 2 + [settings.vision_std[1] ** 2]) + floor
+    return np.array(sample.covariance) + floor
+
+
+def motion_of(settings: Settings, xy_slows: bool, z_slows: bool) -> Motion:
+    """The motion model where the axes without news slow down to rest, give or take `speed_std`."""
+    slows = (xy_slows, xy_slows, z_slows)
+    rate, own = settings.decay, settings.motion
+    density = [
+        2.0 * rate * settings.speed_std**2 if slow else q for slow, q in zip(slows, own.density, strict=True)
+    ]
+    decay = [rate if slow else given for slow, given in zip(slows, own.decay, strict=True)]
+    return replace(own, density=(density[0], density[1], density[2]), decay=(decay[0], decay[1], decay[2]))
+
+
+def _steps(start: float, end: float, cuts: Iterable[float]) -> list[float]:
+    """Ends of the steps from `start` to `end` that are cut at `cuts`."""
+    return [*sorted({cut for cut in cuts if start < cut < end}), end]
+
+
+def _later(then: float, time: float) -> float:
+    return time if math.isnan(then) else max(then, time)

@@ -1,0 +1,260 @@
+"""A log as samples in the order of their arrival: a folder with one table per stream, or one table of all."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.geometry.rotations import quat_conjugate, quat_from_euler, quat_multiply, quat_to_euler
+from finssim.localization.detection.detections import Frame, read_detections
+from finssim.localization.errors import LocalizationError
+from finssim.localization.fusion.attitude import in_body_axes
+from finssim.localization.fusion.fuse_table import StreamTable, read_stream_table
+from finssim.localization.fusion.streams import DepthSample, ImuSample, Sample, VisionSample
+from finssim.vehicles import Vehicle
+
+__all__ = ["Log", "NoFix", "counted", "load_log"]
+
+Array = npt.NDArray[np.float64]
+
+RATES, FORCE, QUATERNION = ("p", "q", "r"), ("ax", "ay", "az"), ("qx", "qy", "qz", "qw")
+SENSOR_RATES, SENSOR_FORCE = ("gyro_x", "gyro_y", "gyro_z"), ("accel_x", "accel_y", "accel_z")
+"""Names that say that the numbers are in the IMU's own axes."""
+HELD = 0.5
+"""A stream of whose rows more than this share repeat the one before was written into a faster table."""
+
+
+@dataclass(frozen=True)
+class NoFix:
+    """A picture in which the vehicle was not located."""
+
+    time: float
+    """Stamp of the picture [s]."""
+    reason: str
+
+
+@dataclass
+class Log:
+    """What a log holds."""
+
+    samples: list[Sample] = field(default_factory=list)
+    """In the order of their arrival."""
+    frames: list[Frame] = field(default_factory=list)
+    """Pictures with tags, in the order of their stamps, where the log has no fixes."""
+    missed: list[NoFix] = field(default_factory=list)
+    """Pictures that `finssim localize` refused."""
+    truth: StreamTable | None = None
+    """Where the vehicle really was: t, x, y, z [m], yaw [rad], pool frame."""
+    notes: list[str] = field(default_factory=list)
+    """What was repaired or left out."""
+
+
+def load_log(path: str | Path, vehicle: Vehicle, *, latency: float = 0.0, imu_axes: str | None = None) -> Log:
+    """Read a log.
+
+    Args:
+        path: A folder with imu.csv, depth.csv, vision.csv or detections.csv, and perhaps truth.csv; or one table.
+        vehicle: Says how the IMU is mounted and how old samples are when they arrive.
+        latency: Of the camera: stamp of a picture minus the middle of its exposure [s].
+        imu_axes: `body` or `sensor`: axes of the IMU's columns. None: `gyro_x`, `accel_x`, ... are the sensor's, `p`,
+            `ax`, ... the body's.
+
+    Raises:
+        LocalizationError: Nothing there, or a table without the columns of its stream.
+    """
+    path = Path(path)
+    if imu_axes not in (None, "body", "sensor"):
+        raise LocalizationError(f"unknown IMU axes '{imu_axes}'; available: body, sensor")
+    log = Log()
+    if path.is_dir():
+        tables = {n: read_stream_table(path / f"{n}.csv") for n in _STREAMS if (path / f"{n}.csv").is_file()}
+        if "vision" not in tables and (path / "detections.csv").is_file():
+            log.frames = sorted(read_detections(path / "detections.csv"), key=lambda frame: frame.time)
+        if not tables and not log.frames:
+            raise LocalizationError(f"{path}: holds no imu.csv, depth.csv, vision.csv or detections.csv")
+        log.truth = tables.pop("truth", None)
+    else:
+        whole = read_stream_table(path)
+        tables = {name: whole for name in ("imu", "depth", "vision") if _present(name, whole)}
+        if not tables:
+            raise LocalizationError(
+                f"{path}: no column p, q, r, depth, or x and y: see docs/trials.md for the names"
+            )
+    readers = {"imu": _imu, "depth": _depth, "vision": _vision}
+    for name, table in tables.items():
+        if not _present(name, table):
+            raise LocalizationError(f"{table.name}: expected the columns {_EXPECTED[name]}")
+        log.samples += readers[name](table, vehicle, log, latency=latency, imu_axes=imu_axes)
+    log.notes += list(dict.fromkeys(note for table in tables.values() for note in table.notes))
+    here = {sample.stream for sample in log.samples} | ({"vision"} if log.frames else set())
+    log.notes += [note for stream, note in _MISSING.items() if stream not in here]
+    log.samples.sort(key=lambda sample: sample.arrival if sample.arrival is not None else sample.time)
+    return log
+
+
+_STREAMS = ("imu", "depth", "vision", "truth")
+_EXPECTED = {
+    "imu": "t, p, q, r (body axes) or gyro_x, gyro_y, gyro_z (the sensor's)",
+    "depth": "t, depth",
+    "vision": "t or time, x, y and yaw",
+}
+
+
+_MISSING = {
+    "imu": "no IMU samples: the heading is the camera's alone, the vehicle counts as level, and is never ready",
+    "depth": "no depth samples: height stays unknown, and the vehicle is never ready",
+    "vision": "no fixes and no detections: place and heading stay unknown",
+}
+
+
+def _present(name: str, table: StreamTable) -> bool:
+    if name == "imu":
+        return table.has(*RATES) or table.has(*SENSOR_RATES)
+    return table.has("depth") if name == "depth" else table.has("x", "y")
+
+
+def _imu(
+    table: StreamTable, vehicle: Vehicle, log: Log, *, latency: float, imu_axes: str | None
+) -> list[Sample]:
+    sensor = vehicle.sensors.imu
+    own = table.has(*SENSOR_RATES) and not table.has(*RATES)
+    turned = imu_axes == "sensor" or (own and imu_axes is None)
+    if turned and sensor is None:
+        raise LocalizationError(
+            f"{table.name}: rates in the IMU's axes, but the vehicle file has no sensors.imu.orientation: add it"
+        )
+    mount = np.array(sensor.orientation) if turned and sensor is not None else np.array([0.0, 0.0, 0.0, 1.0])
+    omega = in_body_axes(table.columns(*(SENSOR_RATES if own else RATES)), mount)
+    names = SENSOR_FORCE if table.has(*SENSOR_FORCE) else FORCE
+    force = in_body_axes(table.columns(*names), mount) if table.has(*names) else np.full(omega.shape, np.nan)
+    size = float(np.nanmedian(np.linalg.norm(force, axis=1))) if np.isfinite(force).any() else math.nan
+    if size < 0.5 * vehicle.water.gravity:
+        log.notes.append(f"accelerations of {size:.2g} m/s² hold no gravity and were left out")
+        force = np.full(omega.shape, np.nan)
+    tilt = _tilt(table, mount)
+    rows = np.flatnonzero(~np.isnan(omega).any(axis=1))
+    if len(rows) > 1:  # an attitude that was logged in rows of its own is carried on to the next rate
+        tilt = _carried(table.t, tilt)
+    arrival = _arrival(table, 0.0 if sensor is None else sensor.latency)
+    return [
+        ImuSample(
+            float(table.t[k]),
+            (float(omega[k, 0]), float(omega[k, 1]), float(omega[k, 2])),
+            None
+            if np.isnan(force[k]).any()
+            else (float(force[k, 0]), float(force[k, 1]), float(force[k, 2])),
+            None if np.isnan(tilt[k]).any() else (float(tilt[k, 0]), float(tilt[k, 1])),
+            float(arrival[k]),
+        )
+        for k in rows
+    ]
+
+
+def _tilt(table: StreamTable, mount: Array) -> Array:
+    """Roll and pitch of the body in each row [rad], (n, 2); NaN where the row has none."""
+    if table.has(*QUATERNION):
+        q = table.columns(*QUATERNION)
+    elif table.has("roll", "pitch"):
+        q = quat_from_euler(table.numbers["roll"], table.numbers["pitch"], 0.0)
+    else:
+        return np.full((len(table.t), 2), np.nan)
+    length = np.linalg.norm(q, axis=1, keepdims=True)
+    q = np.where(np.abs(length - 1.0) < 0.05, q / np.where(length > 0.0, length, 1.0), np.nan)
+    roll, pitch, _ = quat_to_euler(quat_multiply(q, quat_conjugate(mount)))
+    return np.stack([roll, pitch], axis=-1)
+
+
+def _carried(t: Array, values: Array) -> Array:
+    """Each row's values or, for at most 0.1 s, those of the row before."""
+    known = np.where(np.isfinite(values).all(axis=1), np.arange(len(t)), -1)
+    last = np.maximum.accumulate(known)
+    fresh = (last >= 0) & (t - t[np.maximum(last, 0)] <= 0.1)
+    return np.where(fresh[:, None], values[np.maximum(last, 0)], np.nan)
+
+
+def _depth(
+    table: StreamTable, vehicle: Vehicle, log: Log, *, latency: float, imu_axes: str | None
+) -> list[Sample]:
+    sensor, depth = vehicle.sensors.depth, table.numbers["depth"]
+    arrival = _arrival(table, 0.0 if sensor is None else sensor.latency)
+    rows = _thinned(np.flatnonzero(~np.isnan(depth)), depth[:, None], "depth", log)
+    return [DepthSample(float(table.t[k]), float(depth[k]), float(arrival[k])) for k in rows]
+
+
+def _vision(
+    table: StreamTable, vehicle: Vehicle, log: Log, *, latency: float, imu_axes: str | None
+) -> list[Sample]:
+    xy = table.columns("x", "y")
+    yaw = _angle(table, "yaw")
+    usable = ~np.isnan(xy).any(axis=1)
+    if "status" in table.words:
+        usable &= np.array([word.lower() == "ok" for word in table.words["status"]])
+        reasons = table.words.get("reason", ["refused"] * len(usable))
+        log.missed += [NoFix(float(table.t[k]), counted(reasons[k])) for k in np.flatnonzero(~usable)]
+    rows = _thinned(np.flatnonzero(usable), np.column_stack([xy, yaw]), "vision", log)
+    covariance = _covariance(table)
+    arrival = _arrival(table, 0.0)
+    time = table.numbers["exposure"] if table.has("exposure") else table.t - latency
+    return [
+        VisionSample(
+            float(time[k]),
+            (float(xy[k, 0]), float(xy[k, 1])),
+            None if math.isnan(yaw[k]) else float(yaw[k]),
+            None if np.isnan(covariance[k]).any() else _rows(covariance[k]),
+            float(arrival[k]),
+        )
+        for k in rows
+    ]
+
+
+def _covariance(table: StreamTable) -> Array:
+    """Covariance of x, y and yaw in each row, (n, 3, 3); NaN where the row has none."""
+    if not table.has("std_x", "std_y"):
+        return np.full((len(table.t), 3, 3), np.nan)
+    none = np.full(len(table.t), math.radians(180.0))  # a fix without yaw does not use its variance
+    std_yaw = _angle(table, "std_yaw")
+    std = np.column_stack([table.columns("std_x", "std_y"), np.where(np.isnan(std_yaw), none, std_yaw)])
+    R: Array = (std * np.abs(std))[:, :, None] * np.eye(3)  # a negative deviation stays no covariance
+    for i, j, name in ((0, 1, "cov_xy"), (0, 2, "cov_xyaw"), (1, 2, "cov_yyaw")):
+        if table.has(name):
+            R[:, i, j] = R[:, j, i] = table.numbers[name]
+    return R
+
+
+def counted(reason: str) -> str:
+    """A reason without its particulars, for counting."""
+    return re.split(r"[:(]", reason, maxsplit=1)[0].strip() or "refused"
+
+
+def _angle(table: StreamTable, name: str) -> Array:
+    """A column of angles in radians, or of degrees with `_deg` in its name; NaN where there is none."""
+    if name in table.numbers:
+        return table.numbers[name]
+    if f"{name}_deg" in table.numbers:
+        return np.radians(table.numbers[f"{name}_deg"])
+    return np.full(len(table.t), math.nan)
+
+
+def _arrival(table: StreamTable, latency: float) -> Array:
+    """When the rows came: column `arrival`, or the time plus the sensor's latency."""
+    return table.numbers["arrival"] if table.has("arrival") else table.t + latency
+
+
+def _thinned(rows: npt.NDArray[np.intp], values: Array, stream: str, log: Log) -> npt.NDArray[np.intp]:
+    """Rows without those that repeat the one before, if most do: a slow stream in a fast table."""
+    if len(rows) < 3:
+        return rows
+    new = np.append(True, (values[rows[1:]] != values[rows[:-1]]).any(axis=1))
+    if np.mean(~new) <= HELD:
+        return rows
+    log.notes.append(f"{stream}: {np.sum(~new)} of {len(rows)} rows repeat the one before and were left out")
+    return np.asarray(rows[new])
+
+
+def _rows(R: Array) -> tuple[tuple[float, float, float], ...]:
+    return tuple((float(row[0]), float(row[1]), float(row[2])) for row in R)

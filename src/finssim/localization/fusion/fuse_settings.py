@@ -1,0 +1,177 @@
+"""Everything that can be tuned in the fusion, with the published values beside ours."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.localization.errors import LocalizationError
+from finssim.localization.fusion.gate import Gate
+from finssim.localization.fusion.position_filter import Motion
+from finssim.localization.fusion.yaw_filter import YawNoise
+from finssim.localization.pool import Pool
+from finssim.vehicles import Vehicle
+
+__all__ = ["PROFILES", "Settings", "Site", "settings_of", "site_of"]
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Of the estimator. Times in seconds; `published` gives those of the FinsROV software."""
+
+    fresh: float = 0.25
+    """Age of vision up to which the state is called fresh."""
+    coast: float = 0.75
+    """Up to which velocity is trusted to go on."""
+    hold: float = 3.0
+    """Up to which velocity dies away; beyond it the position stands still and its covariance grows."""
+    imu_fresh: float = 0.10
+    depth_fresh: float = 0.30
+    horizon: float = 1.0
+    """How late a sample may come and still be put in its place."""
+    jump: float = 1.0
+    """How far a stamp may run ahead of its arrival before the clock is doubted."""
+    gate: Gate = Gate()
+    motion: Motion = Motion()
+    half_life: float = 1.0
+    """Of velocity while the state is held."""
+    speed_std: float = 0.3
+    """Speed per axis that the vehicle may have when nothing is known [m/s]."""
+    largest_variance: float = 100.0
+    """Of a position [m²]: doubt does not grow beyond it."""
+    vision_std: tuple[float, float] = (0.02, 0.03)
+    """Of x and y [m] and of yaw [rad], where a measurement brings no covariance."""
+    vision_floor: tuple[float, float] = (0.002, 0.003)
+    """Added to a measurement's own standard deviations, in squares [m, rad]: errors that its covariance leaves out."""
+    vision_fixed: bool = False
+    """Take `vision_std` even where a measurement brings its covariance."""
+    depth_std: float = 0.01
+    """[m]"""
+    gyro: YawNoise = YawNoise()
+    bias_std: float = 0.01
+    """Of the gyro at power-on [rad/s]."""
+    blind_rate: float = 0.3
+    """Noise density of the yaw rate where the gyro is silent [rad/s/√Hz]."""
+    accel_noise: float = 0.02
+    """Noise density of the accelerometer [m/s²/√Hz], vibration included."""
+    accel_bias_walk: float = 1e-3
+    """[m/s³/√Hz]"""
+    accel_bias_std: float = 0.05
+    """At power-on [m/s²]."""
+    tilt_std: float = 0.03
+    """Of roll and pitch at the start of the error-state filter [rad]."""
+    ready_position: float = 0.04
+    """Largest variance of a position with which the state is ready [m²]."""
+    ready_yaw: float = 0.03
+    """And of yaw [rad²]."""
+
+    @classmethod
+    def published(cls) -> Settings:
+        """The FinsROV software: its noises, one gate of 9 for all, no bias, and a gate that never gives in."""
+        return cls(
+            gate=Gate(fixed=9.0, reacquire_after=math.inf),
+            motion=Motion(density=(0.10,) * 3, walk=(0.02,) * 3, integrated=False),
+            speed_std=math.sqrt(10.0),
+            vision_std=(0.05, math.sqrt(0.05)),
+            vision_floor=(0.0, 0.0),
+            vision_fixed=True,
+            depth_std=0.05,
+            gyro=YawNoise(rate=math.sqrt(0.02), bias_walk=0.0),
+            bias_std=0.0,
+            ready_position=4.0,
+            ready_yaw=1.0,
+        )
+
+    @property
+    def decay(self) -> float:
+        """Rate at which a held velocity dies away [1/s]."""
+        return math.log(2.0) / self.half_life
+
+
+PROFILES = ("default", "published")
+
+
+@dataclass(frozen=True)
+class Site:
+    """What of pool and vehicle the fusion needs."""
+
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Normal of the still surface, upwards, pool frame."""
+    offset: float = 0.0
+    """Height of a point p above the surface is up . p + offset [m]."""
+    depth_port: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Pressure port, body frame [m]."""
+    imu: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Accelerometer, body frame [m]."""
+    gravity: float = 9.81
+    """[m/s²]"""
+    R_wp: tuple[tuple[float, float, float], ...] = field(default=((1, 0, 0), (0, 1, 0), (0, 0, 1)))
+    """Pool axes to world axes, for velocities in the report."""
+
+
+def site_of(pool: Pool, vehicle: Vehicle) -> Site:
+    """The site of a pool file and a vehicle file.
+
+    Heights are measured from the water plane itself, tilt included, where that plane is a surface; behind a wall from
+    the world frame's origin.
+
+    Raises:
+        LocalizationError: The pool frame's z does not point up.
+    """
+    R_wp = pool.T_wp[:3, :3]
+    if pool.is_surface:
+        up, offset = np.asarray(pool.interface.normal, float), float(pool.interface.offset)
+    else:
+        up, offset = R_wp[2], float(pool.T_wp[2, 3])
+    if up[2] < math.cos(math.radians(10.0)):
+        raise LocalizationError(
+            f"pool frame: up is {np.round(up, 3).tolist()} in its axes, expected z within 10 degrees of it: depth and "
+            "heading are fused about z; survey the pool with z up, or give frames: world: in the pool file"
+        )
+    sensors = vehicle.sensors
+    return Site(
+        up=_three(up),
+        offset=offset,
+        depth_port=_three(sensors.depth.position) if sensors.depth else (0.0, 0.0, 0.0),
+        imu=_three(sensors.imu.position) if sensors.imu else (0.0, 0.0, 0.0),
+        gravity=float(vehicle.water.gravity),
+        R_wp=tuple(_three(row) for row in R_wp),
+    )
+
+
+def settings_of(vehicle: Vehicle, profile: str = "default") -> Settings:
+    """Settings with the vehicle file's sensor noises, never below what mounting and sampling leave besides them.
+
+    Args:
+        vehicle: The vehicle.
+        profile: `default` or `published`; the latter takes nothing from the vehicle.
+
+    Raises:
+        LocalizationError: Unknown profile.
+    """
+    if profile == "published":
+        return Settings.published()
+    if profile != "default":
+        raise LocalizationError(f"unknown profile '{profile}'; available: {', '.join(PROFILES)}")
+    settings, imu, depth = Settings(), vehicle.sensors.imu, vehicle.sensors.depth
+    if imu is not None:
+        settings = replace(
+            settings,
+            gyro=YawNoise(max(imu.gyro_noise_density, settings.gyro.rate), max(imu.gyro_bias_walk, 2e-5)),
+            bias_std=max(imu.gyro_bias_initial, settings.bias_std),
+            accel_noise=max(imu.accel_noise_density, settings.accel_noise),
+            accel_bias_std=max(imu.accel_bias_initial, settings.accel_bias_std),
+        )
+    if depth is not None:
+        settings = replace(settings, depth_std=max(depth.noise_std, settings.depth_std))
+    return settings
+
+
+def _three(values: npt.ArrayLike) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in np.asarray(values, float))
+    return x, y, z

@@ -1,0 +1,1 @@
+"""What the commands run that take pictures, points and pixels."""

@@ -1,0 +1,167 @@
+"""What `finssim project` and `finssim backproject` run: tables of points to pixels, and of pixels to points."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.files import atomic_write, refuse_unwritable
+from finssim.geometry.optics import Status, back_project, count_rejections, plane_jacobian, project
+from finssim.localization.errors import LocalizationError
+from finssim.localization.locate.point_table import PointTable, read_points, table_text, write_table
+from finssim.localization.pool import load_pool
+
+__all__ = ["run_backproject", "run_project"]
+
+Array = npt.NDArray[np.float64]
+
+_REASONS = {
+    Status.NO_RAY: "beyond what the lens maps one to one",
+    Status.PARALLEL: "the ray runs along the plane",
+    Status.TOTAL_REFLECTION: "the ray is reflected at the interface",
+    Status.AWAY: "the ray heads away from the plane",
+    Status.BEHIND_CAMERA: "behind the camera",
+    Status.WRONG_SIDE: "not on the far side of the interface",
+    Status.OUTSIDE_IMAGE: "outside the image, pixel given",
+}
+
+
+def run_project(points: Path, *, pool: Path, out: Path | None = None, as_json: bool = False) -> None:
+    """Write the pixels at which points appear.
+
+    Args:
+        points: Table with columns x, y, z, pool frame [m]; others are carried along. `-` is the standard input.
+        pool: The pool file.
+        out: Table to write, the columns of `points` with u, v [px] and status; the standard output if none.
+        as_json: Print a summary as JSON (with the points in it, if there is no `out`).
+
+    Raises:
+        LocalizationError: A file that cannot be used; wrong rows are named.
+        OutputError: `out` cannot be written.
+    """
+    if out is not None:
+        refuse_unwritable(atomic_write(out))
+    scene = load_pool(pool)
+    table = read_points(points, ("x", "y", "z"))
+    seen = project(scene.camera, scene.interface, np.stack([table.numbers[c] for c in "xyz"], axis=-1))
+    columns = {
+        "u": _cells(seen.pixels[:, 0], 6),
+        "v": _cells(seen.pixels[:, 1], 6),
+        "status": _words(seen.status),
+    }
+    _give(table, columns, seen.status, "project", "points have a pixel in the image", out, as_json)
+
+
+def run_backproject(
+    pixels: Path,
+    *,
+    pool: Path,
+    z: float | None = None,
+    plane: str | None = None,
+    pixel_std: float | None = None,
+    out: Path | None = None,
+    as_json: bool = False,
+) -> None:
+    """Write the points that pixels see on a horizontal plane, or on any other.
+
+    Args:
+        pixels: Table with columns u, v [px] and perhaps z [m], which goes before the argument `z`; others are carried
+            along. `-` is the standard input.
+        pool: The pool file.
+        z: Height of the points, pool frame [m].
+        plane: "a,b,c,d" of a plane a x + b y + c z + d = 0 instead, pool frame.
+        pixel_std: Standard error of u and of v [px], for columns sigma_x, sigma_y, sigma_z [m] of the point.
+        out: Table to write, the columns of `pixels` with x, y, z [m] and status; the standard output if none.
+        as_json: Print a summary as JSON (with the points in it, if there is no `out`).
+
+    Raises:
+        LocalizationError: A file that cannot be used (wrong rows are named), no plane or two, or numbers that make no
+            plane or error.
+        OutputError: `out` cannot be written.
+    """
+    if out is not None:
+        refuse_unwritable(atomic_write(out))
+    if pixel_std is not None and not (np.isfinite(pixel_std) and pixel_std > 0.0):
+        raise LocalizationError(f"the pixel error is {pixel_std}, expected a positive number of pixels")
+    scene = load_pool(pool)
+    table = read_points(pixels, ("u", "v"), ("z",))
+    rays = back_project(scene.camera, scene.interface, np.stack([table.numbers[c] for c in "uv"], axis=-1))
+    normal, offset = _plane(table, z, plane)
+    if plane is None:
+        points, status = rays.at_z(-offset)
+    else:
+        points, status = rays.at_plane(normal, offset)
+    columns = {axis: _cells(points[:, i], 9) for i, axis in enumerate("xyz")}
+    columns["status"] = _words(status)
+    if pixel_std is not None:
+        by_pixel = plane_jacobian(scene.camera, scene.interface, points, normal)[..., :2]
+        sigma = pixel_std * np.sqrt(np.sum(by_pixel**2, axis=-1))
+        columns |= {f"sigma_{axis}": _cells(sigma[:, i], 9) for i, axis in enumerate("xyz")}
+    _give(table, columns, status, "backproject", "pixels have a point", out, as_json)
+
+
+def _plane(table: PointTable, z: float | None, plane: str | None) -> tuple[Array, Array | float]:
+    """Normal and offset of the plane, from the only place that gives one."""
+    up = np.array([0.0, 0.0, 1.0])
+    if plane is not None:
+        if z is not None:
+            raise LocalizationError("both a height z and a plane are given: give one of them")
+        try:
+            a, b, c, d = (float(word) for word in plane.replace(",", " ").split())
+        except ValueError:
+            raise LocalizationError(f"plane is '{plane}', expected four numbers a,b,c,d") from None
+        if not (np.isfinite([a, b, c, d]).all() and (a, b, c) != (0.0, 0.0, 0.0)):
+            raise LocalizationError(f"plane is '{plane}', expected finite numbers, a, b and c not all zero")
+        return np.array([a, b, c]), d
+    if "z" in table.numbers:
+        return up, -table.numbers["z"]
+    if z is None:
+        raise LocalizationError(
+            f"{table.where}: nothing says on which plane the points lie: give a height z, a plane, or a column z"
+        )
+    if not np.isfinite(z):
+        raise LocalizationError(f"z is {z}, expected a finite height in metres")
+    return up, -float(z)
+
+
+def _cells(values: Array, digits: int) -> list[str]:
+    """Numbers as text, empty where there is none."""
+    return [f"{x:.{digits}f}" if np.isfinite(x) else "" for x in values.tolist()]
+
+
+def _words(status: npt.NDArray[np.int8]) -> list[str]:
+    return [Status(i).name.lower() for i in status.tolist()]
+
+
+def _give(
+    table: PointTable,
+    columns: dict[str, list[str]],
+    status: npt.NDArray[np.int8],
+    command: str,
+    claim: str,
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Write the table, and say on standard error how many rows have no answer, and why."""
+    names, rows = table.with_columns(dict[str, Sequence[str]](columns))
+    rejected = count_rejections(status)
+    good = len(status) - sum(rejected.values())
+    if out is not None or not as_json:
+        write_table(out, table_text(names, rows))
+    if as_json:
+        summary: dict[str, Any] = {"command": command, "rows": len(status), "ok": good}
+        summary["rejected"] = {name.lower(): n for name, n in rejected.items()}
+        if out is not None:
+            summary["out"] = str(out)
+        else:
+            summary["table"] = [dict(zip(names, row, strict=True)) for row in rows]
+        print(json.dumps(summary, indent=2))
+    print(f"{command}: {good} of {len(status)} {claim}", file=sys.stderr)
+    for name, n in rejected.items():
+        print(f"  {n} {name.lower()}: {_REASONS[Status[name]]}", file=sys.stderr)

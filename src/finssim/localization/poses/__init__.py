@@ -1,0 +1,1 @@
+"""A pose from the tags of one picture, by several methods."""

@@ -1,0 +1,176 @@
+"""The command writes a pool file that gives the points back, says what it found, and refuses without writing."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from finssim.calibration.errors import CalibrationError
+from finssim.calibration.vision.pool.pool_command import run
+from finssim.files import OutputError
+from finssim.geometry.optics import Interface, back_project
+from finssim.localization.camera_file import write_camera
+from finssim.localization.pool import load_pool
+
+from .surveyed_pools import FLOOR, GLASS, PLUMB_BOB, TANK, TANK_LENS, before_tank, overhead, survey, wall
+
+WATER = Interface.water(1.0)
+
+
+@pytest.fixture
+def pool(tmp_path):
+    """Folder with a camera file and a table of a floor."""
+    write_camera(tmp_path / "camera.yaml", PLUMB_BOB, {})
+    table(tmp_path / "points.csv", survey(overhead(), WATER, FLOOR, 40))
+    return tmp_path
+
+
+def table(path, seen):
+    rows = [f"{n},{u},{v},{x},{y},{z}" for n, (u, v), (x, y, z) in zip(seen.names, seen.pixels, seen.points)]  # noqa: B905
+    path.write_text("\n".join(["id,u,v,x,y,z", *rows]) + "\n", encoding="utf-8")
+
+
+def test_a_pool_file_gives_held_out_points_back(pool):
+    """Points that the calibration never saw, back-projected to the floor: 3 mm, of which the survey is 3."""
+    run([pool / "points.csv"], camera=pool / "camera.yaml", out=pool / "pool.yaml", water_height=1.0)
+    found, fresh = (
+        load_pool(pool / "pool.yaml"),
+        survey(overhead(), WATER, FLOOR, 200, seed=9, pixel=0.0, error=0.0),
+    )
+    points, _ = back_project(found.camera, found.interface, fresh.pixels).at_z(0.0)
+    assert np.sqrt(np.mean(np.sum((points - fresh.points) ** 2, axis=1))) < 0.003
+    assert found.record["inputs"].keys() == {str(pool / "points.csv"), str(pool / "camera.yaml")}
+    assert found.record["parameters"]["camera_height"]["ci95"][0] < 1.2
+
+
+def test_the_lens_is_as_sure_as_its_file_remembers(pool):
+    """The intervals of `calibrate camera` become standard errors of focal length and centre; options go before them."""
+    fx, cx = PLUMB_BOB.fx, PLUMB_BOB.cx
+    ends = {"fx": [fx - 1.96, fx + 1.96], "cx": [cx - 3.92, cx + 3.92], "cy": [0.0, 0.0]}
+    record = {
+        "estimates": {
+            name: {"estimate": sum(ci) / 2.0, "ci95": ci, "unit": "px"} for name, ci in ends.items()
+        }
+    }
+    write_camera(pool / "camera.yaml", PLUMB_BOB, record)
+    files = {"camera": pool / "camera.yaml", "out": pool / "pool.yaml", "water_height": 1.0}
+    told = run([pool / "points.csv"], **files).settings
+    assert told.focal_sigma == pytest.approx(1.0 / fx) and told.center_sigma == pytest.approx(2.0)
+    said = run([pool / "points.csv"], **files, focal_sigma=0.01, center_sigma=5.0).settings
+    assert (said.focal_sigma, said.center_sigma) == (0.01, 5.0)
+
+
+def test_json_holds_what_was_promised(pool, capsys):
+    run([pool / "points.csv"], camera=pool / "camera.yaml", out=pool / "pool.yaml", as_json=True)
+    said = json.loads(capsys.readouterr().out)
+    assert said["kind"] == "pool" and said["out"] == str(pool / "pool.yaml")
+    assert said.keys() >= {
+        "parameters",
+        "residual",
+        "held_out",
+        "pinhole",
+        "advice",
+        "provenance",
+        "correlation",
+    }
+    assert said["parameters"]["camera_z"].keys() == {"estimate", "ci95", "unit", "identifiable", "note"}
+    assert said["held_out"]["rms_cm"] < said["pinhole"]["held_out"]["rms_cm"]
+
+
+def test_a_report_has_its_pictures(pool):
+    run([pool / "points.csv"], camera=pool / "camera.yaml", out=pool / "pool.yaml", report=pool / "report")
+    names = {path.name for path in (pool / "report").iterdir()}
+    assert names >= {
+        "report.html",
+        "report.md",
+        "fit.json",
+        "map.png",
+        "picture.png",
+        "outwards.png",
+        "held_out.png",
+    }
+    page = (pool / "report" / "report.html").read_text(encoding="utf-8")
+    assert "camera_height" in page and "finssim calibrate pool" in page and "http" not in page
+
+
+def test_a_tank_with_its_wall_surveyed(tmp_path, capsys):
+    camera, plane = before_tank(30.0), wall(window=GLASS)
+    write_camera(tmp_path / "camera.yaml", TANK_LENS, {})
+    table(tmp_path / "points.csv", survey(camera, plane, TANK, 50, error=0.0005))
+    run(
+        [tmp_path / "points.csv"], camera=tmp_path / "camera.yaml", out=tmp_path / "pool.yaml",
+        plane="0,1,0,0", window=["0.010:1.52"], survey_sigma=0.0005,
+    )  # fmt: skip
+    found = load_pool(tmp_path / "pool.yaml")
+    assert found.interface.window == GLASS
+    assert found.interface.normal[1] < -0.999
+    assert np.linalg.norm(found.camera.position - camera.position) < 0.01
+    assert "camera_distance" in capsys.readouterr().out
+
+
+def test_equal_inputs_write_equal_files(pool):
+    for name in ("a.yaml", "b.yaml"):
+        run([pool / "points.csv"], camera=pool / "camera.yaml", out=pool / name, water_height=1.0)
+    assert (pool / "a.yaml").read_bytes() == (pool / "b.yaml").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"out": "pool.txt"}, "expected .yaml"),
+        ({"plane": "0,1"}, "expected n_x,n_y,n_z,b"),
+        ({"window": ["thick"]}, "expected THICKNESS:INDEX"),
+        ({"inputs": "nowhere.csv"}, "no such file"),
+        ({"window": ["10:1.52"]}, "window is 10 m thick.*metres"),
+        ({"water_height": -1.0}, "other side"),
+        ({"water_height": 100.0}, "--water-height 100 puts the plane 100 m from the points.*unit"),
+        ({"fit": "pose,colour"}, "unknown 'colour'"),
+    ],
+)
+def test_refusals_write_nothing(pool, options, words):
+    options = dict(options)
+    inputs, out = [pool / options.pop("inputs", "points.csv")], pool / options.pop("out", "pool.yaml")
+    with pytest.raises(CalibrationError, match=words):
+        run(inputs, camera=pool / "camera.yaml", out=out, **options)
+    assert not out.exists()
+
+
+def test_pixels_of_another_resolution_are_refused(pool):
+    write_camera(pool / "half.yaml", type(PLUMB_BOB)(640, 360, 270.0, 270.0, 341.0, 174.0), {})
+    with pytest.raises(CalibrationError, match="another resolution"):
+        run([pool / "points.csv"], camera=pool / "half.yaml", out=pool / "pool.yaml")
+
+
+def test_a_folder_of_other_things_is_no_report(pool):
+    with pytest.raises(OutputError, match="already holds files"):
+        run([pool / "points.csv"], camera=pool / "camera.yaml", out=pool / "pool.yaml", report=pool)
+
+
+def test_parts_of_the_picture_are_no_pixels(pool):
+    seen = survey(overhead(), WATER, FLOOR, 40)
+    table(pool / "parts.csv", replace(seen, pixels=seen.pixels / [PLUMB_BOB.width, PLUMB_BOB.height]))
+    with pytest.raises(CalibrationError, match="spread over 0.* px in all.*multiply"):
+        run([pool / "parts.csv"], camera=pool / "camera.yaml", out=pool / "pool.yaml")
+    assert not (pool / "pool.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"focal_sigma": 0.003}, {"focal_sigma": 0.0}, {"fit": "pose,height,focal"}]
+)
+def test_a_lens_taken_as_exact_is_said(pool, capsys, options):
+    """As a note in the table and among the advice in JSON, unless somebody told its errors or it is fitted."""
+    files = {"camera": pool / "camera.yaml", "out": pool / "pool.yaml", "water_height": 1.0}
+    run([pool / "points.csv"], **files, **options)
+    assert ("- the lens is taken as exact" in capsys.readouterr().out) == (not options)
+    run([pool / "points.csv"], **files, **options, as_json=True)
+    said = json.loads(capsys.readouterr().out)
+    assert any("--focal-sigma 0.003" in sentence for sentence in said["advice"]) == (not options)
+
+
+def test_the_surveys_part_of_the_held_out_error_is_said(pool, capsys):
+    """2 mm for each of two coordinates make 2.8 mm, times how much worse than said the survey seems."""
+    fit = run([pool / "points.csv"], camera=pool / "camera.yaml", out=pool / "pool.yaml", water_height=1.0)
+    told = 0.2 * np.sqrt(2.0) * fit.noise.scale
+    assert load_pool(pool / "pool.yaml").record["held_out"]["survey_cm"] == pytest.approx(told)
+    assert f"survey's own error {told:.2f} cm" in " ".join(capsys.readouterr().out.split())

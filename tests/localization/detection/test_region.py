@@ -1,0 +1,141 @@
+"""A tag is searched where it is expected, found again wherever it reappears, and never reported twice."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from finssim.localization.detection.detector import LIBRARIES, detector
+from finssim.localization.detection.region import RegionTracker, merged, region_around
+from reference.tag_picture import draw, pose_corners
+
+SHAPE = (360, 480)
+EMPTY = np.full(SHAPE, 120, np.uint8)
+
+
+def picture(seed=0, **tags):
+    """A picture with tags t15=(u, v), each of 32 px."""
+    rings = {int(name[1:]): ring_at(*place) for name, place in tags.items()}
+    return draw(SHAPE, rings, family="tag25h9", blur=0.6, noise=1.5, seed=seed, oversampling=4)
+
+
+def ring_at(u, v):
+    """Corners of a tag of 32 px, a little turned."""
+    return pose_corners(32.0, centre=(u, v), turn=0.2)
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_a_moving_tag_is_followed_in_regions_with_the_corners_of_a_whole_search(library):
+    """After the first picture only regions are searched, a fraction of the pixels, at 9 px per picture."""
+    find = detector("tag25h9", library=library)
+    tracker = RegionTracker(find, [15, 16])
+    for k in range(8):
+        image = picture(k, t15=(100 + 9 * k, 80 + 4 * k), t16=(300 - 6 * k, 250.4))
+        found = {d.tag: d for d in tracker.detect(image, 0.033 * k)}
+        whole = {d.tag: d for d in find.detect(image)}
+        assert found.keys() == whole.keys() == {15, 16}
+        for tag, detection in found.items():
+            assert np.abs(detection.corners - whole[tag].corners).max() < 0.02
+    assert tracker.counts.whole == 1 and tracker.counts.regions == 14
+    assert tracker.counts.pixels - EMPTY.size < 7 * 0.12 * EMPTY.size
+    assert tracker.counts.found == 16
+
+
+def test_a_tag_that_jumps_is_found_in_the_same_picture():
+    """Nothing where it was expected: the whole picture is searched at once."""
+    tracker = RegionTracker(detector("tag25h9"), [15])
+    places = [(60, 60), (62, 60), (400, 300), (402, 300)]
+    found = [tracker.detect(picture(k, t15=place), 0.1 * k) for k, place in enumerate(places)]
+    assert [len(f) for f in found] == [1, 1, 1, 1]
+    assert np.abs(found[2][0].corners - ring_at(400, 300)).max() < 0.3
+    assert tracker.counts.recovered == 2 and tracker.counts.whole == 2
+
+
+def test_a_missing_tag_is_searched_in_the_whole_picture_every_so_often():
+    """One of two is seen; the other is looked for near its last place always, and everywhere every third picture."""
+    tracker = RegionTracker(detector("tag25h9"), [15, 16], search_every=3)
+    tracker.detect(picture(t15=(100, 100), t16=(300, 250)), 0.0)
+    for k in range(1, 7):
+        tracker.detect(picture(k, t15=(100, 100)), 0.1 * k)
+    assert tracker.counts.whole == 1 + 2
+    back = picture(9, t15=(100, 100), t16=(420, 60))
+    seen = [{d.tag for d in tracker.detect(back, 0.7 + 0.1 * k)} for k in range(4)]
+    assert seen[0] == {15} and seen[-1] == {15, 16}
+
+
+def test_a_tag_that_is_hidden_for_a_while_is_found_near_where_it_was():
+    """The region grows while it is lost, and follows its last velocity."""
+    corners = ring_at(100, 100)
+    widths = [
+        np.diff(np.reshape(region_around(corners, 2.0, lost), (2, 2)), axis=0).min() for lost in range(5)
+    ]
+    assert all(a < b for a, b in itertools.pairwise(widths))
+    tracker = RegionTracker(detector("tag25h9"), [15, 16], search_every=1000)
+    for k in range(3):
+        tracker.detect(picture(k, t15=(60, 300), t16=(100 + 10 * k, 100)), 0.1 * k)
+    for k in range(3, 6):
+        tracker.detect(picture(k, t15=(60, 300)), 0.1 * k)
+    found = tracker.detect(picture(6, t15=(60, 300), t16=(160, 108)), 0.6)
+    assert {d.tag for d in found} == {15, 16}
+    assert tracker.counts.whole == 1
+
+
+def test_a_prediction_is_searched_before_the_tag_was_ever_seen():
+    """No search of the whole picture where the filter knows; a prediction that is no number is left aside."""
+    image = picture(t15=(200, 150))
+    tracker = RegionTracker(detector("tag25h9"), [15])
+    [found] = tracker.detect(image, 0.0, predicted={15: ring_at(206, 146)}, predicted_std=5.0)
+    assert np.abs(found.corners - ring_at(200, 150)).max() < 0.3
+    assert tracker.counts.whole == 0 and tracker.counts.share < 0.1
+    [found] = tracker.detect(image, 0.1, predicted={15: np.full((4, 2), np.nan)})
+    assert found.tag == 15
+
+
+@pytest.mark.parametrize("times", [True, False])
+def test_an_id_is_never_reported_twice(times):
+    """Two plates with one id, and regions that overlap: the surer one stays."""
+    rings = {15: ring_at(100, 100), 16: ring_at(145, 110)}
+    tracker = RegionTracker(detector("tag25h9"))
+    for k in range(4):
+        image = draw(SHAPE, rings, family="tag25h9", seed=k, oversampling=4)
+        image[200:300, 250:350] = image[50:150, 50:150]  # 15 a second time
+        found = tracker.detect(image, 0.1 * k if times else np.nan)
+        assert sorted(d.tag for d in found) == [15, 16]
+
+
+def test_tags_nobody_asked_for_are_left_out():
+    """Only the ids of the vehicle."""
+    tracker = RegionTracker(detector("tag25h9"), [15])
+    assert [d.tag for d in tracker.detect(picture(t15=(100, 100), t3=(300, 200)))] == [15]
+
+
+def test_pictures_without_tags_cost_one_whole_search_each():
+    """And give nothing."""
+    tracker = RegionTracker(detector("tag25h9"), [15])
+    assert [tracker.detect(EMPTY, 0.1 * k) for k in range(3)] == [[], [], []]
+    assert (tracker.counts.whole, tracker.counts.regions, tracker.counts.found) == (3, 0, 0)
+
+
+def test_a_tag_that_leaves_the_picture_is_not_followed_out_of_it():
+    """A prediction far outside gives an empty region and a search of the whole picture, not an error."""
+    find = detector("tag25h9")
+    tracker = RegionTracker(find, [15])
+    found = tracker.detect(picture(t15=(100, 100)), 0.0, predicted={15: ring_at(-5000.0, 9000.0)})
+    assert [d.tag for d in found] == [15]
+
+
+def test_merged_regions_cover_the_same_places_without_overlap():
+    """Chains of overlaps become one; regions that only touch stay apart."""
+    assert merged([(0, 0, 10, 10), (10, 0, 20, 10)]) == [(0, 0, 10, 10), (10, 0, 20, 10)]
+    assert merged([(0, 0, 10, 10), (18, 0, 30, 10), (9, 0, 19, 10)]) == [(0, 0, 30, 10)]
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        low = rng.integers(0, 80, (6, 2))
+        regions = [
+            (*map(int, a), *map(int, a + s)) for a, s in zip(low, rng.integers(5, 30, (6, 2)), strict=True)
+        ]
+        apart = merged(regions)
+        for a, b in itertools.combinations(apart, 2):
+            assert a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] or b[3] <= a[1]
+        for r in regions:
+            assert any(o[0] <= r[0] and o[1] <= r[1] and o[2] >= r[2] and o[3] >= r[3] for o in apart)

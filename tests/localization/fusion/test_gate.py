@@ -1,0 +1,80 @@
+"""Gates pass the stated share of honest measurements, and give in to a run that agrees with itself."""
+
+import numpy as np
+import pytest
+
+from finssim.localization.fusion.gate import Gate, GateMemory, due, judge, remember
+
+
+@pytest.mark.parametrize("dimension", [1, 2, 3])
+@pytest.mark.parametrize("probability", [0.95, 0.999])
+def test_the_limit_passes_its_share(dimension, probability):
+    """Squared lengths of standard normal vectors of that dimension are below the limit with that probability."""
+    draws = np.random.default_rng(0).standard_normal((200000, dimension))
+    passed = np.mean(np.sum(draws**2, axis=1) <= Gate(probability).limit(dimension))
+    assert passed == pytest.approx(probability, abs=4 * np.sqrt(probability * (1 - probability) / 200000))
+
+
+def test_nine_for_all_is_two_different_gates():
+    """The published 9 refuses 0.27 % of honest scalars and 1.1 % of honest pairs."""
+    draws = np.random.default_rng(1).standard_normal((400000, 2)) ** 2
+    limit = Gate(fixed=9.0).limit(1)
+    assert np.mean(draws[:, 0] > limit) == pytest.approx(0.0027, abs=0.0003)
+    assert np.mean(draws.sum(axis=1) > Gate(fixed=9.0).limit(2)) == pytest.approx(0.0111, abs=0.0006)
+
+
+def refused(gate, values, period=0.1, variance=1e-4, support=5):
+    """Verdicts on far measurements of those values, of a state that so many others have supported."""
+    memory, verdicts, R = GateMemory(support), [], variance * np.eye(len(values[0]))
+    for k, value in enumerate(values):
+        verdict, memory = judge(gate, memory, k * period, np.asarray(value, float), R, 1e6, 0.3)
+        verdicts.append(verdict)
+    return verdicts
+
+
+def test_a_run_that_agrees_takes_over_in_time():
+    """Refused for a second at 10 Hz, the eleventh measurement ends the run."""
+    assert refused(Gate(), [(5.0, 1.0)] * 11) == ["gate"] * 10 + ["reacquired"]
+
+
+def test_a_slow_stream_needs_its_number():
+    """At 1 Hz five measurements are asked for, not two."""
+    assert refused(Gate(), [(5.0, 1.0)] * 5, period=1.0) == ["gate"] * 4 + ["reacquired"]
+
+
+def test_scattered_outliers_never_take_over():
+    """Measurements that agree with nothing stay refused for ever."""
+    values = np.random.default_rng(2).uniform(-50, 50, (200, 2))
+    assert set(refused(Gate(), values)) == {"gate"}
+
+
+def test_outliers_in_between_do_not_stop_a_run():
+    """With every third measurement an outlier, the run still ends in time."""
+    values = [(5.0, 1.0) if k % 3 else (np.sin(k) * 40, 30.0) for k in range(1, 20)]
+    assert "reacquired" in refused(Gate(), values)[:13]
+
+
+def test_the_run_may_move():
+    """A vehicle that drives while it is refused agrees with itself."""
+    assert refused(Gate(), [(5.0 + 0.03 * k, 1.0) for k in range(11)])[-1] == "reacquired"
+
+
+def test_a_gate_that_never_gives_in():
+    """`reacquire_after` of infinity is the published behaviour."""
+    assert set(refused(Gate(reacquire_after=np.inf), [(5.0, 1.0)] * 100)) == {"gate"}
+
+
+def test_an_accepted_measurement_clears_the_memory():
+    """A measurement that passes ends the run."""
+    gate, R = Gate(), np.eye(1)
+    suspects = remember(None, 0.0, np.ones(1), R, 0.3, gate)
+    assert not due(suspects, gate)
+    verdict, memory = judge(gate, GateMemory(5, suspects), 0.1, np.ones(1), R, 0.5, 0.3)
+    assert (verdict, memory) == ("accepted", GateMemory(5))
+
+
+def test_a_first_measurement_is_outvoted_by_the_next_two():
+    """A state started from an outlier is taken over by two that agree, and then stays where five have supported it."""
+    assert refused(Gate(), [(5.0, 1.0)] * 2, support=1) == ["gate", "reacquired"]
+    assert refused(Gate(), [(5.0, 1.0)] * 4, support=3) == ["gate"] * 3 + ["reacquired"]
+    assert refused(Gate(reacquire_after=np.inf), [(5.0, 1.0)] * 9, support=1) == ["gate"] * 9

@@ -1,0 +1,274 @@
+"""From files to poses: times are kept apart, what is missing is said, nothing is made up."""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from finssim.geometry.rotations import quat_from_euler
+from finssim.localization.detection.detections import Frame, write_detections
+from finssim.localization.detection.families import printable
+from finssim.localization.errors import LocalizationError
+from finssim.localization.locate import localize
+from finssim.localization.locate.localize_known import known_of
+from finssim.localization.pool import write_pool
+from finssim.localization.poses.methods import METHODS, NEEDS_DEPTH
+from finssim.vehicles import load_vehicle
+from localization.poses.seen_vehicle import POOLS, TAGS, rotation, seen
+
+LATENCY = 0.05
+POOL = replace(POOLS["tilted water"], latency=LATENCY)
+PORT = np.array([0.0, 0.0, -0.115])  # finsrov.yaml
+
+
+def state(t):
+    """A vehicle that dives, leans and turns: position above the water's plane, roll, pitch, yaw about its normal."""
+    position = np.array([0.3 * np.sin(0.5 * t), -0.2 + 0.2 * np.cos(0.4 * t), 0.45 + 0.1 * np.sin(0.9 * t)])
+    return position, np.array([0.1 * np.sin(2.0 * t), 0.1 * np.cos(1.7 * t), 3.0 + 0.2 * t])
+
+
+def depth_of(t):
+    """What its pressure port reads [m]."""
+    position, angles = state(t)
+    port = position + rotation(angles, tuple(POOL.interface.normal)) @ PORT
+    return -float(POOL.interface.distance(port))
+
+
+@pytest.fixture
+def files(tmp_path):
+    """A pool, detections at 5 Hz with stamps late by the latency, depth at 20 Hz and IMU at 100 Hz."""
+    write_pool(POOL, tmp_path / "pool.yaml")
+    up = tuple(POOL.interface.normal)
+    frames = [
+        Frame(float(t + LATENCY), f"{i:03d}.png", tuple(seen(POOL, *state(t), up=up)))
+        for i, t in enumerate(np.arange(0.0, 10.0, 0.2))
+    ]
+    write_detections(frames, tmp_path / "tags.csv")
+    with (tmp_path / "depth.csv").open("w") as file:
+        file.write("t,depth\n" + "".join(f"{t:.3f},{depth_of(t):.9f}\n" for t in np.arange(0.0, 9.0, 0.05)))
+    with (tmp_path / "imu.csv").open("w") as file:
+        file.write("t,qx,qy,qz,qw\n")
+        for t in np.arange(-0.5, 10.5, 0.01):
+            file.write(f"{t:.3f}," + ",".join(f"{x:.9f}" for x in quat_from_euler(*state(t)[1])) + "\n")
+    with (tmp_path / "truth.csv").open("w") as file:
+        file.write("image,x,y,yaw_deg\n")
+        for frame in frames:
+            (x, y, _), angles = state(frame.time - LATENCY)
+            R = rotation(angles, up)
+            file.write(f"{frame.image},{x},{y},{np.degrees(np.arctan2(R[1, 0], R[0, 0]))}\n")
+    return tmp_path
+
+
+def located(files, **options):
+    """What `run` wrote, and its JSON."""
+    given = {"pool": files / "pool.yaml", "vehicle": "finsrov", "out": files / "out.csv", **options}
+    found = localize.run(files / "tags.csv", **given)
+    with (files / "out.csv").open() as file:
+        return found, list(csv.DictReader(file))
+
+
+def test_poses_are_those_of_the_exposure(files, capsys):
+    """With depth and IMU read at the exposure, not at the stamp, each picture gives the pose to 0.1 mm."""
+    found, rows = located(
+        files, depth=files / "depth.csv", imu=files / "imu.csv", truth=files / "truth.csv", as_json=True
+    )
+    document = json.loads(capsys.readouterr().out)
+    assert document["frames"] == 50
+    assert document["located"] == 45  # the depth file ends at 8.95 s
+    assert document["refused"] == {"no depth at the exposure": 5}
+    assert document["truth"]["compared"] == 45
+    assert document["truth"]["rmse_m"] < 2e-4
+    assert document["truth"]["rmse_yaw_deg"] < 0.02
+    assert document["pool"]["sha256"] == POOL.sha256
+    assert document["vehicle"]["sha256"] == load_vehicle("finsrov").sha256
+    position, angles = state(4.0)
+    row = rows[20]
+    assert row["status"] == "ok"
+    assert row["tags"] == "15 16"
+    assert [float(row[k]) for k in "xyz"] == pytest.approx(position, abs=3e-4)
+    R = rotation(angles, tuple(POOL.interface.normal))
+    assert float(row["yaw"]) == pytest.approx(np.arctan2(R[1, 0], R[0, 0]), abs=1e-3)
+    assert rows[-1]["status"] == "refused"
+    assert rows[-1]["x"] == ""
+    assert "outside the file" in rows[-1]["reason"]
+    assert not found.interrupted
+
+
+def test_reading_at_the_stamp_would_miss(files, capsys):
+    """The latency matters: without it depth and tilt belong to another moment, and the error grows fourfold."""
+    write_pool(replace(POOL, latency=0.0), files / "pool.yaml")
+    options = {
+        "depth": files / "depth.csv",
+        "imu": files / "imu.csv",
+        "truth": files / "truth.csv",
+        "as_json": True,
+    }
+    located(files, **options)
+    assert json.loads(capsys.readouterr().out)["truth"]["rmse_m"] > 8e-4
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_runs_from_files(files, method, capsys):
+    """A file of detections gives a row per picture with every method; those without need of depth work without."""
+    depth = 0.5 if method in NEEDS_DEPTH else None
+    found, rows = located(files, method=method, depth=depth, imu=files / "imu.csv")
+    assert len(rows) == 50
+    assert f"with method {method}" in capsys.readouterr().out
+    assert all((row["status"] == "ok") == bool(row["x"]) == (not row["reason"]) for row in rows)
+    if method == "refractive-6dof":
+        assert sum(row["status"] == "ok" for row in rows) > 40
+
+
+def test_a_constant_depth_needs_no_time(files, capsys):
+    """Pictures without time stamps are located with one depth; without IMU as level, and it says so."""
+    position, angles = np.array([0.3, -0.2, 0.4]), np.array([0.0, 0.0, 0.5])
+    up = tuple(POOL.interface.normal)
+    detections = tuple(seen(POOL, position, angles, up=up))
+    write_detections([Frame(np.nan, "a.png", detections), Frame(np.nan, "b.png", ())], files / "tags.csv")
+    depth = -float(POOL.interface.distance(position + rotation(angles, up) @ PORT))
+    _, rows = located(files, depth=str(depth))
+    printed = capsys.readouterr().out
+    assert "taken as level, give or take 2.0 degrees" in printed
+    assert [float(rows[0][k]) for k in "xyz"] == pytest.approx(position, abs=1e-6)
+    assert rows[1]["reason"] == "no tag seen"
+    assert float(rows[0]["std_x"]) > 3e-3  # 2 degrees of tilt, and a depth sensor's centimetre
+    _, rows = located(files, depth=files / "depth.csv")
+    assert "no time stamp" in rows[0]["reason"]
+
+
+def test_a_gap_in_the_depth_is_not_bridged(files):
+    """Between samples 3 s apart nothing is interpolated, unless a longer gap is allowed."""
+    lines = (files / "depth.csv").read_text().splitlines()
+    kept = [lines[0], *(line for line in lines[1:] if not 3.0 < float(line.split(",")[0]) < 6.0)]
+    (files / "depth.csv").write_text("\n".join(kept) + "\n")
+    _, rows = located(files, depth=files / "depth.csv", imu=files / "imu.csv")
+    refused = [row for row in rows if "apart" in row["reason"]]
+    assert len(refused) == 14
+    _, rows = located(files, depth=files / "depth.csv", imu=files / "imu.csv", longest_gap=4.0)
+    assert not [row for row in rows if "apart" in row["reason"]]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({}, "needs --depth"),
+        ({"method": "pinhole-depth"}, "needs --depth"),
+        ({"method": "snell"}, "unknown method 'snell'; available: refractive"),
+        ({"depth": "inf"}, "depth is inf"),
+        ({"depth": "missing.csv"}, "cannot be read"),
+        ({"depth": 0.5, "vehicle": "bluerov2"}, "has no tags"),
+        ({"depth": 0.5, "pixel_std": 0.0}, "pixel_std"),
+        ({"depth": 0.5, "tilt_std_deg": -1.0}, "tilt_std"),
+    ],
+)
+def test_what_cannot_be_used_is_said_in_one_sentence(files, options, words):
+    """Nothing is written then."""
+    with pytest.raises(LocalizationError, match=words) as refused:
+        located(files, **options)
+    assert "\n" not in str(refused.value)
+    assert not (files / "out.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("t,temperature\n0,20\n", "no attitude"),
+        ("t,roll,pitch\n0,45,90\n", "exceeds a turn"),
+        ("t,qx,qy,qz,qw\n0,1,1,1,1\n", "unit length"),
+    ],
+)
+def test_a_wrong_imu_file_is_refused(files, text, words):
+    """Degrees, foreign columns and quaternions that are none are told apart from attitudes."""
+    (files / "imu.csv").write_text(text)
+    with pytest.raises(LocalizationError, match=words):
+        located(files, depth=0.5, imu=files / "imu.csv")
+
+
+def test_tags_of_another_family_are_not_ours(files):
+    """The same id of another family is refused by name."""
+    detections = tuple(replace(d, family="tag36h11") for d in seen(POOL, *state(0.0)))
+    write_detections([Frame(0.0, "a.png", detections)], files / "tags.csv")
+    _, rows = located(files, depth=0.5)
+    assert rows[0]["reason"] == "no tag of family tag25h9 seen: tag36h11"
+    _, rows = located(files, family="36h11", method="refractive-6dof")
+    assert rows[0]["tags"] == "15 16"
+
+
+def test_an_interrupt_keeps_the_rows_so_far(files, monkeypatch):
+    """After Ctrl-C the table holds what was measured until then, and the interrupt goes on."""
+    measured = []
+
+    def measure(*arguments):
+        if len(measured) == 7:
+            raise KeyboardInterrupt
+        measured.append(1)
+        return METHODS["pinhole"](*arguments)
+
+    monkeypatch.setitem(METHODS, "refractive", measure)
+    with pytest.raises(KeyboardInterrupt):
+        located(files, depth=0.5)
+    assert len((files / "out.csv").read_text().splitlines()) == 8
+
+
+def test_height_follows_from_pressure_behind_a_wall(tmp_path):
+    """Where the plane is a wall, the surface is the world frame's origin."""
+    pool = replace(POOLS["window wall"], world_position=(0.0, 0.0, 1.2))
+    known = known_of(pool, load_vehicle("finsrov"), depth=0.5, imu=None)
+    found = known.at(0.0, needs_height=True)
+    assert found.z_b == pytest.approx(1.2 - 0.5 + 0.115)
+    assert found.up == (0.0, 0.0, 1.0)
+
+
+def drawn(position, angles, up):
+    """A picture of the two tags on gray."""
+    cv2 = pytest.importorskip("cv2")
+    image = np.full((POOL.camera.lens.height, POOL.camera.lens.width), 200, np.uint8)
+    for detection in seen(POOL, position, angles, up=up):
+        plate = printable("tag25h9", detection.tag, pixels_per_cell=20, margin=0.0)
+        size = len(plate) - 0.5
+        flat = np.array([[-0.5, -0.5], [size, -0.5], [size, size], [-0.5, size]], np.float32)
+        H = cv2.getPerspectiveTransform(flat, detection.corners.astype(np.float32))
+        shape = (image.shape[1], image.shape[0])
+        inside = cv2.warpPerspective(np.ones_like(plate), H, shape, flags=cv2.INTER_NEAREST) > 0
+        image[inside] = cv2.warpPerspective(plate, H, shape, flags=cv2.INTER_AREA)[inside]
+    return cv2.GaussianBlur(image, (0, 0), 0.8)
+
+
+UP = tuple(POOL.interface.normal)
+
+
+def test_pictures_give_what_their_detections_give(files):
+    """Tags drawn into a picture are located to 5 mm; a picture of another size than the lens is refused."""
+    cv2 = pytest.importorskip("cv2")
+    position, angles = np.array([0.2, -0.1, 0.8]), np.array([0.0, 0.0, 0.5])
+    image = drawn(position, angles, UP)
+    cv2.imwrite(str(files / "a_0.5.png"), image)
+    given = {"pool": files / "pool.yaml", "vehicle": "finsrov", "out": files / "out.csv"}
+    given["depth"] = -float(POOL.interface.distance(position + rotation(angles, UP) @ PORT))
+    ((frame, measured),) = localize.run([files / "a_0.5.png"], **given).rows
+    assert frame.time == 0.5
+    assert measured.ok, measured.reason
+    assert measured.tags == tuple(TAGS)
+    assert np.abs(measured.position - position).max() < 0.005
+    cv2.imwrite(str(files / "small.png"), image[:100])
+    with pytest.raises(LocalizationError, match="1280 x 100 pixels, expected 1280 x 720"):
+        localize.run([files / "small.png"], **given)
+
+
+def test_a_video_is_followed(files):
+    """Every picture of a short video of a vehicle under way is located to 3 cm at a rough depth, with rising times."""
+    cv2 = pytest.importorskip("cv2")
+    path = files / "dive.avi"
+    film = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (1280, 720), isColor=False)
+    way = [np.array([0.2 + 0.03 * i, -0.1, 0.7]) for i in range(6)]
+    for position in way:
+        film.write(drawn(position, np.zeros(3), UP))
+    film.release()
+    found = localize.run(path, pool=files / "pool.yaml", vehicle="finsrov", out=files / "out.csv", depth=0.3)
+    assert [frame.image for frame, _ in found.rows] == [f"dive.avi#{i}" for i in range(6)]
+    assert (np.diff([frame.time for frame, _ in found.rows]) > 0.05).all()
+    for position, (_, measured) in zip(way, found.rows, strict=True):
+        assert measured.ok, measured.reason
+        assert np.abs(measured.position - position)[:2].max() < 0.03
