@@ -385,6 +385,8 @@ PLAIN = [*NO_DEPTH, "--depth", "0.5"]
         ([*PLAIN, "--shared-pixel-std", "-1"], "shared_pixel_std is -1"),
         ([*PLAIN, "--depth-std", "-1"], "depth_std is -1"),
         ([*PLAIN, "--tilt-std-deg", "-1"], "tilt_std is"),
+        ([*PLAIN, "--longest-gap", "-1"], "longest_gap is -1"),
+        ([*PLAIN, "--longest-gap", "nan"], "longest_gap is nan"),
         ([*NO_DEPTH, "--depth", "nowhere.csv"], "nowhere.csv: cannot be read"),
         ([*NO_DEPTH, "--depth", "imu.csv"], "imu.csv: no column 'depth'"),
         ([*NO_DEPTH, "--depth", "nan"], "depth is nan"),

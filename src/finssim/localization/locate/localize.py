@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from finssim.files import atomic_write, refuse_unwritable
 from finssim.localization.detection.detections import Frame
+from finssim.localization.errors import LocalizationError
 from finssim.localization.locate.localize_inputs import Seeing, frames_of
 from finssim.localization.locate.localize_known import known_of
 from finssim.localization.locate.localize_output import Row, summary_lines, summary_of, write_rows
@@ -89,6 +90,10 @@ def run(
     """
     out, paths = Path(out), [Path(p) for p in ([inputs] if isinstance(inputs, (str, Path)) else inputs)]
     refuse_unwritable(atomic_write(out))
+    if not longest_gap >= 0.0:
+        raise LocalizationError(
+            f"longest_gap is {longest_gap}, expected a time in seconds that is not negative"
+        )
     site, body = load_pool(pool), load_vehicle(str(vehicle))
     known = known_of(
         site,
