@@ -50,7 +50,10 @@ EXTRAS = {
         },
         "read Parquet, ArduSub logs and ROS 2 bags, draw the report of a calibration and the figures of a replay",
     ),
-    "view": Extra({"matplotlib": "matplotlib"}, "draw pictures of vehicles and figures of evaluations"),
+    "view": Extra(
+        {"matplotlib": "matplotlib", "viser": "viser"},
+        "draw pictures of vehicles and figures of evaluations, see runs live in the browser",
+    ),
     "mujoco": Extra({"mujoco": "mujoco"}, "measure speed as a ratio to MuJoCo's"),
     "vision": Extra(
         {"opencv-python-headless": "cv2", "pupil-apriltags": "pupil_apriltags", "matplotlib": "matplotlib"},
@@ -59,8 +62,13 @@ EXTRAS = {
     "render": Extra(
         {"mitsuba": "mitsuba"}, "render the localization experiment with Mitsuba instead of our own"
     ),
-    "ros2": Extra({"cyclonedds": "cyclonedds", "rosbags": "rosbags"}, "nothing yet: kept for ROS 2"),
-    "hardware": Extra({"pyserial": "serial"}, "nothing yet: kept for the link to a vehicle"),
+    "ros2": Extra(
+        {"cyclonedds": "cyclonedds", "rosbags": "rosbags"}, "be ROS 2 nodes without an installed ROS 2"
+    ),
+    "hardware": Extra(
+        {"mcap": "mcap", "pygame": "pygame", "pyserial": "serial", "rosbags": "rosbags"},
+        "reach a vehicle over a serial line, steer it with a gamepad, record its runs",
+    ),
 }
 
 EXTRA_OF_MODULE = {

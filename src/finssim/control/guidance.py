@@ -1,0 +1,70 @@
+"""Where a vehicle should be, as a function of time: a station, or a trajectory (`control.trajectories`)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.control.tracking import Goal
+from finssim.geometry.rotations import quat_from_yaw
+
+__all__ = ["Guide", "Reference", "Station", "goal_at"]
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The wanted motion at one time or, with a leading batch, at several."""
+
+    position: Array
+    """Body origin, world frame [m], (..., 3)."""
+    velocity: Array
+    """World frame [m/s], (..., 3)."""
+    yaw: Array
+    """Wanted heading [rad], (...)."""
+    progress: Array
+    """Part of the way in [0, 1], (...)."""
+
+
+class Guide(Protocol):
+    """A wanted motion; time counts from its start."""
+
+    @property
+    def name(self) -> str:
+        """Of the station or trajectory."""
+
+    @property
+    def duration(self) -> float:
+        """[s]; infinite for a station."""
+
+    def at(self, t: npt.ArrayLike) -> Reference:
+        """The reference at times since the start [s], (...); held at the ends beyond them."""
+
+
+@dataclass(frozen=True)
+class Station:
+    """One pose to reach and hold."""
+
+    position: tuple[float, float, float]
+    """World frame [m]."""
+    yaw: float
+    """[rad]"""
+    name: str = "station"
+    duration: float = math.inf
+
+    def at(self, t: npt.ArrayLike) -> Reference:
+        """The same at all times."""
+        shape = np.shape(t)
+        place = np.broadcast_to(np.asarray(self.position, float), (*shape, 3))
+        return Reference(place, np.zeros((*shape, 3)), np.full(shape, self.yaw), np.zeros(shape))
+
+
+def goal_at(guide: Guide, t: float) -> Goal:
+    """The level pose and velocity that a pose controller is given at a time since the start [s]."""
+    reference = guide.at(t)
+    return Goal(reference.position, quat_from_yaw(reference.yaw), reference.velocity)

@@ -1,0 +1,96 @@
+"""What crosses the wires of a robot, as plain values in SI units; `robot.link` turns them into bytes and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["CommandEcho", "Delivery", "Picture", "Telemetry", "TagCorners", "ThrusterCommand"]
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ThrusterCommand:
+    """What the motor controller is told, in its own order of outputs and with its own signs."""
+
+    enable: bool
+    """False: motors off, whatever the numbers are."""
+    normalised: tuple[float, ...]
+    """Part of the full-scale shaft speed per motor output, in [-1, 1]."""
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """A snapshot of the vehicle as its motor controller sends it."""
+
+    sequence: int
+    """Counts up, modulo 2¹⁶."""
+    mcu_ms: int
+    """The controller's clock [ms], modulo 2³²."""
+    quaternion: tuple[float, float, float, float]
+    """IMU frame to the level world of its own attitude filter, xyzw (wxyz on the wire)."""
+    gyro: tuple[float, float, float]
+    """IMU frame [rad/s]."""
+    accel: tuple[float, float, float]
+    """Specific force, IMU frame [m/s²]; +9.81 upwards at rest."""
+    depth: float
+    """Of the pressure port, positive down [m]."""
+    pressure: float
+    """Absolute [Pa]."""
+    flags: int
+    """Status bits (see `robot.link`)."""
+    motor_rpm: tuple[float, ...] | None
+    """Per motor output, with the controller's own signs [rpm]; None from a firmware that does not tell."""
+
+
+@dataclass(frozen=True)
+class CommandEcho:
+    """What the motor controller made of a command, sent on request."""
+
+    sequence: int
+    mcu_ms: int
+    command_count: int
+    receive_ms: int
+    command_crc: int
+    enabled: bool
+    accepted: bool
+    reject_flags: int
+    received: tuple[float, ...]
+    applied: tuple[float, ...]
+    debug_mask: int
+    decimation: int
+
+
+@dataclass(frozen=True)
+class TagCorners:
+    """A tag that a camera's own processor found."""
+
+    tag_id: int
+    corners: Array
+    """As `localization.detection.Detection.corners`, (4, 2) [px]."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One exposure of the overhead camera: grey values, or the tags already found in them."""
+
+    time: float
+    """When it came, robot's clock [s]; the middle of the exposure is `Pool.latency` earlier."""
+    sequence: int
+    image: npt.NDArray[np.uint8] | None = None
+    """(rows, columns); None where only tags are sent."""
+    tags: tuple[TagCorners, ...] = ()
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """Everything that reached the robot's computer up to a time."""
+
+    time: float
+    """Robot's clock [s]."""
+    frames: tuple[tuple[float, bytes], ...] = ()
+    """Datagrams of the motor controller, each with its time of arrival [s]."""
+    pictures: tuple[Picture, ...] = field(default=())

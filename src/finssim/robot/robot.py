@@ -1,0 +1,51 @@
+"""The robot as a controller sees it: `read()` what is known, `send()` thrusts and learn how they were limited."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.vehicles import Vehicle
+
+__all__ = ["Reading", "Robot"]
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What is known of the vehicle at one time; it is a `control.tracking.Measured`."""
+
+    time: float
+    """[s], the robot's clock."""
+    position: Array
+    """Body origin, world frame (z = 0 on the still water) [m], (3,); NaN while unknown."""
+    quaternion: Array
+    """Body to world, xyzw, (4,)."""
+    nu: Array
+    """Velocity of the body origin and angular velocity, body frame [m/s, rad/s], (6,)."""
+    ready: bool
+    """Whether a controller may act on it."""
+    mode: str = "fresh"
+    """Of vision: uninitialized, fresh, coast, hold or lost."""
+    reason: str = ""
+    """Why it is not ready; empty if it is."""
+    std: Array = field(default_factory=lambda: np.full(7, np.nan))
+    """Standard deviations of position [m], velocity [m/s] and yaw [rad], (7,)."""
+
+
+class Robot(Protocol):
+    """A simulator, the virtual pool or the vehicle: a controller cannot tell which it holds."""
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """As its file has it."""
+
+    def read(self) -> Reading:
+        """The newest state."""
+
+    def send(self, force: npt.ArrayLike) -> Array:
+        """Command thrusts in canonical order [N], (n,); returns them as limited (zeros while not armed)."""
