@@ -94,7 +94,7 @@ def train(
         str | None,
         typer.Option(
             help="Ranges that vehicle and water are drawn from: "
-            "hold_for_position, fossen_learn_to_swim, equivalent_box, or a file.",
+            "hold_for_position, fossen_learn_to_swim, equivalent_box, pool, no_thruster_dynamics, or a file.",
             metavar="FILE",
         ),
     ] = None,

@@ -3,7 +3,7 @@
 import difflib
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
@@ -109,7 +109,7 @@ class WaveRanges(Part):
     """[m]"""
 
     @model_validator(mode="after")
-    def _unbroken(self) -> Self:
+    def _unbroken(self) -> "WaveRanges":
         highest, shortest = self.amplitude[1], self.wavelength[0]
         try:
             Wave(amplitude=highest, wavelength=shortest)

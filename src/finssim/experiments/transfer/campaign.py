@@ -1,0 +1,98 @@
+"""Many trials over several processes: resumable, each result a file of its own."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from pathlib import Path
+from typing import Any
+
+from finssim.experiments.running import Say
+from finssim.experiments.transfer.job import Job
+from finssim.files import atomic_write
+
+__all__ = ["Play", "run_jobs"]
+
+Play = Callable[[Job, Path], dict[str, Any]]
+"""Plays a job, leaves its series in files that begin with the given path, and returns its result as plain data."""
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    folder: Path,
+    play: Play,
+    *,
+    processes: int | None = None,
+    say: Say = lambda part, what: None,
+) -> list[dict[str, Any]]:
+    """Play what has no result yet; after Ctrl-C or a kill the next call goes on where this one was.
+
+    Args:
+        jobs: Trials; equal ones are played once.
+        folder: Takes KEY.json of each, made if missing.
+        play: A function of a module, as it is called in other processes.
+        processes: As many as there are processors if None.
+        say: Told the share that is done and what is left.
+
+    Returns:
+        The results in the order of the jobs, each with its `job` and `key`.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    keys = [job.key() for job in jobs]
+    missing = {
+        key: job for key, job in zip(keys, jobs, strict=True) if not (folder / f"{key}.json").is_file()
+    }
+    if missing:
+        _play_all(missing, folder, play, processes or os.cpu_count() or 1, len(set(keys)), say)
+    return [json.loads((folder / f"{key}.json").read_text(encoding="utf-8")) for key in keys]
+
+
+def _play_all(
+    missing: dict[str, Job], folder: Path, play: Play, processes: int, total: int, say: Say
+) -> None:
+    context = multiprocessing.get_context(
+        "spawn"
+    )  # a fork would copy the threads of Warp and torch half-alive
+    executor = ProcessPoolExecutor(min(processes, len(missing)), mp_context=context, initializer=_one_thread)
+    try:
+        running: set[Future[None]] = {
+            executor.submit(_play_one, key, job, folder, play) for key, job in missing.items()
+        }
+        while running:
+            done, running = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                future.result()
+            say(1.0 - len(running) / total, f"{len(running)} trials left")
+    except BaseException:
+        _stop(executor)
+        raise
+    executor.shutdown()
+
+
+def _stop(executor: ProcessPoolExecutor) -> None:
+    """End without waiting for trials that nobody will read."""
+    workers = list((executor._processes or {}).values())
+    executor.shutdown(wait=False, cancel_futures=True)
+    for worker in workers:
+        worker.terminate()
+
+
+def _one_thread() -> None:
+    """Of a worker: there are as many workers as processors."""
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears Ctrl-C and ends its workers
+    os.environ["OMP_NUM_THREADS"] = "1"
+
+
+def _play_one(key: str, job: Job, folder: Path, play: Play) -> None:
+    result = {
+        "key": key,
+        "job": {**job.described(), "row": job.row, "target": job.target},
+        **play(job, folder / key),
+    }
+    with atomic_write(folder / f"{key}.json") as temporary:
+        temporary.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
