@@ -1,0 +1,253 @@
+"""ROS 2 messages of what the robot knows, told and did; frames map, base_link and imu_link, SI units."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.geometry.rotations import quat_conjugate, quat_from_yaw, quat_multiply, quat_to_matrix
+from finssim.robot.messages import CommandEcho, Picture, Telemetry
+from finssim.robot.record_types import types
+from finssim.robot.robot import Reading
+from finssim.vehicles import Vehicle
+
+__all__ = ["Messages", "floats"]
+
+MAP, BASE, IMU = "map", "base_link", "imu_link"
+
+IMU_VARIANCES = ((0.02, 0.02, 0.05), (0.01,) * 3, (0.1,) * 3)
+"""Of attitude [rad²], rates [rad²/s²] and specific force [m²/s⁴], as the published bridge sends them."""
+
+PRESSURE_VARIANCE = (0.05 * 9.81e3) ** 2
+"""Of 0.05 m of water [Pa²]: the published 0.0025 m²."""
+
+ECHO = tuple(field.name for field in fields(CommandEcho) if field.name not in ("received", "applied"))
+
+STATES = ("disarmed", "armed", "hold", "fault")
+"""Words for the states of the bridge, in their order."""
+
+THRUSTER_LISTS = ("requested", "force", "achieved", "normalised", "shaft_speed")
+
+LEVELS = ("ok", "warn", "error", "stale")
+"""Words for the levels of a diagnostic, in their order."""
+
+
+class Messages:
+    """Makes messages of one vehicle; times are integers [ns]."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self.types = types()
+        self._of = self.types.types
+        self.names = list(vehicle.thruster_names)
+        imu = vehicle.sensors.imu
+        q_body_imu = np.array([0.0, 0.0, 0.0, 1.0]) if imu is None else np.array(imu.orientation)
+        self._R_body_imu = quat_to_matrix(q_body_imu)
+        # Multiplying by a constant quaternion from the right is a matrix, and a call of it takes a microsecond.
+        self._to_body = quat_multiply(np.eye(4), quat_conjugate(q_body_imu)).T
+        self._imu_variances = [np.diag(v).ravel() for v in IMU_VARIANCES]
+        thrusters = vehicle.thrusters.values()
+        self._outputs = [t.motor_index for t in thrusters if t.motor_index is not None]
+        signs = np.array([float(t.motor_sign or 1) for t in thrusters])
+        self._rad_per_s = signs * (2.0 * math.pi / 60.0)
+
+    def cdr(self, message: Any, kind: str) -> bytes:
+        """A message's bytes."""
+        return bytes(self.types.serialize_cdr(message, kind))
+
+    def imu(self, stamp: int, telemetry: Telemetry) -> Any:
+        """Attitude of the body, rates and specific force in body axes."""
+        attitude, rates, force = self._imu_variances
+        return self._of["sensor_msgs/msg/Imu"](
+            self.header(stamp, BASE),
+            self.quaternion(self._to_body @ telemetry.quaternion),
+            attitude,
+            self.vector(self._R_body_imu @ telemetry.gyro),
+            rates,
+            self.vector(self._R_body_imu @ telemetry.accel),
+            force,
+        )
+
+    def pressure(self, stamp: int, telemetry: Telemetry) -> Any:
+        """Absolute pressure at the port."""
+        return self._of["sensor_msgs/msg/FluidPressure"](
+            self.header(stamp, BASE), telemetry.pressure, PRESSURE_VARIANCE
+        )
+
+    def telemetry(self, stamp: int, received: int, telemetry: Telemetry) -> Any:
+        """The snapshot as it came."""
+        return self._of["finssim_msgs/msg/HardwareTelemetry"](
+            header=self.header(stamp, IMU),
+            received=self.time(received),
+            sequence=telemetry.sequence & 0xFFFF,
+            mcu_ms=telemetry.mcu_ms & 0xFFFFFFFF,
+            status_flags=telemetry.flags & 0xFFFFFFFF,
+            orientation=self.quaternion(telemetry.quaternion),
+            angular_velocity=self.vector(telemetry.gyro),
+            linear_acceleration=self.vector(telemetry.accel),
+            depth=telemetry.depth,
+            pressure=telemetry.pressure,
+            motor_rpm=floats(telemetry.motor_rpm or ()),
+        )
+
+    def shafts(self, stamp: int, motor_rpm: Sequence[float]) -> Any | None:
+        """Measured shaft speeds by thruster, with the signs of positive thrust [rad/s]; None if not of all."""
+        if len(self._outputs) < len(self.names) or len(motor_rpm) <= max(self._outputs):
+            return None
+        speed, none = np.asarray(motor_rpm, float)[self._outputs] * self._rad_per_s, np.zeros(0)
+        return self._of["sensor_msgs/msg/JointState"](self.header(stamp, BASE), self.names, none, speed, none)
+
+    def odometry(self, stamp: int, reading: Reading) -> Any:
+        """Pose in the map, velocity in body axes; the variances of x, y, z, yaw and velocity on the diagonals."""
+        variance = np.square(np.asarray(reading.std, float))
+        of = self._of
+        return of["nav_msgs/msg/Odometry"](
+            self.header(stamp, MAP),
+            BASE,
+            of["geometry_msgs/msg/PoseWithCovariance"](
+                self.pose(reading.position, reading.quaternion), diagonal(variance[:3], variance[6])
+            ),
+            of["geometry_msgs/msg/TwistWithCovariance"](
+                of["geometry_msgs/msg/Twist"](self.vector(reading.nu[:3]), self.vector(reading.nu[3:])),
+                diagonal(variance[3:6], math.nan),
+            ),
+        )
+
+    def transform(self, stamp: int, reading: Reading) -> Any:
+        """map to base_link, for viewers."""
+        of = self._of
+        pose = of["geometry_msgs/msg/Transform"](
+            self.vector(reading.position), self.quaternion(reading.quaternion)
+        )
+        one = of["geometry_msgs/msg/TransformStamped"](self.header(stamp, MAP), BASE, pose)
+        return of["tf2_msgs/msg/TFMessage"]([one])
+
+    def estimator(self, stamp: int, reading: Reading, health: Mapping[str, Any]) -> Any:
+        """Whether the estimate may be acted on; what `health` does not tell is NaN, 0 or empty."""
+        std = np.asarray(reading.std, float)
+        return self._of["finssim_msgs/msg/EstimatorStatus"](
+            header=self.header(stamp, MAP),
+            ready=bool(reading.ready),
+            mode=reading.mode,
+            reason=reading.reason,
+            vision_age=float(health.get("vision_age", math.nan)),
+            imu_age=float(health.get("imu_age", math.nan)),
+            depth_age=float(health.get("depth_age", math.nan)),
+            fixes_accepted=int(health.get("fixes_accepted", 0)),
+            fixes_rejected=int(health.get("fixes_rejected", 0)),
+            reject_reason=str(health.get("reject_reason", "")),
+            mahalanobis=float(health.get("mahalanobis", math.nan)),
+            position_std=std[:3].copy(),
+            velocity_std=std[3:6].copy(),
+            yaw_std=float(std[6]),
+        )
+
+    def goal(self, stamp: int, position: Any, yaw: float) -> Any:
+        """A level pose in the map."""
+        pose = self.pose(position, quat_from_yaw(yaw))
+        return self._of["geometry_msgs/msg/PoseStamped"](self.header(stamp, MAP), pose)
+
+    def wrench(self, stamp: int, tau: Any) -> Any:
+        """A wrench asked for, body axes, (6,) [N, N m]."""
+        wrench = self._of["geometry_msgs/msg/Wrench"](self.vector(tau[:3]), self.vector(tau[3:]))
+        return self._of["geometry_msgs/msg/WrenchStamped"](self.header(stamp, BASE), wrench)
+
+    def command(self, stamp: int, force: Any, source: str) -> Any:
+        """Thrusts asked for, canonical order [N]."""
+        return self._of["finssim_msgs/msg/ThrusterCommand"](
+            self.header(stamp, BASE), source, self.names, floats(force)
+        )
+
+    def thrusters(self, stamp: int, state: str, values: Mapping[str, Any]) -> Any:
+        """What the bridge made of commands."""
+        words = {name: str(values.get(name, "")) for name in ("reason", "source")}
+        lists = {name: floats(values.get(name, ())) for name in THRUSTER_LISTS}
+        return self._of["finssim_msgs/msg/ThrusterState"](
+            header=self.header(stamp, BASE), state=STATES.index(state), names=self.names, **words, **lists
+        )
+
+    def policy(self, stamp: int, pilot: str, values: Mapping[str, Any]) -> Any:
+        """One decision of a controller."""
+        words = {name: str(values.get(name, "")) for name in ("task", "policy_sha256", "vehicle_sha256")}
+        lists = {name: floats(values.get(name, ())) for name in ("observation", "action", "force")}
+        return self._of["finssim_msgs/msg/PolicyInfo"](
+            header=self.header(stamp, BASE),
+            pilot=pilot,
+            period=float(values.get("period", math.nan)),
+            compute_time=float(values.get("compute_time", math.nan)),
+            missed=int(values.get("missed", 0)),
+            wrench=floats(values.get("wrench", (math.nan,) * 6)),
+            **words,
+            **lists,
+        )
+
+    def echo(self, stamp: int, echo: CommandEcho) -> Any:
+        """What the motor controller made of a command."""
+        given = {name: getattr(echo, name) for name in ECHO}
+        given |= {"received": floats(echo.received), "applied": floats(echo.applied)}
+        return self._of["finssim_msgs/msg/CommandEcho"](header=self.header(stamp, BASE), **given)
+
+    def picture(self, stamp: int, jpeg: bytes) -> Any:
+        """A picture in JPEG."""
+        data = np.frombuffer(jpeg, np.uint8)
+        return self._of["sensor_msgs/msg/CompressedImage"](self.header(stamp, "camera"), "jpeg", data)
+
+    def tags(self, picture: Picture) -> Any:
+        """Corners of the tags that came with a picture [px], as JSON."""
+        tags = [{"id": tag.tag_id, "corners": np.asarray(tag.corners).tolist()} for tag in picture.tags]
+        return self.words({"sequence": picture.sequence, "tags": tags})
+
+    def words(self, values: Mapping[str, Any]) -> Any:
+        """Values as JSON."""
+        return self._of["std_msgs/msg/String"](json.dumps(values, default=str))
+
+    def diagnostics(self, stamp: int, name: str, level: str, message: str, values: Mapping[str, Any]) -> Any:
+        """One status; level is one of ok, warn, error, stale."""
+        of = self._of
+        pairs = [of["diagnostic_msgs/msg/KeyValue"](key, str(value)) for key, value in values.items()]
+        status = of["diagnostic_msgs/msg/DiagnosticStatus"](
+            level=LEVELS.index(level), name=name, message=message, hardware_id="", values=pairs
+        )
+        return of["diagnostic_msgs/msg/DiagnosticArray"](self.header(stamp, ""), [status])
+
+    def header(self, stamp: int, frame: str) -> Any:
+        """Stamp and frame."""
+        return self._of["std_msgs/msg/Header"](self.time(stamp), frame)
+
+    def time(self, stamp: int) -> Any:
+        """A time; those before 1970, and after 2038, wrap as the type does."""
+        return self._of["builtin_interfaces/msg/Time"](stamp // 1_000_000_000, stamp % 1_000_000_000)
+
+    def vector(self, v: Any) -> Any:
+        """A vector, (3,)."""
+        return self._of["geometry_msgs/msg/Vector3"](float(v[0]), float(v[1]), float(v[2]))
+
+    def quaternion(self, q: Any) -> Any:
+        """A quaternion, xyzw."""
+        return self._of["geometry_msgs/msg/Quaternion"](float(q[0]), float(q[1]), float(q[2]), float(q[3]))
+
+    def pose(self, position: Any, q: Any) -> Any:
+        """A pose."""
+        point = self._of["geometry_msgs/msg/Point"](
+            float(position[0]), float(position[1]), float(position[2])
+        )
+        return self._of["geometry_msgs/msg/Pose"](point, self.quaternion(q))
+
+
+def floats(values: Any) -> npt.NDArray[np.float64]:
+    """A copy of numbers as rosbags wants them."""
+    return np.array(values, dtype=np.float64).ravel()
+
+
+def diagonal(linear: Any, last: float) -> npt.NDArray[np.float64]:
+    """A covariance, (36,): three variances and that of the turn about z; those of the other turns are not known."""
+    covariance = np.zeros(36)
+    covariance[[0, 7, 14]] = linear
+    covariance[[21, 28]] = math.nan
+    covariance[35] = last
+    return covariance

@@ -1,0 +1,170 @@
+"""The record: what was put in comes out, in any reader; what is written stays readable when the process dies."""
+
+import json
+
+import numpy as np
+import pytest
+
+from finssim.files import OutputError
+from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
+from finssim.robot.messages import CommandEcho, Picture, TagCorners, Telemetry
+from finssim.robot.robot import Reading
+from finssim.vehicles import load_vehicle
+
+pytest.importorskip("mcap")
+pytest.importorskip("rosbags")
+from rosbags.highlevel import AnyReader
+
+from finssim.robot.record_messages import Messages
+from finssim.robot.recorder import Recorder
+
+VEHICLE = load_vehicle("finsrov")
+RPM = tuple(100.0 * (i + 1) for i in range(8))
+
+
+def telemetry(i=0, *, rpm=RPM):
+    return Telemetry(
+        i & 0xFFFF, 10 * i, (0.0, 0.0, 0.0, 1.0), (0.1, 0.2, 0.3), (0.5, -0.25, 9.81), 0.4, 105e3, 7, rpm
+    )
+
+
+def reading(t, *, x=0.0):
+    return Reading(
+        t,
+        np.array([x, 0.2, -0.5]),
+        quat_from_euler(0.1, -0.2, 0.3),
+        np.array([0.4, 0.1, -0.1, 0.01, 0.02, 0.03]),
+        True,
+        "coast",
+        std=np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3, 0.05]),
+    )
+
+
+def messages(path):
+    """Topic -> its messages with their times [ns]."""
+    found = {}
+    with AnyReader([path]) as reader:
+        for connection, time, raw in reader.messages():
+            found.setdefault(connection.topic, []).append((time, reader.deserialize(raw, connection.msgtype)))
+    return found
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory):
+    """A finished record with every kind of message."""
+    path = tmp_path_factory.mktemp("record") / "run.mcap"
+    picture = np.tile(np.arange(64, dtype=np.uint8) * 4, (48, 1))
+    echo = CommandEcho(1, 2, 3, 4, 5, True, False, 8, (0.5,) * 8, (0.4,) * 8, 1, 2)
+    with Recorder(path, VEHICLE, {"seed": 3, "configuration": {"rate": 60}}, epoch=1.7e9) as recorder:
+        recorder.telemetry(0.02, telemetry(), time=0.01)
+        recorder.reading(0.03, reading(0.025), {"vision_age": 0.5})
+        recorder.command(0.04, np.arange(8.0), "pid", np.arange(6.0))
+        recorder.thrusters(0.05, "fault", reason="tilt", force=np.ones(8), normalised=(0.1,) * 8)
+        recorder.policy(0.06, "policy", task="t1", observation=(1.0, 2.0), missed=4)
+        recorder.goal(0.07, (1.0, 2.0, -0.5), np.pi / 2)
+        recorder.echo(0.08, echo)
+        recorder.picture(0.09, Picture(0.085, 1, picture))
+        recorder.picture(0.10, Picture(0.095, 2, tags=(TagCorners(15, np.arange(8.0).reshape(4, 2)),)))
+        recorder.event(0.11, "arm", "by hand", source="keyboard")
+        recorder.diagnostics(0.12, "link", "warn", "3 lost", {"lost": 3})
+    assert recorder.problem == "" and recorder.dropped == 0
+    return path
+
+
+def test_rosbags_reads_back_what_the_robot_knew(full):
+    """Odometry, body-frame inertial data, shaft speeds by thruster, raw telemetry and their times."""
+    found = messages(full)
+    time, odometry = found["/finsrov/odom"][0]
+    assert time == 1_700_000_000_030_000_000
+    assert (odometry.header.stamp.sec, odometry.header.stamp.nanosec) == (1_700_000_000, 25_000_000)
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ("map", "base_link")
+    assert odometry.pose.pose.position.z == -0.5 and odometry.twist.twist.angular.z == 0.03
+    assert odometry.pose.covariance[[0, 35]] == pytest.approx([1e-4, 25e-4])
+    _, imu = found["/finsrov/imu"][0]
+    # The IMU is turned by half a turn about z: its x and y point backwards and right.
+    assert (imu.angular_velocity.x, imu.linear_acceleration.y) == pytest.approx((-0.1, 0.25))
+    assert imu.orientation.z == pytest.approx(-1.0)
+    _, shafts = found["/finsrov/joint_states"][0]
+    assert list(shafts.name) == list(VEHICLE.thruster_names)
+    # V_LF is output 2 (300 rpm) with sign -1, H_RF output 5 with sign +1.
+    assert shafts.velocity[[0, 7]] == pytest.approx(np.array([-300.0, 600.0]) * 2 * np.pi / 60)
+    _, raw = found["/finsrov/telemetry"][0]
+    assert list(raw.motor_rpm) == list(RPM) and raw.depth == 0.4 and raw.header.stamp.nanosec == 10_000_000
+    _, status = found["/finsrov/estimator_status"][0]
+    assert (status.mode, status.vision_age) == ("coast", 0.5) and np.isnan(status.imu_age)
+    _, tree = found["/tf"][0]
+    assert tree.transforms[0].child_frame_id == "base_link"
+
+
+def test_rosbags_reads_back_what_the_robot_did(full):
+    """Commands, bridge state, decisions, goal, echo, events, health and pictures."""
+    found = messages(full)
+    _, command = found["/finsrov/thruster_cmd"][0]
+    assert (command.source, list(command.force)) == ("pid", list(range(8)))
+    assert list(command.names) == list(VEHICLE.thruster_names)
+    assert found["/finsrov/wrench_cmd"][0][1].wrench.torque.z == 5.0
+    _, state = found["/finsrov/thruster_state"][0]
+    assert (state.state, state.reason, list(state.force)) == (state.FAULT, "tilt", [1.0] * 8)
+    _, policy = found["/finsrov/policy_info"][0]
+    assert (policy.pilot, policy.task, policy.missed, list(policy.observation)) == ("policy", "t1", 4, [1, 2])
+    _, goal = found["/finsrov/goal"][0]
+    assert goal.pose.orientation.w == pytest.approx(np.cos(np.pi / 4))
+    _, echo = found["/finsrov/command_echo"][0]
+    assert (echo.accepted, echo.reject_flags, list(echo.applied)) == (False, 8, [0.4] * 8)
+    event = json.loads(found["/finsrov/events"][0][1].data)
+    assert (event["kind"], event["text"], event["source"]) == ("arm", "by hand", "keyboard")
+    _, health = found["/finsrov/diagnostics"][0]
+    assert (health.status[0].level, health.status[0].values[0].value) == (1, "3")
+    tags = json.loads(found["/finsrov/camera/tags"][0][1].data)["tags"]
+    assert tags == [{"id": 15, "corners": [[0, 1], [2, 3], [4, 5], [6, 7]]}]
+    _, picture = found["/finsrov/camera/image/compressed"][0]
+    assert picture.format == "jpeg" and bytes(picture.data[:2]) == b"\xff\xd8"
+
+
+def test_the_mcap_library_finds_summary_metadata_and_vehicle_file(full):
+    """An independent reader checks every checksum and decodes each message."""
+    from mcap.reader import make_reader
+
+    decoders = pytest.importorskip("mcap_ros2.decoder").DecoderFactory()
+    with full.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[decoders])
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary.statistics.message_count == 17 == len(list(reader.iter_decoded_messages()))
+        (about,) = [m.metadata for m in reader.iter_metadata()]
+        (kept,) = list(reader.iter_attachments())
+    assert about["vehicle_sha256"] == VEHICLE.sha256
+    assert json.loads(about["configuration"]) == {"rate": 60} and about["seed"] == "3"
+    assert "finssim" in json.loads(about["provenance"])
+    assert kept.data == VEHICLE.path.read_bytes()
+
+
+def test_pictures_are_left_out_on_request(tmp_path):
+    """`pictures="none"` keeps tags and drops images."""
+    with Recorder(tmp_path / "run.mcap", VEHICLE, pictures="none") as recorder:
+        recorder.picture(0.0, Picture(0.0, 1, np.zeros((4, 4), np.uint8)))
+        recorder.picture(0.1, Picture(0.1, 2, tags=(TagCorners(1, np.zeros((4, 2))),)))
+    assert set(messages(tmp_path / "run.mcap")) == {"/finsrov/camera/tags"}
+
+
+def test_an_existing_record_is_never_replaced(tmp_path):
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"mine")
+    with pytest.raises(OutputError, match="never replaced: give a new name"):
+        Recorder(path, VEHICLE)
+    assert path.read_bytes() == b"mine"
+
+
+def test_the_imu_message_agrees_with_the_mount():
+    """Attitude of the body is the IMU's times the inverse of its mount, for a vehicle with any mount."""
+    mount = quat_from_euler(0.3, -0.4, 1.0)
+    imu = VEHICLE.sensors.imu.model_copy(update={"orientation": tuple(mount)})
+    turned = VEHICLE.model_copy(update={"sensors": VEHICLE.sensors.model_copy(update={"imu": imu})})
+    q_world_imu = quat_from_euler(-0.1, 0.2, 0.7)
+    sample = Telemetry(0, 0, tuple(q_world_imu), (0.1, 0.2, 0.3), (1.0, 2.0, 3.0), 0.0, 0.0, 0, None)
+    message = Messages(turned).imu(0, sample)
+    q = [message.orientation.x, message.orientation.y, message.orientation.z, message.orientation.w]
+    R = quat_to_matrix(q_world_imu) @ quat_to_matrix(mount).T
+    assert quat_to_matrix(q) == pytest.approx(R, abs=1e-12)
+    force = message.linear_acceleration
+    assert [force.x, force.y, force.z] == pytest.approx(quat_to_matrix(mount) @ [1.0, 2.0, 3.0])
