@@ -1,0 +1,11 @@
+"""The errors of this layer."""
+
+__all__ = ["MessageError", "Ros2Error"]
+
+
+class Ros2Error(ValueError):
+    """A setting, name or definition of ROS 2 cannot be used; the message is one sentence that says what to do."""
+
+
+class MessageError(AssertionError, Ros2Error):
+    """A value does not fit its field. Real rclpy asserts here, so code written for it may expect an AssertionError."""
