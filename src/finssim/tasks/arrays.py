@@ -6,6 +6,18 @@ from finssim.physics.types import vec6
 
 
 @wp.struct
+class ReferenceTable:
+    """A wanted motion for every world: knots at equal times, between them a cubic with the knots' velocities."""
+
+    position: wp.array2d(dtype=wp.vec3)  # (worlds, knots), world frame [m]
+    velocity: wp.array2d(dtype=wp.vec3)  # there [m/s]
+    spacing: float  # time between two knots [s]
+    duration: wp.array(dtype=float)  # time from progress 0 to 1; held from then on [s]
+    offset: wp.array(dtype=float)  # progress at the start
+    given: wp.array(dtype=int)  # 1: filled from outside; an episode that starts keeps it
+
+
+@wp.struct
 class TaskArrays:
     """Inputs and outputs of a task for every world; vehicle 0 of a world is the one that acts."""
 
@@ -24,6 +36,7 @@ class TaskArrays:
     final_held: wp.array(dtype=float)  # the same when the last episode ended [s]
     goal_position: wp.array(dtype=wp.vec3)  # world frame [m]
     goal_quaternion: wp.array(dtype=wp.quat)  # body to world
+    reference: ReferenceTable  # of tasks that follow one
     position: wp.array2d(dtype=wp.vec3)  # as measured: the truth, or the truth with noise
     quaternion: wp.array2d(dtype=wp.quat)
     velocity: wp.array2d(dtype=vec6)

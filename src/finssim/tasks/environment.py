@@ -115,6 +115,7 @@ class Environment:
         self.worlds, self.device = worlds, self.simulator.device
         size = action_size(action, len(self.simulator.vehicles[0].thrusters))
         self.arrays = task_arrays(worlds, task.observation_size, size, self.device)
+        task.allocate(self.arrays, worlds, self.device)
         self.wrench_scale = np.broadcast_to(np.asarray(wrench_scale, dtype=float), (6,))
         self.noise = noise or MeasurementNoise()
         self.randomization = randomization

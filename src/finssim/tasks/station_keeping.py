@@ -8,6 +8,7 @@ import warp as wp
 
 from finssim.engine.state import State
 from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.episode import action_effort, close_episode, open_episode, report_frozen, uniform3
 from finssim.tasks.task import ObservationPart, Task
 
 DISTANCE_SCALE = 3.0
@@ -119,35 +120,16 @@ def write_observation(arrays: TaskArrays, w: int):
 @wp.func
 def reward_of(arrays: TaskArrays, p: Parameters, w: int, e: float, theta: float, omega: wp.vec3) -> float:
     """Reward of one step; see `Reward`. Keeps the action for the next step's change."""
-    size = arrays.action.shape[1]
-    effort = float(0.0)
-    change = float(0.0)
-    for i in range(size):
-        a = wp.clamp(arrays.action[w, i], -1.0, 1.0)
-        d = a - arrays.previous_action[w, i]
-        effort += a * a
-        change += d * d
-        arrays.previous_action[w, i] = a
-    n = float(size)
+    effort = action_effort(arrays, w)
     return (
         p.position_weight * wp.exp(-e / p.position_scale)
         - p.distance_weight * e
         + p.heading_weight * wp.exp(-theta / p.heading_scale)
         - p.turn_weight * theta
-        - p.action_weight * effort / n
-        - p.change_weight * change / n
+        - p.action_weight * effort[0]
+        - p.change_weight * effort[1]
         - p.rate_weight * wp.min(wp.dot(omega, omega), 4.0)
     )
-
-
-@wp.func
-def close_episode(state: State, arrays: TaskArrays, w: int):
-    """Keep the last observation and the totals of an episode that ends."""
-    for i in range(arrays.observation.shape[1]):
-        arrays.final_observation[w, i] = arrays.observation[w, i]
-    arrays.final_return[w] = arrays.episode_return[w]
-    arrays.final_length[w] = state.steps[w]
-    arrays.final_held[w] = arrays.held[w]
 
 
 @wp.kernel(enable_backward=False)
@@ -155,11 +137,7 @@ def evaluate(state: State, arrays: TaskArrays, p: Parameters, world_offset: int)
     """After a step: reward, ends, success timer and the observation; a frozen world ends and waits for its report."""
     w = world_offset + wp.tid()
     if state.frozen[w] != 0:
-        arrays.reward[w] = 0.0
-        arrays.terminated[w] = 1
-        arrays.truncated[w] = 0
-        arrays.done[w] = 0
-        close_episode(state, arrays, w)
+        report_frozen(state, arrays, w)
         return
     x = state.position[w, 0]
     q = state.quaternion[w, 0]
@@ -185,15 +163,6 @@ def evaluate(state: State, arrays: TaskArrays, p: Parameters, world_offset: int)
     write_observation(arrays, w)
     if done:
         close_episode(state, arrays, w)
-
-
-@wp.func
-def uniform3(rng: wp.uint32, low: wp.vec3, high: wp.vec3) -> wp.vec3:
-    """A point drawn uniformly from a box; the caller passes a stream of its own."""
-    a = wp.randf(rng)
-    b = wp.randf(rng)
-    c = wp.randf(rng)
-    return low + wp.cw_mul(wp.vec3(a, b, c), high - low)
 
 
 @wp.kernel(enable_backward=False)
@@ -223,10 +192,7 @@ def spawn(
     for i in range(3):
         nu[i + 3] = wp.randf(rng, -p.rate, p.rate)
     state.velocity[w, 0] = nu
-    arrays.held[w] = 0.0
-    arrays.episode_return[w] = 0.0
-    for i in range(arrays.action.shape[1]):
-        arrays.previous_action[w, i] = 0.0
+    open_episode(arrays, w)
 
 
 @wp.kernel(enable_backward=False)

@@ -3,6 +3,10 @@
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import warp as wp
+
+from finssim.tasks.arrays import TaskArrays
+
 
 @dataclass(frozen=True)
 class ObservationPart:
@@ -39,6 +43,9 @@ class Task:
     def observation_size(self) -> int:
         """Numbers in the observation."""
         return sum(part.size for part in self.observation)
+
+    def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
+        """Give `arrays` what only this task uses; nothing unless the task says so."""
 
     def parameters(self) -> Any:
         """The struct that the kernels take."""
