@@ -1,0 +1,64 @@
+"""A campaign plays each trial once, keeps what is finished, and returns results in the order of its jobs."""
+
+import json
+
+import pytest
+
+from finssim.experiments.transfer.campaign import run_jobs
+from finssim.experiments.transfer.job import Job
+from reference import played
+
+JOBS = [Job(row="pid", controller="pid", target=target) for target in ("P01", "P02", "P03")]
+
+
+def marks(folder):
+    """Targets that were played, sorted."""
+    return sorted((folder / "played.txt").read_text().split())
+
+
+def test_results_come_in_the_order_of_the_jobs(tmp_path):
+    """Whatever process ended first."""
+    results = run_jobs(JOBS, tmp_path, played.known, processes=2)
+    assert [r["job"]["target"] for r in results] == ["P01", "P02", "P03"]
+    assert [r["success"] for r in results] == [True, False, True]
+
+
+def test_what_is_finished_is_not_played_again(tmp_path):
+    """A second call plays only what is new."""
+    run_jobs(JOBS[:2], tmp_path, played.known, processes=1)
+    told = []
+    run_jobs(JOBS, tmp_path, played.known, processes=1, say=lambda part, what: told.append(part))
+    assert marks(tmp_path) == ["P01", "P02", "P03"]
+    assert told[-1] == 1.0
+
+
+def test_a_trial_that_breaks_loses_no_other(tmp_path):
+    """Its error is raised; the results so far stay, whole."""
+    with pytest.raises(RuntimeError, match="P02 broke"):
+        run_jobs(JOBS, tmp_path, played.failing, processes=1)
+    kept = [json.loads(path.read_text()) for path in tmp_path.glob("*.json")]
+    assert [r["job"]["target"] for r in kept] == ["P01"]
+
+
+def test_a_key_names_everything_that_decides_the_result():
+    """Another noise, camera or plant is another trial; another row of the same trial differs in its name alone."""
+    base = JOBS[0]
+    others = [
+        Job(row="pid", controller="pid", target="P01", **change)
+        for change in (
+            {"plant": 2},
+            {"seed": 2},
+            {"severity": "hard"},
+            {"camera": "corners"},
+            {"fusion": False},
+            {"position_noise": 0.05},
+            {"yaw_noise": 0.1},
+            {"vehicle": "bluerov2"},
+            {"pool_vehicle": "bluerov2"},
+            {"duration": 30.0},
+        )
+    ]
+    assert len({job.key() for job in (base, *others)}) == len(others) + 1
+    assert Job(row="x", controller="pid", target="P01").key().removeprefix("x") == base.key().removeprefix(
+        "pid"
+    )
