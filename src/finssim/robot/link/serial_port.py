@@ -57,7 +57,7 @@ class SerialTransport:
             ) from None
 
     def send(self, data: bytes) -> None:
-        """Write one frame; without a line it is counted and dropped."""
+        """Write one frame; without a line, or on one that is stuck, it is counted and dropped."""
         if not self._ready():
             self.send_errors += 1
             return
@@ -65,7 +65,7 @@ class SerialTransport:
             self._port.write(data)
         except _problems() as problem:
             self.send_errors += 1
-            if not _only_slow(problem):
+            if not (_only_slow(problem) and self._forget_waiting()):
                 self._lose(problem)
 
     def receive(self) -> list[bytes]:
@@ -101,6 +101,14 @@ class SerialTransport:
             self.reconnects += 1
             _LOG.warning("serial %s: is back", self.device)
         return self._port is not None
+
+    def _forget_waiting(self) -> bool:
+        """Drop what has not left yet: by the time that the line moves again those commands are old."""
+        try:
+            self._port.reset_output_buffer()
+        except _problems():
+            return False
+        return True
 
     def _lose(self, problem: BaseException) -> None:
         _LOG.warning("serial %s: lost (%s); trying again every %g s", self.device, problem, self.retry)
