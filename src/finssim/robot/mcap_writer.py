@@ -8,14 +8,12 @@ from collections import Counter, defaultdict
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-__all__ = ["END", "McapWriter", "RawFile"]
+from finssim.mcap_repair import MAGIC
 
-MAGIC = b"\x89MCAP0\r\n"
+__all__ = ["McapWriter", "RawFile"]
+
 MESSAGE = struct.Struct("<BQHIQQ")
 """Kind 5, length of what follows, channel, sequence, log time and publish time [ns]."""
-
-END = struct.pack("<BQI", 0x0F, 4, 0) + struct.pack("<BQQQI", 0x02, 20, 0, 0, 0) + MAGIC
-"""What closes a file without a summary: end of data without a checksum, an empty footer, the magic."""
 
 COMPRESSION = "lz4"
 

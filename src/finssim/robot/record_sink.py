@@ -10,7 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from finssim.files import OutputError, atomic_write, refuse_unwritable
-from finssim.robot.mcap_writer import END, McapWriter
+from finssim.mcap_repair import END
+from finssim.robot.mcap_writer import McapWriter
 
 __all__ = ["RecordSink"]
 

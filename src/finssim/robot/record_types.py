@@ -6,7 +6,15 @@ from functools import cache
 from importlib import resources
 from typing import Any, NamedTuple
 
-__all__ = ["TOPICS", "Topic", "definition", "types"]
+__all__ = ["METADATA", "TOPICS", "RecordError", "Topic", "definition", "types"]
+
+
+class RecordError(ValueError):
+    """A record cannot be read, or not played as asked."""
+
+
+METADATA = "finssim"
+"""Name of the metadata record that says what the record is of."""
 
 
 class Topic(NamedTuple):

@@ -18,14 +18,11 @@ from finssim.robot.messages import CommandEcho, Picture, Telemetry
 from finssim.robot.record_messages import Messages
 from finssim.robot.record_pictures import jpeg
 from finssim.robot.record_sink import RecordSink
-from finssim.robot.record_types import TOPICS, definition
+from finssim.robot.record_types import METADATA, TOPICS, definition
 from finssim.robot.robot import Reading
 from finssim.vehicles import Vehicle
 
-__all__ = ["METADATA", "Recorder"]
-
-METADATA = "finssim"
-"""Name of the metadata record."""
+__all__ = ["Recorder"]
 
 
 class Recorder:

@@ -11,11 +11,11 @@ import numpy as np
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.importers.assemble import in_our_axes
-from finssim.calibration.importers.mcap_repair import whole_mcap
 from finssim.calibration.importers.message_fields import USUAL, number_at, stamp_of, word_at
 from finssim.calibration.importers.source_map import ColumnSource, SourceMap
 from finssim.calibration.importers.streams import Stream
 from finssim.calibration.importers.tables import spoken, values_of
+from finssim.mcap_repair import whole_mcap
 from finssim.vehicles.part import did_you_mean
 
 __all__ = ["BAGS", "bag_files", "read_bag"]

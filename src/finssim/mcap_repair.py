@@ -5,16 +5,20 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import BinaryIO
 
-__all__ = ["whole_mcap"]
+__all__ = ["END", "MAGIC", "whole_mcap"]
 
 MAGIC = b"\x89MCAP0\r\n"
 DATA_END, FOOTER, CHUNK = 0x0F, 0x02, 0x06
 """Kinds of records (MCAP specification)."""
 
-_END = struct.pack("<BQI", DATA_END, 4, 0) + struct.pack("<BQQQI", FOOTER, 20, 0, 0, 0) + MAGIC
+COPIED_AT_ONCE = 1 << 20
+
+END = struct.pack("<BQI", DATA_END, 4, 0) + struct.pack("<BQQQI", FOOTER, 20, 0, 0, 0) + MAGIC
 """What closes a file without a summary: end of data without a checksum, an empty footer, the magic."""
 
 
@@ -31,9 +35,11 @@ def whole_mcap(path: Path, notes: list[str]) -> Iterator[Path]:
         return
     with TemporaryDirectory() as folder:
         copy = Path(folder) / path.name
-        data = path.read_bytes()
-        end = _last_whole_record(data, len(MAGIC))
-        copy.write_bytes(data[:end] + _of_cut_chunk(data[end:]) + _END)
+        with path.open("rb") as source, copy.open("wb") as target:
+            end = _last_whole_record(source, len(MAGIC))
+            source.seek(0)
+            _copy(source, target, end)
+            target.write(_of_cut_chunk(source.read()) + END)
         notes.append(f"{path.name} is cut off and was read up to the cut")
         yield copy
 
@@ -46,14 +52,23 @@ def _ends_well(path: Path) -> bool:
         return file.tell() > 0 and file.read() == MAGIC
 
 
-def _last_whole_record(data: bytes, at: int) -> int:
+def _last_whole_record(file: BinaryIO, at: int) -> int:
     """Where the last whole data record ends, from a place where one begins."""
-    while at + 9 <= len(data):
-        kind, length = struct.unpack_from("<BQ", data, at)
-        if kind in (DATA_END, FOOTER, 0) or at + 9 + length > len(data):
+    size = file.seek(0, 2)
+    while at + 9 <= size:
+        file.seek(at)
+        kind, length = struct.unpack("<BQ", file.read(9))
+        if kind in (DATA_END, FOOTER, 0) or at + 9 + length > size:
             break
         at += 9 + length
     return at
+
+
+def _copy(source: BinaryIO, target: BinaryIO, count: int) -> None:
+    """The next bytes of one file at the end of another."""
+    while count > 0 and (part := source.read(min(count, COPIED_AT_ONCE))):
+        target.write(part)
+        count -= len(part)
 
 
 def _of_cut_chunk(data: bytes) -> bytes:
@@ -65,7 +80,7 @@ def _of_cut_chunk(data: bytes) -> bytes:
     compression = data[41 : 41 + length].decode("ascii", errors="replace")
     packed = data[41 + length + 8 :]
     records = _unpacked(compression, packed)
-    return records[: _last_whole_record(records, 0)]
+    return records[: _last_whole_record(BytesIO(records), 0)]
 
 
 def _unpacked(compression: str, packed: bytes) -> bytes:

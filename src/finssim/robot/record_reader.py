@@ -1,0 +1,126 @@
+"""Records read back, finished or cut: what they are about, and their messages in time order."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+from finssim.mcap_repair import whole_mcap
+from finssim.robot.record_repair import refuse_foreign, write_whole
+from finssim.robot.record_types import METADATA, RecordError, types
+
+__all__ = ["Entry", "Record", "open_record"]
+
+
+class Entry(NamedTuple):
+    """One message of a record."""
+
+    time: float
+    """When it was recorded, robot's clock [s]."""
+    topic: str
+    kind: str
+    """Its type, such as `sensor_msgs/msg/Imu`."""
+    message: Any
+    """With the type's fields."""
+
+
+class Record:
+    """An open record; see `open_record`."""
+
+    def __init__(self, path: Path, reader: Any, notes: tuple[str, ...]) -> None:
+        summary = reader.get_summary()
+        self._reader = reader
+        self.path = path
+        self.notes = notes
+        """What was found damaged, one sentence each."""
+        self.metadata: dict[str, str] = next(
+            (m.metadata for m in reader.iter_metadata() if m.name == METADATA), {}
+        )
+        """What the recorder was told; empty of a file that FinsSim did not write."""
+        self.files: dict[str, str] = {
+            a.name: a.data.decode("utf-8", errors="replace") for a in reader.iter_attachments()
+        }
+        """Name -> text of the files kept in it."""
+        self.topics: dict[str, str] = {
+            c.topic: summary.schemas[c.schema_id].name for c in summary.channels.values()
+        }
+        """Topic -> type."""
+        self._epoch = round(float(self.metadata.get("epoch", 0.0)) * 1e9)
+
+    @property
+    def cut(self) -> bool:
+        """Whether it has no proper end, as after a crash or while it is being written."""
+        return bool(self.notes)
+
+    def topic(self, name: str) -> str:
+        """The topic that ends in `/name`, such as `odom`; the name itself if there is none."""
+        return next((topic for topic in sorted(self.topics) if topic.endswith(f"/{name}")), name)
+
+    def sizes(self) -> Iterator[tuple[float, str, int]]:
+        """Time [s], topic and size [bytes] of each message, none of them decoded."""
+        for _, channel, message in self._reader.iter_messages():
+            yield self._seconds(message.log_time), channel.topic, len(message.data)
+
+    def messages(self, topics: Collection[str] | None = None, start: float | None = None) -> Iterator[Entry]:
+        """Messages in time order.
+
+        Args:
+            topics: Names, or their last parts, such as `odom`; all topics if None.
+            start: Earlier ones are passed over [s].
+
+        Raises:
+            RecordError: There is no such topic, or one of a type that cannot be decoded.
+        """
+        wanted = None if topics is None else [self._known(self.topic(topic)) for topic in topics]
+        for schema, channel, message in self._reader.iter_messages(topics=wanted):
+            time = self._seconds(message.log_time)
+            if start is not None and time < start:
+                continue
+            if schema.name not in types().types:
+                raise RecordError(
+                    f"{self.path}: {channel.topic} is of the unknown type {schema.name}: leave it out"
+                )
+            yield Entry(time, channel.topic, schema.name, types().deserialize_cdr(message.data, schema.name))
+
+    def _known(self, topic: str) -> str:
+        if topic not in self.topics:
+            raise RecordError(f"{self.path}: no topic '{topic}'; it has {', '.join(sorted(self.topics))}")
+        return topic
+
+    def _seconds(self, ns: int) -> float:
+        return (ns - self._epoch) * 1e-9
+
+
+@contextmanager
+def open_record(path: Path | str) -> Iterator[Record]:
+    """Open a record; one that was cut is read up to the cut.
+
+    Raises:
+        RecordError: Not an MCAP file, or one without messages.
+    """
+    from mcap.reader import make_reader
+
+    path = Path(path)
+    refuse_foreign(path)
+    notes: list[str] = []
+    with ExitStack() as stack:
+        whole = stack.enter_context(whole_mcap(path, notes))
+        file = stack.enter_context(whole.open("rb"))
+        if not _indexed(file):
+            copy = Path(stack.enter_context(TemporaryDirectory())) / path.name
+            write_whole(whole, copy, notes)
+            file = stack.enter_context(copy.open("rb"))
+        yield Record(path, make_reader(file), tuple(notes))
+
+
+def _indexed(file: Any) -> bool:
+    """Whether the file has a summary that can be read."""
+    from mcap.reader import make_reader
+
+    try:
+        return make_reader(file).get_summary() is not None
+    except Exception:  # a damaged summary breaks in whatever layer reads it; the data are read without it
+        return False

@@ -1,0 +1,102 @@
+"""Records are read whether finished, cut or damaged, and repaired into files that every reader takes."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mcap")
+pytest.importorskip("rosbags")
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from finssim.robot.messages import Telemetry
+from finssim.robot.record_reader import open_record
+from finssim.robot.record_repair import repair_record
+from finssim.robot.record_types import RecordError
+from finssim.robot.recorder import Recorder
+from finssim.vehicles import load_vehicle
+
+VEHICLE = load_vehicle("finsrov")
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Four seconds of telemetry on a clock that begins in 2023, in eight chunks or more."""
+    path = tmp_path_factory.mktemp("record") / "run.mcap"
+    with Recorder(path, VEHICLE, {"seed": 5}, epoch=1.7e9) as recorder:
+        for i in range(400):
+            rpm = tuple(np.random.default_rng(i).normal(0.0, 100.0, 8))
+            recorder.telemetry(
+                10.0 + 0.01 * i, Telemetry(i, 10 * i, LEVEL, LEVEL[:3], LEVEL[:3], 0.01 * i, 0.0, 0, rpm)
+            )
+    return path
+
+
+def depths(path):
+    with open_record(path) as record:
+        return [entry.message.depth for entry in record.messages(["telemetry"])]
+
+
+def test_times_are_of_the_robots_clock(run):
+    """The epoch is taken off again; `start` passes over what is earlier."""
+    with open_record(run) as record:
+        times = [entry.time for entry in record.messages(["telemetry"])]
+        later = [entry.time for entry in record.messages(["/finsrov/telemetry"], start=13.0)]
+        assert not record.cut and record.topics["/finsrov/telemetry"] == "finssim_msgs/msg/HardwareTelemetry"
+        assert record.files["finsrov.yaml"] == VEHICLE.path.read_text(encoding="utf-8")
+    assert times == pytest.approx(10.0 + 0.01 * np.arange(400), abs=1e-6)
+    assert len(later) == 100
+
+
+def test_an_unknown_topic_is_refused_with_those_there_are(run):
+    with open_record(run) as record, pytest.raises(RecordError, match="no topic 'odom'; it has .*/imu"):
+        list(record.messages(["odom"]))
+
+
+@pytest.mark.parametrize("part", [0.2, 0.35, 0.6, 0.95, 0.999])
+def test_a_cut_anywhere_leaves_what_is_before_it(run, tmp_path, part):
+    """Of a file cut to a part of its length, the messages that are left are its first ones, unchanged."""
+    cut = tmp_path / "cut.mcap"
+    whole = run.read_bytes()
+    cut.write_bytes(whole[: int(part * len(whole))])
+    found, all_of_it = depths(cut), depths(run)
+    assert found == all_of_it[: len(found)]
+    assert len(found) >= (part - 0.3) * len(all_of_it)
+    with open_record(cut) as record:
+        assert record.cut and record.metadata["seed"] == "5"
+
+
+def test_a_repaired_record_is_whole(run, tmp_path):
+    """It has a summary, opens in rosbags, and holds the metadata and files; the cut one stays as it was."""
+    cut, mended = tmp_path / "cut.mcap", tmp_path / "mended.mcap"
+    cut.write_bytes(run.read_bytes()[:-3000])
+    before = cut.read_bytes()
+    (note,) = repair_record(cut, mended)
+    assert "cut off" in note and cut.read_bytes() == before
+    with open_record(mended) as record:
+        assert not record.cut and record.metadata["seed"] == "5" and "finsrov.yaml" in record.files
+    assert depths(mended) == depths(cut)
+    with AnyReader([mended]) as reader:
+        assert reader.message_count == sum(1 for _ in reader.messages())
+    assert repair_record(mended, tmp_path / "again.mcap") == []
+
+
+def test_a_flipped_bit_is_noticed(run, tmp_path):
+    """A chunk whose checksum is wrong ends what is read, and a sentence says so."""
+    damaged, mended = tmp_path / "damaged.mcap", tmp_path / "mended.mcap"
+    data = bytearray(run.read_bytes())
+    with run.open("rb") as file:
+        chunk = make_reader(file).get_summary().chunk_indexes[4]
+    data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0x10
+    damaged.write_bytes(data)
+    (note,) = repair_record(damaged, mended)
+    assert "damaged and was read up to there" in note
+    assert 0 < len(depths(mended)) < 400
+
+
+@pytest.mark.parametrize("data", [b"", b"\x89MCA", b"t,x\n0,1\n"])
+def test_other_files_are_refused(tmp_path, data):
+    path = tmp_path / "log.mcap"
+    path.write_bytes(data)
+    with pytest.raises(RecordError, match="is no MCAP file"), open_record(path):
+        pass
