@@ -1,0 +1,115 @@
+"""Pictures of a vehicle under water, drawn by the overhead camera's renderer."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.geometry.rotations import quat_multiply, quat_rotate
+from finssim.localization.detection.families import bitmap, family_named
+from finssim.localization.pool import Pool
+from finssim.pool.plant_spec import Basin
+from finssim.robot.messages import Picture
+from finssim.sensors import overhead_camera as oc
+from finssim.vehicles.equipment import Mount, Tags
+
+__all__ = ["PictureCamera"]
+
+Array = npt.NDArray[np.float64]
+
+MARGIN = 0.15
+"""White around a tag, part of its edge."""
+UNDER_TAGS = 0.004
+"""Of the hull's top below the lowest tag [m]."""
+RAYS = 2
+"""A pixel's rays along each axis, near tags."""
+FREEBOARD = 0.1
+"""Of the pool's edge above the water [m]."""
+
+
+class PictureCamera:
+    """Draws what moves anew in every picture, and the pool around it once."""
+
+    def __init__(
+        self,
+        tags: Tags,
+        site: Pool,
+        ripples: oc.Ripples | None,
+        *,
+        size: Array,
+        basin: Basin,
+        exposure: float,
+        seed: int,
+    ) -> None:
+        """
+        Args:
+            tags: Where they truly sit.
+            site: Camera and water as they are; the pool's floor is at z = 0 under its middle.
+            ripples: Of the water; None for flat.
+            size: Of the hull's box [m], (3,).
+            basin: Of the pool.
+            exposure: [s]
+            seed: Of the noise.
+        """
+        self._tags, self._seed = tags, seed
+        self._bitmaps = {tag: bitmap(tags.family, tag).astype(bool) for tag in tags.mounts}
+        top = min(float(m.position[2]) for m in tags.mounts.values()) - UNDER_TAGS
+        height = max(min(float(size[2]), 0.5 * float(size[2]) + top), 0.02)
+        self._hull_size = (float(size[0]), float(size[1]), height)
+        self._hull_middle = np.array([0.0, 0.0, top - 0.5 * height])
+        reach = (0.5 * basin.length, 0.5 * basin.width)
+        surface = float(site.interface.height(0.0, 0.0))
+        scene = oc.Scene(
+            camera=site.camera,
+            interface=site.interface,
+            basin=oc.Basin(
+                lower=(-reach[0], -reach[1], surface - basin.depth),
+                upper=(reach[0], reach[1], surface + FREEBOARD),
+            ),
+            ripples=ripples,
+            sensor=oc.Sensor(shutter=exposure),
+            samples=RAYS,
+        )
+        self._camera = oc.OverheadCamera(scene)
+
+    def picture(
+        self, start: tuple[Array, Array], end: tuple[Array, Array], middle: float, sequence: int
+    ) -> Picture:
+        """Expose; arguments as of `CornerCamera.picture`."""
+        image = self._camera.render(
+            tags=[self._tag(tag, mount, start, end) for tag, mount in self._tags.mounts.items()],
+            bodies=[self._hull(start, end)],
+            time=middle,
+            seed=(self._seed * 1_000_003 + sequence) % 2**31,
+            region="tags",
+        )
+        return Picture(middle, sequence, image=image)
+
+    def _tag(
+        self, tag: int, mount: Mount, start: tuple[Array, Array], end: tuple[Array, Array]
+    ) -> oc.TagInScene:
+        family = family_named(self._tags.family)
+        return oc.TagInScene(
+            bitmap=self._bitmaps[tag],
+            edge=self._tags.edge,
+            border_cells=family.border,
+            margin=MARGIN * self._tags.edge,
+            pose=_placed(start, mount.position, mount.orientation),
+            end=_placed(end, mount.position, mount.orientation),
+        )
+
+    def _hull(self, start: tuple[Array, Array], end: tuple[Array, Array]) -> oc.Body:
+        upright = (0.0, 0.0, 0.0, 1.0)
+        return oc.Body(
+            size=self._hull_size,
+            pose=_placed(start, self._hull_middle, upright),
+            end=_placed(end, self._hull_middle, upright),
+        )
+
+
+def _placed(body: tuple[Array, Array], position: npt.ArrayLike, orientation: npt.ArrayLike) -> oc.Pose:
+    """Pose of a thing fixed to the body, pool frame."""
+    x, y, z = (body[0] + quat_rotate(body[1], np.asarray(position))).tolist()
+    q = np.asarray(quat_multiply(body[1], orientation))
+    a, b, c, d = (q / np.linalg.norm(q)).tolist()
+    return oc.Pose(position=(x, y, z), orientation=(a, b, c, d))

@@ -1,0 +1,109 @@
+"""What a detector that lays the whole known tag over the picture makes of it when ripples bend the tag's image.
+
+The fit of `localization.detection` moves a homography until the edges of all cells agree with the picture, so its
+corners are those of the tag as ripples shift it on average, not of the bent image. For small bends that is linear:
+the corners follow from a few points of the tag by a matrix that the tag's cells alone decide.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.localization.detection.families import bitmap, family_named
+
+__all__ = ["CornerFit"]
+
+Array = npt.NDArray[np.float64]
+
+NODES = 6
+"""Along each side of the tag: a polynomial of degree 5 follows ripples as long as the tag's edge."""
+SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+
+
+class CornerFit:
+    """One tag: where to look at it, and which corners the fit reports."""
+
+    def __init__(self, family: str, tag: int, edge: float) -> None:
+        """
+        Args:
+            family: Name of the tag's family.
+            tag: Its id.
+            edge: Of the black border [m].
+        """
+        along = 0.5 - 0.5 * np.cos(np.pi * np.arange(NODES) / (NODES - 1))  # Chebyshev's, the ends included
+        self._square = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
+        self._at_corner = [0, NODES - 1, NODES * NODES - 1, NODES * (NODES - 1)]
+        self.nodes = np.zeros((NODES * NODES, 3))
+        """Points of the tag whose pixels `corners` wants, tag frame [m], (N, 3)."""
+        self.nodes[:, 0] = edge * (self._square[:, 0] - 0.5)
+        self.nodes[:, 1] = edge * (0.5 - self._square[:, 1])
+        points, across = _cell_edges(family, tag)
+        there = np.kron(np.ones(1), _interpolation(along, points))
+        rows = np.where(across[:, None], _warp_columns(points)[:, 0], _warp_columns(points)[:, 1])
+        u = np.where(across[:, None], there, 0.0)
+        v = np.where(across[:, None], 0.0, there)
+        self._warp = np.linalg.pinv(rows) @ np.concatenate([u, v], axis=1)
+        self._bend = np.eye(2 * len(self.nodes)) - _stacked(self._square) @ self._warp
+
+    def corners(self, pixels: Array) -> tuple[Array, float]:
+        """Corners that the fit reports, and how far ripples bend the tag.
+
+        Args:
+            pixels: Of `nodes`, (N, 2).
+
+        Returns:
+            Corners (4, 2) [px], and the rms distance of the nodes from where the fit has them, in edges of the tag.
+        """
+        H = _from_square(pixels[self._at_corner])
+        seen = np.append(pixels, np.ones((len(pixels), 1)), axis=1) @ np.linalg.inv(H).T
+        moved = (seen[:, :2] / seen[:, 2:] - self._square).T.ravel()
+        h = self._warp @ moved
+        left = self._bend @ moved
+        change = np.eye(3) + np.append(h, 0.0).reshape(3, 3)
+        image = np.append(SQUARE, np.ones((4, 1)), axis=1) @ (H @ change).T
+        return image[:, :2] / image[:, 2:], float(np.sqrt(2.0 * np.mean(left * left)))
+
+
+def _cell_edges(family: str, tag: int) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """Middles of all edges between a black and a white cell, unit square of the border with y down, (E, 2), and
+    whether each is upright, so that the fit feels motion along x there, (E,)."""
+    kind = family_named(family)
+    cells = np.pad(bitmap(family, tag).astype(bool), 1, constant_values=True)
+    upright = np.argwhere(cells[:, 1:] != cells[:, :-1])[:, ::-1] + np.array([0.0, -0.5])
+    level = np.argwhere(cells[1:] != cells[:-1])[:, ::-1] + np.array([-0.5, 0.0])
+    points = (np.concatenate([upright, level]) - kind.outside) / kind.border
+    return points, np.arange(len(points)) < len(upright)
+
+
+def _warp_columns(points: Array) -> Array:
+    """d(x, y)/d(h) of the homography I + [[h0, h1, h2], [h3, h4, h5], [h6, h7, 0]] at points, (E, 2, 8)."""
+    x, y = points.T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    return np.stack(
+        [
+            np.stack([x, y, one, zero, zero, zero, -x * x, -x * y], axis=-1),
+            np.stack([zero, zero, zero, x, y, one, -x * y, -y * y], axis=-1),
+        ],
+        axis=1,
+    )
+
+
+def _stacked(points: Array) -> Array:
+    """`_warp_columns` with all x before all y, (2 E, 8)."""
+    columns = _warp_columns(points)
+    return np.concatenate([columns[:, 0], columns[:, 1]])
+
+
+def _interpolation(along: Array, points: Array) -> Array:
+    """Weights of the nodes of a square grid in the polynomial through them, at points, (E, N)."""
+    one = np.vander(along, len(along))
+    by_x, by_y = (np.vander(x, len(along)) @ np.linalg.inv(one) for x in points.T)
+    return np.asarray((by_y[:, :, None] * by_x[:, None, :]).reshape(len(points), -1))
+
+
+def _from_square(corners: Array) -> Array:
+    """The homography that takes the unit square, x right and y down, to four corners, (3, 3)."""
+    a, b, c, d = corners
+    pull = np.linalg.solve(np.column_stack([b - c, d - c]), a - b + c - d)
+    return np.vstack([np.column_stack([b - a + pull[0] * b, d - a + pull[1] * d, a]), [*pull, 1.0]])

@@ -1,0 +1,178 @@
+"""The overhead camera of a virtual pool as it truly hangs, as its calibration has it, and how good its pictures are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.geometry.optics import Camera, Interface, Lens
+from finssim.geometry.rotations import quat_from_rotvec, quat_multiply
+from finssim.localization.pool import Pool
+from finssim.pool.plant_spec import Basin, PlantSpecError, Severity
+from finssim.vehicles import Vehicle
+from finssim.vehicles.equipment import Mount
+
+__all__ = ["CameraSettings", "camera_of", "paper_lens", "true_site"]
+
+Array = npt.NDArray[np.float64]
+
+HEIGHT = 1.4
+"""Of the camera above the water, for a pool of 4 m x 2 m [m]. The paper's hung at 1.21 m, from where its lens does not
+see the ends of the pool; from here everything in a 4 m x 2 m pool is seen from 0.5 m down, and tags of a vehicle that
+keeps its middle 0.2 m off the walls from 0.2 m down."""
+PAPER_POOL = 4.0, 2.0
+"""[m]"""
+LATENCY = 0.045
+"""From the middle of the exposure to the robot's computer, on average [s]: readout, compression, USB."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraSettings:
+    """How the camera takes its pictures, and what is on the vehicle that it looks at."""
+
+    rate: float = 30.0
+    """Pictures a second [Hz]."""
+    exposure: float = 0.006
+    """[s]"""
+    latency: float = LATENCY
+    """True mean time from the middle of the exposure to arrival [s]."""
+    jitter: float = 0.0
+    """Standard deviation of the latency from picture to picture [s]."""
+    dropout: float = 0.0
+    """Chance that a picture is lost."""
+    ripples: float = 0.0
+    """Root mean square of the water's slope."""
+    pixel_noise: float = 0.05
+    """Of corners that are made without a picture, per axis [px]; rendered pictures have the noise of their pixels."""
+    mounts: Mapping[int, Mount] = field(default_factory=dict)
+    """Where tags truly sit, by id; those not named as the vehicle file has them."""
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """Standard deviations of what a calibration does not know, and the pictures' faults."""
+
+    position: float = 0.0  # of the camera, per axis [m]
+    tilt: float = 0.0  # about each axis [rad]
+    focal: float = 0.0  # relative
+    water: float = 0.0  # height [m]
+    latency: float = 0.0  # [s]
+    mount_position: float = 0.0  # per axis [m]
+    mount_turn: float = 0.0  # per axis [rad]
+    jitter: float = 0.0  # [s]
+    dropout: float = 0.0
+    ripples: float = 0.0
+
+
+ERRORS: Mapping[str, _Errors] = {
+    "nominal": _Errors(),
+    "realistic": _Errors(
+        position=0.002,
+        tilt=math.radians(0.1),
+        focal=0.001,
+        water=0.002,
+        latency=0.003,
+        mount_position=0.001,
+        mount_turn=math.radians(0.2),
+        jitter=0.002,
+        dropout=0.005,
+        ripples=0.01,
+    ),
+    "hard": _Errors(
+        position=0.004,
+        tilt=math.radians(0.2),
+        focal=0.002,
+        water=0.004,
+        latency=0.006,
+        mount_position=0.002,
+        mount_turn=math.radians(0.4),
+        jitter=0.005,
+        dropout=0.02,
+        ripples=0.03,
+    ),
+}
+"""Severity -> errors."""
+
+
+def paper_lens() -> Lens:
+    """The lens of the published pool: 1280 x 720 pixels, 100° across."""
+    distortion = (0.02944176, -0.05975546, 0.00088098, 0.00179148, 0.01256862)
+    return Lens(1280, 720, 540.9305, 540.9305, 682.2341, 348.6136, "plumb_bob", distortion)
+
+
+def true_site(basin: Basin | None = None) -> Pool:
+    """The camera above the middle of a pool. Pool frame: x and y as the world's, z = 0 on the floor.
+
+    Args:
+        basin: 4 m x 2 m, 1 m deep if not given; the camera hangs higher over a larger one.
+    """
+    basin = basin or Basin()
+    lens = paper_lens()
+    height = HEIGHT * max(basin.length / PAPER_POOL[0], basin.width / PAPER_POOL[1])
+    # So far beside the middle that the middle of the picture, not the lens's axis, looks at the middle of the pool.
+    x = height * (lens.cx - 0.5 * (lens.width - 1)) / lens.fx
+    y = -height * (lens.cy - 0.5 * (lens.height - 1)) / lens.fy
+    camera = Camera(lens, np.array([x, y, basin.depth + height]), np.array([1.0, 0.0, 0.0, 0.0]))
+    return Pool(camera, Interface.water(basin.depth), LATENCY)
+
+
+def camera_of(
+    vehicle: Vehicle, seed: int, severity: Severity = "realistic", *, basin: Basin | None = None
+) -> tuple[Pool, Pool, CameraSettings]:
+    """Draw the camera of a plant.
+
+    Args:
+        vehicle: Has tags.
+        seed: Of all errors; equal seeds give equal cameras.
+        severity: How large they are: nominal has none.
+        basin: Of the plant.
+
+    Returns:
+        The pool as it is, the pool as its calibration has it, and the settings for `PoolCamera`.
+
+    Raises:
+        PlantSpecError: The vehicle has no tags, or there is no such severity.
+    """
+    if severity not in ERRORS:
+        raise PlantSpecError(f"unknown severity '{severity}'; available: {', '.join(ERRORS)}")
+    if vehicle.tags is None:
+        raise PlantSpecError(f"vehicle {vehicle.name} has no tags: a camera cannot find it, run without one")
+    errors, random = ERRORS[severity], np.random.default_rng([seed, 0x517E])
+    true = true_site(basin)
+    late = float(random.normal(0.0, errors.latency))
+    settings = CameraSettings(
+        latency=max(LATENCY + late, 0.01),
+        jitter=errors.jitter,
+        dropout=errors.dropout,
+        ripples=errors.ripples,
+        mounts={tag: _moved(mount, errors, random) for tag, mount in vehicle.tags.mounts.items()},
+    )
+    return replace(true, latency=settings.latency), _calibrated(true, errors, random, severity), settings
+
+
+def _calibrated(true: Pool, errors: _Errors, random: np.random.Generator, severity: str) -> Pool:
+    """What a survey with these errors finds of a camera."""
+    lens, focal = true.camera.lens, 1.0 + errors.focal * random.normal(0.0, 1.0)
+    lens = replace(lens, fx=lens.fx * focal, fy=lens.fy * focal)
+    turn = quat_from_rotvec(random.normal(0.0, errors.tilt, 3))
+    camera = Camera(
+        lens,
+        true.camera.position + random.normal(0.0, errors.position, 3),
+        np.asarray(quat_multiply(turn, true.camera.orientation)),
+    )
+    height = float(true.interface.height(0.0, 0.0)) + random.normal(0.0, errors.water)
+    return Pool(
+        camera, Interface.water(height), true.latency, record={"made_by": f"virtual pool, {severity}"}
+    )
+
+
+def _moved(mount: Mount, errors: _Errors, random: np.random.Generator) -> Mount:
+    turn = quat_from_rotvec(random.normal(0.0, errors.mount_turn, 3))
+    return Mount(
+        position=np.asarray(mount.position) + random.normal(0.0, errors.mount_position, 3),
+        orientation=np.asarray(quat_multiply(turn, mount.orientation)),
+    )
