@@ -1,13 +1,13 @@
 """From thrusts to what a motor controller is told: curve, order, sign, and small thrusts as pulses.
 
-A motor does not turn below a slowest speed, so the thrust of that speed is the least one that can be held. Anything smaller is
-delivered on average: the motor runs at its slowest speed in pulses, started and ended by what is owed.
+A motor does not turn below a slowest speed, so the thrust of that speed is the least one that can be held. Anything
+smaller is delivered on average: the motor runs at its slowest speed in pulses, begun and ended by what is owed.
 
     owed_dot = T(ω_ideal) - T(ω),      pulse begins at owed = +h, ends at owed = -h,      h = T_slow t_pulse / 2
 
-ω follows what is commanded and ω_ideal what was asked for, both through the same first-order lag, so the lag itself owes
-nothing. A constant request f < T_slow becomes pulses of at least t_pulse with gaps of at least t_pulse and a period of about
-t_pulse T_slow² / (f (T_slow - f)); the impulse is never more than a pulse away from what was asked.
+ω follows what is commanded and ω_ideal what was asked for, both through the same first-order lag, so the lag itself
+owes nothing. A constant request f < T_slow becomes pulses and gaps of at least t_pulse each, with a period
+of about t_pulse T_slow² / (f (T_slow - f)); the impulse is never more than about one pulse away from what was asked.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Array = npt.NDArray[np.float64]
 
 RPM = 2.0 * math.pi / 60.0
 """One rpm in rad/s."""
-SLOWEST_MARGIN = 1.05
+SLOWEST_MARGIN = 1.1
 """Speed of a pulse over the slowest speed in the vehicle file: right at its edge a motor might stand still."""
 SHORTEST_PULSE = 0.05
 """[s]; three periods of a loop at 60 Hz, for motors faster than that."""
@@ -77,7 +77,8 @@ class MotorMap:
         self._c = _sides([t.c_minus for t in thrusters], [t.c_plus for t in thrusters])
         self._lag: Array = np.array([t.time_constant for t in thrusters])
         rpm = _sides([t.rpm_min for t in thrusters], [t.rpm_max for t in thrusters])
-        reach = self._c * (np.minimum(np.abs(rpm), full_scale) * RPM) ** 2
+        # Short of full scale by rounding, so that no command comes out as 1.0000000000000002.
+        reach = self._c * (np.minimum(np.abs(rpm), full_scale) * RPM) ** 2 * (1.0 - 1e-12)
         self.lower: Array = -np.minimum([-t.force_min for t in thrusters], reach[0])
         self.upper: Array = np.minimum([t.force_max for t in thrusters], reach[1])
         dead = _sides([t.dead_rpm_minus for t in thrusters], [t.dead_rpm_plus for t in thrusters])
