@@ -13,6 +13,8 @@ from finssim.control.errors import ControlError
 from finssim.control.guidance import Guide
 from finssim.control.observe_t1 import SCHEMA as SCHEMA_T1
 from finssim.control.observe_t1 import observe_t1
+from finssim.control.observe_t2 import SCHEMA as SCHEMA_T2
+from finssim.control.observe_t2 import observe_t2
 from finssim.control.policy_description import ObservationSchema
 from finssim.control.tracking import Measured
 
@@ -35,7 +37,10 @@ class Observer:
         return {"name": task, "observation": self.schema.model_dump(mode="json")}
 
 
-OBSERVERS: dict[str, Observer] = {"t1": Observer(SCHEMA_T1, observe_t1)}
+OBSERVERS: dict[str, Observer] = {
+    "t1": Observer(SCHEMA_T1, observe_t1),
+    "t2": Observer(SCHEMA_T2, observe_t2),
+}
 """Task -> its observer."""
 
 

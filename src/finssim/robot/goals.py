@@ -1,0 +1,89 @@
+"""What a person asks a vehicle to do, as text, a file or a name: a station to keep or a trajectory to follow."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from finssim.control.guidance import Guide, Station
+from finssim.vehicles import Vehicle
+
+__all__ = ["GoalError", "check_reachable", "guide_of", "station_of"]
+
+
+class GoalError(ValueError):
+    """A goal that cannot be read or that the vehicle may not go to."""
+
+
+def station_of(text: str) -> Station:
+    """A station from "x,y,z,yaw_deg" (world frame [m], left positive [deg]) or from a file (.yaml) with such a `goal`.
+
+    Raises:
+        GoalError: Neither four finite numbers nor a file that holds them.
+    """
+    if text.endswith((".yaml", ".yml")):
+        return _numbers(text, _goal_in(Path(text)))
+    return _numbers(f"goal '{text}'", text.split(","))
+
+
+def guide_of(goal: str | None, trajectory: str | None) -> Guide:
+    """The wanted motion of a command line: one of the two.
+
+    Raises:
+        GoalError: Both, none, or a goal that cannot be read.
+        ControlError: A trajectory that cannot be.
+    """
+    if (goal is None) == (trajectory is None):
+        raise GoalError(
+            "give either a goal x,y,z,yaw_deg or a trajectory, not " + ("both" if goal else "neither")
+        )
+    if goal is not None:
+        return station_of(goal)
+    from finssim.control.trajectories import load_trajectory
+
+    return load_trajectory(str(trajectory))
+
+
+def check_reachable(guide: Guide, vehicle: Vehicle) -> None:
+    """Refuse a motion that leaves the box in which the vehicle file lets the vehicle move.
+
+    Raises:
+        GoalError: It does; says where.
+    """
+    end = guide.duration if math.isfinite(guide.duration) else 0.0
+    places = guide.at(np.linspace(0.0, end, 401)).position
+    lower, upper = vehicle.safety.workspace_lower, vehicle.safety.workspace_upper
+    outside = np.any((places < lower) | (places > upper), axis=1)
+    if outside.any():
+        place = np.round(places[outside][0], 3).tolist()
+        raise GoalError(
+            f"{guide.name} leads to {place}, outside the workspace {lower.tolist()} to {upper.tolist()} of "
+            f"{vehicle.name} (world frame, z = 0 on the water): choose another, or change safety in the vehicle file"
+        )
+
+
+def _goal_in(path: Path) -> list[object]:
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise GoalError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
+    goal = data.get("goal") if isinstance(data, dict) else None
+    if not isinstance(goal, list):
+        raise GoalError(f"{path}: no goal in it: write goal: [x, y, z, yaw_deg]")
+    return goal
+
+
+def _numbers(where: str, values: list[object] | list[str]) -> Station:
+    try:
+        x, y, z, yaw_deg = (float(str(v)) for v in values)
+    except ValueError:
+        x = y = z = yaw_deg = math.nan
+    if not all(map(math.isfinite, (x, y, z, yaw_deg))):
+        raise GoalError(
+            f"{where}: expected four numbers x,y,z,yaw_deg: metres in the world frame (z = 0 on the water, negative "
+            "below) and degrees"
+        )
+    return Station((x, y, z), math.radians(yaw_deg))

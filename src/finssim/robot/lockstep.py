@@ -1,0 +1,132 @@
+"""Lock-step: the robot's software and a world take turns, so that time goes as fast as both can compute."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from finssim.robot.lockstep_codec import (
+    LockstepError,
+    decode_delivery,
+    encode_request,
+    receive,
+)
+from finssim.robot.messages import Delivery
+from finssim.robot.runtime import Runtime
+
+__all__ = ["DEFAULT_PORT", "Exchange", "LockstepClient", "run_lockstep"]
+
+DEFAULT_PORT = 58768
+"""Where a pool listens for a robot in lock-step, on this machine."""
+LAST_FRAMES = 3
+"""Frames without thrust that a run ends with."""
+
+
+class Exchange(Protocol):
+    """A world that stands still until it is asked to go on."""
+
+    def exchange(self, until: float, sent: Sequence[bytes]) -> Delivery:
+        """Let the world go on.
+
+        Args:
+            until: To this time, robot's clock [s].
+            sent: Datagrams to the motor controller, sent at the time of the last call.
+
+        Returns:
+            What has reached the robot's computer meanwhile.
+        """
+
+
+class LockstepClient:
+    """A world in another process, over TCP."""
+
+    def __init__(self, address: str = f"127.0.0.1:{DEFAULT_PORT}", *, timeout: float = 60.0) -> None:
+        """Connect.
+
+        Args:
+            address: HOST:PORT of `finssim pool --lockstep`.
+            timeout: Longest silence [s].
+
+        Raises:
+            LockstepError: Nobody answers there.
+        """
+        host, _, port = address.rpartition(":")
+        self.address = address
+        try:
+            self._connection = socket.create_connection((host or "127.0.0.1", int(port)), timeout=timeout)
+        except (OSError, ValueError, OverflowError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise LockstepError(
+                f"no world in lock-step at {address} ({reason}): start one with finssim pool --lockstep"
+            ) from None
+        self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def exchange(self, until: float, sent: Sequence[bytes]) -> Delivery:
+        """Let the world go on; see `Exchange`.
+
+        Raises:
+            LockstepError: It refused, fell silent or has gone.
+        """
+        try:
+            self._connection.sendall(encode_request(until, sent))
+            message = receive(self._connection)
+        except OSError as error:
+            reason = "silent for too long" if isinstance(error, TimeoutError) else error.strerror or error
+            raise LockstepError(
+                f"the world at {self.address} does not answer ({reason}): look at what its process says"
+            ) from None
+        if message is None:
+            raise LockstepError(f"the world at {self.address} has gone: look at what its process says")
+        return decode_delivery(*message)
+
+    def close(self) -> None:
+        """Let go of the world."""
+        self._connection.close()
+
+    def __enter__(self) -> LockstepClient:
+        return self
+
+    def __exit__(self, *problem: object) -> None:
+        self.close()
+
+
+def run_lockstep(
+    runtime: Runtime,
+    world: Exchange,
+    duration: float,
+    *,
+    rate: float = 60.0,
+    start: float = 0.0,
+    show: Callable[[Runtime], None] | None = None,
+    until: Callable[[Runtime], bool] | None = None,
+) -> float:
+    """Run a robot against a world, and end with its thrusters stopped.
+
+    Args:
+        runtime: The robot.
+        world: Its world, which stands at `start`.
+        duration: How long [s].
+        rate: Steps a second [Hz].
+        start: Robot's clock at the beginning [s].
+        show: Called after every step.
+        until: Ends the run early where it says so; asked after every step.
+
+    Returns:
+        Robot's clock at the end [s].
+    """
+    now: float = start
+    sent: list[bytes] = []
+    try:
+        for k in range(1, round(duration * rate) + 1):
+            delivery = world.exchange(start + k / rate, sent)
+            now = delivery.time
+            sent = runtime.step(now, delivery.frames, delivery.pictures)
+            runtime.sent(now)
+            if show is not None:
+                show(runtime)
+            if until is not None and until(runtime):
+                break
+    finally:
+        last = runtime.stop(now, LAST_FRAMES)
+    return world.exchange(now + 1.0 / rate, last).time

@@ -1,0 +1,251 @@
+"""From telemetry and pictures to the state that a controller reads. Bad data is counted and never raises."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.geometry.rotations import matrix_to_quat
+from finssim.localization.detection.detections import Detection, Frame
+from finssim.localization.detection.detector import detector
+from finssim.localization.detection.region import RegionTracker
+from finssim.localization.fusion.attitude import up_of
+from finssim.localization.fusion.estimator import Estimator
+from finssim.localization.fusion.fuse_detections import Fixes
+from finssim.localization.fusion.fuse_settings import Settings, settings_of, site_of
+from finssim.localization.fusion.health import Estimate, Health, health_of
+from finssim.localization.fusion.streams import DepthSample, ImuSample, VisionSample
+from finssim.localization.pool import Pool
+from finssim.localization.poses.measurement import axes_of_up
+from finssim.robot.aboard import Aboard, Stuck
+from finssim.robot.messages import Picture, Telemetry
+from finssim.robot.robot import Reading
+from finssim.robot.unfused import Unfused
+from finssim.vehicles import Vehicle
+
+__all__ = ["Perception"]
+
+Array = npt.NDArray[np.float64]
+
+PICTURE_STUCK = 0.4
+"""Corners that stay the same to the last digit for this long are one picture sent again and again [s]."""
+
+
+class Perception:
+    """The state of one vehicle from its telemetry and an overhead camera."""
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        pool: Pool,
+        *,
+        method: str = "refractive",
+        mode: str = "constant-velocity",
+        fusion: bool = True,
+        settings: Settings | None = None,
+        library: str | None = None,
+    ) -> None:
+        """
+        Args:
+            vehicle: Its tags and sensors.
+            pool: Camera, water and frames.
+            method: How tags become fixes, a name of `localization.poses.methods.METHODS`.
+            mode: Of the estimator: constant-velocity or error-state.
+            fusion: False: no filter, for the ablation "without EKF" (`robot.unfused`).
+            settings: Of the estimator; the vehicle file's noises if None.
+            library: That finds tags in pictures: apriltag or opencv; apriltag if None.
+
+        Raises:
+            LocalizationError: Unknown method, mode or library; a vehicle without tags; a pool whose z is not up.
+        """
+        self.vehicle, self.pool = vehicle, pool
+        self.fixes = Fixes(pool, vehicle, method=method, pixel_std=pool.pixel_std)
+        self.estimator = Estimator(settings or settings_of(vehicle), site_of(pool, vehicle), mode=mode)
+        self.unfused = None if fusion else Unfused()
+        self._aboard = Aboard(vehicle)
+        self._library, self._tracker = library, None if library is None else self._new_tracker(library)
+        self._frame = _WorldFrame(pool, self.estimator.site.up)
+        self._omega, self._omega_time = (math.nan,) * 3, -math.inf
+        self._rate = math.nan
+        self._pictures = Stuck(PICTURE_STUCK)
+        self._last_picture = -math.inf
+
+    def telemetry(self, now: float, telemetry: Telemetry, time: float) -> None:
+        """Take in what the vehicle sent.
+
+        Args:
+            now: When it came [s].
+            telemetry: As it was decoded.
+            time: When it was measured, the vehicle's clock mapped to ours [s].
+        """
+        imu = self._aboard.imu(telemetry, time, now)
+        if isinstance(imu, ImuSample):
+            if self.estimator.add(imu) == "accepted" and imu.time > self._omega_time:
+                self._omega, self._omega_time = imu.omega, imu.time
+        else:
+            self.estimator.refuse("imu", imu)
+        if self.unfused is not None:
+            self.unfused.heading(self._aboard.yaw(telemetry))
+        depth = self._aboard.depth(telemetry, time, now)
+        if isinstance(depth, DepthSample):
+            self.estimator.add(depth)
+            if self.unfused is not None:
+                self.unfused.height(self._height(telemetry), depth.time)
+        elif depth:
+            self.estimator.refuse("depth", depth)
+
+    def picture(self, now: float, picture: Picture) -> str:
+        """Take in a picture, or the tags that were found in it.
+
+        Returns:
+            `accepted`, or why it gave no fix.
+        """
+        time = min(picture.time, now) if math.isfinite(picture.time) else math.nan
+        if time <= self._last_picture:
+            return self.estimator.refuse(
+                "vision", "duplicate" if time == self._last_picture else "out of order"
+            )
+        found = self._detections(picture, time)
+        if found is None:
+            return self.estimator.refuse("vision", "not a picture of this camera")
+        if math.isfinite(time):
+            self._last_picture = time
+        seen = tuple(tuple(d.corners.ravel().tolist()) for d in found)
+        if seen and self._pictures.look(seen, time):
+            return self.estimator.refuse("vision", "frozen")
+        fix = self.fixes.fix(Frame(time, "", tuple(found)), self.estimator)
+        if not isinstance(fix, VisionSample):
+            return self.estimator.refuse("vision", fix)
+        if self.unfused is not None:
+            self.unfused.fix(fix.position, fix.yaw, fix.time)
+        return self.estimator.add(fix)
+
+    def reading(self, now: float) -> Reading:
+        """The state at a time [s], in world and body axes."""
+        estimate = self._estimate(now)
+        health = self._health_of(estimate)
+        position, quaternion, velocity = self._frame.state(estimate)
+        return Reading(
+            time=now,
+            position=position,
+            quaternion=quaternion,
+            nu=np.concatenate([velocity, self._turning(estimate)]),
+            ready=health.ready,
+            mode=health.vision_mode,
+            reason="" if health.ready else _why(health),
+            std=self._frame.std(estimate),
+        )
+
+    def health(self) -> Health:
+        """The estimator's condition at the time of its newest sample, with what it refused and why."""
+        return self.estimator.health(self.estimator.estimate())
+
+    def _estimate(self, now: float) -> Estimate:
+        estimate = self.estimator.estimate(now)
+        if self.unfused is None:
+            return estimate
+        raw = self.unfused
+        return replace(estimate, x=raw.x, yaw=raw.yaw, vision_time=raw.vision_time)
+
+    def _health_of(self, estimate: Estimate) -> Health:
+        return health_of(estimate, self.estimator.settings, self.estimator.site, {}, "", {})
+
+    def _turning(self, estimate: Estimate) -> Array:
+        """Angular velocity, body frame [rad/s], less what is known of the gyro's bias: its part about the vertical."""
+        omega = np.array(self._omega)
+        if not math.isfinite(estimate.yaw_rate):
+            return np.full(3, math.nan)
+        up = up_of(estimate.roll, estimate.pitch)
+        level = math.cos(estimate.pitch) ** 2
+        measured = (omega[1] * up[1] + omega[2] * up[2]) / level
+        return np.asarray(omega - (measured - estimate.yaw_rate) * up)
+
+    def _height(self, telemetry: Telemetry) -> float:
+        """Height of the body origin in the pool frame from depth and tilt alone [m]."""
+        tilt, site = self._aboard.tilt(telemetry), self.estimator.site
+        if tilt is None:
+            return math.nan
+        return -telemetry.depth - site.offset - float(up_of(*tilt) @ np.array(site.depth_port))
+
+    def _detections(self, picture: Picture, time: float) -> list[Detection] | None:
+        if picture.image is None or picture.tags:
+            return [Detection(tag.tag_id, np.asarray(tag.corners, float)) for tag in picture.tags]
+        lens = self.pool.camera.lens
+        if picture.image.dtype != np.uint8 or picture.image.shape != (lens.height, lens.width):
+            return None
+        self._tracker = self._tracker or self._new_tracker(self._library)
+        return self._tracker.detect(picture.image, time)
+
+    def _new_tracker(self, library: str | None) -> RegionTracker:
+        tags = self.vehicle.tags
+        assert tags is not None  # Fixes has refused such a vehicle
+        return RegionTracker(detector(tags.family, library=library), set(tags.mounts))
+
+
+class _WorldFrame:
+    """Turns what is known in the pool frame into world and body axes."""
+
+    def __init__(self, pool: Pool, up: tuple[float, float, float]) -> None:
+        T = pool.T_wp
+        self._R_wp, self._t = T[:3, :3].copy(), T[:3, 3].copy()
+        self._R_wg = self._R_wp @ axes_of_up(up)
+        self._q_wg = tuple(matrix_to_quat(self._R_wg).tolist())
+        self._plain = bool(np.allclose(self._R_wp, np.eye(3), atol=1e-12))
+
+    def state(self, estimate: Estimate) -> tuple[Array, Array, Array]:
+        """Position [m], attitude xyzw, velocity in body axes [m/s]."""
+        position = self._R_wp @ estimate.x[:3] + self._t
+        r, p, y = 0.5 * estimate.roll, 0.5 * estimate.pitch, 0.5 * estimate.yaw
+        cr, sr, cp, sp, cy, sy = math.cos(r), math.sin(r), math.cos(p), math.sin(p), math.cos(y), math.sin(y)
+        level = (
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        )
+        x, y, z, w = _product(self._q_wg, level)
+        R = np.array(
+            [
+                [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+                [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
+                [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
+            ]
+        )
+        return position, np.array([x, y, z, w]), (self._R_wp @ estimate.x[3:]) @ R
+
+    def std(self, estimate: Estimate) -> Array:
+        """Standard deviations of position, velocity (world axes) and yaw, (7,)."""
+        if self._plain:
+            return estimate.std()
+        P = np.zeros((6, 6))
+        P[:3, :3] = self._R_wp @ estimate.P[:3, :3] @ self._R_wp.T
+        P[3:, 3:] = self._R_wp @ estimate.P[3:, 3:] @ self._R_wp.T
+        return replace(estimate, P=P).std()
+
+
+def _product(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, float, float]:
+    """Quaternions xyzw multiplied."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        aw * bx + bw * ax + ay * bz - az * by,
+        aw * by + bw * ay + az * bx - ax * bz,
+        aw * bz + bw * az + ax * by - ay * bx,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def _why(health: Health) -> str:
+    """In words why a state is not ready."""
+    if math.isnan(health.age_imu) or not health.imu_fresh:
+        return "no inertial data"
+    if math.isnan(health.age_depth) or not health.depth_fresh:
+        return "no depth"
+    if health.vision_mode == "uninitialized":
+        return "not seen by the camera yet"
+    if health.vision_mode in ("hold", "lost"):
+        return f"not seen by the camera for {health.age_vision:.1f} s"
+    return "position or heading too uncertain"

@@ -1,0 +1,220 @@
+"""From what sensors say to what a controller reads: in the right frames and times, whatever else arrives."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from finssim.geometry.rotations import quat_from_yaw
+from finssim.localization.errors import LocalizationError
+from finssim.robot.messages import Picture, TagCorners
+from finssim.robot.perception import Perception
+from finssim.vehicles import load_vehicle
+from reference.rounds import Rounds, overhead, without_latency, yaw_between
+
+VEHICLE = without_latency(load_vehicle("finsrov"))
+BAD = (math.nan, -math.inf, 3e38)
+
+
+def run(world, perception, duration, *, telemetry=lambda t, x: x, picture=lambda t, x: x, depart=0.0):
+    """Readings 60 times a second; telemetry at 100 Hz and pictures at 30 Hz, altered or dropped (None) on the way."""
+    events = [(depart + 0.01 * k, 0, k) for k in range(round(100 * duration))]
+    events += [(depart + k / 30 + world.pool.latency, 1, k) for k in range(round(30 * duration))]
+    events += [(depart + k / 60 + 1e-6, 2, k) for k in range(round(60 * duration))]
+    readings = []
+    for t, kind, k in sorted(events):
+        if kind == 0 and (x := telemetry(t, world.telemetry(t, k))) is not None:
+            perception.telemetry(t, x, t)
+        elif kind == 1 and (x := picture(t, world.picture(depart + k / 30, k))) is not None:
+            perception.picture(t, x)
+        elif kind == 2:
+            readings.append(perception.reading(t))
+    return readings
+
+
+def errors(world, readings):
+    """Distance [m], turn [rad], velocity [m/s], rate [rad/s] from the truth, rms."""
+    found = [
+        (
+            np.linalg.norm(r.position - world.position(r.time)),
+            yaw_between(world.quaternion(r.time), r.quaternion),
+            np.linalg.norm((r.nu - world.nu(r.time))[:3]),
+            np.linalg.norm((r.nu - world.nu(r.time))[3:]),
+        )
+        for r in readings
+    ]
+    return np.sqrt(np.mean(np.square(found), axis=0))
+
+
+@pytest.mark.parametrize("mode", ["constant-velocity", "error-state"])
+def test_the_state_is_the_vehicles(mode):
+    """A moving, rocking vehicle seen 50 ms late is known to a centimetre and half a degree, and its speed to 3 cm/s."""
+    world = Rounds(overhead(latency=0.05), VEHICLE)
+    readings = run(world, Perception(VEHICLE, world.pool, mode=mode), 4.0)[90:]
+    assert all(r.ready and r.mode == "fresh" and r.reason == "" for r in readings)
+    assert np.all(errors(world, readings) < (0.01, math.radians(0.5), 0.03, 0.01))
+
+
+def test_the_world_frame_of_the_pool_file_is_that_of_the_reading():
+    """A pool surveyed in axes turned by 40° and moved: position, heading and velocity come out in world axes."""
+    turned = overhead(world_position=(0.1, -0.2, 0.0), world_orientation=tuple(quat_from_yaw(0.7).tolist()))
+    world = Rounds(turned, VEHICLE)
+    readings = run(world, Perception(VEHICLE, turned), 3.0)[90:]
+    assert all(r.ready for r in readings)
+    assert np.all(errors(world, readings) < (0.01, math.radians(0.5), 0.03, 0.01))
+
+
+def test_a_latency_that_the_pool_file_does_not_tell_shows():
+    """Pictures 0.1 s late taken for new ones put a vehicle at 0.09 m/s a centimetre behind; compensated, it is not."""
+    late = overhead(latency=0.1)
+    world = Rounds(late, VEHICLE)
+    told = errors(world, run(world, Perception(VEHICLE, late), 4.0)[90:])[0]
+    untold = errors(world, run(world, Perception(VEHICLE, overhead(latency=0.0)), 4.0)[90:])[0]
+    assert told < 0.005 < 0.007 < untold
+
+
+def test_the_mcus_own_heading_does_not_enter():
+    """It points elsewhere and drifts by 10°/s; the heading is the camera's and the gyro's."""
+    pool = overhead()
+    steady, drifting = (Rounds(pool, VEHICLE, mcu_yaw=y, drift=d) for y, d in ((0.0, 0.0), (2.0, 0.17)))
+    a, b = (run(world, Perception(VEHICLE, pool), 2.0)[-1] for world in (steady, drifting))
+    np.testing.assert_allclose(a.quaternion, b.quaternion, atol=1e-6)
+
+
+def test_before_the_first_fix_the_position_is_unknown_and_says_so():
+    """NaN, not ready, and why."""
+    world = Rounds(overhead(), VEHICLE)
+    perception = Perception(VEHICLE, world.pool)
+    assert perception.reading(0.0).reason == "no inertial data"
+    readings = run(world, perception, 0.5, picture=lambda t, x: None)
+    assert not readings[-1].ready and readings[-1].mode == "uninitialized"
+    assert readings[-1].reason == "not seen by the camera yet"
+    assert np.isnan(readings[-1].position[:2]).all()
+
+
+def test_three_seconds_without_vision_end_readiness_and_it_comes_back():
+    """Coast, hold and lost in turn; ready again after the pictures are back."""
+    world = Rounds(overhead(), VEHICLE)
+    readings = run(
+        world, Perception(VEHICLE, world.pool), 7.0, picture=lambda t, x: None if 2.0 < t < 5.5 else x
+    )
+    modes = {r.mode for r in readings if 2.3 < r.time < 5.4}
+    assert modes == {"coast", "hold", "lost"}
+    assert not any(r.ready for r in readings if 2.9 < r.time < 5.4)
+    assert all(r.ready for r in readings if r.time > 6.5)
+    assert "not seen by the camera for" in next(r.reason for r in readings if r.time > 4.0)
+
+
+FIELDS = ["quaternion", "gyro", "accel", "depth", "pressure"]
+
+
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("bad", BAD)
+def test_a_bad_number_in_telemetry_never_raises_and_never_gets_through(field, bad):
+    """While it lasts the reading is not ready or right; afterwards it is ready and right."""
+    world = Rounds(overhead(), VEHICLE)
+
+    def broken(t, telemetry):
+        if not 0.6 < t < 1.0:
+            return telemetry
+        value = getattr(telemetry, field)
+        return replace(telemetry, **{field: (bad, *value[1:]) if isinstance(value, tuple) else bad})
+
+    readings = run(world, Perception(VEHICLE, world.pool), 1.7, telemetry=broken)
+    used = [r for r in readings if r.ready and r.time > 0.4]
+    assert np.linalg.norm([r.position - world.position(r.time) for r in used], axis=1).max() < 0.05
+    assert readings[-1].ready
+
+
+@pytest.mark.parametrize("bad", BAD)
+def test_bad_corners_never_raise_and_never_get_through(bad):
+    """One corner without a number: no fix from that tag, and the other one carries on."""
+    world = Rounds(overhead(), VEHICLE)
+
+    def broken(t, picture):
+        first = picture.tags[0]
+        corners = first.corners.copy()
+        corners[0, 0] = bad
+        return replace(picture, tags=(TagCorners(first.tag_id, corners), *picture.tags[1:]))
+
+    readings = run(world, Perception(VEHICLE, world.pool), 1.0, picture=broken)
+    used = [r for r in readings if r.ready]
+    assert all(np.linalg.norm(r.position - world.position(r.time)) < 0.05 for r in used)
+
+
+def test_a_picture_that_is_none_is_counted():
+    """Colours, floats, another camera's, nothing at all, or a stamp that is no number."""
+    world = Rounds(overhead(), VEHICLE)
+    perception = Perception(VEHICLE, world.pool)
+    run(world, perception, 1.0)
+    size = (720, 1280)
+    for k, image in enumerate(
+        (
+            np.zeros((*size, 3), np.uint8),
+            np.zeros(size),
+            np.zeros((480, 640), np.uint8),
+            np.zeros(0, np.uint8),
+        )
+    ):
+        assert perception.picture(2.0 + k, Picture(2.0 + k, k, image=image)) == "not a picture of this camera"
+    assert perception.picture(6.0, Picture(6.0, 9)) == "no tag"
+    assert perception.picture(7.0, replace(world.picture(6.9, 10), time=math.nan)) == "time not finite"
+    assert perception.health().counts["vision"]["not a picture of this camera"] == 4
+
+
+@pytest.mark.parametrize("what", ["gyro and accel", "depth", "picture"])
+def test_a_frozen_sensor_ends_readiness(what):
+    """One that repeats its last value with new stamps is not believed for longer than it takes to tell."""
+    world = Rounds(overhead(), VEHICLE)
+    last = {}
+
+    def stuck(t, telemetry):
+        last.setdefault("telemetry", telemetry)
+        if t < 1.0:
+            last["telemetry"] = telemetry
+        names = {"gyro and accel": ("gyro", "accel"), "depth": ("depth",), "picture": ()}[what]
+        return replace(telemetry, **{name: getattr(last["telemetry"], name) for name in names})
+
+    def still(t, picture):
+        if t < 1.0 or what != "picture":
+            last["picture"] = picture
+            return picture
+        return replace(last["picture"], time=picture.time, sequence=picture.sequence)
+
+    readings = run(world, Perception(VEHICLE, world.pool), 4.0, telemetry=stuck, picture=still)
+    assert readings[-1].time > 3.5 and not readings[-1].ready
+    assert any(r.ready for r in readings)
+
+
+def test_telemetry_that_repeats_a_depth_adds_it_once():
+    """Of a 20 Hz sensor in 100 Hz telemetry, about twenty samples a second count."""
+    world = Rounds(overhead(), VEHICLE)
+    perception, held = Perception(VEHICLE, world.pool), {}
+
+    def repeated(t, telemetry):
+        held[round(20.0 * t)] = held.get(round(20.0 * t), telemetry.depth)
+        return replace(telemetry, depth=held[round(20.0 * t)])
+
+    run(world, perception, 5.0, telemetry=repeated)
+    assert 95 <= sum(perception.health().counts["depth"].values()) <= 105
+
+
+def test_without_a_filter_the_state_is_the_latest_fix():
+    """The ablation: position to centimetres, but a heading that drifts as the motor controller's own does."""
+    world = Rounds(overhead(), VEHICLE, drift=0.05)
+    readings = run(world, Perception(VEHICLE, world.pool, fusion=False), 4.0)
+    distance, turn, speed, _ = errors(world, readings[90:])
+    assert distance < 0.03 and speed < 0.3 and turn > math.radians(3.0)
+    assert all(r.ready for r in readings[90:])
+
+
+def test_what_cannot_be_is_refused():
+    """Method, mode and a vehicle without tags, in a sentence each."""
+    pool = overhead()
+    with pytest.raises(LocalizationError, match="unknown method 'x'"):
+        Perception(VEHICLE, pool, method="x")
+    with pytest.raises(LocalizationError, match="unknown mode 'x'"):
+        Perception(VEHICLE, pool, mode="x")
+    with pytest.raises(LocalizationError, match="no tags"):
+        Perception(VEHICLE.model_copy(update={"tags": None}), pool)

@@ -1,0 +1,167 @@
+"""One turn of the loop after the other: decides on its grid, arms once, stops when the pilot fails."""
+
+import math
+
+import numpy as np
+import pytest
+
+from finssim.control.guidance import Station
+from finssim.robot.link.decoder import MCU, Decoder
+from finssim.robot.link.frames import encode_telemetry
+from finssim.robot.lockstep import run_lockstep
+from finssim.robot.messages import Delivery
+from finssim.robot.pilots import PidPilot
+from finssim.robot.runtime import Runtime
+from finssim.vehicles import load_vehicle
+from reference.rounds import Rounds, overhead, without_latency
+
+VEHICLE = without_latency(load_vehicle("finsrov"))
+POOL = overhead()
+STATION = Station((0.5, 0.2, -0.5), 0.3)
+
+
+class Shown:
+    """A world that shows a vehicle on its rounds, whatever it is told; keeps what it is told."""
+
+    def __init__(self, *, telemetry=lambda t: True, pictures=lambda t: True, **options):
+        self.rounds, self.sent = Rounds(POOL, VEHICLE, **options), []
+        self.telemetry, self.pictures = telemetry, pictures
+        self.frames, self.seen = 0, 0
+
+    def exchange(self, until, sent):
+        self.sent += [(until, frame) for frame in sent]
+        frames, pictures = [], []
+        while self.frames * 0.01 <= until:
+            t = self.frames * 0.01
+            if self.telemetry(t):
+                frames.append((t, encode_telemetry(self.rounds.telemetry(t, self.frames))))
+            self.frames += 1
+        while self.seen / 30.0 + POOL.latency <= until:
+            if self.pictures(self.seen / 30.0):
+                pictures.append(self.rounds.picture(self.seen / 30.0, self.seen))
+            self.seen += 1
+        return Delivery(until, tuple(frames), tuple(pictures))
+
+    def commands(self):
+        """Time and command of each frame that was sent."""
+        decoder = Decoder(MCU)
+        return [(t, command) for t, frame in self.sent for command in decoder.feed(frame)]
+
+
+class Constant:
+    """Always wants the same."""
+
+    name, period, needs_state = "constant", 0.1, True
+
+    def __init__(self, force=None):
+        self.force, self.times = np.full(8, 1.0) if force is None else force, []
+
+    def describe(self):
+        return {"name": self.name}
+
+    def reset(self):
+        self.times = []
+
+    def act(self, reading, guide, t):
+        self.times.append(t)
+        if isinstance(self.force, Exception):
+            raise self.force
+        return self.force
+
+
+def test_a_decision_falls_on_every_multiple_of_the_pilots_period():
+    """At 60 steps a second and 10 decisions: none is missed, and each is within a step of its time."""
+    pilot = Constant()
+    runtime = Runtime(VEHICLE, POOL, pilot, STATION, arm=True)
+    run_lockstep(runtime, Shown(), 3.0)
+    expected = 0.1 * np.arange(len(pilot.times))
+    np.testing.assert_allclose(pilot.times, expected, atol=1e-6)
+    assert len(pilot.times) >= 25 and runtime.counters.missed == 0
+
+
+def test_a_late_loop_misses_decisions_and_counts_them():
+    """After 0.35 s without a step, three of ten a second are gone; the grid stays where it was."""
+    pilot = Constant()
+    runtime, world = Runtime(VEHICLE, POOL, pilot, STATION), Shown()
+    for k in range(1, 121):
+        now = k / 60 if k <= 60 else k / 60 + 0.35
+        delivery = world.exchange(now, ())
+        runtime.step(now, delivery.frames, delivery.pictures)
+    assert runtime.counters.missed == 3
+    assert pilot.times[-1] % 0.1 == pytest.approx(0.0, abs=0.02) or pilot.times[-1] % 0.1 > 0.08
+
+
+def test_without_arming_no_thruster_is_ever_enabled():
+    """A dry run decides, and sends zeros."""
+    runtime, world = Runtime(VEHICLE, POOL, Constant(), STATION), Shown()
+    run_lockstep(runtime, world, 2.0)
+    assert runtime.counters.decisions > 10
+    assert not any(c.enable or any(c.normalised) for _, c in world.commands())
+
+
+def test_an_armed_run_commands_and_ends_with_three_frames_without_thrust():
+    """Armed as soon as the state is ready; disarmed at the end."""
+    runtime, world = Runtime(VEHICLE, POOL, Constant(), STATION, arm=True), Shown()
+    run_lockstep(runtime, world, 2.0)
+    enabled = [c.enable for _, c in world.commands()]
+    assert any(enabled) and enabled[-4:] == [True, False, False, False]
+    assert runtime.bridge.state == "disarmed"
+
+
+@pytest.mark.parametrize(
+    "wish",
+    [RuntimeError("broken network"), np.full(8, math.nan), np.zeros(7)],
+    ids=["raises", "nan", "short"],
+)
+def test_a_pilot_that_fails_stops_the_vehicle(wish):
+    """Fault with the reason, and zero frames until somebody acknowledges."""
+    runtime, world = Runtime(VEHICLE, POOL, Constant(wish), STATION, arm=True), Shown()
+    run_lockstep(runtime, world, 2.0)
+    assert runtime.bridge.state == "fault" and "pilot constant" in runtime.bridge.reason
+    assert not any(any(c.normalised) for _, c in world.commands())
+
+
+def test_it_never_arms_a_second_time():
+    """After a fault the vehicle stays stopped, though everything is well again."""
+    runtime = Runtime(VEHICLE, POOL, Constant(), STATION, arm=True)
+    world = Shown(telemetry=lambda t: not 1.5 < t < 2.5)
+    run_lockstep(runtime, world, 4.0)
+    late = [c for t, c in world.commands() if t > 2.2]
+    assert runtime.bridge.state == "fault" and not any(c.enable for c in late)
+
+
+def test_three_seconds_without_vision_hold_the_vehicle():
+    """No thrust from a second after the pictures ended until they are back; then it goes on by itself."""
+    runtime = Runtime(VEHICLE, POOL, Constant(), STATION, arm=True)
+    world = Shown(pictures=lambda t: not 2.0 < t < 5.0)
+    run_lockstep(runtime, world, 7.0)
+    enabled = {round(60 * t): c.enable for t, c in world.commands()}
+    assert enabled[round(60 * 1.9)] and not any(enabled[k] for k in range(round(60 * 3.0), round(60 * 5.0)))
+    assert enabled[round(60 * 6.9)]
+
+
+def test_the_latency_counts_from_the_newest_picture_in_the_state():
+    """In lock-step a picture waits for the next decision: at most one period of the pilot."""
+    runtime = Runtime(VEHICLE, POOL, Constant(), STATION, arm=True)
+    run_lockstep(runtime, Shown(), 3.0)
+    summary = runtime.counters.summary()
+    assert 0.0 <= summary["latency_s"]["p50"] <= summary["latency_s"]["p99"] <= 1 / 30 + 1 / 60 + 1e-6
+
+
+def test_any_bytes_are_survived():
+    """Garbage, parts of frames and frames of another kind leave the loop running."""
+    runtime, rng = (
+        Runtime(VEHICLE, POOL, PidPilot("pid", VEHICLE), STATION, arm=True),
+        np.random.default_rng(0),
+    )
+    world = Shown()
+    for k in range(1, 200):
+        delivery = world.exchange(k / 60, ())
+        noise = [(k / 60, rng.bytes(int(rng.integers(0, 200)))) for _ in range(3)]
+        cut = [
+            (t, frame[: int(rng.integers(0, len(frame)))])
+            for t, frame in delivery.frames
+            if rng.random() < 0.2
+        ]
+        runtime.step(k / 60, [*delivery.frames, *noise, *cut], delivery.pictures)
+    assert runtime.bridge.state == "armed"
