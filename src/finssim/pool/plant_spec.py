@@ -1,0 +1,315 @@
+"""A plant of the virtual pool: every number in which it differs from the vehicle file, as one YAML file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError, field_validator, model_validator
+
+from finssim.files import atomic_write
+from finssim.pool.coupled import PrincipalAxes, Section, Six, Three
+from finssim.yaml_file import read_mapping
+
+__all__ = ["PlantSpec", "PlantSpecError", "Severity", "load_plant_spec"]
+
+Array = NDArray[np.float64]
+Severity = Literal["nominal", "realistic", "hard"]
+Rows = tuple[Six, Six, Six, Six, Six, Six]
+
+
+class PlantSpecError(ValueError):
+    """A plant file that cannot be used, or a vehicle that the plant does not fit."""
+
+
+class Basin(Section):
+    """The pool: a box centred on the world's z axis, the water surface at z = 0."""
+
+    length: float = Field(default=4.0, gt=0.0)
+    """Along world x [m]."""
+    width: float = Field(default=2.0, gt=0.0)
+    """Along world y [m]."""
+    depth: float = Field(default=1.0, gt=0.0)
+    """[m]"""
+
+
+class TrueBody(Section):
+    """The rigid body as it is, not as it was weighed."""
+
+    mass: float = Field(gt=0.0)
+    """[kg]"""
+    inertia: tuple[Three, Three, Three]
+    """About the centre of gravity, body axes [kg m²]."""
+    center_of_gravity: Three
+    """Body frame [m]."""
+    displaced_volume: float = Field(gt=0.0)
+    """[m³]"""
+    center_of_buoyancy: Three
+    """Body frame [m]."""
+
+
+class AddedMass(PrincipalAxes):
+    """M_A = Tᵀ A T, with T from the body origin to these axes."""
+
+    matrix: Rows
+    """A, symmetric [kg, kg m, kg m²]."""
+
+    @model_validator(mode="after")
+    def _physical(self) -> AddedMass:
+        A = np.array(self.matrix)
+        if not np.allclose(A, A.T, rtol=0.0, atol=1e-9 * np.abs(A).max(initial=1.0)):
+            raise ValueError("matrix is not symmetric: added mass is an energy, give a symmetric matrix")
+        if np.linalg.eigvalsh(A)[0] < -1e-9:
+            raise ValueError("matrix has a negative eigenvalue, expected positive semidefinite")
+        return self
+
+    def about_origin(self) -> Array:
+        """M_A about the body origin, (6, 6)."""
+        T = self.to_axes()
+        return np.asarray(T.T @ np.array(self.matrix) @ T)
+
+
+class Damping(PrincipalAxes):
+    """tau_D = -Tᵀ [D1 x + D2 (|x| x)], x = T nu_r: dissipative for every velocity."""
+
+    linear: Rows
+    """D1 [N s/m, N s, N m s]."""
+    quadratic: Rows
+    """D2 [N s²/m², ..., N m s²]."""
+
+    @model_validator(mode="after")
+    def _dissipative(self) -> Damping:
+        D1, D2 = np.array(self.linear), np.array(self.quadratic)
+        if np.linalg.eigvalsh(D1 + D1.T)[0] < -1e-9:
+            raise ValueError("linear adds energy: its symmetric part has a negative eigenvalue")
+        # |x_i| x_j² <= (|x_i|³ + 2 |x_j|³) / 3, so these margins suffice for x · D2 (|x| x) >= 0.
+        off = np.abs(D2 - np.diag(np.diag(D2)))
+        if np.any(np.diag(D2) - off.sum(axis=1) / 3.0 - 2.0 * off.sum(axis=0) / 3.0 < -1e-9):
+            raise ValueError("quadratic may add energy: an off-diagonal entry is too large for its diagonal")
+        return self
+
+
+class HullDrag(Section):
+    """Drag of the hull mesh's panels (paper, eq. 4), besides the damping."""
+
+    form_drag: float = Field(default=0.0, ge=0.0)
+    skin_drag: float = Field(default=0.0, ge=0.0)
+
+
+class TrueThruster(Section):
+    """One thruster as built."""
+
+    gain_plus: float = Field(gt=0.0)
+    """Thrust over the file's, forward [-]."""
+    gain_minus: float = Field(gt=0.0)
+    """The same in reverse."""
+    deduction: float = Field(ge=0.0, lt=1.0)
+    """Part of the thrust that its own jet takes back from the hull [-]."""
+    time_constant: float = Field(gt=0.0)
+    """Of the shaft's speed [s]."""
+    delay: float = Field(ge=0.0, le=1.0)
+    """From throttle to shaft [s]."""
+    dead_rpm_plus: float = Field(ge=0.0)
+    """Slowest forward speed that turns the shaft [rpm]."""
+    dead_rpm_minus: float = Field(ge=0.0)
+    """Slowest reverse speed, as a magnitude [rpm]."""
+    full_rpm: float = Field(gt=0.0)
+    """Speed at full throttle on a full battery [rpm]."""
+
+
+class Propellers(Section):
+    """How water that already moves takes thrust away: T (1 - V / (J0 n D)), V the inflow, n turns a second."""
+
+    diameter: float = Field(default=0.07, gt=0.0)
+    """D [m]."""
+    own_share: float = Field(default=0.0, ge=0.0)
+    """Part of the vehicle's own speed along the axis that enters V [-]."""
+    advance_at_zero_thrust: float = Field(default=0.8, gt=0.0)
+    """J0 [-]"""
+    induced_share: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Part of a neighbour's induced speed that enters V, at no distance [-]."""
+    induced_reach: float = Field(default=0.3, gt=0.0)
+    """Falls by e over this distance [m]."""
+
+
+class Battery(Section):
+    """Voltage falls with time and with load."""
+
+    full_voltage: float = Field(default=16.4, gt=0.0)
+    """[V]"""
+    fade: float = Field(default=0.0, ge=0.0, lt=0.5)
+    """Part of the voltage lost after `fade_time` [-]."""
+    fade_time: float = Field(default=900.0, gt=0.0)
+    """[s]; the voltage stays there afterwards."""
+    resistance: float = Field(default=0.0, ge=0.0)
+    """Of cells and wiring [ohm]."""
+    motor_power: float = Field(default=45.0, ge=0.0)
+    """Of one motor at `full_rpm`; falls with the cube of speed [W]."""
+    idle_current: float = Field(default=0.6, ge=0.0)
+    """Of everything else [A]."""
+
+
+class BuoyancyDrift(Section):
+    """Bubbles, warming air and soaking foam: slow changes of buoyancy, a sum of sines."""
+
+    grams: tuple[float, ...] = ()
+    """Amplitude of each [g]."""
+    periods: tuple[float, ...] = ()
+    """[s]"""
+    phases: tuple[float, ...] = ()
+    """[rad]"""
+
+    @model_validator(mode="after")
+    def _same_length(self) -> BuoyancyDrift:
+        if not len(self.grams) == len(self.periods) == len(self.phases):
+            raise ValueError("grams, periods and phases differ in length: give each sine all three")
+        if any(period <= 0.0 for period in self.periods):
+            raise ValueError("periods must exceed 0 s")
+        return self
+
+
+class SlackTether(Section):
+    """A line that hangs slack and pulls only when it is nearly straight."""
+
+    anchor: Three
+    """Where it leaves the pool's edge, world frame [m]."""
+    attachment: Three
+    """On the vehicle, body frame [m]."""
+    length: float = Field(gt=0.0)
+    """[m]"""
+    stiffness: float = Field(default=30.0, ge=0.0)
+    """Of its last stretch before it is straight [N/m]."""
+    slack_share: float = Field(default=0.08, gt=0.0, lt=1.0)
+    """The pull sets in at (1 - slack_share) length [-]."""
+    diameter: float = Field(default=0.004, gt=0.0)
+    """[m]"""
+    drag_coefficient: float = Field(default=0.5, ge=0.0)
+    """Of a cylinder; less than 1.2, since a slack line follows only in part."""
+    wet_weight: float = 0.0
+    """[N/m]; negative floats."""
+
+
+class Eddy(Section):
+    """One mode of the pool's circulation: `cells` eddies side by side along x."""
+
+    cells: int = Field(ge=1, le=4)
+    speed: float = Field(ge=0.0, le=0.5)
+    """Largest, at the surface [m/s]."""
+    unsteadiness: float = Field(ge=0.0, le=1.0)
+    """Part of the speed that comes and goes [-]."""
+    period: float = Field(gt=0.0)
+    """[s]"""
+    phase: float
+    """[rad]"""
+    sense: Literal[-1, 1] = 1
+    """1: anticlockwise from above."""
+
+
+class Circulation(Section):
+    """The current: eddies that vanish at the walls."""
+
+    eddies: tuple[Eddy, ...] = ()
+    floor_share: float = Field(default=0.5, ge=0.0, le=1.0)
+    """Speed at the floor over that at the surface [-]."""
+
+
+class Instruments(Section):
+    """How the instruments differ from the vehicle file."""
+
+    noise: float = Field(default=1.0, ge=0.0)
+    """Factor on the file's noise, bias and drift [-]."""
+    pressure_drift: float = Field(default=0.0, ge=0.0)
+    """Random walk of the depth's bias, besides the file's [m/√s]."""
+
+
+class FirmwareSpec(Section):
+    """The motor controller: its speed loop, clock and attitude filter, and the wire behind it."""
+
+    loop_period: float = Field(default=0.002, ge=0.001, le=0.005)
+    """Of the rpm loop [s]."""
+    feed_forward: float = Field(default=1.0, gt=0.0)
+    """Throttle over what the file's speed range would need [-]."""
+    gain: float = Field(default=0.4, ge=0.0)
+    """Proportional: throttle per normalised speed error [-]."""
+    integral_gain: float = Field(default=1.5, ge=0.0)
+    """[1/s]"""
+    derivative_gain: float = Field(default=0.004, ge=0.0)
+    """[s]"""
+    rpm_noise: float = Field(default=12.0, ge=0.0)
+    """Standard deviation of one measurement [rpm]."""
+    rpm_quantum: float = Field(default=8.0, ge=0.0)
+    """[rpm]"""
+    crystal_ppm: float = Field(default=0.0, ge=-500.0, le=500.0)
+    """How fast its clock runs [ppm]."""
+    clock_start: int = Field(default=0, ge=0, lt=2**32)
+    """Reading of its clock when the pool starts [ms]; 0 after a reboot."""
+    reboot_time: float = Field(default=1.5, ge=0.0)
+    """Silence after a reboot [s]."""
+    attitude_gain: float = Field(default=0.5, ge=0.0)
+    """Of the accelerometer in the attitude filter [1/s]."""
+    attitude_integral: float = Field(default=0.01, ge=0.0)
+    """[1/s²]"""
+    uplink: tuple[float, float] = (0.001, 0.003)
+    """Shortest and longest way of a telemetry frame to the robot [s]."""
+    downlink: tuple[float, float] = (0.0008, 0.0014)
+    """The same for a command."""
+
+    @field_validator("uplink", "downlink")
+    @classmethod
+    def _ordered(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if not 0.0 <= value[0] <= value[1]:
+            raise ValueError("expected the shortest time first, none below 0 s")
+        return value
+
+
+class PlantSpec(Section):
+    """Everything hidden about one plant; the vehicle file gives thruster places, envelope and instruments."""
+
+    title: str
+    severity: Severity
+    seed: int = Field(ge=0)
+    vehicle: str
+    """Name of the vehicle it was drawn around."""
+    basin: Basin = Basin()
+    body: TrueBody
+    added_mass: AddedMass
+    damping: Damping
+    hull: HullDrag = HullDrag()
+    thrusters: dict[str, TrueThruster]
+    """By name, as in the vehicle file."""
+    propellers: Propellers = Propellers()
+    battery: Battery = Battery()
+    buoyancy: BuoyancyDrift = BuoyancyDrift()
+    tether: SlackTether | None = None
+    circulation: Circulation = Circulation()
+    instruments: Instruments = Instruments()
+    firmware: FirmwareSpec = FirmwareSpec()
+
+    def write(self, path: Path) -> None:
+        """Write the plant file, whole or not at all."""
+        text = yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, width=118)
+        with atomic_write(path) as temporary:
+            temporary.write_text(
+                f"# A plant of FinsSim's virtual pool: finssim pool --plant {Path(path).name}\n"
+                "# Units are SI unless a name says otherwise; docs/virtual_pool.md explains every key.\n"
+                + text,
+                encoding="utf-8",
+            )
+
+
+def load_plant_spec(path: str | Path) -> PlantSpec:
+    """The plant in a file.
+
+    Raises:
+        PlantSpecError: The file cannot be used; names file, key and expectation.
+    """
+    data = read_mapping(Path(path), PlantSpecError, such_as="severity: realistic")
+    try:
+        return PlantSpec.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(x) for x in first["loc"])
+        raise PlantSpecError(f"{path}: {where}: {first['msg'].removeprefix('Value error, ')}") from None
