@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Callable
 from typing import Any
@@ -14,8 +15,6 @@ __all__ = ["SerialTransport"]
 _LOG = logging.getLogger("finssim.robot.link")
 _AT_ONCE = 65536
 """Bytes taken by one call."""
-_WRITE_TIMEOUT = 0.002
-"""[s] A line that takes nothing (flow control, a stuck adapter) holds a frame up no longer than this."""
 
 
 class SerialTransport:
@@ -62,11 +61,13 @@ class SerialTransport:
             self.send_errors += 1
             return
         try:
-            self._port.write(data)
+            if _written(self._port, data) < len(data):
+                self._forget_waiting()
+        except BlockingIOError:
+            self._forget_waiting()
         except _problems() as problem:
             self.send_errors += 1
-            if not (_only_slow(problem) and self._forget_waiting()):
-                self._lose(problem)
+            self._lose(problem)
 
     def receive(self) -> list[bytes]:
         """What has come, as one piece or none; opens a lost device again when it is time."""
@@ -102,13 +103,13 @@ class SerialTransport:
             _LOG.warning("serial %s: is back", self.device)
         return self._port is not None
 
-    def _forget_waiting(self) -> bool:
-        """Drop what has not left yet: by the time that the line moves again those commands are old."""
+    def _forget_waiting(self) -> None:
+        """Drop what a stuck line has not taken: by the time that it moves again those commands are old."""
+        self.send_errors += 1
         try:
             self._port.reset_output_buffer()
-        except _problems():
-            return False
-        return True
+        except _problems() as problem:
+            self._lose(problem)
 
     def _lose(self, problem: BaseException) -> None:
         _LOG.warning("serial %s: lost (%s); trying again every %g s", self.device, problem, self.retry)
@@ -131,7 +132,7 @@ def _opened(device: str, baud: int) -> Any:
         raise LinkError(
             f"serial:{device}: needs pyserial, which is not installed: pip install 'finssim[hardware]'"
         ) from None
-    return serial.Serial(device, baud, timeout=0, write_timeout=_WRITE_TIMEOUT, exclusive=True)
+    return serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
 
 
 def _problems(*more: type[Exception]) -> tuple[type[Exception], ...]:
@@ -143,7 +144,6 @@ def _problems(*more: type[Exception]) -> tuple[type[Exception], ...]:
     return (OSError, error, *more)
 
 
-def _only_slow(problem: BaseException) -> bool:
-    import serial
-
-    return isinstance(problem, serial.SerialTimeoutException)
+def _written(port: Any, data: bytes) -> int:
+    """Bytes that the line took at once; pyserial's own `write` waits on POSIX, whatever its timeout."""
+    return os.write(port.fileno(), data) if os.name == "posix" else int(port.write(data))
