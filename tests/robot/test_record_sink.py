@@ -63,7 +63,7 @@ def test_kill_9_loses_less_than_the_last_second(tmp_path):
 def test_a_full_disk_stops_the_record_and_not_the_loop(tmp_path):
     """At a limit on the file's size recording stops with a sentence; the file is readable, the loop goes on."""
     path = tmp_path / "run.mcap"
-    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (900_000, 900_000))\n"
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))\n"
     with recording(path, before=limit) as process:
         *times, last = process.stdout.read().splitlines()
     assert process.returncode == 0
@@ -73,7 +73,7 @@ def test_a_full_disk_stops_the_record_and_not_the_loop(tmp_path):
     with open_record(path) as record:
         kept = [m.time for m in record.messages(["/finsrov/telemetry"])]
     assert 10 < len(kept) < len(times)
-    assert Path(path).stat().st_size <= 900_000
+    assert Path(path).stat().st_size <= 300_000
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")

@@ -16,6 +16,7 @@ pytest.importorskip("rosbags")
 from rosbags.highlevel import AnyReader
 
 from finssim.robot.record_messages import Messages
+from finssim.robot.record_reader import open_record
 from finssim.robot.recorder import Recorder
 
 VEHICLE = load_vehicle("finsrov")
@@ -168,3 +169,11 @@ def test_the_imu_message_agrees_with_the_mount():
     assert quat_to_matrix(q) == pytest.approx(R, abs=1e-12)
     force = message.linear_acceleration
     assert [force.x, force.y, force.z] == pytest.approx(quat_to_matrix(mount) @ [1.0, 2.0, 3.0])
+
+
+def test_a_vehicle_changed_by_a_program_is_kept_as_it_is(tmp_path):
+    """Its file would tell another mass."""
+    with Recorder(tmp_path / "run.mcap", VEHICLE.replace({"body.mass": 13.0})):
+        pass
+    with open_record(tmp_path / "run.mcap") as record:
+        assert json.loads(record.files["finsrov.json"])["body"]["mass"] == 13.0

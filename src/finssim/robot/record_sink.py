@@ -22,6 +22,9 @@ LOG = logging.getLogger(__name__)
 LARGEST_CHUNK = 1 << 20
 """A chunk is closed when it has grown to so many bytes."""
 
+DISORDER = 1_000_000_000
+"""A message that is late by less is recorded at the time of the one before; later ones mean a clock set back [ns]."""
+
 POLLS = 5
 """The queue is looked at so many times a chunk."""
 
@@ -70,6 +73,7 @@ class RecordSink:
         self._chunk_seconds, self._longest_queue = chunk_seconds, longest_queue
         self._queue: deque[tuple[str, int, Payload, int]] = deque()
         self._put_bytes = self._taken_bytes = 0  # each written by one thread only
+        self._newest = 0
         self._opened: int | None = None
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"recorder {path.name}", daemon=True)
@@ -91,6 +95,10 @@ class RecordSink:
         if self.problem or self._put_bytes - self._taken_bytes > self._longest_queue:
             self.dropped += 1
             return
+        # Readers of a file without an index want its messages in order; their own stamps keep when things were.
+        if 0 < self._newest - time < DISORDER:
+            time = self._newest
+        self._newest = time
         self._put_bytes += size
         self._queue.append((key, time, payload, size))
 

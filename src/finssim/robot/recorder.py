@@ -20,7 +20,7 @@ from finssim.robot.record_pictures import jpeg
 from finssim.robot.record_sink import RecordSink
 from finssim.robot.record_types import METADATA, TOPICS, definition
 from finssim.robot.robot import Reading
-from finssim.vehicles import Vehicle
+from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["Recorder"]
 
@@ -54,15 +54,14 @@ class Recorder:
             pictures: Whether camera pictures are kept.
             chunk_seconds: How much of the record is written at a time [s].
             epoch: What the record's clock shows when the robot's shows 0 [s].
-            files: Name -> file whose text the record keeps, such as the pool's; the vehicle's is always kept.
+            files: Name -> file that the record keeps, such as the pool's; the vehicle's is always kept.
 
         Raises:
             OutputError: The file exists or cannot be made.
             OSError: One of `files` cannot be read.
         """
         texts = {name: Path(file).read_bytes() for name, file in (files or {}).items()}
-        if vehicle.path is not None:
-            texts[f"{vehicle.name}.yaml"] = vehicle.path.read_bytes()
+        texts |= _vehicle_file(vehicle)
         self._name, self._messages = vehicle.name, Messages(vehicle)
         self._pictures, self._epoch = pictures, round(epoch * 1e9)
         self._sink = RecordSink(Path(path), self._announce, chunk_seconds=chunk_seconds)
@@ -75,7 +74,7 @@ class Recorder:
         given = {k: v if isinstance(v, str) else json.dumps(v, default=str) for k, v in (meta or {}).items()}
         self._sink.writer.metadata(METADATA, {**given, **about})
         for name, text in texts.items():
-            self._sink.writer.attachment(name, "text/yaml", text)
+            self._sink.writer.attachment(name, "text/plain", text)
         self._sink.start()
 
     @property
@@ -209,3 +208,10 @@ class Recorder:
 
     def _ns(self, seconds: float) -> int:
         return self._epoch + (round(seconds * 1e9) if math.isfinite(seconds) else 0)
+
+
+def _vehicle_file(vehicle: Vehicle) -> dict[str, bytes]:
+    """The vehicle's file; its values where a program changed them after reading."""
+    if vehicle.path is not None and load_vehicle(vehicle.path).sha256 == vehicle.sha256:
+        return {f"{vehicle.name}.yaml": vehicle.path.read_bytes()}
+    return {f"{vehicle.name}.json": json.dumps(vehicle.values(), default=str).encode()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -107,13 +108,13 @@ class ColumnMap(Part):
                 )
         return {**data, "header": {**data.get("header", {}), **header}}
 
-    def header_of(self, trial: str, vehicle: str | None) -> Header:
-        """The header of a trial; a vehicle given on the command line comes first.
+    def header_of(self, trial: str, vehicle: str | None, recorded: Mapping[str, Any] | None = None) -> Header:
+        """The header of a trial; a vehicle given on the command line comes first, what the log says itself last.
 
         Raises:
             CalibrationError: A key or value that `trial.yaml` does not take.
         """
-        keys = {**self.header, **self.trials.get(trial, {})}
+        keys = {**(recorded or {}), **self.header, **self.trials.get(trial, {})}
         if vehicle is not None:
             keys["vehicle"] = vehicle
         for key in keys:

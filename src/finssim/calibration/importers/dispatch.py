@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.importers.assemble import trial_of
 from finssim.calibration.importers.column_map import ColumnMap, SplitRule, read_map, split_rule
+from finssim.calibration.importers.finssim_record import recorded_header
 from finssim.calibration.importers.rosbag import BAGS, bag_files, read_bag
 from finssim.calibration.importers.source_map import SourceMap
 from finssim.calibration.importers.split import split_table
@@ -22,6 +23,8 @@ __all__ = ["FORMATS", "Format", "import_trials", "read_trials"]
 
 Format = Literal["auto", "csv", "ardupilot", "rosbag"]
 FORMATS: tuple[Format, ...] = get_args(Format)
+
+Group = tuple[str, list[Stream], dict[str, Any]]
 
 ARDUPILOT = (".bin", ".tlog")
 
@@ -88,11 +91,11 @@ def read_trials(
             load_vehicle(name)  # an unknown one is refused before any log is read
     rule = split_rule(split) if isinstance(split, str) else split or mapped.split
     trials: list[Trial] = []
-    for name, streams in _groups(
+    for name, streams, recorded in _groups(
         [Path(path) for path in paths], mapped, format, vehicle, column_map is not None
     ):
         for piece, table in split_table(name, merge(streams), rule).items():
-            header = mapped.header_of(piece if piece in mapped.trials else name, vehicle)
+            header = mapped.header_of(piece if piece in mapped.trials else name, vehicle, recorded)
             trials.append(trial_of(piece, table, header, mapped))
     unknown = [name for name in mapped.trials if name not in {trial.name for trial in trials}]
     if unknown and not any(trial.name.startswith(tuple(unknown)) for trial in trials):
@@ -104,11 +107,11 @@ def read_trials(
 
 def _groups(
     paths: list[Path], mapped: ColumnMap, format: Format, vehicle: str | None, has_map: bool
-) -> list[tuple[str, list[Stream]]]:
-    """Name of a trial and its streams, for each log or set of tables."""
+) -> list[Group]:
+    """Trial, streams and what the log says for the header, for each log or set of tables."""
     if not paths:
         raise CalibrationError("no logs given: give at least one file")
-    groups: list[tuple[str, list[Stream]]] = []
+    groups: list[Group] = []
     tables = []
     for path in paths:
         if not path.exists():
@@ -120,9 +123,12 @@ def _groups(
             name = vehicle or mapped.header.get("vehicle")
             pulses = not mapped.header.get("passive", False)
             body = load_vehicle(name) if name else None
-            groups.append((path.stem, read_ardusub(path, mapped.ardusub, body, pulses=pulses)))
+            groups.append((path.stem, read_ardusub(path, mapped.ardusub, body, pulses=pulses), {}))
         elif kind == "rosbag":
-            groups.append((path.stem, read_bag(path, mapped.topics)))
+            recorded, notes = recorded_header(path)
+            notes = [] if vehicle or mapped.header.get("vehicle") else notes
+            first, *others = read_bag(path, mapped.topics)
+            groups.append((path.stem, [first.noting(*notes), *others], recorded))
         else:
             tables.append(path)
     return groups + _table_groups(tables, mapped, has_map)
@@ -142,7 +148,7 @@ def _kind(path: Path) -> Format:
     )
 
 
-def _table_groups(paths: list[Path], mapped: ColumnMap, has_map: bool) -> list[tuple[str, list[Stream]]]:
+def _table_groups(paths: list[Path], mapped: ColumnMap, has_map: bool) -> list[Group]:
     """Tables by trial: those for which `{trial}` or the first `*` of their patterns stands for the same text."""
     if paths and has_map and not mapped.files:
         raise CalibrationError(
@@ -183,7 +189,7 @@ def _table_groups(paths: list[Path], mapped: ColumnMap, has_map: bool) -> list[t
         streams[0] = streams[0].noting(
             *(f"{name} is in no pattern of the map and is left out" for name in left_out)
         )
-        groups.append((trial, streams))
+        groups.append((trial, streams, {}))
     return groups
 
 

@@ -42,6 +42,7 @@ USUAL: dict[str, dict[str, str]] = {
     "geometry_msgs/msg/TwistWithCovarianceStamped": _twist("twist.twist"),
     "sensor_msgs/msg/FluidPressure": {"pressure": "fluid_pressure"},
     "sensor_msgs/msg/BatteryState": {"voltage": "voltage"},
+    "finssim_msgs/msg/HardwareTelemetry": {"depth": "depth"},
 }
 """Type -> canonical column -> field. An Imu's attitude is taken only where a map says so, for many leave it unset.
 Where two of them hold one column and no map says which, the type that stands first here is believed."""
@@ -50,7 +51,7 @@ _PART = re.compile(r"([^.\[\]]+)|\[([^\]]*)\]")
 
 
 def number_at(message: Any, path: str, topic: str) -> float:
-    """The number at a dotted path: `twist.twist.linear.x`, `data[3]`, `velocity[T1]` (by the message's list `name`).
+    """The number at a dotted path: `twist.twist.linear.x`, `data[3]`, `velocity[T1]` (by the list `name` or `names`).
 
     Raises:
         CalibrationError: No such field, or no number there.
@@ -94,7 +95,7 @@ def _value_at(message: Any, path: str, topic: str) -> Any:
                 )
             continue
         key = index or name
-        names = [str(x) for x in getattr(message, "name", ())]
+        names = [str(x) for x in getattr(message, "names", getattr(message, "name", ()))]
         place = int(key) if key.lstrip("-").isdigit() else names.index(key) if key in names else None
         if place is None:
             raise CalibrationError(

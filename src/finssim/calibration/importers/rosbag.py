@@ -11,6 +11,12 @@ import numpy as np
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.importers.assemble import in_our_axes
+from finssim.calibration.importers.finssim_record import (
+    THRUSTERS,
+    own_topics,
+    spoken_events,
+    thruster_columns,
+)
 from finssim.calibration.importers.message_fields import USUAL, number_at, stamp_of, word_at
 from finssim.calibration.importers.source_map import ColumnSource, SourceMap
 from finssim.calibration.importers.streams import Stream
@@ -21,6 +27,8 @@ from finssim.vehicles.part import did_you_mean
 __all__ = ["BAGS", "bag_files", "read_bag"]
 
 BAGS = (".mcap", ".db3", ".bag")
+
+WORDS = "std_msgs/msg/String"
 
 
 def read_bag(path: Path, topics: Mapping[str, SourceMap]) -> list[Stream]:
@@ -36,6 +44,8 @@ def read_bag(path: Path, topics: Mapping[str, SourceMap]) -> list[Stream]:
     """
     with _opened(path) as (reader, notes):
         known = {c.topic: c.msgtype for c in reader.connections}
+        own = {} if topics else own_topics(known)
+        topics = topics or own
         if not topics:
             topics = {topic: SourceMap() for topic, kind in sorted(known.items()) if kind in USUAL}
         if not topics:
@@ -48,16 +58,17 @@ def read_bag(path: Path, topics: Mapping[str, SourceMap]) -> list[Stream]:
                 raise CalibrationError(
                     f"{path.name}: no topic '{topic}'{did_you_mean(topic, list(known))} its topics are {_listed(known)}"
                 )
-            sources[topic] = _columns(topic, known[topic], source)
+            sources[topic] = _columns(reader, topic, known[topic], source)
         _choose(sources, known, [topic for topic in topics if not topics[topic].columns], notes)
         collected = _collect(reader, sources, topics, notes)
+        events = _events(reader) if own else []
     streams = [_stream(topic, sources[topic], topics[topic], *collected[topic]) for topic in topics]
-    found = [stream for stream in streams if len(stream.t) >= 2]
+    found = [stream for stream in streams if len(stream.t) >= 2 and (stream.channels or stream.words)]
     if not found:
         raise CalibrationError(f"{path.name}: {', '.join(topics)} hold fewer than two messages each")
     notes += [f"{topic} holds fewer than two messages" for topic in topics if len(collected[topic][0]) < 2]
     found[0] = found[0].noting(*notes)
-    return found
+    return found + events
 
 
 def bag_files(path: Path) -> list[Path]:
@@ -94,15 +105,36 @@ def _opened(path: Path) -> Iterator[tuple[Any, list[str]]]:
             reader.close()
 
 
-def _columns(topic: str, kind: str, source: SourceMap) -> dict[str, ColumnSource]:
+def _columns(reader: Any, topic: str, kind: str, source: SourceMap) -> dict[str, ColumnSource]:
     """Columns of a topic: the map's, or the usual ones of its type."""
     if source.columns or source.phase is not None or source.split is not None:
         return source.columns
+    if kind in THRUSTERS:
+        return _thruster_columns(reader, topic, kind)
     if kind not in USUAL:
         raise CalibrationError(
             f"{topic} is of type {kind}, for which no columns are usual: give 'columns: {{u: FIELD, ...}}'"
         )
     return {name: ColumnSource(column=path) for name, path in USUAL[kind].items()}
+
+
+def _thruster_columns(reader: Any, topic: str, kind: str) -> dict[str, ColumnSource]:
+    """Columns that the first message of a topic names."""
+    connections = [c for c in reader.connections if c.topic == topic]
+    for connection, _, raw in reader.messages(connections=connections):
+        return thruster_columns(kind, reader.deserialize(raw, connection.msgtype))
+    return {}
+
+
+def _events(reader: Any) -> list[Stream]:
+    """What the events of our own records say."""
+    connections = [c for c in reader.connections if c.topic.endswith("/events") and c.msgtype == WORDS]
+    said = (
+        (time * 1e-9, reader.deserialize(raw, c.msgtype).data)
+        for c, time, raw in reader.messages(connections=connections)
+    )
+    stream = spoken_events("events", said, reader.start_time * 1e-9) if connections else None
+    return [] if stream is None else [stream]
 
 
 def _choose(
@@ -112,7 +144,12 @@ def _choose(
 
     Two topics of one type keep it, and are refused where the streams are put together.
     """
-    rank = {topic: list(USUAL).index(known[topic]) for topic in usual if known[topic] in USUAL}
+    order = [*THRUSTERS, *USUAL]
+    rank = {topic: order.index(known[topic]) for topic in usual if known[topic] in order}
+    if any("depth" in columns for columns in sources.values()):
+        for topic in rank:
+            if sources[topic].pop("pressure", None) is not None:
+                notes.append(f"pressure of {topic} left out, for the depth is there")
     for topic in sorted(rank, key=lambda topic: rank[topic], reverse=True):
         better = {
             name: other for other in sources for name in sources[other] if rank.get(other, -1) < rank[topic]
