@@ -67,7 +67,6 @@ class PoolCamera:
                 tags,
                 site,
                 ripples,
-                size=vehicle.body.size,
                 basin=basin or Basin(),
                 exposure=s.exposure,
                 seed=seed,

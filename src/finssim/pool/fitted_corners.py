@@ -7,6 +7,8 @@ the corners follow from a few points of the tag by a matrix that the tag's cells
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
@@ -18,7 +20,8 @@ Array = npt.NDArray[np.float64]
 
 NODES = 6
 """Along each side of the tag: a polynomial of degree 5 follows ripples as long as the tag's edge."""
-SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+HOMOGENEOUS = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 1.0], [0.0, 1.0, 1.0]])
+"""Corners of the unit square."""
 
 
 class CornerFit:
@@ -39,12 +42,13 @@ class CornerFit:
         self.nodes[:, 0] = edge * (self._square[:, 0] - 0.5)
         self.nodes[:, 1] = edge * (0.5 - self._square[:, 1])
         points, across = _cell_edges(family, tag)
-        there = np.kron(np.ones(1), _interpolation(along, points))
-        rows = np.where(across[:, None], _warp_columns(points)[:, 0], _warp_columns(points)[:, 1])
-        u = np.where(across[:, None], there, 0.0)
-        v = np.where(across[:, None], 0.0, there)
-        self._warp = np.linalg.pinv(rows) @ np.concatenate([u, v], axis=1)
-        self._bend = np.eye(2 * len(self.nodes)) - _stacked(self._square) @ self._warp
+        columns, there = _warp_columns(points), _interpolation(along, points)
+        rows = np.where(across[:, None], columns[:, 0], columns[:, 1])
+        u, v = np.where(across[:, None], there, 0.0), np.where(across[:, None], 0.0, there)
+        warp = np.linalg.pinv(rows) @ np.concatenate([u, v], axis=1)
+        at_nodes = _warp_columns(self._square)
+        bend = np.eye(2 * len(self.nodes)) - np.concatenate([at_nodes[:, 0], at_nodes[:, 1]]) @ warp
+        self._matrix = np.concatenate([warp, bend])
 
     def corners(self, pixels: Array) -> tuple[Array, float]:
         """Corners that the fit reports, and how far ripples bend the tag.
@@ -56,13 +60,14 @@ class CornerFit:
             Corners (4, 2) [px], and the rms distance of the nodes from where the fit has them, in edges of the tag.
         """
         H = _from_square(pixels[self._at_corner])
-        seen = np.append(pixels, np.ones((len(pixels), 1)), axis=1) @ np.linalg.inv(H).T
+        back = np.linalg.inv(H)
+        seen = pixels @ back[:, :2].T + back[:, 2]
         moved = (seen[:, :2] / seen[:, 2:] - self._square).T.ravel()
-        h = self._warp @ moved
-        left = self._bend @ moved
-        change = np.eye(3) + np.append(h, 0.0).reshape(3, 3)
-        image = np.append(SQUARE, np.ones((4, 1)), axis=1) @ (H @ change).T
-        return image[:, :2] / image[:, 2:], float(np.sqrt(2.0 * np.mean(left * left)))
+        change = self._matrix @ moved
+        h, left = change[:8], change[8:]
+        warp = np.array([[1.0 + h[0], h[1], h[2]], [h[3], 1.0 + h[4], h[5]], [h[6], h[7], 1.0]])
+        image = HOMOGENEOUS @ (H @ warp).T
+        return image[:, :2] / image[:, 2:], math.sqrt(2.0 * float(left @ left) / len(left))
 
 
 def _cell_edges(family: str, tag: int) -> tuple[Array, npt.NDArray[np.bool_]]:
@@ -89,12 +94,6 @@ def _warp_columns(points: Array) -> Array:
     )
 
 
-def _stacked(points: Array) -> Array:
-    """`_warp_columns` with all x before all y, (2 E, 8)."""
-    columns = _warp_columns(points)
-    return np.concatenate([columns[:, 0], columns[:, 1]])
-
-
 def _interpolation(along: Array, points: Array) -> Array:
     """Weights of the nodes of a square grid in the polynomial through them, at points, (E, N)."""
     one = np.vander(along, len(along))
@@ -104,6 +103,11 @@ def _interpolation(along: Array, points: Array) -> Array:
 
 def _from_square(corners: Array) -> Array:
     """The homography that takes the unit square, x right and y down, to four corners, (3, 3)."""
-    a, b, c, d = corners
-    pull = np.linalg.solve(np.column_stack([b - c, d - c]), a - b + c - d)
-    return np.vstack([np.column_stack([b - a + pull[0] * b, d - a + pull[1] * d, a]), [*pull, 1.0]])
+    (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners.tolist()
+    ux, uy, vx, vy = bx - cx, by - cy, dx - cx, dy - cy
+    wx, wy = ax - bx + cx - dx, ay - by + cy - dy
+    area = ux * vy - uy * vx
+    p, q = (wx * vy - wy * vx) / area, (ux * wy - uy * wx) / area
+    return np.array(
+        [[bx - ax + p * bx, dx - ax + q * dx, ax], [by - ay + p * by, dy - ay + q * dy, ay], [p, q, 1.0]]
+    )

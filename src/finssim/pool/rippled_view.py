@@ -7,15 +7,17 @@ import numpy.typing as npt
 
 from finssim.geometry.optics import Camera, Interface
 from finssim.sensors.overhead_camera import Ripples
-from finssim.sensors.overhead_camera.surface import Waves, waves_of
+from finssim.sensors.overhead_camera.surface import waves_of
 from finssim.sensors.overhead_camera.view import surface_frame
 
 __all__ = ["RippledView"]
 
 Array = npt.NDArray[np.float64]
 
-STEPS = 4
-"""Of Newton's method with the Jacobian of the first step: the last one moves the image by less than 0.001 px."""
+FLAT_STEPS = 3
+"""Of Newton's method for still water."""
+RIPPLE_STEPS = 2
+"""And then for ripples, with the slope's own slope from the first: the last one moves the image by 0.01 px."""
 
 
 class RippledView:
@@ -30,9 +32,11 @@ class RippledView:
         """
         self.camera = camera
         self._frame = surface_frame(camera, interface)
-        self._waves: Waves | None = None if ripples is None or not ripples.rms_slope else waves_of(ripples)
         self._ratio = interface.index_near / interface.index_far
-        self._R_cs = camera.R_pc.T @ self._frame.R_sp.T
+        self._R_sc = np.ascontiguousarray((camera.R_pc.T @ self._frame.R_sp.T).T)
+        self._surface = (
+            None if ripples is None or not ripples.rms_slope else _Surface(ripples, self._frame.offset)
+        )
 
     def pixels(self, points_p: Array, time: float) -> tuple[Array, npt.NDArray[np.bool_]]:
         """Pixels at which points appear.
@@ -46,74 +50,99 @@ class RippledView:
             the lens has a place for it, (N,).
         """
         points = self._frame.point(points_p)
-        depth = -points[:, 2]
-        place, height = self._crossing(points[:, :2], depth, time)
-        direction = np.concatenate([place, (height - self._frame.camera_height)[:, None]], axis=1)
-        pixels, seen = self.camera.lens.project(direction @ self._R_cs.T)
-        return pixels, seen & (depth > height) & np.isfinite(place).all(axis=1)
+        direction = np.empty_like(points)
+        with np.errstate(all="ignore"):
+            x, y, height = self._crossing(points[:, 0], points[:, 1], -points[:, 2], time)
+            direction[:, 0], direction[:, 1], direction[:, 2] = x, y, height - self._frame.camera_height
+            pixels, seen = self.camera.lens.project(direction @ self._R_sc)
+        return pixels, seen & (points[:, 2] < height) & np.isfinite(x)
 
-    def _crossing(self, target: Array, depth: Array, time: float) -> tuple[Array, Array]:
-        """Where the ray from the camera to each point crosses the surface, (N, 2) and (N,), surface frame [m].
+    def _crossing(
+        self, px: Array, py: Array, depth: Array, time: float
+    ) -> tuple[Array, Array, Array | float]:
+        """Where the ray from the camera to each point crosses the surface: x, y, height, surface frame [m], (N,).
 
-        Found as the root of the miss: the ray through a place of the surface, bent by the slope there, lands
-        beside the point.
+        Found as the root of the miss: the ray through a place of the surface, bent by the slope there, lands beside
+        the point.
         """
         H, r = self._frame.camera_height, self._ratio
-        with np.errstate(all="ignore"):
-            place = target * (H / (H + r * np.maximum(depth, 0.0)))[:, None]
-            inverse = self._inverse_jacobian(place, depth, time)
-            height = np.zeros(len(depth))
-            for _ in range(STEPS):
-                landing, height = self._landing(place, depth, time)
-                place = place + np.einsum("nij,nj->ni", inverse, target - landing)
-        return place, height
+        reach = np.hypot(px, py)
+        radius = reach * (H / (H + r * depth))
+        for _ in range(FLAT_STEPS):
+            cosine = H / np.sqrt(H * H + radius * radius)
+            beyond = np.sqrt(1.0 - r * r * (1.0 - cosine * cosine))
+            spread = depth * r * cosine / (beyond * H)
+            along = 1.0 + spread * (cosine / beyond) ** 2
+            radius = radius + (reach - radius * (1.0 + spread)) / along
+        share = radius / np.maximum(reach, 1e-12)
+        x, y = px * share, py * share
+        if self._surface is None:
+            return x, y, 0.0
+        across = 1.0 + spread
+        return self._rippled((x, y), (px, py), depth, (along, across, (1.0 - r) / beyond * depth), time)
 
-    def _landing(self, place: Array, depth: Array, time: float) -> tuple[Array, Array]:
-        """Where rays through places of the surface come down at a depth, (N, 2), and the surface's height (N,) [m]."""
-        r = self._ratio
-        height, slope = self._surface(place, time)
-        drop = self._frame.camera_height - height
-        length = np.sqrt(np.einsum("ni,ni->n", place, place) + drop * drop)
-        steep = np.sqrt(1.0 + np.einsum("ni,ni->n", slope, slope))
-        cosine = (np.einsum("ni,ni->n", place, slope) + drop) / (length * steep)
-        # Snell's law: b = r ray + (r cos - cos') n, with ray = (place, -drop)/length and n = (-slope, 1)/steep.
-        turn = (r * cosine - np.sqrt(1.0 - r * r * (1.0 - cosine * cosine))) / steep
-        down = r * drop / length - turn
-        across = place * (r / length)[:, None] - slope * turn[:, None]
-        return place + across * ((depth + height) / down)[:, None], height
-
-    def _inverse_jacobian(self, place: Array, depth: Array, time: float) -> Array:
-        """Inverse of d landing / d place, (N, 2, 2): that of flat water, and what curvature adds to it."""
-        H, r = self._frame.camera_height, self._ratio
-        s2 = np.einsum("ni,ni->n", place, place)
-        cosine = H / np.sqrt(H * H + s2)
-        beyond = np.sqrt(1.0 - r * r * (1.0 - cosine * cosine))
-        along = 1.0 + depth * r * (cosine / beyond) ** 3 / H
-        across = 1.0 + depth * r * (cosine / beyond) / H
-        unit = place / np.sqrt(np.maximum(s2, 1e-12))[:, None]
-        J = (
-            across[:, None, None] * np.eye(2)
-            + (along - across)[:, None, None] * unit[:, :, None] * unit[:, None]
+    def _rippled(
+        self,
+        place: tuple[Array, Array],
+        target: tuple[Array, Array],
+        depth: Array,
+        flat: tuple[Array, Array, Array],
+        time: float,
+    ) -> tuple[Array, Array, Array]:
+        """From the place on still water to that on ripples. `flat`: d landing / d place along the radius and across it
+        on still water, and by how much curvature adds to them."""
+        assert self._surface is not None
+        x, y = place
+        along, across, by_curvature = flat
+        height, sx, sy, hxx, hxy, hyy = self._surface.at(x, y, time)
+        pull = (along - across) / np.maximum(x * x + y * y, 1e-12)
+        a, b, c = (
+            across + pull * x * x + by_curvature * hxx,
+            pull * x * y + by_curvature * hxy,
+            across + pull * y * y + by_curvature * hyy,
         )
-        if self._waves is not None:
-            J = J + (depth * (1.0 - r) / beyond)[:, None, None] * self._curvature(place, time)
-        return np.asarray(np.linalg.inv(J))
+        inverse = 1.0 / (a * c - b * b)
+        for k in range(RIPPLE_STEPS):
+            if k > 0:
+                height, sx, sy, *_ = self._surface.at(x, y, time)
+            fx, fy = self._step(x, y, height, sx, sy, depth)
+            miss_x, miss_y = (target[0] - x - fx) * inverse, (target[1] - y - fy) * inverse
+            x, y = x + c * miss_x - b * miss_y, y + a * miss_y - b * miss_x
+        return x, y, height
 
-    def _surface(self, place: Array, time: float) -> tuple[Array, Array]:
-        """Height (N,) [m] and slope (N, 2)."""
-        if self._waves is None:
-            return np.zeros(len(place)), np.zeros_like(place)
-        w = self._waves
-        angle = self._angle(place, time)
-        return np.sin(angle) @ w.amplitude, (np.cos(angle) * w.amplitude) @ w.k
+    def _step(
+        self, x: Array, y: Array, height: Array, sx: Array, sy: Array, depth: Array
+    ) -> tuple[Array, Array]:
+        """How far to the side a ray goes under water before it is at a depth [m], (N,) each."""
+        r = self._ratio
+        drop = self._frame.camera_height - height
+        length = np.sqrt(x * x + y * y + drop * drop)
+        steep = 1.0 / np.sqrt(1.0 + sx * sx + sy * sy)
+        cosine = (x * sx + y * sy + drop) * steep / length
+        # Snell's law: b = r ray + (r cos - cos') n, with ray = (x, y, -drop)/length and n = (-sx, -sy, 1) steep.
+        turn = (r * cosine - np.sqrt(1.0 - r * r * (1.0 - cosine * cosine))) * steep
+        short = r / length
+        scale = (depth + height) / (drop * short - turn)
+        return (x * short - sx * turn) * scale, (y * short - sy * turn) * scale
 
-    def _curvature(self, place: Array, time: float) -> Array:
-        """Second derivatives of the height [1/m], (N, 2, 2)."""
-        assert self._waves is not None
-        w = self._waves
-        return -np.einsum("nw,wi,wj->nij", np.sin(self._angle(place, time)) * w.amplitude, w.k, w.k)
 
-    def _angle(self, place: Array, time: float) -> Array:
-        assert self._waves is not None
-        w = self._waves
-        return np.asarray((place + self._frame.offset) @ w.k.T - w.omega * time + w.phase)
+class _Surface:
+    """Height, slope and curvature of the ripples, surface frame."""
+
+    def __init__(self, ripples: Ripples, offset: Array) -> None:
+        waves = waves_of(ripples)
+        self._k = np.ascontiguousarray(waves.k.T)
+        self._omega = waves.omega
+        self._phase = waves.phase + offset @ self._k
+        kx, ky = self._k
+        a = waves.amplitude
+        self._of_sine = np.stack([a, -a * kx * kx, -a * kx * ky, -a * ky * ky], axis=1)
+        self._of_cosine = np.stack([a * kx, a * ky], axis=1)
+
+    def at(self, x: Array, y: Array, time: float) -> tuple[Array, Array, Array, Array, Array, Array]:
+        """h [m], h_x, h_y, h_xx, h_xy, h_yy [1/m] at places, (N,) each."""
+        angle = np.stack([x, y], axis=1) @ self._k
+        angle += self._phase - self._omega * time
+        even = np.sin(angle) @ self._of_sine
+        odd = np.cos(angle) @ self._of_cosine
+        return even[:, 0], odd[:, 0], odd[:, 1], even[:, 1], even[:, 2], even[:, 3]

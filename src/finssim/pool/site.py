@@ -46,7 +46,7 @@ class CameraSettings:
     """Chance that a picture is lost."""
     ripples: float = 0.0
     """Root mean square of the water's slope."""
-    pixel_noise: float = 0.05
+    pixel_noise: float = 0.03
     """Of corners that are made without a picture, per axis [px]; rendered pictures have the noise of their pixels."""
     mounts: Mapping[int, Mount] = field(default_factory=dict)
     """Where tags truly sit, by id; those not named as the vehicle file has them."""
