@@ -8,6 +8,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from finssim.geometry.rotations import (
+    cross,
     matrix_to_quat,
     quat_conjugate,
     quat_from_euler,
@@ -41,6 +42,14 @@ def test_products_and_matrices_agree_with_scipy():
     np.testing.assert_allclose(up_to_sign(product), up_to_sign((RANDOM * other).as_quat()), atol=1e-14)
     np.testing.assert_allclose(quat_rotate(Q, VECTORS), RANDOM.apply(VECTORS), atol=1e-14)
     np.testing.assert_allclose(quat_inverse_rotate(Q, VECTORS), RANDOM.inv().apply(VECTORS), atol=1e-14)
+
+
+def test_cross_is_numpys_to_the_last_digit():
+    """For one pair, for many, and for shapes that are broadcast."""
+    other = np.roll(VECTORS, 1, axis=0)
+    assert np.array_equal(cross(VECTORS, other), np.cross(VECTORS, other))
+    assert np.array_equal(cross(X, VECTORS[:5, None]), np.cross(X, VECTORS[:5, None]))
+    assert np.array_equal(cross(X, Y), Z)
 
 
 def test_euler_angles_agree_with_scipy():

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 __all__ = [
+    "cross",
     "matrix_to_quat",
     "quat_conjugate",
     "quat_from_euler",
@@ -28,25 +29,34 @@ __all__ = [
 
 Array = npt.NDArray[np.float64]
 
+_YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
+
 
 def wrap_angle(angle: npt.ArrayLike) -> Array:
     """The same angle in [-pi, pi) [rad], (...)."""
     return np.asarray(np.remainder(np.asarray(angle, float) + np.pi, 2.0 * np.pi) - np.pi)
 
 
+def cross(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
+    """a x b, (..., 3) each: the same numbers as `np.cross`, which takes a multiple of the time for a single pair."""
+    a, b = np.asarray(a, float), np.asarray(b, float)
+    return np.asarray((a * b[..., _YZX] - a[..., _YZX] * b)[..., _YZX])
+
+
 def skew(a: npt.ArrayLike) -> Array:
     """Matrix S(a) with S(a) b = a x b, (..., 3) -> (..., 3, 3)."""
-    x, y, z = np.moveaxis(np.asarray(a, float), -1, 0)
-    o = np.zeros_like(x)
-    entries = np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1)
-    return np.asarray(entries.reshape(*x.shape, 3, 3))
+    a = np.asarray(a, float)
+    S = np.zeros((*a.shape, 3))
+    S[..., _ZXY, _YZX] = a
+    S[..., _YZX, _ZXY] = -a
+    return S
 
 
 def quat_multiply(q_ab: npt.ArrayLike, q_bc: npt.ArrayLike) -> Array:
     """Composition q_ac = q_ab q_bc, (..., 4)."""
     a, b = np.asarray(q_ab, float), np.asarray(q_bc, float)
     va, wa, vb, wb = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
-    vector = wa * vb + wb * va + np.cross(va, vb)
+    vector = wa * vb + wb * va + cross(va, vb)
     return np.concatenate([vector, wa * wb - np.sum(va * vb, axis=-1, keepdims=True)], axis=-1)
 
 
@@ -58,8 +68,8 @@ def quat_conjugate(q: npt.ArrayLike) -> Array:
 def quat_rotate(q_ab: npt.ArrayLike, vector_b: npt.ArrayLike) -> Array:
     """A vector written in b, written in a: (..., 4), (..., 3) -> (..., 3)."""
     q, v = np.asarray(q_ab, float), np.asarray(vector_b, float)
-    twice = 2.0 * np.cross(q[..., :3], v)
-    return np.asarray(v + q[..., 3:] * twice + np.cross(q[..., :3], twice))
+    twice = 2.0 * cross(q[..., :3], v)
+    return np.asarray(v + q[..., 3:] * twice + cross(q[..., :3], twice))
 
 
 def quat_inverse_rotate(q_ab: npt.ArrayLike, vector_a: npt.ArrayLike) -> Array:
@@ -81,15 +91,11 @@ def matrix_to_quat(R_ab: npt.ArrayLike) -> Array:
     yx, zx, zy = R[..., 1, 0] + R[..., 0, 1], R[..., 2, 0] + R[..., 0, 2], R[..., 2, 1] + R[..., 1, 2]
     xw, yw, zw = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
     # Four times q q^T: every row is proportional to q, and the one with the largest diagonal loses no digits.
-    outer = np.stack(
-        [
-            np.stack([1.0 + xx - yy - zz, yx, zx, xw], -1),
-            np.stack([yx, 1.0 - xx + yy - zz, zy, yw], -1),
-            np.stack([zx, zy, 1.0 - xx - yy + zz, zw], -1),
-            np.stack([xw, yw, zw, 1.0 + xx + yy + zz], -1),
-        ],
-        axis=-2,
-    )
+    outer = np.empty((*R.shape[:-2], 4, 4))
+    outer[..., 0, 0], outer[..., 1, 1] = 1.0 + xx - yy - zz, 1.0 - xx + yy - zz
+    outer[..., 2, 2], outer[..., 3, 3] = 1.0 - xx - yy + zz, 1.0 + xx + yy + zz
+    for i, j, value in ((0, 1, yx), (0, 2, zx), (0, 3, xw), (1, 2, zy), (1, 3, yw), (2, 3, zw)):
+        outer[..., i, j] = outer[..., j, i] = value
     largest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
     q = np.take_along_axis(outer, largest[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
