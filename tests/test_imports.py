@@ -82,6 +82,7 @@ HOMES = {
         "robot/record_pictures.py",
     },
     "pupil_apriltags": {"localization/detection/detector_apriltag.py"},
+    "serial": {"robot/link/serial_port.py"},
     "cyclonedds": set(),
     "rclpy": set(),
     "viser": set(),

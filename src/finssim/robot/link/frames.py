@@ -92,7 +92,7 @@ def _head(kind: int) -> tuple[Field, ...]:
     return (
         Field("type", "B", "kind of frame", constant=kind),
         Field("version", "B", "of the layout", constant=1),
-        Field("length", "H", "bytes of the payload: everything after the header, without the CRC"),
+        Field("length", "H", "bytes between the header and the CRC"),
         Field("sequence", "H", "counts frames, modulo 2¹⁶"),
     )
 
@@ -154,7 +154,7 @@ DEBUG_CONFIG = Layout(
     payload=(
         Field("mask", "I", "bit 0: echo commands"),
         Field("decimation", "H", "one echo for this many commands"),
-        Field("reserved", "H", "0; not looked at", constant=0),
+        Field("reserved", "H", "not looked at", constant=0),
     ),
 )
 LAYOUTS = (COMMAND, TELEMETRY, ECHO, DEBUG_CONFIG)
