@@ -1,0 +1,258 @@
+"""Pilots decide what the same controller decides elsewhere, and refuse what does not fit."""
+
+import hashlib
+import math
+
+import numpy as np
+import pytest
+import yaml
+from onnx import TensorProto, helper, numpy_helper
+
+from finssim.control.controllers import controller
+from finssim.control.errors import ControlError
+from finssim.control.guidance import Station, goal_at
+from finssim.control.modes import Wrench4, Wrench6
+from finssim.control.observations import OBSERVERS
+from finssim.control.policy_description import PolicyError
+from finssim.geometry.rotations import quat_from_euler
+from finssim.robot.ablation import NoisyInput
+from finssim.robot.counters import Ticks
+from finssim.robot.goals import GoalError, check_reachable, guide_of, station_of
+from finssim.robot.pilots import ModeSwitch, PidPilot, PolicyPilot, WrenchPilot, make_pilot
+from finssim.robot.robot import Reading
+from finssim.vehicles import load_vehicle
+
+VEHICLE = load_vehicle("finsrov")
+STATION = Station((1.0, -0.3, -0.5), 0.6)
+READING = Reading(
+    5.0,
+    np.array([0.2, 0.1, -0.4]),
+    quat_from_euler(0.05, -0.03, 0.2),
+    np.array([0.1, -0.05, 0.02, 0.01, 0.0, -0.1]),
+    True,
+)
+GAIN = np.random.default_rng(0).normal(0.0, 0.3, (4, 16)).astype(np.float32)
+
+
+def network():
+    """clip(GAIN x, -1, 1), as an ONNX file."""
+    weights = [numpy_helper.from_array(GAIN, "gain")]
+    weights += [numpy_helper.from_array(np.float32(v), n) for v, n in ((-1, "low"), (1, "high"))]
+    nodes = [helper.make_node("Gemm", ["observation", "gain"], ["x"], transB=1)]
+    nodes += [helper.make_node("Clip", ["x", "low", "high"], ["action"])]
+    x = helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["N", 16])
+    y = helper.make_tensor_value_info("action", TensorProto.FLOAT, ["N", 4])
+    graph = helper.make_graph(nodes, "policy", [x], [y], weights)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    return model.SerializeToString()
+
+
+@pytest.fixture
+def policy(tmp_path):
+    """Writes a policy directory of T1 for FinsROV, with changes to its description."""
+
+    def write(**changes):
+        content = network()
+        description = {
+            "format": 1,
+            "task": "t1",
+            "observation": OBSERVERS["t1"].schema.model_dump(mode="json"),
+            "action": Wrench4.from_vehicle(VEHICLE, 0.5).describe(),
+            "control_period": 0.1,
+            "vehicle": {"name": VEHICLE.name, "sha256": VEHICLE.sha256},
+            "hydrodynamics": "calibrated",
+            "seed": 42,
+            "files": {"policy.onnx": hashlib.sha256(content).hexdigest()},
+            **changes,
+        }
+        folder = tmp_path / "hold"
+        folder.mkdir(exist_ok=True)
+        (folder / "policy.onnx").write_bytes(content)
+        (folder / "policy.yaml").write_text(yaml.safe_dump(description))
+        return folder
+
+    return write
+
+
+def test_a_policy_pilot_gives_the_thrusts_of_its_network(policy):
+    """Observation, network, action mode and allocation in a row."""
+    pilot = PolicyPilot(policy(), VEHICLE)
+    action = np.clip(GAIN @ OBSERVERS["t1"].observe(READING, STATION, 0.0), -1.0, 1.0)
+    expected = Wrench4.from_vehicle(VEHICLE, 0.5).to_thrusters(action)
+    np.testing.assert_allclose(pilot.act(READING, STATION, 0.0), expected, atol=1e-4)
+    assert pilot.period == 0.1 and pilot.describe()["task"] == "t1"
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"vehicle": {"name": "finsrov", "sha256": "0" * 64}}, "trained for vehicle finsrov 000000000000"),
+        ({"task": "t9"}, "unknown task 't9'"),
+        ({"task": "t2"}, "observation schema does not fit"),
+        (
+            {"action": {**Wrench4.from_vehicle(VEHICLE).describe(), "limits": [1.0] * 6}},
+            "wrench4: limits was",
+        ),
+        (
+            {"action": {**Wrench4.from_vehicle(VEHICLE).describe(), "mode": "jet"}},
+            "unknown action mode 'jet'",
+        ),
+    ],
+)
+def test_a_policy_that_does_not_fit_is_refused(policy, changes, sentence):
+    """Vehicle, task, observation or limits: one sentence that names it."""
+    with pytest.raises((PolicyError, ControlError), match=sentence):
+        PolicyPilot(policy(**changes), VEHICLE)
+
+
+def test_a_policy_of_another_task_or_rate_than_asked_is_refused(policy):
+    """`--task t2` with a policy of T1, and a loop that would ask twice as often."""
+    with pytest.raises(PolicyError, match="trained for task 't1', but this is 't2'"):
+        make_pilot(policy(), VEHICLE, task="t2")
+    with pytest.raises(PolicyError, match=r"control period of 0.1 s, but it would be called every 0.05 s"):
+        PolicyPilot(policy(), VEHICLE, period=0.05)
+
+
+def test_a_network_that_was_changed_is_refused(policy):
+    """Its hash is in the description."""
+    folder = policy()
+    (folder / "policy.onnx").write_bytes(b"x")
+    with pytest.raises(PolicyError, match="corrupt"):
+        PolicyPilot(folder, VEHICLE)
+
+
+@pytest.mark.parametrize("name", ["pid", "pid-paper"])
+def test_a_pid_pilot_allocates_the_controllers_wrench(name):
+    """Two decisions in a row, with the memory between them; reset forgets it."""
+    pilot, same = PidPilot(name, VEHICLE), controller(name, VEHICLE)
+    memory, limits, first = same.reset(), VEHICLE.wrench_limits, None
+    for _ in range(2):
+        tau, memory = same.command(memory, READING, goal_at(STATION, 0.0))
+        expected = Wrench6.from_vehicle(VEHICLE).allocator.allocate(np.clip(tau, -limits, limits))[0]
+        given = pilot.act(READING, STATION, 0.0)
+        first = given if first is None else first
+        np.testing.assert_allclose(given, expected)
+    pilot.reset()
+    np.testing.assert_allclose(pilot.act(READING, STATION, 0.0), first)
+    assert pilot.period == same.period
+
+
+def test_a_wrench_pilot_gives_a_persons_wrench_within_the_limits():
+    """Surge that the thrusters can give comes out whole; a hundred times the limit comes out as the limit."""
+    wanted = np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    pilot = WrenchPilot(lambda: wanted, VEHICLE)
+    blind = Reading(0.0, np.full(3, np.nan), np.full(4, np.nan), np.full(6, np.nan), False)
+    np.testing.assert_allclose(VEHICLE.control_matrix @ pilot.act(blind, STATION, 0.0), wanted, atol=2e-3)
+    wanted = np.array([1e4, 0.0, 0.0, 0.0, 0.0, 0.0])
+    reached = VEHICLE.control_matrix @ pilot.act(blind, STATION, 0.0)
+    assert reached[0] == pytest.approx(VEHICLE.wrench_limits[0], rel=0.01) and not pilot.needs_state
+
+
+def test_a_mode_switch_is_the_pilot_that_is_selected():
+    """Its period, its need of a state and its decisions; a new one starts without memory."""
+    pilots = {"hold": PidPilot("pid", VEHICLE), "hand": WrenchPilot(lambda: np.zeros(6), VEHICLE)}
+    switch = ModeSwitch(pilots)
+    first = switch.act(READING, STATION, 0.0)
+    assert switch.mode == "hold" and switch.needs_state and switch.period == pilots["hold"].period
+    switch.select("hand")
+    assert not switch.needs_state and not switch.act(READING, STATION, 0.0).any()
+    assert switch.describe() == {"mode": "hand", **pilots["hand"].describe()}
+    switch.select("hold")
+    np.testing.assert_allclose(switch.act(READING, STATION, 0.0), first)
+    with pytest.raises(ControlError, match="unknown mode 'x'; available: hold, hand"):
+        switch.select("x")
+    with pytest.raises(ControlError, match="at least one pilot"):
+        ModeSwitch({})
+
+
+def test_who_is_neither_pid_nor_policy_is_refused():
+    """The sentence lists what there is."""
+    with pytest.raises(PolicyError, match="neither pid nor pid-paper nor a policy directory"):
+        make_pilot("runs/nothing", VEHICLE)
+
+
+class Mirror:
+    """Gives back what it sees."""
+
+    name, period, needs_state = "mirror", 0.1, True
+
+    def reset(self):
+        pass
+
+    def describe(self):
+        return {"name": self.name}
+
+    def act(self, reading, guide, t):
+        return np.concatenate([reading.position, reading.quaternion, reading.nu])
+
+
+def test_noise_on_the_input_has_the_size_asked_for_and_touches_pose_alone():
+    """Over 2000 decisions: 5 cm on each axis, 10 degrees of heading, tilt and velocity untouched."""
+    noisy = NoisyInput(Mirror(), position_std=0.05, yaw_std=math.radians(10.0), seed=3)
+    seen = np.array([noisy.act(READING, STATION, 0.0) for _ in range(2000)])
+    np.testing.assert_allclose(seen[:, :3].std(axis=0), 0.05, rtol=0.1)
+    x, y, z, w = seen[:, 3:7].T
+    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    assert yaw.std() == pytest.approx(math.radians(10.0), rel=0.1)
+    up = 1.0 - 2.0 * (x * x + y * y)
+    np.testing.assert_allclose(up, up[0], atol=1e-12)
+    assert (seen[:, 7:] == READING.nu).all()
+
+
+def test_noise_on_the_input_repeats_from_its_seed():
+    """After a reset, and in another instance; another seed differs."""
+    a, b, c = (NoisyInput(Mirror(), seed=s) for s in (1, 1, 2))
+    first = a.act(READING, STATION, 0.0)
+    a.reset()
+    assert np.array_equal(a.act(READING, STATION, 0.0), first)
+    assert np.array_equal(b.act(READING, STATION, 0.0), first)
+    assert not np.array_equal(c.act(READING, STATION, 0.0), first)
+    assert a.describe()["input_noise"]["seed"] == 1 and a.name == "mirror" and a.period == 0.1
+
+
+def test_turns_stay_on_the_grid_of_their_start():
+    """Late calls miss turns and shift none; a turn may come 2 ms early."""
+    ticks = Ticks(10.0)
+    due = [ticks.due(t, 0.1) for t in (10.0, 10.05, 10.099, 10.15, 10.23, 10.55, 10.6)]
+    assert due == [(True, 0), (False, 0), (True, 0), (False, 0), (True, 0), (True, 2), (True, 0)]
+
+
+def test_goals_are_read_from_text_and_files(tmp_path):
+    """x, y, z [m] and degrees."""
+    assert station_of("1,-0.3,-0.5,90") == Station((1.0, -0.3, -0.5), math.radians(90.0))
+    file = tmp_path / "goal.yaml"
+    file.write_text("goal: [0.5, 0, -0.4, -45]\n")
+    assert guide_of(str(file), None) == Station((0.5, 0.0, -0.4), math.radians(-45.0))
+    assert guide_of(None, "ellipse").name == "ellipse"
+
+
+@pytest.mark.parametrize("text", ["1,2,3", "1,2,3,x", "nan,0,0,0", ""])
+def test_a_goal_that_is_none_is_refused(text):
+    """What was expected, with units."""
+    with pytest.raises(GoalError, match="expected four numbers x,y,z,yaw_deg"):
+        station_of(text)
+
+
+def test_a_goal_file_without_a_goal_is_refused(tmp_path):
+    """And one that is no YAML."""
+    (tmp_path / "a.yaml").write_text("x: 1\n")
+    (tmp_path / "b.yaml").write_text("goal: [1, 2\n")
+    with pytest.raises(GoalError, match="no goal in it"):
+        station_of(str(tmp_path / "a.yaml"))
+    with pytest.raises(GoalError, match="not valid YAML"):
+        station_of(str(tmp_path / "b.yaml"))
+
+
+def test_one_of_goal_and_trajectory_must_be_given():
+    """Not both, not neither."""
+    for both in (("0,0,-0.5,0", "ellipse"), (None, None)):
+        with pytest.raises(GoalError, match="either a goal"):
+            guide_of(*both)
+
+
+def test_a_goal_outside_the_workspace_is_refused():
+    """Above the water, or beyond a wall; the published trajectories are inside."""
+    check_reachable(guide_of(None, "ellipse"), VEHICLE)
+    for place in ("0,0,0.2,0", "2.5,0,-0.5,0"):
+        with pytest.raises(GoalError, match="outside the workspace"):
+            check_reachable(station_of(place), VEHICLE)
