@@ -189,8 +189,7 @@ class Bridge:
 
     def _limited(self, now: float) -> Array:
         """The newest command within the limits of the thrusters and of the workspace [N], (n,)."""
-        force = np.minimum(np.maximum(self._commander.force, self.motors.lower), self.motors.upper)
-        return self._watchdogs.limited(now, force)
+        return self._watchdogs.limited(now, self.motors.limited(self._commander.force))
 
     def _refusal(self, now: float) -> str:
         """Why arming is refused; "" if nothing stands against it."""
