@@ -80,15 +80,37 @@ def test_a_reboot_is_noticed_with_its_first_frame(uptime):
     assert clock.reboots == 1
 
 
-def test_a_frame_overtaken_by_others_gets_its_own_time():
-    """Late by 200 ms, it is stamped between its neighbours and moves nothing."""
+@pytest.mark.parametrize("old", [20, 200, 450])
+def test_a_frame_overtaken_by_others_gets_its_own_time(old):
+    """Late by up to seconds, it is stamped between its neighbours; no reboot would have counted so far so soon."""
     clock = ClockMap()
     made, ms, arrival = frames(20.0)
     stamps(clock, ms, arrival)
-    late = clock.stamp(int(ms[-20]), arrival[-1] + 0.001)
-    assert late == pytest.approx(made[-20] + LEAST, abs=0.002)
+    late = clock.stamp(int(ms[-old]), arrival[-1] + 0.001)
+    assert late == pytest.approx(made[-old] + LEAST, abs=0.002)
     assert clock.stamp(int(ms[-1]), arrival[-1] + 0.002) == pytest.approx(made[-1] + LEAST, abs=0.002)
     assert (clock.jumps, clock.reboots) == (0, 0)
+
+
+def test_a_reboot_soon_after_the_start_is_no_overtaken_frame():
+    """Up for 3 s, then up for 0.1 s: only three seconds back, and still a reboot."""
+    clock = ClockMap()
+    made, ms, arrival = frames(3.0)
+    stamps(clock, ms, arrival)
+    clock.stamp(100, arrival[-1] + 0.5)
+    assert (clock.reboots, clock.jumps) == (1, 0)
+
+
+@pytest.mark.parametrize("back", [2_000, 8_000])
+def test_a_step_back_of_the_controllers_clock_is_a_jump(back):
+    """Set back while it runs, as no reboot does: counted once, and in time stamps are right again."""
+    clock = ClockMap()
+    made, ms, arrival = frames(60.0, start_ms=50_000)
+    half = ms.size // 2
+    ms[half:] -= back
+    error = stamps(clock, ms, arrival) - made - LEAST
+    assert (clock.jumps, clock.reboots) == (1, 0)
+    assert np.abs(error[half + 500 :]).max() < 0.02
 
 
 @pytest.mark.parametrize("step", [40.0, -40.0, 0.6, -0.6])

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 __all__ = ["ClockMap"]
 
 _WRAP = 1 << 32
-_REORDERED = 500
-"""[ms] A frame this much older than the newest came late; an older one is from a clock that was reset."""
+_OVERTAKEN = 5000
+"""[ms] A frame at most this much older than the newest was overtaken by it."""
 _STEP = 0.25
 """[s] Frames earlier than the line by more, or all later in a whole second, come from a clock that was moved."""
 _SECOND = 1.0
@@ -29,8 +29,8 @@ class ClockMap:
     """Stamps of frames in the robot's time, never later than their arrival.
 
     Note:
-        `reboots` counts how often the controller's clock began anew, `jumps` other steps of either clock. A step back
-        of less than half a second, or one that only makes frames late, shows after two seconds.
+        `reboots` counts how often the controller's clock began anew, `jumps` other steps of either clock. A step that
+        only makes frames late shows within two seconds, a step back by less than 5 s after that time.
     """
 
     def __init__(self, window: float = 60.0) -> None:
@@ -57,13 +57,15 @@ class ClockMap:
         if self._newest is None:
             return self._restart(mcu_ms, 0.001 * mcu_ms, arrival)
         behind = (self._newest - mcu_ms) % _WRAP
-        if behind <= _REORDERED:
-            return min(arrival, self._line(self._time - 0.001 * behind))
         m = self._time + 0.001 * (_WRAP - behind)
-        if arrival < self._line(m) - _STEP:
-            began_anew = mcu_ms < self._newest
-            self.reboots += began_anew
-            self.jumps += not began_anew
+        moved = arrival < self._line(m) - _STEP
+        if moved and self._began_anew(mcu_ms, arrival):
+            self.reboots += 1
+            return self._restart(mcu_ms, 0.001 * mcu_ms, arrival)
+        if behind <= _OVERTAKEN:
+            return min(arrival, self._line(self._time - 0.001 * behind))
+        if moved:
+            self.jumps += 1
             return self._restart(mcu_ms, 0.001 * mcu_ms, arrival)
         if arrival - self._second >= _SECOND:
             if self._all_late():
@@ -73,6 +75,11 @@ class ClockMap:
         self._newest, self._time = mcu_ms, m
         self._keep(m, arrival)
         return min(arrival, self._line(m))
+
+    def _began_anew(self, mcu_ms: int, arrival: float) -> bool:
+        """Whether a controller that made the newest frame can since have started and counted so far."""
+        since = arrival - self._line(self._time)
+        return self._newest is not None and mcu_ms < self._newest and 0.001 * mcu_ms <= since + _STEP
 
     def _line(self, m: float) -> float:
         """Robot's time of a controller's time [s]."""
