@@ -1,0 +1,130 @@
+"""The camera's end of the picture wire: over UDP to one robot, or into shared memory."""
+
+from __future__ import annotations
+
+import os
+import socket
+import struct
+import tempfile
+import zlib
+from typing import Protocol
+
+from finssim.robot.link.layout import LinkError
+from finssim.robot.messages import Picture
+from finssim.robot.picture_codec import encode_picture
+from finssim.robot.picture_fragments import LONGEST_FRAGMENT, fragments
+from finssim.robot.picture_memory import HEAD, MAGIC, SLOT, VERSION, memory_path
+
+__all__ = ["PictureSink", "SharedMemorySender", "UdpSender"]
+
+SLOTS = 8
+SLOT_BYTES = 2 * 2**20
+"""A raw picture of 1920 x 1080 fits."""
+
+
+class PictureSink(Protocol):
+    """Takes pictures for a robot."""
+
+    def send(self, picture: Picture, now: float) -> None:
+        """Hand a picture on; `now` and `picture.time` are on this machine's `time.monotonic` [s]."""
+
+    def close(self) -> None:
+        """Let go of the wire."""
+
+
+class UdpSender:
+    """Datagrams to one robot: JPEG of quality 90, or the tags alone in one of them."""
+
+    def __init__(
+        self, bind: tuple[str, int], peer: tuple[str, int], *, fragment: int = LONGEST_FRAGMENT
+    ) -> None:
+        """
+        Args:
+            bind: Address and port of this end; port 0 takes a free one (see `address`).
+            peer: Of the robot.
+            fragment: Bytes of a picture in a datagram; 1400 for a network, more only on this machine.
+
+        Raises:
+            LinkError: The address cannot be bound.
+        """
+        self.sent = self.lost = 0
+        self._peer, self._fragment = peer, fragment
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4 * 2**20)
+        try:
+            self._socket.bind(bind)
+        except OSError as problem:
+            self._socket.close()
+            raise LinkError(
+                f"cannot bind {bind[0]}:{bind[1]} for pictures ({problem.strerror or problem}): "
+                "end the program that has it, or give another port"
+            ) from None
+        self.address: tuple[str, int] = self._socket.getsockname()
+
+    def send(self, picture: Picture, now: float) -> None:
+        """Send a picture; one that cannot leave is counted and forgotten."""
+        data = encode_picture(picture, late=max(now - picture.time, 0.0), compress=True)
+        try:
+            for datagram in fragments(data, self.sent + self.lost, self._fragment):
+                self._socket.sendto(datagram, self._peer)
+            self.sent += 1
+        except OSError:
+            self.lost += 1
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+class SharedMemorySender:
+    """A ring in memory under a name: made anew at every start, taken away at the end."""
+
+    def __init__(self, name: str, *, slots: int = SLOTS, slot_bytes: int = SLOT_BYTES) -> None:
+        """
+        Args:
+            name: Letters, digits, - and _.
+            slots: Pictures that it holds.
+            slot_bytes: Longest picture [bytes].
+
+        Raises:
+            LinkError: It is not a plain name, or the memory cannot be had.
+        """
+        self.path = memory_path(name)
+        self.sent = self.lost = 0
+        self._slots, self._size = slots, slot_bytes
+        temporary = ""
+        try:
+            self._file, temporary = tempfile.mkstemp(prefix=f".{self.path.name}-", dir=self.path.parent)
+            os.truncate(self._file, HEAD.size + slots * slot_bytes)
+            os.pwrite(self._file, HEAD.pack(MAGIC, VERSION, slots, slot_bytes, 0), 0)
+            os.replace(temporary, self.path)
+        except OSError as problem:
+            if temporary and os.path.exists(temporary):
+                os.unlink(temporary)
+            raise LinkError(f"shared memory {self.path}: {problem.strerror}: free some or use udp") from None
+
+    def send(self, picture: Picture, now: float) -> None:
+        """Write a picture into the next slot; one that is too long, or finds no memory, is counted and forgotten."""
+        data = encode_picture(picture, late=max(now - picture.time, 0.0))
+        if len(data) > self._size - SLOT.size:
+            self.lost += 1
+            return
+        number = self.sent + 1
+        at = HEAD.size + (number - 1) % self._slots * self._size
+        try:
+            os.pwrite(self._file, bytes(SLOT.size), at)
+            os.pwrite(self._file, data, at + SLOT.size)
+            os.pwrite(self._file, SLOT.pack(number, len(data), zlib.crc32(data)), at)
+            os.pwrite(self._file, struct.pack("<Q", number), HEAD.size - 8)
+            self.sent = number
+        except OSError:
+            self.lost += 1
+
+    def close(self) -> None:
+        """Take the memory away, unless another camera has taken the name since."""
+        try:
+            if os.stat(self.path).st_ino == os.fstat(self._file).st_ino:
+                os.unlink(self.path)
+        except OSError:
+            pass
+        os.close(self._file)

@@ -1,0 +1,249 @@
+"""Pictures on their way to the robot: whole or not at all, from one peer, through the death of either side."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from finssim.pool.picture_wire import SharedMemorySender, UdpSender
+from finssim.robot.link.layout import LinkError
+from finssim.robot.messages import Picture, TagCorners
+from finssim.robot.picture_codec import decode_picture, encode_picture
+from finssim.robot.picture_fragments import MOST_BYTES, Assembler, fragments
+from finssim.robot.picture_memory import HEAD
+from finssim.robot.picture_source import NoPictures, SharedMemoryPictures, UdpPictures, open_pictures
+
+RANDOM = np.random.default_rng(0)
+NOISE = RANDOM.integers(0, 256, (48, 64)).astype(np.uint8)
+SMOOTH = np.tile(np.arange(0, 256, 2, dtype=np.uint8), (72, 1))
+TAGS = (
+    TagCorners(15, RANDOM.normal(300.0, 100.0, (4, 2))),
+    TagCorners(16, RANDOM.normal(500.0, 50.0, (4, 2))),
+)
+
+
+def name():
+    """A name of shared memory that no other test has."""
+    return f"test-{os.getpid()}-{time.monotonic_ns()}"
+
+
+def until(receive, count=1, patience=10.0):
+    """What has come when there are so many pictures."""
+    found, end = [], time.monotonic() + patience
+    while len(found) < count and time.monotonic() < end:
+        found += receive(time.monotonic())
+        time.sleep(0.002)
+    return found
+
+
+def udp_pair(**options):
+    """A camera's and a robot's end on loopback."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        camera = free.getsockname()
+    robot = UdpPictures(("127.0.0.1", 0), camera)
+    return UdpSender(camera, robot.address, **options), robot
+
+
+def test_a_picture_comes_back_from_its_bytes():
+    """Image and tags are the same to the bit, with the sender's word on its lateness."""
+    posted = decode_picture(encode_picture(Picture(3.25, 7, NOISE, TAGS), late=0.5))
+    assert (posted.picture.time, posted.picture.sequence, posted.late) == (3.25, 7, 0.5)
+    assert np.array_equal(posted.picture.image, NOISE)
+    for a, b in zip(posted.picture.tags, TAGS, strict=True):
+        assert a.tag_id == b.tag_id and np.array_equal(a.corners, b.corners)
+
+
+def test_compression_takes_fewer_bytes_and_keeps_gray_to_a_few_levels():
+    """JPEG of a smooth picture: below half the bytes, within 4 levels."""
+    raw, packed = (encode_picture(Picture(0.0, 0, SMOOTH), compress=c) for c in (False, True))
+    assert len(packed) < len(raw) / 2
+    there = decode_picture(packed).picture.image.astype(int)
+    assert np.abs(there - SMOOTH).max() <= 4
+
+
+@given(data=st.binary(max_size=300))
+@settings(max_examples=300, deadline=None)
+def test_bytes_at_random_are_no_picture(data):
+    """Neither codec nor assembler raises or makes a picture of noise."""
+    assert decode_picture(data) is None
+    assert decode_picture(b"FSPC\x01\x02" + data) is None
+    assert Assembler().add(data) is None or data[:4] == b"FSPF"
+
+
+@given(
+    place=st.integers(0, 10_000), value=st.integers(0, 255), cut=st.integers(0, 10_000), packed=st.booleans()
+)
+@settings(max_examples=300, deadline=None)
+def test_a_spoilt_picture_raises_nothing(place, value, cut, packed):
+    """Any byte changed, any length cut: a picture with finite numbers comes out, or none."""
+    data = bytearray(encode_picture(Picture(1.0, 1, SMOOTH, TAGS), compress=packed))
+    data[place % len(data)] = value
+    for spoilt in (bytes(data), bytes(data[: cut % len(data)])):
+        posted = decode_picture(spoilt)
+        assert posted is None or np.isfinite([posted.picture.time, posted.late]).all()
+        assert posted is None or all(np.isfinite(tag.corners).all() for tag in posted.picture.tags)
+
+
+def test_fragments_find_together_in_any_order_and_not_without_each_other():
+    """Shuffled and doubled fragments make the message once; one that is missing or spoilt drops it."""
+    data = bytes(RANDOM.integers(0, 256, 10_000, dtype=np.uint8))
+    pieces = fragments(data, 5, 1400)
+    assert len(pieces) == 8
+    order = RANDOM.permutation(16) % 8
+    assembler = Assembler()
+    assert [whole for i in order if (whole := assembler.add(pieces[i])) is not None] == [data]
+    assembler = Assembler()
+    assert not any(assembler.add(piece) for piece in pieces[1:])
+    assembler = Assembler()
+    spoilt = pieces[3][:-1] + bytes([pieces[3][-1] ^ 1])
+    assert not any(assembler.add(piece) for piece in [*pieces[:3], spoilt, *pieces[4:]])
+    assert assembler.counts["corrupt"] == 1
+
+
+def test_unfinished_messages_take_bounded_memory():
+    """Of a hundred messages that never end, few are kept."""
+    assembler, piece = Assembler(), bytes(50_000)
+    for number in range(100):
+        for datagram in fragments(piece * 30 + bytes([number]), number, 50_000)[:-1]:
+            assembler.add(datagram)
+    held = sum(len(p) for parts in assembler._parts.values() for p in parts.values())
+    assert held <= min(MOST_BYTES, 4 * 30 * 50_000) and assembler.counts["incomplete"] == 96
+
+
+@pytest.mark.parametrize("fragment", [1400, 60_000])
+def test_pictures_cross_udp(fragment):
+    """Image, tags and sequence arrive; the time is that of reception less the lateness."""
+    camera, robot = udp_pair(fragment=fragment)
+    try:
+        before = time.monotonic()
+        camera.send(Picture(before - 0.3, 4, SMOOTH, TAGS), before)
+        (picture,) = until(robot.receive)
+        assert picture.sequence == 4 and picture.image.shape == SMOOTH.shape and len(picture.tags) == 2
+        assert before - 0.3 <= picture.time <= time.monotonic() - 0.3
+    finally:
+        camera.close()
+        robot.close()
+
+
+def test_tags_alone_fit_one_datagram():
+    """Without an image a picture is a few hundred bytes."""
+    assert len(fragments(encode_picture(Picture(0.0, 0, tags=TAGS)), 0, 1400)) == 1
+
+
+def test_others_are_refused_and_named_once(caplog):
+    """A stranger's picture is not taken, whatever it holds, and the log says once who it was."""
+    camera, robot = udp_pair()
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.bind(("127.0.0.1", 0))
+            for i in range(3):
+                stranger.sendto(fragments(encode_picture(Picture(0.0, i, SMOOTH)), i)[0], robot.address)
+            address = stranger.getsockname()
+        camera.send(Picture(time.monotonic(), 9, SMOOTH), time.monotonic())
+        assert [p.sequence for p in until(robot.receive)] == [9]
+        assert robot.refused == {address: 3}
+        assert sum("refused" in r.message for r in caplog.records) == 1
+    finally:
+        camera.close()
+        robot.close()
+
+
+def test_shared_memory_gives_the_newest_pictures_once():
+    """Pictures arrive once, in order and to the bit; a reader that fell behind goes on with the newest."""
+    key = name()
+    camera, robot = SharedMemorySender(key, slots=4, slot_bytes=8192), SharedMemoryPictures(key)
+    try:
+        now = time.monotonic()
+        for i in range(2):
+            camera.send(Picture(now - 0.01, i, NOISE, TAGS), now)
+        found = robot.receive(now)
+        assert [p.sequence for p in found] == [0, 1] and np.array_equal(found[1].image, NOISE)
+        assert found[0].time == now - 0.01 and robot.receive(now) == []
+        for i in range(2, 12):
+            camera.send(Picture(now, i, NOISE), now)
+        assert [p.sequence for p in robot.receive(now)] == [9, 10, 11] and robot.missed == 7
+        camera.send(Picture(now, 12, np.zeros((200, 200), np.uint8)), now)
+        assert camera.lost == 1 and robot.receive(now) == []
+    finally:
+        camera.close()
+        robot.close()
+    assert not camera.path.exists()
+
+
+def test_shared_memory_outlives_either_side():
+    """A camera killed in the middle and started anew is found again; so is the picture after a reader's restart."""
+    key = name()
+    script = (
+        "import sys, time, numpy as np\n"
+        "from finssim.pool.picture_wire import SharedMemorySender\n"
+        "from finssim.robot.messages import Picture\n"
+        "camera = SharedMemorySender(sys.argv[1], slots=4, slot_bytes=8192)\n"
+        "i = 0\n"
+        "while True:\n"
+        "    i += 1\n"
+        "    t = time.monotonic()\n"
+        "    camera.send(Picture(t, i, np.full((48, 64), i % 256, np.uint8)), t)\n"
+        "    time.sleep(0.001)\n"
+    )
+    robot = SharedMemoryPictures(key)
+    assert robot.receive(0.0) == []
+    for _ in range(2):
+        camera = subprocess.Popen([sys.executable, "-c", script, key])
+        try:
+            found = until(robot.receive, 20, 30.0)
+            assert len(found) >= 20
+            assert all((p.image == p.sequence % 256).all() for p in found)
+        finally:
+            camera.send_signal(signal.SIGKILL)
+            camera.wait()
+        robot.receive(time.monotonic())
+        robot.close()  # the robot restarts too
+        robot = SharedMemoryPictures(key)
+        assert len(robot.receive(time.monotonic())) > 0
+    robot.path.unlink()
+
+
+def test_a_slot_that_is_being_written_is_left_out():
+    """A number that does not fit, bytes that do not fit and a file cut short give no picture and raise nothing."""
+    key = name()
+    camera, robot = SharedMemorySender(key, slots=4, slot_bytes=8192), SharedMemoryPictures(key)
+    try:
+        slot = HEAD.size
+        for at, data in (
+            (slot, bytes(8)),
+            (slot + 100, b"spoilt"),
+            (0, b"????"),
+            (HEAD.size - 8, b"\xff" * 8),
+        ):
+            camera.send(Picture(0.0, 1, NOISE), 0.0)
+            slot = HEAD.size + (camera.sent - 1) % 4 * 8192
+            place = at + (slot - HEAD.size if at >= HEAD.size else 0)
+            os.pwrite(camera._file, data, place)
+            assert robot.receive(0.0) == []
+        os.truncate(camera._file, 30)
+        assert robot.receive(0.0) == []
+        os.truncate(camera._file, 3)
+        assert robot.receive(0.0) == []
+    finally:
+        camera.close()
+        robot.close()
+
+
+def test_a_source_is_opened_by_its_address():
+    """Each address opens its source; others are refused in one sentence."""
+    assert isinstance(open_pictures("none"), NoPictures) and open_pictures("none").receive(0.0) == []
+    assert isinstance(open_pictures("shm:pool"), SharedMemoryPictures)
+    source = open_pictures("udp://127.0.0.1:58767", "127.0.0.1:0")
+    assert isinstance(source, UdpPictures) and source.peer == ("127.0.0.1", 58767)
+    source.close()
+    for address in ("tcp://1.2.3.4:5", "shm:", "shm:../x", "udp://127.0.0.1", "", "udp://localhost:99999"):
+        with pytest.raises(LinkError, match=r"."):
+            open_pictures(address, "127.0.0.1:0")
