@@ -54,6 +54,8 @@ class TelemetryWatch:
             "restarted" if the controller's clock went back, "old" if the message brings nothing new, "" otherwise.
         """
         last = self._last
+        if last is not None and (message.sequence, message.mcu_ms) == (last.sequence, last.mcu_ms):
+            return "old"
         # After a silence the old numbers say nothing about the new ones.
         if last is None or self.age(now) > self._timeout:
             restarted = last is not None and _signed(message.mcu_ms - last.mcu_ms, 32) < -REORDERED
