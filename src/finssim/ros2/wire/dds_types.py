@@ -10,7 +10,7 @@ from cyclonedds.idl import types as idl
 from finssim.ros2.codec import Codec
 from finssim.ros2.definitions import Nodetype
 
-__all__ = ["DdsTypes", "dds_type_name"]
+__all__ = ["DdsTypes", "dds_type_name", "ros_type_name"]
 
 PRIMITIVES: dict[str, Any] = {
     **{
@@ -28,6 +28,14 @@ def dds_type_name(name: str) -> str:
     """`nav_msgs/msg/Odometry` as DDS has it: `nav_msgs::msg::dds_::Odometry_`."""
     package, kind, short = name.split("/")
     return f"{package}::{kind}::dds_::{short}_"
+
+
+def ros_type_name(name: str) -> str:
+    """The reverse of `dds_type_name`; a name of another form is left as it is."""
+    parts = name.split("::")
+    if len(parts) != 4 or parts[2] != "dds_":
+        return name
+    return f"{parts[0]}/{parts[1]}/{parts[3].removesuffix('_')}"
 
 
 class DdsTypes:

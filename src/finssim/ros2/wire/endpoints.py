@@ -38,9 +38,11 @@ class Endpoint:
     """With its prefix, e.g. `rt/finsrov/odom`."""
     gid: bytes
     """The endpoint's globally unique identifier, 16 bytes."""
+    closed = False
 
     def close(self) -> None:
         """Leave the wire."""
+        self.closed = True
         self.entity.__del__()
 
     def _incompatible(self, status: Any) -> str:

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
+from cyclonedds.core import InstanceState
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.pub import Publisher
 from cyclonedds.qos import Policy, Qos
@@ -14,7 +16,7 @@ from cyclonedds.sub import Subscriber
 from cyclonedds.topic import Topic
 
 from finssim.ros2.codec import Codec, codec_of
-from finssim.ros2.wire.dds_types import DdsTypes
+from finssim.ros2.wire.dds_types import DdsTypes, ros_type_name
 from finssim.ros2.wire.endpoints import Reader, Writer
 from finssim.ros2.wire.quality import LATCHED, Quality, dds_qos
 from finssim.ros2.wire.settings import WireSettings
@@ -57,6 +59,7 @@ class Participant:
         self._publisher, self._subscriber = Publisher(self.entity), Subscriber(self.entity)
         self._types = DdsTypes(self.codec)
         self._topics: dict[tuple[str, str], Topic] = {}
+        self._builtin: dict[str, Any] = {}
         self._lock = threading.Lock()
         self._node_list = self._plain_writer("ros_discovery_info", NODE_LIST, LATCHED)
         keep_all = Quality(depth=0, transient_local=True)
@@ -98,6 +101,23 @@ class Participant:
             alive = {peer.participant_key.bytes for peer in self._others.peers()}
             self._seen = {gid: nodes for gid, nodes in self._seen.items() if gid in alive}
             return [node for nodes in self._seen.values() for node in nodes]
+
+    def endpoints(self, kind: str) -> list[tuple[str, str]]:
+        """Topic with its prefix, and ROS type, of every endpoint on the wire.
+
+        Args:
+            kind: "publications" or "subscriptions".
+        """
+        topics = {"publications": BuiltinTopicDcpsPublication, "subscriptions": BuiltinTopicDcpsSubscription}
+        if kind not in self._builtin:
+            self._builtin[kind] = BuiltinDataReader(self.entity, topics[kind])
+        samples = self._builtin[kind].read(N=10_000)
+        alive = [
+            s
+            for s in samples
+            if s.sample_info.instance_state == InstanceState.Alive and hasattr(s, "topic_name")
+        ]
+        return [(sample.topic_name, ros_type_name(sample.type_name)) for sample in alive]
 
     def close(self) -> None:
         """Leave the wire at once: peers are told, and wait for nothing."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Any
 
 from cyclonedds.core import GuardCondition, WaitSet
 
@@ -25,7 +26,8 @@ class Waiter:
         """Watch exactly these from now on."""
         wanted = set(endpoints)
         for endpoint in self._watched - wanted:
-            self._each(endpoint, self._set.detach)
+            if not endpoint.closed:  # DDS itself lets go of a closed one
+                self._each(endpoint, self._set.detach)
         for endpoint in wanted - self._watched:
             self._each(endpoint, self._set.attach)
         self._watched = wanted
@@ -41,9 +43,14 @@ class Waiter:
         """End the current or the next `wait`; from any thread."""
         self._guard.set(True)
 
+    def close(self) -> None:
+        """Let everything go."""
+        self._set.attached = []
+        self._set.__del__()
+        self._guard.__del__()
+
     @staticmethod
-    def _each(endpoint: Endpoint, act: object) -> None:
-        assert callable(act)
+    def _each(endpoint: Endpoint, act: Callable[[Any], None]) -> None:
         act(endpoint.entity)
         if isinstance(endpoint, Reader):
             act(endpoint.condition)

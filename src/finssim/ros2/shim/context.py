@@ -1,0 +1,120 @@
+"""`rclpy.context`: what a process holds between `init` and `shutdown`: one participant, its nodes, its arguments."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+import weakref
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from finssim.ros2.shim.arguments import RosArguments, parse_arguments
+from finssim.ros2.shim.exceptions import NotInitializedException
+from finssim.ros2.shim.logging import set_logger_level
+from finssim.ros2.wire.participant import Participant
+from finssim.ros2.wire.settings import wire_settings
+
+__all__ = ["Context"]
+
+
+class Context:
+    """One presence on the wire. Nodes of one process share it."""
+
+    def __init__(self) -> None:
+        self.arguments = RosArguments()
+        self.nodes: list[Any] = []
+        self.changes = 0
+        """Counts every endpoint that came or went."""
+        self.executor: Any = None
+        """The one that `rclpy.spin` uses, once it was used."""
+        self._participant: Participant | None = None
+        self._waiters: weakref.WeakSet[Any] = weakref.WeakSet()
+        self._on_shutdown: list[Callable[[], None]] = []
+        self._lock = threading.RLock()
+
+    def init(self, args: Sequence[str] | None = None, *, domain_id: int | None = None) -> None:
+        """Join the wire.
+
+        Args:
+            args: Command line; that of the process where it is None.
+            domain_id: ROS domain instead of that of the environment.
+
+        Raises:
+            RuntimeError: Joined already.
+            Ros2Error: A malformed argument or environment variable.
+        """
+        if self._participant is not None:
+            raise RuntimeError("Context.init() must only be called once")
+        self.arguments = parse_arguments(sys.argv if args is None else args)
+        for logger, level in self.arguments.levels:
+            set_logger_level(logger, level)
+        self._participant = Participant(wire_settings(domain=domain_id), self.arguments.enclave)
+
+    @property
+    def participant(self) -> Participant:
+        """The presence on the wire.
+
+        Raises:
+            NotInitializedException: Not joined, or left already.
+        """
+        if self._participant is None:
+            raise NotInitializedException("ROS 2 is not initialized: call rclpy.init() first")
+        return self._participant
+
+    def ok(self) -> bool:
+        """Whether joined."""
+        return self._participant is not None
+
+    def get_domain_id(self) -> int:
+        """The ROS domain."""
+        return self.participant.settings.domain
+
+    def announce(self) -> None:
+        """Tell peers and executors that nodes or endpoints came or went."""
+        with self._lock:
+            self.changes += 1
+            self.participant.announce([node.record() for node in self.nodes])
+            self.wake()
+
+    def on_shutdown(self, callback: Callable[[], None]) -> None:
+        """Call it when the wire is left."""
+        self._on_shutdown.append(callback)
+
+    def add_waiter(self, waiter: Any) -> None:
+        """Wake this too when something changes."""
+        self._waiters.add(waiter)
+
+    def wake(self) -> None:
+        """End every executor's wait."""
+        for waiter in list(self._waiters):
+            waiter.wake()
+
+    def shutdown(self) -> None:
+        """Leave the wire.
+
+        Raises:
+            RuntimeError: Not joined.
+        """
+        if self._participant is None:
+            raise RuntimeError("Context.shutdown() was called on a context that is not initialized")
+        self.try_shutdown()
+
+    def try_shutdown(self) -> None:
+        """Leave the wire if joined."""
+        with self._lock:
+            participant, self._participant = self._participant, None
+            if participant is None:
+                return
+            for waiter in list(self._waiters):
+                waiter.close()
+            self.nodes.clear()
+            participant.close()
+        for callback in self._on_shutdown:
+            callback()
+
+    def leave_on_sigterm(self) -> None:
+        """Let SIGTERM end `spin` as rclpy does, unless the program handles that signal or this is no main thread."""
+        main = threading.current_thread() is threading.main_thread()
+        if main and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
+            signal.signal(signal.SIGTERM, lambda *_: self.try_shutdown())

@@ -1,0 +1,247 @@
+"""`rclpy.node`: a node: its names, its endpoints, its clock, its parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
+
+from finssim.ros2.shim.arguments import parse_arguments
+from finssim.ros2.shim.client import Client
+from finssim.ros2.shim.clock import Clock, ROSClock
+from finssim.ros2.shim.context import Context
+from finssim.ros2.shim.endpoint import Endpoint
+from finssim.ros2.shim.logging import RcutilsLogger, get_logger
+from finssim.ros2.shim.names import check_node, full_node_name, remapped
+from finssim.ros2.shim.node_graph import NodeGraph
+from finssim.ros2.shim.node_parameters import NodeParameters
+from finssim.ros2.shim.parameter import Parameter
+from finssim.ros2.shim.parameter_files import overrides_for
+from finssim.ros2.shim.publisher import Publisher
+from finssim.ros2.shim.qos import qos_profile_services_default
+from finssim.ros2.shim.service import Service
+from finssim.ros2.shim.subscription import Subscription
+from finssim.ros2.shim.time_source import TimeSource
+from finssim.ros2.shim.timer import Timer
+from finssim.ros2.shim.utilities import get_default_context
+from finssim.ros2.wire.participant import NodeRecord
+
+__all__ = ["Node"]
+
+Made = TypeVar("Made", bound=Endpoint)
+
+
+class Node(NodeParameters, NodeGraph):
+    """A node.
+
+    Args:
+        node_name: Its name, unless the command line renames it.
+        context: What it belongs to; that of `rclpy.init()` where none is given.
+        cli_args: Arguments for this node alone, with `--ros-args`.
+        namespace: What its relative names stand below.
+        use_global_arguments: Whether the process's command line counts too.
+        parameter_overrides: Values that win over files and command line.
+        allow_undeclared_parameters: Whether parameters need no declaration.
+        automatically_declare_parameters_from_overrides: Declare every parameter that is given from outside.
+        **services: `start_parameter_services`, `enable_rosout` and `enable_logger_service` are accepted; the shim has
+            neither parameter services nor /rosout.
+    """
+
+    def __init__(
+        self,
+        node_name: str,
+        *,
+        context: Context | None = None,
+        cli_args: Sequence[str] | None = None,
+        namespace: str | None = None,
+        use_global_arguments: bool = True,
+        parameter_overrides: Sequence[Parameter] | None = None,
+        allow_undeclared_parameters: bool = False,
+        automatically_declare_parameters_from_overrides: bool = False,
+        **services: bool,
+    ) -> None:
+        unknown = set(services) - {"start_parameter_services", "enable_rosout", "enable_logger_service"}
+        if unknown:
+            raise TypeError(f"Node takes no argument '{min(unknown)}'")
+        self.context = context or get_default_context()
+        sources = [parse_arguments(cli_args)] if cli_args is not None else []
+        sources += [self.context.arguments] if use_global_arguments else []
+        self._rules = [rule for source in sources for rule in source.remaps]
+        self._name, self._namespace = self._named(node_name, namespace or "")
+        self.context.participant.codec  # noqa: B018 - refuses a context that is not initialized, before anything else
+        self.timers: list[Timer] = []
+        self._ends: list[Any] = []
+        assignments = [a for source in reversed(sources) for a in source.parameters]
+        overrides = overrides_for(self.get_fully_qualified_name(), assignments)
+        overrides |= {p.name: p.value for p in parameter_overrides or ()}
+        NodeParameters.__init__(self, overrides, allow_undeclared_parameters)
+        self._clock = ROSClock()
+        self.context.nodes.append(self)
+        self.context.announce()
+        self._time_source = TimeSource(self, self._clock)
+        if automatically_declare_parameters_from_overrides:
+            for name in set(overrides) - {"use_sim_time"}:
+                self.declare_parameter(name, overrides[name])
+
+    def get_name(self) -> str:
+        """Its name."""
+        return self._name
+
+    def get_namespace(self) -> str:
+        """Its namespace, with a leading slash."""
+        return self._namespace
+
+    def get_fully_qualified_name(self) -> str:
+        """Namespace and name."""
+        return full_node_name(self._name, self._namespace)
+
+    def get_logger(self) -> RcutilsLogger:
+        """Its logger, named by namespace and name with dots."""
+        return get_logger(self.get_fully_qualified_name().strip("/").replace("/", "."))
+
+    def get_clock(self) -> ROSClock:
+        """Its clock: system time, or that of /clock where the parameter `use_sim_time` is true."""
+        return self._clock
+
+    def resolve_topic_name(self, topic: str, *, only_expand: bool = False) -> str:
+        """The full name that a topic's name stands for, remapped unless `only_expand`."""
+        return remapped(topic, self._name, self._namespace, () if only_expand else self._rules)
+
+    resolve_service_name = resolve_topic_name
+
+    def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Publisher:
+        """A publisher; `qos_profile` is a `QoSProfile` or a depth."""
+        _check_options(options)
+        return self._added(Publisher(self, msg_type, topic, qos_profile))
+
+    def create_subscription(
+        self,
+        msg_type: Any,
+        topic: str,
+        callback: Callable[[Any], None],
+        qos_profile: Any,
+        *,
+        raw: bool = False,
+        **options: Any,
+    ) -> Subscription:
+        """A subscription; with `raw` the callback gets CDR bytes."""
+        _check_options(options)
+        return self._added(Subscription(self, msg_type, topic, callback, qos_profile, raw))
+
+    def create_service(
+        self,
+        srv_type: Any,
+        srv_name: str,
+        callback: Callable[[Any, Any], Any],
+        *,
+        qos_profile: Any = qos_profile_services_default,
+        **options: Any,
+    ) -> Service:
+        """A service; the callback fills in and returns the response it is given."""
+        _check_options(options)
+        return self._added(Service(self, srv_type, srv_name, callback, qos_profile))
+
+    def create_client(
+        self, srv_type: Any, srv_name: str, *, qos_profile: Any = qos_profile_services_default, **options: Any
+    ) -> Client:
+        """A client of a service."""
+        _check_options(options)
+        return self._added(Client(self, srv_type, srv_name, qos_profile))
+
+    def create_timer(
+        self,
+        timer_period_sec: float,
+        callback: Callable[[], Any],
+        callback_group: Any = None,
+        clock: Clock | None = None,
+        autostart: bool = True,
+    ) -> Timer:
+        """A timer with a period [s] of the node's clock, or of another."""
+        timer = Timer(callback, int(timer_period_sec * 1e9), clock or self._clock, autostart=autostart)
+        self.timers.append(timer)
+        self.context.wake()
+        return timer
+
+    def destroy_timer(self, timer: Timer) -> bool:
+        """Remove a timer; whether it was the node's."""
+        known = timer in self.timers
+        timer.cancel()
+        self.timers = [t for t in self.timers if t is not timer]
+        return known
+
+    def destroy_publisher(self, publisher: Publisher) -> bool:
+        """Remove a publisher; whether it was the node's."""
+        return self._removed(publisher)
+
+    def destroy_subscription(self, subscription: Subscription) -> bool:
+        """Remove a subscription; whether it was the node's."""
+        return self._removed(subscription)
+
+    def destroy_service(self, service: Service) -> bool:
+        """Remove a service; whether it was the node's."""
+        return self._removed(service)
+
+    def destroy_client(self, client: Client) -> bool:
+        """Remove a client; whether it was the node's."""
+        return self._removed(client)
+
+    def destroy_node(self) -> None:
+        """Remove the node with all it has."""
+        for timer in self.timers:
+            timer.cancel()
+        self.timers = []
+        if self in self.context.nodes:
+            self.context.nodes.remove(self)
+            ends, self._ends = self._ends, []
+            for end in ends:
+                end.close()
+            self.context.announce()
+
+    def endpoints(self) -> list[Any]:
+        """Publishers, subscriptions, services and clients."""
+        return list(self._ends)
+
+    def takers(self) -> Iterator[Any]:
+        """Those endpoints that may have work."""
+        return (end for end in list(self._ends) if hasattr(end, "take"))
+
+    def record(self) -> NodeRecord:
+        """The node as the node list has it."""
+        wires = [wire for end in self._ends for wire in end.wires]
+        return NodeRecord(
+            self._name,
+            self._namespace,
+            readers=[wire.gid for wire in wires if hasattr(wire, "take")],
+            writers=[wire.gid for wire in wires if hasattr(wire, "write")],
+        )
+
+    def _named(self, name: str, namespace: str) -> tuple[str, str]:
+        """Name and namespace after the rules `__node` and `__ns`, checked."""
+        rules = [rule for rule in self._rules if rule.node in ("", name)]
+        namespace = next((r.target for r in rules if r.source == "__ns"), namespace)
+        name = next((r.target for r in rules if r.source in ("__node", "__name")), name)
+        return name, check_node(name, namespace)
+
+    def _added(self, end: Made) -> Made:
+        self._ends.append(end)
+        self.context.announce()
+        return end
+
+    def _removed(self, end: Endpoint) -> bool:
+        if end not in self._ends:
+            return False
+        self._ends.remove(end)
+        end.close()
+        self.context.announce()
+        return True
+
+    def _parameters_changed(self, parameters: Sequence[Parameter]) -> None:
+        for parameter in parameters:
+            if parameter.name == "use_sim_time":
+                self._time_source.use_simulated(bool(parameter.value))
+
+
+def _check_options(options: dict[str, Any]) -> None:
+    """Callback groups are met anyway; everything else would be ignored, so it is refused."""
+    unknown = set(options) - {"callback_group"}
+    if unknown:
+        raise TypeError(f"'{min(unknown)}' needs a sourced ROS 2: leave it out")

@@ -1,0 +1,59 @@
+"""`rclpy.subscription`: the receiving end of a topic."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from finssim.ros2.codec import Message
+from finssim.ros2.errors import Ros2Error
+from finssim.ros2.shim.endpoint import Endpoint, check_callback
+
+__all__ = ["Subscription"]
+
+
+class Subscription(Endpoint):
+    """Calls back with each message of a topic. Made by `Node.create_subscription`."""
+
+    def __init__(
+        self,
+        node: Any,
+        msg_type: type[Message],
+        topic: str,
+        callback: Callable[[Any], None],
+        qos_profile: Any,
+        raw: bool = False,
+    ) -> None:
+        check_callback(callback)
+        quality = self._settle(node, msg_type, topic, qos_profile)
+        self.callback, self.raw = callback, raw
+        self._reader = node.context.participant.reader(f"rt{self.topic_name}", msg_type.TYPE, quality)
+        self._codec = node.context.participant.codec
+        self.wires = (self._reader,)
+
+    def take(self) -> Callable[[], None] | None:
+        """What calls back with the oldest waiting message; None without one."""
+        sample = self._reader.take()
+        if sample is None:
+            return None
+        data = sample[0]
+        return lambda: self._deliver(data)
+
+    def get_publisher_count(self) -> int:
+        """How many publishers are known."""
+        return int(self._reader.matched())
+
+    def destroy(self) -> None:
+        """Leave the topic."""
+        self.node.destroy_subscription(self)
+
+    def _deliver(self, data: bytes) -> None:
+        if self.raw:
+            self.callback(data)
+            return
+        try:
+            message = self._codec.deserialize(bytearray(data), self.msg_type.TYPE)
+        except Ros2Error as error:
+            self.node.get_logger().error(f"{self.topic_name}: dropped: {error}", throttle_duration_sec=1.0)
+            return
+        self.callback(message)
