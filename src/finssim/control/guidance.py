@@ -12,9 +12,12 @@ import numpy.typing as npt
 from finssim.control.tracking import Goal
 from finssim.geometry.rotations import quat_from_yaw
 
-__all__ = ["Guide", "Reference", "Station", "goal_at"]
+__all__ = ["Guide", "Reference", "Station", "acceleration_at", "goal_at"]
 
 Array = npt.NDArray[np.float64]
+
+DIFFERENCE = 0.05
+"""Half the time across which an acceleration is taken [s]: a controller's period."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,16 @@ class Station:
 
 
 def goal_at(guide: Guide, t: float) -> Goal:
-    """The level pose and velocity that a pose controller is given at a time since the start [s]."""
+    """The level pose, velocity and acceleration that a pose controller is given at a time since the start [s]."""
     reference = guide.at(t)
-    return Goal(reference.position, quat_from_yaw(reference.yaw), reference.velocity)
+    acceleration = acceleration_at(guide, t)
+    return Goal(reference.position, quat_from_yaw(reference.yaw), reference.velocity, acceleration)
+
+
+def acceleration_at(guide: Guide, t: float) -> Array:
+    """Acceleration of a guide, world frame [m/s²], (3,): the change of its velocity over 0.1 s; zero past its ends."""
+    if not 0.0 <= t <= guide.duration:
+        return np.zeros(3)
+    before, after = max(t - DIFFERENCE, 0.0), min(t + DIFFERENCE, guide.duration)
+    change = guide.at(np.array([before, after])).velocity
+    return np.asarray((change[1] - change[0]) / (after - before))

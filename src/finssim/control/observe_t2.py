@@ -22,6 +22,8 @@ VELOCITY_CLIP = 2.0
 """Velocities are clipped here [m/s, rad/s]."""
 LOOK_AHEAD = (0.0, 0.1, 0.2, 0.3)
 """The reference is seen at these times from now [s]."""
+REST = 1.0e-6
+"""A reference slower than this has no tangent: it is taken to lie ahead [m/s]."""
 
 _CLIP = (-VELOCITY_CLIP, VELOCITY_CLIP)
 
@@ -75,9 +77,11 @@ def observe_t2(measured: Measured, guide: Guide, t: npt.ArrayLike) -> Array:
     offsets = [quat_inverse_rotate(q, place - position) / DISTANCE_SCALE for place in places]
     reference = guide.at(time)
     drift = quat_inverse_rotate(q, reference.velocity)
-    tangent = np.arctan2(drift[..., 1], drift[..., 0])
-    turns = 2.0 * math.pi * np.broadcast_to(reference.progress, tangent.shape)
-    angles = [np.sin(tangent), np.cos(tangent), np.sin(turns), np.cos(turns)]
+    pace = np.hypot(drift[..., 0], drift[..., 1])
+    moving = pace > REST
+    tangent = [np.where(moving, drift[..., i] / np.where(moving, pace, 1.0), 1.0 - i) for i in (1, 0)]
+    turns = 2.0 * math.pi * np.broadcast_to(reference.progress, pace.shape)
+    angles = [*tangent, np.sin(turns), np.cos(turns)]
     angles += [np.sin(2.0 * turns), np.cos(2.0 * turns)]
     nu = np.clip(np.asarray(measured.nu, float), -VELOCITY_CLIP, VELOCITY_CLIP)
     up = quat_inverse_rotate(q, np.array([0.0, 0.0, 1.0]))

@@ -39,7 +39,7 @@ class PidMemory:
 class Pid:
     """Position and attitude PID with weight and buoyancy fed forward.
 
-        tau = tau_goal + C(nu) nu + D nu_goal + kp clip(e) - kd (nu - nu_goal) + integral
+        tau = tau_goal + M a_goal + C(nu) nu + D nu_goal + kp clip(e) - kd (nu - nu_goal) + integral
 
     about the vehicle's wrench reference. tau_goal holds the goal at rest against weight and buoyancy; e is clipped
     where it would ask for more than the cruise speed; the derivative acts on the measured velocity. The integral
@@ -135,7 +135,13 @@ class Pid:
         damping = self.model.damping(nu)
         integral = np.concatenate([quat_inverse_rotate(q, memory.force), memory.moment], axis=-1)
         steady = self.holding_wrench(q, goal.quaternion) + damping * error.velocity + self.model.coriolis(nu)
-        wanted = steady + self.gains.kp * clipped - self.gains.kd * slip + integral
+        wanted = (
+            steady
+            + self.accelerating_wrench(q, goal)
+            + self.gains.kp * clipped
+            - self.gains.kd * slip
+            + integral
+        )
         tau = np.clip(wanted, -self.wrench_limits, self.wrench_limits)
 
         thrusts, _ = self.allocator.allocate(tau)
@@ -145,6 +151,14 @@ class Pid:
         bound = INTEGRAL_SHARE * self.wrench_limits
         integral = np.clip(integral + self.period * self.gains.rate * left_over, -bound, bound)
         return tau, PidMemory(quat_rotate(q, integral[..., :3]), integral[..., 3:])
+
+    def accelerating_wrench(self, quaternion: Array, goal: Goal) -> Array:
+        """Force that accelerates the vehicle as the goal is, body frame [N, N m], (..., 6); the moment is zero.
+
+        The inertia, water included, differs from axis to axis: what is left over on turning is for the feedback.
+        """
+        force = self.model.inertia[:3] * quat_inverse_rotate(quaternion, np.asarray(goal.acceleration, float))
+        return np.concatenate([force, np.zeros_like(force)], axis=-1)
 
     def holding_wrench(self, quaternion: npt.ArrayLike, goal: npt.ArrayLike) -> Array:
         """Wrench that holds the goal attitude at rest against weight and buoyancy, body frame [N, N m], (..., 6).

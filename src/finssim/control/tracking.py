@@ -40,7 +40,7 @@ class Measured(Protocol):
 
 @dataclass(frozen=True)
 class Goal:
-    """The pose to hold, and the velocity it moves with."""
+    """The pose to hold, and how it moves."""
 
     position: Any
     """Where the body origin should be, world frame [m], (..., 3)."""
@@ -48,6 +48,8 @@ class Goal:
     """Attitude the body should have, body to world, xyzw, (..., 4)."""
     velocity: Any = (0.0, 0.0, 0.0)
     """Velocity of the goal, world frame [m/s], (..., 3)."""
+    acceleration: Any = (0.0, 0.0, 0.0)
+    """Acceleration of the goal, world frame [m/s²], (..., 3)."""
 
 
 class Controller(Protocol):

@@ -26,7 +26,7 @@ ROLLOUT_SAMPLES = 8192
 CHECKPOINT_STEPS = 500_000
 """Control steps of all worlds together between two checkpoints."""
 
-RANDOMIZED_STEPS = 3_000_000
+RANDOMIZED_STEPS = {"t1": 3_000_000, "t2": 2_500_000}
 """Control steps when every episode has another vehicle: what must be learnt is more."""
 
 
@@ -55,11 +55,18 @@ class PpoSettings:
     """Units of the hidden layers, ELU, of the policy and of the value each."""
 
 
+SETTINGS = {"t1": PpoSettings(), "t2": PpoSettings()}
+"""By task; any other task learns as T1 does."""
+
+
 def settings_for(
-    *, randomized: bool = False, worlds: int | None = None, steps: int | None = None
+    task: str = "t1", *, randomized: bool = False, worlds: int | None = None, steps: int | None = None
 ) -> PpoSettings:
     """The settings of a training; what is None keeps its default."""
-    settings = PpoSettings(steps=steps or (RANDOMIZED_STEPS if randomized else PpoSettings.steps))
+    settings = SETTINGS.get(task, SETTINGS["t1"])
+    if randomized:
+        settings = replace(settings, steps=RANDOMIZED_STEPS.get(task, RANDOMIZED_STEPS["t1"]))
+    settings = replace(settings, steps=steps or settings.steps)
     worlds = worlds or settings.worlds
     rollout = max(settings.rollout, math.ceil(ROLLOUT_SAMPLES / worlds))
     return replace(settings, worlds=worlds, rollout=rollout)

@@ -88,7 +88,7 @@ def train(
     from finssim.learning.progress import TrainingView
     from finssim.learning.sb3 import Sb3VecEnv
 
-    settings = settings_for(randomized=randomization is not None, worlds=worlds, steps=steps)
+    settings = settings_for(task, randomized=randomization is not None, worlds=worlds, steps=steps)
     # A second thread gains little on so small a network, and loses much where anything else computes.
     torch.set_num_threads(1)
     environment = Environment(
@@ -98,6 +98,7 @@ def train(
         hydrodynamics=hydrodynamics,
         action=action,
         randomization=randomization,
+        noise=environment_task.training_noise,
         device=device,
         seed=seed,
     )

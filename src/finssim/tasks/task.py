@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.measurement import MeasurementNoise
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,8 @@ class Task:
     """Physics steps between actions."""
     time_limit: float = 20.0
     """Length of an episode in training [s]."""
+    training_noise: MeasurementNoise = field(default_factory=MeasurementNoise)
+    """On what the controller sees in training."""
     evaluate: ClassVar[Any]
     spawn: ClassVar[Any]
     observe: ClassVar[Any]

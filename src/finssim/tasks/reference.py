@@ -1,0 +1,108 @@
+"""References to follow: a table of knots per world, filled by a task's kernel or from trajectories."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from finssim.control.guidance import Guide
+from finssim.geometry.rotations import quat_from_yaw
+from finssim.tasks.arrays import ReferenceTable
+from finssim.tasks.environment import Environment, EnvironmentSetupError
+
+
+def reference_table(worlds: int, knots: int, spacing: float, device: wp.Device) -> ReferenceTable:
+    """An empty table of `knots` knots, `spacing` apart [s]."""
+    table = ReferenceTable()
+    table.position = wp.zeros((worlds, knots), dtype=wp.vec3, device=device)
+    table.velocity = wp.zeros((worlds, knots), dtype=wp.vec3, device=device)
+    table.spacing = spacing
+    table.duration = wp.ones(worlds, dtype=wp.float32, device=device)
+    table.offset = wp.zeros(worlds, dtype=wp.float32, device=device)
+    table.given = wp.zeros(worlds, dtype=wp.int32, device=device)
+    return table
+
+
+@wp.func
+def reference_knot(r: ReferenceTable, w: int, t: float) -> int:
+    """The knot at or before a time."""
+    return wp.clamp(int(wp.floor(t / r.spacing)), 0, r.position.shape[1] - 2)
+
+
+@wp.func
+def held_time(r: ReferenceTable, w: int, t: float) -> float:
+    """The time, held at the end of the reference and of its table."""
+    return wp.min(wp.min(t, r.duration[w]), float(r.position.shape[1] - 1) * r.spacing)
+
+
+@wp.func
+def reference_position(r: ReferenceTable, w: int, t: float) -> wp.vec3:
+    """Where the vehicle should be at a time since the episode's start, world frame [m]."""
+    now = held_time(r, w, t)
+    k = reference_knot(r, w, now)
+    u = now / r.spacing - float(k)
+    way = r.position[w, k + 1] - r.position[w, k]
+    a = r.spacing * r.velocity[w, k]
+    b = r.spacing * r.velocity[w, k + 1]
+    return r.position[w, k] + u * (a + u * (3.0 * way - 2.0 * a - b + u * (a + b - 2.0 * way)))
+
+
+@wp.func
+def reference_velocity(r: ReferenceTable, w: int, t: float) -> wp.vec3:
+    """Velocity of `reference_position`, zero where it is held [m/s]."""
+    now = held_time(r, w, t)
+    if now < t:
+        return wp.vec3()
+    k = reference_knot(r, w, now)
+    u = now / r.spacing - float(k)
+    way = r.position[w, k + 1] - r.position[w, k]
+    a = r.spacing * r.velocity[w, k]
+    b = r.spacing * r.velocity[w, k + 1]
+    return (a + u * (6.0 * way - 4.0 * a - 2.0 * b + 3.0 * u * (a + b - 2.0 * way))) / r.spacing
+
+
+@wp.func
+def reference_progress(r: ReferenceTable, w: int, t: float) -> float:
+    """Part of the way, from `offset` to `offset + 1`."""
+    return r.offset[w] + wp.min(t / r.duration[w], 1.0)
+
+
+def follow(environment: Environment, guides: Sequence[Guide]) -> np.ndarray:
+    """Start an episode in every world at rest on its guide's first pose; world i follows guides[i] from then on.
+
+    Args:
+        environment: Of a task that follows references, such as `TrajectoryTracking`.
+        guides: One per world.
+
+    Returns:
+        Observations, (worlds, size).
+
+    Raises:
+        EnvironmentSetupError: Another number of guides, or one that is longer than the task's `time_limit`.
+    """
+    table = environment.arrays.reference
+    if len(guides) != environment.worlds or table.position is None:
+        raise EnvironmentSetupError(
+            f"{len(guides)} guides for {environment.worlds} worlds of task '{environment.task.name}': "
+            "give one for each world of a task that follows references, such as t2"
+        )
+    longest = max(guide.duration for guide in guides)
+    if longest > environment.task.time_limit:
+        raise EnvironmentSetupError(
+            f"a guide takes {longest:g} s, longer than the task's time_limit of {environment.task.time_limit:g} s: "
+            "make the task with a longer one"
+        )
+    t = table.spacing * np.arange(table.position.shape[1])
+    ends = [np.minimum(t, guide.duration) for guide in guides]
+    places = [guide.at(time) for guide, time in zip(guides, ends, strict=True)]
+    velocity = np.stack([place.velocity for place in places])
+    # Past its end a motion goes on in the table, so that the piece with the end in it is followed; none reads further.
+    beyond = (t - np.stack(ends))[..., None] * velocity
+    table.position.assign((np.stack([place.position for place in places]) + beyond).astype(np.float32))
+    table.velocity.assign(velocity.astype(np.float32))
+    table.duration.assign(np.array([guide.duration for guide in guides], np.float32))
+    table.offset.zero_()
+    table.given.fill_(1)
+    position, yaw = (np.stack([getattr(place, name)[0] for place in places]) for name in ("position", "yaw"))
+    q = quat_from_yaw(yaw)
+    return environment.start(position, q, position, q)
