@@ -43,6 +43,12 @@ COMMANDS = [
     "fuse",
     "project",
     "backproject",
+    "run",
+    "record",
+    "record info",
+    "record repair",
+    "play",
+    "teleop",
 ]
 
 

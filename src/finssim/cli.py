@@ -8,7 +8,16 @@ from typing import Annotated
 
 import typer
 
-from finssim import __version__, boundary, cli_calibrate, cli_localization, cli_trials, cli_vision
+from finssim import (
+    __version__,
+    boundary,
+    cli_calibrate,
+    cli_localization,
+    cli_record,
+    cli_robot,
+    cli_trials,
+    cli_vision,
+)
 from finssim.cli_options import Device, Hydrodynamics, Json, Seed, Steps, Vehicle
 from finssim.quiet import start_warp
 
@@ -37,6 +46,10 @@ app.command()(cli_localization.localize)
 app.command()(cli_localization.fuse)
 app.command()(cli_localization.project)
 app.command()(cli_localization.backproject)
+app.add_typer(cli_record.record_app, name="record")
+app.command()(cli_record.play)
+app.command()(cli_record.teleop)
+app.command()(cli_robot.run)
 
 PICTURES = (".png", ".svg", ".pdf")
 

@@ -30,8 +30,8 @@ Array = npt.NDArray[np.float64]
 class HardwareRobot:
     """Read, send, and nothing more: without an `arm` that succeeds, thrusters never turn.
 
-    Call `read` and `send` at least 20 times a second: the motor controller stops the motors half a second after the last
-    frame, and so does the bridge after the last command.
+    Call `read` and `send` at least 20 times a second: the motor controller stops the motors half a second after the
+    last frame, and so does the bridge after the last command.
     """
 
     def __init__(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import socket
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+from finssim.robot.interrupt import interruptible
 from finssim.robot.lockstep_codec import (
     LockstepError,
     decode_delivery,
@@ -101,7 +103,7 @@ def run_lockstep(
     show: Callable[[Runtime], None] | None = None,
     until: Callable[[Runtime], bool] | None = None,
 ) -> float:
-    """Run a robot against a world, and end with its thrusters stopped.
+    """Run a robot against a world until the time is over, `until` says so, or Ctrl-C; then stop its thrusters.
 
     Args:
         runtime: The robot.
@@ -117,8 +119,10 @@ def run_lockstep(
     """
     now: float = start
     sent: list[bytes] = []
-    try:
-        for k in range(1, round(duration * rate) + 1):
+    with interruptible() as interrupted:
+        for k in itertools.count(1):
+            if interrupted() or k > duration * rate + 1e-6:
+                break
             delivery = world.exchange(start + k / rate, sent)
             now = delivery.time
             sent = runtime.step(now, delivery.frames, delivery.pictures)
@@ -127,6 +131,5 @@ def run_lockstep(
                 show(runtime)
             if until is not None and until(runtime):
                 break
-    finally:
-        last = runtime.stop(now, LAST_FRAMES)
-    return world.exchange(now + 1.0 / rate, last).time
+    # A world that broke off above stands still: only one that goes on needs to hear of the end.
+    return world.exchange(now + 1.0 / rate, runtime.stop(now, LAST_FRAMES)).time

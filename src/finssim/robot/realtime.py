@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import gc
 import math
-import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from finssim.robot.interrupt import interruptible
 from finssim.robot.link.transports import Transport
 from finssim.robot.runtime import Runtime
 
@@ -64,7 +63,7 @@ def run_realtime(
     period, turn = 1.0 / rate, 0
     start = collected = clock()
     now = start
-    with _calm(), _interruptible() as interrupted:
+    with _calm(), interruptible() as interrupted:
         try:
             while not interrupted() and (now := clock()) - start < duration:
                 frames = [(now, data) for data in transport.receive()]
@@ -107,27 +106,3 @@ def _calm() -> Iterator[None]:
         gc.unfreeze()
         if enabled:
             gc.enable()
-
-
-@contextmanager
-def _interruptible() -> Iterator[Callable[[], bool]]:
-    """Let Ctrl-C and SIGTERM end the loop between two steps; a second one ends it at once."""
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
-        return
-    asked = False
-    before: dict[int, Any] = {}
-
-    def end(number: int, frame: object) -> None:
-        nonlocal asked
-        if asked:
-            raise KeyboardInterrupt
-        asked = True
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        before[number] = signal.signal(number, end)
-    try:
-        yield lambda: asked
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -28,7 +28,7 @@ WAITING = 8
 
 
 class TagFinder:
-    """Pictures in, pictures with their tags out. A picture without tags comes out without its image: there was nothing."""
+    """Pictures in, pictures with their tags out; one without tags comes out without its image."""
 
     def __init__(
         self,
@@ -66,6 +66,10 @@ class TagFinder:
         while self._found:
             found.append(self._found.popleft())
         return found
+
+    def describe(self) -> str:
+        """The source and how it fares, in a few words."""
+        return f"{self._source.describe()}, {self.skipped} skipped"
 
     def close(self) -> None:
         """Stop looking and let go of the source."""

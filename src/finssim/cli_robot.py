@@ -1,0 +1,122 @@
+"""`finssim run`: a policy or a PID on a vehicle, or in the virtual pool."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from finssim.cli_options import Json, Vehicle
+
+__all__ = ["run"]
+
+
+def run(
+    policy: Annotated[
+        str, typer.Option(help="A policy's directory, or pid, or pid-paper.", metavar="DIR|pid|pid-paper")
+    ],
+    task: Annotated[
+        str | None,
+        typer.Option(
+            help="Task that the policy must have been trained for: t1 (station keeping) or t2 (trajectories); "
+            "its own if not given.",
+            metavar="TASK",
+        ),
+    ] = None,
+    goal: Annotated[
+        str | None,
+        typer.Option(
+            help="Station to keep: x,y,z [m] in the world frame (z = 0 on the water, negative below) and heading "
+            "[deg], or a file with goal: [x, y, z, yaw_deg].",
+            metavar="X,Y,Z,YAW|FILE",
+        ),
+    ] = None,
+    trajectory: Annotated[
+        str | None,
+        typer.Option(
+            help="Trajectory to follow in place of a goal: straight, broken, ellipse, lemniscate, circle, helix, "
+            "or a file.",
+            metavar="NAME|FILE",
+        ),
+    ] = None,
+    robot: Annotated[
+        str,
+        typer.Option(
+            help="Motor controller: udp://HOST:PORT, serial:DEVICE, or pool for the virtual pool on this machine. "
+            "With --lockstep: pool, or HOST:PORT.",
+            metavar="ADDRESS",
+        ),
+    ] = "pool",
+    bind: Annotated[
+        str,
+        typer.Option(
+            help="Address and port of this end, for udp; loopback unless told otherwise.",
+            metavar="ADDRESS:PORT",
+        ),
+    ] = "127.0.0.1:54321",
+    pictures: Annotated[
+        str | None,
+        typer.Option(
+            help="Overhead camera: udp://HOST:PORT, shm:NAME or none; the virtual pool's with --robot pool, "
+            "otherwise none, if not given.",
+            metavar="ADDRESS",
+        ),
+    ] = None,
+    pool_file: Annotated[
+        Path, typer.Option(help="Pool file: camera, water plane and frames (.yaml).", metavar="FILE")
+    ] = Path("pool.yaml"),
+    vehicle: Vehicle = "finsrov",
+    mode: Annotated[
+        str, typer.Option(help="Estimator: constant-velocity or error-state.", metavar="MODE")
+    ] = "constant-velocity",
+    record: Annotated[
+        Path | None, typer.Option(help="Record everything into this file (.mcap).", metavar="FILE")
+    ] = None,
+    duration: Annotated[
+        float | None,
+        typer.Option(
+            help="End after this time [s]; at the end of the trajectory, or with Ctrl-C, if not given.",
+            min=0.0,
+        ),
+    ] = None,
+    lockstep: Annotated[
+        bool,
+        typer.Option("--lockstep", help="Take turns with finssim pool --lockstep, as fast as both compute."),
+    ] = False,
+    arm: Annotated[
+        bool,
+        typer.Option(
+            "--arm", help="Let thrusters turn, as soon as the state is known. Without it they never do."
+        ),
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Run a controller on a vehicle: estimate, decide, command; print how it went. Ctrl-C stops the thrusters.
+
+    Exit status 3: the run ended in a fault of the vehicle.
+
+    Example: finssim run --policy runs/hold --goal 0.5,0,-0.5,90 --pool-file pool.yaml --duration 60 --arm
+    """
+    from finssim.quiet import start_warp
+
+    start_warp()
+    from finssim.robot.run import Wiring
+    from finssim.robot.run import run as drive
+
+    status = drive(
+        policy,
+        task=task,
+        goal=goal,
+        trajectory=trajectory,
+        pool_file=pool_file,
+        vehicle=vehicle,
+        wiring=Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep),
+        record=record,
+        duration=duration,
+        mode=mode,
+        arm=arm,
+        as_json=as_json,
+    )
+    if status:
+        raise typer.Exit(status)

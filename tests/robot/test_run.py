@@ -1,0 +1,153 @@
+"""`finssim run`, as a person types it: against a world in lock-step and on a wire with nobody at its end."""
+
+import json
+import socket
+import threading
+
+import numpy as np
+import pytest
+
+from finssim import boundary
+from finssim.cli import app
+from finssim.localization.pool import write_pool
+from finssim.robot.link.decoder import MCU, Decoder
+from finssim.robot.link.frames import encode_telemetry
+from finssim.robot.lockstep_codec import decode_request, encode_delivery, receive
+from finssim.robot.messages import Delivery
+from finssim.vehicles import load_vehicle
+from reference.rounds import Rounds, overhead, without_latency
+
+POOL = overhead()
+VEHICLE = without_latency(load_vehicle("finsrov"))
+
+
+@pytest.fixture
+def pool_file(tmp_path):
+    """Of the camera that sees the rounds."""
+    write_pool(POOL, tmp_path / "pool.yaml")
+    return tmp_path / "pool.yaml"
+
+
+class Served:
+    """A vehicle on its rounds, in lock-step over TCP; keeps the commands it hears."""
+
+    def __init__(self, telemetry_ends=1e9):
+        self.commands, self._ends = [], telemetry_ends
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.address = f"127.0.0.1:{self._server.getsockname()[1]}"
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self):
+        connection, _ = self._server.accept()
+        rounds, decoder, before = Rounds(POOL, VEHICLE), Decoder(MCU), 0.0
+        with self._server, connection:
+            while (message := receive(connection)) is not None:
+                until, sent = decode_request(*message)
+                self.commands += [c for data in sent for c in decoder.feed(data)]
+                ticks = np.arange(np.ceil(before * 100), np.ceil(until * 100)).astype(int)
+                frames = [
+                    (k / 100, encode_telemetry(rounds.telemetry(k / 100, k)))
+                    for k in ticks.tolist()
+                    if k / 100 < self._ends
+                ]
+                shots = np.arange(np.ceil((before - POOL.latency) * 30), np.ceil((until - POOL.latency) * 30))
+                pictures = [rounds.picture(k / 30, k) for k in shots.astype(int).tolist() if k >= 0]
+                connection.sendall(encode_delivery(Delivery(until, tuple(frames), tuple(pictures))))
+                before = until
+
+    def finish(self):
+        self._thread.join(10.0)
+        return self.commands
+
+
+def finssim(*words):
+    return boundary.run(app, ["run", *map(str, words)])
+
+
+def told(capsys, *words):
+    """What `--json` prints."""
+    status = finssim(*words, "--json")
+    return status, json.loads(capsys.readouterr().out)
+
+
+def test_an_armed_run_in_lockstep_commands_records_and_tells(capsys, tmp_path, pool_file):
+    """Armed, every decision made, the thrusters disabled at the end, and a record that opens."""
+    world, record = Served(), tmp_path / "run.mcap"
+    words = ("--policy", "pid", "--goal", "0.5,0.2,-0.5,30", "--pool-file", pool_file, "--lockstep")
+    status, summary = told(
+        capsys, *words, "--robot", world.address, "--duration", 3, "--record", record, "--arm"
+    )
+    enabled = [c.enable for c in world.finish()]
+    assert status == 0 and summary["state"] == "armed" and summary["missed"] == 0
+    assert 0.1 < summary["position_rms_m"] < 1.0 and summary["steps"] == 180
+    assert any(enabled) and enabled[-3:] == [False] * 3
+    assert record.stat().st_size > 10_000
+
+
+def test_a_run_that_is_not_armed_says_so_and_turns_nothing(capsys, pool_file):
+    """Decisions are made, and no frame is enabled."""
+    world = Served()
+    words = ("--policy", "pid-paper", "--goal", "0.5,0.2,-0.5,30", "--pool-file", pool_file, "--lockstep")
+    assert finssim(*words, "--robot", world.address, "--duration", 2) == 0
+    out, err = capsys.readouterr()
+    assert "thrusters will not turn without --arm" in err and "disarmed" in out
+    assert not any(c.enable for c in world.finish())
+
+
+def test_a_run_that_ends_in_a_fault_tells_why_with_status_3(capsys, pool_file):
+    """Telemetry ends at 2 s: fault within a second, and the run is over."""
+    world = Served(telemetry_ends=2.0)
+    words = ("--policy", "pid", "--goal", "0.5,0.2,-0.5,30", "--pool-file", pool_file, "--lockstep", "--arm")
+    status, summary = told(capsys, *words, "--robot", world.address, "--duration", 60)
+    world.finish()
+    assert status == 3 and summary["state"] == "fault" and summary["duration_s"] < 3.0
+    assert "telemetry" in summary["reason"] and len(summary["faults"]) >= 1
+
+
+def test_the_error_state_estimator_can_be_chosen(capsys, pool_file):
+    """And an unknown one is refused before anything starts."""
+    world = Served()
+    words = ("--policy", "pid", "--goal", "0.5,0.2,-0.5,30", "--pool-file", pool_file, "--lockstep")
+    status, summary = told(capsys, *words, "--robot", world.address, "--duration", 1, "--mode", "error-state")
+    assert status == 0 and summary["fixes"] > 20
+    assert finssim(*words, "--robot", world.address, "--mode", "psychic") == 2
+    assert "unknown mode 'psychic'" in capsys.readouterr().err
+
+
+def test_a_trajectory_can_be_followed_in_place_of_a_goal(capsys, pool_file):
+    """By name; the goal moves with the time since the start."""
+    world = Served()
+    words = ("--policy", "pid", "--trajectory", "straight", "--pool-file", pool_file, "--lockstep")
+    status, summary = told(capsys, *words, "--robot", world.address, "--duration", 2, "--vehicle", "finsrov")
+    assert status == 0 and summary["goal"] == "straight" and summary["decisions"] > 20
+
+
+def test_on_a_wire_with_nobody_at_its_end_nothing_is_armed(capsys, pool_file):
+    """In real time, over UDP, without a camera: disarmed, and why."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        free = f"127.0.0.1:{one.getsockname()[1]}"
+    words = ("--policy", "pid", "--goal", "0.5,0.2,-0.5,30", "--pool-file", pool_file, "--pictures", "none")
+    status, summary = told(
+        capsys, *words, "--robot", "udp://127.0.0.1:9", "--bind", free, "--duration", 0.3, "--arm"
+    )
+    assert status == 0 and summary["state"] == "disarmed" and summary["decisions"] == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--policy", "pid"), "either a goal"),
+        (("--policy", "pid", "--goal", "1,2,3"), "expected four numbers"),
+        (("--policy", "pid", "--goal", "0,0,0.5,0"), "outside the workspace"),
+        (("--policy", "nobody", "--goal", "0,0,-0.5,0"), "neither pid nor pid-paper"),
+        (("--policy", "pid", "--goal", "0,0,-0.5,0", "--robot", "tin://can"), "unknown wire"),
+        (("--policy", "pid", "--goal", "0,0,-0.5,0", "--pictures", "eyes", "--bind", "127.0.0.1:0"), "eyes"),
+        (("--policy", "pid", "--goal", "0,0,-0.5,0", "--lockstep", "--robot", "127.0.0.1:1"), "no world in"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_in_a_sentence(capsys, pool_file, words, sentence):
+    """Status 2, before anything is sent."""
+    assert finssim(*words, "--pool-file", pool_file) == 2
+    assert sentence in capsys.readouterr().err
