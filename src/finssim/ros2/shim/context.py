@@ -28,6 +28,8 @@ class Context:
         """Counts every endpoint that came or went."""
         self.executor: Any = None
         """The one that `rclpy.spin` uses, once it was used."""
+        self.asked_to_leave = False
+        """Whether SIGTERM came."""
         self._participant: Participant | None = None
         self._waiters: weakref.WeakSet[Any] = weakref.WeakSet()
         self._on_shutdown: list[Callable[[], None]] = []
@@ -63,8 +65,8 @@ class Context:
         return self._participant
 
     def ok(self) -> bool:
-        """Whether joined."""
-        return self._participant is not None
+        """Whether joined, and not asked to leave by a signal."""
+        return self._participant is not None and not self.asked_to_leave
 
     def get_domain_id(self) -> int:
         """The ROS domain."""
@@ -116,5 +118,16 @@ class Context:
     def leave_on_sigterm(self) -> None:
         """Let SIGTERM end `spin` as rclpy does, unless the program handles that signal or this is no main thread."""
         main = threading.current_thread() is threading.main_thread()
-        if main and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
-            signal.signal(signal.SIGTERM, lambda *_: self.try_shutdown())
+        if main and signal.getsignal(signal.SIGTERM) in (signal.SIG_DFL, _on_sigterm):
+            _leaving[:] = [self]
+            signal.signal(signal.SIGTERM, _on_sigterm)
+
+
+_leaving: list[Context] = []
+"""The context that SIGTERM asks to leave."""
+
+
+def _on_sigterm(*_: Any) -> None:
+    """Only ask: the wire is left where no call on it is under way."""
+    for context in _leaving:
+        context.asked_to_leave = True

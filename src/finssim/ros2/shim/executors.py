@@ -87,6 +87,8 @@ class SingleThreadedExecutor:
         """
         while self.context.ok() and not self._stopped:
             self.spin_once()
+        if self.context.asked_to_leave:
+            raise ExternalShutdownException("SIGTERM came while an executor spun")
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Run one callback, waiting for it if need be.

@@ -9,7 +9,7 @@ from cyclonedds._clayer import ddspy_take
 from cyclonedds.core import DDSException, DDSStatus, InstanceState, ReadCondition, SampleState, ViewState
 from cyclonedds.internal import DDS
 from cyclonedds.pub import DataWriter, Publisher
-from cyclonedds.qos import Qos
+from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader, Subscriber
 from cyclonedds.topic import Topic
 
@@ -28,6 +28,10 @@ class _Blob(ctypes.Structure):
 # own write would hold it and stop every thread.
 _dds_write = DDS._dll_handle.dds_write
 _dds_write.argtypes, _dds_write.restype = [ctypes.c_int32, ctypes.c_void_p], ctypes.c_int32
+
+_count_readers = DDS._dll_handle.dds_get_matched_subscriptions
+_count_readers.argtypes = [ctypes.c_int32, ctypes.c_void_p, ctypes.c_size_t]
+_count_readers.restype = ctypes.c_int32
 
 
 class Endpoint:
@@ -56,10 +60,10 @@ class Writer(Endpoint):
     """Sends ready CDR bytes."""
 
     def __init__(self, publisher: Publisher, topic: Topic, qos: Qos) -> None:
+        self._keeps = Policy.Durability.TransientLocal in qos
         self.entity = DataWriter(publisher, topic, qos)
         self.entity.set_status_mask(DDSStatus.OfferedIncompatibleQos)
         self.topic, self.gid = topic.name, self.entity.guid.bytes
-        self._blob = _Blob()
 
     def write(self, buffer: bytearray) -> bool:
         """Send one sample, a multiple of four bytes; False if slow readers left no room for it within 100 ms.
@@ -67,6 +71,8 @@ class Writer(Endpoint):
         Raises:
             DDSException: The wire refused it for another reason.
         """
+        if not self._keeps and self.matched() == 0:
+            return True  # nobody would ever see it, and Cyclone copies even then
         view = (ctypes.c_char * 0).from_buffer(buffer)
         blob = _Blob(ctypes.addressof(view), len(buffer))
         code = _dds_write(self.entity._ref, ctypes.byref(blob))
@@ -78,7 +84,7 @@ class Writer(Endpoint):
 
     def matched(self) -> int:
         """How many readers are known to get it."""
-        return len(self.entity.get_matched_subscriptions())
+        return int(_count_readers(self.entity._ref, None, 0))
 
     def peers(self) -> list[Any]:
         """What is known of those readers."""
