@@ -44,6 +44,7 @@ COMMANDS = [
     "project",
     "backproject",
     "run",
+    "pool",
     "record",
     "record info",
     "record repair",

@@ -13,6 +13,7 @@ from finssim import (
     boundary,
     cli_calibrate,
     cli_localization,
+    cli_pool,
     cli_record,
     cli_robot,
     cli_trials,
@@ -50,6 +51,7 @@ app.add_typer(cli_record.record_app, name="record")
 app.command()(cli_record.play)
 app.command()(cli_record.teleop)
 app.command()(cli_robot.run)
+app.command()(cli_pool.pool)
 
 PICTURES = (".png", ".svg", ".pdf")
 

@@ -1,0 +1,101 @@
+"""`finssim pool`: the virtual pool as a process of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from finssim.cli_options import Seed, Vehicle
+from finssim.quiet import start_warp
+
+__all__ = ["pool"]
+
+
+def pool(
+    vehicle: Vehicle = "finsrov",
+    plant: Annotated[
+        str,
+        typer.Option(
+            help="Plant in the water: a seed to draw it from, or a plant file.", metavar="SEED|FILE"
+        ),
+    ] = "1",
+    severity: Annotated[
+        str,
+        typer.Option(
+            help="How far a drawn plant and its camera are from what is known: nominal, realistic or hard.",
+            metavar="NAME",
+        ),
+    ] = "realistic",
+    lockstep: Annotated[
+        bool, typer.Option("--lockstep", help="Time goes as fast as one robot asks, instead of in real time.")
+    ] = False,
+    camera: Annotated[
+        str,
+        typer.Option(help="What the camera sends: pictures, corners (of the tags) or none.", metavar="KIND"),
+    ] = "pictures",
+    pictures: Annotated[
+        str,
+        typer.Option(help="How pictures travel in real time: udp, or shm (shared memory).", metavar="WAY"),
+    ] = "udp",
+    port: Annotated[
+        int,
+        typer.Option(
+            help="UDP port of the motor controller; pictures leave from the next, lock-step (TCP) is the "
+            "one after."
+        ),
+    ] = 58766,
+    bind: Annotated[
+        str, typer.Option(help="Address of this end: this machine alone unless given.", metavar="ADDRESS")
+    ] = "127.0.0.1",
+    robot: Annotated[
+        str,
+        typer.Option(
+            help="The only robot that may command; its pictures go to the port after this.",
+            metavar="HOST:PORT",
+        ),
+    ] = "127.0.0.1:54321",
+    pool_file: Annotated[
+        Path | None,
+        typer.Option(
+            help="Pool file to write: the camera as its calibration has it (.yaml).", metavar="FILE"
+        ),
+    ] = None,
+    truth: Annotated[
+        Path | None, typer.Option(help="File to write what truly happened into, for scoring.", metavar="FILE")
+    ] = None,
+    start: Annotated[
+        str,
+        typer.Option(
+            help="Where the vehicle starts, world frame: x,y,z [m], yaw [deg].", metavar="X,Y,Z,YAW"
+        ),
+    ] = "0,0,-0.5,0",
+    duration: Annotated[
+        float | None, typer.Option(help="When to end, pool's clock [s]; never if not given.", min=0.0)
+    ] = None,
+    seed: Seed = 0,
+) -> None:
+    """Be the vehicle and its pool for a robot on this machine, until Ctrl-C.
+
+    Example: finssim pool --plant 1 --severity realistic --pool-file pool.yaml --truth truth.fst
+    """
+    start_warp()
+    from finssim.pool.run import run
+
+    run(
+        vehicle,
+        plant=plant,
+        severity=severity,  # type: ignore[arg-type]
+        lockstep=lockstep,
+        camera=camera,  # type: ignore[arg-type]
+        pictures=pictures,  # type: ignore[arg-type]
+        port=port,
+        bind=bind,
+        robot=robot,
+        pool_file=pool_file,
+        truth=truth,
+        start=start,
+        duration=duration,
+        seed=seed,
+    )

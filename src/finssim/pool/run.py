@@ -1,0 +1,239 @@
+"""`finssim pool`: make a plant, a camera and a motor controller, and serve a robot until it is told to stop."""
+
+from __future__ import annotations
+
+import logging
+import math
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import typer
+
+from finssim.geometry.rotations import quat_from_yaw
+from finssim.localization.pool import Pool, write_pool
+from finssim.pool.draw_plant import draw_plant
+from finssim.pool.picture_process import CameraPlan, PictureProcess, PictureWire
+from finssim.pool.picture_wire import PictureSink
+from finssim.pool.plant_spec import PlantSpec, PlantSpecError, Severity, load_plant_spec
+from finssim.pool.server import LockstepServer, serve_realtime
+from finssim.pool.site import camera_of
+from finssim.pool.virtual_pool import VirtualPool
+from finssim.robot.goals import station_of
+from finssim.robot.link.layout import LinkError
+from finssim.robot.link.transports import host_port
+from finssim.robot.link.udp import UdpTransport
+from finssim.vehicles import Vehicle, load_vehicle
+
+__all__ = ["MCU_PORT", "PoolPlan", "make_plan", "run"]
+
+MCU_PORT = 58766
+"""Of the motor controller; pictures come from the next port, lock-step is the one after."""
+MEMORY = "pool"
+"""Name of the shared memory."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoolPlan:
+    """A virtual pool before it lives."""
+
+    vehicle: Vehicle
+    spec: PlantSpec
+    camera: CameraPlan | None
+    calibrated: Pool | None
+    """What a robot may know of the camera."""
+
+    def world(self, camera: Any, *, start: str, seed: int, truth: Path | None) -> VirtualPool:
+        """The living pool.
+
+        Args:
+            camera: Of the pool; None for none.
+            start: "x,y,z,yaw_deg", world frame [m], [deg].
+            seed: Of instruments and wire.
+            truth: File that is written.
+        """
+        station = station_of(start)
+        pose = np.asarray(station.position), quat_from_yaw(station.yaw)
+        return VirtualPool(self.vehicle, self.spec, camera=camera, start=pose, seed=seed, truth=truth)
+
+
+def make_plan(
+    vehicle: str,
+    plant: str,
+    severity: Severity,
+    *,
+    camera: Literal["pictures", "corners", "none"] = "pictures",
+    seed: int = 0,
+) -> PoolPlan:
+    """Draw a plant and its camera, or read the plant from its file.
+
+    Args:
+        vehicle: Name or file.
+        plant: Seed, or a plant file, whose own severity and seed then also make the camera.
+        severity: Of a drawn plant.
+        camera: What it sends.
+        seed: Of ripples, noise, jitter and losses.
+
+    Raises:
+        PlantSpecError: The plant cannot be made, or there is no such severity or camera.
+    """
+    ours = load_vehicle(vehicle)
+    spec = draw_plant(ours, int(plant), severity) if plant.isdecimal() else load_plant_spec(plant)
+    if camera not in ("pictures", "corners", "none"):
+        raise PlantSpecError(f"unknown camera '{camera}'; available: pictures, corners, none")
+    if camera == "none":
+        return PoolPlan(vehicle=ours, spec=spec, camera=None, calibrated=None)
+    site, calibrated, settings = camera_of(ours, spec.seed, spec.severity, basin=spec.basin)
+    plan = CameraPlan(vehicle=ours, site=site, settings=settings, basin=spec.basin, mode=camera, seed=seed)
+    return PoolPlan(vehicle=ours, spec=spec, camera=plan, calibrated=calibrated)
+
+
+def run(
+    vehicle: str,
+    *,
+    plant: str,
+    severity: Severity,
+    lockstep: bool,
+    camera: Literal["pictures", "corners", "none"],
+    pictures: Literal["udp", "shm"],
+    port: int,
+    bind: str,
+    robot: str,
+    pool_file: Path | None,
+    truth: Path | None,
+    start: str,
+    duration: float | None,
+    seed: int,
+) -> None:
+    """Run a virtual pool; arguments as of the command."""
+    logging.basicConfig(level=logging.WARNING, format="finssim: %(message)s", stream=sys.stderr)
+    plan = make_plan(vehicle, plant, severity, camera=camera, seed=seed)
+    if pictures not in ("udp", "shm"):
+        raise LinkError(f"pictures over '{pictures}': give udp or shm")
+    if not 0 < port <= 65533:
+        raise LinkError(f"port {port}: expected 1 to 65533, as the two after it are taken too")
+    if pool_file is not None:
+        if plan.calibrated is None:
+            raise PlantSpecError("--pool-file tells of the camera, and --camera none has none: leave one out")
+        write_pool(plan.calibrated, pool_file)
+    _tell_plant(plan, pool_file, truth)
+    world: Callable[[Any], VirtualPool] = lambda eye: plan.world(eye, start=start, seed=seed, truth=truth)  # noqa: E731
+    longest = math.inf if duration is None else duration
+    if lockstep:
+        _lockstep(plan, world, (bind, port + 2), longest)
+    else:
+        wire = PictureWire((bind, port + 1), _next(robot), MEMORY if pictures == "shm" else "")
+        _realtime(plan, world, UdpTransport((bind, port), host_port(robot, "--robot")), wire, longest)
+
+
+def _lockstep(
+    plan: PoolPlan, make_world: Callable[[Any], VirtualPool], address: tuple[str, int], duration: float
+) -> None:
+    server = LockstepServer(address)
+    world, why = make_world(plan.camera.camera() if plan.camera is not None else None), "stopped"
+    try:
+        _say(f"lock-step: {_name(server.address)}")
+        with _stoppable(at_once=True):
+            why = server.serve(world, duration=duration)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        server.close()
+        world.close()
+    _say(f"{why} at {world.time:.1f} s")
+
+
+def _realtime(
+    plan: PoolPlan,
+    make_world: Callable[[Any], VirtualPool],
+    transport: UdpTransport,
+    wire: PictureWire,
+    duration: float,
+) -> None:
+    with _stoppable() as asked:
+        drawn, sink, eye = _camera(plan, wire)
+        world = make_world(eye)
+        try:
+            _say(f"motor controller: {_name(transport.address)}, for {_name(transport.peer)} alone")
+            if eye is not None:
+                where = f"shm:{wire.memory}" if wire.memory else f"{_name(wire.bind)}, for {_name(wire.peer)}"
+                _say(f"pictures: {where}")
+            pace = serve_realtime(
+                world, transport, sink=sink, camera=drawn, duration=duration, until=lambda _: asked()
+            )
+            _say(pace.sentence)
+            if drawn is not None and drawn.dropped:
+                _say(
+                    f"{drawn.dropped} pictures could not be drawn in time: --camera corners needs no drawing"
+                )
+        finally:
+            world.close()
+            transport.close()
+            for end in (drawn, sink):
+                if end is not None:
+                    end.close()
+
+
+def _camera(plan: PoolPlan, wire: PictureWire) -> tuple[PictureProcess | None, PictureSink | None, Any]:
+    """The process that draws, or the sink for what is computed here, and the camera for the world."""
+    if plan.camera is None:
+        return None, None, None
+    if plan.camera.mode == "corners":
+        return None, wire.open(), plan.camera.camera()
+    drawn = PictureProcess(plan.camera, wire)
+    return drawn, None, drawn
+
+
+@contextmanager
+def _stoppable(*, at_once: bool = False) -> Iterator[Callable[[], bool]]:
+    """Let Ctrl-C and SIGTERM ask for the end, or end a wait at once; gives whether they did. The second ends all."""
+    asked = False
+    before: dict[int, Any] = {}
+
+    def stop(number: int, frame: object) -> None:
+        nonlocal asked
+        if asked or at_once:
+            raise KeyboardInterrupt
+        asked = True
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        before[number] = signal.signal(number, stop)
+    try:
+        yield lambda: asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _next(robot: str) -> tuple[str, int]:
+    """Where the robot takes its pictures: the port after that of its own end."""
+    host, port = host_port(robot, "--robot")
+    return host, port + 1
+
+
+def _tell_plant(plan: PoolPlan, pool_file: Path | None, truth: Path | None) -> None:
+    spec = plan.spec
+    _say(f"plant: {spec.title}, {spec.severity}, seed {spec.seed}")
+    if plan.camera is not None:
+        s = plan.camera.settings
+        _say(
+            f"camera: {plan.camera.mode}, {s.rate:g} Hz, {plan.camera.site.camera.lens.width} x "
+            f"{plan.camera.site.camera.lens.height}, ripples of slope {s.ripples:g}"
+        )
+    for name, path in (("pool file", pool_file), ("truth", truth)):
+        if path is not None:
+            _say(f"{name}: {path}")
+
+
+def _name(address: tuple[str, int]) -> str:
+    return f"{address[0]}:{address[1]}"
+
+
+def _say(line: str) -> None:
+    typer.echo(line)
+    sys.stdout.flush()
