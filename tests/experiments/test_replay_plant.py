@@ -10,31 +10,11 @@ from hypothesis import strategies as st
 from finssim.calibration.excitation.programmes import programmes
 from finssim.engine import Simulator
 from finssim.experiments.plants import PlantError
-from finssim.experiments.replay_plant import CoupledMatrix, load_replay_plant
+from finssim.experiments.replay_plant import load_replay_plant
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")
 PLANT = load_replay_plant()
-
-small = st.floats(-0.3, 0.3)
-positive = st.floats(0.01, 100.0)
-
-
-@given(
-    diagonal=st.tuples(*[positive] * 6),
-    center=st.tuples(small, small, small),
-    tilt=st.tuples(*[st.floats(-45.0, 45.0)] * 3),
-)
-def test_any_coupled_matrix_is_symmetric_and_positive(diagonal, center, tilt):
-    M = CoupledMatrix(diagonal=diagonal, center=center, tilt_deg=tilt).matrix()
-    np.testing.assert_allclose(M, M.T, atol=1e-9 * np.abs(M).max())
-    assert np.linalg.eigvalsh(M)[0] > -1e-9 * np.abs(M).max()
-
-
-def test_a_matrix_about_the_origin_in_body_axes_is_its_diagonal():
-    M = CoupledMatrix(diagonal=(1, 2, 3, 4, 5, 6), center=(0, 0, 0), tilt_deg=(0, 0, 0)).matrix()
-    np.testing.assert_allclose(M, np.diag([1, 2, 3, 4, 5, 6]), atol=1e-12)
-
 
 def test_the_plant_couples_axes_that_every_model_of_the_file_keeps_apart():
     """Sway with roll, surge with heave and pitch."""

@@ -10,24 +10,21 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from finssim.calibration.excitation.programmes import Programme
 from finssim.calibration.excitation.recording import Recording, record
 from finssim.calibration.excitation.synthetic import trials_of
 from finssim.calibration.trials.trial import Trial
 from finssim.engine import Simulator, TetherLine
-from finssim.engine.plant_arrays import twist_shift
 from finssim.experiments.plants import PlantError
-from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
+from finssim.pool.coupled import CoupledMatrix, Section, Three
 from finssim.vehicles import Vehicle
 from finssim.yaml_file import read_mapping
 
-__all__ = ["PLANT_FILE", "CoupledMatrix", "ReplayPlant", "load_replay_plant"]
+__all__ = ["PLANT_FILE", "ReplayPlant", "load_replay_plant"]
 
 Array = NDArray[np.float64]
-Six = tuple[float, float, float, float, float, float]
-Three = tuple[float, float, float]
 
 PLANT_FILE = Path(__file__).with_suffix(".yaml")
 
@@ -35,52 +32,30 @@ SLOWEST = 3.0
 """Below this propeller speed the loss of thrust is taken as at it [1/s]: there is hardly any thrust to lose."""
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class CoupledMatrix(_Section):
-    """A 6x6 matrix that is diagonal about some point in some axes."""
-
-    diagonal: Six
-    """[kg, kg m²] or [N s/m, N m s]; above 0."""
-    center: Three
-    """Where it is diagonal, body frame [m]."""
-    tilt_deg: Three
-    """Roll, pitch, yaw of the axes in which it is diagonal [deg]."""
-
-    def matrix(self) -> Array:
-        """About the body origin, body axes: Hᵀ R diag Rᵀ H; positive definite for a positive diagonal, (6, 6)."""
-        tilt = quat_to_matrix(quat_from_euler(*np.radians(self.tilt_deg)))
-        R = np.kron(np.eye(2), tilt)
-        H = twist_shift(self.center)
-        return np.asarray(H.T @ R @ np.diag(self.diagonal) @ R.T @ H)
-
-
-class _Hull(_Section):
+class _Hull(Section):
     form_drag: float = Field(ge=0.0)
     skin_drag: float = Field(ge=0.0)
 
 
-class _Motors(_Section):
+class _Motors(Section):
     time_constant: float = Field(gt=0.0)
     delay: float = Field(ge=0.0)
 
 
-class _Propellers(_Section):
+class _Propellers(Section):
     diameter: float = Field(gt=0.0)
     advance_at_zero_thrust: float = Field(gt=0.0)
     induced_share: float = Field(ge=0.0, le=1.0)
     induced_reach: float = Field(gt=0.0)
 
 
-class _Tether(_Section):
+class _Tether(Section):
     diameter: float = Field(gt=0.0)
     drag_coefficient: float = Field(ge=0.0)
     attachment: Three
 
 
-class ReplayPlant(_Section):
+class ReplayPlant(Section):
     """What `replay_plant.yaml` says; the vehicle file gives inertia, buoyancy, thruster places and allocation."""
 
     title: str

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.pool.plant_spec import PlantSpec, PlantSpecError, Severity
-from finssim.pool.share import hull_share, steady_share
+from finssim.pool.share import hull_share, less_share, steady_share
 from finssim.vehicles import Vehicle
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 
@@ -67,11 +67,11 @@ class Spread:
 SPREADS: dict[Severity, Spread] = {
     "nominal": Spread(noise=0.5),
     "realistic": Spread(
-        hydrodynamics=0.12,
+        hydrodynamics=0.1,
         center=0.012,
         tilt_deg=3.0,
-        hull_share=0.15,
-        own_share=0.6,
+        hull_share=0.1,
+        own_share=0.4,
         induced_share=0.05,
         deduction=(0.02, 0.06),
         thrust=0.15,
@@ -88,11 +88,11 @@ SPREADS: dict[Severity, Spread] = {
         crystal=30.0,
     ),
     "hard": Spread(
-        hydrodynamics=0.25,
+        hydrodynamics=0.2,
         center=0.025,
         tilt_deg=6.0,
-        hull_share=0.3,
-        own_share=1.0,
+        hull_share=0.2,
+        own_share=0.7,
         induced_share=0.1,
         deduction=(0.04, 0.12),
         thrust=0.25,
@@ -200,9 +200,8 @@ def _water(
             f"vehicle '{vehicle.name}' has surge_damping, which the pool's plants do not model"
         )
     hull = hull_share(vehicle, spread.hull_share) if vehicle.hull is not None else {}
-    taken = steady_share(vehicle, hull, sections["propellers"])
-    # What panels and propellers already take is not taken twice; a third of the file's own always stays.
-    D1 = D1 - np.diag(np.minimum(taken, (2.0 / 3.0) * np.diag(D1)))
+    taken = steady_share(vehicle, hull, sections["propellers"], sum(spread.deduction) / 2.0)
+    D1, D2 = less_share(vehicle, D1, D2, taken)
     axes = [
         {
             "center": tuple((np.asarray(hydro.reference_point) + draw.around(spread.center, 3)).tolist()),

@@ -15,6 +15,11 @@ __all__ = ["FaultError", "Faults"]
 REORDERED = 0.025
 """How much later a frame that is overtaken arrives [s]: behind the two that follow it at 100 Hz."""
 
+PROBABILITIES = ("drop", "drop_commands", "corrupt", "reorder", "duplicate")
+NUMBERS = {f.name: f.values for f in TELEMETRY.payload if f.code == "f"}
+"""Telemetry fields that can be NaN, and how many values each has (0: one per motor output)."""
+SPOILABLE = {*NUMBERS, *(f"{name}.{i}" for name, values in NUMBERS.items() for i in range(values or 8))}
+
 
 class FaultError(ValueError):
     """A fault that cannot be: a probability out of range, a field that no frame has."""
@@ -41,6 +46,15 @@ class Faults:
     """Telemetry field sent as NaN, `depth` or an element of one, `gyro.2`; none if empty."""
     _frozen: Telemetry | None = None
 
+    def __setattr__(self, name: str, value: object) -> None:
+        if name in PROBABILITIES and not (isinstance(value, int | float) and 0.0 <= value <= 1.0):
+            raise FaultError(f"{name} is {value!r}, expected a probability from 0 to 1")
+        if name == "nan_field" and value and str(value) not in SPOILABLE:
+            raise FaultError(
+                f"telemetry has no number '{value}': give one of {', '.join(NUMBERS)}, or an element as in gyro.2"
+            )
+        super().__setattr__(name, value)
+
     def __post_init__(self) -> None:
         self._random = random.Random(f"faults {self.seed}")
 
@@ -49,8 +63,6 @@ class Faults:
         return self._happens(self.drop_commands if commands else self.drop)
 
     def _happens(self, probability: float) -> bool:
-        if not 0.0 <= probability <= 1.0:
-            raise FaultError(f"probability of a fault is {probability}, expected 0 to 1")
         return probability > 0.0 and self._random.random() < probability
 
     def encode(self, telemetry: Telemetry) -> bytes:
@@ -89,21 +101,14 @@ class Faults:
 
 
 def _with_nan(frame: bytes, name: str, outputs: int) -> bytes:
-    """The frame with one field NaN, or all its elements, and a right CRC: no checksum tells a controller's NaN."""
+    """The frame with one field NaN, or one element of it, and a right CRC: no checksum tells a controller's NaN."""
     field, _, element = name.partition(".")
-    at = len(TELEMETRY.magic)
+    body = bytearray(frame[len(TELEMETRY.magic) : -2])
+    at = 0
     for entry in forms(TELEMETRY, outputs)[0].fields:
-        size = struct.calcsize("<" + entry.code)
-        count = entry.values or outputs
-        if entry.name == field and entry.code == "f":
-            chosen = range(count) if not element else [int(element)] if element.isdecimal() else []
-            if not chosen or max(chosen) >= count:
-                break
-            body = bytearray(frame[len(TELEMETRY.magic) : -2])
-            for i in chosen:
-                struct.pack_into("<f", body, at - len(TELEMETRY.magic) + i * size, float("nan"))
-            return TELEMETRY.magic + bytes(body) + struct.pack("<H", crc16_modbus(bytes(body)))
-        at += size * count
-    raise FaultError(
-        f"telemetry has no number '{name}': give quaternion, gyro, accel, depth, pressure or motor_rpm, or gyro.2"
-    )
+        size, values = struct.calcsize("<" + entry.code), entry.values or outputs
+        if entry.name == field:
+            for i in [int(element)] if element else range(values):
+                struct.pack_into("<f", body, at + i * size, float("nan"))
+        at += size * values
+    return TELEMETRY.magic + bytes(body) + struct.pack("<H", crc16_modbus(bytes(body)))

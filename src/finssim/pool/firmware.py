@@ -78,7 +78,7 @@ class Firmware:
         self._last_command: float | None = None
         self._bad_frames = self._sequence = self._debug_mask = self._unechoed = 0
         self._decimation = 1
-        self._enabled = self._timed_out = False
+        self._enabled = self._timed_out = self._aiming = False
         self._rpm_outputs = np.zeros(self._outputs)
         self.target: Array = np.zeros(len(self._sign))
         self.commands = 0
@@ -140,6 +140,7 @@ class Firmware:
         """Target speeds of a command, by motor output and with the motors' signs."""
         wanted = self._sign * normalised[self._output] * self._full
         self.target = np.where((wanted < self._slow_plus) & (wanted > -self._slow_minus), 0.0, wanted)
+        self._aiming = bool(self.target.any())
 
     def _echo(self, now: float, command: ThrusterCommand, accepted: bool, refused: int) -> bytes:
         applied = np.zeros(self._outputs)
@@ -181,7 +182,8 @@ class Firmware:
             return None
         self._filter.update(sample.gyro, sample.accel, now - self._sampled)
         self._sampled = now
-        self._rpm_outputs[self._output] = self._sign * speed / RPM
+        # Adding 0 turns the -0 of a motor that stands the wrong way round into 0.
+        self._rpm_outputs[self._output] = self._sign * speed / RPM + 0.0
         return Telemetry(
             sequence=self._next(),
             mcu_ms=self.clock(now),
@@ -199,7 +201,7 @@ class Firmware:
         flags |= RECEIVED if self.commands else 0
         flags |= ECHO_ON if self._debug_mask & DEBUG_ECHO else 0
         flags |= DRIVING if self._enabled else 0
-        flags |= AIMING if self.target.any() else 0
+        flags |= AIMING if self._aiming else 0
         return flags | (THROTTLED if throttled else 0)
 
     def _next(self) -> int:

@@ -13,12 +13,15 @@ from finssim.geometry.mesh import face_geometry
 from finssim.pool.plant_spec import Propellers
 from finssim.vehicles import Vehicle
 
-__all__ = ["cruise", "hull_share", "steady_share"]
+__all__ = ["cruise", "hull_share", "less_share", "steady_share"]
 
 Array = NDArray[np.float64]
 
-CRUISE = 0.3
+CRUISE = 0.4
 """Part of the largest wrench at which the shares are taken: between hovering and full speed [-]."""
+
+LARGEST = 2.0 / 3.0
+"""Largest part of a damping coefficient that is taken out [-]."""
 
 SKIN = 0.02
 """Skin drag over form drag, as in the published mesh set [-]."""
@@ -71,15 +74,19 @@ def hull_share(vehicle: Vehicle, share: float) -> dict[str, float]:
     return {"form_drag": form, "skin_drag": float(f"{SKIN * form:.6g}")}
 
 
-def steady_share(vehicle: Vehicle, hull: Mapping[str, float], propellers: Mapping[str, float]) -> Array:
-    """Damping that panels and propellers stand for when cruising, by axis [N s/m, N m s], (6,).
+def steady_share(
+    vehicle: Vehicle, hull: Mapping[str, float], propellers: Mapping[str, float], deduction: float
+) -> Array:
+    """What panels and propellers take when cruising, by axis [N, N m], (6,).
 
-    The propellers' part is the thrust lost to their own motion through the water, T V / (J0 n D); see `losses`.
+    The propellers' part is the thrust lost to their own motion through the water, T V / (J0 n D), see `losses`, and to
+    the thrust deduction: a file's damping was fitted to thrusts measured on a bench, so it holds both.
 
     Args:
         vehicle: Its file.
         hull: form_drag, as from `hull_share`; nothing where there is no hull.
         propellers: Keys of `Propellers`.
+        deduction: Mean of the thrust deduction [-].
     """
     F, v = cruise(vehicle)
     p = Propellers.model_validate(propellers)
@@ -95,4 +102,23 @@ def steady_share(vehicle: Vehicle, hull: Mapping[str, float], propellers: Mappin
         own = v[i] * np.sum(axis * motion, axis=1)
         stall = p.advance_at_zero_thrust * p.diameter / (2.0 * math.pi) * np.maximum(speed, 20.0)
         taken[i] += B[i] @ (np.abs(T) * p.own_share * own / stall)
-    return np.divide(taken, v, out=np.zeros(6), where=v > 0.0)
+    return np.where(v > 0.0, taken + deduction * F, 0.0)
+
+
+def less_share(vehicle: Vehicle, D1: Array, D2: Array, taken: Array) -> tuple[Array, Array]:
+    """Damping that is left when a part of the drag is made by something else; a third always stays.
+
+    Args:
+        vehicle: Its file.
+        D1: Linear [N s/m, N m s], (6, 6).
+        D2: Quadratic [N s²/m², N m s²], (6, 6).
+        taken: Drag when cruising, by axis [N, N m], (6,): out of the linear part first.
+
+    Returns:
+        D1 and D2 with smaller diagonals.
+    """
+    _, v = cruise(vehicle)
+    first = np.minimum(taken, LARGEST * np.diag(D1) * v)
+    second = np.minimum(taken - first, LARGEST * np.diag(D2) * v * v)
+    safe = np.where(v > 0.0, v, 1.0)
+    return D1 - np.diag(first / safe), D2 - np.diag(second / safe**2)

@@ -78,12 +78,12 @@ class TruthWriter:
 
         Args:
             time: [s]
-            values: Position, quaternion, nu, shaft rpm, thrust, voltage and current, in this order.
+            values: Position, quaternion, nu, shaft rpm, thrust, voltage and current, in this order; float32.
         """
         if self._file is None:
             return
         try:
-            self._file.write(struct.pack("<d", time) + b"".join([v.astype("<f4").tobytes() for v in values]))
+            self._file.write(struct.pack("<d", time) + b"".join([v.tobytes() for v in values]))
             self._count += 1
             if self._count % FLUSH == 0:
                 self._file.flush()

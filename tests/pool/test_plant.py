@@ -1,0 +1,117 @@
+"""The plant's motion: the engine's where nothing is hidden, and physical where everything is."""
+
+import numpy as np
+import pytest
+
+from finssim.engine import Pool, Simulator
+from finssim.geometry.rotations import quat_to_matrix
+from finssim.pool import draw_plant
+from finssim.pool.plant import Plant
+from finssim.pool.plant_spec import Basin, Battery, BuoyancyDrift, Circulation
+from finssim.vehicles import load_vehicle
+
+FINSROV = load_vehicle("finsrov")
+QUIET = {"circulation": Circulation(), "tether": None, "buoyancy": BuoyancyDrift()}
+
+
+def test_the_nominal_plant_moves_as_the_engine_does():
+    """Driven with the thrusts that its motors deliver, the calibrated simulation follows it for five seconds."""
+    spec = draw_plant(FINSROV, 0, "nominal")
+    plant = Plant(FINSROV, spec)
+    engine = Simulator(FINSROV, control_step=plant.step, substeps=1, pool=Pool(), max_delay=0.1)
+    engine.plant.time_constant.zero_()
+    engine.plant.delay.zero_()
+    engine.plant.dead_plus.zero_()
+    engine.plant.dead_minus.zero_()
+    engine.refresh()
+    engine.place(position=(0.0, 0.0, -0.5))
+    plant.target[:] = (80.0, 80.0, 60.0, 60.0, 120.0, 90.0, -80.0, -110.0)
+    for _ in range(1000):
+        plant.advance()
+        engine.set_thrust(plant.thrust)
+        engine.step()
+    assert np.linalg.norm(plant.position[:2]) > 0.2
+    # float32, and two orders of the same sums, over a thousand steps
+    np.testing.assert_allclose(plant.position, engine.numpy("position")[0, 0], atol=2e-3)
+    np.testing.assert_allclose(plant.nu, engine.numpy("velocity")[0, 0], atol=2e-3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_without_thrust_a_moving_plant_only_slows_down(seed):
+    """Coupled damping and panels take energy out at every step; what trim and buoyancy add is left out by balance."""
+    spec = draw_plant(FINSROV, seed, "hard")
+    body = spec.body.model_copy(update={"displaced_volume": spec.body.mass / FINSROV.water.density,
+                                        "center_of_buoyancy": spec.body.center_of_gravity})  # fmt: skip
+    basin = Basin(length=400.0, width=400.0, depth=200.0)
+    plant = Plant(
+        FINSROV, spec.model_copy(update={**QUIET, "body": body, "basin": basin}), position=(0.0, 0.0, -100.0)
+    )
+    M = np.linalg.inv(plant.simulator.plant.M_inv.numpy()[0, 0].astype(float))
+    plant.nu[:] = np.random.default_rng(seed).normal(size=6) * (0.4, 0.4, 0.3, 1.0, 1.0, 1.0)
+    energy = []
+    for _ in range(400):
+        energy.append(0.5 * plant.nu @ M @ plant.nu)
+        plant.advance()
+    assert np.all(np.diff(energy) < 1e-6 * energy[0])
+    assert energy[-1] < 0.3 * energy[0]
+
+
+def test_a_plant_lies_where_its_hidden_trim_puts_it():
+    """At rest it hangs with its centre of gravity below its centre of buoyancy, not level."""
+    spec = draw_plant(FINSROV, 2, "hard").model_copy(update=QUIET)
+    plant = Plant(FINSROV, spec)
+    plant.advance(2000)
+    arm = np.subtract(spec.body.center_of_buoyancy, spec.body.center_of_gravity)
+    up = quat_to_matrix(plant.quaternion)[2]
+    assert np.allclose(up, arm / np.linalg.norm(arm), atol=2e-3)
+
+
+def test_it_drifts_with_the_circulation():
+    """A vehicle that does nothing is carried along; in still water it stays."""
+    spec = draw_plant(FINSROV, 1, "realistic").model_copy(update={"tether": None})
+    carried = Plant(FINSROV, spec, position=(0.6, 0.3, -0.5))
+    still = Plant(FINSROV, spec.model_copy(update={"circulation": Circulation()}), position=(0.6, 0.3, -0.5))
+    for plant in (carried, still):
+        plant.advance(2000)
+    assert np.hypot(*(carried.position[:2] - (0.6, 0.3))) > 0.04
+    assert np.hypot(*(still.position[:2] - (0.6, 0.3))) < 0.01
+
+
+def test_it_stays_inside_the_walls():
+    """Full surge into the wall: the envelope ends there, to within the wall's give."""
+    spec = draw_plant(FINSROV, 1, "hard")
+    plant = Plant(FINSROV, spec)
+    share = np.linalg.pinv(FINSROV.control_matrix) @ (15.0 * np.eye(6)[0])
+    plant.target[:] = [float(t.speed(f)) for t, f in zip(FINSROV.thrusters.values(), share, strict=True)]
+    for _ in range(200):
+        plant.advance(10)
+        assert np.all(np.abs(plant.position[:2]) < (2.0, 1.0)) and -1.0 < plant.position[2] < 0.1
+
+
+def test_buoyancy_drifts_by_grams():
+    """A plant heavier by a few grams sinks at the speed where damping balances them."""
+    drift = BuoyancyDrift(grams=(50.0,), periods=(1.0e6,), phases=(-np.pi / 2.0,))
+    spec = draw_plant(FINSROV, 0, "nominal")
+    body = spec.body.model_copy(update={"displaced_volume": spec.body.mass / FINSROV.water.density})
+    basin = Basin(depth=20.0)
+    plant = Plant(
+        FINSROV,
+        spec.model_copy(update={"buoyancy": drift, "body": body, "basin": basin}),
+        position=(0.0, 0.0, -5.0),
+    )
+    plant.advance(1600)
+    F, d1, d2 = 0.05 * 9.81, 80.09677, 100.0
+    assert plant.nu[2] == pytest.approx(-2.0 * F / (d1 + np.sqrt(d1 * d1 + 4.0 * d2 * F)), rel=0.02)
+
+
+def test_a_battery_that_sags_gives_less_speed_at_full_throttle():
+    """The same full command turns the shafts slower by the part of the voltage that is missing."""
+    spec = draw_plant(FINSROV, 0, "nominal")
+    speeds = []
+    for battery in (Battery(), Battery(fade=0.2, fade_time=0.1)):
+        plant = Plant(FINSROV, spec.model_copy(update={"battery": battery}))
+        plant.target[4] = 600.0
+        plant.advance(300)
+        speeds.append(float(plant.shaft_speed[4]))
+        assert plant.electric[0] == pytest.approx(16.4 * (1.0 - battery.fade), rel=1e-5)
+    assert speeds[1] == pytest.approx(0.8 * speeds[0], rel=1e-3)
