@@ -1,0 +1,199 @@
+"""`finssim teleop`: a person drives, over the same bridge and with the same record as a controller."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+from finssim.control.guidance import Guide, Station
+from finssim.localization.pool import Pool, load_pool
+from finssim.robot.bridge import Bridge
+from finssim.robot.bridge_settings import BridgeSettings
+from finssim.robot.goals import station_of
+from finssim.robot.link.transports import Transport, open_transport
+from finssim.robot.operator import Device, Operator
+from finssim.robot.perception import Perception
+from finssim.robot.picture_source import PictureSource, open_pictures
+from finssim.robot.pilots import ModeSwitch, Pilot, WrenchPilot, make_pilot
+from finssim.robot.realtime import run_realtime
+from finssim.robot.recorder import Recorder
+from finssim.robot.runtime import Runtime
+from finssim.robot.teleop import TeleopError
+from finssim.robot.unlocated import Unlocated
+from finssim.vehicles import Vehicle, load_vehicle
+
+__all__ = ["POOL", "drive", "run"]
+
+POOL = "udp://127.0.0.1:58766"
+"""Where the virtual pool listens for frames."""
+
+SHOWN_EVERY = 0.2
+"""[s]"""
+
+
+def drive(
+    vehicle: Vehicle,
+    device: Device,
+    transport: Transport,
+    *,
+    pool: Pool | None = None,
+    pictures: PictureSource | None = None,
+    recorder: Recorder | None = None,
+    other: Pilot | None = None,
+    guide: Guide | None = None,
+    rate: float = 60.0,
+    duration: float = math.inf,
+    show: Callable[[Runtime, Operator], None] | None = None,
+    clock: Callable[[], float] = time.monotonic,
+    wait: Callable[[float], None] = time.sleep,
+) -> Runtime:
+    """Drive until the time is over or Ctrl-C; the vehicle starts disarmed, and ends with frames without thrust.
+
+    Args:
+        vehicle: As its file has it.
+        device: In the person's hands.
+        transport: To the motor controller.
+        pool: Camera, water and frames; None: the vehicle is driven, and armed, without localization.
+        pictures: From the camera.
+        recorder: Takes down everything.
+        other: Whom the mode button hands over to; None: nobody.
+        guide: Where `other` steers to.
+        rate: Turns of the loop a second [Hz].
+        duration: [s]
+        show: Called at every turn.
+        clock: [s]
+        wait: Waits so long [s].
+    """
+    switch: ModeSwitch | None = None
+
+    def swap() -> None:
+        if switch is not None and other is not None:
+            switch.select("other" if switch.mode == "person" else "person")
+
+    operator = Operator(device, swap=swap)
+    person = WrenchPilot(operator.wrench, vehicle, period=1.0 / rate)
+    switch = ModeSwitch({"person": person, **({} if other is None else {"other": other})})
+    perception = Unlocated(vehicle) if pool is None else Perception(vehicle, pool)
+    bridge = Bridge(vehicle, BridgeSettings.of(vehicle, need_reading=False))
+    runtime = Runtime(
+        vehicle,
+        pool,
+        switch,
+        guide or Station((0.0, 0.0, 0.0), 0.0),
+        perception=perception,
+        bridge=bridge,
+        recorder=recorder,
+    )
+
+    def turn(running: Runtime) -> bool:
+        if running.reading is not None:
+            operator.turn(running.reading.time, bridge)
+        if show is not None:
+            show(running, operator)
+        return False
+
+    run_realtime(
+        runtime, transport, pictures, rate=rate, duration=duration, until=turn, clock=clock, wait=wait
+    )
+    return runtime
+
+
+def run(
+    vehicle: str,
+    *,
+    device: str,
+    robot: str,
+    bind: str,
+    pool_file: Path | None,
+    camera: str,
+    camera_bind: str,
+    policy: str | None,
+    goal: str | None,
+    record: Path | None,
+    key_hold: float,
+    rate: float,
+    duration: float | None,
+) -> None:
+    """Open everything, drive, and put everything back.
+
+    Raises:
+        TeleopError, LinkError, VehicleError, LocalizationError, PolicyError, OutputError: What cannot be used.
+    """
+    body = load_vehicle(vehicle)
+    pool = load_pool(pool_file) if pool_file is not None else None
+    if policy is not None and (pool is None or goal is None):
+        raise TeleopError(
+            "a controller to hand over to needs a state and a goal: give --pool-file and --goal"
+        )
+    other = make_pilot(policy, body) if policy is not None else None
+    with ExitStack() as stack:
+        hands, keys = _open_device(device, key_hold, stack)
+        transport = open_transport(POOL if robot == "pool" else robot, bind)
+        stack.callback(transport.close)
+        pictures = None
+        if pool is not None:
+            pictures = open_pictures(camera, camera_bind)
+            stack.callback(pictures.close)
+        recorder = _recorder(record, body, pool_file, robot, stack)
+        print(keys, file=sys.stderr)
+        drive(
+            body,
+            hands,
+            transport,
+            pool=pool,
+            pictures=pictures,
+            recorder=recorder,
+            other=other,
+            guide=station_of(goal) if goal is not None else None,
+            rate=rate,
+            duration=math.inf if duration is None else duration,
+            show=_Line(),
+        )
+        print(f"\n{transport.describe()}", file=sys.stderr)
+
+
+def _open_device(name: str, key_hold: float, stack: ExitStack) -> tuple[Device, str]:
+    """The device and what its keys do."""
+    if name == "keyboard":
+        from finssim.robot import keyboard
+
+        return stack.enter_context(keyboard.Keyboard(hold=key_hold)), keyboard.HELP
+    if name == "gamepad":
+        from finssim.robot import gamepad
+
+        return stack.enter_context(gamepad.Gamepad()), gamepad.HELP
+    raise TeleopError(f"unknown device '{name}': expected gamepad or keyboard")
+
+
+def _recorder(
+    path: Path | None, vehicle: Vehicle, pool_file: Path | None, robot: str, stack: ExitStack
+) -> Recorder | None:
+    if path is None:
+        return None
+    files = {"pool.yaml": pool_file} if pool_file is not None else {}
+    epoch = time.time() - time.monotonic()
+    meta = {"command": "finssim teleop", "robot": robot}
+    return stack.enter_context(Recorder(path, vehicle, meta, epoch=epoch, files=files))
+
+
+class _Line:
+    """One line on the terminal: state, gear, wrench, and what there is to say."""
+
+    def __init__(self) -> None:
+        self._at = -math.inf
+
+    def __call__(self, runtime: Runtime, operator: Operator) -> None:
+        now = runtime.reading.time if runtime.reading is not None else -math.inf
+        if now - self._at < SHOWN_EVERY:
+            return
+        self._at = now
+        x, y, z, _, _, n = operator.command.wrench
+        said = runtime.bridge.reason or operator.said
+        if runtime.recorder is not None:
+            said = runtime.recorder.problem or said
+        line = f"{runtime.bridge.state:8} {operator.command.gear:9} surge {x:5.1f} sway {y:5.1f} heave {z:5.1f} N "
+        print(f"\r{line}yaw {n:5.2f} N m  {said}\x1b[K", end="", file=sys.stderr, flush=True)
