@@ -1,12 +1,12 @@
-"""`finssim evaluate`: 60 s trials of a controller on the published setpoints; table, JSON, figure, trajectories."""
+"""`finssim evaluate`: trials of a controller on the published setpoints or trajectories; table, JSON, figure."""
 
 from __future__ import annotations
 
 import json as json_module
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.progress import Progress
@@ -16,7 +16,10 @@ from finssim.experiments.plants import Plant, load_plant
 from finssim.experiments.players import make_player
 from finssim.experiments.results_table import print_plants, print_results
 from finssim.experiments.setpoints import T1_SETPOINTS
-from finssim.experiments.trials import Trials, run_trials
+from finssim.experiments.t2_metrics import summarize_tracking
+from finssim.experiments.t2_table import print_tracking, print_tracking_plants
+from finssim.experiments.t2_trials import T2_TRAJECTORIES, run_tracking
+from finssim.experiments.trials import run_trials
 from finssim.files import atomic_directory
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
@@ -26,7 +29,6 @@ from finssim.vehicles import Vehicle, load_vehicle
 __all__ = ["EVALUATION_FILE", "Evaluation", "EvaluationError", "evaluate", "evaluate_controller"]
 
 EVALUATION_FILE = "evaluation.json"
-FIGURE_FILE = "error_envelope.png"
 TRAJECTORIES = "trajectories"
 
 
@@ -40,7 +42,8 @@ class Evaluation:
 
     result: dict[str, Any]
     """What `--json` prints: who, where, the measures over all trials, `per_trial`, provenance."""
-    trials: Trials
+    trials: Any
+    """`Trials` of T1, `TrackingTrials` of T2."""
 
     @property
     def label(self) -> str:
@@ -71,7 +74,7 @@ def evaluate(
         vehicle: A vehicle, a catalogue name or a file.
         hydrodynamics: Model, unless the plant names one.
         plant: Name or file, or several.
-        trials: How many in each plant; the eight setpoints once if None.
+        trials: How many in each plant; the eight setpoints, or the four trajectories, once if None.
         seed: Of what the plant draws.
         out: Directory for `evaluation.json`, the figure and the trajectories; an earlier evaluation is replaced.
         json: Print the result in place of the table.
@@ -84,12 +87,12 @@ def evaluate(
         EvaluationError, PolicyError, ControlError, PlantError, VehicleError, OutputError: As they say.
     """
     plants = _plants([plant] if isinstance(plant, str | Path) else plant)
-    count = len(T1_SETPOINTS) if trials is None else trials
+    form = _form(task)
     options: dict[str, Any] = {
         "task": task,
         "vehicle": vehicle,
         "hydrodynamics": hydrodynamics,
-        "trials": count,
+        "trials": trials,
         "seed": seed,
     }
     if out is None:
@@ -103,15 +106,15 @@ def evaluate(
                 )
                 for one in plants
             ]
-            _write(evaluations, folder)
+            _write(evaluations, folder, form)
     if json:
         print(json_module.dumps(_document(evaluations), allow_nan=False))
         return evaluations
     console = console or Console()
     if len(evaluations) == 1:
-        print_results(evaluations[0].result, console)
+        form.show(evaluations[0].result, console)
     else:
-        print_plants([evaluation.result for evaluation in evaluations], console)
+        form.show_plants([evaluation.result for evaluation in evaluations], console)
     if out is not None:
         console.print(f"written: {out}", highlight=False, soft_wrap=True)
     return evaluations
@@ -143,13 +146,13 @@ def evaluate_controller(
     task: str = "t1",
     vehicle: str | Vehicle = "finsrov",
     hydrodynamics: str = "calibrated",
-    trials: int = 8,
+    trials: int | None = None,
     seed: int = 42,
     record: Path | None = None,
 ) -> Evaluation:
     """Run the trials and measure them; arguments as `evaluate`."""
-    if task not in TASKS:
-        raise EvaluationError(f"unknown task '{task}'; available: {', '.join(TASKS)}")
+    form = _form(task)
+    trials = form.count if trials is None else trials
     if trials < 1:
         raise EvaluationError(f"trials is {trials}, expected 1 or more")
     start_warp()
@@ -159,7 +162,7 @@ def evaluate_controller(
     screen = Console(stderr=True)
     with Progress(console=screen, transient=True, disable=not screen.is_terminal) as progress:
         bar = progress.add_task(f"{trials} trials", total=1.0)
-        done = run_trials(
+        done = form.run(
             player,
             the_task,
             body,
@@ -177,20 +180,70 @@ def evaluate_controller(
         "hydrodynamics": plant.hydrodynamics or hydrodynamics,
         "plant": plant.model_dump(mode="json", exclude_defaults=True),
         "seed": seed,
-        **summarize(done.measures()),
+        **form.summarize(done.measures()),
         "provenance": provenance(),
     }
     return Evaluation(result, done)
 
 
-def _write(evaluations: Sequence[Evaluation], folder: Path) -> None:
-    from finssim.experiments.envelope import error_envelope, save_envelopes
-
+def _write(evaluations: Sequence[Evaluation], folder: Path, form: Form) -> None:
     text = json_module.dumps(_document(evaluations), indent=2, allow_nan=False) + "\n"
     (folder / EVALUATION_FILE).write_text(text, encoding="utf-8")
+    title = evaluations[0].result["plant"].get("title", "") if len(evaluations) == 1 else ""
+    form.draw(evaluations, folder, title)
+
+
+def _draw_envelopes(evaluations: Sequence[Evaluation], folder: Path, title: str) -> None:
+    from finssim.experiments.envelope import error_envelope, save_envelopes
+
     envelopes = {
         e.label: error_envelope([e.trials.series(i) for i in range(len(e.trials.setpoints))])
         for e in evaluations
     }
-    title = evaluations[0].result["plant"].get("title", "") if len(evaluations) == 1 else ""
-    save_envelopes(envelopes, folder / FIGURE_FILE, title)
+    save_envelopes(envelopes, folder / "error_envelope.png", title)
+
+
+def _draw_paths(evaluations: Sequence[Evaluation], folder: Path, title: str) -> None:
+    from finssim.experiments.t2_figure import save_tracking
+
+    runs = {
+        e.label: [(guide, e.trials.t, e.trials.position[:, i]) for i, guide in enumerate(e.trials.guides)]
+        for e in evaluations
+    }
+    save_tracking(runs, folder / "trajectories.png", title)
+
+
+def _summarize_tracking(trials: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    return {**summarize_tracking(trials), "per_trial": list(trials)}
+
+
+class Form(NamedTuple):
+    """How the trials of one task are run, summed up and shown."""
+
+    count: int
+    """Trials, unless told otherwise."""
+    run: Callable[..., Any]
+    summarize: Callable[[Sequence[dict[str, Any]]], dict[str, Any]]
+    show: Callable[[Any, Console], None]
+    show_plants: Callable[[Any, Console], None]
+    draw: Callable[[Sequence[Evaluation], Path, str], None]
+
+
+FORMS = {
+    "t1": Form(len(T1_SETPOINTS), run_trials, summarize, print_results, print_plants, _draw_envelopes),
+    "t2": Form(
+        len(T2_TRAJECTORIES),
+        run_tracking,
+        _summarize_tracking,
+        print_tracking,
+        print_tracking_plants,
+        _draw_paths,
+    ),
+}
+"""Tasks that can be evaluated."""
+
+
+def _form(task: str) -> Form:
+    if task not in FORMS:
+        raise EvaluationError(f"unknown task '{task}'; available: {', '.join(FORMS)}")
+    return FORMS[task]

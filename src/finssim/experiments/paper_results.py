@@ -1,11 +1,11 @@
-"""The paper's own results of station keeping, on its real vehicle: for orientation beside simulated ones."""
+"""The paper's own results on its real vehicle, of T1 and T2: for orientation beside simulated ones."""
 
 from __future__ import annotations
 
 from types import MappingProxyType
 from typing import Any
 
-__all__ = ["PAPER_T1", "paper_row"]
+__all__ = ["PAPER_T1", "PAPER_T2", "paper_row", "paper_t2_row"]
 
 KEYS = ("e_p_m", "e_y_m", "e_psi_deg", "success", "trials", "t_s_s", "J_p_m", "J_psi_deg")
 
@@ -27,3 +27,35 @@ PAPER_T1 = MappingProxyType(
 def paper_row(name: str) -> dict[str, Any]:
     """One row with the keys of our own results, and `name`."""
     return {"name": name, **dict(zip(KEYS, PAPER_T1[name], strict=True))}
+
+
+T2_KEYS = ("horizontal_rmse_m", "vertical_rmse_m", "p95_m")
+
+PAPER_T2 = MappingProxyType(
+    {
+        "calibrated + DR": {
+            "straight": (0.068, 0.129, 0.409),
+            "broken": (0.086, 0.084, 0.265),
+            "ellipse": (0.091, 0.080, 0.366),
+            "lemniscate": (0.051, 0.073, 0.134),
+        },
+        "calibrated": {
+            "straight": (0.135, 0.139, 0.406),
+            "broken": (0.136, 0.133, 0.310),
+            "ellipse": (0.166, 0.102, 0.338),
+            "lemniscate": (0.163, 0.103, 0.305),
+        },
+        "PID": {
+            "straight": (0.182, 0.146, 0.405),
+            "broken": (0.196, 0.152, 0.426),
+            "ellipse": (0.174, 0.134, 0.433),
+            "lemniscate": (0.207, 0.170, 0.514),
+        },
+    }
+)
+"""Table of T2: controller -> trajectory -> horizontal RMSE, vertical RMSE and 95th percentile of the distance [m]."""
+
+
+def paper_t2_row(name: str, trajectory: str) -> dict[str, Any]:
+    """One controller on one trajectory, with the keys of our own results."""
+    return dict(zip(T2_KEYS, PAPER_T2[name][trajectory], strict=True))

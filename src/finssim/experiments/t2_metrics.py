@@ -125,8 +125,8 @@ def _errors(t: Array, position: Array, guide: Guide) -> dict[str, Any]:
 def projected_times(t: Array, position: Array, guide: Guide) -> Array:
     """Times at which the reference is nearest to each position, (T,): never backwards, and never far ahead.
 
-    Both matter where a way crosses or repeats itself. The reference is searched at 50 Hz from the last projection to 2 s
-    after it, but not to more than 2 s after the sample's own time. Who stops is projected where he stopped.
+    Both matter where a way crosses or repeats itself. The reference is searched at 50 Hz from the last projection to
+    2 s after it, but not to more than 2 s after the sample's own time. Who stops is projected where he stopped.
     """
     times = np.arange(math.floor(guide.duration * DENSE_RATE + 1e-6) + 1) / DENSE_RATE
     way = guide.at(times).position
