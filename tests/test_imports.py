@@ -75,7 +75,12 @@ HOMES = {
         "vehicles/picture.py",
     },
     "pymavlink": {"calibration/importers/ardupilot_log.py"},
-    "rosbags": {"calibration/importers/rosbag.py", "robot/record_types.py"},
+    "rosbags": {
+        "calibration/importers/rosbag.py",
+        "robot/record_types.py",
+        "ros2/codec.py",
+        "ros2/definitions.py",
+    },
     "cv2": {
         "calibration/vision/camera/boards.py",
         "localization/detection/detector_opencv.py",
@@ -90,8 +95,14 @@ HOMES = {
         "robot/record_repair.py",
     },
     "pygame": {"robot/gamepad.py"},
-    "cyclonedds": set(),
-    "rclpy": set(),
+    "cyclonedds": {
+        "ros2/wire/dds_types.py",
+        "ros2/wire/endpoints.py",
+        "ros2/wire/participant.py",
+        "ros2/wire/quality.py",
+        "ros2/wire/waiting.py",
+    },
+    "rclpy": {"ros2/topics.py"},
     "viser": set(),
     "mitsuba": {"experiments/mitsuba_renderer.py"},
 }

@@ -6,8 +6,6 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from cyclonedds.core import DDSException
-
 from finssim.ros2.shim.context import Context
 from finssim.ros2.shim.task import Future
 from finssim.ros2.wire.waiting import Waiter
@@ -148,12 +146,7 @@ class SingleThreadedExecutor:
             self._watching = key
         timers = [t for node in self._nodes for t in node.timers if t.clock.real and not t.is_canceled()]
         due = min((t.time_until_next_call() for t in timers), default=10**18) / 1e9
-        try:
-            return self._waiter.wait(max(min(longest, due, LONGEST_WAIT), 0.0))
-        except DDSException:
-            if self.context.ok():
-                raise
-            return False  # another thread shut the context down
+        return self._waiter.wait(max(min(longest, due, LONGEST_WAIT), 0.0))
 
     def _tell_mismatches(self, *, now: bool) -> None:
         if now or time.monotonic() - self._looked > MISMATCH_PERIOD:

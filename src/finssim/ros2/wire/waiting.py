@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from cyclonedds.core import GuardCondition, WaitSet
+from cyclonedds.core import DDSException, GuardCondition, WaitSet
 
 from finssim.ros2.wire.endpoints import Endpoint, Reader
 from finssim.ros2.wire.participant import Participant
@@ -20,6 +20,7 @@ class Waiter:
         self._set = WaitSet(participant.entity)
         self._guard = GuardCondition(participant.entity)
         self._set.attach(self._guard)
+        self._closed = False
         self._watched: set[Endpoint] = set()
 
     def watch(self, endpoints: Iterable[Endpoint]) -> None:
@@ -34,17 +35,24 @@ class Waiter:
 
     def wait(self, timeout: float) -> bool:
         """Sleep at most `timeout` [s]; whether anything happened."""
-        happened = self._set.wait(int(timeout * 1e9)) > 0
-        if happened:
-            self._guard.set(False)
+        try:
+            happened = self._set.wait(int(timeout * 1e9)) > 0
+            if happened:
+                self._guard.set(False)
+        except DDSException:
+            if not self._closed:
+                raise
+            return False  # another thread closed it meanwhile
         return happened
 
     def wake(self) -> None:
         """End the current or the next `wait`; from any thread."""
-        self._guard.set(True)
+        if not self._closed:
+            self._guard.set(True)
 
     def close(self) -> None:
         """Let everything go."""
+        self._closed = True
         self._set.attached = []
         self._set.__del__()
         self._guard.__del__()
