@@ -68,9 +68,12 @@ def test_a_plant_lies_where_its_hidden_trim_puts_it():
 
 def test_it_drifts_with_the_circulation():
     """A vehicle that does nothing is carried along; in still water it stays."""
-    spec = draw_plant(FINSROV, 1, "realistic").model_copy(update={"tether": None})
+    spec = draw_plant(FINSROV, 1, "realistic")
+    spec = spec.model_copy(update={"tether": spec.tether.model_copy(update={"length": 50.0})})
+    # Eddies without speed: the same kernel, so nothing is compiled for this test alone.
+    calm = Circulation(eddies=[eddy.model_copy(update={"speed": 0.0}) for eddy in spec.circulation.eddies])
     carried = Plant(FINSROV, spec, position=(0.6, 0.3, -0.5))
-    still = Plant(FINSROV, spec.model_copy(update={"circulation": Circulation()}), position=(0.6, 0.3, -0.5))
+    still = Plant(FINSROV, spec.model_copy(update={"circulation": calm}), position=(0.6, 0.3, -0.5))
     for plant in (carried, still):
         plant.advance(2000)
     assert np.hypot(*(carried.position[:2] - (0.6, 0.3))) > 0.04

@@ -7,11 +7,13 @@ import warp as wp
 from finssim.physics.types import vec6
 from finssim.pool import draw_plant
 from finssim.pool.plant import Plant
-from finssim.pool.plant_spec import Basin, Circulation, SlackTether
+from finssim.pool.plant_spec import Basin, Circulation, Eddy, HullDrag, SlackTether
 from finssim.pool.tether import Slack, dragged_line, slack_line, slack_pull
 from finssim.vehicles import load_vehicle
 
-TETHER = SlackTether(anchor=(0.0, 0.0, 0.0), attachment=(-0.2, 0.0, 0.1), length=3.0, slack_share=0.1)
+TETHER = SlackTether(
+    anchor=(0.0, 0.0, 0.0), attachment=(-0.2, 0.0, 0.1), length=3.0, slack_share=0.1, stiffness=30.0
+)
 
 
 @wp.kernel(enable_backward=False)
@@ -56,7 +58,15 @@ def test_a_plant_cannot_leave_its_tether():
     vehicle = load_vehicle("finsrov")
     short = SlackTether(anchor=(0.0, 0.0, -0.5), attachment=(0.0, 0.0, 0.0), length=1.0, stiffness=200.0)
     spec = draw_plant(vehicle, 0, "nominal").model_copy(
-        update={"tether": short, "circulation": Circulation(), "basin": Basin(length=20.0, width=20.0)}
+        update={
+            "tether": short,
+            "basin": Basin(length=20.0, width=20.0),
+            # Next to nothing, so that the kernel is the one of every drawn plant and nothing is compiled for this test.
+            "hull": HullDrag(form_drag=1e-9),
+            "circulation": Circulation(
+                eddies=(Eddy(cells=1, speed=0.0, unsteadiness=0.0, period=1.0, phase=0.0),)
+            ),
+        }
     )
     plant = Plant(vehicle, spec)
     share = np.linalg.pinv(vehicle.control_matrix) @ (5.0 * np.eye(6)[0])

@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
+from finssim.geometry.rotations import quat_inverse_rotate, quat_rotate
 from finssim.pool import VirtualPool, draw_plant, read_truth
+from finssim.pool.motors import RPM
+from finssim.pool.plant_spec import Instruments
 from finssim.pool.virtual_pool import PoolClockError
 from finssim.robot.link.decoder import Decoder
 from finssim.robot.link.frames import encode_command
@@ -145,3 +148,52 @@ def test_start_and_truth(tmp_path):
     assert np.allclose(truth.position[0], start[0]) and np.allclose(truth.quaternion[0], start[1])
     assert np.allclose(truth.position[-1], pool.plant.position)
     assert truth.header["plant_seed"] == 1 and truth.header["thrusters"] == list(FINSROV.thruster_names)
+
+
+def test_telemetry_is_the_truth_through_the_instruments():
+    """In the IMU's axes (x back, y right): the body's angular rate, its tilt, and the depth of the port."""
+    spec = draw_plant(FINSROV, 1, "nominal")
+    pool = VirtualPool(FINSROV, spec.model_copy(update={"instruments": Instruments(noise=0.0)}))
+    yaw = np.linalg.pinv(FINSROV.control_matrix) @ (1.0 * np.eye(6)[5])
+    normalised = np.zeros(8)
+    for thruster, f in zip(FINSROV.thrusters.values(), yaw, strict=True):
+        rpm = float(thruster.speed(f)) / RPM
+        normalised[thruster.motor_index] = thruster.motor_sign * rpm / 3000.0
+    last = driven(pool, 4.0, normalised)[-1]
+    q_bs = FINSROV.sensors.imu.orientation
+    assert pool.plant.nu[5] > 0.5
+    np.testing.assert_allclose(quat_rotate(q_bs, last.gyro), pool.plant.nu[3:], atol=0.02)
+    up = quat_inverse_rotate(last.quaternion, (0.0, 0.0, 1.0))
+    np.testing.assert_allclose(
+        quat_rotate(q_bs, up), quat_inverse_rotate(pool.plant.quaternion, (0.0, 0.0, 1.0)), atol=0.02
+    )
+    assert last.depth == pytest.approx(-pool.plant.position[2] + 0.115, abs=0.005)
+    rpm = np.array(last.motor_rpm)
+    assert np.allclose(rpm, normalised * 3000.0, atol=50.0)
+
+
+def test_faults_and_a_reboot_reach_the_robot():
+    """Losses thin the telemetry out, lost commands stop the motors, a reboot is 1.5 s of silence."""
+    pool = VirtualPool(FINSROV, draw_plant(FINSROV, 1, "realistic"))
+    pool.faults.drop = 0.5
+    assert 30 <= len(driven(pool, 1.0)) <= 70
+    pool.faults.drop = 0.0
+    driven(pool, 1.0, forward(pool))
+    pool.faults.drop_commands = 1.0
+    driven(pool, 0.7, forward(pool))
+    assert not pool.firmware.target.any()
+    pool.faults.drop_commands = 0.0
+    pool.reboot()
+    pool.exchange(pool.time + 0.01)  # what was on its way still comes
+    assert driven(pool, 1.5) == []
+    again = driven(pool, 0.5)
+    assert again[0].sequence == 1 and again[0].mcu_ms < 50
+
+
+def test_an_hour_costs_no_memory_of_its_own():
+    """What is kept does not grow with time: queues and poses stay as they are after a second."""
+    pool = VirtualPool(FINSROV, draw_plant(FINSROV, 1, "realistic"))
+    driven(pool, 2.0)
+    sizes = len(pool._up), len(pool._down), len(pool._poses)
+    driven(pool, 5.0)
+    assert max(len(pool._up), len(pool._down)) <= 2 and len(pool._poses) == sizes[2]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.pool.plant_spec import PlantSpec, PlantSpecError, Severity
-from finssim.pool.share import hull_share, less_share, steady_share
+from finssim.pool.share import hull_share, less_share, panel_drag, steady_share
 from finssim.vehicles import Vehicle
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 
@@ -55,7 +55,8 @@ class Spread:
     """Least and most of the pool's circulation [m/s]; none at 0."""
     tether_weight: float = 0.0
     """[N/m]"""
-    tether: bool = False
+    tether: tuple[float, float] = (0.0, 0.0)
+    """Shortest and longest [m]; none at 0."""
     noise: float = 1.0
     """Factor on the file's instrument noise [-]."""
     pressure_drift: float = 0.0
@@ -82,7 +83,7 @@ SPREADS: dict[Severity, Spread] = {
         gravity_offset=(0.003, 0.006),
         buoyancy=4.0,
         current=(0.02, 0.04),
-        tether=True,
+        tether=(4.4, 5.0),
         tether_weight=0.015,
         pressure_drift=2.0e-4,
         crystal=30.0,
@@ -103,7 +104,7 @@ SPREADS: dict[Severity, Spread] = {
         gravity_offset=(0.006, 0.012),
         buoyancy=8.0,
         current=(0.04, 0.08),
-        tether=True,
+        tether=(3.9, 4.5),
         tether_weight=0.03,
         noise=1.5,
         pressure_drift=4.0e-4,
@@ -199,8 +200,10 @@ def _water(
         raise PlantSpecError(
             f"vehicle '{vehicle.name}' has surge_damping, which the pool's plants do not model"
         )
-    hull = hull_share(vehicle, spread.hull_share) if vehicle.hull is not None else {}
-    taken = steady_share(vehicle, hull, sections["propellers"], sum(spread.deduction) / 2.0)
+    drag = panel_drag(vehicle)
+    hull = hull_share(vehicle, spread.hull_share, drag)
+    panels = hull["form_drag"] * drag
+    taken = steady_share(vehicle, panels, sections["propellers"], sum(spread.deduction) / 2.0)
     D1, D2 = less_share(vehicle, D1, D2, taken)
     axes = [
         {
@@ -277,9 +280,9 @@ def _circulation(spread: Spread, draw: _Draw) -> dict[str, Any]:
 
 def _tether(vehicle: Vehicle, spread: Spread, draw: _Draw) -> dict[str, Any] | None:
     anchor = (draw.sign() * 2.0, draw.sign() * draw.within(0.6, 1.0), 0.3)
-    length, size = draw.within(3.8, 4.6), vehicle.body.size
+    length, size = draw.within(*spread.tether), vehicle.body.size
     weight = draw.around(spread.tether_weight)
-    if not spread.tether:
+    if not length:
         return None
     return {
         "anchor": anchor,

@@ -180,7 +180,7 @@ class SlackTether(Section):
     """On the vehicle, body frame [m]."""
     length: float = Field(gt=0.0)
     """[m]"""
-    stiffness: float = Field(default=30.0, ge=0.0)
+    stiffness: float = Field(default=15.0, ge=0.0)
     """Of its last stretch before it is straight [N/m]."""
     slack_share: float = Field(default=0.08, gt=0.0, lt=1.0)
     """The pull sets in at (1 - slack_share) length [-]."""

@@ -65,10 +65,14 @@ class PoolSensors:
         suite.reset(self._state)
         self._update, self._suite = captured(lambda: suite.update(self._state)), suite
         self._count: Any = self._state.steps.numpy()
+
+        def view(readings: Any) -> Any:
+            return readings.numpy()[0]
+
         imu, gauge = suite.imu, suite.depth
         assert imu is not None and gauge is not None  # draw_plant refuses a vehicle without them
-        self._gyro, self._accel = imu.gyro.numpy()[0, 0], imu.accel.numpy()[0, 0]
-        self._depth, self._pressure = gauge.depth.numpy()[0], gauge.pressure.numpy()[0]
+        self._gyro, self._accel = view(imu.gyro)[0], view(imu.accel)[0]
+        self._depth, self._pressure = view(gauge.depth), view(gauge.pressure)
 
     def sample(self) -> Sample:
         """Read both; the gauge gives its newest sample that has arrived."""

@@ -13,7 +13,7 @@ from finssim.geometry.mesh import face_geometry
 from finssim.pool.plant_spec import Propellers
 from finssim.vehicles import Vehicle
 
-__all__ = ["cruise", "hull_share", "less_share", "steady_share"]
+__all__ = ["cruise", "hull_share", "less_share", "panel_drag", "steady_share"]
 
 Array = NDArray[np.float64]
 
@@ -43,7 +43,9 @@ def cruise(vehicle: Vehicle) -> tuple[Array, Array]:
 
 
 def panel_drag(vehicle: Vehicle) -> Array:
-    """Drag of the hull's panels at the cruising velocity of each axis with C_form = 1 [N, N m], (6,)."""
+    """Drag of the hull's panels when cruising along each axis, with C_form = 1 [N, N m], (6,); zeros without a hull."""
+    if vehicle.hull is None:
+        return np.zeros(6)
     _, v = cruise(vehicle)
     hydro: Any = vehicle.hydrodynamics["calibrated"]
     normal, area, middle = face_geometry(*vehicle.hull_mesh())
@@ -65,18 +67,21 @@ def panel_drag(vehicle: Vehicle) -> Array:
     return drag
 
 
-def hull_share(vehicle: Vehicle, share: float) -> dict[str, float]:
-    """Coefficients with which the panels make a share of the file's drag, on the driven axis where that is largest."""
+def hull_share(vehicle: Vehicle, share: float, drag: Array) -> dict[str, float]:
+    """Coefficients with which the panels make a share of the file's drag, on the driven axis where that is largest.
+
+    Args:
+        vehicle: Its file.
+        share: Of the drag when cruising [-].
+        drag: As from `panel_drag`.
+    """
     F, _ = cruise(vehicle)
-    drag = panel_drag(vehicle)
     largest = np.max(np.divide(drag, F, out=np.zeros(6), where=F > 0.0), initial=0.0)
     form = float(f"{share / largest:.6g}") if largest > 0.0 else 0.0
     return {"form_drag": form, "skin_drag": float(f"{SKIN * form:.6g}")}
 
 
-def steady_share(
-    vehicle: Vehicle, hull: Mapping[str, float], propellers: Mapping[str, float], deduction: float
-) -> Array:
+def steady_share(vehicle: Vehicle, panels: Array, propellers: Mapping[str, float], deduction: float) -> Array:
     """What panels and propellers take when cruising, by axis [N, N m], (6,).
 
     The propellers' part is the thrust lost to their own motion through the water, T V / (J0 n D), see `losses`, and to
@@ -84,7 +89,7 @@ def steady_share(
 
     Args:
         vehicle: Its file.
-        hull: form_drag, as from `hull_share`; nothing where there is no hull.
+        panels: Drag of the panels, by axis [N, N m], (6,).
         propellers: Keys of `Propellers`.
         deduction: Mean of the thrust deduction [-].
     """
@@ -94,7 +99,7 @@ def steady_share(
     B = vehicle.thruster_matrix()
     axis = np.array([t.axis for t in thrusters])
     place = np.array([t.position for t in thrusters])
-    taken = hull.get("form_drag", 0.0) * panel_drag(vehicle) if hull else np.zeros(6)
+    taken = panels.copy()
     for i in np.flatnonzero(v > 0.0):
         T = np.linalg.pinv(B) @ (F[i] * np.eye(6)[i])
         speed = np.array([abs(t.speed(f)) for t, f in zip(thrusters, T, strict=True)])
