@@ -185,7 +185,7 @@ def test_faults_and_a_reboot_reach_the_robot():
     pool.faults.drop_commands = 0.0
     pool.reboot()
     pool.exchange(pool.time + 0.01)  # what was on its way still comes
-    assert driven(pool, 1.5) == []
+    assert driven(pool, 1.4) == []
     again = driven(pool, 0.5)
     assert again[0].sequence == 1 and again[0].mcu_ms < 50
 
