@@ -93,17 +93,11 @@ class PoolCamera:
         self._mail.post(self._shutter.advance(t0, t1, pose_at))
         return self._mail.arrived(t1)
 
-    def closed(self, t0: float, t1: float, pose_at: PoseAt) -> list[Exposure]:
-        """Exposures that ended in (t0, t1], whenever they arrive: a process that draws them waits for that itself."""
-        return self._shutter.advance(t0, t1, pose_at)
-
     def develop(self, exposure: Exposure) -> Picture:
         """What the robot gets of an exposure."""
-        start, end = (self._in_pool(*pose) for pose in (exposure.start, exposure.end))
+        T = self._T_pw
+        places = np.stack([exposure.start[0], exposure.end[0]]) @ T[:3, :3].T + T[:3, 3]
+        turns = np.asarray(quat_multiply(self._q_pw, np.stack([exposure.start[1], exposure.end[1]])))
+        start, end = zip(places, turns, strict=True)
         picture = self._view.picture(start, end, exposure.middle, exposure.sequence)
         return replace(picture, time=exposure.arrival)
-
-    def _in_pool(self, position: Array, quaternion: Array) -> tuple[Array, Array]:
-        """A pose in the pool frame: position [m] and body to pool, xyzw."""
-        T = self._T_pw
-        return T[:3, :3] @ position + T[:3, 3], np.asarray(quat_multiply(self._q_pw, quaternion))

@@ -51,12 +51,14 @@ class CornerCamera:
         self._noise, self._seed = pixel_noise, seed
         self._inside = site.camera.lens.inside
         self._view = RippledView(site.camera, site.interface, ripples)
-        self._fits = {tag: CornerFit(tags.family, tag, tags.edge) for tag in tags.mounts}
-        mounted = [
-            (np.asarray(m.position), quat_to_matrix(m.orientation), self._fits[t].nodes)
-            for t, m in tags.mounts.items()
-        ]
-        self._nodes_b = np.concatenate([p + nodes @ R.T for p, R, nodes in mounted])
+        self._ids = list(tags.mounts)
+        self._fit = CornerFit(tags.family, self._ids, tags.edge)
+        self._nodes_b = np.concatenate(
+            [
+                np.asarray(m.position) + self._fit.nodes @ quat_to_matrix(m.orientation).T
+                for m in tags.mounts.values()
+            ]
+        )
 
     def picture(
         self, start: tuple[Array, Array], end: tuple[Array, Array], middle: float, sequence: int
@@ -72,20 +74,19 @@ class CornerCamera:
         q = start[1] + math.copysign(1.0, float(start[1] @ end[1])) * end[1]
         position, R = 0.5 * (start[0] + end[0]), quat_to_matrix(q / np.linalg.norm(q))
         pixels, seen = self._view.pixels(position + self._nodes_b @ R.T, middle)
-        noise = np.random.default_rng([self._seed, sequence]).standard_normal((len(self._fits), 4, 2))
-        found = []
-        per_tag = len(pixels) // len(self._fits)
-        for i, (tag, fit) in enumerate(self._fits.items()):
-            part = slice(i * per_tag, (i + 1) * per_tag)
-            if seen[part].all():
-                corners = self._reported(fit, pixels[part], noise[i])
-                if corners is not None:
-                    found.append(TagCorners(tag, corners))
+        shape = len(self._ids), -1
+        seen = seen.reshape(shape).all(axis=1)
+        corners, bend = self._fit.corners(pixels.reshape(*shape, 2))
+        noise = np.random.default_rng([self._seed, sequence]).standard_normal(corners.shape)
+        found = [
+            TagCorners(tag, reported)
+            for tag, there, c, b, e in zip(self._ids, seen, corners, bend.tolist(), noise, strict=True)
+            if there and (reported := self._reported(c, b, e)) is not None
+        ]
         return Picture(middle, sequence, tags=tuple(found))
 
-    def _reported(self, fit: CornerFit, pixels: Array, noise: Array) -> Array | None:
+    def _reported(self, corners: Array, bend: float, noise: Array) -> Array | None:
         """Corners of one tag, None where a detector would not find it."""
-        corners, bend = fit.corners(pixels)
         (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners.tolist()
         sides = math.hypot(bx - ax, by - ay), math.hypot(cx - bx, cy - by), math.hypot(dx - cx, dy - cy)
         area = 0.5 * ((cx - ax) * (dy - by) - (cy - ay) * (dx - bx))

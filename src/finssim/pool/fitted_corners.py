@@ -7,7 +7,7 @@ the corners follow from a few points of the tag by a matrix that the tag's cells
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -25,49 +25,58 @@ HOMOGENEOUS = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 1.0], [0.0,
 
 
 class CornerFit:
-    """One tag: where to look at it, and which corners the fit reports."""
+    """The tags of a vehicle: where to look at each, and which corners the fit reports."""
 
-    def __init__(self, family: str, tag: int, edge: float) -> None:
+    def __init__(self, family: str, tags: Sequence[int], edge: float) -> None:
         """
         Args:
-            family: Name of the tag's family.
-            tag: Its id.
+            family: Name of the tags' family.
+            tags: Their ids.
             edge: Of the black border [m].
         """
         along = 0.5 - 0.5 * np.cos(np.pi * np.arange(NODES) / (NODES - 1))  # Chebyshev's, the ends included
         self._square = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
         self._at_corner = [0, NODES - 1, NODES * NODES - 1, NODES * (NODES - 1)]
         self.nodes = np.zeros((NODES * NODES, 3))
-        """Points of the tag whose pixels `corners` wants, tag frame [m], (N, 3)."""
+        """Points of a tag whose pixels `corners` wants, tag frame [m], (N, 3)."""
         self.nodes[:, 0] = edge * (self._square[:, 0] - 0.5)
         self.nodes[:, 1] = edge * (0.5 - self._square[:, 1])
-        points, across = _cell_edges(family, tag)
-        columns, there = _warp_columns(points), _interpolation(along, points)
-        rows = np.where(across[:, None], columns[:, 0], columns[:, 1])
-        u, v = np.where(across[:, None], there, 0.0), np.where(across[:, None], 0.0, there)
-        warp = np.linalg.pinv(rows) @ np.concatenate([u, v], axis=1)
-        at_nodes = _warp_columns(self._square)
-        bend = np.eye(2 * len(self.nodes)) - np.concatenate([at_nodes[:, 0], at_nodes[:, 1]]) @ warp
-        self._matrix = np.concatenate([warp, bend])
+        self._matrix = np.stack([_fit_matrix(family, tag, along, self._square) for tag in tags])
 
-    def corners(self, pixels: Array) -> tuple[Array, float]:
-        """Corners that the fit reports, and how far ripples bend the tag.
+    def corners(self, pixels: Array) -> tuple[Array, Array]:
+        """Corners that the fit reports, and how far ripples bend each tag.
 
         Args:
-            pixels: Of `nodes`, (N, 2).
+            pixels: Of `nodes` of every tag, (T, N, 2).
 
         Returns:
-            Corners (4, 2) [px], and the rms distance of the nodes from where the fit has them, in edges of the tag.
+            Corners (T, 4, 2) [px], and the rms distance of the nodes from where the fit has them, in edges of the tag,
+            (T,). Those of a tag of which not all nodes have pixels mean nothing.
         """
-        H = _from_square(pixels[self._at_corner])
-        back = np.linalg.inv(H)
-        seen = pixels @ back[:, :2].T + back[:, 2]
-        moved = (seen[:, :2] / seen[:, 2:] - self._square).T.ravel()
-        change = self._matrix @ moved
-        h, left = change[:8], change[8:]
-        warp = np.array([[1.0 + h[0], h[1], h[2]], [h[3], 1.0 + h[4], h[5]], [h[6], h[7], 1.0]])
-        image = HOMOGENEOUS @ (H @ warp).T
-        return image[:, :2] / image[:, 2:], math.sqrt(2.0 * float(left @ left) / len(left))
+        with np.errstate(all="ignore"):
+            H = np.array([_from_square(tag) for tag in pixels[:, self._at_corner].tolist()])
+            back = np.linalg.inv(H)
+            seen = pixels @ back[:, :, :2].transpose(0, 2, 1) + back[:, None, :, 2]
+            moved = (seen[..., :2] / seen[..., 2:] - self._square).transpose(0, 2, 1).reshape(len(H), -1)
+            change = (self._matrix @ moved[..., None])[..., 0]
+            warp = np.concatenate([change[:, :8], np.zeros((len(H), 1))], axis=1).reshape(-1, 3, 3) + np.eye(
+                3
+            )
+            image = HOMOGENEOUS @ (H @ warp).transpose(0, 2, 1)
+            left = change[:, 8:]
+            return image[..., :2] / image[..., 2:], np.sqrt(2.0 * np.mean(left * left, axis=1))
+
+
+def _fit_matrix(family: str, tag: int, along: Array, square: Array) -> Array:
+    """From motions of the nodes, all x before all y, to the fit's homography (8 rows) and what it leaves of them."""
+    points, across = _cell_edges(family, tag)
+    columns, there = _warp_columns(points), _interpolation(along, points)
+    rows = np.where(across[:, None], columns[:, 0], columns[:, 1])
+    u, v = np.where(across[:, None], there, 0.0), np.where(across[:, None], 0.0, there)
+    warp = np.linalg.pinv(rows) @ np.concatenate([u, v], axis=1)
+    at_nodes = _warp_columns(square)
+    left = np.eye(2 * len(square)) - np.concatenate([at_nodes[:, 0], at_nodes[:, 1]]) @ warp
+    return np.concatenate([warp, left])
 
 
 def _cell_edges(family: str, tag: int) -> tuple[Array, npt.NDArray[np.bool_]]:
@@ -101,13 +110,13 @@ def _interpolation(along: Array, points: Array) -> Array:
     return np.asarray((by_y[:, :, None] * by_x[:, None, :]).reshape(len(points), -1))
 
 
-def _from_square(corners: Array) -> Array:
-    """The homography that takes the unit square, x right and y down, to four corners, (3, 3)."""
-    (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners.tolist()
+def _from_square(corners: list[list[float]]) -> list[list[float]]:
+    """The homography that takes the unit square, x right and y down, to four corners, (3, 3); unity where none does."""
+    (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners
     ux, uy, vx, vy = bx - cx, by - cy, dx - cx, dy - cy
     wx, wy = ax - bx + cx - dx, ay - by + cy - dy
     area = ux * vy - uy * vx
+    if not abs(area) > 1e-9:
+        return np.eye(3).tolist()
     p, q = (wx * vy - wy * vx) / area, (ux * wy - uy * wx) / area
-    return np.array(
-        [[bx - ax + p * bx, dx - ax + q * dx, ax], [by - ay + p * by, dy - ay + q * dy, ay], [p, q, 1.0]]
-    )
+    return [[bx - ax + p * bx, dx - ax + q * dx, ax], [by - ay + p * by, dy - ay + q * dy, ay], [p, q, 1.0]]

@@ -14,10 +14,10 @@ __all__ = ["RippledView"]
 
 Array = npt.NDArray[np.float64]
 
-FLAT_STEPS = 3
-"""Of Newton's method for still water."""
+FLAT_STEPS = 2
+"""Of Newton's method for still water: within 1e-5 px. One is enough to begin with ripples."""
 RIPPLE_STEPS = 2
-"""And then for ripples, with the slope's own slope from the first: the last one moves the image by 0.01 px."""
+"""For ripples, with the surface's curvature from the first: within 0.001 px rms at a slope of 0.01, 0.03 px at 0.03."""
 
 
 class RippledView:
@@ -68,7 +68,7 @@ class RippledView:
         H, r = self._frame.camera_height, self._ratio
         reach = np.hypot(px, py)
         radius = reach * (H / (H + r * depth))
-        for _ in range(FLAT_STEPS):
+        for _ in range(FLAT_STEPS if self._surface is None else 1):
             cosine = H / np.sqrt(H * H + radius * radius)
             beyond = np.sqrt(1.0 - r * r * (1.0 - cosine * cosine))
             spread = depth * r * cosine / (beyond * H)
