@@ -9,12 +9,13 @@ Nominal state: position and velocity of the IMU in the pool frame, attitude, gyr
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
+from finssim.localization.fusion.changed import changed
 from finssim.localization.fusion.fuse_turns import matrix_of, product, skew, turn_of
 from finssim.localization.fusion.position_filter import Motion, process_noise, transition
 
@@ -94,7 +95,7 @@ def predict(
     F[..., V, B], F[..., P, B] = -turned, (-0.5 * dt) * turned
     F[..., A, G] = -turned
     covariance = F @ state.covariance @ np.swapaxes(F, -1, -2) + _noise(dt, noise)
-    return replace(
+    return changed(
         state,
         p=state.p + dt * state.v + 0.5 * dt**2 * a,
         v=state.v + dt * a,
@@ -119,7 +120,7 @@ def drift(state: InertialState, dt: float, motion: Motion, turning: float) -> In
     Q[A, A] = turning**2 * dt * np.eye(3)
     moved = np.concatenate([state.p, state.v], axis=-1) @ F[:6, :6].T
     covariance = F @ state.covariance @ F.T + Q
-    return replace(state, p=moved[..., :3], v=moved[..., 3:], covariance=covariance)
+    return changed(state, p=moved[..., :3], v=moved[..., 3:], covariance=covariance)
 
 
 def _noise(dt: float, noise: ErrorStateNoise) -> Array:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from finssim.localization.fusion import position_filter, yaw_filter
 from finssim.localization.fusion.attitude import Tilt, TiltGains, follow, roll_pitch, tilt_from, up_of
+from finssim.localization.fusion.changed import changed
 from finssim.localization.fusion.fuse_settings import Settings, Site
 from finssim.localization.fusion.gate import GateMemory, judge
 from finssim.localization.fusion.health import Estimate, Outcome
@@ -84,8 +85,8 @@ class ConstantVelocity:
         yaw = self._yaw_at(track, sample.time)
         if track.rate is not None and rate is not None and dt <= GYRO_HOLD:
             # Up to here the older rate was held; half the difference makes a trapezium of the step.
-            yaw = replace(yaw, yaw=yaw.yaw + 0.5 * (rate - track.rate) * dt)
-        track = replace(track, yaw=yaw, yaw_time=sample.time, rate=rate, imu_time=sample.time)
+            yaw = changed(yaw, yaw=yaw.yaw + 0.5 * (rate - track.rate) * dt)
+        track = changed(track, yaw=yaw, yaw_time=sample.time, rate=rate, imu_time=sample.time)
         return track, (Outcome("imu", "steep" if steep else "accepted"),)
 
     def depth(self, track: Track, sample: DepthSample) -> tuple[Track, tuple[Outcome, ...]]:
@@ -108,14 +109,14 @@ class ConstantVelocity:
             height = (z - site.up[0] * x - site.up[1] * y) / site.up[2]
             position = position_filter.restarted(track.position, [2], height, R, s.speed_std)
         then = track.depth_time if verdict == "gate" else sample.time
-        track = replace(track, position=position, depth_time=then, gates=(*track.gates[:2], memory))
+        track = changed(track, position=position, depth_time=then, gates=(*track.gates[:2], memory))
         return track, (Outcome("depth", verdict, float(found.mahalanobis), 1),)
 
     def vision(self, track: Track, sample: VisionSample) -> tuple[Track, tuple[Outcome, ...]]:
         """Take in a fix of the camera: x and y, and yaw if it has one."""
         R = vision_covariance(sample, self.settings)
-        track = replace(self._positioned(track, sample.time), yaw=self._yaw_at(track, sample.time))
-        track = replace(track, yaw_time=_later(track.yaw_time, sample.time))
+        track = changed(self._positioned(track, sample.time), yaw=self._yaw_at(track, sample.time))
+        track = changed(track, yaw_time=_later(track.yaw_time, sample.time))
         track, seen = self._fixed(track, sample, R[:2, :2])
         if sample.yaw is None:
             return track, (seen,)
@@ -161,7 +162,7 @@ class ConstantVelocity:
         else:
             position = position_filter.restarted(track.position, [0, 1], z, R, s.speed_std)
         then = track.vision_time if verdict == "gate" else sample.time
-        track = replace(track, position=position, vision_time=then, gates=(memory, *track.gates[1:]))
+        track = changed(track, position=position, vision_time=then, gates=(memory, *track.gates[1:]))
         return track, Outcome("vision", verdict, float(found.mahalanobis), 2)
 
     def _turned(self, track: Track, sample: VisionSample, variance: float) -> tuple[Track, Outcome]:
@@ -178,13 +179,13 @@ class ConstantVelocity:
             yaw = yaw_filter.restarted(track.yaw, sample.yaw or 0.0, variance, s.bias_std)
         then = track.yaw_seen if verdict == "gate" else sample.time
         gates = (track.gates[0], memory, track.gates[2])
-        track = replace(track, yaw=yaw, yaw_seen=then, gates=gates)
+        track = changed(track, yaw=yaw, yaw_seen=then, gates=gates)
         return track, Outcome("yaw", verdict, float(found.mahalanobis), 1)
 
     def _tilted(self, track: Track, sample: ImuSample, dt: float) -> Track:
         """Roll and pitch after a sample: the unit's own, else those of gyro and accelerometer."""
         if sample.tilt is not None:
-            return replace(track, roll=sample.tilt[0], pitch=sample.tilt[1], tilt=None)
+            return changed(track, roll=sample.tilt[0], pitch=sample.tilt[1], tilt=None)
         force = np.full(3, math.nan) if sample.force is None else np.array(sample.force)
         gains = TiltGains(gravity=self.site.gravity)
         if track.tilt is not None and dt <= gains.longest_gap:
@@ -194,13 +195,13 @@ class ConstantVelocity:
         else:
             return track
         roll, pitch = roll_pitch(tilt.up)
-        return replace(track, roll=float(roll), pitch=float(pitch), tilt=tilt)
+        return changed(track, roll=float(roll), pitch=float(pitch), tilt=tilt)
 
     def _positioned(self, track: Track, time: float) -> Track:
         """The track with its position at a time; axes without news slow down, then stand still."""
         s, then = self.settings, track.position_time
         if math.isnan(then) or time <= then:
-            return replace(track, position_time=_later(then, time))
+            return changed(track, position_time=_later(then, time))
         position = track.position
         cuts = [
             t + limit
@@ -218,7 +219,7 @@ class ConstantVelocity:
             position = position_filter.predict(position, until - then, motion)
             then = until
         position = position_filter.capped(position, s.largest_variance)
-        return replace(track, position=position, position_time=time)
+        return changed(track, position=position, position_time=time)
 
     def _yaw_at(self, track: Track, time: float) -> YawState:
         """Yaw at a time: the latest rate held, and none where the gyro has been silent for too long."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ from finssim.geometry.rotations import (
 )
 from finssim.localization.fusion import error_state, fuse_restart
 from finssim.localization.fusion.attitude import roll_pitch
+from finssim.localization.fusion.changed import changed
 from finssim.localization.fusion.error_state import ErrorStateNoise, InertialState
 from finssim.localization.fusion.fuse_constant_velocity import (
     GYRO_HOLD,
@@ -88,7 +89,7 @@ class ErrorState:
             return track, (Outcome("imu", "no acceleration"),)
         if track.inertial is None:
             before, outcomes = self._before.imu(track.before, sample)
-            track = replace(
+            track = changed(
                 track,
                 before=before,
                 omega=sample.omega,
@@ -101,17 +102,17 @@ class ErrorState:
         heard = track.imu_time is not None and sample.time - track.imu_time <= GYRO_HOLD
         if heard and track.force is not None:  # the step's mean, rather than what it began with
             omega, force = _mean(track.omega, sample.omega), _mean(track.force, sample.force)
-            track = self._until(replace(track, omega=omega, force=force), sample.time)
+            track = self._until(changed(track, omega=omega, force=force), sample.time)
         else:
             track = self._until(track, sample.time)
-        track = replace(track, omega=sample.omega, force=sample.force, imu_time=sample.time)
+        track = changed(track, omega=sample.omega, force=sample.force, imu_time=sample.time)
         return track, (Outcome("imu", "accepted"),)
 
     def depth(self, track: InertialTrack, sample: DepthSample) -> tuple[InertialTrack, tuple[Outcome, ...]]:
         """Take in a depth."""
         if track.inertial is None:
             before, outcomes = self._before.depth(track.before, sample)
-            return self._begun(replace(track, before=before), sample.time), outcomes
+            return self._begun(changed(track, before=before), sample.time), outcomes
         s, track = self.settings, self._until(track, sample.time)
         assert track.inertial is not None
         height, H = error_state.depth_model(track.inertial, self._port, self._up, self.site.offset)
@@ -127,14 +128,14 @@ class ErrorState:
             state = fuse_restart.restarted(state, [2], state.p[2:] + residual / self._up[2], R, s.speed_std)
         then = track.depth_time if verdict == "gate" else sample.time
         gates = (*track.gates[:2], memory)
-        track = self._kept(replace(track, inertial=state, depth_time=then, gates=gates))
+        track = self._kept(changed(track, inertial=state, depth_time=then, gates=gates))
         return track, (Outcome("depth", verdict, float(distance), 1),)
 
     def vision(self, track: InertialTrack, sample: VisionSample) -> tuple[InertialTrack, tuple[Outcome, ...]]:
         """Take in a fix of the camera."""
         if track.inertial is None:
             before, outcomes = self._before.vision(track.before, sample)
-            return self._begun(replace(track, before=before), sample.time), outcomes
+            return self._begun(changed(track, before=before), sample.time), outcomes
         R = vision_covariance(sample, self.settings)
         track, seen = self._fixed(self._until(track, sample.time), sample, R[:2, :2])
         if sample.yaw is None:
@@ -196,8 +197,8 @@ class ErrorState:
         state = InertialState(
             known.x[:3] - R @ self._body, known.x[3:], q, np.zeros(3), np.zeros(3), covariance
         )
-        track = replace(track, inertial=state, time=time, vision_time=before.vision_time, gates=before.gates)
-        return self._kept(replace(track, depth_time=before.depth_time))
+        track = changed(track, inertial=state, time=time, vision_time=before.vision_time, gates=before.gates)
+        return self._kept(changed(track, depth_time=before.depth_time))
 
     def _fixed(self, track: InertialTrack, sample: VisionSample, R: Array) -> tuple[InertialTrack, Outcome]:
         s, state = self.settings, track.inertial
@@ -212,7 +213,7 @@ class ErrorState:
         elif verdict == "reacquired":
             state = fuse_restart.restarted(state, [0, 1], state.p[:2] + residual, R, s.speed_std)
         then = track.vision_time if verdict == "gate" else sample.time
-        track = replace(track, inertial=state, vision_time=then, gates=(memory, *track.gates[1:]))
+        track = changed(track, inertial=state, vision_time=then, gates=(memory, *track.gates[1:]))
         return track, Outcome("vision", verdict, float(distance), 2)
 
     def _turned(self, track: InertialTrack, sample: VisionSample, R: Array) -> tuple[InertialTrack, Outcome]:
@@ -226,7 +227,7 @@ class ErrorState:
             state = error_state.correct(state, residual, H, R, gain)
         elif verdict == "reacquired":
             state = fuse_restart.turned(state, float(residual[0]), float(R[0, 0]))
-        track = replace(track, inertial=state, gates=(track.gates[0], memory, track.gates[2]))
+        track = changed(track, inertial=state, gates=(track.gates[0], memory, track.gates[2]))
         return track, Outcome("yaw", verdict, float(distance), 1)
 
     def _until(self, track: InertialTrack, time: float) -> InertialTrack:
@@ -245,7 +246,7 @@ class ErrorState:
             state = self._step(state, track, until - then, blind=middle > heard, age=age)
             then = until
         return self._kept(
-            replace(track, inertial=fuse_restart.capped(state, s.largest_variance, TILT_CAP), time=time)
+            changed(track, inertial=fuse_restart.capped(state, s.largest_variance, TILT_CAP), time=time)
         )
 
     def _step(
@@ -264,7 +265,7 @@ class ErrorState:
             lost
         ):  # the place is no longer told by the accelerometer, only that the vehicle may be anywhere near
             walk = 2.0 * s.speed_std**2 / s.decay * dt
-            after = fuse_restart.parted(replace(after, p=np.append(state.p[:2], after.p[2])), [0, 1], walk)
+            after = fuse_restart.parted(changed(after, p=np.append(state.p[:2], after.p[2])), [0, 1], walk)
         H = np.eye(15)[3:5]
         R = np.eye(2) * s.speed_std**2 / (s.decay * dt)
         residual = -after.v[:2]
@@ -275,7 +276,7 @@ class ErrorState:
         """The track with roll and pitch read from its attitude."""
         assert track.inertial is not None
         roll, pitch = roll_pitch(self._up @ matrix_of(track.inertial.q))
-        return replace(track, roll=float(roll), pitch=float(pitch))
+        return changed(track, roll=float(roll), pitch=float(pitch))
 
 
 def _mean(a: tuple[float, float, float], b: tuple[float, float, float]) -> tuple[float, float, float]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from finssim.localization.fusion.health import Outcome
-from finssim.localization.fusion.streams import DepthSample, ImuSample, Sample
+from finssim.localization.fusion.streams import DepthSample, Sample
 
 __all__ = ["Surroundings", "Timeline"]
 
@@ -116,24 +116,25 @@ class Timeline(Generic[S]):
 
     def depth_at(self, time: float, longest: float) -> float:
         """Depth at a time, in a straight line between two samples or the nearest one within `longest` [m]; or NaN."""
-        near = [s for s in self._samples if isinstance(s, DepthSample)]
-        return _between([(s.time, s.depth) for s in near], time, longest)
+        near = [self._samples[i] for i in self._around(time, "depth")]
+        return _between([(s.time, s.depth) for s in near if isinstance(s, DepthSample)], time, longest)
 
     def tilt_at(
         self, time: float, longest: float, tilt: Callable[[S], tuple[float, float]]
     ) -> tuple[float, float]:
         """Roll and pitch at a time, likewise, from the states after the IMU's samples [rad]."""
-        k = bisect.bisect_right(self._keys, (time, 0))
-        window = range(max(0, k - 64), min(len(self._keys), k + 64))
-        near = [
-            (self._keys[i][0], *tilt(self._states[i]))
-            for i in window
-            if isinstance(self._samples[i], ImuSample)
-        ]
+        near = [(self._keys[i][0], *tilt(self._states[i])) for i in self._around(time, "imu")]
         return (
             _between([(t, roll) for t, roll, _ in near], time, longest),
             _between([(t, pitch) for t, _, pitch in near], time, longest),
         )
+
+    def _around(self, time: float, stream: str) -> list[int]:
+        """Where the last sample of a stream before a time and the first not before it stand, as far as there are."""
+        k = bisect.bisect_left(self._keys, (time, -1))
+        before = next((i for i in range(k - 1, -1, -1) if self._samples[i].stream == stream), None)
+        after = next((i for i in range(k, len(self._keys)) if self._samples[i].stream == stream), None)
+        return [i for i in (before, after) if i is not None]
 
 
 def _between(points: list[tuple[float, float]], time: float, longest: float) -> float:

@@ -91,10 +91,14 @@ def predict(state: YawState, rate: Array | float, dt: float, noise: YawNoise) ->
         dt: Time that passes [s].
         noise: Errors of the rate.
     """
-    F = np.array([[1.0, -dt], [0.0, 1.0]])
-    w = noise.bias_walk**2
-    Q = np.array([[noise.rate**2 * dt + w * dt**3 / 3.0, -0.5 * w * dt**2], [-0.5 * w * dt**2, w * dt]])
-    return YawState(wrap_angle(state.yaw + (rate - state.bias) * dt), state.bias, F @ state.P @ F.T + Q)
+    # P <- F P F' + Q with F = [1 -dt; 0 1], written out: for one vehicle the products of matrices cost most.
+    w, old = noise.bias_walk**2, state.P
+    cross, bias = old[..., 0, 1], old[..., 1, 1]
+    P = np.empty(old.shape)
+    P[..., 0, 0] = old[..., 0, 0] + dt * (dt * bias - 2.0 * cross + noise.rate**2) + w * dt**3 / 3.0
+    P[..., 0, 1] = P[..., 1, 0] = cross - dt * bias - 0.5 * w * dt**2
+    P[..., 1, 1] = bias + w * dt
+    return YawState(wrap_angle(state.yaw + (rate - state.bias) * dt), state.bias, P)
 
 
 def innovation(state: YawState, yaw: Array | float, variance: Array | float) -> YawInnovation:
