@@ -10,8 +10,9 @@ WORDS = {
     "success_rate": ("the share of setpoints held", 100.0, "percentage points", ".0f"),
     "e_p_m": ("the position error", 100.0, "cm", ".1f"),
     "e_psi_deg": ("the heading error", 1.0, "°", ".1f"),
-    "horizontal_m": ("the horizontal error", 100.0, "cm", ".1f"),
-    "vertical_m": ("the vertical error", 100.0, "cm", ".1f"),
+    "horizontal_rmse_m": ("the horizontal error", 100.0, "cm", ".1f"),
+    "vertical_rmse_m": ("the vertical error", 100.0, "cm", ".1f"),
+    "p95_m": ("the 95th percentile of the distance", 100.0, "cm", ".1f"),
 }
 """Key -> words, factor, unit and format of a difference."""
 

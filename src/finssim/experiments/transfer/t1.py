@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any
 
+from finssim.experiments.setpoints import T1_SETPOINTS
+from finssim.experiments.transfer.intervals import mean_of, median_of
 from finssim.experiments.transfer.policies import Training
+from finssim.experiments.transfer.ranges import INTERVALS
+from finssim.experiments.transfer.spec import Row, Spec
+from finssim.experiments.transfer.t1_figure import draw_t1
+from finssim.experiments.transfer.t1_table import t1_table
 
-__all__ = ["BASE", "ROWS", "TRAININGS", "Row"]
+__all__ = ["ROWS", "T1"]
 
 POSITION_NOISE, YAW_NOISE = 0.05, math.radians(10.0)
 """Of the paper's row with localization noise: per axis [m], and in heading [rad]."""
@@ -28,28 +32,12 @@ TRAININGS = MappingProxyType(
             Training(name="mesh-dr", hydrodynamics="mesh", randomize=DR),
             Training(name="simplified", hydrodynamics="simplified"),
             Training(name="simplified-dr", hydrodynamics="simplified", randomize=DR),
+            Training(name="calibrated-intervals", randomize=INTERVALS),
             Training(name="calibrated-pool", randomize="pool"),
         )
     }
 )
 """Every policy of the experiment by name."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Row:
-    """One row: who steers and what is taken from it."""
-
-    title: str
-    training: str | None = None
-    """Key of `TRAININGS`; None for a PID."""
-    controller: str = ""
-    """Name of the PID."""
-    changes: dict[str, Any] = field(default_factory=dict)
-    """Fields of its jobs."""
-    paper: str | None = None
-    """Row of the paper's table; None where it has none."""
-    module: str = ""
-    """What the row takes away or puts in place of the reference, as a sentence begins."""
 
 
 ROWS: dict[str, Row] = {
@@ -77,9 +65,7 @@ ROWS: dict[str, Row] = {
         paper="without thruster dynamics",
         module="Training without thruster dynamics",
     ),
-    "mesh": Row(
-        title="Physics-Mesh", training="mesh", paper="mesh", module="Training in the mesh model"
-    ),
+    "mesh": Row(title="Physics-Mesh", training="mesh", paper="mesh", module="Training in the mesh model"),
     "mesh-dr": Row(
         title="Physics-Mesh + DR",
         training="mesh-dr",
@@ -102,11 +88,37 @@ ROWS: dict[str, Row] = {
         title="PID, published gains", controller="pid-paper", paper="PID", module="The published PID"
     ),
     "pid": Row(title="PID, tuned from the model", controller="pid", module="The tuned PID"),
+    "calibrated-intervals": Row(
+        title="Calibrated + ranges of its intervals",
+        training="calibrated-intervals",
+        module="Randomisation within the calibration's intervals",
+    ),
     "calibrated-pool": Row(
         title="Calibrated + pool ranges", training="calibrated-pool", module="Randomisation made for a pool"
     ),
 }
-"""The table in its order; the last two are ours."""
+"""The table in its order; the last three are ours."""
 
-BASE = "calibrated"
-"""The row that the others are compared with."""
+TITLES = {name: row.title for name, row in ROWS.items()}
+
+T1 = Spec(
+    name="t1",
+    rows=ROWS,
+    trainings=TRAININGS,
+    targets=tuple(T1_SETPOINTS),
+    known_targets=tuple(T1_SETPOINTS),
+    base="calibrated",
+    figures={
+        "success_rate": mean_of,
+        "e_p_m": mean_of,
+        "e_y_m": mean_of,
+        "e_psi_deg": mean_of,
+        "t_s_s": median_of,
+        "J_p_m": mean_of,
+        "J_psi_deg": mean_of,
+    },
+    differences=("success_rate", "e_p_m", "e_psi_deg"),
+    shown=lambda result: t1_table(result, ROWS),
+    draw=lambda by_row, folder: draw_t1(by_row, TITLES, folder),
+)
+"""`finssim experiment t1`."""

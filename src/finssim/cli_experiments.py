@@ -1,0 +1,154 @@
+"""Commands of the experiments in the virtual pool: t1, t2, ablation, all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from finssim.cli_options import Json, Seed, Steps, Vehicle
+
+__all__ = ["ablation", "everything", "t1", "t2"]
+
+Out = Annotated[
+    Path,
+    typer.Option(
+        help="Directory for JSON, Markdown, figures, policies and trials; one that was interrupted goes on.",
+        metavar="DIR",
+    ),
+]
+Plants = Annotated[
+    int, typer.Option(help="Virtual pools, each with its own vehicle, water and camera.", min=1, max=1000)
+]
+Seeds = Annotated[
+    int, typer.Option(help="Trainings of each policy, each tried with its own noise.", min=1, max=1000)
+]
+Severity = Annotated[
+    str,
+    typer.Option(
+        help="How far the pools are from the vehicle file: nominal, realistic or hard.", metavar="WORD"
+    ),
+]
+Camera = Annotated[
+    str,
+    typer.Option(
+        help="corners (projected through the rippling water, with noise), or pictures (drawn, and searched for tags: "
+        "several times slower).",
+        metavar="MODE",
+    ),
+]
+Rows = Annotated[str | None, typer.Option(help="Rows of the table, separated by commas; all if not given.")]
+Targets = Annotated[
+    str | None,
+    typer.Option(help="Setpoints or trajectories, separated by commas; all published ones if not given."),
+]
+Processes = Annotated[
+    int | None, typer.Option(help="Trials at once; as many as processors if not given.", min=1)
+]
+
+
+def _options(rows: str | None, targets: str | None, **options: Any) -> dict[str, Any]:
+    chosen = {"rows": rows, "targets": targets}
+    return options | {key: tuple(words.split(",")) for key, words in chosen.items() if words is not None}
+
+
+def t1(
+    out: Out,
+    plants: Plants = 3,
+    seeds: Seeds = 3,
+    seed: Seed = 1,
+    severity: Severity = "realistic",
+    camera: Camera = "corners",
+    rows: Rows = None,
+    setpoints: Targets = None,
+    vehicle: Vehicle = "finsrov",
+    steps: Steps = None,
+    processes: Processes = None,
+    as_json: Json = False,
+) -> None:
+    """Station keeping in the virtual pool (the paper's Table IV): success, errors [m, deg], time to settle [s], jitter.
+
+    Example: finssim experiment t1 --rows calibrated,pid --seeds 1 --out t1
+    """
+    from finssim.experiments.transfer.experiment import run
+    from finssim.experiments.transfer.t1 import T1
+
+    options = _options(
+        rows, setpoints, plants=plants, seeds=seeds, seed=seed, severity=severity, camera=camera
+    )
+    run(T1, out=out, vehicle=vehicle, steps=steps, processes=processes, as_json=as_json, **options)
+
+
+def t2(
+    out: Out,
+    plants: Plants = 3,
+    seeds: Seeds = 3,
+    seed: Seed = 1,
+    severity: Severity = "realistic",
+    camera: Camera = "corners",
+    rows: Rows = None,
+    trajectories: Targets = None,
+    vehicle: Vehicle = "finsrov",
+    steps: Steps = None,
+    processes: Processes = None,
+    as_json: Json = False,
+) -> None:
+    """Trajectory tracking in the virtual pool (the paper's Table V): horizontal and vertical RMSE, 3-D P95 [m].
+
+    Example: finssim experiment t2 --rows calibrated-dr,pid --trajectories lemniscate --seeds 1 --out t2
+    """
+    from finssim.experiments.transfer.experiment import run
+    from finssim.experiments.transfer.t2 import T2
+
+    options = _options(
+        rows, trajectories, plants=plants, seeds=seeds, seed=seed, severity=severity, camera=camera
+    )
+    run(T2, out=out, vehicle=vehicle, steps=steps, processes=processes, as_json=as_json, **options)
+
+
+def ablation(
+    out: Out,
+    plants: Plants = 3,
+    seeds: Seeds = 3,
+    seed: Seed = 1,
+    severity: Severity = "realistic",
+    camera: Camera = "corners",
+    vehicle: Vehicle = "finsrov",
+    steps: Steps = None,
+    processes: Processes = None,
+    as_json: Json = False,
+) -> None:
+    """What each module is worth: differences of paired trials with intervals, and a sentence that they support.
+
+    Example: finssim experiment ablation --seeds 3 --out ablation
+    """
+    from finssim.experiments.transfer.ablation import run
+
+    run(
+        out=out, plants=plants, seeds=seeds, seed=seed, severity=severity, camera=camera, vehicle=vehicle,
+        steps=steps, processes=processes, as_json=as_json,
+    )  # fmt: skip
+
+
+def everything(
+    out: Out,
+    plants: Plants = 3,
+    seeds: Seeds = 3,
+    seed: Seed = 1,
+    severity: Severity = "realistic",
+    camera: Camera = "corners",
+    steps: Steps = None,
+    processes: Processes = None,
+    as_json: Json = False,
+) -> None:
+    """Run localization, replay, t1, t2 and ablation, and write one report with the paper's figures beside ours.
+
+    Example: finssim experiment all --seeds 1 --plants 1 --out everything
+    """
+    from finssim.experiments.transfer.everything import run
+
+    run(
+        out=out, plants=plants, seeds=seeds, seed=seed, severity=severity, camera=camera, steps=steps,
+        processes=processes, as_json=as_json,
+    )  # fmt: skip

@@ -1,0 +1,196 @@
+"""Plays one job: the robot's whole software in lock-step with a virtual pool, scored from the truth afterwards."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.control.guidance import Guide, Station
+from finssim.control.trajectories import load_trajectory
+from finssim.experiments.metrics import measure_trial
+from finssim.experiments.setpoints import T1_SETPOINTS, T1_START
+from finssim.experiments.t2_metrics import ERRORS, measure_tracking
+from finssim.experiments.transfer.job import Job
+from finssim.experiments.transfer.series import write_series
+from finssim.geometry.rotations import quat_from_yaw, quat_yaw
+from finssim.pool.camera import PoolCamera
+from finssim.pool.draw_plant import draw_plant
+from finssim.pool.site import camera_of
+from finssim.pool.truth import Truth, read_truth
+from finssim.pool.virtual_pool import VirtualPool
+from finssim.provenance import provenance
+from finssim.quiet import start_warp
+from finssim.robot.ablation import NoisyInput
+from finssim.robot.lockstep import run_lockstep
+from finssim.robot.perception import Perception
+from finssim.robot.pilots import Pilot, make_pilot
+from finssim.robot.runtime import Runtime
+from finssim.vehicles import load_vehicle
+
+__all__ = ["play"]
+
+Array = NDArray[np.float64]
+
+GETTING_READY = 10.0
+"""Longest time until the estimator knows where the vehicle is [s]."""
+
+SERIES_PERIOD = 0.1
+"""Between the samples that are kept [s]."""
+
+
+class _Estimates:
+    """What the robot believed, at the period of the series."""
+
+    def __init__(self) -> None:
+        self.rows: list[tuple[float, ...]] = []
+
+    def __call__(self, runtime: Runtime) -> None:
+        reading, t = runtime.reading, runtime.t
+        if reading is None or math.isnan(t) or (self.rows and t < self.rows[-1][0] + SERIES_PERIOD - 1e-6):
+            return
+        self.rows.append((t, *reading.position, float(quat_yaw(reading.quaternion))))
+
+
+def play(job: Job, path: Path) -> dict[str, Any]:
+    """Play a job.
+
+    Args:
+        job: Who, where and what.
+        path: PATH.npz takes the series of truth and estimate.
+
+    Returns:
+        The measures of its task, `fault` (why the bridge stopped it, or empty), `localization` (errors of the estimate
+        against the truth, rms) and how the robot's loop did.
+    """
+    start_warp()
+    began = time.perf_counter()
+    guide, start = _guide(job)
+    vehicle, standing = load_vehicle(job.vehicle), load_vehicle(job.pool_vehicle)
+    true_site, known_site, settings = camera_of(standing, job.plant, job.severity)
+    seed = zlib.crc32(f"{job.seed} {job.target}".encode()) & 0x7FFFFFFF
+    runtime = Runtime(
+        vehicle,
+        known_site,
+        _pilot(job, vehicle, seed),
+        guide,
+        arm=True,
+        perception=Perception(vehicle, known_site, fusion=job.fusion),
+    )
+    estimates = _Estimates()
+    duration = guide.duration if math.isfinite(guide.duration) else job.duration
+    with tempfile.TemporaryDirectory() as folder:
+        world = VirtualPool(
+            standing,
+            draw_plant(standing, job.plant, job.severity),
+            camera=PoolCamera(standing, true_site, mode=job.camera, settings=settings, seed=seed),
+            start=(start[:3], quat_from_yaw(start[3])),
+            seed=seed,
+            truth=Path(folder) / "truth",
+        )
+        try:
+            run_lockstep(
+                runtime,
+                world,
+                GETTING_READY + duration,
+                show=estimates,
+                until=lambda r: r.t >= duration or r.bridge.state == "fault",
+            )
+        finally:
+            world.close()
+        truth = read_truth(Path(folder) / "truth")
+    series = _series(truth, runtime.started, duration, np.array(estimates.rows))
+    write_series(path, series)
+    fault = _fault(runtime)
+    return {
+        **_measures(job, guide, series, vehicle.force_limits, bool(fault)),
+        "fault": fault,
+        "localization": _localization(series),
+        "missed_decisions": runtime.counters.missed,
+        "seconds": time.perf_counter() - began,
+        "provenance": provenance(),
+    }
+
+
+def _fault(runtime: Runtime) -> str:
+    """Why the trial ended before its time, or never began; empty if it did neither."""
+    if math.isnan(runtime.started):
+        return f"never armed: {runtime.refusal or 'no state'}"
+    return runtime.bridge.reason if runtime.bridge.state == "fault" else ""
+
+
+def _guide(job: Job) -> tuple[Guide, Array]:
+    """The wanted motion, and the pose at which the vehicle is put into the pool: [x, y, z, yaw]."""
+    if job.task == "t1":
+        x, y, z, yaw = T1_SETPOINTS[job.target]
+        return Station((x, y, z), yaw, name=job.target), np.asarray(T1_START)
+    trajectory = load_trajectory(job.target)
+    first = trajectory.at(0.0)
+    return trajectory, np.array([*first.position, float(first.yaw)])
+
+
+def _pilot(job: Job, vehicle: Any, seed: int) -> Pilot:
+    pilot: Pilot = make_pilot(job.controller, vehicle, task=job.task)
+    if job.position_noise or job.yaw_noise:
+        return NoisyInput(pilot, position_std=job.position_noise, yaw_std=job.yaw_noise, seed=seed)
+    return pilot
+
+
+def _series(truth: Truth, started: float, duration: float, estimates: Array) -> dict[str, Array]:
+    """Truth from the start of the guide's time, and the estimates at their own times."""
+    t = truth.time - started
+    kept = (t >= 0.0) & (t <= duration + 1e-6)
+    every = max(1, round(SERIES_PERIOD / np.median(np.diff(truth.time))))
+    t, position, quaternion = t[kept][::every], truth.position[kept][::every], truth.quaternion[kept][::every]
+    estimates = estimates.reshape(-1, 5)
+    return {
+        "t": t,
+        "position": position,
+        "quaternion": quaternion,
+        "yaw": np.asarray(quat_yaw(quaternion)),
+        "nu": truth.nu[kept][::every],
+        "thrust": truth.thrust[kept][::every],
+        "estimate_t": estimates[:, 0],
+        "estimate": estimates[:, 1:4],
+        "estimate_yaw": estimates[:, 4],
+    }
+
+
+def _measures(job: Job, guide: Guide, series: dict[str, Array], limits: Any, stopped: bool) -> dict[str, Any]:
+    if job.task == "t1":
+        return measure_trial(series["t"], series["position"], series["yaw"], T1_SETPOINTS[job.target])
+    measures = measure_tracking(
+        series["t"],
+        series["position"],
+        guide,
+        quaternion=series["quaternion"],
+        thrust=series["thrust"],
+        limits=limits,
+    )
+    if stopped:  # errors of half a way say nothing of the other half
+        measures |= dict.fromkeys(ERRORS)
+    return {"success": bool(measures["complete"]) and not stopped, **measures}
+
+
+def _localization(series: dict[str, Array]) -> dict[str, float] | None:
+    """Errors of the estimate at its own times: rms in 3-D and horizontally [m], and in heading [°]."""
+    t, estimate = series["estimate_t"], series["estimate"]
+    inside = (t >= series["t"][:1].max(initial=0.0)) & (t <= series["t"][-1:].max(initial=-1.0))
+    inside &= np.isfinite(estimate).all(axis=1)
+    if not inside.any():
+        return None
+    true = np.stack([np.interp(t[inside], series["t"], column) for column in series["position"].T], axis=1)
+    error = estimate[inside] - true
+    turn = series["estimate_yaw"][inside] - np.interp(t[inside], series["t"], np.unwrap(series["yaw"]))
+    turn = (turn + math.pi) % (2.0 * math.pi) - math.pi
+    return {
+        "position_m": float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),
+        "horizontal_m": float(np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1)))),
+        "heading_deg": math.degrees(float(np.sqrt(np.mean(turn**2)))),
+    }
