@@ -273,6 +273,17 @@ def test_commands_are_limited_in_force_and_in_slew():
     np.testing.assert_allclose(before, rig.bridge.motors.lower)
 
 
+def test_thrust_after_a_hold_begins_at_zero():
+    """What was under way before the hold is not carried over it: the slew limit starts from nothing."""
+    rig = Rig(FINSROV, slew=np.full(8, 20.0)).armed()
+    rig.bridge.hold(rig.now)
+    rig.run(0.2, 2.0)
+    rig.bridge.resume(rig.now)
+    while not rig.frame.enable:
+        rig.step(2.0)
+    assert (np.abs(rig.bridge.force) <= 20.0 * DT + 1e-9).all()
+
+
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_near_a_face_thrust_only_pushes_inwards(rig, axis, side):
