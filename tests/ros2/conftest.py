@@ -1,0 +1,9 @@
+"""Each test process talks on a ROS domain of its own, over the loopback alone."""
+
+import os
+
+worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw") or 0)
+os.environ["ROS_DOMAIN_ID"] = str(10 + 50 * (worker % 4) + os.getpid() % 50)
+for variable in ("CYCLONEDDS_URI", "ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_DISTRO"):
+    os.environ.pop(variable, None)
+os.environ["PLATFORM_ROS"] = "dds"
