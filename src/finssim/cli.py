@@ -12,6 +12,7 @@ from finssim import (
     __version__,
     boundary,
     cli_calibrate,
+    cli_experiments,
     cli_localization,
     cli_pool,
     cli_record,
@@ -43,6 +44,8 @@ cli_calibrate.calibrate_app.command()(cli_vision.camera)
 cli_calibrate.calibrate_app.command()(cli_vision.pool)
 cli_calibrate.calibrate_app.command()(cli_vision.mounts)
 cli_calibrate.experiment_app.command("localization")(cli_vision.experiment_localization)
+cli_calibrate.experiment_app.command()(cli_experiments.t1)
+cli_calibrate.experiment_app.command()(cli_experiments.t2)
 app.command()(cli_localization.localize)
 app.command()(cli_localization.fuse)
 app.command()(cli_localization.project)
