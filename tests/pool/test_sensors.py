@@ -5,8 +5,9 @@ import pytest
 
 from finssim.pool import draw_plant
 from finssim.pool.plant import Plant
-from finssim.pool.plant_spec import Circulation, Instruments
+from finssim.pool.plant_spec import Instruments
 from finssim.pool.sensors import PoolSensors
+from finssim.pool.water_spec import Circulation
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")

@@ -6,7 +6,8 @@ from typing import Any
 
 import warp as wp
 
-from finssim.pool.plant_spec import Basin, Circulation
+from finssim.pool.plant_spec import Basin
+from finssim.pool.water_spec import Circulation
 
 
 @wp.struct

@@ -5,7 +5,7 @@ import warp as wp
 
 from finssim.engine import TetherLine
 from finssim.physics.types import join, vec6
-from finssim.pool.plant_spec import SlackTether
+from finssim.pool.water_spec import SlackTether
 
 
 @wp.struct
