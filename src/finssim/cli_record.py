@@ -106,12 +106,14 @@ def teleop(
             metavar="FILE",
         ),
     ] = None,
-    camera: Annotated[
-        str, typer.Option(help="Where pictures come from: udp://HOST:PORT, shm:NAME or none.", metavar="WIRE")
-    ] = "udp://127.0.0.1:58767",
-    camera_bind: Annotated[
-        str, typer.Option(help="This end of the camera's wire, for UDP.", metavar="ADDRESS:PORT")
-    ] = "127.0.0.1:54322",
+    pictures: Annotated[
+        str | None,
+        typer.Option(
+            help="Overhead camera: udp://HOST:PORT, shm:NAME or none; the virtual pool's with --robot pool, "
+            "otherwise none, if not given. Needs --pool-file.",
+            metavar="ADDRESS",
+        ),
+    ] = None,
     policy: Annotated[
         str | None,
         typer.Option(
@@ -149,8 +151,7 @@ def teleop(
         robot=robot,
         bind=bind,
         pool_file=pool_file,
-        camera=camera,
-        camera_bind=camera_bind,
+        pictures=pictures,
         policy=policy,
         goal=goal,
         record=record,

@@ -56,7 +56,7 @@ def test_info_tells_rates_gaps_events_and_the_vehicle(run, capsys):
 def test_info_is_readable(run, capsys):
     text = finssim(capsys, "record", "info", run)
     assert "2.00 s" in text and "vehicle finsrov" in text and "seed: 7" in text
-    assert "101.000  fault: tilted" in text and "/finsrov/telemetry" in text
+    assert " 1.000 s  fault: tilted" in text and "/finsrov/telemetry" in text
 
 
 def test_repair_writes_beside_the_cut_record(run, tmp_path, capsys):

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from finssim.robot.link.decoder import MCU, Decoder
@@ -109,3 +110,35 @@ def test_a_drive_is_recorded(world, tmp_path):
     assert [event["kind"] for event in told["events"]][:1] == ["armed"]
     assert told["topics"]["/finsrov/telemetry"]["messages"] > 100
     assert told["topics"]["/finsrov/thruster_cmd"]["messages"] > 100
+
+
+def test_the_mode_button_hands_over_to_a_controller_and_back(world):
+    """The controller's thrust comes from 1 s on, the person's zeros again from 2 s on."""
+
+    class Hold:
+        name, period, needs_state = "hold", 0.05, False
+
+        def describe(self):
+            return {"name": self.name}
+
+        def reset(self):
+            pass
+
+        def act(self, reading, guide, t):
+            return np.full(8, 1.0)
+
+    class Modes(Script):
+        def read(self, now):
+            return replace(super().read(now), mode=1.0 <= now < 1.1 or 2.0 <= now < 2.1)
+
+    drive(
+        VEHICLE,
+        Modes(drives=False),
+        world.ours,
+        other=Hold(),
+        duration=3.0,
+        clock=world.clock,
+        wait=world.wait,
+    )
+    moving = [t for t, frame in world.frames if frame.enable and any(frame.normalised)]
+    assert 1.0 <= moving[0] < 1.2 and 2.0 <= moving[-1] < 2.3

@@ -68,7 +68,8 @@ def _lines(found: dict[str, Any]) -> list[str]:
             f"{told_of['longest_gap_s']:13.2f}  {told_of['type']}"
         )
     events = found["events"]
-    lines += [f"{e['time']:10.3f}  {e['kind']}: {e['text']}" for e in events[:EVENTS_SHOWN]]
+    start = found["start_s"]
+    lines += [f"{e['time'] - start:10.3f} s  {e['kind']}: {e['text']}" for e in events[:EVENTS_SHOWN]]
     if len(events) > EVENTS_SHOWN:
         lines.append(
             f"and {len(events) - EVENTS_SHOWN} more events: finssim play FILE --topics events --fast"

@@ -17,11 +17,12 @@ from finssim.robot.goals import station_of
 from finssim.robot.link.transports import Transport, open_transport
 from finssim.robot.operator import Device, Operator
 from finssim.robot.perception import Perception
-from finssim.robot.picture_source import PictureSource, open_pictures
+from finssim.robot.picture_source import DEFAULT_CAMERA, NoPictures, PictureSource, open_pictures
 from finssim.robot.pilots import ModeSwitch, Pilot, WrenchPilot, make_pilot
 from finssim.robot.realtime import run_realtime
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
+from finssim.robot.tag_finder import TagFinder
 from finssim.robot.teleop import TeleopError
 from finssim.robot.unlocated import Unlocated
 from finssim.vehicles import Vehicle, load_vehicle
@@ -68,15 +69,7 @@ def drive(
         clock: [s]
         wait: Waits so long [s].
     """
-    switch: ModeSwitch | None = None
-
-    def swap() -> None:
-        if switch is not None and other is not None:
-            switch.select("other" if switch.mode == "person" else "person")
-
-    operator = Operator(device, swap=swap)
-    person = WrenchPilot(operator.wrench, vehicle, period=1.0 / rate)
-    switch = ModeSwitch({"person": person, **({} if other is None else {"other": other})})
+    operator, switch = _crew(vehicle, device, other, 1.0 / rate)
     perception = Unlocated(vehicle) if pool is None else Perception(vehicle, pool)
     bridge = Bridge(vehicle, BridgeSettings.of(vehicle, need_reading=False))
     runtime = Runtime(
@@ -102,6 +95,21 @@ def drive(
     return runtime
 
 
+def _crew(
+    vehicle: Vehicle, device: Device, other: Pilot | None, period: float
+) -> tuple[Operator, ModeSwitch]:
+    """The person, and the switch between person and controller, which the person's mode button turns."""
+
+    def swap() -> None:
+        if other is not None:
+            switch.select("other" if switch.mode == "person" else "person")
+
+    operator = Operator(device, swap=swap)
+    person = WrenchPilot(operator.wrench, vehicle, period=period)
+    switch = ModeSwitch({"person": person, **({} if other is None else {"other": other})})
+    return operator, switch
+
+
 def run(
     vehicle: str,
     *,
@@ -109,8 +117,7 @@ def run(
     robot: str,
     bind: str,
     pool_file: Path | None,
-    camera: str,
-    camera_bind: str,
+    pictures: str | None,
     policy: str | None,
     goal: str | None,
     record: Path | None,
@@ -134,10 +141,7 @@ def run(
         hands, keys = _open_device(device, key_hold, stack)
         transport = open_transport(POOL if robot == "pool" else robot, bind)
         stack.callback(transport.close)
-        pictures = None
-        if pool is not None:
-            pictures = open_pictures(camera, camera_bind)
-            stack.callback(pictures.close)
+        source = None if pool is None else _open_pictures(pictures, robot, body, pool, stack)
         recorder = _recorder(record, body, pool_file, robot, stack)
         print(keys, file=sys.stderr)
         drive(
@@ -145,7 +149,7 @@ def run(
             hands,
             transport,
             pool=pool,
-            pictures=pictures,
+            pictures=source,
             recorder=recorder,
             other=other,
             guide=station_of(goal) if goal is not None else None,
@@ -167,6 +171,18 @@ def _open_device(name: str, key_hold: float, stack: ExitStack) -> tuple[Device, 
 
         return stack.enter_context(gamepad.Gamepad()), gamepad.HELP
     raise TeleopError(f"unknown device '{name}': expected gamepad or keyboard")
+
+
+def _open_pictures(
+    address: str | None, robot: str, vehicle: Vehicle, pool: Pool, stack: ExitStack
+) -> PictureSource:
+    """The camera's wire, with tags found beside the loop."""
+    source = open_pictures(address or (f"udp://{DEFAULT_CAMERA}" if robot == "pool" else "none"))
+    if not isinstance(source, NoPictures):
+        lens = pool.camera.lens
+        source = TagFinder(source, vehicle, size=(lens.height, lens.width))
+    stack.callback(source.close)
+    return source
 
 
 def _recorder(
