@@ -14,6 +14,8 @@ PAPER_T1 = MappingProxyType(
         "calibrated": (0.077, 0.027, 6.54, 7, 8, 20.16, 0.032, 2.35),
         "calibrated + DR": (0.092, 0.043, 5.42, 7, 8, 36.92, 0.034, 2.06),
         "calibrated, localisation noise": (0.658, 0.079, 13.53, 2, 8, 41.16, 0.025, 3.98),
+        "without EKF": (0.069, 0.025, 13.48, 7, 8, 29.52, 0.035, 2.60),
+        "without thruster dynamics": (0.055, 0.030, 3.82, 6, 8, 24.41, 0.034, 2.12),
         "mesh": (0.746, 0.108, 12.19, 0, 8, None, None, None),
         "mesh + DR": (0.197, 0.103, 8.62, 0, 8, None, None, None),
         "simplified": (0.598, 0.504, 23.37, 0, 8, None, None, None),

@@ -50,6 +50,8 @@ class Spec:
     """Key of a trial's result -> how the trials that have it become one figure."""
     differences: Sequence[str]
     """Keys in which rows are compared."""
+    paper_differences: Callable[[str | None, str | None], dict[str, float] | None]
+    """Rows of the paper's table -> key of `differences` -> first less second; None where it has not both."""
     shown: Callable[[Mapping[str, Any]], Shown]
     """The table of a result."""
     draw: Callable[[Mapping[str, list[dict[str, Any]]], Path], Path | None]

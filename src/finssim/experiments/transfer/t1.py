@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from types import MappingProxyType
 
+from finssim.experiments.paper_results import paper_row
 from finssim.experiments.setpoints import T1_SETPOINTS
 from finssim.experiments.transfer.intervals import mean_of, median_of
 from finssim.experiments.transfer.policies import Training
@@ -101,6 +102,16 @@ ROWS: dict[str, Row] = {
 
 TITLES = {name: row.title for name, row in ROWS.items()}
 
+
+def _paper_differences(row: str | None, base: str | None) -> dict[str, float] | None:
+    if row is None or base is None:
+        return None
+    theirs, reference = paper_row(row), paper_row(base)
+    rates = theirs["success"] / theirs["trials"] - reference["success"] / reference["trials"]
+    errors = {key: theirs[key] - reference[key] for key in ("e_p_m", "e_psi_deg")}
+    return {"success_rate": rates, **errors}
+
+
 T1 = Spec(
     name="t1",
     rows=ROWS,
@@ -118,6 +129,7 @@ T1 = Spec(
         "J_psi_deg": mean_of,
     },
     differences=("success_rate", "e_p_m", "e_psi_deg"),
+    paper_differences=_paper_differences,
     shown=lambda result: t1_table(result, ROWS),
     draw=lambda by_row, folder: draw_t1(by_row, TITLES, folder),
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import MappingProxyType
 
 from finssim.control.trajectories import TRAJECTORIES
+from finssim.experiments.paper_results import paper_t2_row
 from finssim.experiments.transfer.intervals import mean_of
 from finssim.experiments.transfer.policies import Training
 from finssim.experiments.transfer.spec import Row, Spec
@@ -44,6 +45,17 @@ ROWS: dict[str, Row] = {
 
 TITLES = {name: row.title for name, row in ROWS.items()}
 
+
+def _paper_differences(row: str | None, base: str | None) -> dict[str, float] | None:
+    if row is None or base is None:
+        return None
+    pairs = [(paper_t2_row(row, name), paper_t2_row(base, name)) for name in PUBLISHED]
+    return {
+        key: sum(theirs[key] - reference[key] for theirs, reference in pairs) / len(pairs)
+        for key in pairs[0][0]
+    }
+
+
 T2 = Spec(
     name="t2",
     rows=ROWS,
@@ -53,6 +65,7 @@ T2 = Spec(
     base="calibrated-dr",
     figures=dict.fromkeys(("horizontal_rmse_m", "vertical_rmse_m", "p95_m", "cross_track_rmse_m"), mean_of),
     differences=("horizontal_rmse_m", "vertical_rmse_m", "p95_m"),
+    paper_differences=_paper_differences,
     shown=lambda result: t2_table(result, ROWS),
     draw=lambda by_row, folder: draw_t2(by_row, TITLES, folder),
 )
