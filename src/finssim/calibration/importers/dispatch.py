@@ -171,7 +171,7 @@ def _table_groups(paths: list[Path], mapped: ColumnMap, has_map: bool) -> list[G
             found.setdefault(trial, []).append((pattern, path, mapped.files.get(pattern)))
     if not found and unread:
         raise CalibrationError(f"{unread[0]} fits none of the files of the map: {', '.join(mapped.files)}")
-    groups = []
+    groups: list[Group] = []
     for trial, sources in found.items():
         if len(paths) == 1 and sources[0][0] in mapped.files and not set("*{") & set(sources[0][0]):
             trial = paths[0].stem  # a single file has a name of its own
