@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -19,6 +20,10 @@ OURS, THEIRS = "ours", "theirs"
 """Whose a row is: measured in the virtual pool, or the paper's on hardware."""
 
 
+WIDE = 120
+"""Columns of a screen that has room for intervals."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Shown:
     """What a person reads of an experiment."""
@@ -33,13 +38,14 @@ class Shown:
 
 
 def print_shown(shown: Shown, console: Console) -> None:
-    """On a screen."""
+    """On a screen; one that is narrow shows no intervals of the table."""
     console.print(shown.headline, highlight=False)
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for k, head in enumerate(shown.heads):
         table.add_column(head, justify="right" if k else "left")
     for row, whose in shown.rows:
-        table.add_row(*row, style="dim" if whose == THEIRS else None)
+        cells = row if console.width >= WIDE else [re.sub(r" \[.+\]$", "", cell) for cell in row]
+        table.add_row(*cells, style="dim" if whose == THEIRS else None)
     console.print(table)
     console.print(shown.note, highlight=False)
     for sentence in shown.sentences:
