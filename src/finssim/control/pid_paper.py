@@ -15,7 +15,7 @@ from finssim.geometry.frames import FROM_CONTROLLER, TO_CONTROLLER
 from finssim.geometry.rotations import quat_inverse_rotate, quat_yaw, wrap_angle
 from finssim.vehicles import Vehicle
 
-__all__ = ["PAPER_PROFILE", "PaperMemory", "PaperPid", "PaperProfile"]
+__all__ = ["PAPER_PROFILE", "TRAJECTORY_PROFILE", "PaperMemory", "PaperPid", "PaperProfile"]
 
 Array = npt.NDArray[np.float64]
 
@@ -38,6 +38,8 @@ class PaperProfile(NamedTuple):
     """What a period leaves of the filtered derivative."""
     yaw_dead_band: float = 5.0
     """Heading error that is ignored [deg]."""
+    unit: float = 7.0
+    """Force at an effort of one [N], and moment [N m]."""
 
 
 PAPER_PROFILE = PaperProfile(
@@ -48,6 +50,21 @@ PAPER_PROFILE = PaperProfile(
     axis_range=(10.0, 20.0, 20.0, 5.0),
 )
 """'Position + yaw (hardware)' of the published configuration; what it leaves out is the published core's default."""
+
+TRAJECTORY_PROFILE = PaperProfile(
+    kp=(12.0, 20.0, 20.0, 0.0),
+    ki=(0.0, 0.1, 0.1, 0.0),
+    kd=(1.0, 0.8, 0.8, 0.0),
+    output_limit=(250.0, 30.0, 30.0, 0.10),
+    axis_range=(20.0, 20.0, 20.0, 200.0),
+    integral_decay=0.985,
+    unit=19.8,
+)
+"""'Trajectory (hardware)' of the published configuration: what T2's baseline ran with; it leaves the heading alone.
+
+An effort of one is read as all four slanted thrusters at their limit, 4 * 7 N * cos 45°: the errors in the simulator
+are then 0.12 to 0.19 m, near the published 0.17 to 0.21 m; with 7 N they would be twice as large.
+"""
 
 
 @dataclass(frozen=True)
@@ -87,7 +104,11 @@ class PaperPid:
 
     @classmethod
     def from_vehicle(
-        cls, vehicle: Vehicle, hydrodynamics: str = "calibrated", period: float = 1.0 / 60.0
+        cls,
+        vehicle: Vehicle,
+        hydrodynamics: str = "calibrated",
+        period: float = 1.0 / 60.0,
+        profile: PaperProfile = PAPER_PROFILE,
     ) -> PaperPid:
         """Controller of a vehicle; the published gains do not depend on its hydrodynamics.
 
@@ -96,7 +117,8 @@ class PaperPid:
         """
         if not period > 0.0:
             raise ControlError(f"period is {period}, expected a positive time in seconds")
-        return cls(reference=np.asarray(vehicle.wrench_reference, float), period=period)
+        reference = np.asarray(vehicle.wrench_reference, float)
+        return cls(reference=reference, period=period, profile=profile, unit=profile.unit)
 
     def reset(self, n: int | None = None) -> PaperMemory:
         """Memory before the first command, for one vehicle or for a batch of n."""

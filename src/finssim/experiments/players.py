@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.control.controllers import CONTROLLERS, controller
+from finssim.control.controllers import CONTROLLERS, controller_for
 from finssim.control.modes import mode_from_dict
 from finssim.control.policy import Policy
 from finssim.control.tracking import Controller, Goal
@@ -94,10 +94,10 @@ class PidPlayer:
     action = "wrench6"
     wrench_scale = 1.0
 
-    def __init__(self, name: str, vehicle: Vehicle) -> None:
-        """Make the controller of that name for a vehicle."""
+    def __init__(self, name: str, vehicle: Vehicle, task: str = "t1") -> None:
+        """Make the controller of that name for a vehicle and a task."""
         self.name = name
-        self.controller: Controller = controller(name, vehicle)
+        self.controller: Controller = controller_for(task, name, vehicle)
         self.period = self.controller.period
         self._limits = np.asarray(vehicle.wrench_limits, dtype=float)
 
@@ -121,5 +121,5 @@ class PidPlayer:
 def make_player(name_or_directory: str | Path, vehicle: Vehicle, task: Task) -> PolicyPlayer | PidPlayer:
     """A PID by its name, or the policy of a directory."""
     if str(name_or_directory) in CONTROLLERS:
-        return PidPlayer(str(name_or_directory), vehicle)
+        return PidPlayer(str(name_or_directory), vehicle, task.name)
     return PolicyPlayer(name_or_directory, vehicle, task)

@@ -1,0 +1,131 @@
+"""`finssim evaluate --task t2`: trajectories followed in every plant, as table, JSON and files."""
+
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from finssim.control.controllers import controller_for
+from finssim.control.pid_paper import PAPER_PROFILE, TRAJECTORY_PROFILE
+from finssim.control.trajectories import TRAJECTORIES
+from finssim.experiments.evaluate import evaluate, evaluate_controller
+from finssim.experiments.paper_results import PAPER_T2, paper_t2_row
+from finssim.experiments.plants import load_plant
+from finssim.experiments.players import make_player
+from finssim.experiments.t2_figure import draw_tracking
+from finssim.experiments.t2_metrics import MEASURES
+from finssim.experiments.t2_table import by_trajectory
+from finssim.experiments.t2_trials import T2_TRAJECTORIES, run_tracking
+from finssim.tasks import TrajectoryTracking
+from finssim.vehicles import load_vehicle
+
+FINSROV = load_vehicle("finsrov")
+TASK = TrajectoryTracking()
+NOMINAL = load_plant("nominal")
+
+
+@pytest.fixture(scope="module")
+def nominal(tmp_path_factory):
+    """One evaluation of the PID on the four trajectories, written to a folder."""
+    folder = tmp_path_factory.mktemp("t2") / "e"
+    (evaluation,) = evaluate("pid", task="t2", out=folder, console=Console(quiet=True))
+    return folder, evaluation
+
+
+def test_the_pid_follows_the_published_trajectories_within_a_centimetre(nominal):
+    """In the nominal plant; the eight begins with a jump in velocity from rest, which costs most."""
+    _, evaluation = nominal
+    for name, row in by_trajectory(evaluation.result["per_trial"]).items():
+        assert row["horizontal_rmse_m"] < 0.01 and row["vertical_rmse_m"] < 0.001, name
+        assert row["complete"] == row["trials"] == 1
+    assert (
+        evaluation.result["horizontal_rmse_m"]
+        < paper_t2_row("calibrated + DR", "lemniscate")["horizontal_rmse_m"]
+    )
+
+
+def test_a_directory_holds_result_figure_and_states(nominal):
+    folder, evaluation = nominal
+    stored = json.loads((folder / "evaluation.json").read_text(encoding="utf-8"))
+    assert stored == evaluation.result
+    assert [trial["trajectory"] for trial in stored["per_trial"]] == list(T2_TRAJECTORIES)
+    assert all(set(MEASURES) <= trial.keys() for trial in stored["per_trial"])
+    assert (folder / "trajectories.png").read_bytes().startswith(b"\x89PNG")
+    assert any((folder / "trajectories").iterdir())
+
+
+def test_the_table_has_a_row_per_trajectory_and_the_papers(nominal, capsys):
+    from finssim.experiments.t2_table import print_tracking, print_tracking_plants
+
+    result = nominal[1].result
+    print_tracking(result, Console(width=80))
+    out = capsys.readouterr().out
+    assert all(f"{name} " in out and f"paper, {name}" in out for name in T2_TRAJECTORIES)
+    assert "0.182" in out and "…" not in out
+    print_tracking_plants([result, result], Console(width=80))
+    assert "nominal, ellipse" in capsys.readouterr().out
+
+
+def test_a_current_and_the_number_of_trials_are_heard():
+    """Still water differs from a current, and the trajectories are taken in turn."""
+    guides = [TRAJECTORIES["straight"]]
+    player = make_player("pid", FINSROV, TASK)
+    still, current = (
+        run_tracking(player, TASK, FINSROV, load_plant(plant), trials=2, guides=guides)
+        for plant in ("nominal", "current")
+    )
+    assert np.abs(still.position[:, 0] - still.position[:, 1]).max() == 0.0
+    assert np.abs(current.position[:, 0] - current.position[:, 1]).max() > 1e-3
+    assert current.measures()[0]["horizontal_rmse_m"] > 2.0 * still.measures()[0]["horizontal_rmse_m"]
+
+
+def test_a_feed_forward_of_acceleration_halves_the_error():
+    """The straight line within 1 mm; without the goal's acceleration it was 2.6 mm."""
+    player = make_player("pid", FINSROV, TASK)
+    trials = run_tracking(player, TASK, FINSROV, NOMINAL, guides=[TRAJECTORIES["straight"]], trials=1)
+    assert trials.measures()[0]["horizontal_rmse_m"] < 1e-3
+
+
+def test_the_published_baseline_has_a_profile_for_trajectories():
+    """As published: other gains for T2; its errors are those of centimetres to decimetres that the paper reports."""
+    assert controller_for("t2", "pid-paper", FINSROV).profile == TRAJECTORY_PROFILE
+    assert controller_for("t1", "pid-paper", FINSROV).profile == PAPER_PROFILE
+    player = make_player("pid-paper", FINSROV, TASK)
+    trials = run_tracking(player, TASK, FINSROV, NOMINAL, guides=[TRAJECTORIES["straight"]], trials=1)
+    published = paper_t2_row("PID", "straight")["horizontal_rmse_m"]
+    assert trials.measures()[0]["horizontal_rmse_m"] == pytest.approx(published, rel=0.2)
+
+
+def test_the_figure_has_a_row_for_each_trajectory(nominal):
+    trials = nominal[1].trials
+    runs = [(guide, trials.t, trials.position[:, i]) for i, guide in enumerate(trials.guides)]
+    figure = draw_tracking({"a": runs, "b": runs}, "title")
+    assert len(figure.axes) == 2 * len(T2_TRAJECTORIES)
+    assert [axes.get_title(loc="left") for axes in figure.axes[::2]] == list(T2_TRAJECTORIES)
+
+
+def test_the_papers_table_is_transcribed_whole():
+    """Three controllers on four trajectories; the best horizontal error of each is that of + DR."""
+    assert set(PAPER_T2) == {"calibrated + DR", "calibrated", "PID"}
+    for name in T2_TRAJECTORIES:
+        best = min(PAPER_T2[kind][name][0] for kind in PAPER_T2)
+        assert PAPER_T2["calibrated + DR"][name][0] == best
+
+
+def test_equal_seeds_are_equal_trials():
+    guides = [TRAJECTORIES["lemniscate"]]
+    plant = load_plant("randomised")
+    player = make_player("pid", FINSROV, TASK)
+    one, again, other = (
+        run_tracking(player, TASK, FINSROV, plant, trials=1, guides=guides, seed=seed).position
+        for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(one, again)
+    assert np.abs(one - other).max() > 1e-4
+
+
+def test_the_result_says_who_was_tried_where():
+    result = evaluate_controller("pid", NOMINAL, task="t2", trials=1).result
+    assert (result["task"], result["trials"], result["plant"]["name"]) == ("t2", 1, "nominal")
+    assert result["vehicle"]["sha256"] == FINSROV.sha256
