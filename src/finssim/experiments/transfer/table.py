@@ -20,7 +20,7 @@ OURS, THEIRS = "ours", "theirs"
 """Whose a row is: measured in the virtual pool, or the paper's on hardware."""
 
 
-WIDE = 120
+WIDE = 160
 """Columns of a screen that has room for intervals."""
 
 
