@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
@@ -19,8 +22,12 @@ Array = npt.NDArray[np.float64]
 
 MARGIN = 0.15
 """White around a tag, part of its edge."""
-RAYS = 1
-"""A pixel's rays along each axis near tags: places corners to 0.03 px while the vehicle moves at 0.2 m/s."""
+STILL = 0.05
+"""Motion during the exposure that is left out [px]."""
+SLOW = 0.4
+"""Motion up to which one ray a pixel will do, where corners are placed to 0.03 px; beyond it, two by two [px]."""
+REACH = 0.2
+"""Of a tag's corner from the body's origin, for the motion that a turn makes [m]."""
 FREEBOARD = 0.1
 """Of the pool's edge above the water [m]."""
 
@@ -60,24 +67,34 @@ class PictureCamera:
             ),
             ripples=ripples,
             sensor=oc.Sensor(shutter=exposure),
-            samples=RAYS,
+            samples=1,
         )
-        self._camera = oc.OverheadCamera(scene)
+        self._slow = oc.OverheadCamera(scene)
+        self._fast = oc.OverheadCamera(replace(scene, samples=2))
+        height = float(site.interface.distance(site.camera.position))
+        self._per_metre = site.camera.lens.fx / (height + 0.25 * basin.depth)
 
     def picture(
         self, start: tuple[Array, Array], end: tuple[Array, Array], middle: float, sequence: int
     ) -> Picture:
         """Expose; arguments as of `CornerCamera.picture`."""
-        image = self._camera.render(
-            tags=[self._tag(tag, mount, start, end) for tag, mount in self._tags.mounts.items()],
+        motion = self._motion(start, end)
+        moves = motion > STILL
+        image = (self._slow if motion < SLOW else self._fast).render(
+            tags=[self._tag(t, m, start, end if moves else None) for t, m in self._tags.mounts.items()],
             time=middle,
             seed=(self._seed * 1_000_003 + sequence) % 2**31,
             region="tags",
         )
         return Picture(middle, sequence, image=image)
 
+    def _motion(self, start: tuple[Array, Array], end: tuple[Array, Array]) -> float:
+        """About how far a tag moves in the picture [px]."""
+        turn = 2.0 * math.sqrt(max(1.0 - float(start[1] @ end[1]) ** 2, 0.0))
+        return self._per_metre * (float(np.linalg.norm(end[0] - start[0])) + REACH * turn)
+
     def _tag(
-        self, tag: int, mount: Mount, start: tuple[Array, Array], end: tuple[Array, Array]
+        self, tag: int, mount: Mount, start: tuple[Array, Array], end: tuple[Array, Array] | None
     ) -> oc.TagInScene:
         family = family_named(self._tags.family)
         return oc.TagInScene(
@@ -86,7 +103,7 @@ class PictureCamera:
             border_cells=family.border,
             margin=MARGIN * self._tags.edge,
             pose=_placed(start, mount.position, mount.orientation),
-            end=_placed(end, mount.position, mount.orientation),
+            end=None if end is None else _placed(end, mount.position, mount.orientation),
         )
 
 

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 import typer
 
+from finssim.control.guidance import Station
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.localization.pool import Pool, write_pool
 from finssim.pool.draw_plant import draw_plant
@@ -48,17 +49,16 @@ class PoolPlan:
     calibrated: Pool | None
     """What a robot may know of the camera."""
 
-    def world(self, camera: Any, *, start: str, seed: int, truth: Path | None) -> VirtualPool:
+    def world(self, camera: Any, *, start: Station, seed: int, truth: Path | None) -> VirtualPool:
         """The living pool.
 
         Args:
             camera: Of the pool; None for none.
-            start: "x,y,z,yaw_deg", world frame [m], [deg].
+            start: Where the vehicle begins, at rest and level.
             seed: Of instruments and wire.
             truth: File that is written.
         """
-        station = station_of(start)
-        pose = np.asarray(station.position), quat_from_yaw(station.yaw)
+        pose = np.asarray(start.position), quat_from_yaw(start.yaw)
         return VirtualPool(self.vehicle, self.spec, camera=camera, start=pose, seed=seed, truth=truth)
 
 
@@ -112,6 +112,7 @@ def run(
 ) -> None:
     """Run a virtual pool; arguments as of the command."""
     logging.basicConfig(level=logging.WARNING, format="finssim: %(message)s", stream=sys.stderr)
+    begin = station_of(start)
     plan = make_plan(vehicle, plant, severity, camera=camera, seed=seed)
     if pictures not in ("udp", "shm"):
         raise LinkError(f"pictures over '{pictures}': give udp or shm")
@@ -122,7 +123,7 @@ def run(
             raise PlantSpecError("--pool-file tells of the camera, and --camera none has none: leave one out")
         write_pool(plan.calibrated, pool_file)
     _tell_plant(plan, pool_file, truth)
-    world: Callable[[Any], VirtualPool] = lambda eye: plan.world(eye, start=start, seed=seed, truth=truth)  # noqa: E731
+    world: Callable[[Any], VirtualPool] = lambda eye: plan.world(eye, start=begin, seed=seed, truth=truth)  # noqa: E731
     longest = math.inf if duration is None else duration
     if lockstep:
         _lockstep(plan, world, (bind, port + 2), longest)

@@ -22,8 +22,10 @@ Array = npt.NDArray[np.float64]
 
 HEIGHT = 1.4
 """Of the camera above the water, for a pool of 4 m x 2 m [m]. The paper's hung at 1.21 m, from where its lens does not
-see the ends of the pool; from here everything in a 4 m x 2 m pool is seen from 0.5 m down, and tags of a vehicle that
-keeps its middle 0.2 m off the walls from 0.2 m down."""
+see the ends of the pool. From here it sees everything that is 0.4 m under the surface, and between the walls' last
+0.23 m everything from 0.1 m down."""
+SWIM = 0.4
+"""Where tags usually are, part of the pool's depth."""
 PAPER_POOL = 4.0, 2.0
 """[m]"""
 LATENCY = 0.045
@@ -113,9 +115,13 @@ def true_site(basin: Basin | None = None) -> Pool:
     basin = basin or Basin()
     lens = paper_lens()
     height = HEIGHT * max(basin.length / PAPER_POOL[0], basin.width / PAPER_POOL[1])
-    # So far beside the middle that the middle of the picture, not the lens's axis, looks at the middle of the pool.
-    x = height * (lens.cx - 0.5 * (lens.width - 1)) / lens.fx
-    y = -height * (lens.cy - 0.5 * (lens.height - 1)) / lens.fy
+    # So far beside the middle that both ends of the pool are as far from the edges of the picture.
+    middle = 0.5 * (lens.width - 1), 0.5 * (lens.height - 1)
+    edges = [[0.0, middle[1]], [2.0 * middle[0], middle[1]], [middle[0], 0.0], [middle[0], 2.0 * middle[1]]]
+    left, right, top, bottom = lens.rays(edges)[0]
+    distance = height + SWIM * basin.depth / Interface.water(0.0).index_far
+    x = -0.5 * distance * float(left[0] / left[2] + right[0] / right[2])
+    y = 0.5 * distance * float(top[1] / top[2] + bottom[1] / bottom[2])
     camera = Camera(lens, np.array([x, y, basin.depth + height]), np.array([1.0, 0.0, 0.0, 0.0]))
     return Pool(camera, Interface.water(basin.depth), LATENCY)
 
