@@ -127,7 +127,11 @@ class Codec:
         return self.definitions.fields(name)
 
 
-@cache
 def codec_of(distro: str | None = None) -> Codec:
-    """The process's codec for a release; that of `ROS_DISTRO` where none is named."""
-    return Codec(distro or distro_of().name)
+    """The process's one codec for a release; that of `ROS_DISTRO` where none is named."""
+    return _codec(distro or distro_of().name)
+
+
+@cache
+def _codec(distro: str) -> Codec:
+    return Codec(distro)
