@@ -14,6 +14,7 @@ from finssim.robot.link.decoder import MCU, Decoder
 from finssim.robot.link.frames import encode_telemetry
 from finssim.robot.lockstep_codec import decode_request, encode_delivery, receive
 from finssim.robot.messages import Delivery
+from finssim.robot.record_reader import open_record
 from finssim.vehicles import load_vehicle
 from reference.rounds import Rounds, overhead, without_latency
 
@@ -82,7 +83,9 @@ def test_an_armed_run_in_lockstep_commands_records_and_tells(capsys, tmp_path, p
     assert status == 0 and summary["state"] == "armed" and summary["missed"] == 0
     assert 0.1 < summary["position_rms_m"] < 1.0 and summary["steps"] == 180
     assert any(enabled) and enabled[-3:] == [False] * 3
-    assert record.stat().st_size > 10_000
+    names = ("telemetry", "odom", "goal", "thruster_cmd", "thruster_state", "policy_info", "camera/tags")
+    with open_record(record) as kept:
+        assert set(kept.topics) >= {f"/finsrov/{name}" for name in names} and not kept.cut
 
 
 def test_a_run_that_is_not_armed_says_so_and_turns_nothing(capsys, pool_file):

@@ -15,7 +15,7 @@ from finssim.robot.bridge import Bridge
 from finssim.robot.counters import Counters, Ticks
 from finssim.robot.intake import Intake
 from finssim.robot.link.frames import encode_command
-from finssim.robot.messages import Picture
+from finssim.robot.messages import Picture, ThrusterCommand
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import Pilot
 from finssim.robot.robot import Reading
@@ -95,7 +95,7 @@ class Runtime:
         self._begin(now, reading)
         self._decide(now, reading)
         command = self.bridge.tick(now)
-        self._record(now, reading)
+        self._record(now, reading, command)
         return [encode_command(command)]
 
     def sent(self, now: float) -> None:
@@ -107,6 +107,8 @@ class Runtime:
         self.started = now
         self._ticks = Ticks(now)
         self.pilot.reset()
+        if self.recorder is not None:
+            self.recorder.event(now, "trial_start", self.guide.name)
 
     def stop(self, now: float, frames: int = 3) -> list[bytes]:
         """Disarm; returns frames without thrust to send."""
@@ -149,7 +151,15 @@ class Runtime:
         if self.recorder is not None:
             goal = self.guide.at(now - self.started)
             self.recorder.goal(now, goal.position, float(goal.yaw))
-            self.recorder.command(now, force, self.pilot.name)
+            self.recorder.command(now, force, self.pilot.name, self.vehicle.control_matrix @ force)
+            self.recorder.policy(
+                now,
+                self.pilot.name,
+                period=self.pilot.period,
+                missed=self.counters.missed,
+                force=force,
+                vehicle_sha256=self.vehicle.sha256,
+            )
 
     def _asked(self, now: float, reading: Reading) -> Array | None:
         """What the pilot wants; None, and the vehicle stopped, where it fails."""
@@ -165,10 +175,19 @@ class Runtime:
             return None
         return force
 
-    def _record(self, now: float, reading: Reading) -> None:
-        if self.recorder is None:
-            return
-        self.recorder.reading(now, reading)
+    def _record(self, now: float, reading: Reading, command: ThrusterCommand) -> None:
+        bridge = self.bridge
+        if self.recorder is not None:
+            self.recorder.reading(now, reading)
+            self.recorder.thrusters(
+                now,
+                bridge.state,
+                reason=bridge.reason,
+                source=bridge.source,
+                requested=bridge.requested,
+                force=bridge.force,
+                normalised=command.normalised,
+            )
         self._record_events()
 
     def _record_events(self) -> None:
