@@ -101,7 +101,12 @@ def demo(
 
 @app.command()
 def train(
-    task: Annotated[str, typer.Argument(help="Task to learn: t1 (station keeping).", metavar="TASK")],
+    task: Annotated[
+        str,
+        typer.Argument(
+            help="Task to learn: t1 (station keeping) or t2 (trajectory tracking).", metavar="TASK"
+        ),
+    ],
     out: Annotated[
         Path, typer.Option(help="Directory of the policy; an earlier policy there is replaced when done.")
     ],
@@ -150,7 +155,8 @@ def evaluate(
         str, typer.Argument(help="A policy's directory, or pid, or pid-paper.", metavar="DIR|pid|pid-paper")
     ],
     task: Annotated[
-        str, typer.Option(help="Task to be tried on: t1 (station keeping).", metavar="TASK")
+        str,
+        typer.Option(help="Task to be tried on: t1 (station keeping) or t2 (trajectories).", metavar="TASK"),
     ] = "t1",
     vehicle: Vehicle = "finsrov",
     hydrodynamics: Hydrodynamics = "calibrated",
@@ -162,8 +168,20 @@ def evaluate(
             metavar="FILE|NAME",
         ),
     ] = None,
+    trajectory: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="What t2 follows: straight, broken, ellipse, lemniscate (all four if not given), circle, "
+            "figure_eight, helix, or a YAML or CSV file. May be given several times.",
+            metavar="FILE|NAME",
+        ),
+    ] = None,
     trials: Annotated[
-        int | None, typer.Option(help="Trials of 60 s in each plant; 8 are the published setpoints.", min=1)
+        int | None,
+        typer.Option(
+            help="Trials in each plant; if not given, t1's eight setpoints for 60 s, or each trajectory, once.",
+            min=1,
+        ),
     ] = None,
     seed: Seed = 42,
     out: Annotated[
@@ -171,9 +189,11 @@ def evaluate(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Try a controller: success, errors [m, deg], time to settle [s], tracking cost.
+    """Try a controller: success, errors [m, deg], time to settle [s]; or errors along trajectories [m].
 
     Example: finssim evaluate runs/hold --plant current --trials 64 --out runs/hold-current
+
+    Example: finssim evaluate runs/track --task t2 --trajectory ellipse --trajectory my-way.csv
     """
     start_warp()
     from finssim.experiments.evaluate import evaluate as run
@@ -184,6 +204,7 @@ def evaluate(
         vehicle=vehicle,
         hydrodynamics=hydrodynamics,
         plant=plant or "nominal",
+        trajectories=trajectory or (),
         trials=trials,
         seed=seed,
         out=out,

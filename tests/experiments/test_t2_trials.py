@@ -7,9 +7,10 @@ import pytest
 from rich.console import Console
 
 from finssim.control.controllers import controller_for
+from finssim.control.errors import ControlError
 from finssim.control.pid_paper import PAPER_PROFILE, TRAJECTORY_PROFILE
 from finssim.control.trajectories import TRAJECTORIES
-from finssim.experiments.evaluate import evaluate, evaluate_controller
+from finssim.experiments.evaluate import EvaluationError, evaluate, evaluate_controller
 from finssim.experiments.paper_results import PAPER_T2, paper_t2_row
 from finssim.experiments.plants import load_plant
 from finssim.experiments.players import make_player
@@ -129,3 +130,17 @@ def test_the_result_says_who_was_tried_where():
     result = evaluate_controller("pid", NOMINAL, task="t2", trials=1).result
     assert (result["task"], result["trials"], result["plant"]["name"]) == ("t2", 1, "nominal")
     assert result["vehicle"]["sha256"] == FINSROV.sha256
+
+
+def test_ones_own_trajectory_is_followed(tmp_path):
+    """A file beside a name, in turn; T1 follows none, and a way out of the pool is refused."""
+    own = tmp_path / "own.csv"
+    own.write_text("t,x,y,z\n0,0,0,-0.5\n10,0.3,0,-0.5\n20,0.3,0.3,-0.6\n")
+    rows = evaluate_controller("pid", NOMINAL, task="t2", trajectories=[own, "straight"]).result["per_trial"]
+    assert [row["trajectory"] for row in rows] == ["own", "straight"]
+    assert max(row["p95_m"] for row in rows) < 0.02
+    with pytest.raises(EvaluationError, match="t1' follows no trajectory"):
+        evaluate_controller("pid", NOMINAL, task="t1", trajectories=[own])
+    own.write_text("t,x,y,z\n0,0,0,-0.5\n60,0,1.5,-0.5\n")
+    with pytest.raises(ControlError, match="own: y is 1"):
+        evaluate_controller("pid", NOMINAL, task="t2", trajectories=[own])

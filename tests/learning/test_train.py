@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from finssim.control.modes import action_mode
+from finssim.control.observe_t2 import SCHEMA as SCHEMA_T2
 from finssim.control.policy import Policy
 from finssim.engine.ranges_file import RangesError
 from finssim.experiments.evaluate import evaluate_controller
@@ -186,3 +187,22 @@ def test_a_policy_trained_from_nothing_holds_the_published_setpoints(tmp_path):
     result = evaluate_controller(train("t1", out=tmp_path / "p", seed=1), load_plant("nominal")).result
     assert (result["success"], result["trials"]) == (8, 8)
     assert result["e_p_m"] <= 0.02 and result["e_psi_deg"] <= 1.5
+
+
+def test_trajectory_tracking_is_trained_too(tmp_path):
+    """T2's own settings and noise, in a policy that the robot's observation fits."""
+    folder = train("t2", out=tmp_path / "t2", seed=1, randomize="hold_for_position", **TINY)
+    policy = Policy.load(folder, task={"name": "t2", "observation": SCHEMA_T2.model_dump(mode="json")})
+    assert policy.act(np.zeros((2, 30))).shape == (2, 6)
+    training = yaml.safe_load((folder / "policy.yaml").read_text(encoding="utf-8"))["training"]
+    assert training["discount"] == ppo.SETTINGS["t2"].discount != ppo.SETTINGS["t1"].discount
+    assert training["task"]["training_noise"]["position_std"] == 0.01
+    assert ppo.settings_for("t2", randomized=True).steps > ppo.settings_for("t2").steps
+
+
+@pytest.mark.long
+def test_a_short_training_follows_the_straight_line(tmp_path):
+    """After half of the usual steps: within 3 cm, several times better than the paper's best on hardware."""
+    folder = train("t2", out=tmp_path / "t2", seed=1, steps=650_000)
+    result = evaluate_controller(folder, load_plant("nominal"), task="t2", trials=1).result
+    assert result["horizontal_rmse_m"] < 0.03 and result["vertical_rmse_m"] < 0.03

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from rich.console import Console
 from rich.progress import Progress
 
+from finssim.control.trajectories import load_trajectory
 from finssim.experiments.metrics import summarize
 from finssim.experiments.plants import Plant, load_plant
 from finssim.experiments.players import make_player
@@ -60,6 +61,7 @@ def evaluate(
     vehicle: str | Vehicle = "finsrov",
     hydrodynamics: str = "calibrated",
     plant: str | Path | Sequence[str | Path] = "nominal",
+    trajectories: Sequence[str | Path] = (),
     trials: int | None = None,
     seed: int = 42,
     out: Path | None = None,
@@ -74,6 +76,7 @@ def evaluate(
         vehicle: A vehicle, a catalogue name or a file.
         hydrodynamics: Model, unless the plant names one.
         plant: Name or file, or several.
+        trajectories: Names or files of what is followed in T2, in turn; the published four if none.
         trials: How many in each plant; the eight setpoints, or the four trajectories, once if None.
         seed: Of what the plant draws.
         out: Directory for `evaluation.json`, the figure and the trajectories; an earlier evaluation is replaced.
@@ -92,6 +95,7 @@ def evaluate(
         "task": task,
         "vehicle": vehicle,
         "hydrodynamics": hydrodynamics,
+        "trajectories": trajectories,
         "trials": trials,
         "seed": seed,
     }
@@ -146,18 +150,22 @@ def evaluate_controller(
     task: str = "t1",
     vehicle: str | Vehicle = "finsrov",
     hydrodynamics: str = "calibrated",
+    trajectories: Sequence[str | Path] = (),
     trials: int | None = None,
     seed: int = 42,
     record: Path | None = None,
 ) -> Evaluation:
     """Run the trials and measure them; arguments as `evaluate`."""
     form = _form(task)
-    trials = form.count if trials is None else trials
+    if trajectories and task != "t2":
+        raise EvaluationError(f"task '{task}' follows no trajectory: leave it out, or evaluate t2")
+    trials = (len(trajectories) or form.count) if trials is None else trials
     if trials < 1:
         raise EvaluationError(f"trials is {trials}, expected 1 or more")
     start_warp()
     body = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
     the_task = TASKS[task]()
+    guides = {"guides": [load_trajectory(x, vehicle=body) for x in trajectories]} if trajectories else {}
     player = make_player(controller, body, the_task)
     screen = Console(stderr=True)
     with Progress(console=screen, transient=True, disable=not screen.is_terminal) as progress:
@@ -172,6 +180,7 @@ def evaluate_controller(
             seed=seed,
             record=record,
             show=lambda part: progress.update(bar, completed=part),
+            **guides,
         )
     result = {
         "controller": player.describe(),
