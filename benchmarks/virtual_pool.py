@@ -1,4 +1,4 @@
-"""The virtual pool in figures: `python benchmarks/virtual_pool.py [plants] [speed] [memory] [--seeds 20] [--json FILE]`.
+"""The pool in figures: `python benchmarks/virtual_pool.py [plants] [speed] [memory] [--seeds 20] [--json FILE]`.
 
 Parts:
     plants  steady speed of drawn plants along one axis, over the file's, at 0.1, 0.3 and 0.7 of full power
