@@ -1,4 +1,4 @@
-"""The nodes of a robot, written against rclpy: the real one in a sourced ROS 2, our shim elsewhere."""
+"""The robot's nodes, each a module with `main`. Importing this package makes `import rclpy` work, real or ours."""
 
 from finssim.ros2.backend import activate
 

@@ -1,0 +1,162 @@
+"""Messages of ROS 2 to the robot's own values. What is malformed comes out as a sentence or None; nothing raises."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.control.guidance import Station
+from finssim.geometry.rotations import quat_yaw
+from finssim.robot.messages import Picture, TagCorners, Telemetry
+from finssim.robot.record_pictures import picture_of
+from finssim.robot.robot import Reading
+
+__all__ = [
+    "compressed_of",
+    "force_of",
+    "image_of",
+    "nanoseconds",
+    "reading_of",
+    "station_of_pose",
+    "tags_of",
+    "telemetry_of",
+    "wrench_of",
+]
+
+Array = npt.NDArray[np.float64]
+
+LEVEL = math.radians(20.0)
+"""A goal's roll and pitch must be smaller: vehicles here hold level poses."""
+GRAY = {"rgb8": (0.299, 0.587, 0.114), "bgr8": (0.114, 0.587, 0.299)}
+"""Weights of the channels in brightness (ITU-R BT.601)."""
+MOST_TAGS = 1000
+
+
+def nanoseconds(stamp: Any) -> int:
+    """A stamp [ns]."""
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def xyz(v: Any) -> tuple[float, float, float]:
+    """A vector's or point's numbers."""
+    return float(v.x), float(v.y), float(v.z)
+
+
+def xyzw(q: Any) -> tuple[float, float, float, float]:
+    """A quaternion's numbers."""
+    return float(q.x), float(q.y), float(q.z), float(q.w)
+
+
+def telemetry_of(message: Any) -> Telemetry:
+    """The snapshot in a HardwareTelemetry; what is no number is left to those who use it, as on the wire."""
+    rpm = tuple(float(v) for v in message.motor_rpm)
+    return Telemetry(
+        sequence=int(message.sequence),
+        mcu_ms=int(message.mcu_ms),
+        quaternion=xyzw(message.orientation),
+        gyro=xyz(message.angular_velocity),
+        accel=xyz(message.linear_acceleration),
+        depth=float(message.depth),
+        pressure=float(message.pressure),
+        flags=int(message.status_flags),
+        motor_rpm=rpm or None,
+    )
+
+
+def force_of(message: Any, names: Sequence[str]) -> Array | str:
+    """The thrusts of a ThrusterCommand in canonical order [N], or why it cannot be used."""
+    told, force = list(message.names), [float(f) for f in message.force]
+    if sorted(told) != sorted(names):
+        return f"it names the thrusters {', '.join(told) or 'none'}, expected {', '.join(names)}, each once"
+    if len(force) != len(told):
+        return f"it has {len(force)} thrusts for {len(told)} thrusters"
+    by_name = dict(zip(told, force, strict=True))
+    ordered = np.array([by_name[name] for name in names])
+    return ordered if np.isfinite(ordered).all() else "it holds a thrust that is not finite"
+
+
+def wrench_of(message: Any) -> Array | None:
+    """The wrench of a WrenchStamped, body frame [N, N m], (6,); None where it is of another frame or not finite."""
+    tau = np.array([*xyz(message.wrench.force), *xyz(message.wrench.torque)])
+    fits = message.header.frame_id in ("", "base_link")
+    return tau if fits and np.isfinite(tau).all() else None
+
+
+def station_of_pose(message: Any) -> Station | str:
+    """The station of a PoseStamped, or why it is none."""
+    frame = message.header.frame_id
+    if frame not in ("", "map", "odom"):
+        return f"a goal in frame '{frame}', expected map"
+    place, q = np.array(xyz(message.pose.position)), np.array(xyzw(message.pose.orientation))
+    if not (np.isfinite(place).all() and np.isfinite(q).all()):
+        return "a goal that is not finite"
+    length = float(np.linalg.norm(q))
+    if not 0.9 < length < 1.1:
+        return "a goal whose orientation is no unit quaternion"
+    x, y, _, _ = q / length
+    # The z axis' lean: its cosine is 1 - 2 (x² + y²), whatever the yaw.
+    if 1.0 - 2.0 * (x * x + y * y) < math.cos(LEVEL):
+        return "a goal that is not level: give a turn about z alone"
+    return Station((float(place[0]), float(place[1]), float(place[2])), float(quat_yaw(q / length)))
+
+
+def reading_of(status: Any, odometry: Any | None, time: float) -> Reading:
+    """The reading of an EstimatorStatus and the Odometry of the same stamp; without one nothing is known.
+
+    Args:
+        status: EstimatorStatus.
+        odometry: Odometry; None: position and velocity are NaN.
+        time: Of its stamp, robot's clock [s].
+    """
+    std = np.array([*status.position_std, *status.velocity_std, status.yaw_std], float)
+    if odometry is None:
+        place, q, nu = np.full(3, math.nan), np.array([0.0, 0.0, 0.0, 1.0]), np.full(6, math.nan)
+    else:
+        pose, twist = odometry.pose.pose, odometry.twist.twist
+        place, q = np.array(xyz(pose.position)), np.array(xyzw(pose.orientation))
+        nu = np.array([*xyz(twist.linear), *xyz(twist.angular)])
+    whole = bool(np.isfinite(place).all() and np.isfinite(nu).all() and abs(np.linalg.norm(q) - 1.0) < 0.01)
+    reason = str(status.reason) or ("" if whole else "no odometry")
+    return Reading(time, place, q, nu, bool(status.ready) and whole, str(status.mode), reason, std)
+
+
+def image_of(message: Any) -> npt.NDArray[np.uint8] | None:
+    """The gray picture in an Image of encoding mono8, rgb8 or bgr8, (rows, columns); None where it is none."""
+    channels = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3}.get(message.encoding, 0)
+    rows, columns, step = int(message.height), int(message.width), int(message.step)
+    data = np.frombuffer(memoryview(message.data), np.uint8)
+    if not channels or rows * columns == 0 or step < channels * columns or len(data) != rows * step:
+        return None
+    pixels = data.reshape(rows, step)[:, : channels * columns]
+    if channels == 1:
+        return np.ascontiguousarray(pixels)
+    weights = np.array(GRAY[message.encoding])
+    return np.round(pixels.reshape(rows, columns, 3) @ weights).astype(np.uint8)
+
+
+def compressed_of(message: Any) -> npt.NDArray[np.uint8] | None:
+    """The gray picture in a CompressedImage; None where it is none."""
+    return picture_of(np.frombuffer(memoryview(message.data), np.uint8))
+
+
+def tags_of(message: Any) -> tuple[int, str, Picture] | None:
+    """Time of exposure [ns], finder, and tags of a String with JSON; None where it is malformed."""
+    try:
+        told = json.loads(message.data)
+        tags = tuple(_tag(tag) for tag in told["tags"][:MOST_TAGS])
+        stamp, sequence, finder = int(told["stamp_ns"]), int(told["sequence"]), str(told["finder"])
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
+        return None
+    return stamp, finder, Picture(0.0, sequence, None, tags)
+
+
+def _tag(told: Any) -> TagCorners:
+    corners = np.array(told["corners"], float)
+    if corners.shape != (4, 2) or not np.isfinite(corners).all():
+        raise ValueError("no corners")
+    return TagCorners(int(told["id"]), corners)
