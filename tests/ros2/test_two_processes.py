@@ -1,6 +1,7 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
 """Two processes on the loopback: what one says, the other hears."""
 
+import os
 import subprocess
 import sys
 import time
@@ -28,9 +29,10 @@ pytestmark = pytest.mark.xdist_group("ros2")  # one peer at a time on this domai
 PATIENCE = 10.0  # [s] on a busy machine; nothing here takes a tenth of it
 
 
-def start(*arguments):
+def start(*arguments, **environ):
     """A peer process."""
-    return subprocess.Popen([sys.executable, str(PEER), *arguments], stderr=subprocess.PIPE, text=True)
+    command = [sys.executable, str(PEER), *arguments]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env={**os.environ, **environ})
 
 
 def finish(process):
@@ -137,6 +139,17 @@ def test_a_parameter_file_and_a_new_name_reach_the_other_process(node, tmp_path)
     node.destroy_subscription(subscription)
     status, text = finish(process)
     assert status == 0 and "loopback only" in text
+
+
+def test_data_flows_between_releases(node):
+    """A peer that speaks Humble is heard; only the node list of the other release cannot be read."""
+    process, got = start("settings", "--ros-args", "-r", "settings:=/humble", ROS_DISTRO="humble"), []
+    subscription = node.create_subscription(ThrusterCommand, "/humble", got.append, LATCHED)
+    assert until(node, lambda: bool(got)) and got[0].source == "/peer/settings"
+    assert "tester" in node.get_node_names()
+    node.destroy_subscription(subscription)
+    status, text = finish(process)
+    assert status == 0 and "as humble" in text
 
 
 def test_a_killed_peer_does_not_hold_up_the_others(node):
