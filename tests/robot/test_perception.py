@@ -106,6 +106,16 @@ def test_three_seconds_without_vision_end_readiness_and_it_comes_back():
     assert "not seen by the camera for" in next(r.reason for r in readings if r.time > 4.0)
 
 
+def test_a_clock_that_is_set_back_costs_a_moment():
+    """By a minute: not believed at first, ready again two seconds later, with the rates of now."""
+    world = Rounds(overhead(), VEHICLE)
+    perception = Perception(VEHICLE, world.pool)
+    assert run(world, perception, 1.0, depart=100.0)[-1].ready
+    last = run(world, perception, 2.5, depart=40.0)[-1]
+    assert last.ready and np.linalg.norm(last.position - world.position(last.time)) < 0.02
+    np.testing.assert_allclose(last.nu[3:], world.nu(last.time)[3:], atol=0.05)
+
+
 FIELDS = ["quaternion", "gyro", "accel", "depth", "pressure"]
 
 

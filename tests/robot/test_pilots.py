@@ -217,6 +217,13 @@ def test_turns_stay_on_the_grid_of_their_start():
     assert due == [(True, 0), (False, 0), (True, 0), (False, 0), (True, 0), (True, 2), (True, 0)]
 
 
+def test_turns_go_on_after_the_clock_was_set_back():
+    """From then on at once and on a new grid."""
+    ticks = Ticks(10.0)
+    assert ticks.due(10.0, 0.1) == (True, 0)
+    assert [ticks.due(t, 0.1) for t in (3.0, 3.05, 3.1)] == [(True, 0), (False, 0), (True, 0)]
+
+
 def test_goals_are_read_from_text_and_files(tmp_path):
     """x, y, z [m] and degrees."""
     assert station_of("1,-0.3,-0.5,90") == Station((1.0, -0.3, -0.5), math.radians(90.0))

@@ -35,6 +35,8 @@ class Ticks:
             period: From now on [s].
         """
         early = min(EARLY, 0.1 * period)
+        if self._next - now > 2.0 * period:  # the clock was set back, or the period has become shorter
+            self._next = now
         late = now + early - self._next
         if late < 0.0:
             return False, 0

@@ -33,6 +33,9 @@ Array = npt.NDArray[np.float64]
 PICTURE_STUCK = 0.4
 """Corners that stay the same to the last digit for this long are one picture sent again and again [s]."""
 
+JUMP = 1.0
+"""Data that is older than the newest by more than this comes from a clock that was set back [s]."""
+
 
 class Perception:
     """The state of one vehicle from its telemetry and an overhead camera."""
@@ -83,7 +86,7 @@ class Perception:
         """
         imu = self._aboard.imu(telemetry, time, now)
         if isinstance(imu, ImuSample):
-            if self.estimator.add(imu) == "accepted" and imu.time > self._omega_time:
+            if self.estimator.add(imu) == "accepted" and not _older(imu.time, self._omega_time):
                 self._omega, self._omega_time = imu.omega, imu.time
         else:
             self.estimator.refuse("imu", imu)
@@ -104,7 +107,7 @@ class Perception:
             `accepted`, or why it gave no fix.
         """
         time = min(picture.time, now) if math.isfinite(picture.time) else math.nan
-        if time <= self._last_picture:
+        if _older(time, self._last_picture):
             return self.estimator.refuse(
                 "vision", "duplicate" if time == self._last_picture else "out of order"
             )
@@ -224,6 +227,11 @@ class _WorldFrame:
         P[:3, :3] = self._R_wp @ estimate.P[:3, :3] @ self._R_wp.T
         P[3:, 3:] = self._R_wp @ estimate.P[3:, 3:] @ self._R_wp.T
         return replace(estimate, P=P).std()
+
+
+def _older(time: float, last: float) -> bool:
+    """Whether something comes again or late; much too late means that the clock was set back."""
+    return last - JUMP < time <= last
 
 
 def _product(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, float, float]:
