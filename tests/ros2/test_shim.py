@@ -381,3 +381,12 @@ def test_the_real_one_can_be_insisted_on(tmp_path):
     """PLATFORM_ROS=native without one is an error, not a surprise."""
     run = chosen(tmp_path, None, PLATFORM_ROS="native")
     assert run.returncode and "source a ROS 2 first" in run.stderr
+
+
+def test_without_cyclone_the_sentence_says_what_to_install():
+    """A machine with neither ROS 2 nor Cyclone's wheel."""
+    script = (
+        "import sys; sys.modules['cyclonedds'] = None; from finssim.ros2.backend import activate; activate()"
+    )
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert run.returncode and "source a ROS 2, or install finssim[ros2]" in run.stderr

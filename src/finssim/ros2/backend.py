@@ -78,6 +78,14 @@ def _native(asked: str) -> Backend:
 
 
 def _shim(interfaces: Sequence[Path], reason: str) -> Backend:
+    try:
+        importlib.import_module("finssim.ros2.shim")
+    except ModuleNotFoundError as error:
+        missing = (error.name or "").partition(".")[0]
+        raise Ros2Error(
+            f"neither rclpy ({reason}) nor '{missing}' can be imported: source a ROS 2, or install finssim[ros2] "
+            "on Python 3.10 or 3.11"
+        ) from None
     from finssim.ros2.finder import install
     from finssim.ros2.wire.settings import wire_settings
 

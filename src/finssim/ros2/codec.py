@@ -14,7 +14,7 @@ from finssim.ros2.distro import distro_of
 from finssim.ros2.errors import MessageError, Ros2Error
 from finssim.ros2.message_class import Message, message_class
 
-__all__ = ["Codec", "Service", "codec_of"]
+__all__ = ["HEADER", "Codec", "Message", "Service", "codec_of"]
 
 HEADER = b"\x00\x01\x00\x00"
 """Encapsulation: plain CDR, little endian."""

@@ -16,6 +16,7 @@ from cyclonedds.sub import Subscriber
 from cyclonedds.topic import Topic
 
 from finssim.ros2.codec import Codec, codec_of
+from finssim.ros2.errors import Ros2Error
 from finssim.ros2.wire.dds_types import DdsTypes, ros_type_name
 from finssim.ros2.wire.endpoints import Reader, Writer
 from finssim.ros2.wire.quality import LATCHED, Quality, dds_qos
@@ -94,7 +95,10 @@ class Participant:
         """Every node that is known on the wire, those of this participant among them."""
         with self._lock:
             while (sample := self._others.take()) is not None:
-                message: Any = self.codec.deserialize(sample[0], NODE_LIST)
+                try:
+                    message: Any = self.codec.deserialize(sample[0], NODE_LIST)
+                except Ros2Error:
+                    continue  # a participant of another release: its data flows, its nodes cannot be read
                 self._seen[bytes(message.gid.data[:16])] = [
                     _record(n) for n in message.node_entities_info_seq
                 ]
