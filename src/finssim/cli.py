@@ -183,6 +183,10 @@ def evaluate(
             min=1,
         ),
     ] = None,
+    trim: Annotated[
+        bool,
+        typer.Option("--trim", help="Put the integral of the position error in front of a policy."),
+    ] = False,
     seed: Seed = 42,
     out: Annotated[
         Path | None, typer.Option(help="Directory for evaluation.json, the figure and trajectories.")
@@ -206,6 +210,7 @@ def evaluate(
         plant=plant or "nominal",
         trajectories=trajectory or (),
         trials=trials,
+        trim=trim,
         seed=seed,
         out=out,
         json=as_json,

@@ -4,11 +4,15 @@ import json
 
 import numpy as np
 import pytest
+import torch
 from rich.console import Console
+from torch import nn
 
 from finssim.control.controllers import controller_for
 from finssim.control.errors import ControlError
+from finssim.control.modes import action_mode
 from finssim.control.pid_paper import PAPER_PROFILE, TRAJECTORY_PROFILE
+from finssim.control.policy_description import PolicyDescription, VehicleIdentity
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.experiments.evaluate import EvaluationError, evaluate, evaluate_controller
 from finssim.experiments.paper_results import PAPER_T2, paper_t2_row
@@ -18,6 +22,8 @@ from finssim.experiments.t2_figure import draw_tracking
 from finssim.experiments.t2_metrics import MEASURES
 from finssim.experiments.t2_table import by_trajectory
 from finssim.experiments.t2_trials import T2_TRAJECTORIES, run_tracking
+from finssim.learning.description import observation_schema
+from finssim.learning.export import export_policy
 from finssim.tasks import TrajectoryTracking
 from finssim.vehicles import load_vehicle
 
@@ -144,3 +150,40 @@ def test_ones_own_trajectory_is_followed(tmp_path):
     own.write_text("t,x,y,z\n0,0,0,-0.5\n60,0,1.5,-0.5\n")
     with pytest.raises(ControlError, match="own: y is 1"):
         evaluate_controller("pid", NOMINAL, task="t2", trajectories=[own])
+
+
+def stiff_policy(folder):
+    """A policy written by hand as one layer: thrust towards the reference and against velocity."""
+    layer = nn.Linear(30, 6)
+    with torch.no_grad():
+        layer.weight.zero_()
+        layer.bias.zero_()
+        for axis in range(3):
+            layer.weight[axis, axis], layer.weight[axis, 15 + axis] = 6.0, -2.0
+            layer.weight[axis, 12 + axis] = 4.0
+        layer.weight[5, 20] = -0.3
+    description = PolicyDescription(
+        task="t2",
+        observation=observation_schema(TASK),
+        action=action_mode("wrench6", FINSROV).describe(),
+        control_period=TASK.control_step,
+        vehicle=VehicleIdentity(name=FINSROV.name, sha256=FINSROV.sha256),
+        hydrodynamics="calibrated",
+        seed=0,
+        training={"randomization": None},
+    )
+    return export_policy(nn.Sequential(layer), folder, description)
+
+
+def test_a_trim_takes_out_what_a_current_leaves(tmp_path):
+    """In 0.10 m/s a policy without memory is pushed away by centimetres; with the integral in front of it, less."""
+    folder = stiff_policy(tmp_path / "stiff")
+    options = {"task": "t2", "trajectories": ["broken"], "trials": 2}
+    plain, trimmed = (
+        evaluate_controller(folder, load_plant("current"), trim=trim, **options).result
+        for trim in (False, True)
+    )
+    assert trimmed["horizontal_rmse_m"] < 0.6 * plain["horizontal_rmse_m"]
+    assert (plain["controller"]["trim"], trimmed["controller"]["trim"]["rate"]) == (None, 0.3)
+    with pytest.raises(EvaluationError, match="'pid' has an integral of its own"):
+        evaluate_controller("pid", NOMINAL, task="t2", trim=True)

@@ -12,9 +12,10 @@ from rich.console import Console
 from rich.progress import Progress
 
 from finssim.control.trajectories import load_trajectory
+from finssim.control.trim import Trim
 from finssim.experiments.metrics import summarize
 from finssim.experiments.plants import Plant, load_plant
-from finssim.experiments.players import make_player
+from finssim.experiments.players import PolicyPlayer, make_player
 from finssim.experiments.results_table import print_plants, print_results
 from finssim.experiments.setpoints import T1_SETPOINTS
 from finssim.experiments.t2_metrics import summarize_tracking
@@ -63,6 +64,7 @@ def evaluate(
     plant: str | Path | Sequence[str | Path] = "nominal",
     trajectories: Sequence[str | Path] = (),
     trials: int | None = None,
+    trim: bool = False,
     seed: int = 42,
     out: Path | None = None,
     json: bool = False,
@@ -78,6 +80,7 @@ def evaluate(
         plant: Name or file, or several.
         trajectories: Names or files of what is followed in T2, in turn; the published four if none.
         trials: How many in each plant; the eight setpoints, or the four trajectories, once if None.
+        trim: Put the integral of the position error (`control.trim`) in front of a policy.
         seed: Of what the plant draws.
         out: Directory for `evaluation.json`, the figure and the trajectories; an earlier evaluation is replaced.
         json: Print the result in place of the table.
@@ -97,6 +100,7 @@ def evaluate(
         "hydrodynamics": hydrodynamics,
         "trajectories": trajectories,
         "trials": trials,
+        "trim": trim,
         "seed": seed,
     }
     if out is None:
@@ -152,6 +156,7 @@ def evaluate_controller(
     hydrodynamics: str = "calibrated",
     trajectories: Sequence[str | Path] = (),
     trials: int | None = None,
+    trim: bool = False,
     seed: int = 42,
     record: Path | None = None,
 ) -> Evaluation:
@@ -166,7 +171,9 @@ def evaluate_controller(
     body = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
     the_task = TASKS[task]()
     guides = {"guides": [load_trajectory(x, vehicle=body) for x in trajectories]} if trajectories else {}
-    player = make_player(controller, body, the_task)
+    player = make_player(controller, body, the_task, Trim() if trim else None)
+    if trim and not isinstance(player, PolicyPlayer):
+        raise EvaluationError(f"'{controller}' has an integral of its own: trim a policy, or leave it out")
     screen = Console(stderr=True)
     with Progress(console=screen, transient=True, disable=not screen.is_terminal) as progress:
         bar = progress.add_task(f"{trials} trials", total=1.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,6 +13,7 @@ from finssim.control.controllers import CONTROLLERS, controller_for
 from finssim.control.modes import mode_from_dict
 from finssim.control.policy import Policy
 from finssim.control.tracking import Controller, Goal
+from finssim.control.trim import Trim
 from finssim.learning.description import observation_schema
 from finssim.tasks import Task
 from finssim.vehicles import Vehicle
@@ -43,8 +44,8 @@ class Player(Protocol):
 class PolicyPlayer:
     """A policy directory, run with onnxruntime."""
 
-    def __init__(self, directory: str | Path, vehicle: Vehicle, task: Task) -> None:
-        """Load a policy for the vehicle and task.
+    def __init__(self, directory: str | Path, vehicle: Vehicle, task: Task, trim: Trim | None = None) -> None:
+        """Load a policy for the vehicle and task, with an integral in front of it or none.
 
         Raises:
             PolicyError, ControlError: It was trained for another vehicle, task, observation or other limits.
@@ -56,14 +57,21 @@ class PolicyPlayer:
         self.action = mode.name
         self.wrench_scale = mode.scale if mode.name.startswith("wrench") else 1.0
         self.policy = policy
+        self.trim = trim
         self._directory = Path(directory)
 
-    def reset(self, n: int) -> None:
-        """A policy remembers nothing."""
+    def reset(self, n: int) -> NDArray[np.float64] | None:
+        """A policy remembers nothing; a trim its shift."""
+        return self.trim.reset(n) if self.trim else None
 
-    def act(self, memory: None, arrays: Any, goal: Goal) -> tuple[NDArray[np.float32], None]:
+    def act(self, memory: Any, arrays: Any, goal: Goal) -> tuple[NDArray[np.float32], Any]:
         """Actions for the environment's observations."""
-        return self.policy.act(arrays.observation.numpy()), None
+        observation = arrays.observation.numpy()
+        if self.trim is not None:
+            measured = _read(arrays)
+            memory = self.trim.update(memory, measured, goal.position, self.period)
+            observation = self.trim.shown(observation, measured, memory, self.policy.description.observation)
+        return self.policy.act(observation), memory
 
     def describe(self) -> dict[str, Any]:
         """Name, network, and what it was trained in."""
@@ -72,6 +80,7 @@ class PolicyPlayer:
         return {
             "name": self._directory.resolve().name,
             "kind": "policy",
+            "trim": asdict(self.trim) if self.trim else None,
             "action": self.action,
             "period_s": self.period,
             "hydrodynamics": d.hydrodynamics,
@@ -86,6 +95,12 @@ class _Measured:
     position: Any
     quaternion: Any
     nu: Any
+
+
+def _read(arrays: Any) -> _Measured:
+    """What the environment measured of vehicle 0 in every world."""
+    parts = (arrays.position, arrays.quaternion, arrays.velocity)
+    return _Measured(*(array.numpy()[:, 0].astype(float) for array in parts))
 
 
 class PidPlayer:
@@ -107,9 +122,7 @@ class PidPlayer:
 
     def act(self, memory: Any, arrays: Any, goal: Goal) -> tuple[NDArray[np.float32], Any]:
         """Wrench of each world, as a part of the limits; more than a limit is limited axis by axis."""
-        pose = (arrays.position.numpy()[:, 0], arrays.quaternion.numpy()[:, 0])
-        measured = _Measured(*(x.astype(float) for x in (*pose, arrays.velocity.numpy()[:, 0])))
-        tau, memory = self.controller.command(memory, measured, goal)
+        tau, memory = self.controller.command(memory, _read(arrays), goal)
         part = np.divide(tau, self._limits, out=np.zeros_like(tau), where=self._limits > 0.0)
         return part.astype(np.float32), memory
 
@@ -118,8 +131,10 @@ class PidPlayer:
         return {"name": self.name, "kind": "pid", "action": self.action, "period_s": self.period}
 
 
-def make_player(name_or_directory: str | Path, vehicle: Vehicle, task: Task) -> PolicyPlayer | PidPlayer:
-    """A PID by its name, or the policy of a directory."""
+def make_player(
+    name_or_directory: str | Path, vehicle: Vehicle, task: Task, trim: Trim | None = None
+) -> PolicyPlayer | PidPlayer:
+    """A PID by its name, or the policy of a directory; a PID has an integral of its own and takes no trim."""
     if str(name_or_directory) in CONTROLLERS:
         return PidPlayer(str(name_or_directory), vehicle, task.name)
-    return PolicyPlayer(name_or_directory, vehicle, task)
+    return PolicyPlayer(name_or_directory, vehicle, task, trim)
