@@ -51,7 +51,7 @@ def run(
     bind: Annotated[
         str,
         typer.Option(
-            help="Address and port of this end, for udp; loopback unless told otherwise.",
+            help="Address and port of this end, for udp; pictures come to the port after it. Loopback unless given.",
             metavar="ADDRESS:PORT",
         ),
     ] = "127.0.0.1:54321",

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from finssim.localization.pool import Pool, load_pool
 from finssim.robot.goals import check_reachable, guide_of
-from finssim.robot.link.transports import DEFAULT_BIND, open_transport
+from finssim.robot.link.transports import DEFAULT_BIND, host_port, open_transport
 from finssim.robot.lockstep import DEFAULT_PORT, LockstepClient, run_lockstep
 from finssim.robot.perception import Perception
 from finssim.robot.picture_source import DEFAULT_CAMERA, NoPictures, open_pictures
@@ -44,7 +44,7 @@ class Wiring:
     robot: str = "pool"
     """Address of the motor controller, or `pool`."""
     bind: str = DEFAULT_BIND
-    """Own end, for UDP."""
+    """Own end, for UDP; pictures come to the port after it."""
     pictures: str | None = None
     """Address of the camera; that of the virtual pool for `pool`, else none, if None."""
     lockstep: bool = False
@@ -143,7 +143,8 @@ def _realtime(
     local = wiring.robot == "pool"
     camera = wiring.pictures or (f"udp://{DEFAULT_CAMERA}" if local else "none")
     transport = open_transport(POOL_ADDRESS if local else wiring.robot, wiring.bind)
-    pictures = open_pictures(camera)
+    host, port = host_port(wiring.bind, "bind")
+    pictures = open_pictures(camera, f"{host}:{port + 1 if port else 0}")
     if not isinstance(pictures, NoPictures):
         lens = pool.camera.lens
         pictures = TagFinder(pictures, runtime.vehicle, size=(lens.height, lens.width))
