@@ -7,7 +7,6 @@ import pytest
 
 from finssim.geometry.rotations import quat_from_euler
 from finssim.localization.detection.detector import detector
-from finssim.localization.detection.region import RegionTracker
 from finssim.pool.camera import PoolCamera
 from finssim.pool.plant_spec import PlantSpecError
 from finssim.pool.site import CameraSettings, camera_of
@@ -46,12 +45,16 @@ def test_computed_corners_are_those_found_in_drawn_pictures(severity, most):
     computed = {
         p.sequence: p for p in camera("corners", severity, pixel_noise=0.0).advance(0.0, 20.0, pose_at)
     }
-    tracker = RegionTracker(detector(FINSROV.tags.family), FINSROV.tags.mounts)
+    find = detector(FINSROV.tags.family)
     errors, found, expected = [], 0, 0
     for exposure in drawn.exposures(0.0, 20.0, pose_at)[::15]:
         picture = drawn.develop(exposure)
-        there = {d.tag: d.corners for d in tracker.detect(picture.image, picture.time)}
         here = {t.tag_id: t.corners for t in computed[picture.sequence].tags}
+        around = np.concatenate(list(here.values())) if here else np.array([[0, 0], [1280, 720]])
+        region = tuple(
+            np.clip([*around.min(0) - 60, *around.max(0) + 60], 0, [1280, 720] * 2).astype(int).tolist()
+        )
+        there = {d.tag: d.corners for d in find.detect(picture.image, region) if d.tag in FINSROV.tags.mounts}
         assert picture.time == computed[picture.sequence].time
         found, expected = found + len(there), expected + len(here)
         errors += [there[tag] - here[tag] for tag in there.keys() & here.keys()]
