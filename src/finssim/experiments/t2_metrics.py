@@ -70,7 +70,7 @@ def measure_tracking(
         horizontal = sqrt(mean(e_x² + e_y²))    vertical = sqrt(mean e_z²)    p95: 95 % of |e| are smaller
 
     Cross-track errors are distances to the nearest point of the way (`projected_times`); `completion` is the part of
-    the way reached by the last sample's projection.
+    the way, by length, that lies before the last sample's projection.
 
     Args:
         t: Times since the start of the trajectory [s], increasing, (T,).
@@ -110,7 +110,7 @@ def _errors(t: Array, position: Array, guide: Guide) -> dict[str, Any]:
     error = position - guide.at(t).position
     projected = projected_times(t, position, guide)
     away = np.linalg.norm(position - guide.at(projected).position, axis=-1)
-    completion = float(guide.at(projected[-1]).progress)
+    completion = _way_share(guide, float(projected[-1]))
     return {
         "horizontal_rmse_m": _rms(np.linalg.norm(error[:, :2], axis=-1)),
         "vertical_rmse_m": _rms(error[:, 2]),
@@ -138,6 +138,15 @@ def projected_times(t: Array, position: Array, guide: Guide) -> Array:
         reached += int(np.argmin(np.sum((way[reached:end] - x) ** 2, axis=-1)))
         nearest[i] = reached
     return np.asarray(times[nearest])
+
+
+def _way_share(guide: Guide, time: float) -> float:
+    """Part of the way's length that lies before a time: near a rest, seconds are millimetres."""
+    times = np.linspace(0.0, guide.duration, round(guide.duration * DENSE_RATE) + 2)
+    length = np.concatenate(
+        [[0.0], np.cumsum(np.linalg.norm(np.diff(guide.at(times).position, axis=0), axis=-1))]
+    )
+    return float(np.interp(time, times, length) / length[-1])
 
 
 def effort_measures(t: Array, thrust: Array, limits: tuple[ArrayLike, ArrayLike]) -> dict[str, float]:
