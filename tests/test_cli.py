@@ -50,6 +50,9 @@ COMMANDS = [
     "record repair",
     "play",
     "teleop",
+    "ros2",
+    "ros2 node",
+    "ros2 up",
 ]
 
 

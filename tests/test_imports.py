@@ -25,6 +25,7 @@ ARROWS = {
     "robot": {"control", "localization"},
     "ros2": {"robot"},
     "pool": {"engine", "sensors", "robot"},
+    "ros2_worlds": {"ros2", "pool"},
 }
 """Layer -> the layers right below it. A layer may import everything below."""
 
@@ -102,7 +103,13 @@ HOMES = {
         "ros2/wire/quality.py",
         "ros2/wire/waiting.py",
     },
-    "rclpy": {"ros2/topics.py"},
+    "rclpy": {
+        "ros2/nodes/robot_node.py",
+        "ros2/topics.py",
+        "ros2/up.py",
+        "ros2/watcher.py",
+        "ros2_worlds/sim.py",
+    },
     "viser": set(),
     "mitsuba": {"experiments/mitsuba_renderer.py"},
 }

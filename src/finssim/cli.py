@@ -17,6 +17,7 @@ from finssim import (
     cli_pool,
     cli_record,
     cli_robot,
+    cli_ros2,
     cli_trials,
     cli_vision,
 )
@@ -57,6 +58,7 @@ app.command()(cli_record.play)
 app.command()(cli_record.teleop)
 app.command()(cli_robot.run)
 app.command()(cli_pool.pool)
+app.add_typer(cli_ros2.ros2_app, name="ros2")
 
 PICTURES = (".png", ".svg", ".pdf")
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.rotations import quat_from_yaw
+from finssim.geometry.rotations import matrix_to_quat, quat_from_yaw, quat_multiply
 from finssim.localization.pool import Pool
 from finssim.robot.messages import Picture
 from finssim.robot.record_messages import BASE, IMU, MAP, Messages, floats
@@ -21,6 +21,8 @@ from finssim.vehicles import Vehicle
 __all__ = ["OPTICAL", "RosMessages", "ros_type"]
 
 OPTICAL = "camera_optical"
+LENS_MODELS = {"plumb_bob": "plumb_bob", "rational": "rational_polynomial", "fisheye": "equidistant"}
+"""Our name of a lens model -> that of ROS, with the same coefficients in the same order."""
 
 
 def ros_type(name: str) -> Any:
@@ -72,7 +74,7 @@ class RosMessages(Messages):
         return self.words({"stamp_ns": stamp, "finder": finder, **values})
 
     def camera_info(self, stamp: int, pool: Pool) -> Any:
-        """The camera's calibration: ROS' plumb_bob has the same five numbers as ours, in the same order."""
+        """The camera's calibration."""
         lens = pool.camera.lens
         K = [lens.fx, 0.0, lens.cx, 0.0, lens.fy, lens.cy, 0.0, 0.0, 1.0]
         P = [*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0]
@@ -80,8 +82,8 @@ class RosMessages(Messages):
             header=self.header(stamp, OPTICAL),
             height=lens.height,
             width=lens.width,
-            distortion_model=lens.model,
-            d=floats(lens.distortion),
+            distortion_model=LENS_MODELS[lens.model],
+            d=floats(lens.distortion or (0.0,) * 5),
             k=floats(K),
             r=np.eye(3).ravel(),
             p=floats(P),
@@ -95,8 +97,6 @@ class RosMessages(Messages):
         if imu is not None:
             parts.append((BASE, IMU, np.asarray(imu.position), np.asarray(imu.orientation)))
         if pool is not None:
-            from finssim.geometry.rotations import matrix_to_quat, quat_multiply
-
             T = pool.T_wp
             place = T[:3, :3] @ pool.camera.position + T[:3, 3]
             turn = quat_multiply(matrix_to_quat(T[:3, :3]), pool.camera.orientation)

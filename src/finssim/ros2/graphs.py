@@ -1,0 +1,92 @@
+"""Which nodes make up a robot, its virtual pool or a simulated vehicle, and with which parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from finssim.ros2.errors import Ros2Error
+from finssim.ros2.topics import TOPICS, Topic
+
+__all__ = ["GRAPHS", "MCU_PORT", "NODES", "PARENT", "Plan", "topics_of"]
+
+NODES = {
+    **{
+        name: f"finssim.ros2.nodes.{name}"
+        for name in (
+            "camera",
+            "controller",
+            "hardware_bridge",
+            "localizer",
+            "recorder",
+            "state_estimation",
+            "teleop",
+        )
+    },
+    **{name: f"finssim.ros2_worlds.{name}" for name in ("sim", "virtual_pool")},
+}
+"""Node -> module with its `main`."""
+
+ROBOT = ("hardware_bridge", "camera", "localizer", "state_estimation", "controller")
+
+GRAPHS = {"sim": ("sim", "controller"), "robot": ROBOT, "pool": ("virtual_pool", *ROBOT)}
+"""Graph -> nodes, in the order of their start; they end in the reverse order, the bridge after who commands it."""
+
+MCU_PORT = 58766
+"""Of a virtual pool's motor controller, if not told otherwise; pictures leave from the next port."""
+PARENT = "FINSSIM_PARENT"
+"""Environment of a node: process without which it ends too."""
+
+
+@dataclass
+class Plan:
+    """A graph before it lives."""
+
+    graph: str
+    vehicle: str
+    namespace: str
+    parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Node, or `/**` for all -> parameters."""
+    extra: tuple[str, ...] = ()
+    """Nodes besides those of the graph: recorder, teleop."""
+
+    def __post_init__(self) -> None:
+        if self.graph not in GRAPHS:
+            raise Ros2Error(f"unknown graph '{self.graph}'; available: {', '.join(GRAPHS)}")
+        everywhere: dict[str, Any] = {"vehicle": self.vehicle}
+        if self.graph == "sim":
+            everywhere["use_sim_time"] = True
+            self.set("sim", use_sim_time=False)
+        self.parameters["/**"] = {**everywhere, **self.parameters.get("/**", {})}
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """In the order of their start."""
+        return GRAPHS[self.graph] + self.extra
+
+    def set(self, node: str, **values: Any) -> None:
+        """Give parameters; None leaves a node's own default."""
+        known = {name: value for name, value in values.items() if value is not None}
+        self.parameters.setdefault(node, {}).update(known)
+
+    def write(self, path: Path) -> None:
+        """The parameters as a ROS 2 parameter file."""
+        tree = {
+            key if key == "/**" else f"/{self.namespace}/{key}": {"ros__parameters": values}
+            for key, values in self.parameters.items()
+            if values
+        }
+        path.write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
+
+
+def topics_of(plan: Plan) -> list[tuple[str, Topic]]:
+    """Full names of what a graph's nodes publish, and of what they take from people."""
+    senders = {*plan.nodes, "you", "every node"}
+    return [
+        (topic.under(plan.namespace), topic)
+        for topic in TOPICS.values()
+        if senders & {word.strip() for word in topic.sender.split(",")}
+    ]

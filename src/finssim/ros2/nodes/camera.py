@@ -1,0 +1,60 @@
+"""Camera node: the wire of the overhead camera to pictures, tags and calibration as topics."""
+
+from __future__ import annotations
+
+import sys
+
+from finssim.localization.pool import load_pool
+from finssim.robot.messages import Picture
+from finssim.robot.picture_source import DEFAULT_CAMERA, DEFAULT_PICTURES, open_pictures
+from finssim.ros2.nodes.robot_node import RobotNode, run
+
+__all__ = ["Camera", "main"]
+
+POLL = 100.0
+"""Looks for a new picture [Hz]."""
+
+
+class Camera(RobotNode):
+    """Publishes pictures, stamped with the middle of their exposure; each form only while somebody listens to it."""
+
+    def __init__(self) -> None:
+        super().__init__("camera")
+        self.pool = load_pool(self.parameter("pool_file", "pool.yaml"))
+        address = self.parameter("pictures", f"udp://{DEFAULT_CAMERA}")
+        self.source = open_pictures(address, self.parameter("pictures_bind", DEFAULT_PICTURES))
+        self.sends("image", "picture", "camera_info", "tags", "diagnostics", "event")
+        self.send("camera_info", self.make.camera_info(self.ns(self.now()), self.pool))
+        self.count = 0
+        self.create_timer(1.0 / POLL, self._look)
+        self.create_timer(1.0, self._tell)
+        self.event("start", self.source.describe())
+
+    def _look(self) -> None:
+        for picture in self.source.receive(self.now()):
+            self.count += 1
+            self._publish(picture)
+
+    def _publish(self, picture: Picture) -> None:
+        stamp = self.ns(picture.time - self.pool.latency)
+        if picture.tags or picture.image is None:
+            self.send("tags", self.make.found_tags(stamp, picture, "camera"))
+        if picture.image is None:
+            return
+        if self.heard("image"):
+            self.send("image", self.make.image(stamp, picture.image))
+        if self.heard("picture"):
+            self.send("picture", self.make.compressed(stamp, picture.image))
+
+    def _tell(self) -> None:
+        level, self.count = ("ok" if self.count else "stale"), 0
+        self.diagnose(level, self.source.describe(), {})
+
+    def close(self) -> None:
+        """Let go of the wire."""
+        self.source.close()
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run(Camera))

@@ -1,0 +1,117 @@
+"""Controller node: PID, policy or a person's wrench to thrusts, while the bridge says that it is armed."""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import Any
+
+import numpy as np
+
+from finssim.control.errors import ControlError
+from finssim.control.guidance import Guide, Station
+from finssim.geometry.rotations import quat_yaw
+from finssim.robot.goals import GoalError, check_reachable, guide_of
+from finssim.robot.robot import Reading
+from finssim.robot.runtime import Runtime
+from finssim.ros2.nodes.conversions import station_of_pose
+from finssim.ros2.nodes.modes import Modes
+from finssim.ros2.nodes.remote import RemoteBridge, RemoteState
+from finssim.ros2.nodes.robot_node import RobotNode, run
+
+__all__ = ["Controller", "main"]
+
+STATE_TIMEOUT = 0.5
+"""Oldest reading to act on, where the vehicle file does not say [s]."""
+PATH_POINTS = 200
+
+
+class Controller(RobotNode):
+    """Silent until the bridge is armed; a trajectory's time begins then, and without a goal the place is kept."""
+
+    def __init__(self) -> None:
+        super().__init__("controller")
+        self.sends("command", "path", "policy", "event", "diagnostics")
+        safety = self.vehicle.safety
+        self.modes = Modes(self, self.parameter("policy", "pid"), self.parameter("task", ""))
+        self.bridge = RemoteBridge(self)
+        self.state = RemoteState(self, safety.state_timeout if safety else STATE_TIMEOUT)
+        nowhere = Station((0.0, 0.0, 0.0), 0.0)
+        self.runtime = Runtime(
+            self.vehicle, None, self.modes.switch, nowhere, perception=self.state, bridge=self.bridge
+        )
+        self.guide: Guide | None = None
+        self.armed = False
+        goal, trajectory = self.parameter("goal", ""), self.parameter("trajectory", "")
+        if goal or trajectory:
+            self._follow(guide_of(goal or None, trajectory or None))
+        self.hears("goal", self._on_goal)
+        self.hears("trajectory", self._on_trajectory)
+        self.hears("mode", self._on_mode)
+        self.create_timer(1.0 / self.parameter("rate", 60.0), self._turn)
+        self.create_timer(1.0, self._tell)
+
+    def _turn(self) -> None:
+        now, armed = self.now(), self.bridge.state in ("armed", "hold")
+        begins, self.armed = armed and not self.armed, armed
+        if begins:
+            self.runtime.started = math.nan
+        if not armed:
+            return
+        if math.isnan(self.runtime.started):
+            self.runtime.guide = self.guide or _here(self.state.reading(now))
+        before = self.runtime.counters.decisions
+        self.runtime.step(now, ())
+        if self.runtime.counters.decisions > before:
+            self.send("policy", self.modes.told(self.ns(now), self.runtime))
+
+    def _follow(self, guide: Guide) -> None:
+        """From now on, if the vehicle may go there.
+
+        Raises:
+            GoalError: It may not.
+        """
+        check_reachable(guide, self.vehicle)
+        self.guide = self.runtime.guide = guide
+        if not math.isnan(self.runtime.started):
+            self.runtime.start(self.now())
+        end = guide.duration if math.isfinite(guide.duration) else 0.0
+        way = guide.at(np.linspace(0.0, end, PATH_POINTS if end else 1))
+        self.send("path", self.make.path(self.ns(self.now()), way.position, way.yaw))
+        self.event("goal", guide.name)
+
+    def _on_goal(self, message: Any) -> None:
+        station = station_of_pose(message)
+        if isinstance(station, str):
+            self.event("refused", station)
+        else:
+            self._try(lambda: station)
+
+    def _on_trajectory(self, message: Any) -> None:
+        self._try(lambda: guide_of(None, str(message.data)))
+
+    def _on_mode(self, message: Any) -> None:
+        if self.modes.select(str(message.data)):
+            self.runtime.started = math.nan  # who takes over begins anew
+
+    def _try(self, make: Any) -> None:
+        try:
+            self._follow(make())
+        except (GoalError, ControlError, OSError) as error:
+            self.event("refused", " ".join(str(error).split()))
+
+    def _tell(self) -> None:
+        counters = self.runtime.counters
+        values = {"mode": self.modes.switch.mode, "decisions": counters.decisions, "missed": counters.missed}
+        self.diagnose("ok", self.bridge.state, values)
+
+
+def _here(reading: Reading) -> Guide:
+    """The place and heading of a reading, to be kept."""
+    x, y, z = (float(v) for v in reading.position)
+    return Station((x, y, z), float(quat_yaw(reading.quaternion)), "here")
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run(Controller))

@@ -1,0 +1,89 @@
+"""Hardware bridge node: the one process that talks to the motor controller, with arming and every watchdog."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from finssim.robot.bridge import Bridge
+from finssim.robot.bridge_settings import BridgeSettings
+from finssim.robot.counters import Counters
+from finssim.robot.intake import Intake
+from finssim.robot.link.frames import encode_command
+from finssim.robot.link.transports import DEFAULT_BIND, open_transport
+from finssim.robot.messages import CommandEcho, Telemetry
+from finssim.robot.run import POOL_ADDRESS
+from finssim.robot.unlocated import Unlocated
+from finssim.ros2.nodes.bridge_topics import BridgeTopics
+from finssim.ros2.nodes.robot_node import RobotNode, run
+
+__all__ = ["HardwareBridge", "main"]
+
+LAST_FRAMES = 3
+"""Frames without thrust at the end."""
+RPM = 2.0 * math.pi / 60.0
+
+
+class HardwareBridge(RobotNode):
+    """Frames to and from the motor controller; disarmed until the topic `arm` says true, whatever else comes."""
+
+    def __init__(self) -> None:
+        super().__init__("hardware_bridge")
+        address, bind = self.parameter("robot", "pool"), self.parameter("bind", DEFAULT_BIND)
+        located = self.parameter("need_reading", True)
+        self.transport = open_transport(POOL_ADDRESS if address == "pool" else address, bind)
+        self.bridge = Bridge(self.vehicle, BridgeSettings.of(self.vehicle, need_reading=located))
+        self.counters, self.shafts = Counters(), np.zeros(0)
+        self.intake = Intake(Unlocated(self.vehicle), self.bridge, self.counters, self)
+        self.sends("imu", "pressure", "telemetry", "shafts", "echo")
+        self.topics = BridgeTopics(self, self.bridge)
+        self.create_timer(1.0 / self.parameter("rate", 60.0), self._turn)
+        self.create_timer(1.0, self._tell)
+        self.event("start", self.transport.describe())
+
+    def telemetry(self, now: float, telemetry: Telemetry, time: float) -> None:
+        """Publish a snapshot, as `robot.intake` gives it to a recorder; stamps are of the measurement."""
+        stamp, received = self.ns(time), self.ns(now)
+        self.send("telemetry", self.make.telemetry(stamp, received, telemetry))
+        self.send("imu", self.make.imu(stamp, telemetry))
+        self.send("pressure", self.make.pressure(stamp, telemetry))
+        self.send("shafts", self._speeds(stamp, telemetry.motor_rpm))
+
+    def echo(self, now: float, echo: CommandEcho) -> None:
+        """Publish what the motor controller made of a command."""
+        self.send("echo", self.make.echo(self.ns(now), echo))
+
+    def _speeds(self, stamp: int, rpm: Sequence[float] | None) -> Any:
+        message = None if rpm is None else self.make.shafts(stamp, rpm)
+        if message is not None:
+            self.shafts = np.asarray(message.velocity, float)
+        return message
+
+    def _turn(self) -> None:
+        now = self.now()
+        self.intake.take(now, [(now, data) for data in self.transport.receive()])
+        command = self.bridge.tick(now)
+        self.transport.send(encode_command(command))
+        self.topics.tell(now, normalised=command.normalised, shaft_speed=self.shafts)
+
+    def _tell(self) -> None:
+        state = self.bridge.state
+        counts = {"telemetry": self.counters.telemetry, "wire": self.transport.describe()}
+        level = {"fault": "error", "hold": "warn"}.get(state, "ok")
+        self.diagnose(level, state + (f": {self.bridge.reason}" if self.bridge.reason else ""), counts)
+
+    def close(self) -> None:
+        """Disarm, tell the motor controller so, and let go of the wire."""
+        self.bridge.disarm(self.now())
+        for _ in range(LAST_FRAMES):
+            self.transport.send(encode_command(self.bridge.tick(self.now())))
+        self.transport.close()
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run(HardwareBridge))

@@ -1,0 +1,150 @@
+"""The bridge and the estimator of another process, as the robot's own objects know them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.robot.events import Event
+from finssim.robot.messages import Telemetry, ThrusterCommand
+from finssim.robot.record_messages import STATES
+from finssim.robot.robot import Reading
+from finssim.ros2.nodes.conversions import nanoseconds, reading_of
+from finssim.ros2.nodes.robot_node import RobotNode
+from finssim.ros2.nodes.ros_messages import ros_type
+
+__all__ = ["Readings", "RemoteBridge", "RemoteState"]
+
+Array = npt.NDArray[np.float64]
+
+SILENT = 0.5
+"""A bridge that has not been heard for so long does nothing that we know of [s]."""
+
+
+class Readings:
+    """Puts Odometry and EstimatorStatus of one stamp together; calls back with each reading."""
+
+    def __init__(self, node: RobotNode, take: Any) -> None:
+        self._node, self._take = node, take
+        self._odometry: Any = None
+        self._status: Any = None
+        node.hears("odometry", self._on_odometry)
+        node.hears("estimator", self._on_status)
+
+    def _on_odometry(self, message: Any) -> None:
+        self._odometry = message
+        self._match()
+
+    def _on_status(self, message: Any) -> None:
+        self._status = message
+        if all(map(math.isfinite, message.position_std)):
+            self._match()
+        else:  # nothing is known, so no odometry comes with it
+            self._give(message, None)
+
+    def _match(self) -> None:
+        status, odometry = self._status, self._odometry
+        if status is None or odometry is None:
+            return
+        if nanoseconds(status.header.stamp) == nanoseconds(odometry.header.stamp):
+            self._give(status, odometry)
+
+    def _give(self, status: Any, odometry: Any) -> None:
+        self._status = None
+        self._take(reading_of(status, odometry, self._node.seconds(status.header.stamp)))
+
+
+class RemoteState:
+    """The newest reading, in place of a `Perception`; one that is too old is not ready."""
+
+    def __init__(self, node: RobotNode, oldest: float) -> None:
+        """
+        Args:
+            node: That hears it.
+            oldest: Age at which a reading may not be acted on any more [s].
+        """
+        # `robot.intake` wants to know the frames of a motor controller; here none comes.
+        self.vehicle = node.vehicle if node.vehicle.mcu else SimpleNamespace(mcu=SimpleNamespace(outputs=8))
+        self._oldest = oldest
+        nothing = np.full(3, math.nan), np.array([0.0, 0.0, 0.0, 1.0]), np.full(6, math.nan)
+        self._newest = Reading(-math.inf, *nothing, False, "uninitialized", "the estimator is silent")
+        Readings(node, self._take)
+
+    def reading(self, now: float) -> Reading:
+        """The state."""
+        age = now - self._newest.time
+        if age > self._oldest:
+            return replace(self._newest, ready=False, reason=f"the estimator is silent for {age:.1f} s")
+        return self._newest
+
+    def telemetry(self, now: float, telemetry: Telemetry, time: float) -> None:
+        """None comes here."""
+
+    def _take(self, reading: Reading) -> None:
+        self._newest = reading
+
+
+class RemoteBridge:
+    """The bridge of another process: what it is told travels as messages, its state comes back as one."""
+
+    def __init__(self, node: RobotNode) -> None:
+        self._node = node
+        self._state, self.reason, self._at = "disarmed", "", -math.inf
+        node.sends("arm", "stop", "acknowledge")
+        node.hears("thrusters", self._on_state)
+
+    @property
+    def state(self) -> str:
+        """As the bridge last said; disarmed where it is silent."""
+        return self._state if self._node.now() - self._at <= SILENT else "disarmed"
+
+    def arm(self, now: float, source: str) -> str:
+        """Ask for arming; whether it is granted shows in the state."""
+        self._node.send("arm", ros_type("std_msgs/msg/Bool")(data=True))
+        return ""
+
+    def disarm(self, now: float) -> None:
+        """Thrusters off."""
+        self._node.send("arm", ros_type("std_msgs/msg/Bool")(data=False))
+
+    def stop(self, now: float, why: str) -> None:
+        """Emergency stop."""
+        self._node.send("stop", ros_type("std_msgs/msg/Empty")())
+        self._node.event("stop", why, now)
+
+    def acknowledge(self, now: float) -> None:
+        """End a fault."""
+        self._node.send("acknowledge", ros_type("std_msgs/msg/Empty")())
+
+    def command(self, now: float, force: npt.ArrayLike, source: str, stamp: float | None = None) -> Array:
+        """Ask for thrusts, canonical order [N], (n,)."""
+        wanted = np.asarray(force, float)
+        self._node.send("command", self._node.make.command(self._node.ns(now), wanted, source))
+        return wanted
+
+    def reading(self, now: float, reading: Reading) -> None:
+        """The bridge hears the estimator itself."""
+
+    def telemetry(self, now: float, telemetry: Telemetry) -> None:
+        """None comes here."""
+
+    def tick(self, now: float) -> ThrusterCommand:
+        """Frames are the bridge's own affair."""
+        return ThrusterCommand(False, (0.0,) * 8)
+
+    def drain(self) -> list[Event]:
+        """Events are published where they happen."""
+        return []
+
+    def _on_state(self, message: Any) -> None:
+        if message.state < len(STATES):
+            self._state, self.reason, self._at = (
+                STATES[message.state],
+                str(message.reason),
+                self._node.now(),
+            )

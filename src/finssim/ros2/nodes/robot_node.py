@@ -1,0 +1,178 @@
+"""What every node of a robot has: a vehicle, a clock in seconds, the topics of the table, and an orderly end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import rclpy
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+
+from finssim.ros2.graphs import PARENT
+from finssim.ros2.nodes.conversions import nanoseconds
+from finssim.ros2.nodes.ros_messages import RosMessages, ros_type
+from finssim.ros2.topics import LATCHED, STREAM, TOPICS, quality_profile
+from finssim.vehicles import load_vehicle
+
+__all__ = ["RobotNode", "run"]
+
+Made = TypeVar("Made", bound="RobotNode")
+
+ORPHANED = 0.5
+"""Between looks whether it is there [s]."""
+REFUSED = 2
+"""Exit status of a node that cannot do what it is told."""
+
+
+class RobotNode(Node):
+    """A node of one vehicle.
+
+    Topics stand below the node's namespace, or below the vehicle's name where it has none. The robot's clock counts
+    seconds of the node's ROS clock from its start, so that no digits are lost; simulated time counts from 0.
+    """
+
+    def __init__(self, name: str) -> None:
+        """
+        Raises:
+            VehicleError: The parameter `vehicle` names none.
+        """
+        super().__init__(name)
+        self.vehicle = load_vehicle(self.parameter("vehicle", "finsrov"))
+        self.make = RosMessages(self.vehicle)
+        self._below = "" if self.get_namespace() != "/" else f"{self.vehicle.name.replace('-', '_')}/"
+        simulated = self.get_parameter("use_sim_time").value
+        self.base = 0 if simulated else self.get_clock().now().nanoseconds // 10**9 * 10**9
+        """What the ROS clock shows when the robot's shows 0 [ns]."""
+        self._out: dict[str, Any] = {}
+
+    # -- parameters and time ------------------------------------------------------------------------------------
+
+    def parameter(self, name: str, default: Any) -> Any:
+        """Declare a parameter; its value."""
+        return self.declare_parameter(name, default).value
+
+    def now(self) -> float:
+        """The robot's clock [s]."""
+        return (self.get_clock().now().nanoseconds - self.base) * 1e-9
+
+    def seconds(self, stamp: Any) -> float:
+        """A message's stamp on the robot's clock [s]."""
+        return (nanoseconds(stamp) - self.base) * 1e-9
+
+    def ns(self, seconds: float) -> int:
+        """A time of the robot's clock as a stamp [ns]; times before 1970 are no stamps."""
+        return max(self.base + round(seconds * 1e9), 0)
+
+    # -- topics -------------------------------------------------------------------------------------------------
+
+    def topic(self, key: str) -> str:
+        """Name of a topic."""
+        return self.below(TOPICS[key].name)
+
+    def below(self, name: str) -> str:
+        """A name below the vehicle's, unless it begins with a slash."""
+        return name if name.startswith("/") else self._below + name
+
+    def sends(self, *keys: str) -> None:
+        """Make publishers, before there is something to say: peers need time to find them."""
+        for key in keys:
+            kind, quality = ros_type(TOPICS[key].type), quality_profile(TOPICS[key].quality)
+            self._out[key] = self.create_publisher(kind, self.topic(key), quality)
+
+    def send(self, key: str, message: Any) -> None:
+        """Publish; None is nothing to say."""
+        if message is not None:
+            self._out[key].publish(message)
+
+    def heard(self, key: str) -> bool:
+        """Whether somebody listens to what we publish."""
+        return bool(self._out[key].get_subscription_count())
+
+    def hears(self, key: str, take: Callable[[Any], None], *, raw: bool = False) -> None:
+        """Listen to a topic. What is latched is taken from publishers that do not latch too, each news once."""
+        kind, quality = ros_type(TOPICS[key].type), TOPICS[key].quality
+        if quality != LATCHED:
+            self.create_subscription(kind, self.topic(key), take, quality_profile(quality), raw=raw)
+            return
+        news = _News(take)
+        for one in (LATCHED, STREAM):
+            self.create_subscription(kind, self.topic(key), news, quality_profile(one), raw=raw)
+
+    # -- what every node says of itself ---------------------------------------------------------------------------
+
+    def event(self, kind: str, text: str, at: float | None = None) -> None:
+        """Something that happened, on the topic `events` and in the log."""
+        now = self.now() if at is None else at
+        values = {"stamp_ns": self.ns(now), "time": now, "kind": kind, "text": text, "node": self.get_name()}
+        self.send("event", self.make.words(values))
+        log = self.get_logger()
+        (log.warning if kind in ("fault", "refused", "error") else log.info)(f"{kind}: {text}")
+
+    def diagnose(self, level: str, text: str, values: dict[str, Any]) -> None:
+        """Health, on the topic `diagnostics`; level is ok, warn, error or stale."""
+        name = f"{self.vehicle.name}: {self.get_name()}"
+        self.send("diagnostics", self.make.diagnostics(self.ns(self.now()), name, level, text, values))
+
+    def close(self) -> None:
+        """Put in order what is not the middleware's; called once at the end, however it came."""
+
+
+class _News:
+    """Passes on what differs from the message before."""
+
+    def __init__(self, take: Callable[[Any], None]) -> None:
+        self._take, self._last = take, None
+
+    def __call__(self, message: Any) -> None:
+        if self._last is None or message != self._last:
+            self._last = message
+            self._take(message)
+
+
+def run(make: Callable[[], Made], spin: Callable[[Made], None] = rclpy.spin) -> int:
+    """Run a node until SIGINT, SIGTERM or the end of its launcher.
+
+    Args:
+        make: Makes it.
+        spin: Runs it.
+
+    Returns:
+        Exit status: 0, or `REFUSED` with a sentence on standard error.
+    """
+    _follow_parent()
+    node: Made | None = None
+    try:
+        rclpy.init()
+        node = make()
+        spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except (ValueError, ParameterException) as error:
+        print(f"finssim: {' '.join(str(error).split())}", file=sys.stderr)
+        return REFUSED
+    finally:
+        if node is not None:
+            node.close()
+        rclpy.try_shutdown()
+    return 0
+
+
+def _follow_parent() -> None:
+    """End with the launcher, even if it was killed."""
+    parent = os.environ.get(PARENT, "")
+    if not parent.isdecimal():
+        return
+
+    def watch() -> None:
+        while os.getppid() == int(parent):
+            time.sleep(ORPHANED)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, name="launcher", daemon=True).start()

@@ -1,0 +1,78 @@
+"""State estimation node: fixes, inertial samples and depth to one state, sixty times a second."""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import Any
+
+import numpy as np
+
+from finssim.localization.fusion.health import Health
+from finssim.localization.pool import load_pool
+from finssim.robot.intake import USED
+from finssim.robot.perception import Perception
+from finssim.ros2.nodes.conversions import telemetry_of
+from finssim.ros2.nodes.fix_frame import FixFrame
+from finssim.ros2.nodes.robot_node import RobotNode, run
+
+__all__ = ["StateEstimation", "health_values", "main"]
+
+
+class StateEstimation(RobotNode):
+    """Publishes Odometry, tf and EstimatorStatus of one stamp; no Odometry while the place is not known."""
+
+    def __init__(self) -> None:
+        super().__init__("state_estimation")
+        pool = load_pool(self.parameter("pool_file", "pool.yaml"))
+        mode = self.parameter("mode", "constant-velocity")
+        self.perception = Perception(self.vehicle, pool, mode=mode)
+        self.frame = FixFrame(pool, self.perception.estimator)
+        self.sends("odometry", "transform", "fixed_transform", "estimator", "diagnostics", "event")
+        stamp = self.ns(self.now())
+        self.send("fixed_transform", self.make.fixed_transforms(stamp, self.vehicle, pool))
+        self.hears("telemetry", self._on_telemetry)
+        self.hears("fix", self._on_fix)
+        self.create_timer(1.0 / self.parameter("rate", 60.0), self._estimate)
+        self.create_timer(1.0, self._tell)
+
+    def _on_telemetry(self, message: Any) -> None:
+        times = self.seconds(message.received), self.seconds(message.header.stamp)
+        self.perception.telemetry(times[0], telemetry_of(message), times[1])
+
+    def _on_fix(self, message: Any) -> None:
+        time = self.seconds(message.header.stamp)
+        self.perception.estimator.add(self.frame.from_map(message, time, self.now()))
+
+    def _estimate(self) -> None:
+        now = self.now()
+        reading, stamp = self.perception.reading(now), self.ns(now)
+        if np.isfinite(reading.position).all():
+            self.send("odometry", self.make.odometry(stamp, reading))
+            self.send("transform", self.make.transform(stamp, reading))
+        self.send("estimator", self.make.estimator(stamp, reading, health_values(self.perception.health())))
+
+    def _tell(self) -> None:
+        reading, health = self.perception.reading(self.now()), self.perception.health()
+        counts = {f"{s}: {word}": n for s, words in health.counts.items() for word, n in words.items()}
+        self.diagnose("ok" if reading.ready else "warn", reading.reason or reading.mode, counts)
+
+
+def health_values(health: Health) -> dict[str, Any]:
+    """What EstimatorStatus says beyond a reading."""
+    vision = health.counts.get("vision", {})
+    used = sum(n for word, n in vision.items() if word in USED)
+    return {
+        "vision_age": health.age_vision,
+        "imu_age": health.age_imu,
+        "depth_age": health.age_depth,
+        "fixes_accepted": used,
+        "fixes_rejected": sum(vision.values()) - used,
+        "reject_reason": health.reject_reason,
+        "mahalanobis": health.mahalanobis.get("vision", math.nan),
+    }
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run(StateEstimation))

@@ -1,0 +1,115 @@
+"""Teleoperation node: a gamepad, the keyboard or the topic `joy` to wrenches, arming and stops."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import ExitStack
+from typing import Any
+
+from finssim.robot.gamepad import XBOX
+from finssim.robot.operator import Device, Operator
+from finssim.robot.teleop import Hands, TeleopError
+from finssim.ros2.nodes.remote import RemoteBridge
+from finssim.ros2.nodes.robot_node import RobotNode, run
+from finssim.ros2.nodes.ros_messages import ros_type
+from finssim.ros2.topics import LATCHED, SENSOR, quality_profile
+
+__all__ = ["JoyDevice", "Teleop", "main"]
+
+LAST_WRENCHES = 3
+"""Wrenches of zero at the end."""
+
+
+class Teleop(RobotNode):
+    """Publishes what the hands want; the mode button hands over between `teleop` and the controller `other`."""
+
+    def __init__(self) -> None:
+        super().__init__("teleop")
+        self.sends("wrench", "event", "diagnostics")
+        self._mode = self.create_publisher(
+            ros_type("std_msgs/msg/String"), self.topic("mode"), quality_profile(LATCHED)
+        )
+        self._other, self._mine = self.parameter("other", "pid"), False
+        self._stack = ExitStack()
+        device = self._device(self.parameter("device", "joy"))
+        self.bridge, self.operator = RemoteBridge(self), Operator(device, swap=self._swap)
+        self._said = ""
+        self.create_timer(1.0 / self.parameter("rate", 30.0), self._turn)
+
+    def _device(self, name: str) -> Device:
+        if name == "joy":
+            device = JoyDevice()
+            self.create_subscription(
+                ros_type("sensor_msgs/msg/Joy"), "joy", device.take, quality_profile(SENSOR)
+            )
+            return device
+        if name == "gamepad":
+            from finssim.robot.gamepad import Gamepad
+
+            return self._stack.enter_context(Gamepad())
+        if name == "keyboard":
+            from finssim.robot.keyboard import HELP, Keyboard
+
+            print(HELP, file=sys.stderr)
+            return self._stack.enter_context(Keyboard())
+        raise TeleopError(f"unknown device '{name}': expected joy, gamepad or keyboard")
+
+    def _turn(self) -> None:
+        now = self.now()
+        self.operator.turn(now, self.bridge)
+        self.send("wrench", self.make.wrench(self.ns(now), self.operator.wrench()))
+        if self.operator.said and self.operator.said != self._said:
+            self.event("teleop", self.operator.said)
+        self._said = self.operator.said
+
+    def _swap(self) -> None:
+        self._mine = not self._mine
+        self._mode.publish(ros_type("std_msgs/msg/String")(data="teleop" if self._mine else self._other))
+
+    def close(self) -> None:
+        """Put the device back, and leave without thrust where the wire still carries it."""
+        self._stack.close()
+        if self.context.ok():
+            for _ in range(LAST_WRENCHES):
+                self.send("wrench", self.make.wrench(self.ns(self.now()), (0.0,) * 6))
+
+
+class JoyDevice:
+    """The topic `joy`, as ROS' joy_node publishes it for pads of the Xbox family: left and up are positive there."""
+
+    def __init__(self) -> None:
+        self._newest: Any = None
+        self._moved: set[int] = set()
+
+    def take(self, message: Any) -> None:
+        """The newest message."""
+        self._newest = message
+
+    def read(self, now: float) -> Hands | None:
+        """What the newest message shows; None where none came since the last look, or it is too short."""
+        message, self._newest = self._newest, None
+        if message is None or len(message.axes) < XBOX.axes or len(message.buttons) < XBOX.buttons:
+            return None
+        axes, held = message.axes, [bool(b) for b in message.buttons]
+        return Hands(
+            surge=float(axes[XBOX.left_y]),
+            sway=float(axes[XBOX.left_x]),
+            heave=self._trigger(axes, XBOX.right_trigger) - self._trigger(axes, XBOX.left_trigger),
+            yaw=float(axes[XBOX.right_x]),
+            **{
+                name: held[getattr(XBOX, name)]
+                for name in ("dead_man", "precision", "boost", "arm", "stop", "acknowledge", "mode")
+            },
+        )
+
+    def _trigger(self, axes: Any, axis: int) -> float:
+        """How far a trigger is pulled, [0, 1]: 1 at rest to -1, but 0 until it is moved for the first time."""
+        value = float(axes[axis])
+        if value != 0.0:
+            self._moved.add(axis)
+        return (1.0 - value) / 2.0 if axis in self._moved else 0.0
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run(Teleop))

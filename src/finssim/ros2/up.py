@@ -1,0 +1,168 @@
+"""`finssim ros2 up`: a whole graph of nodes as processes, without ROS installed."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from finssim.robot.goals import check_reachable, guide_of
+from finssim.robot.interrupt import interruptible
+from finssim.ros2.errors import Ros2Error
+from finssim.ros2.graphs import MCU_PORT, Plan, topics_of
+from finssim.ros2.supervisor import Supervisor
+from finssim.vehicles import load_vehicle
+
+__all__ = ["DIED", "FAULT", "Options", "plan_of", "up"]
+
+DIED, FAULT = 1, 3
+"""Exit status where a node died, and where the bridge ended in a fault."""
+STARTING = 180.0
+"""Time for the virtual pool to write its pool file [s]; the first rendering on a machine compiles."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What a person may choose."""
+
+    vehicle: str = "finsrov"
+    policy: str = "pid"
+    task: str | None = None
+    goal: str | None = None
+    trajectory: str | None = None
+    arm: bool = False
+    robot: str = "pool"
+    bind: str = "127.0.0.1:54321"
+    pictures: str | None = None
+    pool_file: Path | None = None
+    plant: str = "1"
+    severity: str = "realistic"
+    camera: str = "pictures"
+    port: int = MCU_PORT
+    truth: Path | None = None
+    start: str | None = None
+    hydrodynamics: str | None = None
+    record: Path | None = None
+    teleop: str | None = None
+    duration: float | None = None
+    seed: int = 0
+
+
+def plan_of(graph: str, options: Options, pool_file: Path) -> Plan:
+    """Nodes and parameters.
+
+    Args:
+        graph: sim, pool or robot.
+        options: As the person chose.
+        pool_file: That robot's nodes read, and the virtual pool writes.
+
+    Raises:
+        Ros2Error: There is no such graph, or a robot without pool file.
+        VehicleError, GoalError, ControlError: A vehicle, goal or trajectory that cannot be used.
+    """
+    o, vehicle = options, load_vehicle(options.vehicle)
+    if o.goal is not None or o.trajectory is not None:
+        check_reachable(guide_of(o.goal, o.trajectory), vehicle)
+    extra = (*(("recorder",) if o.record else ()), *(("teleop",) if o.teleop else ()))
+    plan = Plan(graph, o.vehicle, vehicle.name.replace("-", "_"), extra=extra)
+    if graph == "robot" and o.pool_file is None:
+        raise Ros2Error("a robot needs its pool file: give --pool-file")
+    plan.set("controller", policy=o.policy, task=o.task, goal=o.goal, trajectory=o.trajectory)
+    plan.set("sim", start=o.start, hydrodynamics=o.hydrodynamics, seed=o.seed)
+    _wire(plan, o)
+    for node in ("camera", "localizer", "state_estimation"):
+        plan.set(node, pool_file=str(pool_file))
+    if o.record is not None:
+        located = graph != "sim"
+        plan.set("recorder", record=str(o.record), pool_file=str(pool_file) if located else None)
+    plan.set("teleop", device=o.teleop, other=o.policy if o.policy.startswith("pid") else "policy")
+    if graph == "pool":
+        plan.set(
+            "virtual_pool", plant=o.plant, severity=o.severity, camera=o.camera, port=o.port, seed=o.seed
+        )
+        plan.set("virtual_pool", bind=o.bind, pool_file=str(pool_file), start=o.start)
+        plan.set("virtual_pool", truth=None if o.truth is None else str(o.truth))
+    return plan
+
+
+def _wire(plan: Plan, o: Options) -> None:
+    """Addresses: pictures come from the port after the motor controller's, to the port after our own end's."""
+    host, _, port = o.bind.rpartition(":")
+    if not port.isdecimal():
+        raise Ros2Error(f"--bind {o.bind}: expected ADDRESS:PORT")
+    pool = plan.graph == "pool" or o.robot == "pool"
+    address = f"udp://127.0.0.1:{o.port}" if pool else o.robot
+    camera = o.pictures or (f"udp://127.0.0.1:{o.port + 1}" if pool else "none")
+    plan.set("hardware_bridge", robot=address, bind=o.bind, need_reading=False if o.teleop else None)
+    plan.set("camera", pictures=camera, pictures_bind=f"{host}:{int(port) + 1}")
+
+
+def up(graph: str, options: Options, say: Callable[[str], None]) -> int:
+    """Run a graph until its time is over, all nodes have died, or Ctrl-C.
+
+    Args:
+        graph: sim, pool or robot.
+        options: As the person chose.
+        say: Takes a sentence.
+
+    Returns:
+        Exit status: 0, `DIED` or `FAULT`.
+    """
+    with TemporaryDirectory(prefix="finssim-ros2-") as folder:
+        pool_file = (options.pool_file or Path(folder) / "pool.yaml").resolve()
+        plan, parameters = plan_of(graph, options, pool_file), Path(folder) / "parameters.yaml"
+        plan.write(parameters)
+        for name, topic in topics_of(plan):
+            say(f"  {name}  {topic.type}  {topic.meaning}")
+        with interruptible() as interrupted, Supervisor(plan, parameters, say) as nodes:
+            if graph == "pool":
+                nodes.start("virtual_pool")
+                _await(pool_file, nodes, interrupted)
+            for name in plan.nodes:
+                if name != "virtual_pool":
+                    nodes.start(name)
+            return _watch(plan, options, nodes, interrupted, say)
+
+
+def _await(pool_file: Path, nodes: Supervisor, interrupted: Callable[[], bool]) -> None:
+    """Wait for the pool file of a virtual pool that has just been started."""
+    begun, end = time.time() - 1.0, time.monotonic() + STARTING
+    while not (pool_file.exists() and pool_file.stat().st_mtime >= begun - 1.0):
+        if interrupted():
+            raise KeyboardInterrupt
+        if nodes.look() or time.monotonic() > end:
+            raise Ros2Error("the virtual pool did not start: see what it said above")
+        time.sleep(0.05)
+
+
+def _watch(
+    plan: Plan,
+    options: Options,
+    nodes: Supervisor,
+    interrupted: Callable[[], bool],
+    say: Callable[[str], None],
+) -> int:
+    import rclpy
+
+    from finssim.ros2.watcher import Watcher
+
+    rclpy.init(args=["--ros-args", "-r", f"__ns:=/{plan.namespace}", "-p", f"vehicle:={options.vehicle}"])
+    watcher, died = Watcher(arm=options.arm), False
+    if not options.arm:
+        say("disarmed: thrusters will not turn until somebody publishes true on the topic arm, or with --arm")
+    end = time.monotonic() + (float("inf") if options.duration is None else options.duration)
+    try:
+        while not interrupted() and time.monotonic() < end:
+            watcher.turn(0.2)
+            died = bool(nodes.look()) or died
+            if all(child.dead for child in nodes.children):
+                break
+        watcher.bridge.disarm(watcher.now())
+        watcher.turn(0.1)
+    finally:
+        rclpy.try_shutdown()
+    sys.stdout.flush()
+    return DIED if died else FAULT if watcher.state == "fault" else 0

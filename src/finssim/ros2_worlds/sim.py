@@ -1,0 +1,117 @@
+"""Sim node: any vehicle of the engine as a ROS 2 robot, with the bridge and the topics of a real one, and /clock."""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import Any
+
+import numpy as np
+from rclpy.clock import Clock, ClockType
+
+from finssim.engine import Simulator
+from finssim.geometry.rotations import quat_from_yaw
+from finssim.quiet import start_warp
+from finssim.robot.bridge import Bridge
+from finssim.robot.bridge_settings import BridgeSettings
+from finssim.robot.goals import station_of
+from finssim.robot.robot import Reading
+from finssim.ros2.nodes.bridge_topics import BridgeTopics
+from finssim.ros2.nodes.robot_node import RobotNode, run
+from finssim.ros2.nodes.ros_messages import ros_type
+from finssim.ros2.topics import SERVICES
+from finssim.ros2_worlds.ideal_sensors import IdealSensors
+
+__all__ = ["Sim", "main"]
+
+STEP = 1.0 / 60.0
+"""Between commands, states and ticks of /clock [s]."""
+SUBSTEPS = 3
+MOST_BEHIND = 5
+"""Steps made up for at a time; a computer that is slower lets simulated time be slower."""
+
+
+class Sim(RobotNode):
+    """Simulated time begins at 0 and is everybody's; the state is the truth, so nothing has to be estimated."""
+
+    def __init__(self) -> None:
+        super().__init__("sim")
+        self.base, self.time = 0, 0.0
+        self.sends("clock", "odometry", "transform", "fixed_transform", "estimator")
+        self.sends("imu", "pressure", "event", "diagnostics")
+        hydrodynamics, seed = self.parameter("hydrodynamics", "calibrated"), self.parameter("seed", 0)
+        self.sim = Simulator(
+            self.vehicle, hydrodynamics=hydrodynamics, control_step=STEP, substeps=SUBSTEPS, seed=seed
+        )
+        self.start = station_of(self.parameter("start", "0,0,-0.5,0"))
+        self.sensors = IdealSensors(self.vehicle)
+        limits = BridgeSettings.of(self.vehicle, telemetry_timeout=math.inf)
+        self.bridge = Bridge(self.vehicle, limits)
+        self.topics = BridgeTopics(self, self.bridge, readings=False)
+        service = SERVICES["reset"]
+        self.create_service(ros_type(service.type), self.below(service.name), self._on_reset)
+        self._reset()
+        self.send("fixed_transform", self.make.fixed_transforms(0, self.vehicle, None))
+        self._factor, steady = (
+            self.parameter("real_time_factor", 1.0),
+            Clock(clock_type=ClockType.STEADY_TIME),
+        )
+        self._steady, self._began = steady, steady.now().nanoseconds
+        self._made = 0
+        self.create_timer(STEP / self._factor if self._factor > 0.0 else 0.0, self._turn, clock=steady)
+
+    def now(self) -> float:
+        """Simulated time [s]."""
+        return self.time
+
+    def _turn(self) -> None:
+        """As many steps as are due, but no more than a few."""
+        passed = (self._steady.now().nanoseconds - self._began) * 1e-9 * self._factor / STEP
+        due = int(passed) - self._made if self._factor > 0.0 else 1
+        for _ in range(min(due, MOST_BEHIND)):
+            self._step()
+        self._made += due
+
+    def _step(self) -> None:
+        self.bridge.reading(self.time, self._reading())
+        command = self.bridge.tick(self.time)
+        self.sim.set_thrust(self.bridge.force)
+        self.sim.step()
+        self.time += STEP
+        self._publish(command.normalised)
+
+    def _publish(self, normalised: Any) -> None:
+        stamp, reading, make = self.ns(self.time), self._reading(), self.make
+        self.send("clock", make.clock(stamp))
+        self.send("odometry", make.odometry(stamp, reading))
+        self.send("transform", make.transform(stamp, reading))
+        self.send("estimator", make.estimator(stamp, reading, {}))
+        sample = self.sensors.sample(reading, STEP)
+        self.send("imu", make.imu(stamp, sample))
+        self.send("pressure", make.pressure(stamp, sample))
+        self.topics.tell(self.time, normalised=normalised)
+
+    def _reading(self) -> Reading:
+        place, q, nu = (
+            np.array(self.sim.numpy(name)[0, 0], float) for name in ("position", "quaternion", "velocity")
+        )
+        whole = bool(np.isfinite([*place, *q, *nu]).all())
+        reason = "" if whole else "the simulation has come to grief: reset it"
+        return Reading(self.time, place, q / np.linalg.norm(q), nu, whole, "fresh", reason, np.zeros(7))
+
+    def _reset(self) -> None:
+        self.sim.place(self.start.position, quat_from_yaw(self.start.yaw))
+        self.sensors.reset()
+
+    def _on_reset(self, request: Any, response: Any) -> Any:
+        """Back to the start, disarmed; time goes on."""
+        self.bridge.disarm(self.time)
+        self._reset()
+        response.success, response.message = True, f"at {self.start.position}"
+        return response
+
+
+def main() -> None:
+    """Run the node."""
+    start_warp()
+    sys.exit(run(Sim))

@@ -1,0 +1,50 @@
+"""Virtual pool node: vehicle and room on the wires of real ones, of which camera and hardware_bridge make topics."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from finssim.pool.run import MCU_PORT
+from finssim.pool.run import run as serve
+from finssim.quiet import start_warp
+from finssim.robot.link.transports import DEFAULT_BIND
+from finssim.ros2.nodes.robot_node import RobotNode, run
+
+__all__ = ["VirtualPoolNode", "main"]
+
+
+class VirtualPoolNode(RobotNode):
+    """Reads its parameters and then is the pool until it is ended; nothing of the truth is published."""
+
+    def __init__(self) -> None:
+        super().__init__("virtual_pool")
+        self.sends("event", "diagnostics")
+        self.plan = {
+            "plant": str(self.parameter("plant", "1")),
+            "severity": self.parameter("severity", "realistic"),
+            "camera": self.parameter("camera", "pictures"),
+            "pictures": self.parameter("pictures", "udp"),
+            "port": self.parameter("port", MCU_PORT),
+            "robot": self.parameter("bind", DEFAULT_BIND),
+            "pool_file": _path(self.parameter("pool_file", "")),
+            "truth": _path(self.parameter("truth", "")),
+            "start": self.parameter("start", "0,0,-0.5,0"),
+            "seed": self.parameter("seed", 0),
+        }
+        self._vehicle_name = self.get_parameter("vehicle").value
+        self.event("start", f"plant {self.plan['plant']}, {self.plan['severity']}")
+
+    def serve(self) -> None:
+        """Be the pool until SIGINT or SIGTERM."""
+        serve(self._vehicle_name, lockstep=False, bind="127.0.0.1", duration=None, **self.plan)
+
+
+def _path(text: str) -> Path | None:
+    return Path(text) if text else None
+
+
+def main() -> None:
+    """Run the node."""
+    start_warp()
+    sys.exit(run(VirtualPoolNode, spin=VirtualPoolNode.serve))
