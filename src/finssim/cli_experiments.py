@@ -1,4 +1,4 @@
-"""Commands of the experiments in the virtual pool: t1, t2, ablation, all."""
+"""Commands of the experiments in the virtual pool: t1, t2, ablation, all, faults, soak, timing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import typer
 
 from finssim.cli_options import Json, Seed, Steps, Vehicle
 
-__all__ = ["ablation", "everything", "t1", "t2"]
+__all__ = ["ablation", "everything", "faults", "soak", "t1", "t2", "timing"]
 
 Out = Annotated[
     Path,
@@ -152,3 +152,77 @@ def everything(
         out=out, plants=plants, seeds=seeds, seed=seed, severity=severity, camera=camera, steps=steps,
         processes=processes, as_json=as_json,
     )  # fmt: skip
+
+
+def faults(
+    out: Out,
+    seeds: Annotated[
+        int, typer.Option(help="Virtual pools, each with its own vehicle, water and noise.", min=1, max=1000)
+    ] = 1,
+    seed: Seed = 1,
+    scenarios: Annotated[
+        str | None, typer.Option(help="Faults, separated by commas; all if not given.", metavar="NAMES")
+    ] = None,
+    severity: Severity = "realistic",
+    vehicle: Vehicle = "finsrov",
+    processes: Processes = None,
+    as_json: Json = False,
+) -> None:
+    """Break one thing after another while a vehicle drives: time until thrust is gone [s], place in the workspace [m].
+
+    Exit status 3: a fault did what it must not.
+
+    Example: finssim experiment faults --scenarios link-cut,blind-3 --out faults
+    """
+    from finssim.experiments.reliability.faults import run
+
+    chosen = None if scenarios is None else tuple(scenarios.split(","))
+    result = run(
+        out=out, seeds=seeds, seed=seed, scenarios=chosen, severity=severity, vehicle=vehicle,
+        processes=processes, as_json=as_json,
+    )  # fmt: skip
+    if not result["ok"]:
+        raise typer.Exit(3)
+
+
+def soak(
+    out: Annotated[Path, typer.Option(help="Directory for the result and the samples.", metavar="DIR")],
+    hours: Annotated[float, typer.Option(help="Vehicle time to keep a station [h].", min=0.001)] = 20.0,
+    seed: Seed = 1,
+    severity: Severity = "realistic",
+    vehicle: Vehicle = "finsrov",
+    as_json: Json = False,
+) -> None:
+    """Keep a station for hours in lock-step and watch the memory [MiB]. Ctrl-C ends it with what is known until then.
+
+    Exit status 3: the memory grew, or the bridge stopped the vehicle.
+
+    Example: finssim experiment soak --hours 20 --out soak
+    """
+    from finssim.experiments.reliability.soak import run
+
+    result = run(out=out, hours=hours, seed=seed, severity=severity, vehicle=vehicle, as_json=as_json)
+    if result["verdict"] == "grows" or result["faults"]:
+        raise typer.Exit(3)
+
+
+def timing(
+    out: Annotated[Path, typer.Option(help="Directory for the result.", metavar="DIR")],
+    minutes: Annotated[float, typer.Option(help="Of the run in real time [min].", min=0.05)] = 10.0,
+    camera: Camera = "pictures",
+    policy: Annotated[
+        str, typer.Option(help="A policy's directory, or pid, or pid-paper.", metavar="DIR|pid|pid-paper")
+    ] = "pid",
+    seed: Seed = 1,
+    vehicle: Vehicle = "finsrov",
+    as_json: Json = False,
+) -> None:
+    """Time the robot beside its pool on this machine: decisions missed, picture to command [ms], lock-step speed.
+
+    Example: finssim experiment timing --minutes 10 --out timing
+    """
+    from finssim.experiments.reliability.timing import run
+
+    run(
+        out=out, minutes=minutes, camera=camera, policy=policy, seed=seed, vehicle=vehicle, as_json=as_json
+    )
