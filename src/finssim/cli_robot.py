@@ -67,6 +67,12 @@ def run(
         Path, typer.Option(help="Pool file: camera, water plane and frames (.yaml).", metavar="FILE")
     ] = Path("pool.yaml"),
     vehicle: Vehicle = "finsrov",
+    trim: Annotated[
+        bool,
+        typer.Option(
+            "--trim", help="Put an integral in front of a policy, against a steady current or weight."
+        ),
+    ] = False,
     mode: Annotated[
         str, typer.Option(help="Estimator: constant-velocity or error-state.", metavar="MODE")
     ] = "constant-velocity",
@@ -115,6 +121,7 @@ def run(
         record=record,
         duration=duration,
         mode=mode,
+        trim=trim,
         arm=arm,
         as_json=as_json,
     )

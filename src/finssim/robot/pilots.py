@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from finssim.control.controllers import CONTROLLERS, controller
+from finssim.control.controllers import CONTROLLERS, controller_for
 from finssim.control.errors import ControlError
 from finssim.control.guidance import Guide, goal_at
 from finssim.control.modes import Wrench6, mode_from_dict
@@ -17,6 +18,7 @@ from finssim.control.observations import observer
 from finssim.control.policy import Policy
 from finssim.control.policy_description import PolicyError, read_description
 from finssim.control.tracking import Measured
+from finssim.control.trim import Trim
 from finssim.vehicles import Vehicle
 
 __all__ = ["ModeSwitch", "PidPilot", "Pilot", "PolicyPilot", "WrenchPilot", "make_pilot"]
@@ -60,17 +62,18 @@ class PidPilot:
 
     needs_state = True
 
-    def __init__(self, name: str, vehicle: Vehicle) -> None:
+    def __init__(self, name: str, vehicle: Vehicle, task: str = "t1") -> None:
         """
         Args:
             name: pid or pid-paper.
             vehicle: Its model gives the gains.
+            task: What it is for: pid-paper has a published profile of its own for t2.
 
         Raises:
             ControlError: Unknown name.
         """
         self.name = name
-        self._controller = controller(name, vehicle)
+        self._controller = controller_for(task, name, vehicle)
         self._mode = Wrench6.from_vehicle(vehicle)
         self._limits = np.asarray(vehicle.wrench_limits, float)
         self._memory: Any = self._controller.reset()
@@ -100,7 +103,13 @@ class PolicyPilot:
     needs_state = True
 
     def __init__(
-        self, directory: str | Path, vehicle: Vehicle, *, task: str | None = None, period: float | None = None
+        self,
+        directory: str | Path,
+        vehicle: Vehicle,
+        *,
+        task: str | None = None,
+        period: float | None = None,
+        trim: Trim | None = None,
     ) -> None:
         """Load a policy and check that it fits.
 
@@ -109,6 +118,7 @@ class PolicyPilot:
             vehicle: It must be the very one that the policy was trained for.
             task: It must have been trained for; None: whatever it was trained for.
             period: Time between two decisions at which it would be asked [s]; None: its own.
+            trim: An integral in front of it, for a steady current or weight; none if None.
 
         Raises:
             PolicyError, ControlError: Another vehicle, task, observation, rate or other limits, in one sentence.
@@ -123,6 +133,7 @@ class PolicyPilot:
         )
         self._mode = mode_from_dict(self.policy.description.action, vehicle)
         self.name = Path(directory).resolve().name
+        self._trim, self._shift = trim, np.zeros(3)
 
     @property
     def period(self) -> float:
@@ -138,17 +149,24 @@ class PolicyPilot:
             "task": d.task,
             "action": self._mode.name,
             "period_s": self.period,
+            "trim": asdict(self._trim) if self._trim else None,
             "hydrodynamics": d.hydrodynamics,
             "seed": d.seed,
             "files": dict(d.files),
         }
 
     def reset(self) -> None:
-        """A policy remembers nothing."""
+        """A policy remembers nothing; a trim its shift."""
+        self._shift = np.zeros(3)
 
     def act(self, reading: Measured, guide: Guide, t: float) -> Array:
         """Wanted thrusts in canonical order [N], (n,)."""
-        return self._mode.to_thrusters(self.policy.act(self._observer.observe(reading, guide, t)))
+        observation = self._observer.observe(reading, guide, t)
+        if self._trim is not None:
+            self._shift = self._trim.update(self._shift, reading, guide.at(t).position, self.period)
+            schema = self.policy.description.observation
+            observation = self._trim.shown(observation, reading, self._shift, schema)
+        return self._mode.to_thrusters(self.policy.act(observation))
 
 
 class WrenchPilot:
@@ -249,17 +267,17 @@ class ModeSwitch:
 
 
 def make_pilot(
-    name_or_directory: str | Path, vehicle: Vehicle, *, task: str | None = None
+    name_or_directory: str | Path, vehicle: Vehicle, *, task: str | None = None, trim: Trim | None = None
 ) -> PidPilot | PolicyPilot:
-    """A PID by its name, or the policy of a directory.
+    """A PID by its name, or the policy of a directory; a PID has an integral of its own and takes no trim.
 
     Raises:
         PolicyError, ControlError: It does not fit the vehicle or the task.
     """
     if str(name_or_directory) in CONTROLLERS:
-        return PidPilot(str(name_or_directory), vehicle)
+        return PidPilot(str(name_or_directory), vehicle, task or "t1")
     if not Path(name_or_directory).exists():
         raise PolicyError(
             f"{name_or_directory}: neither {' nor '.join(CONTROLLERS)} nor a policy directory: give one of these"
         )
-    return PolicyPilot(name_or_directory, vehicle, task=task)
+    return PolicyPilot(name_or_directory, vehicle, task=task, trim=trim)

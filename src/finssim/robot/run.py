@@ -13,6 +13,8 @@ from typing import Any
 
 from rich.console import Console
 
+from finssim.control.controllers import CONTROLLERS
+from finssim.control.trim import Trim
 from finssim.localization.pool import Pool, load_pool
 from finssim.robot.goals import check_reachable, guide_of
 from finssim.robot.link.transports import DEFAULT_BIND, host_port, open_transport
@@ -63,6 +65,7 @@ def run(
     record: Path | None = None,
     duration: float | None = None,
     mode: str = "constant-velocity",
+    trim: bool = False,
     arm: bool = False,
     as_json: bool = False,
 ) -> int:
@@ -79,6 +82,7 @@ def run(
         record: File that takes down everything.
         duration: When to end [s]; at the end of a trajectory, or when interrupted, if None.
         mode: Of the estimator.
+        trim: Put an integral in front of a policy.
         arm: Let thrusters turn.
         as_json: Print one JSON object.
 
@@ -88,7 +92,10 @@ def run(
     wiring, console = wiring or Wiring(), Console(stderr=True)
     ours, guide = load_vehicle(vehicle), guide_of(goal, trajectory)
     check_reachable(guide, ours)
-    pilot, pool = make_pilot(policy, ours, task=task), load_pool(pool_file)
+    if task is None and trajectory is not None and policy in CONTROLLERS:
+        task = "t2"
+    pilot = make_pilot(policy, ours, task=task, trim=Trim() if trim else None)
+    pool = load_pool(pool_file)
     perception = Perception(ours, pool, mode=mode)
     if not arm:
         console.print("dry run: thrusters will not turn without --arm")

@@ -40,6 +40,8 @@ class Job:
     """pictures (drawn and searched for tags) or corners (of the tags, with noise)."""
     fusion: bool = True
     """Whether the controller sees the fused state, or what each sensor said last."""
+    trim: bool = False
+    """Whether an integral stands in front of the policy."""
     position_noise: float = 0.0
     """Added to what the controller sees, per axis [m]."""
     yaw_noise: float = 0.0

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from finssim.control.guidance import Guide, Station
 from finssim.control.trajectories import load_trajectory
+from finssim.control.trim import Trim
 from finssim.experiments.metrics import measure_trial
 from finssim.experiments.setpoints import T1_SETPOINTS, T1_START
 from finssim.experiments.t2_metrics import ERRORS, measure_tracking
@@ -136,7 +137,7 @@ def _guide(job: Job) -> tuple[Guide, Array]:
 
 
 def _pilot(job: Job, vehicle: Any, seed: int) -> Pilot:
-    pilot: Pilot = make_pilot(job.controller, vehicle, task=job.task)
+    pilot: Pilot = make_pilot(job.controller, vehicle, task=job.task, trim=Trim() if job.trim else None)
     if job.position_noise or job.yaw_noise:
         return NoisyInput(pilot, position_std=job.position_noise, yaw_std=job.yaw_noise, seed=seed)
     return pilot

@@ -94,11 +94,17 @@ ROWS: dict[str, Row] = {
         training="calibrated-intervals",
         module="Randomisation within the calibration's intervals",
     ),
+    "calibrated-trim": Row(
+        title="Calibrated, with trim",
+        training="calibrated",
+        changes={"trim": True},
+        module="An integral in front of the policy",
+    ),
     "calibrated-pool": Row(
         title="Calibrated + pool ranges", training="calibrated-pool", module="Randomisation made for a pool"
     ),
 }
-"""The table in its order; the last three are ours."""
+"""The table in its order; the last four are ours."""
 
 TITLES = {name: row.title for name, row in ROWS.items()}
 

@@ -37,6 +37,12 @@ ROWS: dict[str, Row] = {
     "pid-paper": Row(
         title="PID, published gains", controller="pid-paper", paper="PID", module="The published PID"
     ),
+    "calibrated-dr-trim": Row(
+        title="Calibrated + DR, with trim",
+        training="calibrated-dr",
+        changes={"trim": True},
+        module="An integral in front of the policy",
+    ),
     "calibrated-pool": Row(
         title="Calibrated + pool ranges", training="calibrated-pool", module="Randomisation made for a pool"
     ),
