@@ -31,7 +31,7 @@ class BridgeTopics:
         self._node, self._bridge = node, bridge
         self._rivals = 0
         node.sends("thrusters", "event", "diagnostics")
-        node.hears("command", self._on_command)
+        self._commands = node.hears("command", self._on_command)
         node.hears("arm", lambda message: self._arm(bool(message.data)))
         node.hears("stop", lambda message: bridge.stop(node.now(), "emergency stop by topic"))
         node.hears("acknowledge", lambda message: bridge.acknowledge(node.now()))
@@ -82,10 +82,15 @@ class BridgeTopics:
 
     def _count(self) -> None:
         """Two that publish commands are a fault, even under one name."""
-        self._rivals = self._node.count_publishers(self._node.topic("command"))
+        self._rivals = self._publishers()
         if self._rivals > 1 and self._bridge.state in ("armed", "hold"):
             why = f"two publishers command the thrusters: {self._rivals} on {self._node.topic('command')}"
             self._bridge.stop(self._node.now(), why)
+
+    def _publishers(self) -> int:
+        """How many are known; Humble's rclpy can only look through the whole graph for it."""
+        count = getattr(self._commands, "get_publisher_count", None)
+        return int(count() if count else self._node.count_publishers(self._node.topic("command")))
 
     def _on_service(self, request: Any, response: Any) -> Any:
         why = self._arm(bool(request.data))

@@ -11,7 +11,7 @@ from finssim.ros2.nodes.robot_node import RobotNode, run
 
 __all__ = ["Camera", "main"]
 
-POLL = 100.0
+POLL = 90.0
 """Looks for a new picture [Hz]."""
 
 

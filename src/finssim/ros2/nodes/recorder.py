@@ -83,4 +83,4 @@ class _WireRecord(Recorder):
 
 def main() -> None:
     """Run the node."""
-    sys.exit(run(RecorderNode))
+    sys.exit(run(RecorderNode, urgent=False))

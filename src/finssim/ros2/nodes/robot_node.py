@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, TypeVar
 
 import rclpy
@@ -27,6 +28,8 @@ Made = TypeVar("Made", bound="RobotNode")
 
 ORPHANED = 0.5
 """Between looks whether it is there [s]."""
+URGENCY = -10
+"""Niceness of a node that others wait for; only a privileged user may have it, others do without."""
 REFUSED = 2
 """Exit status of a node that cannot do what it is told."""
 
@@ -95,15 +98,15 @@ class RobotNode(Node):
         """Whether somebody listens to what we publish."""
         return bool(self._out[key].get_subscription_count())
 
-    def hears(self, key: str, take: Callable[[Any], None], *, raw: bool = False) -> None:
-        """Listen to a topic. What is latched is taken from publishers that do not latch too, each news once."""
+    def hears(self, key: str, take: Callable[[Any], None], *, raw: bool = False) -> Any:
+        """Listen to a topic; the subscription. What is latched is taken from others too, each news once."""
         kind, quality = ros_type(TOPICS[key].type), TOPICS[key].quality
         if quality != LATCHED:
-            self.create_subscription(kind, self.topic(key), take, quality_profile(quality), raw=raw)
-            return
+            return self.create_subscription(kind, self.topic(key), take, quality_profile(quality), raw=raw)
         news = _News(take)
         for one in (LATCHED, STREAM):
-            self.create_subscription(kind, self.topic(key), news, quality_profile(one), raw=raw)
+            found = self.create_subscription(kind, self.topic(key), news, quality_profile(one), raw=raw)
+        return found
 
     # -- what every node says of itself ---------------------------------------------------------------------------
 
@@ -136,17 +139,23 @@ class _News:
             self._take(message)
 
 
-def run(make: Callable[[], Made], spin: Callable[[Made], None] = rclpy.spin) -> int:
+def run(
+    make: Callable[[], Made], spin: Callable[[Made], None] = rclpy.spin, *, urgent: bool = True
+) -> int:
     """Run a node until SIGINT, SIGTERM or the end of its launcher.
 
     Args:
         make: Makes it.
         spin: Runs it.
+        urgent: Whether it stands between a sensor and a thruster, and goes before other programs where it may.
 
     Returns:
         Exit status: 0, or `REFUSED` with a sentence on standard error.
     """
     _follow_parent()
+    if urgent:
+        with suppress(PermissionError):
+            os.nice(URGENCY)
     node: Made | None = None
     try:
         rclpy.init()
