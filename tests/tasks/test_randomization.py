@@ -228,4 +228,26 @@ def test_an_unknown_name_is_told_the_nearest():
 
 
 def test_the_published_sets_ship():
-    assert available() == ["equivalent_box", "fossen_learn_to_swim", "hold_for_position"]
+    assert {"equivalent_box", "fossen_learn_to_swim", "hold_for_position"} <= set(available())
+
+
+def test_without_thruster_dynamics_thrust_follows_in_one_physics_step():
+    """The ranges of the paper's ablation take lag and delay away; nominally a step does not suffice."""
+
+    def reached(ranges):
+        environment = Environment(StationKeeping(), worlds=4, action="thruster8", randomization=ranges, seed=3)
+        environment.step(np.full((4, 8), 0.5, dtype=np.float32))
+        thrust = environment.simulator.numpy("actuator")[:, 0]
+        return thrust / (0.5 * environment.simulator.vehicles[0].force_limits[1])
+
+    np.testing.assert_allclose(reached(Randomization("no_thruster_dynamics")), 1.0, atol=1e-5)
+    assert (reached(None) < 0.9).all()
+
+
+def test_the_ranges_of_a_pool_draw_currents_and_unlike_propellers():
+    """Every world has its own, within the bounds of the file."""
+    environment = Environment(StationKeeping(), worlds=64, randomization=Randomization("pool"), seed=3)
+    gain = environment.simulator.plant.gain.numpy()[:, 0]
+    current = np.linalg.norm(environment.simulator.water.current.numpy(), axis=1)
+    assert 0.72 <= gain.min() and gain.max() <= 1.21 and gain.std(axis=1).min() > 0.02
+    assert current.max() <= 0.06 + 1e-6 and current.std() > 0.01
