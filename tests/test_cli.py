@@ -52,6 +52,7 @@ COMMANDS = [
     "record info",
     "record repair",
     "play",
+    "view",
     "teleop",
     "ros2",
     "ros2 node",

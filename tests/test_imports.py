@@ -110,7 +110,7 @@ HOMES = {
         "ros2/watcher.py",
         "ros2_worlds/sim.py",
     },
-    "viser": set(),
+    "viser": {"viewer/app.py", "viewer/panel.py", "viewer/scene.py"},
     "mitsuba": {"experiments/mitsuba_renderer.py"},
 }
 """Library -> the files that may import it, each of which does."""

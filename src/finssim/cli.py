@@ -19,6 +19,7 @@ from finssim import (
     cli_robot,
     cli_ros2,
     cli_trials,
+    cli_view,
     cli_vision,
 )
 from finssim.cli_options import Device, Hydrodynamics, Json, Seed, Steps, Vehicle
@@ -61,6 +62,7 @@ app.command()(cli_record.play)
 app.command()(cli_record.teleop)
 app.command()(cli_robot.run)
 app.command()(cli_pool.pool)
+app.command()(cli_view.view)
 app.add_typer(cli_ros2.ros2_app, name="ros2")
 
 PICTURES = (".png", ".svg", ".pdf")

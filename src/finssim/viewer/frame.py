@@ -1,0 +1,114 @@
+"""What a view shows: the stage, which stands still, and a frame for every moment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.localization.pool import Pool
+from finssim.robot.messages import TagCorners
+from finssim.vehicles import Vehicle
+
+__all__ = ["Curve", "Frame", "Picture", "Pose", "Source", "Stage", "ViewError", "nowhere"]
+
+Array = npt.NDArray[np.float64]
+
+
+class ViewError(ValueError):
+    """Something that cannot be shown."""
+
+
+class Pose(NamedTuple):
+    """Where the body is."""
+
+    position: Array
+    """World frame [m], (3,)."""
+    quaternion: Array
+    """Body to world, xyzw, (4,)."""
+
+
+def nowhere() -> Array:
+    """No points, (0, 3)."""
+    return np.zeros((0, 3))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """What does not change while somebody looks."""
+
+    vehicle: Vehicle
+    title: str
+    lower: Array
+    """Corner of the water's box, world frame [m], (3,)."""
+    upper: Array
+    """The opposite corner [m], (3,)."""
+    walls: bool = True
+    """Whether the box is a pool; otherwise it is the space in which the vehicle may move."""
+    site: Pool | None = None
+    """Camera, if one looks on."""
+    path: Array = field(default_factory=nowhere)
+    """Trajectory to follow, world frame [m], (k, 3)."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What the camera saw last."""
+
+    image: npt.NDArray[np.uint8] | None
+    """Grey values; None where only tags are known."""
+    tags: Sequence[TagCorners] = ()
+    size: tuple[int, int] = (720, 1280)
+    """Rows and columns."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """One moment."""
+
+    time: float
+    """Since the source's beginning [s]."""
+    truth: Pose | None = None
+    estimate: Pose | None = None
+    goal: Pose | None = None
+    force: Array = field(default_factory=lambda: np.zeros(0))
+    """Of the thrusters, canonical order [N], (n,), or none."""
+    trail: Array = field(default_factory=nowhere)
+    """Where the vehicle was lately, world frame [m], (k, 3)."""
+    picture: Picture | None = None
+    status: Mapping[str, str] = field(default_factory=dict)
+    """Name -> a few words or a number with its unit."""
+    events: Sequence[str] = ()
+    """The latest, newest last."""
+
+
+class Curve(NamedTuple):
+    """One line of a plot."""
+
+    plot: str
+    """Title of the plot, with the unit."""
+    label: str
+    time: Array
+    """[s], (k,)"""
+    value: Array
+    """NaN where there is none, (k,)."""
+
+
+class Source(Protocol):
+    """Gives frames. A recorded one at any time; a live one goes on to the time, and never back."""
+
+    stage: Stage
+    duration: float
+    """[s]; infinite for a live one."""
+
+    def frame(self, time: float) -> Frame:
+        """The moment at a time since the beginning [s]."""
+
+    def curves(self) -> Sequence[Curve]:
+        """Errors over time, as far as they are known. Curves of one plot have the same times."""
+
+    def close(self) -> None:
+        """Let go of what it holds."""

@@ -1,0 +1,1 @@
+"""Where the pictures of a view come from: records, runs of the engine, the virtual pool and the simulator."""
