@@ -128,6 +128,24 @@ def excite(
     simulate: Annotated[
         bool, typer.Option("--simulate", help="Run them in the simulator and write the trials they make.")
     ] = False,
+    pool: Annotated[
+        int | None,
+        typer.Option(
+            help="Seed of a virtual pool: the robot's whole software plays them there, records, and makes trials.",
+            min=0,
+            metavar="SEED",
+        ),
+    ] = None,
+    severity: Annotated[
+        str, typer.Option(help="Of that pool: nominal, realistic or hard.", metavar="NAME")
+    ] = "realistic",
+    pool_vehicle: Annotated[
+        str | None,
+        typer.Option(
+            help="Vehicle around which that pool's own is drawn; the robot's if not given.",
+            metavar="NAME|FILE",
+        ),
+    ] = None,
     hydrodynamics: Hydrodynamics = "calibrated",
     noise: Annotated[
         str, typer.Option(help="Noise of simulated trials: sensors, published or none.", metavar="NAME")
@@ -148,12 +166,35 @@ def excite(
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Write excitation programmes (wrench [N, N m] and thrust [N] at 50 Hz) for a robot, or simulate them.
+    """Write excitation programmes (wrench [N, N m] and thrust [N] at 50 Hz) for a robot, or run them in a simulation.
 
-    Example: finssim excite surge,yaw --vehicle finsrov --simulate --out trials
+    Example: finssim excite surge,yaw --vehicle finsrov --pool 1 --out trials
     """
     wanted = _levels(levels)
     start_warp()
+    if pool is not None:
+        if simulate or room is not None:
+            raise typer.BadParameter(
+                "--pool goes with neither --simulate nor --room: a pool has its own room"
+            )
+        from finssim.experiments.excitation.command import excite_in_pool
+
+        made = excite_in_pool(
+            axes,
+            vehicle=vehicle,
+            out=out,
+            plant=pool,
+            pool_vehicle=pool_vehicle,
+            severity=severity,
+            kind=kind,
+            levels=wanted,
+            repeats=repeats,
+            coast=coast,
+            duration=duration,
+            seed=seed,
+        )
+        _print_folders(made, as_json)
+        return
     from finssim.calibration.excitation.excite import excite as run
 
     folders = run(

@@ -1,0 +1,79 @@
+"""Where in a pool a programme begins, and how far it may go, so that no wall, floor or surface is met."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.calibration.errors import CalibrationError
+from finssim.calibration.excitation.programmes import Programme
+from finssim.pool.plant_spec import Basin
+from finssim.vehicles import AXES, Vehicle
+
+__all__ = ["Place", "place_of"]
+
+Array = NDArray[np.float64]
+
+WALL, SURFACE, FLOOR = 0.35, 0.15, 0.12
+"""Water kept between the vehicle's envelope and these at the ends of a run [m]."""
+STOPPING = {"surge": 0.35, "sway": 0.3, "heave": 0.06}
+"""Of the way, kept for the coast after an excitation [m]."""
+LEAST_ROOM = 0.15
+"""Way on which nothing can be learnt [m]."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a programme begins."""
+
+    position: tuple[float, float, float]
+    """Body origin, world frame [m]."""
+    yaw: float
+    """[rad]"""
+    room: float | None
+    """Way after which the excitation ends [m]; None where it goes nowhere."""
+
+
+def place_of(programme: Programme, vehicle: Vehicle, basin: Basin) -> Place:
+    """The start of a programme: its way then lies in the middle of the pool, surge and sway along the pool's length.
+
+    Args:
+        programme: On one axis; several at once begin in the middle.
+        vehicle: Whose envelope keeps off the walls.
+        basin: The pool.
+
+    Raises:
+        CalibrationError: The pool has no room for it.
+    """
+    length, width, height = vehicle.body.size
+    top, bottom = -(0.5 * height + SURFACE), -basin.depth + 0.5 * height + FLOOR
+    middle = (0.0, 0.0, 0.5 * (top + bottom))
+    if len(programme.axes) != 1 or programme.axes[0] in ("roll", "pitch", "yaw"):
+        return Place(middle, 0.0, 0.5 * basin.width - 0.5 * math.hypot(length, width))
+    axis = programme.axes[0]
+    sign = _sign(programme)
+    if axis == "heave":
+        room = top - bottom - STOPPING[axis]
+        start = Place((0.0, 0.0, top if sign < 0.0 else bottom), 0.0, room)
+    else:
+        half = 0.5 * basin.length - 0.5 * (length if axis == "surge" else width) - WALL
+        # Heading along the pool for surge; across it for sway, so that its left is where x falls.
+        ahead = 1.0 if axis == "surge" else -1.0
+        yaw = 0.0 if axis == "surge" else 0.5 * math.pi
+        room = 2.0 * half - STOPPING[axis]
+        start = Place((-sign * ahead * half, 0.0, middle[2]), yaw, room)
+    if not room >= LEAST_ROOM:
+        raise CalibrationError(
+            f"{programme.name}: the pool leaves {room:.2f} m to go along {axis}, expected {LEAST_ROOM} m "
+            "or more: use a larger pool"
+        )
+    return start
+
+
+def _sign(programme: Programme) -> float:
+    """Direction in which a programme goes along its only axis."""
+    column = programme.tau_desired[:, AXES.index(programme.axes[0])]
+    return float(np.sign(column.sum())) or 1.0
