@@ -49,8 +49,10 @@ class HardwareBridge(RobotNode):
         """Publish a snapshot, as `robot.intake` gives it to a recorder; stamps are of the measurement."""
         stamp, received = self.ns(time), self.ns(now)
         self.send("telemetry", self.make.telemetry(stamp, received, telemetry))
-        self.send("imu", self.make.imu(stamp, telemetry))
-        self.send("pressure", self.make.pressure(stamp, telemetry))
+        if self.heard("imu"):
+            self.send("imu", self.make.imu(stamp, telemetry))
+        if self.heard("pressure"):
+            self.send("pressure", self.make.pressure(stamp, telemetry))
         self.send("shafts", self._speeds(stamp, telemetry.motor_rpm))
 
     def echo(self, now: float, echo: CommandEcho) -> None:

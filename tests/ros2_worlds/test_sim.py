@@ -1,0 +1,213 @@
+# ruff: noqa: E402 - rclpy can be imported once a backend is active
+"""A simulated vehicle on the wire: what it says, who may drive it, and how it is stopped."""
+
+import json
+import math
+import time
+
+import numpy as np
+import pytest
+
+from finssim.ros2.backend import activate
+
+activate(announce=False)
+
+import rclpy
+from rclpy.node import Node
+
+from finssim.ros2.nodes.ros_messages import RosMessages, ros_type
+from finssim.ros2.topics import TOPICS, quality_profile
+from finssim.ros2_worlds.sim import STEP, Sim
+
+PATIENCE = 30.0  # [s] on a busy machine
+STATES = ("disarmed", "armed", "hold", "fault")
+
+
+class World:
+    """A sim whose time we let go on, and a peer that talks to it over the wire."""
+
+    def __init__(self, sim, peer):
+        self.sim, self.peer, self.heard = sim, peer, {}
+        self.make, self._out = RosMessages(sim.vehicle), {}
+        self.count = len(sim.vehicle.thruster_names)
+        for key in ("odometry", "estimator", "thrusters", "imu", "pressure", "clock", "event"):
+            self.heard[key] = []
+            peer.create_subscription(
+                ros_type(TOPICS[key].type), self.name(key), self.heard[key].append, self.quality(key)
+            )
+        for key in ("command", "arm", "stop", "acknowledge"):
+            self.publisher(key)
+        assert self.until(lambda: all(p.get_subscription_count() for p in self._out.values()))
+
+    def name(self, key):
+        return TOPICS[key].under("finsrov")
+
+    def quality(self, key):
+        return quality_profile(TOPICS[key].quality)
+
+    def publisher(self, key):
+        self._out[key] = self.peer.create_publisher(
+            ros_type(TOPICS[key].type), self.name(key), self.quality(key)
+        )
+        return self._out[key]
+
+    def send(self, key, message=None, **fields):
+        self._out[key].publish(message or ros_type(TOPICS[key].type)(**fields))
+
+    def ask(self, force, source="peer", stamp=None):
+        """A command stamped now, by simulated time."""
+        self.send("command", self.make.command(self.sim.ns(stamp or self.sim.time), force, source))
+
+    def steps(self, n):
+        """So many steps of the world, each with the messages that have come."""
+        for _ in range(n):
+            for node in (self.sim, self.peer):
+                for _ in range(20):
+                    rclpy.spin_once(node, timeout_sec=0.0)
+            self.sim._step()
+
+    def until(self, condition, each=lambda: None):
+        """Let the world go on until a condition holds; whether it does in time."""
+        end = time.monotonic() + PATIENCE
+        while not condition() and time.monotonic() < end:
+            each()
+            self.steps(1)
+            time.sleep(0.002)
+        return condition()
+
+    @property
+    def state(self):
+        return STATES[self.heard["thrusters"][-1].state] if self.heard["thrusters"] else ""
+
+    def armed(self):
+        """Arm by the topic, commands at zero; whether the state says so."""
+
+        def each():
+            self.ask(np.zeros(self.count))
+            self.send("arm", data=True)
+
+        return self.until(lambda: self.state == "armed", each)
+
+
+@pytest.fixture(scope="module")
+def wire():
+    """The process's presence."""
+    rclpy.init(args=[])
+    yield
+    rclpy.try_shutdown()
+
+
+@pytest.fixture
+def world(wire):
+    """A fresh sim that goes on only when told to."""
+    sim, peer = Sim(), Node("peer")
+    for timer in list(sim.timers):
+        if timer.callback == sim._turn:
+            sim.destroy_timer(timer)
+    yield World(sim, peer)
+    sim.destroy_node(), peer.destroy_node()
+
+
+def test_time_goes_on_by_steps_and_everything_carries_it(world):
+    """/clock, Odometry, EstimatorStatus and sensors of one step have one stamp; the state is the engine's."""
+    assert world.until(lambda: world.heard["clock"] and world.heard["imu"] and world.heard["pressure"])
+    world.steps(3)
+    assert world.until(lambda: len(world.heard["odometry"]) > 3)
+    odometry = world.heard["odometry"][-1]
+    stamp = odometry.header.stamp.sec + 1e-9 * odometry.header.stamp.nanosec
+    assert stamp / STEP == pytest.approx(round(stamp / STEP), abs=1e-4)
+    assert odometry.pose.pose.position.z == pytest.approx(-0.5, abs=0.05)
+    assert world.heard["estimator"][-1].ready
+    force = world.heard["imu"][-1].linear_acceleration
+    assert math.hypot(force.x, force.y, force.z) == pytest.approx(9.81, abs=0.5)
+
+
+def test_only_an_explicit_word_arms(world):
+    """Commands, acknowledgements and a false do nothing; true on the topic arm does, and then thrust passes."""
+    force = np.full(world.count, 1.0)
+    for _ in range(20):
+        world.ask(force)
+        world.send("acknowledge")
+        world.send("arm", data=False)
+        world.steps(1)
+    assert {m.state for m in world.heard["thrusters"]} == {0}
+    assert not np.any([m.force for m in world.heard["thrusters"]])
+    world.steps(40)  # until the last command is stale
+    assert world.armed()
+    assert world.until(lambda: np.any(world.heard["thrusters"][-1].force), lambda: world.ask(force))
+    world.send("arm", data=False)
+    assert world.until(lambda: world.state == "disarmed", lambda: world.ask(force))
+    assert not np.any(world.heard["thrusters"][-1].force)
+
+
+def test_a_stop_is_a_fault_until_it_is_acknowledged(world):
+    """Arming is refused meanwhile, and the acknowledged vehicle is disarmed."""
+    assert world.armed()
+    world.send("stop")
+    assert world.until(lambda: world.state == "fault")
+    world.steps(70)  # the same event is told once a second
+    world.send("arm", data=True)
+    world.steps(10)
+    assert world.state == "fault" and "emergency stop" in world.heard["thrusters"][-1].reason
+    told = [json.loads(m.data) for m in world.heard["event"]]
+    assert any(e["kind"] == "refused" and "acknowledge" in e["text"] for e in told)
+    world.send("acknowledge")
+    assert world.until(lambda: world.state == "disarmed")
+
+
+def test_a_silent_commander_leaves_no_thrust(world):
+    """Half a second after the last command."""
+    assert world.armed()
+    force = np.full(world.count, 1.0)
+    assert world.until(lambda: np.any(world.heard["thrusters"][-1].force), lambda: world.ask(force))
+    last = world.sim.time
+    assert world.until(lambda: world.state == "hold")
+    stamp = world.heard["thrusters"][-1].header.stamp
+    assert stamp.sec + 1e-9 * stamp.nanosec - last < 0.5 + 10 * STEP
+    assert not np.any(world.heard["thrusters"][-1].force)
+
+
+@pytest.mark.parametrize("source", ["peer", "somebody else"])
+def test_a_second_publisher_is_a_fault(world, source):
+    """Under another name at once; under the same name because there are two on the topic."""
+    assert world.armed()
+    first = world._out["command"]
+    second = world.publisher("command")
+
+    def both():
+        for publisher, name in ((first, "peer"), (second, source)):
+            publisher.publish(world.make.command(world.sim.ns(world.sim.time), np.zeros(world.count), name))
+
+    assert world.until(lambda: world.state == "fault", both)
+    assert "two publishers" in world.heard["thrusters"][-1].reason
+
+
+def test_malformed_commands_are_no_sign_of_life(world):
+    """Wrong names, NaN, too few, an old stamp: none raises, none moves anything, and the vehicle holds."""
+    assert world.armed()
+
+    def bad():
+        world.ask(np.full(world.count, math.nan))
+        world.ask(np.ones(world.count - 1))
+        world.ask(np.ones(world.count), stamp=world.sim.time - 5.0 if world.sim.time > 5.0 else 1e6)
+        world.send("command", names=["nobody"], force=[1.0], source="peer")
+
+    assert world.until(lambda: world.state == "hold", bad)
+    assert not np.any([m.force for m in world.heard["thrusters"]])
+
+
+def test_services_say_what_the_topics_do(world):
+    """set_armed with an answer, reset back to the start."""
+    world.steps(5)
+    for name, kind, wanted in (
+        ("set_armed", "std_srvs/srv/SetBool", {"data": True}),
+        ("reset", "std_srvs/srv/Trigger", {}),
+    ):
+        client = world.peer.create_client(ros_type(kind), f"/finsrov/{name}")
+        assert client.wait_for_service(PATIENCE)
+        future = client.call_async(ros_type(kind).Request(**wanted))
+        assert world.until(future.done)
+        assert future.result().success
+        assert world.until(lambda wanted=wanted: world.state == ("armed" if wanted else "disarmed"))
+    world.steps(2)
+    assert world.heard["odometry"][-1].pose.pose.position.z == pytest.approx(-0.5, abs=0.01)
