@@ -6,6 +6,7 @@ import math
 import tempfile
 import time
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -84,29 +85,19 @@ def play(job: Job, path: Path) -> dict[str, Any]:
         arm=True,
         perception=Perception(vehicle, known_site, fusion=job.fusion),
     )
-    estimates = _Estimates()
     duration = guide.duration if math.isfinite(guide.duration) else job.duration
-    with tempfile.TemporaryDirectory() as folder:
-        world = VirtualPool(
+
+    def world(truth: Path) -> VirtualPool:
+        return VirtualPool(
             standing,
             draw_plant(standing, job.plant, job.severity),
             camera=PoolCamera(standing, true_site, mode=job.camera, settings=settings, seed=seed),
             start=(start[:3], quat_from_yaw(start[3])),
             seed=seed,
-            truth=Path(folder) / "truth",
+            truth=truth,
         )
-        try:
-            run_lockstep(
-                runtime,
-                world,
-                GETTING_READY + duration,
-                show=estimates,
-                until=lambda r: r.t >= duration or r.bridge.state == "fault",
-            )
-        finally:
-            world.close()
-        truth = read_truth(Path(folder) / "truth")
-    series = _series(truth, runtime.started, duration, np.array(estimates.rows))
+
+    series = _played(runtime, world, duration)
     write_series(path, series)
     fault = _fault(runtime)
     return {
@@ -117,6 +108,25 @@ def play(job: Job, path: Path) -> dict[str, Any]:
         "seconds": time.perf_counter() - began,
         "provenance": provenance(),
     }
+
+
+def _played(runtime: Runtime, world: Callable[[Path], VirtualPool], duration: float) -> dict[str, Array]:
+    """Let robot and world run for a time after arming; the series of truth and estimate."""
+    estimates = _Estimates()
+    with tempfile.TemporaryDirectory() as folder:
+        pool = world(Path(folder) / "truth")
+        try:
+            run_lockstep(
+                runtime,
+                pool,
+                GETTING_READY + duration,
+                show=estimates,
+                until=lambda r: r.t >= duration or r.bridge.state == "fault",
+            )
+        finally:
+            pool.close()
+        truth = read_truth(Path(folder) / "truth")
+    return _series(truth, runtime.started, duration, np.array(estimates.rows))
 
 
 def _fault(runtime: Runtime) -> str:
