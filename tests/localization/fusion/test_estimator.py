@@ -388,7 +388,6 @@ def test_surroundings_are_those_of_the_exposure():
     assert near.pitch == pytest.approx(0.05 * math.sin(1.1 * t + 0.5), abs=1e-5)
     port = position(t)[2] - 0.115 * math.cos(near.roll) * math.cos(near.pitch)
     assert near.depth == pytest.approx(1.0 - port, abs=1e-4)
-    assert float(wrap_angle(near.yaw - yaw(t))) == pytest.approx(0.0, abs=0.01)
     assert math.isnan(e.at(99.0).depth) and math.isnan(e.at(99.0).roll)
 
 

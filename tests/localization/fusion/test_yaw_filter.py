@@ -23,8 +23,8 @@ NOISE = YawNoise(rate=3e-3, bias_walk=5e-4)
 
 
 def start(batch=(), variance=0.01, bias_std=0.02):
-    P = np.broadcast_to(np.diag([variance, bias_std**2]), (*batch, 2, 2))
-    return YawState(np.zeros(batch), np.zeros(batch), P)
+    zero = np.zeros(batch)
+    return YawState(zero, zero, zero + variance, zero, zero + bias_std**2)
 
 
 def test_yaw_rate_is_the_derivative_of_yaw_on_a_tilting_path():
@@ -33,9 +33,8 @@ def test_yaw_rate_is_the_derivative_of_yaw_on_a_tilting_path():
     roll, pitch, _ = quat_to_euler(attitude(t))
     omega = body_rates(t)
     h = 1e-4
-    np.testing.assert_allclose(
-        yaw_rate(omega[:, 1], omega[:, 2], roll, pitch), (yaw(t + h) - yaw(t - h)) / (2 * h), atol=2e-7
-    )
+    rates = [yaw_rate(*numbers) for numbers in zip(omega[:, 1], omega[:, 2], roll, pitch, strict=True)]
+    np.testing.assert_allclose(rates, (yaw(t + h) - yaw(t - h)) / (2 * h), atol=2e-7)
     assert (
         np.abs(omega[:, 2] - 0.36 * np.cos(0.4 * t)).max() > 1e-3
     )  # the body's r alone is not the rate of yaw

@@ -6,6 +6,7 @@ is not touched. Pure functions over a leading `...` batch.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,16 @@ import numpy.typing as npt
 from finssim.geometry.rotations import quat_rotate
 from finssim.localization.fusion.fuse_turns import matrix_of, skew, turn_of
 
-__all__ = ["Tilt", "TiltGains", "follow", "in_body_axes", "roll_pitch", "tilt_from", "up_of"]
+__all__ = [
+    "Tilt",
+    "TiltGains",
+    "follow",
+    "height_above_origin",
+    "in_body_axes",
+    "roll_pitch",
+    "tilt_from",
+    "up_of",
+]
 
 Array = npt.NDArray[np.float64]
 
@@ -59,6 +69,12 @@ def up_of(roll: npt.ArrayLike, pitch: npt.ArrayLike) -> Array:
     """Unit vector upwards in the body frame, (..., 3): the last row of R_y(θ) R_x(φ)."""
     roll, pitch = np.asarray(roll, float), np.asarray(pitch, float)
     return np.stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)], axis=-1)
+
+
+def height_above_origin(point: tuple[float, float, float], roll: float, pitch: float) -> float:
+    """How much higher than the body's origin a point of the body is [m]: `up_of` times it, in plain numbers."""
+    x, y, z = point
+    return math.cos(pitch) * (math.sin(roll) * y + math.cos(roll) * z) - math.sin(pitch) * x
 
 
 def roll_pitch(up: Array) -> tuple[Array, Array]:

@@ -115,12 +115,11 @@ class Estimator:
         return health_of(estimate, self.settings, self.site, self._latest, self._reason, self._counts)
 
     def at(self, time: float) -> Surroundings:
-        """Roll, pitch, yaw and depth at the time of an exposure, for the fit of its pose: between samples in a straight
+        """Roll, pitch and depth at the time of an exposure, for the fit of its pose: between samples in a straight
         line, else from one within the freshness of its stream."""
         s = self.settings
         roll, pitch = self._timeline.tilt_at(time, s.imu_fresh, lambda track: (track.roll, track.pitch))
-        yaw = self.estimate(time).yaw
-        return Surroundings(roll, pitch, yaw, self._timeline.depth_at(time, s.depth_fresh))
+        return Surroundings(roll, pitch, self._timeline.depth_at(time, s.depth_fresh))
 
     @property
     def counts(self) -> dict[str, dict[str, int]]:

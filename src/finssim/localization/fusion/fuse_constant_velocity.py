@@ -5,12 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
 from finssim.localization.fusion import position_filter, yaw_filter
-from finssim.localization.fusion.attitude import Tilt, TiltGains, follow, roll_pitch, tilt_from, up_of
+from finssim.localization.fusion.attitude import (
+    Tilt,
+    TiltGains,
+    follow,
+    height_above_origin,
+    roll_pitch,
+    tilt_from,
+)
 from finssim.localization.fusion.changed import changed
 from finssim.localization.fusion.fuse_settings import Settings, Site
 from finssim.localization.fusion.gate import GateMemory, judge
@@ -65,7 +73,6 @@ class ConstantVelocity:
             site: What of pool and vehicle is needed.
         """
         self.settings, self.site = settings, site
-        self._port = np.array(site.depth_port)
         self._H_depth = np.array([[*site.up, 0.0, 0.0, 0.0]])
         self._motions = {(xy, z): motion_of(settings, xy, z) for xy in (False, True) for z in (False, True)}
 
@@ -73,7 +80,7 @@ class ConstantVelocity:
         """The state before any sample: nothing is known."""
         s = self.settings
         P = np.diag([s.largest_variance] * 3 + [s.speed_std**2] * 3)
-        yaw = YawState(np.array(0.0), np.array(0.0), np.diag([YAW_CAP, s.bias_std**2]))
+        yaw = YawState(0.0, 0.0, YAW_CAP, 0.0, s.bias_std**2)
         return Track(PositionState(np.zeros(6), P), yaw)
 
     def imu(self, track: Track, sample: ImuSample) -> tuple[Track, tuple[Outcome, ...]]:
@@ -81,7 +88,7 @@ class ConstantVelocity:
         dt = math.inf if track.imu_time is None else sample.time - track.imu_time
         track = self._tilted(track, sample, dt)
         steep = abs(track.pitch) > STEEPEST
-        rate = None if steep else float(yaw_rate(sample.omega[1], sample.omega[2], track.roll, track.pitch))
+        rate = None if steep else yaw_rate(sample.omega[1], sample.omega[2], track.roll, track.pitch)
         yaw = self._yaw_at(track, sample.time)
         if track.rate is not None and rate is not None and dt <= GYRO_HOLD:
             # Up to here the older rate was held; half the difference makes a trapezium of the step.
@@ -93,7 +100,7 @@ class ConstantVelocity:
         """Take in a depth: up . p + offset + lever = -depth."""
         s, site = self.settings, self.site
         track = self._positioned(track, sample.time)
-        lever = float(up_of(track.roll, track.pitch) @ self._port)
+        lever = height_above_origin(site.depth_port, track.roll, track.pitch)
         z = np.array([-sample.depth - site.offset - lever])
         R = np.array([[s.depth_std**2]])
         found = position_filter.innovation(track.position, self._H_depth, z, R)
@@ -130,18 +137,19 @@ class ConstantVelocity:
         unknown = ([0, 1, 3, 4] if track.vision_time is None else []) + (
             [2, 5] if track.depth_time is None else []
         )
-        x[unknown] = math.nan
-        P[unknown, :] = math.nan
-        P[:, unknown] = math.nan
+        if unknown:
+            x[unknown] = math.nan
+            P[unknown, :] = math.nan
+            P[:, unknown] = math.nan
         seen = track.yaw_seen is not None
         silent = track.rate is None or track.imu_time is None or time - track.imu_time > GYRO_HOLD
         return Estimate(
             time=time,
             x=x,
             P=P,
-            yaw=float(yaw.yaw) if seen else math.nan,
-            yaw_variance=float(yaw.P[0, 0]) if seen else math.nan,
-            yaw_rate=math.nan if silent else float(track.rate or 0.0) - float(yaw.bias),
+            yaw=yaw.yaw if seen else math.nan,
+            yaw_variance=yaw.variance if seen else math.nan,
+            yaw_rate=math.nan if silent else (track.rate or 0.0) - yaw.bias,
             roll=track.roll if track.imu_time is not None else math.nan,
             pitch=track.pitch if track.imu_time is not None else math.nan,
             vision_time=track.vision_time,
@@ -169,8 +177,8 @@ class ConstantVelocity:
         s = self.settings
         found = yaw_filter.innovation(track.yaw, sample.yaw or 0.0, variance)
         # Flipped yaws agree with one another as distances from the prediction, which turns with the vehicle.
-        apart, R = np.array([float(found.residual)]), np.array([[variance]])
-        verdict, memory = judge(s.gate, track.gates[1], sample.time, apart, R, float(found.mahalanobis), 0.05)
+        apart, R = np.array([found.residual]), np.array([[variance]])
+        verdict, memory = judge(s.gate, track.gates[1], sample.time, apart, R, found.mahalanobis, 0.05)
         if verdict == "accepted":
             yaw = yaw_filter.correct(track.yaw, found, variance)
         elif verdict == "gate":
@@ -180,7 +188,7 @@ class ConstantVelocity:
         then = track.yaw_seen if verdict == "gate" else sample.time
         gates = (track.gates[0], memory, track.gates[2])
         track = changed(track, yaw=yaw, yaw_seen=then, gates=gates)
-        return track, Outcome("yaw", verdict, float(found.mahalanobis), 1)
+        return track, Outcome("yaw", verdict, found.mahalanobis, 1)
 
     def _tilted(self, track: Track, sample: ImuSample, dt: float) -> Track:
         """Roll and pitch after a sample: the unit's own, else those of gyro and accelerometer."""
@@ -203,19 +211,15 @@ class ConstantVelocity:
         if math.isnan(then) or time <= then:
             return changed(track, position_time=_later(then, time))
         position = track.position
-        cuts = [
-            t + limit
-            for t in (track.vision_time, track.depth_time)
-            if t is not None
-            for limit in (s.coast, s.hold)
-        ]
-        for until in _steps(then, time, cuts):
+        seen = -math.inf if track.vision_time is None else track.vision_time
+        dived = -math.inf if track.depth_time is None else track.depth_time
+        for until in _steps(then, time, (seen + s.coast, seen + s.hold, dived + s.coast, dived + s.hold)):
             middle = 0.5 * (then + until)
-            old = [math.inf if t is None else middle - t for t in (track.vision_time, track.depth_time)]
-            still = ([0, 1] if old[0] > s.hold else []) + ([2] if old[1] > s.hold else [])
+            blind, deaf = middle - seen, middle - dived
+            still = ([0, 1] if blind > s.hold else []) + ([2] if deaf > s.hold else [])
             if still:
                 position = position_filter.frozen(position, still)
-            motion = self._motions[old[0] > s.coast, old[1] > s.coast]
+            motion = self._motions[blind > s.coast, deaf > s.coast]
             position = position_filter.predict(position, until - then, motion)
             then = until
         position = position_filter.capped(position, s.largest_variance)
@@ -228,14 +232,14 @@ class ConstantVelocity:
             return track.yaw
         yaw = track.yaw
         heard = -math.inf if track.imu_time is None or track.rate is None else track.imu_time + GYRO_HOLD
-        for until in _steps(then, time, [heard]):
+        for until in _steps(then, time, (heard,)):
             if until <= heard + 1e-12 and track.rate is not None:
                 yaw = yaw_filter.predict(yaw, track.rate, until - then, s.gyro)
             else:
                 noise = YawNoise(rate=s.blind_rate, bias_walk=s.gyro.bias_walk)
-                yaw = yaw_filter.predict(yaw, float(yaw.bias), until - then, noise)
+                yaw = yaw_filter.predict(yaw, yaw.bias, until - then, noise)
             then = until
-        return yaw_filter.capped(yaw, YAW_CAP) if yaw.P[0, 0] > YAW_CAP else yaw
+        return yaw_filter.capped(yaw, YAW_CAP) if yaw.variance > YAW_CAP else yaw
 
 
 _H_VISION = np.eye(6)[:2]
@@ -243,10 +247,16 @@ _H_VISION = np.eye(6)[:2]
 
 def vision_covariance(sample: VisionSample, settings: Settings) -> Array:
     """Covariance of x, y and yaw that a fix is given, (3, 3)."""
-    floor = np.diag([settings.vision_floor[0] ** 2] * 2 + [settings.vision_floor[1] ** 2])
+    floor = _diagonal(settings.vision_floor)
     if sample.covariance is None or settings.vision_fixed:
-        return np.diag([settings.vision_std[0] ** 2] * 2 + [settings.vision_std[1] ** 2]) + floor
+        return _diagonal(settings.vision_std) + floor
     return np.array(sample.covariance) + floor
+
+
+@lru_cache(maxsize=64)
+def _diagonal(std: tuple[float, float]) -> Array:
+    """Covariance of x, y and yaw that know nothing of each other, with a standard deviation of place and of yaw."""
+    return np.diag([std[0] ** 2, std[0] ** 2, std[1] ** 2])
 
 
 def motion_of(settings: Settings, xy_slows: bool, z_slows: bool) -> Motion:
@@ -262,7 +272,8 @@ def motion_of(settings: Settings, xy_slows: bool, z_slows: bool) -> Motion:
 
 def _steps(start: float, end: float, cuts: Iterable[float]) -> list[float]:
     """Ends of the steps from `start` to `end` that are cut at `cuts`."""
-    return [*sorted({cut for cut in cuts if start < cut < end}), end]
+    inside = {cut for cut in cuts if start < cut < end}
+    return [*sorted(inside), end] if inside else [end]
 
 
 def _later(then: float, time: float) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from finssim.localization.detection.detections import Frame
 from finssim.localization.detection.tags import tag_corners_b
 from finssim.localization.errors import LocalizationError
-from finssim.localization.fusion.attitude import up_of
+from finssim.localization.fusion.attitude import height_above_origin
 from finssim.localization.fusion.estimator import Estimator
 from finssim.localization.fusion.fuse_log import counted
 from finssim.localization.fusion.streams import VisionSample
@@ -85,7 +85,7 @@ class Fixes:
         near, site = estimator.at(time), estimator.site
         if math.isnan(near.depth) or math.isnan(near.roll) or math.isnan(near.pitch):
             return None
-        lever = float(up_of(near.roll, near.pitch) @ np.array(site.depth_port))
+        lever = height_above_origin(site.depth_port, near.roll, near.pitch)
         return Constraints(
             z_b=-near.depth - site.offset - lever,
             z_std=estimator.settings.depth_std,

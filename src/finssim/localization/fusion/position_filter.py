@@ -93,8 +93,8 @@ def transition(dt: float, motion: Motion) -> Array:
 def process_noise(dt: float, motion: Motion) -> Array:
     """Covariance Q that one step adds, (6, 6); see `Motion`."""
     if not any(motion.decay):
-        first, second, third = _noise_powers(motion)
-        return dt * first + (0.5 * dt**2) * second + (dt**3 / 3.0) * third
+        powers = np.array([dt, 0.5 * dt**2, dt**3 / 3.0])
+        return np.asarray((powers @ _noise_powers(motion)).reshape(6, 6))
     q, rate = np.array(motion.density), np.array(motion.decay)
     slow = rate * dt < 1e-4  # below it the closed form loses digits that the series keeps
     l = np.where(slow, 1.0, rate)
@@ -113,14 +113,14 @@ def process_noise(dt: float, motion: Motion) -> Array:
 
 
 @lru_cache(maxsize=16)
-def _noise_powers(motion: Motion) -> tuple[Array, Array, Array]:
-    """What goes with dt, dt²/2 and dt³/3 in the noise of a step where nothing decays, (6, 6) each."""
-    first, second, third = np.zeros((3, 6, 6))
+def _noise_powers(motion: Motion) -> Array:
+    """What goes with dt, dt²/2 and dt³/3 in the noise of a step where nothing decays, (3, 36)."""
+    first, second, third = powers = np.zeros((3, 6, 6))
     i, j = [0, 1, 2], [3, 4, 5]
     first[i, i], first[j, j] = motion.walk, motion.density
     if motion.integrated:
         second[i, j] = second[j, i] = third[i, i] = motion.density
-    return first, second, third
+    return powers.reshape(3, 36)
 
 
 def predict(state: PositionState, dt: float, motion: Motion) -> PositionState:
@@ -149,9 +149,20 @@ def innovation(state: PositionState, H: Array, z: Array, R: Array) -> Innovation
     residual = z - state.x @ H.T
     PHt = state.P @ H.T
     S = H @ PHt + R
-    inverse = 1.0 / S if S.shape[-1] == 1 else np.linalg.inv(S)
+    inverse = _inverse(S)
     weighted = (inverse @ residual[..., None])[..., 0]
     return Innovation(residual, S, np.asarray(np.sum(residual * weighted, axis=-1)), PHt @ inverse)
+
+
+def _inverse(S: Array) -> Array:
+    """Inverse of symmetric matrices, (..., m, m); np.linalg costs four times as much for a small one."""
+    if S.shape[-1] == 1:
+        return np.asarray(1.0 / S)
+    if S.shape != (2, 2):
+        return np.linalg.inv(S)
+    (a, b), (_, c) = S.tolist()
+    determinant = a * c - b * b
+    return np.array([[c, -b], [-b, a]]) / determinant
 
 
 def correct(state: PositionState, found: Innovation, H: Array, R: Array) -> PositionState:
@@ -161,10 +172,9 @@ def correct(state: PositionState, found: Innovation, H: Array, R: Array) -> Posi
     """
     K = found.gain
     kept = _I6 - K @ H
-    Kt, keptt = np.swapaxes(K, -1, -2), np.swapaxes(kept, -1, -2)
-    P = kept @ state.P @ keptt + K @ R @ Kt
+    P = kept @ state.P @ kept.swapaxes(-1, -2) + K @ R @ K.swapaxes(-1, -2)
     x = state.x + (K @ found.residual[..., None])[..., 0]
-    return PositionState(x, 0.5 * (P + np.swapaxes(P, -1, -2)))
+    return PositionState(x, 0.5 * (P + P.swapaxes(-1, -2)))
 
 
 def restarted(
@@ -200,8 +210,8 @@ def frozen(state: PositionState, axes: list[int]) -> PositionState:
 
 def capped(state: PositionState, variance: float) -> PositionState:
     """No position less certain than `variance` [m²]: rows and columns above it are scaled down together."""
-    d = np.diagonal(state.P, axis1=-2, axis2=-1)[..., :3]
-    if np.all(d <= variance):
+    d = state.P.diagonal(axis1=-2, axis2=-1)[..., :3]
+    if d.max() <= variance:
         return state
     scale = np.ones(state.x.shape)
     scale[..., :3] = np.sqrt(np.minimum(1.0, variance / np.maximum(d, 1e-300)))

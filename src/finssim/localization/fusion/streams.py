@@ -6,12 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
-import numpy as np
-import numpy.typing as npt
-
 __all__ = ["DepthSample", "ImuSample", "Sample", "VisionSample", "refusal"]
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -66,26 +61,29 @@ Sample: TypeAlias = "ImuSample | DepthSample | VisionSample"
 
 def refusal(sample: Sample) -> str | None:
     """Why a sample cannot be used whatever else is known, or None: text for counting, such as "not finite"."""
-    if not _finite(sample.time) or not (sample.arrival is None or _finite(sample.arrival)):
+    if not math.isfinite(sample.time) or not (sample.arrival is None or math.isfinite(sample.arrival)):
         return "time not finite"
     if isinstance(sample, ImuSample):
         values = (*sample.omega, *(sample.force or ()), *(sample.tilt or ()))
-        return None if all(map(_finite, values)) else "not finite"
+        return None if all(map(math.isfinite, values)) else "not finite"
     if isinstance(sample, DepthSample):
-        return None if _finite(sample.depth) else "not finite"
+        return None if math.isfinite(sample.depth) else "not finite"
     values = (*sample.position, *(() if sample.yaw is None else (sample.yaw,)))
-    if not all(map(_finite, values)):
+    if not all(map(math.isfinite, values)):
         return "not finite"
     return None if sample.covariance is None or _covariance(sample.covariance) else "covariance not positive"
 
 
-def _finite(value: float) -> bool:
-    return math.isfinite(value)
-
-
 def _covariance(rows: tuple[tuple[float, float, float], ...]) -> bool:
     """Whether it is a symmetric matrix that can be a covariance with nothing known exactly."""
-    R = np.array(rows, float)
-    if R.shape != (3, 3) or not np.isfinite(R).all() or np.abs(R - R.T).max() > 1e-6 * np.abs(R).max():
+    if len(rows) != 3 or any(len(row) != 3 for row in rows):
         return False
-    return bool(np.linalg.eigvalsh(R)[0] > 0.0)
+    (a, d, e), (D, b, f), (E, F, c) = rows
+    largest = max(map(abs, (a, b, c, d, D, e, E, f, F)))
+    if not math.isfinite(sum(map(abs, (a, b, c, d, D, e, E, f, F)))):
+        return False
+    if max(abs(d - D), abs(e - E), abs(f - F)) > 1e-6 * largest:
+        return False
+    # Sylvester: positive where the leading minors are.
+    second = a * b - d * d
+    return a > 0.0 and second > 0.0 and c * second - a * f * f - b * e * e + 2.0 * d * e * f > 0.0

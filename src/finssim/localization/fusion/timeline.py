@@ -28,8 +28,6 @@ class Surroundings:
     roll: float
     """[rad]; NaN where no IMU sample is near."""
     pitch: float
-    yaw: float
-    """As predicted, pool frame [rad]; NaN before the first fix."""
     depth: float
     """Of the pressure port [m]; NaN where no sample is near."""
 

@@ -1,16 +1,17 @@
 """Yaw from the gyro, corrected by what the camera sees (paper, eq. 15), with the gyro's bias as a second state.
 
-Pure functions over a leading `...` batch; yaw is left positive, about the vertical.
+Pure functions of plain numbers or, but for restarts and caps, of arrays of them. Yaw is left positive, about the
+vertical.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-
-from finssim.geometry.rotations import wrap_angle
 
 __all__ = [
     "YawInnovation",
@@ -25,18 +26,30 @@ __all__ = [
 ]
 
 Array = npt.NDArray[np.float64]
+Number: TypeAlias = Any
+"""A float, or an array with one for each run: the formulas take both, and plain floats cost a tenth."""
 
 
 @dataclass(frozen=True)
 class YawState:
     """What the filter knows."""
 
-    yaw: Array
-    """[rad], in [-pi, pi), (...)."""
-    bias: Array
-    """What the gyro shows too much of yaw rate [rad/s], (...)."""
-    P: Array
-    """Covariance of yaw and bias, (..., 2, 2)."""
+    yaw: Number
+    """[rad], in [-pi, pi)."""
+    bias: Number
+    """What the gyro shows too much of yaw rate [rad/s]."""
+    variance: Number
+    """Of yaw [rad²]."""
+    cross: Number
+    """Covariance of yaw and bias [rad²/s]."""
+    bias_variance: Number
+    """[rad²/s²]"""
+
+    @property
+    def P(self) -> Array:
+        """Covariance of yaw and bias, (..., 2, 2)."""
+        P = np.array([[self.variance, self.cross], [self.cross, self.bias_variance]])
+        return np.moveaxis(P, (0, 1), (-2, -1))
 
 
 @dataclass(frozen=True)
@@ -53,15 +66,15 @@ class YawNoise:
 class YawInnovation:
     """What a measured yaw says that the prediction did not."""
 
-    residual: Array
-    """The short way round [rad], (...)."""
-    S: Array
-    """Its variance [rad²], (...)."""
-    mahalanobis: Array
-    """Squared, (...)."""
+    residual: Number
+    """The short way round [rad]."""
+    S: Number
+    """Its variance [rad²]."""
+    mahalanobis: Number
+    """Squared."""
 
 
-def yaw_rate(q: npt.ArrayLike, r: npt.ArrayLike, roll: npt.ArrayLike, pitch: npt.ArrayLike) -> Array:
+def yaw_rate(q: float, r: float, roll: float, pitch: float) -> float:
     """Rate of yaw from body rates.
 
     psi_dot = (q sin φ + r cos φ) / cos θ
@@ -71,70 +84,73 @@ def yaw_rate(q: npt.ArrayLike, r: npt.ArrayLike, roll: npt.ArrayLike, pitch: npt
     turn left, nose down and left. The rate p about body x does not enter.
 
     Args:
-        q: Angular rate about body y [rad/s], (...).
-        r: Angular rate about body z [rad/s], (...).
-        roll: φ [rad], (...).
-        pitch: θ [rad], (...); not near ±90 degrees, where yaw is not defined.
+        q: Angular rate about body y [rad/s].
+        r: Angular rate about body z [rad/s].
+        roll: φ [rad].
+        pitch: θ [rad]; not near ±90 degrees, where yaw is not defined.
     """
-    q, r, roll, pitch = (np.asarray(a, float) for a in (q, r, roll, pitch))
-    return np.asarray((q * np.sin(roll) + r * np.cos(roll)) / np.cos(pitch))
+    return (q * math.sin(roll) + r * math.cos(roll)) / math.cos(pitch)
 
 
-def predict(state: YawState, rate: Array | float, dt: float, noise: YawNoise) -> YawState:
+def predict(state: YawState, rate: Number, dt: float, noise: YawNoise) -> YawState:
     """Yaw a time later.
 
-    ψ <- ψ + (ω_z - b) dt                                                              (paper, eq. 15)
+    ψ <- ψ + (ω_z - b) dt,  P <- F P F' + Q,  F = [1 -dt; 0 1]                         (paper, eq. 15)
 
     Args:
         state: Before.
-        rate: Rate of yaw as measured [rad/s], (...).
+        rate: Rate of yaw as measured [rad/s].
         dt: Time that passes [s].
         noise: Errors of the rate.
     """
-    # P <- F P F' + Q with F = [1 -dt; 0 1], written out: for one vehicle the products of matrices cost most.
-    w, old = noise.bias_walk**2, state.P
-    cross, bias = old[..., 0, 1], old[..., 1, 1]
-    P = np.empty(old.shape)
-    P[..., 0, 0] = old[..., 0, 0] + dt * (dt * bias - 2.0 * cross + noise.rate**2) + w * dt**3 / 3.0
-    P[..., 0, 1] = P[..., 1, 0] = cross - dt * bias - 0.5 * w * dt**2
-    P[..., 1, 1] = bias + w * dt
-    return YawState(wrap_angle(state.yaw + (rate - state.bias) * dt), state.bias, P)
+    w, doubt = noise.bias_walk**2, state.bias_variance
+    return YawState(
+        _wrapped(state.yaw + (rate - state.bias) * dt),
+        state.bias,
+        state.variance + dt * (dt * doubt - 2.0 * state.cross + noise.rate**2) + w * dt**3 / 3.0,
+        state.cross - dt * doubt - 0.5 * w * dt**2,
+        doubt + w * dt,
+    )
 
 
-def innovation(state: YawState, yaw: Array | float, variance: Array | float) -> YawInnovation:
-    """Compare a measured yaw [rad] of that variance [rad²] with the prediction, (...) each."""
-    residual = wrap_angle(np.asarray(yaw, float) - state.yaw)
-    S = np.asarray(state.P[..., 0, 0] + variance)
-    return YawInnovation(residual, S, np.asarray(residual**2 / S))
+def innovation(state: YawState, yaw: Number, variance: Number) -> YawInnovation:
+    """Compare a measured yaw [rad] of that variance [rad²] with the prediction."""
+    residual = _wrapped(yaw - state.yaw)
+    S = state.variance + variance
+    return YawInnovation(residual, S, residual**2 / S)
 
 
-def correct(state: YawState, found: YawInnovation, variance: Array | float) -> YawState:
+def correct(state: YawState, found: YawInnovation, variance: Number) -> YawState:
     """The state after a measured yaw, in Joseph's form.
 
     ψ <- ψ + K (ψ_vis - ψ),  K = P / (P + R), and likewise the bias                     (paper, eq. 15)
     """
-    K = state.P[..., :, 0] / found.S[..., None]
-    kept = np.eye(2) - K[..., :, None] * np.array([1.0, 0.0])
-    P = kept @ state.P @ np.swapaxes(kept, -1, -2)
-    P = P + np.asarray(variance)[..., None, None] * K[..., :, None] * K[..., None, :]
-    step = K * found.residual[..., None]
+    K, L = state.variance / found.S, state.cross / found.S
+    # P <- [1-K 0; -L 1] P [1-K 0; -L 1]' + R [K L]' [K L]
+    kept = 1.0 - K
+    cross = state.cross - L * state.variance
     return YawState(
-        wrap_angle(state.yaw + step[..., 0]),
-        np.asarray(state.bias + step[..., 1]),
-        0.5 * (P + np.swapaxes(P, -1, -2)),
+        _wrapped(state.yaw + K * found.residual),
+        state.bias + L * found.residual,
+        kept * kept * state.variance + variance * K * K,
+        kept * cross + variance * K * L,
+        state.bias_variance - L * (state.cross + cross) + variance * L * L,
     )
 
 
-def restarted(state: YawState, yaw: Array | float, variance: Array | float, bias_std: float) -> YawState:
+def restarted(state: YawState, yaw: float, variance: float, bias_std: float) -> YawState:
     """Start yaw at a measurement; the bias is kept, with at least the doubt it had at power-on if `bias_std` > 0."""
-    P = np.zeros(state.P.shape)
-    P[..., 0, 0] = variance
-    P[..., 1, 1] = np.maximum(state.P[..., 1, 1], bias_std**2)
-    return YawState(wrap_angle(yaw), state.bias, P)
+    return YawState(_wrapped(yaw), state.bias, variance, 0.0, max(state.bias_variance, bias_std**2))
 
 
 def capped(state: YawState, variance: float) -> YawState:
     """Yaw no less certain than `variance` [rad²]: its row and column are scaled down together."""
-    scale = np.ones(state.P.shape[:-1])
-    scale[..., 0] = np.sqrt(np.minimum(1.0, variance / state.P[..., 0, 0]))
-    return YawState(state.yaw, state.bias, state.P * scale[..., :, None] * scale[..., None, :])
+    scale = math.sqrt(min(1.0, variance / state.variance))
+    return YawState(
+        state.yaw, state.bias, state.variance * scale * scale, state.cross * scale, state.bias_variance
+    )
+
+
+def _wrapped(angle: Number) -> Number:
+    """The same angle in [-pi, pi) [rad]."""
+    return (angle + math.pi) % math.tau - math.pi
