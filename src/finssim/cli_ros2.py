@@ -70,6 +70,12 @@ def up(
         str | None,
         typer.Option(help="Task that the policy must have been trained for; its own if not given."),
     ] = None,
+    trim: Annotated[
+        bool,
+        typer.Option(
+            "--trim", help="Put an integral in front of a policy, against a steady current or weight."
+        ),
+    ] = False,
     vehicle: Vehicle = "finsrov",
     goal: Annotated[
         str | None,
@@ -174,6 +180,7 @@ def up(
         vehicle=vehicle,
         policy=policy,
         task=task,
+        trim=trim,
         goal=goal,
         trajectory=trajectory,
         arm=arm,

@@ -59,7 +59,14 @@ FRAMES = {
 """Coordinate frames; units are SI and radians throughout."""
 
 TOPICS = {
-    "imu": Topic("imu", "sensor_msgs/msg/Imu", SENSOR, "imu_link", "hardware_bridge, sim", "inertial sample"),
+    "imu": Topic(
+        "imu",
+        "sensor_msgs/msg/Imu",
+        SENSOR,
+        "base_link",
+        "hardware_bridge, sim",
+        "inertial sample, body axes",
+    ),
     "pressure": Topic(
         "pressure",
         "sensor_msgs/msg/FluidPressure",
@@ -81,7 +88,7 @@ TOPICS = {
         "sensor_msgs/msg/JointState",
         STREAM,
         "base_link",
-        "hardware_bridge, sim",
+        "hardware_bridge",
         "shafts' speeds",
     ),
     "odometry": Topic(
@@ -97,7 +104,7 @@ TOPICS = {
         "finssim_msgs/msg/EstimatorStatus",
         STREAM,
         "map",
-        "state_estimation",
+        "state_estimation, sim",
         "whether the state may be acted on, and why not",
     ),
     "fix": Topic(
@@ -119,7 +126,12 @@ TOPICS = {
         "name or file of a trajectory to follow from now on",
     ),
     "mode": Topic(
-        "mode", "std_msgs/msg/String", LATCHED, "", "you", "controller to use: pid, policy or teleop"
+        "mode",
+        "std_msgs/msg/String",
+        LATCHED,
+        "",
+        "teleop, you",
+        "controller to use: pid, pid-paper, policy or teleop",
     ),
     "wrench": Topic(
         "wrench_cmd",
@@ -169,11 +181,11 @@ TOPICS = {
         "std_msgs/msg/Empty",
         COMMAND,
         "",
-        "teleop, you",
+        "controller, teleop, you",
         "zero thrust until acknowledged",
     ),
     "acknowledge": Topic(
-        "acknowledge", "std_msgs/msg/Empty", COMMAND, "", "you", "ends a fault; leaves it disarmed"
+        "acknowledge", "std_msgs/msg/Empty", COMMAND, "", "teleop, you", "ends a fault; leaves it disarmed"
     ),
     "image": Topic(
         "camera/image", "sensor_msgs/msg/Image", SENSOR, "camera_optical", "camera", "picture, mono8"
@@ -195,7 +207,7 @@ TOPICS = {
         "its calibration",
     ),
     "tags": Topic(
-        "camera/tags", "std_msgs/msg/String", STREAM, "", "localizer", "tags found in a picture, JSON"
+        "camera/tags", "std_msgs/msg/String", STREAM, "", "camera, localizer", "tags found in a picture, JSON"
     ),
     "event": Topic("events", "std_msgs/msg/String", STREAM, "", "every node", "what happened, JSON"),
     "diagnostics": Topic(
@@ -219,7 +231,7 @@ TOPICS = {
 SERVICES = {
     "reset": ServiceName("reset", "std_srvs/srv/Trigger", "sim", "put the vehicle back to its start"),
     "set_armed": ServiceName(
-        "set_armed", "std_srvs/srv/SetBool", "hardware_bridge", "the topic arm, with an answer"
+        "set_armed", "std_srvs/srv/SetBool", "hardware_bridge, sim", "the topic arm, with an answer"
     ),
 }
 """Key -> service, for convenience beside the topics."""

@@ -31,6 +31,7 @@ class Options:
     vehicle: str = "finsrov"
     policy: str = "pid"
     task: str | None = None
+    trim: bool = False
     goal: str | None = None
     trajectory: str | None = None
     arm: bool = False
@@ -70,7 +71,7 @@ def plan_of(graph: str, options: Options, pool_file: Path) -> Plan:
     plan = Plan(graph, o.vehicle, vehicle.name.replace("-", "_"), extra=extra)
     if graph == "robot" and o.pool_file is None:
         raise Ros2Error("a robot needs its pool file: give --pool-file")
-    plan.set("controller", policy=o.policy, task=o.task, goal=o.goal, trajectory=o.trajectory)
+    plan.set("controller", policy=o.policy, task=o.task, trim=o.trim, goal=o.goal, trajectory=o.trajectory)
     plan.set("sim", start=o.start, hydrodynamics=o.hydrodynamics, seed=o.seed)
     _wire(plan, o)
     for node in ("camera", "localizer", "state_estimation"):

@@ -2,9 +2,11 @@
 
 from importlib import import_module
 
+from finssim.ros2.graphs import NODES
+
 
 def _run(node: str) -> None:
-    import_module(f"finssim.ros2.nodes.{node}").main()
+    import_module(NODES[node]).main()
 
 
 def camera() -> None:

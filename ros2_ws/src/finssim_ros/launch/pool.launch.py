@@ -13,17 +13,18 @@ ARGUMENTS = {
     "vehicle": ("finsrov", "vehicle of the catalogue, or its YAML file"),
     "namespace": ("finsrov", "what the vehicle's topics stand below"),
     "severity": ("realistic", "nominal, realistic or hard"),
-    "plant": ("0", "seed or file of the plant"),
+    "plant": ("1", "seed or file of the plant"),
+    "pool_file": ("pool.yaml", "file to write its calibrated pool and camera to, for the robot"),
     "params_file": ("", "your own parameter file; the package's config/pool.yaml where empty"),
 }
+
+WORDS = ("vehicle", "severity", "plant", "pool_file")
 
 
 def generate_launch_description():
     default = os.path.join(get_package_share_directory("finssim_ros"), "config", "pool.yaml")
     arguments = {**ARGUMENTS, "params_file": (default, ARGUMENTS["params_file"][1])}
-    words = {
-        n: ParameterValue(LaunchConfiguration(n), value_type=str) for n in ("vehicle", "severity", "plant")
-    }
+    words = {n: ParameterValue(LaunchConfiguration(n), value_type=str) for n in WORDS}
     return LaunchDescription(
         [
             *(

@@ -33,7 +33,8 @@ class Controller(RobotNode):
         super().__init__("controller")
         self.sends("command", "path", "policy", "event", "diagnostics")
         safety = self.vehicle.safety
-        self.modes = Modes(self, self.parameter("policy", "pid"), self.parameter("task", ""))
+        policy, task = self.parameter("policy", "pid"), self.parameter("task", "")
+        self.modes = Modes(self, policy, task, self.parameter("trim", False))
         self.bridge = RemoteBridge(self)
         self.state = RemoteState(self, safety.state_timeout if safety else STATE_TIMEOUT)
         nowhere = Station((0.0, 0.0, 0.0), 0.0)

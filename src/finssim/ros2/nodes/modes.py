@@ -14,6 +14,7 @@ from finssim.control.errors import ControlError
 from finssim.control.guidance import Guide
 from finssim.control.policy_description import NETWORK_FILE
 from finssim.control.tracking import Measured
+from finssim.control.trim import Trim
 from finssim.robot.pilots import ModeSwitch, PidPilot, PolicyPilot, WrenchPilot
 from finssim.robot.runtime import Runtime
 from finssim.ros2.nodes.conversions import wrench_of
@@ -30,12 +31,13 @@ STALE = 0.5
 class Modes:
     """PIDs by name, `policy` where a directory was given, and `teleop`: the topic `wrench_cmd`."""
 
-    def __init__(self, node: RobotNode, policy: str, task: str) -> None:
+    def __init__(self, node: RobotNode, policy: str, task: str, trim: bool) -> None:
         """
         Args:
             node: That hears wrenches.
             policy: A PID's name or a policy's directory, to begin with.
             task: That the policy must have been trained for; empty: its own.
+            trim: Put an integral in front of a policy.
 
         Raises:
             PolicyError, ControlError: It does not fit the vehicle.
@@ -46,7 +48,9 @@ class Modes:
         self._observed: _Observed | None = None
         self._hash = ""
         if policy not in pilots:
-            pilots["policy"] = pilot = PolicyPilot(policy, node.vehicle, task=task or None)
+            pilots["policy"] = pilot = PolicyPilot(
+                policy, node.vehicle, task=task or None, trim=Trim() if trim else None
+            )
             pilot.policy = self._observed = _Observed(pilot.policy)
             self._hash = self._observed.description.files.get(NETWORK_FILE, "")
         pilots["teleop"] = WrenchPilot(self._newest, node.vehicle)

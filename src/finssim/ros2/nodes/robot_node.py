@@ -139,9 +139,7 @@ class _News:
             self._take(message)
 
 
-def run(
-    make: Callable[[], Made], spin: Callable[[Made], None] = rclpy.spin, *, urgent: bool = True
-) -> int:
+def run(make: Callable[[], Made], spin: Callable[[Made], None] = rclpy.spin, *, urgent: bool = True) -> int:
     """Run a node until SIGINT, SIGTERM or the end of its launcher.
 
     Args:
