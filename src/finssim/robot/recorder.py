@@ -207,7 +207,8 @@ class Recorder:
         return self._messages.cdr(self._messages.picture(stamp, packed), TOPICS["picture"].kind)
 
     def _ns(self, seconds: float) -> int:
-        return self._epoch + (round(seconds * 1e9) if math.isfinite(seconds) else 0)
+        # An MCAP has no time before 0: a clock that was set back further is recorded as standing there.
+        return max(self._epoch + (round(seconds * 1e9) if math.isfinite(seconds) else 0), 0)
 
 
 def _vehicle_file(vehicle: Vehicle) -> dict[str, bytes]:

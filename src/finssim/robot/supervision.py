@@ -112,10 +112,13 @@ class Supervision:
         return left and f"left the workspace: {left}"
 
     def want(self, now: float, since: float) -> str:
-        """What thrust has to wait for: a command, counted from `since` [s] at the earliest, or the estimator."""
-        if now - max(self.commander.received, since) > self.settings.command_timeout:
-            return f"no command for {self.settings.command_timeout:g} s"
-        return self._estimator(now)
+        """What thrust has to wait for: the estimator, or a command, counted from `since` [s] at the earliest."""
+        # The estimator first: a controller that is not told where it is falls silent for that very reason.
+        why = self._estimator(now)
+        if why:
+            return why
+        late = now - max(self.commander.received, since) > self.settings.command_timeout
+        return f"no command for {self.settings.command_timeout:g} s" if late else ""
 
     def unfit(self, now: float) -> str:
         """What stands against arming."""

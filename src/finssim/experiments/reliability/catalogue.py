@@ -1,4 +1,4 @@
-"""The faults that a robot must survive. A new one is an entry here, and a function in `touches` if it does what none does."""
+"""The faults that a robot must survive. A new one is an entry here, and perhaps a function in `touches`."""
 
 from __future__ import annotations
 
