@@ -15,7 +15,7 @@ from finssim.ros2.graphs import PARENT, Plan
 
 __all__ = ["Supervisor"]
 
-PATIENCE = 5.0
+PATIENCE = 10.0
 """Time that a node has to end before it is killed [s]."""
 
 

@@ -22,7 +22,7 @@ class Watcher(RobotNode):
     def __init__(self, *, arm: bool) -> None:
         """
         Args:
-            arm: Ask for arming as soon as the state is ready, until it is granted for the first time.
+            arm: Ask for arming as soon as the state is ready and a controller is there, until it is granted once.
         """
         super().__init__("ros2_up")
         self._arm, self._asked = arm, 0.0
@@ -43,7 +43,8 @@ class Watcher(RobotNode):
             self._arm = False
         if self._arm and self.ready and end - self._asked >= ASK_EVERY:
             self._asked = end
-            self.bridge.arm(self.now(), "ros2 up")
+            if self.count_publishers(self.topic("command")):
+                self.bridge.arm(self.now(), "ros2 up")
 
     def _on_reading(self, reading: Reading) -> None:
         self.ready = reading.ready
