@@ -1,0 +1,224 @@
+# ruff: noqa: E402 - rclpy can be imported once a backend is active
+"""The controller node beside a bridge and an estimator that we play on the wire, and the person who drives."""
+
+import json
+import math
+import time
+
+import numpy as np
+import pytest
+
+from finssim.ros2.backend import activate
+
+activate(announce=False)
+
+import rclpy
+from rclpy.node import Node
+
+from finssim.control.controllers import controller
+from finssim.control.guidance import Station, goal_at
+from finssim.control.modes import Wrench6
+from finssim.robot.robot import Reading
+from finssim.ros2.nodes.controller import Controller
+from finssim.ros2.nodes.conversions import force_of
+from finssim.ros2.nodes.ros_messages import RosMessages, ros_type
+from finssim.ros2.nodes.teleop import Teleop
+from finssim.ros2.topics import TOPICS, quality_profile
+from finssim.vehicles import load_vehicle
+
+PATIENCE = 30.0  # [s] on a busy machine
+HEARD = ("command", "policy", "event", "stop", "wrench", "arm", "mode", "acknowledge")
+SENT = ("odometry", "estimator", "thrusters", "goal", "trajectory", "mode", "wrench")
+PLACE = np.array([0.2, 0.1, -0.5])
+
+
+class Stage:
+    """A node under test, and a peer that plays everything around it."""
+
+    def __init__(self, make):
+        self.peer = Node("peer", namespace="finsrov")
+        self.heard = {key: [] for key in HEARD}
+        for key in HEARD:
+            self.peer.create_subscription(
+                ros_type(TOPICS[key].type),
+                TOPICS[key].name,
+                self.heard[key].append,
+                quality_profile(TOPICS[key].quality),
+            )
+        self.node = make()
+        self.make, self.state, self.place, self.silent = (
+            RosMessages(self.node.vehicle),
+            "disarmed",
+            PLACE,
+            False,
+        )
+        self._out = {
+            key: self.peer.create_publisher(
+                ros_type(TOPICS[key].type), TOPICS[key].name, quality_profile(TOPICS[key].quality)
+            )
+            for key in SENT
+        }
+
+    def send(self, key, message=None, **fields):
+        self._out[key].publish(message or ros_type(TOPICS[key].type)(**fields))
+
+    def play(self):
+        """One turn of everything around the node: a state, and what the bridge says."""
+        stamp = time.time_ns()
+        nothing = np.zeros(6), True, "fresh", "", np.full(7, 0.01)
+        reading = Reading(0.0, self.place, np.array([0.0, 0.0, 0.0, 1.0]), *nothing)
+        if not self.silent:
+            self.send("odometry", self.make.odometry(stamp, reading))
+            self.send("estimator", self.make.estimator(stamp, reading, {}))
+        self.send("thrusters", self.make.thrusters(stamp, self.state, {}))
+        for node in (self.node, self.peer):
+            for _ in range(8):
+                rclpy.spin_once(node, timeout_sec=0.001)
+
+    def until(self, condition, each=lambda: None):
+        """Play until a condition holds; whether it does in time."""
+        end = time.monotonic() + PATIENCE
+        while not condition() and time.monotonic() < end:
+            each()
+            self.play()
+        return condition()
+
+    def turns(self, n):
+        for _ in range(n):
+            self.play()
+
+    def events(self, kind):
+        return [e["text"] for m in self.heard["event"] if (e := json.loads(m.data))["kind"] == kind]
+
+    def asked(self):
+        """Thrusts of the newest command."""
+        return force_of(self.heard["command"][-1], self.make.names)
+
+    def close(self):
+        self.node.close(), self.node.destroy_node(), self.peer.destroy_node()
+
+
+@pytest.fixture
+def wire():
+    """The process's presence, with the node's parameters as arguments."""
+    stages = []
+
+    def start(make, *arguments):
+        rclpy.init(args=["--ros-args", "-r", "__ns:=/finsrov", *arguments])
+        stages.append(Stage(make))
+        return stages[-1]
+
+    yield start
+    for stage in stages:
+        stage.close()
+    rclpy.try_shutdown()
+
+
+def pid_force(goal):
+    """What the same PID asks for at the stage's place, on its first decision."""
+    vehicle = load_vehicle("finsrov")
+    pid = controller("pid", vehicle)
+    at = Reading(0.0, PLACE, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(6), True)
+    tau, _ = pid.command(pid.reset(), at, goal_at(goal, 0.0))
+    limits = np.asarray(vehicle.wrench_limits, float)
+    return Wrench6.from_vehicle(vehicle).allocator.allocate(np.clip(tau, -limits, limits))[0]
+
+
+def test_it_is_silent_until_the_bridge_is_armed(wire):
+    """Then it asks for what the PID asks for, towards the goal of its parameter; disarmed, it is silent again."""
+    stage = wire(Controller, "-p", "goal:='0.6,0.1,-0.5,0'")
+    assert stage.until(lambda: stage.node.state.reading(stage.node.now()).ready)
+    stage.turns(20)
+    assert not stage.heard["command"]
+    stage.state = "armed"
+    assert stage.until(lambda: stage.heard["command"])
+    first = force_of(stage.heard["command"][0], stage.make.names)
+    assert first == pytest.approx(pid_force(Station((0.6, 0.1, -0.5), 0.0)), abs=1e-6)
+    assert stage.until(lambda: stage.heard["policy"]) and stage.heard["policy"][0].pilot == "pid"
+    stage.state = "disarmed"
+    stage.turns(20)
+    stage.heard["command"].clear()
+    stage.turns(20)
+    assert not stage.heard["command"]
+
+
+def test_without_a_goal_it_keeps_the_place_where_it_was_armed(wire):
+    """And a goal by topic moves it, one outside the workspace or not level does not."""
+    stage = wire(Controller)
+    stage.state = "armed"
+    assert stage.until(lambda: stage.heard["command"])
+    assert stage.node.runtime.guide.name == "here"
+    assert stage.node.runtime.guide.position == pytest.approx(tuple(PLACE))
+    stage.send("goal", stage.make.goal(0, (40.0, 0.0, -0.5), 0.0))
+    assert stage.until(lambda: any("outside the workspace" in text for text in stage.events("refused")))
+    stage.send("goal", stage.make.goal(0, (math.nan, 0.0, -0.5), 0.0))
+    assert stage.until(lambda: any("not finite" in text for text in stage.events("refused")))
+    stage.send("goal", stage.make.goal(0, (0.5, -0.3, -0.6), 0.7))
+    assert stage.until(lambda: stage.node.runtime.guide.name == "station")
+    assert stage.node.runtime.guide.at(0.0).position == pytest.approx([0.5, -0.3, -0.6])
+    stage.send("trajectory", data="no such shape")
+    assert stage.until(lambda: len(stage.events("refused")) == 3)
+
+
+def test_a_silent_estimator_ends_commands(wire):
+    """Half a second after its last word."""
+    stage = wire(Controller, "-p", "goal:='0.6,0.1,-0.5,0'")
+    stage.state = "armed"
+    assert stage.until(lambda: stage.heard["command"])
+    stage.silent = True
+    assert stage.until(lambda: not stage.node.state.reading(stage.node.now()).ready)
+    stage.turns(20)
+    stage.heard["command"].clear()
+    stage.turns(20)
+    assert not stage.heard["command"]
+
+
+def test_a_person_takes_over_by_mode_and_wrench(wire):
+    """The wrench becomes thrusts; one that is not finite, or has grown stale, is none; unknown modes are refused."""
+    stage = wire(Controller)
+    stage.state = "armed"
+    stage.send("mode", data="autopilot")
+    assert stage.until(lambda: any("autopilot" in text for text in stage.events("refused")))
+    stage.send("mode", data="teleop")
+    tau = np.array([3.0, 0.0, 0.0, 0.0, 0.0, 0.2])
+    push = lambda: stage.send("wrench", stage.make.wrench(time.time_ns(), tau))  # noqa: E731
+    wanted = Wrench6.from_vehicle(stage.node.vehicle).allocator.allocate(tau)[0]
+    assert stage.until(lambda: stage.heard["command"] and np.allclose(stage.asked(), wanted), push)
+    bad = lambda: stage.send("wrench", stage.make.wrench(0, [math.nan] * 6))  # noqa: E731
+    assert stage.until(lambda: not np.any(stage.asked()), bad)
+    assert not stage.heard["stop"]
+
+
+def joy(**held):
+    """A pad at rest, but for what is held."""
+    axes, buttons = [0.0] * 8, [0] * 11
+    axes[2] = axes[5] = 1.0
+    for name, value in held.items():
+        kind, index = name[0], int(name[1:])
+        (axes if kind == "a" else buttons)[index] = value
+    return ros_type("sensor_msgs/msg/Joy")(axes=axes, buttons=buttons)
+
+
+def test_hands_on_a_pad_become_wrench_arm_and_stop(wire):
+    """Dead-man and stick: thrust. START: arm. B: stop. SELECT: the mode. A silent pad: no thrust."""
+    stage = wire(Teleop)
+    pad = stage.peer.create_publisher(ros_type("sensor_msgs/msg/Joy"), "joy", 5)
+    rest, drive = joy(), joy(a1=1.0, b4=1)
+    newest = lambda: stage.heard["wrench"][-1].wrench.force.x  # noqa: E731
+    assert stage.until(lambda: stage.heard["wrench"], lambda: pad.publish(rest))
+    stage.turns(20)
+    assert newest() == 0.0
+    assert stage.until(lambda: newest() == pytest.approx(6.0), lambda: pad.publish(drive))
+    assert stage.until(lambda: newest() == 0.0)  # nobody at the pad
+    for _ in range(2):
+        stage.until(lambda: stage.node.operator.command.lost is False, lambda: pad.publish(rest))
+    assert not [m for m in stage.heard["arm"] if m.data]
+
+    def press(button):
+        """Down and up, so that each is seen."""
+        pad.publish(rest if int(time.monotonic() * 5) % 2 else joy(**{f"b{button}": 1}))
+
+    assert stage.until(lambda: [m for m in stage.heard["arm"] if m.data], lambda: press(7))
+    assert stage.until(lambda: stage.heard["mode"], lambda: press(6))
+    assert stage.heard["mode"][0].data == "teleop"
+    assert stage.until(lambda: stage.heard["stop"], lambda: press(1))
