@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from finssim.sensors.batch import SensorError
 from finssim.sensors.overhead_camera.neighbourhood import Rectangle, merged, rectangles
-from finssim.sensors.overhead_camera.packing import pack_scene, put_things
+from finssim.sensors.overhead_camera.packing import on_device, pack_scene, put_things
 from finssim.sensors.overhead_camera.photometry import digitise, noise_key
 from finssim.sensors.overhead_camera.raycast import cast
 from finssim.sensors.overhead_camera.scene import Body, Scene, TagInScene
@@ -78,8 +78,10 @@ class OverheadCamera:
         tags = self.scene.tags if tags is None else tuple(tags)
         bodies = self.scene.bodies if bodies is None else tuple(bodies)
         lens = self.scene.camera.lens
+        boxes = self._rectangles((*bodies, *tags))
         if region is None:
-            return self._picture(tags, bodies, time, seed, [Rectangle(0, 0, lens.width, lens.height)], None)
+            whole = [Rectangle(0, 0, lens.width, lens.height)]
+            return self._picture(tags, bodies, time, seed, whole, boxes, None)
         if self._background is None:
             self._background = self.render(
                 tags=[x for x in self.scene.tags if x.fixed],
@@ -87,9 +89,13 @@ class OverheadCamera:
                 time=time,
                 seed=seed,
             )
-        chosen = self._rectangles(_moving(tags, bodies)) if isinstance(region, str) else _listed(region)
+        if isinstance(region, str):
+            moving = zip((*bodies, *tags), boxes, strict=True)
+            chosen = [box for thing, box in moving if not thing.fixed]
+        else:
+            chosen = _listed(region)
         chosen = merged(r.clipped(lens.width, lens.height) for r in chosen)
-        return self._picture(tags, bodies, time, seed, chosen, self._background)
+        return self._picture(tags, bodies, time, seed, chosen, boxes, self._background)
 
     def radiance(self, *, time: float = 0.0, region: Region | None = None) -> NDArray[np.float32]:
         """Mean radiance of every pixel of the scene before it becomes a number, (height, width, 3); white paper has 1.
@@ -100,7 +106,8 @@ class OverheadCamera:
         """
         lens = self.scene.camera.lens
         r = Rectangle(*(region or (0, 0, lens.width, lens.height))).clipped(lens.width, lens.height)
-        samples = self._prepare(self.scene.tags, self.scene.bodies, time)
+        tags, bodies = self.scene.tags, self.scene.bodies
+        samples = self._prepare(tags, bodies, time, self._rectangles((*bodies, *tags)))
         return np.asarray(self._cast(r, samples).numpy())
 
     def neighbourhood(
@@ -116,16 +123,20 @@ class OverheadCamera:
         border = 2 + math.ceil(self.scene.sensor.spot)
         return rectangles(self.scene.camera, self.scene.interface, things, steepest, border)
 
-    def _prepare(self, tags: Sequence[TagInScene], bodies: Sequence[Body], time: float) -> wp.array[Any]:
-        """Pack what changes; rays per pixel, (height, width)."""
+    def _prepare(
+        self,
+        tags: Sequence[TagInScene],
+        bodies: Sequence[Body],
+        time: float,
+        boxes: Sequence[Rectangle],
+    ) -> wp.array[Any]:
+        """Pack what changes; rays per pixel, (height, width). `boxes`: of the bodies, then of the tags."""
         put_things(self._data, self._frame, tags, bodies, self._waves, time, self.device)
         lens = self.scene.camera.lens
         samples = np.zeros((lens.height, lens.width), np.uint8)
-        parts: tuple[tuple[Sequence[Thing], int], ...] = ((bodies, 1), (tags, self.scene.samples))
-        for things, rays in parts:
-            for r in self._rectangles(things):
-                samples[r.top : r.bottom, r.left : r.right] = rays
-        return wp.array(samples, dtype=wp.uint8, device=self.device)
+        for i, r in enumerate(boxes):
+            samples[r.top : r.bottom, r.left : r.right] = 1 if i < len(bodies) else self.scene.samples
+        return on_device(samples, wp.uint8, self.device)
 
     def _cast(self, r: Rectangle, samples: wp.array[Any]) -> wp.array[Any]:
         shape = (r.bottom - r.top, r.right - r.left)
@@ -142,19 +153,20 @@ class OverheadCamera:
         time: float,
         seed: int,
         region: Sequence[Rectangle],
+        boxes: Sequence[Rectangle],
         background: Image | None,
     ) -> Image:
         sensor, lens = self.scene.sensor, self.scene.camera.lens
         shape = (lens.height, lens.width, 3 if sensor.colour else 1)
-        start = np.zeros(shape, np.uint8) if background is None else background.reshape(shape)
-        image: wp.array[Any] = wp.array(start, dtype=wp.uint8, device=self.device, copy=True)
-        samples = self._prepare(tags, bodies, time)
+        start = np.zeros(shape, np.uint8) if background is None else background.reshape(shape).copy()
+        image = on_device(start, wp.uint8, self.device)
+        samples = self._prepare(tags, bodies, time, boxes)
         levels = [sensor.gain, sensor.full_well, sensor.read_noise, sensor.gamma, sensor.noise]
         for r in region:
             radiance = self._cast(r, samples)
             inputs = [radiance, r.top, r.left, *levels, noise_key(seed, time), image]
             wp.launch(digitise, dim=radiance.shape, inputs=inputs, device=self.device)
-        return np.asarray(image.numpy()).reshape(shape if sensor.colour else shape[:2]).copy()
+        return np.asarray(image.numpy()).reshape(shape if sensor.colour else shape[:2])
 
 
 def render(
