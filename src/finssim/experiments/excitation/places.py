@@ -40,6 +40,8 @@ class Place:
 def place_of(programme: Programme, vehicle: Vehicle, basin: Basin) -> Place:
     """The start of a programme: its way then lies in the middle of the pool, surge and sway along the pool's length.
 
+    One that goes both ways begins in the middle itself, and has half of the way to either side.
+
     Args:
         programme: On one axis; several at once begin in the middle.
         vehicle: Whose envelope keeps off the walls.
@@ -56,24 +58,26 @@ def place_of(programme: Programme, vehicle: Vehicle, basin: Basin) -> Place:
     axis = programme.axes[0]
     sign = _sign(programme)
     if axis == "heave":
-        room = top - bottom - STOPPING[axis]
-        start = Place((0.0, 0.0, top if sign < 0.0 else bottom), 0.0, room)
+        way = top - bottom
+        z = middle[2] - 0.5 * sign * way
+        start = Place((0.0, 0.0, z), 0.0, way * (1.0 if sign else 0.5) - STOPPING[axis])
     else:
         half = 0.5 * basin.length - 0.5 * (length if axis == "surge" else width) - WALL
         # Heading along the pool for surge; across it for sway, so that its left is where x falls.
         ahead = 1.0 if axis == "surge" else -1.0
         yaw = 0.0 if axis == "surge" else 0.5 * math.pi
-        room = 2.0 * half - STOPPING[axis]
-        start = Place((-sign * ahead * half, 0.0, middle[2]), yaw, room)
-    if not room >= LEAST_ROOM:
+        start = Place(
+            (-sign * ahead * half, 0.0, middle[2]), yaw, half * (2.0 if sign else 1.0) - STOPPING[axis]
+        )
+    if start.room is None or not start.room >= LEAST_ROOM:
         raise CalibrationError(
-            f"{programme.name}: the pool leaves {room:.2f} m to go along {axis}, expected {LEAST_ROOM} m "
+            f"{programme.name}: the pool leaves {start.room or 0.0:.2f} m to go along {axis}, expected {LEAST_ROOM} m "
             "or more: use a larger pool"
         )
     return start
 
 
 def _sign(programme: Programme) -> float:
-    """Direction in which a programme goes along its only axis."""
+    """Direction in which a programme goes along its only axis; 0 where it goes both ways."""
     column = programme.tau_desired[:, AXES.index(programme.axes[0])]
-    return float(np.sign(column.sum())) or 1.0
+    return float(column.max() > 0.0) - float(column.min() < 0.0)
