@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import viser
@@ -9,7 +10,7 @@ import viser
 from finssim.viewer.frame import Frame, Picture, Stage
 from finssim.viewer.picture_panel import blank, draw_picture
 from finssim.viewer.playback import SPEEDS, Playback
-from finssim.viewer.plots import plots_of
+from finssim.viewer.plots import legend_of, plots_of
 from finssim.viewer.scene import COLOURS
 
 __all__ = ["Panel"]
@@ -41,7 +42,7 @@ class Panel:
                 self._image = self._gui.add_image(blank(), jpeg_quality=70)
         self._seen: Picture | None = None
         with self._gui.add_folder("errors") as self._figures:
-            pass
+            self._named = self._gui.add_markdown("")
         self._plots: dict[tuple[str, ...], Any] = {}
         with self._gui.add_folder("events"):
             self._events = self._gui.add_markdown("none yet")
@@ -64,7 +65,7 @@ class Panel:
         if self._slider is None:
             self._clock.content = f"{frame.time:.1f} s"
         elif self._shown != playback.time:
-            self._slider.value = self._shown = round(playback.time, 3)
+            self._slider.value = self._shown = min(round(playback.time, 2), self._slider.max)
         rows = "".join(f"| {name} | {text} |\n" for name, text in frame.status.items())
         content = f"| | |\n|---|---|\n{rows}" if rows else ""
         if content != self._status.content:
@@ -79,7 +80,11 @@ class Panel:
 
     def plot(self, curves: Any, now: float) -> None:
         """Draw curves, up to a time in full [s]."""
-        for plot in plots_of(curves):
+        plots = plots_of(curves)
+        named = legend_of(plots)
+        if named != self._named.content:
+            self._named.content = named
+        for plot in plots:
             key = (plot.title, *(curve.label for curve in plot.curves))
             if key not in self._plots:
                 for old in [k for k in self._plots if k[0] == plot.title]:
@@ -103,8 +108,8 @@ class Panel:
         if playback.live:
             self._clock = gui.add_markdown("0.0 s")
         else:
-            longest = max(playback.duration, SLIDER_STEP)
-            self._slider = gui.add_slider("time [s]", 0.0, round(longest, 3), SLIDER_STEP, 0.0)
+            steps = max(1, math.floor(playback.duration / SLIDER_STEP))
+            self._slider = gui.add_slider("time [s]", 0.0, round(steps * SLIDER_STEP, 2), SLIDER_STEP, 0.0)
         self._button = gui.add_button("pause" if playback.playing else "play")
         speeds = tuple(f"{speed:g}x" for speed in SPEEDS)
         first = f"{playback.speed:g}x"

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from finssim.viewer.frame import Curve
 
-__all__ = ["Plot", "plots_of"]
+__all__ = ["Plot", "legend_of", "plots_of"]
 
 Array = npt.NDArray[np.float64]
 
@@ -47,3 +47,11 @@ def plots_of(curves: Sequence[Curve]) -> list[Plot]:
     order = list(dict.fromkeys(curve.plot for curve in curves))
     sorted_curves = sorted(curves, key=lambda curve: order.index(curve.plot))
     return [Plot(title, list(same)) for title, same in groupby(sorted_curves, key=lambda curve: curve.plot)]
+
+
+def legend_of(plots: Sequence[Plot]) -> str:
+    """Which colour is which curve, as markup; curves of the same place in their plots share label and colour."""
+    labels = dict.fromkeys(
+        (colour, curve.label) for plot in plots for colour, curve in zip(LINES, plot.curves, strict=False)
+    )
+    return " · ".join(f'<span style="color:{colour}">■</span> {label}' for colour, label in labels)

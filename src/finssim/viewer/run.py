@@ -20,6 +20,16 @@ from finssim.viewer.sources.guides import guide_for
 __all__ = ["Choice", "open_source", "run"]
 
 
+_DRIVEN = {"policy", "task", "goal", "trajectory", "seed"}
+HEEDED = {
+    "pool": _DRIVEN | {"plant", "severity", "camera"},
+    "sim": _DRIVEN | {"hydrodynamics"},
+    "record": {"truth", "truth_offset", "basin"},
+    "folder": {"world"},
+}
+"""Kind of source -> the options, besides the vehicle, that it heeds."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Choice:
     """What a person wants to look at; fields as the options of the command."""
@@ -48,6 +58,7 @@ def open_source(choice: Choice) -> Source:
         ViewError: There is none of that name.
         ValueError: What it is made of is refused, in one sentence.
     """
+    _refuse_strangers(choice)
     if choice.source == "pool":
         return _pool(choice)
     if choice.source == "sim":
@@ -89,6 +100,17 @@ def run(
             view.run(lambda: interrupted() or time.monotonic() >= end)
     finally:
         view.close()
+
+
+def _refuse_strangers(choice: Choice) -> None:
+    """Refuse options that the source would not heed."""
+    path = Path(choice.source)
+    kind = choice.source if choice.source in HEEDED else "folder" if path.is_dir() else "record"
+    usual = Choice()
+    for name in sorted(set().union(*HEEDED.values()) - HEEDED[kind]):
+        if getattr(choice, name) != getattr(usual, name):
+            takers = " and ".join(other for other in HEEDED if name in HEEDED[other])
+            raise ViewError(f"--{name.replace('_', '-')} is for {takers}, not for a {kind}: leave it out")
 
 
 def _pool(choice: Choice) -> Source:

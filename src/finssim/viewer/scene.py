@@ -29,8 +29,6 @@ COLOURS: dict[str, Colour] = {
     "box": (90, 110, 125),
 }
 """What is drawn in which colour."""
-GHOST = 0.45
-"""Opacity of an estimate beside the truth."""
 PICTURE_HEIGHT = 0.16
 """Of the frustum that stands for the camera [m]."""
 
@@ -78,20 +76,20 @@ class Scene:
 
     def draw(self, frame: Frame) -> None:
         """Move everything to where it is in a frame."""
-        both = frame.truth is not None
-        self._place("truth", frame.truth, None)
-        self._place("estimate", frame.estimate, GHOST if both else None)
+        self._place("truth", frame.truth, ghost=False)
+        self._place("estimate", frame.estimate, ghost=frame.truth is not None)
         self._show(self._goal, frame.goal)
         shown = frame.truth or frame.estimate
         arrows = force_arrows(self.stage.vehicle, frame.force, shown) if shown else np.zeros((0, 2, 3))
         _set_points(self._arrows, arrows)
         _set_points(self._trail, line_of(frame.trail))
 
-    def _place(self, name: str, pose: Pose | None, opacity: float | None) -> None:
+    def _place(self, name: str, pose: Pose | None, *, ghost: bool) -> None:
+        """Put a body where it is; a ghost is a net of lines, which hides nothing of the body that it lies upon."""
         body, hull = self._bodies[name]
         self._show(body, pose)
-        if hull.opacity != opacity:
-            hull.opacity = opacity
+        if hull.wireframe != ghost:
+            hull.wireframe = ghost
 
     def _show(self, node: Any, pose: Pose | None) -> None:
         known = pose is not None and bool(np.isfinite(pose.position).all())
@@ -157,6 +155,7 @@ class Scene:
             fov=2.0 * math.atan(0.5 * lens.height / lens.fy),
             aspect=lens.width / lens.height,
             scale=PICTURE_HEIGHT,
+            thickness=0.008,
             color=COLOURS["box"],
             position=pose.translation(),
             wxyz=pose.rotation().wxyz,

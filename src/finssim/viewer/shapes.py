@@ -15,9 +15,9 @@ __all__ = ["Mesh", "force_arrows", "hull_of", "line_of", "tag_plates", "wall_mes
 
 Array = npt.NDArray[np.float64]
 
-ARROW = 0.9
+ARROW = 1.2
 """Length of the arrow of the largest thrust, part of the vehicle's length."""
-FAINT = 0.02
+FAINT = 0.002
 """Part of the largest thrust below which no arrow is drawn."""
 BOX_FACES = np.array(
     [
@@ -86,7 +86,8 @@ def wall_mesh(lower: Array, upper: Array) -> Mesh:
 def force_arrows(vehicle: Vehicle, force: Array, pose: Pose) -> Array:
     """Start and end of an arrow for each thruster that pushes, world frame [m], (k, 2, 3).
 
-    The arrow points where the vehicle is pushed; its length is in proportion to the force.
+    An arrow points where its thruster pushes the vehicle. Its length grows with the root of the force, as the shaft
+    speed does: linear ones would be too small to see while a station is kept.
     """
     if not len(force):
         return np.zeros((0, 2, 3))
@@ -94,9 +95,10 @@ def force_arrows(vehicle: Vehicle, force: Array, pose: Pose) -> Array:
     part = np.asarray(force, float) / largest
     length = ARROW * float(np.max(vehicle.body.size))
     at = np.array([t.position for t in vehicle.thrusters.values()], float)
+    reach = length * np.sign(part) * np.sqrt(np.abs(part))
     along = np.array([t.axis for t in vehicle.thrusters.values()], float)
     seen = np.isfinite(part) & (np.abs(part) > FAINT)
-    ends = np.stack([at, at + length * part[:, None] * along], axis=1)[seen]
+    ends = np.stack([at, at + reach[:, None] * along], axis=1)[seen]
     return np.asarray(ends @ quat_to_matrix(pose.quaternion).T + pose.position)
 
 

@@ -150,7 +150,7 @@ class PoolSource:
             status["vision"] = reading.mode
             status["state"] = "ready" if reading.ready else f"not ready: {reading.reason}"
         status["to the goal"] = f"{100.0 * to_goal:.1f} cm, {turned:.1f}°"
-        status["estimate off by"] = "-" if math.isnan(off) else f"{100.0 * off:.1f} cm"
+        status["estimate error"] = "-" if math.isnan(off) else f"{100.0 * off:.1f} cm"
         status["battery"] = f"{float(plant.electric[0]):.2f} V"
         rpm = np.asarray(plant.shaft_speed) * 60.0 / (2.0 * math.pi)
         status["shafts [rpm]"] = " ".join(f"{r:.0f}" for r in rpm)

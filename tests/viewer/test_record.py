@@ -1,0 +1,98 @@
+"""Frames of a record are what was recorded, at any time and in any order."""
+
+import numpy as np
+import pytest
+
+from finssim.pool.truth import read_truth
+from finssim.robot.record_reader import open_record
+from finssim.viewer.frame import ViewError
+from finssim.viewer.sources.alignment import offset_between
+from finssim.viewer.sources.record import RecordSource
+from finssim.viewer.sources.series import PoseSeries
+
+GOAL = (0.7, 0.3, -0.6)
+
+
+@pytest.fixture(scope="module")
+def source(trial):
+    return RecordSource(trial.record, truth=trial.truth, basin=(4.0, 2.0, 1.0))
+
+
+def test_frames_are_the_recorded_messages(source, trial):
+    """Estimate, goal and forces are those of the newest messages of the time, and time can run backwards."""
+    with open_record(trial.record) as record:
+        odom = [(e.time, e.message.pose.pose.position) for e in record.messages(["odom"])]
+        states = [(e.time, e.message.force) for e in record.messages(["thruster_state"])]
+    for time in (5.0, 2.0, 3.7):
+        at = source.begin + time
+        frame = source.frame(time)
+        p = [p for t, p in odom if t <= at][-1]
+        assert frame.estimate.position.tolist() == [p.x, p.y, p.z]
+        assert frame.force.tolist() == [f for t, f in states if t <= at][-1].tolist()
+        assert frame.goal.position == pytest.approx(GOAL)
+        assert frame.status["bridge"] == "armed"
+
+
+def test_pictures_come_with_the_tags_in_them(source):
+    """Both tags are found in a recorded picture; a moment between two pictures shows the earlier one again."""
+    frame = source.frame(4.0)
+    assert frame.picture.image.shape == (720, 1280)
+    assert {tag.tag_id for tag in frame.picture.tags} == set(source.stage.vehicle.tags.mounts)
+    assert source.frame(4.001).picture is frame.picture
+    assert source.frame(5.0).picture is not frame.picture
+
+
+def test_the_truth_lies_under_the_estimate(source, trial):
+    """In lock-step both clocks are one: the truth of the file is shown at its own time, near the estimate."""
+    truth, frame = read_truth(trial.truth), source.frame(5.0)
+    true = truth.position[np.searchsorted(truth.time, source.begin + 5.0, side="right") - 1]
+    assert frame.truth.position == pytest.approx(true)
+    assert np.linalg.norm(frame.truth.position - frame.estimate.position) < 0.05
+    labels = {(curve.plot, curve.label) for curve in source.curves()}
+    assert ("position error [m]", "of the estimate") in labels and (
+        "heading error [deg]",
+        "to the goal",
+    ) in labels
+
+
+def test_clocks_are_laid_over_each_other_by_the_motion(trial, source):
+    """Truth whose clock began 123.4 s later is found to within the time in which the vehicle moves some millimetres."""
+    truth = read_truth(trial.truth)
+    found = offset_between(source._odom, truth.time - 123.4, truth.position)
+    assert found == pytest.approx(123.4, abs=0.1)
+    with pytest.raises(ViewError, match="less than half"):
+        offset_between(source._odom, truth.time[:50], truth.position[:50])
+
+
+def test_an_offset_that_is_given_is_used(trial):
+    """--truth-offset moves the truth in time."""
+    late = RecordSource(trial.record, truth=trial.truth, offset=1.0)
+    right = RecordSource(trial.record, truth=trial.truth)
+    assert late.frame(5.0).truth.position == pytest.approx(right.frame(4.0).truth.position, abs=1e-2)
+    assert late.frame(5.0).truth.position != pytest.approx(right.frame(5.0).truth.position, abs=1e-2)
+
+
+def test_the_box_is_the_pool_or_the_workspace(trial, source):
+    """--basin draws walls; without it the vehicle's workspace is outlined."""
+    plain = RecordSource(trial.record)
+    assert source.stage.walls and source.stage.lower.tolist() == [-2.0, -1.0, -1.0]
+    safety = plain.stage.vehicle.safety
+    assert not plain.stage.walls and plain.stage.lower.tolist() == safety.workspace_lower.tolist()
+    assert plain.frame(3.0).truth is None
+
+
+def test_events_are_told_when_they_have_happened(source):
+    """The start of the trial is an event that is not known before."""
+    assert not source.frame(0.0).events
+    assert any("trial_start" in line for line in source.frame(5.0).events)
+
+
+def test_a_trail_ends_where_the_body_is():
+    """The trail has what lies in the past, and of that the last half minute."""
+    time = np.arange(0.0, 100.0, 0.1)
+    poses = PoseSeries(
+        time, np.stack([time, 0 * time, 0 * time], axis=1), np.tile([0.0, 0.0, 0.0, 1.0], (1000, 1))
+    )
+    trail = poses.trail(60.0)
+    assert 29.0 < trail[0, 0] < 31.0 and 59.0 < trail[-1, 0] < 60.0
+    assert poses.at(-1.0) is None and len(poses.trail(-1.0)) == 0
