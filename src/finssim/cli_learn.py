@@ -1,0 +1,129 @@
+"""`finssim train` and `finssim evaluate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from finssim.cli_options import Device, Hydrodynamics, Json, Seed, Steps, Vehicle
+from finssim.quiet import start_warp
+
+__all__ = ["evaluate", "train"]
+
+
+def train(
+    task: Annotated[
+        str,
+        typer.Argument(
+            help="Task to learn: t1 (station keeping) or t2 (trajectory tracking).", metavar="TASK"
+        ),
+    ],
+    out: Annotated[
+        Path, typer.Option(help="Directory of the policy; an earlier policy there is replaced when done.")
+    ],
+    vehicle: Vehicle = "finsrov",
+    hydrodynamics: Hydrodynamics = "calibrated",
+    action: Annotated[
+        str, typer.Option(help="What the policy commands: wrench6, wrench4 or thruster8.", metavar="MODE")
+    ] = "wrench6",
+    randomize: Annotated[
+        str | None,
+        typer.Option(
+            help="Ranges that vehicle and water are drawn from: "
+            "hold_for_position, fossen_learn_to_swim, equivalent_box, pool, no_thruster_dynamics, or a file.",
+            metavar="FILE",
+        ),
+    ] = None,
+    seed: Seed = 42,
+    worlds: Annotated[int | None, typer.Option(help="Worlds simulated at once.", min=1)] = None,
+    steps: Steps = None,
+    device: Device = "cpu",
+) -> None:
+    """Train a policy and write it to a directory that runs without the learner.
+
+    Example: finssim train t1 --vehicle finsrov --seed 1 --out runs/hold
+    """
+    start_warp()
+    from finssim.learning.train import train as run
+
+    run(
+        task,
+        vehicle=vehicle,
+        hydrodynamics=hydrodynamics,
+        action=action,
+        randomize=randomize,
+        seed=seed,
+        worlds=worlds,
+        steps=steps,
+        device=device,
+        out=out,
+    )
+
+
+def evaluate(
+    controller: Annotated[
+        str, typer.Argument(help="A policy's directory, or pid, or pid-paper.", metavar="DIR|pid|pid-paper")
+    ],
+    task: Annotated[
+        str,
+        typer.Option(help="Task to be tried on: t1 (station keeping) or t2 (trajectories).", metavar="TASK"),
+    ] = "t1",
+    vehicle: Vehicle = "finsrov",
+    hydrodynamics: Hydrodynamics = "calibrated",
+    plant: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="What differs from the vehicle file: nominal (nothing), current, lag, mesh, noise, "
+            "randomised, simplified, waves, or a file. May be given several times.",
+            metavar="FILE|NAME",
+        ),
+    ] = None,
+    trajectory: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="What t2 follows: straight, broken, ellipse, lemniscate (all four if not given), circle, "
+            "figure_eight, helix, or a YAML or CSV file. May be given several times.",
+            metavar="FILE|NAME",
+        ),
+    ] = None,
+    trials: Annotated[
+        int | None,
+        typer.Option(
+            help="Trials in each plant; if not given, t1's eight setpoints for 60 s, or each trajectory, once.",
+            min=1,
+        ),
+    ] = None,
+    trim: Annotated[
+        bool,
+        typer.Option("--trim", help="Put the integral of the position error in front of a policy."),
+    ] = False,
+    seed: Seed = 42,
+    out: Annotated[
+        Path | None, typer.Option(help="Directory for evaluation.json, the figure and trajectories.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Try a controller: success, errors [m, deg], time to settle [s]; or errors along trajectories [m].
+
+    Example: finssim evaluate runs/hold --plant current --trials 64 --out runs/hold-current
+
+    Example: finssim evaluate runs/track --task t2 --trajectory ellipse --trajectory my-way.csv
+    """
+    start_warp()
+    from finssim.experiments.evaluate import evaluate as run
+
+    run(
+        controller,
+        task=task,
+        vehicle=vehicle,
+        hydrodynamics=hydrodynamics,
+        plant=plant or "nominal",
+        trajectories=trajectory or (),
+        trials=trials,
+        trim=trim,
+        seed=seed,
+        out=out,
+        json=as_json,
+    )
