@@ -1,0 +1,96 @@
+"""Live sources go on, recorded ones can be read anywhere, and every option changes what is seen."""
+
+import math
+
+import numpy as np
+import pytest
+
+from finssim.engine import Simulator
+from finssim.engine.recorder import Recorder
+from finssim.vehicles import load_vehicle
+from finssim.viewer.frame import ViewError
+from finssim.viewer.run import Choice, open_source
+from finssim.viewer.sources.pool import PoolSource
+from finssim.viewer.sources.run import RunSource
+from finssim.viewer.sources.simulator import SimulatorSource
+
+
+def test_the_pool_lives_and_the_robot_in_it_goes_to_the_goal():
+    """Truth and estimate are both shown, near each other, and nearer to the goal in time; equal seeds, equal frames."""
+    source, twin = (open_source(Choice(source="pool", goal="0.5,0.2,-0.6,20")) for _ in range(2))
+    first = source.frame(0.1)
+    assert math.isinf(source.duration) and first.time == pytest.approx(0.1)
+    frame = source.frame(6.0)
+    assert frame.status["bridge"] == "armed" and np.abs(frame.force).max() > 0.0
+    assert np.linalg.norm(frame.truth.position - frame.estimate.position) < 0.05
+    start, now = (np.linalg.norm(f.truth.position - frame.goal.position) for f in (first, frame))
+    assert now < 0.5 * start
+    assert {tag.tag_id for tag in frame.picture.tags} <= set(source.stage.vehicle.tags.mounts)
+    assert len(frame.trail) > 20 and source.curves()[0].value[-1] == pytest.approx(now, abs=0.02)
+    assert np.array_equal(twin.frame(6.0).truth.position, frame.truth.position)
+    source.close()
+
+
+def test_the_pool_is_the_one_that_was_asked_for():
+    """Plant, severity, policy, trajectory and vehicle are heeded."""
+    plain = open_source(Choice(trajectory="ellipse", camera="pictures"))
+    assert isinstance(plain, PoolSource) and "realistic plant 1: pid, ellipse" in plain.stage.title
+    assert len(plain.stage.path) > 100 and plain.frame(0.3).picture.image.shape == (720, 1280)
+    other = open_source(Choice(plant="3", severity="hard", policy="pid-paper", task="t2"))
+    assert "hard plant 3: pid-paper, ellipse" in other.stage.title
+
+
+def test_the_simulator_is_a_source(tmp_path):
+    """It holds a station from its state alone, in the model that was asked for."""
+    source = open_source(Choice(source="sim", goal="0.3,0.1,-0.6,30"))
+    assert isinstance(source, SimulatorSource)
+    frame = source.frame(10.0)
+    assert frame.estimate is None and np.linalg.norm(frame.truth.position - [0.3, 0.1, -0.6]) < 0.1
+    other = open_source(Choice(source="sim", goal="0.3,0.1,-0.6,30", hydrodynamics="simplified"))
+    assert not np.allclose(other.frame(2.0).truth.position, source.frame(2.0).truth.position)
+
+
+def test_a_run_of_the_engine_is_a_source(tmp_path):
+    """The recorded pose of the chosen world is shown at its time."""
+    simulator = Simulator("finsrov", worlds=2)
+    with Recorder(simulator, tmp_path / "run") as recorder:
+        simulator.set_thrust(np.stack([np.full((1, 8), 1.0), np.full((1, 8), -2.0)]))
+        for _ in range(30):
+            simulator.step()
+            recorder.record()
+    source = open_source(Choice(source=str(tmp_path / "run"), world=1))
+    assert isinstance(source, RunSource) and source.duration == pytest.approx(2.9)
+    assert source.frame(2.9).truth.position == pytest.approx(simulator.numpy("position")[1, 0], abs=1e-6)
+    assert source.frame(2.9).force == pytest.approx(simulator.numpy("thrust")[1, 0], abs=1e-5)
+    with pytest.raises(ViewError, match="world 7 was not recorded; it has 0, 1"):
+        RunSource(tmp_path / "run", world=7)
+
+
+@pytest.mark.parametrize(
+    ("choice", "sentence"),
+    [
+        (Choice(source="nowhere.mcap"), "no such file or folder"),
+        (Choice(source="sim", plant="3"), "--plant is for pool, not for a sim"),
+        (Choice(source="pool", basin="4,2,1"), "--basin is for record, not for a pool"),
+        (Choice(source="pool", goal="5,0,-0.5,0"), "outside the workspace"),
+        (Choice(source="pool", camera="none"), "camera"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused_in_a_sentence(choice, sentence):
+    """The sentence says what to do instead."""
+    with pytest.raises(ValueError, match=sentence):
+        open_source(choice)
+
+
+@pytest.mark.parametrize("basin", ["4,2", "4,2,0", "a,b,c"])
+def test_a_pool_has_three_lengths(trial, basin):
+    """Length, width and depth above zero."""
+    with pytest.raises(ViewError, match=r"expected length,width,depth"):
+        open_source(Choice(source=str(trial.record), basin=basin))
+
+
+def test_a_record_may_be_shown_with_another_vehicle(trial):
+    """--vehicle overrides what the record says."""
+    assert open_source(Choice(source=str(trial.record))).stage.vehicle.name == "finsrov"
+    other = open_source(Choice(source=str(trial.record), vehicle="bluerov2_heavy"))
+    assert other.stage.vehicle.name == load_vehicle("bluerov2_heavy").name
