@@ -7,6 +7,7 @@ import pytest
 
 from finssim.robot.bridge import Bridge
 from finssim.robot.bridge_settings import BridgeError, BridgeSettings
+from finssim.robot.link.frames import StatusFlag
 from finssim.vehicles import catalogue, load_vehicle
 from reference.bridge_rig import DT, Rig, echo, moves, quiet, reading, telemetry
 
@@ -172,6 +173,15 @@ def test_a_passing_condition_holds_and_thrust_returns_by_itself(rig, name):
     assert "held longer than 5 s" in rig.bridge.reason
 
 
+def test_a_controller_that_is_silent_for_want_of_a_state_is_not_blamed(rig):
+    """The estimator's reason stands, in hold and in the fault that it becomes."""
+    rig.armed()
+    rig.run(2.0, reading_=lambda t: reading(t, ready=False, reason="no depth"))
+    assert rig.bridge.state == "hold" and "no depth" in rig.bridge.reason
+    rig.run(4.0, reading_=lambda t: reading(t, ready=False, reason="no depth"))
+    assert rig.bridge.state == "fault" and "no depth" in rig.bridge.reason
+
+
 def test_the_operator_may_hold_for_as_long_as_needed(rig):
     """No limit on the operator's own hold, no thrust in it, and other dangers still become faults."""
     rig.armed()
@@ -246,6 +256,19 @@ def test_refused_commands_become_a_fault_if_it_lasts(rig):
         rig.bridge.echo(rig.now, echo(4 + turn, accepted=False, flags=4))
         rig.step(2.0)
     assert rig.bridge.state == "fault" and "refused every command" in rig.bridge.reason
+
+
+def test_a_controller_that_hears_no_command_is_a_fault(rig):
+    """By its status bits: one that follows, or tells nothing of it, is none; one that follows now and then neither."""
+    rig.armed()
+    told = StatusFlag.DIAGNOSTICS
+    rig.run(1.0, 2.0, telemetry_=lambda k, n: telemetry(k, n, flags=int(told | StatusFlag.DIRECT_THRUSTERS)))
+    follows = [0, int(StatusFlag.DIRECT_THRUSTERS)]
+    rig.run(1.0, 2.0, telemetry_=lambda k, n: telemetry(k, n, flags=int(told) | follows[k % 20 == 0]))
+    rig.run(1.0, 2.0, telemetry_=lambda k, n: telemetry(k, n, flags=0))
+    assert rig.bridge.state == "armed"
+    rig.run(0.6, 2.0, telemetry_=lambda k, n: telemetry(k, n, flags=int(told)))
+    assert rig.bridge.state == "fault" and "not followed any command" in rig.bridge.reason
 
 
 def test_a_count_of_commands_that_begins_again_is_a_restart(rig):

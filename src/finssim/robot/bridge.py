@@ -68,6 +68,7 @@ class Bridge:
             return why
         self._commander.forget()
         self._watchdogs.echo.forget()
+        self._watchdogs.follow.forget()
         self._armed_at = self._clock.now
         self._enter("armed", "", f"armed by {source}")
         return ""
@@ -133,7 +134,7 @@ class Bridge:
         why = self._watchdogs.telemetry.malformed(telemetry)
         if why:
             self.log.repeat(now, "telemetry refused", why)
-        elif self._watchdogs.take_telemetry(now, telemetry):
+        elif self._watchdogs.take_telemetry(now, telemetry, self.state == "armed"):
             self._alarm("restart", "the motor controller restarted: its clock went back")
 
     def echo(self, now: float, echo: CommandEcho) -> None:

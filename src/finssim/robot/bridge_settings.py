@@ -52,7 +52,7 @@ class BridgeSettings:
     clock_step: float = 1.0
     """Longest step of the clock forward between two calls [s]."""
     reject_limit: float = 0.5
-    """Longest time that the motor controller may refuse every command [s]."""
+    """Longest time that the motor controller may refuse every command, or not hear any [s]."""
     need_reading: bool = True
     """Whether the estimator must be ready; False lets an operator drive without localization."""
     vision_modes: tuple[str, ...] = ("fresh", "coast")

@@ -12,7 +12,7 @@ from finssim.robot.bridge_settings import BridgeSettings
 from finssim.robot.commander import Commander
 from finssim.robot.messages import Telemetry
 from finssim.robot.robot import Reading
-from finssim.robot.watchdogs import EchoWatch, StateWatch, TelemetryWatch, TiltWatch
+from finssim.robot.watchdogs import EchoWatch, FollowWatch, StateWatch, TelemetryWatch, TiltWatch
 from finssim.robot.workspace import Workspace
 from finssim.vehicles import Vehicle
 
@@ -58,7 +58,7 @@ class Supervision:
         self.settings = settings
         self.commander = Commander(len(vehicle.thrusters), settings.command_timeout)
         self.telemetry = TelemetryWatch(outputs, settings.telemetry_timeout)
-        self.echo = EchoWatch()
+        self.echo, self.follow = EchoWatch(), FollowWatch()
         self.state = StateWatch(settings.state_timeout, settings.vision_modes)
         imu = vehicle.sensors.imu
         level = UP if imu is None else quat_inverse_rotate(imu.orientation, UP)
@@ -72,15 +72,16 @@ class Supervision:
 
     def forget(self) -> None:
         """As before the first message."""
-        for watch in (self.commander, self.telemetry, self.echo, self.state):
+        for watch in (self.commander, self.telemetry, self.echo, self.follow, self.state):
             watch.forget()
         for tilt in self.tilts.values():
             tilt.forget()
 
-    def take_telemetry(self, now: float, message: Telemetry) -> str:
-        """Takes a well-formed message from the motor controller; "restarted" if it began anew."""
+    def take_telemetry(self, now: float, message: Telemetry, armed: bool) -> str:
+        """Takes a well-formed message that came while `armed`, or not; "restarted" if the controller began anew."""
         news = self.telemetry.accept(now, message)
         if news != "old":
+            self.follow.accept(now, message.flags, armed)
             self.tilts["telemetry"].accept(now, message.quaternion)
         return news if news == "restarted" else ""
 
@@ -103,6 +104,8 @@ class Supervision:
             return f"telemetry is frozen: the {frozen} has repeated its numbers for {limits.frozen_limit:g} s"
         if self.echo.rejecting(limits.reject_limit):
             return f"the motor controller has refused every command for {limits.reject_limit:g} s"
+        if self.follow.deaf(limits.reject_limit):
+            return f"the motor controller has not followed any command for {limits.reject_limit:g} s"
         for source, tilt in self.tilts.items():
             if tilt.over(now):
                 degrees = math.degrees(limits.max_tilt)

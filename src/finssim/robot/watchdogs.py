@@ -7,13 +7,15 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from finssim.robot.link.frames import StatusFlag
 from finssim.robot.messages import CommandEcho, Telemetry
 from finssim.robot.robot import Reading
 
-__all__ = ["EchoWatch", "StateWatch", "TelemetryWatch", "TiltWatch"]
+__all__ = ["EchoWatch", "FollowWatch", "StateWatch", "TelemetryWatch", "TiltWatch"]
 
 Array = npt.NDArray[np.float64]
 
+TOLD, FOLLOWS = int(StatusFlag.DIAGNOSTICS), int(StatusFlag.DIRECT_THRUSTERS)
 REORDERED = 1000
 """A datagram may be overtaken by this much of the controller's clock [ms]; further back is a restart."""
 
@@ -120,6 +122,27 @@ class EchoWatch:
     def rejecting(self, limit: float) -> bool:
         """Whether every command was refused for longer than `limit` [s]."""
         return self.rejected_until - self.rejected_since > limit
+
+
+class FollowWatch:
+    """Whether the motors follow the commands, as the status bits of the telemetry tell: frames may be lost unseen."""
+
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """As if they did."""
+        self._since, self._until = math.inf, -math.inf
+
+    def accept(self, now: float, flags: int, armed: bool) -> None:
+        """Takes status bits, and whether commands were enabled; those of a firmware that sets none say nothing."""
+        if not armed or flags & FOLLOWS or not flags & TOLD:
+            return self.forget()
+        self._since, self._until = min(self._since, now), now
+
+    def deaf(self, limit: float) -> bool:
+        """Whether they have not followed for longer than `limit` [s]."""
+        return self._until - self._since > limit
 
 
 class TiltWatch:
