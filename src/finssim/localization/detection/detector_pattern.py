@@ -49,7 +49,8 @@ class Pattern:
 
     def even(self, seen: Array) -> Array:
         """Gray at the points as under even light: less its local mean, over its local contrast, (n,)."""
-        return self.less_mean(seen) / self.contrast(seen)
+        level = self.less_mean(seen)
+        return level / self._spread(level)
 
     def less_mean(self, seen: Array) -> Array:
         """Gray less its local mean, (n,)."""
@@ -57,7 +58,10 @@ class Pattern:
 
     def contrast(self, seen: Array) -> Array:
         """Local standard deviation of the gray, with a share of that of all of it, (n,)."""
-        square = self.less_mean(seen) ** 2
+        return self._spread(self.less_mean(seen))
+
+    def _spread(self, level: Array) -> Array:
+        square = level * level
         return np.asarray(np.sqrt(self._smooth(square) + FLAT**2 * square.mean() + 1e-12))
 
     def _smooth(self, seen: Array) -> Array:
