@@ -11,6 +11,9 @@ SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 LONGEST_TURN = 0.1
 """What one turn of the loop may advance at single speed [s]: a world that is slower than real time slows the clock."""
 
+NEARLY = 0.05
+"""So near to its end a recording is over [s]: a slider need not reach it to the last digit."""
+
 
 class Playback:
     """Where in a source's time the view is."""
@@ -41,7 +44,7 @@ class Playback:
 
     def play(self, playing: bool) -> None:
         """Run or stand; from the end, run from the beginning."""
-        if playing and self.time >= self.duration:
+        if playing and self.time >= self.duration - NEARLY:
             self.time = 0.0
         self.playing = playing
 

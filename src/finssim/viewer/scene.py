@@ -171,7 +171,7 @@ class Scene:
         lower, upper = self.stage.lower, self.stage.upper
         middle, reach = 0.5 * (lower + upper), float(np.linalg.norm(upper - lower))
         server.initial_camera.look_at = tuple(middle)
-        server.initial_camera.position = tuple(middle + reach * np.array([-0.28, -0.5, 0.48]))
+        server.initial_camera.position = tuple(middle + reach * np.array([-0.31, -0.56, 0.52]))
         server.initial_camera.up = (0.0, 0.0, 1.0)
 
 

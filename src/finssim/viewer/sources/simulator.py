@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,8 +24,6 @@ __all__ = ["SimulatorSource"]
 
 STEP = 0.02
 """Between frames at most [s]; the physics step is half of it."""
-DEEPER = 0.5
-"""Water under the deepest point of a motion, at least [m]."""
 
 
 class SimulatorSource:
@@ -56,7 +55,10 @@ class SimulatorSource:
         """
         self._pilot, self._guide = make_pilot(policy, vehicle, task=task), guide
         way = path_of(guide) if math.isfinite(guide.duration) else guide.at(np.zeros(1)).position
-        size = _basin(np.concatenate([way, np.zeros((1, 3))]))
+        start = start_of(guide)
+        if not math.isfinite(guide.duration):  # wholly under water, however large the vehicle is
+            start = replace(start, position=(0.0, 0.0, min(-0.5, -float(vehicle.body.size[2]))))
+        size = _basin(np.concatenate([way, [start.position]]), float(np.max(vehicle.body.size)))
         self._simulator = Simulator(
             vehicle,
             hydrodynamics=hydrodynamics,
@@ -67,7 +69,6 @@ class SimulatorSource:
             seed=seed,
             threads=1,
         )
-        start = start_of(guide)
         self._simulator.place(position=start.position, quaternion=quat_from_yaw(start.yaw))
         self._n, self._steps, self._decided = len(vehicle.thruster_names), 0, -math.inf
         self._errors = Errors()
@@ -124,7 +125,7 @@ class SimulatorSource:
         return np.asarray(self._simulator.numpy("thrust")[0, 0, : self._n], float)
 
 
-def _basin(way: np.ndarray) -> tuple[float, float, float]:
-    """A pool in which a motion has room: the paper's, or a larger one [m]."""
-    reach = 2.0 * (np.abs(way).max(axis=0) + 1.0)
-    return max(4.0, float(reach[0])), max(2.0, float(reach[1])), max(1.0, DEEPER - float(way[:, 2].min()))
+def _basin(way: np.ndarray, length: float) -> tuple[float, float, float]:
+    """A pool in which a motion of a vehicle of some length has room: the paper's, or a larger one [m]."""
+    half, depth = np.abs(way).max(axis=0) + 1.5 * length, length - float(way[:, 2].min())
+    return max(4.0, 2.0 * float(half[0])), max(2.0, 2.0 * float(half[1])), max(1.0, depth)
