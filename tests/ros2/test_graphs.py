@@ -106,3 +106,22 @@ def test_topics_are_those_of_the_nodes():
     names = {name for name, _ in topics_of(Plan("sim", "finsrov", "rov"))}
     assert {"/rov/odom", "/clock", "/rov/arm", "/rov/thruster_cmd"} <= names
     assert "/rov/camera/image" not in names and "/rov/telemetry" not in names
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["node", "kamera"], "unknown node 'kamera'; available: camera, controller"),
+        (["up", "pond"], "unknown graph 'pond'"),
+        (["up", "robot"], "give --pool-file"),
+        (["up", "sim", "--vehicle", "finrov"], "did you mean 'finsrov'"),
+        (["up", "sim", "--goal", "here"], "expected four numbers"),
+    ],
+)
+def test_the_command_refuses_in_a_sentence(capsys, words, sentence):
+    """With status 2, and nothing started."""
+    from finssim import boundary
+    from finssim.cli import app
+
+    assert boundary.run(app, ["ros2", *words]) == 2
+    assert sentence in capsys.readouterr().err
