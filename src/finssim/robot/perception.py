@@ -12,7 +12,7 @@ from finssim.geometry.rotations import matrix_to_quat
 from finssim.localization.detection.detections import Detection, Frame
 from finssim.localization.detection.detector import detector
 from finssim.localization.detection.region import RegionTracker
-from finssim.localization.fusion.attitude import up_of
+from finssim.localization.fusion.attitude import height_above_origin
 from finssim.localization.fusion.estimator import Estimator
 from finssim.localization.fusion.fuse_detections import Fixes
 from finssim.localization.fusion.fuse_settings import Settings, settings_of, site_of
@@ -158,20 +158,21 @@ class Perception:
 
     def _turning(self, estimate: Estimate) -> Array:
         """Angular velocity, body frame [rad/s], less what is known of the gyro's bias: its part about the vertical."""
-        omega = np.array(self._omega)
         if not math.isfinite(estimate.yaw_rate):
             return np.full(3, math.nan)
-        up = up_of(estimate.roll, estimate.pitch)
-        level = math.cos(estimate.pitch) ** 2
-        measured = (omega[1] * up[1] + omega[2] * up[2]) / level
-        return np.asarray(omega - (measured - estimate.yaw_rate) * up)
+        p, q, r = self._omega
+        level, y = math.cos(estimate.pitch), math.sin(estimate.roll)
+        z = math.cos(estimate.roll)
+        # Upwards is (-sin θ, y cos θ, z cos θ) in the body.
+        bias = (q * y + r * z) / level - estimate.yaw_rate
+        return np.array([p + bias * math.sin(estimate.pitch), q - bias * y * level, r - bias * z * level])
 
     def _height(self, telemetry: Telemetry) -> float:
         """Height of the body origin in the pool frame from depth and tilt alone [m]."""
         tilt, site = self._aboard.tilt(telemetry), self.estimator.site
         if tilt is None:
             return math.nan
-        return -telemetry.depth - site.offset - float(up_of(*tilt) @ np.array(site.depth_port))
+        return -telemetry.depth - site.offset - height_above_origin(site.depth_port, *tilt)
 
     def _detections(self, picture: Picture, time: float) -> list[Detection] | None:
         if picture.image is None or picture.tags:

@@ -83,8 +83,10 @@ class Estimator:
         if reason is not None:
             return self.refuse(sample.stream, reason)
         gone, now = self._timeline.insert(sample, self._apply)
-        self._tally(gone, -1)
-        self._tally(now, +1)
+        # An outcome that is the same object as before stands: those of the IMU's samples, which are most.
+        other = [pair for pair in zip(gone, now[1:], strict=True) if pair[0] is not pair[1]]
+        self._tally([old for old, _ in other], -1)
+        self._tally([now[0], *(new for _, new in other)], +1)
         self._arrived = max(self._arrived, sample.time if sample.arrival is None else sample.arrival)
         for outcome in now[0]:
             if math.isfinite(outcome.mahalanobis):
@@ -161,14 +163,15 @@ class Estimator:
         return None
 
     def _tally(self, outcomes: list[tuple[Outcome, ...]], sign: int) -> None:
-        for outcome in (o for group in outcomes for o in group):
-            self._count(outcome.stream, outcome.verdict, sign)
-            if outcome.verdict == "accepted" and outcome.stream in self.nis:
-                total, numbers = self.nis[outcome.stream]
-                self.nis[outcome.stream] = (
-                    total + sign * outcome.mahalanobis,
-                    numbers + sign * outcome.dimension,
-                )
+        for group in outcomes:
+            for outcome in group:
+                self._count(outcome.stream, outcome.verdict, sign)
+                if outcome.verdict == "accepted" and outcome.stream in self.nis:
+                    total, numbers = self.nis[outcome.stream]
+                    self.nis[outcome.stream] = (
+                        total + sign * outcome.mahalanobis,
+                        numbers + sign * outcome.dimension,
+                    )
 
     def _count(self, stream: str, verdict: str, step: int) -> None:
         verdicts = self._counts.setdefault(stream, {})

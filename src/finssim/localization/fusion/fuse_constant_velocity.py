@@ -37,6 +37,7 @@ YAW_CAP = 10.0
 """Doubt of yaw does not grow beyond this variance [rad²]: far past a full circle."""
 STEEPEST = math.radians(80.0)
 """Pitch beyond which the gyro tells no yaw rate."""
+TAKEN, STEEP = (Outcome("imu", "accepted"),), (Outcome("imu", "steep"),)
 
 
 @dataclass(frozen=True)
@@ -86,15 +87,24 @@ class ConstantVelocity:
     def imu(self, track: Track, sample: ImuSample) -> tuple[Track, tuple[Outcome, ...]]:
         """Take in a rate: tilt, and yaw up to its time."""
         dt = math.inf if track.imu_time is None else sample.time - track.imu_time
-        track = self._tilted(track, sample, dt)
-        steep = abs(track.pitch) > STEEPEST
-        rate = None if steep else yaw_rate(sample.omega[1], sample.omega[2], track.roll, track.pitch)
+        roll, pitch, tilt = self._tilted(track, sample, dt)
+        steep = abs(pitch) > STEEPEST
+        rate = None if steep else yaw_rate(sample.omega[1], sample.omega[2], roll, pitch)
         yaw = self._yaw_at(track, sample.time)
         if track.rate is not None and rate is not None and dt <= GYRO_HOLD:
             # Up to here the older rate was held; half the difference makes a trapezium of the step.
             yaw = changed(yaw, yaw=yaw.yaw + 0.5 * (rate - track.rate) * dt)
-        track = changed(track, yaw=yaw, yaw_time=sample.time, rate=rate, imu_time=sample.time)
-        return track, (Outcome("imu", "steep" if steep else "accepted"),)
+        track = changed(
+            track,
+            roll=roll,
+            pitch=pitch,
+            tilt=tilt,
+            yaw=yaw,
+            yaw_time=sample.time,
+            rate=rate,
+            imu_time=sample.time,
+        )
+        return track, STEEP if steep else TAKEN
 
     def depth(self, track: Track, sample: DepthSample) -> tuple[Track, tuple[Outcome, ...]]:
         """Take in a depth: up . p + offset + lever = -depth."""
@@ -190,10 +200,10 @@ class ConstantVelocity:
         track = changed(track, yaw=yaw, yaw_seen=then, gates=gates)
         return track, Outcome("yaw", verdict, found.mahalanobis, 1)
 
-    def _tilted(self, track: Track, sample: ImuSample, dt: float) -> Track:
-        """Roll and pitch after a sample: the unit's own, else those of gyro and accelerometer."""
+    def _tilted(self, track: Track, sample: ImuSample, dt: float) -> tuple[float, float, Tilt | None]:
+        """Roll and pitch after a sample, the unit's own, else those of gyro and accelerometer; and their filter."""
         if sample.tilt is not None:
-            return changed(track, roll=sample.tilt[0], pitch=sample.tilt[1], tilt=None)
+            return sample.tilt[0], sample.tilt[1], None
         force = np.full(3, math.nan) if sample.force is None else np.array(sample.force)
         gains = TiltGains(gravity=self.site.gravity)
         if track.tilt is not None and dt <= gains.longest_gap:
@@ -201,9 +211,9 @@ class ConstantVelocity:
         elif sample.force is not None and float(np.linalg.norm(force)) > 1.0:
             tilt = tilt_from(force)
         else:
-            return track
+            return track.roll, track.pitch, track.tilt
         roll, pitch = roll_pitch(tilt.up)
-        return changed(track, roll=float(roll), pitch=float(pitch), tilt=tilt)
+        return float(roll), float(pitch), tilt
 
     def _positioned(self, track: Track, time: float) -> Track:
         """The track with its position at a time; axes without news slow down, then stand still."""

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.geometry.rotations import (
+    cross,
     matrix_to_quat,
     quat_from_euler,
     quat_multiply,
@@ -174,7 +175,7 @@ class ErrorState:
         """Jacobian (6, 15) of the body origin's position and velocity, and their values (6,)."""
         position, H = error_state.position_model(state, self._body)
         R = matrix_of(state.q)
-        swing = R @ np.cross(omega - state.gyro_bias, self._body)
+        swing = R @ cross(omega - state.gyro_bias, self._body)
         T = np.zeros((6, 15))
         T[:3] = H
         T[3:, 3:6] = np.eye(3)

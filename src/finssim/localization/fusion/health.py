@@ -59,7 +59,7 @@ class Estimate:
 
     def std(self) -> Array:
         """Standard deviations of position, velocity and yaw, (7,)."""
-        return np.asarray(np.sqrt(np.append(np.diagonal(self.P), self.yaw_variance)))
+        return np.sqrt(np.array([*self.P.diagonal().tolist(), self.yaw_variance]))
 
 
 @dataclass(frozen=True)
@@ -131,10 +131,11 @@ def health_of(
         for then in (estimate.vision_time, estimate.imu_time, estimate.depth_time)
     )
     mode = mode_of(vision, settings)
-    variances = np.diagonal(estimate.P)
+    variances = estimate.P.diagonal().tolist()
+    vx, vy, vz = estimate.x[3:].tolist()
     imu_fresh, depth_fresh = imu <= settings.imu_fresh + 1e-9, depth <= settings.depth_fresh + 1e-9
-    known = bool(np.isfinite(variances[:3]).all()) and math.isfinite(estimate.yaw_variance)
-    sure = known and bool(np.max(variances[:3]) <= settings.ready_position)
+    known = all(map(math.isfinite, (*variances[:3], estimate.yaw_variance)))
+    sure = known and max(variances[:3]) <= settings.ready_position
     return Health(
         ready=sure
         and estimate.yaw_variance <= settings.ready_yaw
@@ -151,9 +152,9 @@ def health_of(
         age_depth=depth,
         reject_reason=reason,
         mahalanobis=dict(latest),
-        position_covariance=tuple(float(v) for v in variances),
+        position_covariance=tuple(variances),
         yaw_covariance=estimate.yaw_variance,
-        velocity_world=tuple(float(v) for v in np.array(site.R_wp) @ estimate.x[3:]),
+        velocity_world=tuple(a * vx + b * vy + c * vz for a, b, c in site.R_wp),
         counts={stream: dict(verdicts) for stream, verdicts in counts.items()},
     )
 

@@ -93,8 +93,10 @@ class Form:
 
     def encode(self, message: Any) -> bytes:
         """Bytes of a message; raises LinkError for a number the wire has no room for, or that is not finite."""
-        numbers = [number for field in self.fields for number in self._numbers(field, message)]
+        numbers = self._numbers(message)
         try:
+            if not math.isfinite(sum(numbers)):
+                self._refuse_not_finite(message)
             body = self._body.pack(*numbers)
         except (struct.error, OverflowError, TypeError) as problem:
             raise LinkError(
@@ -102,20 +104,35 @@ class Form:
             ) from None
         return self.layout.magic + body + struct.pack("<H", crc16_modbus(body)) + self.layout.tail
 
-    def _numbers(self, field: Field, message: Any) -> tuple[Any, ...]:
-        """Values of one field in the order of the wire."""
-        if field.constant is not None:
-            return (field.constant,)
-        given = getattr(message, field.name)
-        values = (given,) if field.values == 1 else tuple(given)
-        where = f"{self.layout.title}: {field.name}"
-        if len(values) != (field.values or self.outputs):
-            raise LinkError(f"{where} has {len(values)} values, expected {field.values or self.outputs}")
-        if field.code == "f" and not all(map(math.isfinite, values)):
-            raise LinkError(
-                f"{where} is {given}, expected finite numbers: stop the motors instead of sending it"
-            )
-        return tuple(values[i] for i in field.order) if field.order else values
+    def _numbers(self, message: Any) -> list[Any]:
+        """Values of all fields in the order of the wire."""
+        numbers: list[Any] = []
+        for name, _, _, count, constant, order in self.fields:
+            if constant is not None:
+                numbers.append(constant)
+                continue
+            given = getattr(message, name)
+            if count == 1:
+                numbers.append(given)
+                continue
+            if len(given) != (count or self.outputs):
+                raise LinkError(
+                    f"{self.layout.title}: {name} has {len(given)} values, expected {count or self.outputs}"
+                )
+            numbers.extend([given[i] for i in order] if order else given)
+        return numbers
+
+    def _refuse_not_finite(self, message: Any) -> None:
+        """Raise LinkError for the first field with a number that is not finite, if there is one."""
+        for field in self.fields:
+            if field.code != "f":
+                continue
+            given = getattr(message, field.name)
+            if not all(map(math.isfinite, (given,) if field.values == 1 else given)):
+                raise LinkError(
+                    f"{self.layout.title}: {field.name} is {given}, expected finite numbers: "
+                    "stop the motors instead of sending it"
+                )
 
     def decode(self, frame: bytes, at: int = 0) -> Any | None:
         """Message of the frame that begins at `at`, its CRC already found right; None if a number is not finite."""
