@@ -136,6 +136,34 @@ def test_on_a_wire_with_nobody_at_its_end_nothing_is_armed(capsys, pool_file):
         capsys, *words, "--robot", "udp://127.0.0.1:9", "--bind", free, "--duration", 0.3, "--arm"
     )
     assert status == 0 and summary["state"] == "disarmed" and summary["decisions"] == 0
+    assert summary["reason"] == "no inertial data"
+
+
+def test_a_vehicle_that_says_nothing_is_told_of(capsys, pool_file):
+    """Once, after three seconds."""
+    words = ("--policy", "pid", "--goal", "0.5,0.2,-0.5,30", "--pool-file", pool_file, "--pictures", "none")
+    assert finssim(*words, "--robot", "udp://127.0.0.1:9", "--bind", "127.0.0.1:0", "--duration", 3.5) == 0
+    assert capsys.readouterr().err.count("no telemetry from udp://127.0.0.1:9") == 1
+
+
+def test_a_duration_of_zero_is_no_time_and_not_for_ever(capsys, pool_file):
+    """Nothing but the frames of the end goes out."""
+    words = ("--policy", "pid", "--goal", "0.5,0.2,-0.5,30", "--pool-file", pool_file, "--pictures", "none")
+    status, summary = told(
+        capsys, *words, "--robot", "dry-run", "--bind", "127.0.0.1:0", "--duration", 0, "--arm"
+    )
+    assert status == 0 and summary["steps"] == 0
+
+
+def test_no_record_is_left_of_a_run_that_could_not_be_connected(capsys, tmp_path, pool_file):
+    """And one that is there is not touched."""
+    words = ("--policy", "pid", "--goal", "0,0,-0.5,0", "--pool-file", pool_file, "--bind", "127.0.0.1:0")
+    record = tmp_path / "run.mcap"
+    assert finssim(*words, "--pictures", "eyes", "--record", record) == 2
+    assert not record.exists()
+    record.write_text("mine")
+    assert finssim(*words, "--pictures", "eyes", "--record", record) == 2
+    assert record.read_text() == "mine" and "never replaced" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -148,6 +176,13 @@ def test_on_a_wire_with_nobody_at_its_end_nothing_is_armed(capsys, pool_file):
         (("--policy", "pid", "--goal", "0,0,-0.5,0", "--robot", "tin://can"), "unknown wire"),
         (("--policy", "pid", "--goal", "0,0,-0.5,0", "--pictures", "eyes", "--bind", "127.0.0.1:0"), "eyes"),
         (("--policy", "pid", "--goal", "0,0,-0.5,0", "--lockstep", "--robot", "127.0.0.1:1"), "no world in"),
+        (
+            ("--policy", "pid", "--goal", "0,0,-0.5,0", "--lockstep", "--robot", "udp://127.0.0.1:1"),
+            "HOST:PORT",
+        ),
+        (("--policy", "pid", "--goal", "0,0,-0.5,0", "--lockstep", "--pictures", "none"), "leave --bind"),
+        (("--policy", "pid", "--goal", "0,0,-0.5,0", "--task", "t9"), "unknown task 't9'"),
+        (("--policy", "pid", "--goal", "0,0,-0.5,0", "--trim"), "leave --trim out"),
     ],
 )
 def test_what_cannot_be_run_is_refused_in_a_sentence(capsys, pool_file, words, sentence):

@@ -1,4 +1,4 @@
-"""Ctrl-C that ends a loop between two steps, so that thrusters are stopped in good order."""
+"""Ctrl-C, or a terminal that closes, ends a loop between two steps, so that thrusters are stopped in good order."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ __all__ = ["interruptible"]
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Gives what tells whether Ctrl-C or SIGTERM has come; a second one interrupts at once."""
+    """Gives what tells whether Ctrl-C, SIGTERM or SIGHUP has come; a second one interrupts at once.
+
+    SIGHUP stays ignored where it is, as under nohup.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
@@ -26,8 +29,9 @@ def interruptible() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         asked = True
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        before[number] = signal.signal(number, end)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+            before[number] = signal.signal(number, end)
     try:
         yield lambda: asked
     finally:

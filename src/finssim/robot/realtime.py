@@ -61,9 +61,8 @@ def run_realtime(
         How long it ran [s].
     """
     period, turn = 1.0 / rate, 0
-    start = collected = clock()
-    now = start
     with _calm(), interruptible() as interrupted:
+        now = start = collected = clock()  # after the garbage of the start, which takes its time
         try:
             while not interrupted() and (now := clock()) - start < duration:
                 frames = [(now, data) for data in transport.receive()]
@@ -88,7 +87,7 @@ def run_realtime(
             for data in runtime.stop(clock(), LAST_FRAMES):
                 transport.send(data)
                 wait(period)
-    return now - start
+        return now - start
 
 
 @contextmanager

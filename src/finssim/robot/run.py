@@ -6,51 +6,34 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from finssim.control.controllers import CONTROLLERS
+from finssim.control.errors import ControlError
+from finssim.control.observations import observer
 from finssim.control.trim import Trim
-from finssim.localization.pool import Pool, load_pool
+from finssim.localization.pool import load_pool
 from finssim.robot.goals import check_reachable, guide_of
-from finssim.robot.link.transports import DEFAULT_BIND, host_port, open_transport
-from finssim.robot.lockstep import DEFAULT_PORT, LockstepClient, run_lockstep
 from finssim.robot.perception import Perception
-from finssim.robot.picture_source import DEFAULT_CAMERA, NoPictures, open_pictures
-from finssim.robot.pilots import make_pilot
-from finssim.robot.realtime import run_realtime
+from finssim.robot.pilots import Pilot, make_pilot
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.robot.summary import Summary, show
-from finssim.robot.tag_finder import TagFinder
-from finssim.vehicles import load_vehicle
+from finssim.robot.wiring import POOL_ADDRESS, Drive, Wiring, connected
+from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["FAULT", "POOL_ADDRESS", "Wiring", "run"]
 
-POOL_ADDRESS = "udp://127.0.0.1:58766"
-"""Where the motor controller of a virtual pool on this machine listens."""
 FAULT = 3
 """Exit status of a run that ended in a fault of the vehicle."""
 AFTERWARDS = 2.0
 """A trajectory's end is held for so long before the run ends [s]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Wiring:
-    """How the robot is connected."""
-
-    robot: str = "pool"
-    """Address of the motor controller, or `pool`."""
-    bind: str = DEFAULT_BIND
-    """Own end, for UDP; pictures come to the port after it."""
-    pictures: str | None = None
-    """Address of the camera; that of the virtual pool for `pool`, else none, if None."""
-    lockstep: bool = False
-    """Take turns with a virtual pool."""
+MUTE = 3.0
+"""A vehicle that has said nothing for so long is told of [s]."""
 
 
 def run(
@@ -92,17 +75,16 @@ def run(
     wiring, console = wiring or Wiring(), Console(stderr=True)
     ours, guide = load_vehicle(vehicle), guide_of(goal, trajectory)
     check_reachable(guide, ours)
-    if task is None and trajectory is not None and policy in CONTROLLERS:
-        task = "t2"
-    pilot = make_pilot(policy, ours, task=task, trim=Trim() if trim else None)
+    pilot = _pilot(policy, ours, task, trim, follows=trajectory is not None)
     pool = load_pool(pool_file)
     perception = Perception(ours, pool, mode=mode)
-    if not arm:
-        console.print("dry run: thrusters will not turn without --arm")
     meta = {"command": "finssim run", "pilot": pilot.describe(), "guide": guide.name, "armed": arm}
-    with _recording(record, ours, {**meta, "pool_sha256": pool.sha256}, pool_file, wiring) as recorder:
+    record_with = (record, ours, {**meta, "pool_sha256": pool.sha256}, pool_file, wiring)
+    with _opened(connected(wiring, ours, pool), *record_with) as (drive, recorder):
+        if not arm:
+            console.print("dry run: thrusters will not turn without --arm")
         runtime = Runtime(ours, pool, pilot, guide, arm=arm, perception=perception, recorder=recorder)
-        summary, watch = Summary(), _Watch(runtime, duration)
+        watch, summary = _Watch(runtime, duration, wiring.robot, console), Summary()
         with _progress(console) as say:
 
             def look(runtime: Runtime) -> None:
@@ -110,8 +92,8 @@ def run(
                 summary.look(runtime)
                 say(runtime, summary)
 
-            drive = _lockstep if wiring.lockstep else _realtime
-            took = drive(runtime, pool, wiring, duration or math.inf, look, watch.over)
+            longest = math.inf if duration is None else duration
+            took = drive(runtime, duration=longest, show=look, until=watch.over)
     told = summary.tell(runtime, took, watch.state)
     if as_json:
         print(json.dumps(told))
@@ -120,60 +102,59 @@ def run(
     return FAULT if watch.state == "fault" else 0
 
 
-class _Watch:
-    """Remembers the state of the bridge while the run lasts, and when the run is over."""
+def _pilot(policy: str, vehicle: Vehicle, task: str | None, trim: bool, *, follows: bool) -> Pilot:
+    """Who steers; a PID that follows a trajectory is that of T2."""
+    if task is not None:
+        observer(task)  # refuses what is no task
+    if policy in CONTROLLERS:
+        if trim:
+            raise ControlError(f"{policy} has an integral of its own: leave --trim out")
+        task = task or ("t2" if follows else None)
+    return make_pilot(policy, vehicle, task=task, trim=Trim() if trim else None)
 
-    def __init__(self, runtime: Runtime, duration: float | None) -> None:
+
+@contextmanager
+def _opened(
+    link: AbstractContextManager[Drive], path: Path | None, *about: Any
+) -> Iterator[tuple[Drive, Recorder | None]]:
+    """What the robot is connected to, and a record; none is left of a run that could not be connected."""
+    with ExitStack() as stack:
+        recorder = stack.enter_context(_recording(path, *about))
+        try:
+            drive = stack.enter_context(link)
+        except ValueError:
+            if recorder is not None:
+                recorder.close()
+                recorder.path.unlink()
+            raise
+        yield drive, recorder
+
+
+class _Watch:
+    """Remembers the state of the bridge, and when the run is over; tells of a vehicle that says nothing."""
+
+    def __init__(self, runtime: Runtime, duration: float | None, robot: str, console: Console) -> None:
         self.state = runtime.bridge.state
         follows = duration is None and math.isfinite(runtime.guide.duration)
         self._end = runtime.guide.duration + AFTERWARDS if follows else math.inf
+        self._robot, self._console = robot, console
+        self._waits_since = math.nan
+        self._told = False
 
     def look(self, runtime: Runtime) -> None:
         self.state = runtime.bridge.state
+        if self._told or runtime.counters.telemetry or runtime.reading is None:
+            return
+        now = runtime.reading.time
+        self._waits_since = now if math.isnan(self._waits_since) else self._waits_since
+        if now - self._waits_since >= MUTE:
+            self._told = True
+            self._console.print(
+                f"no telemetry from {self._robot} yet: is it on, and does it know this end's address?"
+            )
 
     def over(self, runtime: Runtime) -> bool:
         return self.state == "fault" or runtime.t > self._end
-
-
-Look = Callable[[Runtime], None]
-
-
-def _realtime(
-    runtime: Runtime,
-    pool: Pool,
-    wiring: Wiring,
-    duration: float,
-    look: Look,
-    over: Callable[[Runtime], bool],
-) -> float:
-    """Run on the wires; returns how long [s]."""
-    local = wiring.robot == "pool"
-    camera = wiring.pictures or (f"udp://{DEFAULT_CAMERA}" if local else "none")
-    transport = open_transport(POOL_ADDRESS if local else wiring.robot, wiring.bind)
-    host, port = host_port(wiring.bind, "bind")
-    pictures = open_pictures(camera, f"{host}:{port + 1 if port else 0}")
-    if not isinstance(pictures, NoPictures):
-        lens = pool.camera.lens
-        pictures = TagFinder(pictures, runtime.vehicle, size=(lens.height, lens.width))
-    try:
-        return run_realtime(runtime, transport, pictures, duration=duration, show=look, until=over)
-    finally:
-        transport.close()
-        pictures.close()
-
-
-def _lockstep(
-    runtime: Runtime,
-    pool: Pool,
-    wiring: Wiring,
-    duration: float,
-    look: Look,
-    over: Callable[[Runtime], bool],
-) -> float:
-    """Take turns with a virtual pool; returns how long [s]."""
-    address = f"127.0.0.1:{DEFAULT_PORT}" if wiring.robot == "pool" else wiring.robot.removeprefix("tcp://")
-    with LockstepClient(address) as world:
-        return run_lockstep(runtime, world, duration, show=look, until=over)
 
 
 @contextmanager

@@ -62,7 +62,7 @@ class Summary:
         faults = [event.text for event in runtime.counters.events if event.kind == "fault"]
         return {
             "state": state,
-            "reason": runtime.bridge.reason or runtime.refusal,
+            "reason": runtime.bridge.reason or runtime.refusal or _waiting(runtime),
             "duration_s": duration,
             "goal": runtime.guide.name,
             "pilot": runtime.pilot.describe(),
@@ -72,6 +72,12 @@ class Summary:
             "refused": runtime.perception.health().counts,
             **runtime.counters.summary(),
         }
+
+
+def _waiting(runtime: Runtime) -> str:
+    """What a run that never began was waiting for; empty for one that did."""
+    began = not math.isnan(runtime.started)
+    return "" if began or runtime.reading is None else runtime.reading.reason
 
 
 def show(told: dict[str, Any], console: Console) -> None:

@@ -13,24 +13,21 @@ from finssim.control.guidance import Guide, Station
 from finssim.localization.pool import Pool, load_pool
 from finssim.robot.bridge import Bridge
 from finssim.robot.bridge_settings import BridgeSettings
-from finssim.robot.goals import station_of
+from finssim.robot.goals import check_reachable, station_of
 from finssim.robot.link.transports import Transport, open_transport
 from finssim.robot.operator import Device, Operator
 from finssim.robot.perception import Perception
-from finssim.robot.picture_source import DEFAULT_CAMERA, NoPictures, PictureSource, open_pictures
+from finssim.robot.picture_source import PictureSource
 from finssim.robot.pilots import ModeSwitch, Pilot, WrenchPilot, make_pilot
 from finssim.robot.realtime import run_realtime
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
-from finssim.robot.tag_finder import TagFinder
 from finssim.robot.teleop import TeleopError
 from finssim.robot.unlocated import Unlocated
+from finssim.robot.wiring import POOL_ADDRESS, Wiring, open_camera
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["POOL", "drive", "run"]
-
-POOL = "udp://127.0.0.1:58766"
-"""Where the virtual pool listens for frames."""
+__all__ = ["drive", "run"]
 
 SHOWN_EVERY = 0.2
 """[s]"""
@@ -70,21 +67,11 @@ def drive(
         wait: Waits so long [s].
     """
     operator, switch = _crew(vehicle, device, other, 1.0 / rate)
-    perception = Unlocated(vehicle) if pool is None else Perception(vehicle, pool)
-    bridge = Bridge(vehicle, BridgeSettings.of(vehicle, need_reading=False))
-    runtime = Runtime(
-        vehicle,
-        pool,
-        switch,
-        guide or Station((0.0, 0.0, 0.0), 0.0),
-        perception=perception,
-        bridge=bridge,
-        recorder=recorder,
-    )
+    runtime = _robot(vehicle, switch, pool, recorder, guide or Station((0.0, 0.0, 0.0), 0.0))
 
     def turn(running: Runtime) -> bool:
         if running.reading is not None:
-            operator.turn(running.reading.time, bridge)
+            operator.turn(running.reading.time, running.bridge)
         if show is not None:
             show(running, operator)
         return False
@@ -93,6 +80,15 @@ def drive(
         runtime, transport, pictures, rate=rate, duration=duration, until=turn, clock=clock, wait=wait
     )
     return runtime
+
+
+def _robot(
+    vehicle: Vehicle, pilot: Pilot, pool: Pool | None, recorder: Recorder | None, guide: Guide
+) -> Runtime:
+    """A robot that a person may arm without a state; never armed by itself."""
+    perception = Unlocated(vehicle) if pool is None else Perception(vehicle, pool)
+    bridge = Bridge(vehicle, BridgeSettings.of(vehicle, need_reading=False))
+    return Runtime(vehicle, pool, pilot, guide, perception=perception, bridge=bridge, recorder=recorder)
 
 
 def _crew(
@@ -132,32 +128,40 @@ def run(
     """
     body = load_vehicle(vehicle)
     pool = load_pool(pool_file) if pool_file is not None else None
-    if policy is not None and (pool is None or goal is None):
+    other, guide = _controller(policy, goal, body, pool)
+    if pictures is not None and pool is None:
+        raise TeleopError("--pictures says nothing without the camera's place: give --pool-file, too")
+    wiring = Wiring(robot=robot, bind=bind, pictures=pictures)
+    with ExitStack() as stack:
+        hands, keys = _open_device(device, key_hold, stack)
+        transport = open_transport(POOL_ADDRESS if robot == "pool" else robot, bind)
+        stack.callback(transport.close)
+        source = None if pool is None else open_camera(wiring, body, pool)
+        if source is not None:
+            stack.callback(source.close)
+        recorder = _recorder(record, body, pool_file, robot, stack)
+        print(keys, file=sys.stderr)
+        longest = math.inf if duration is None else duration
+        told = {"recorder": recorder, "other": other, "guide": guide, "show": _Line()}
+        drive(body, hands, transport, pool=pool, pictures=source, rate=rate, duration=longest, **told)
+        print(f"\n{transport.describe()}", file=sys.stderr)
+
+
+def _controller(
+    policy: str | None, goal: str | None, vehicle: Vehicle, pool: Pool | None
+) -> tuple[Pilot | None, Station | None]:
+    """Whom the person hands over to, and where it steers to."""
+    if policy is None:
+        if goal is not None:
+            raise TeleopError("--goal is where a controller steers to: give --policy, too, or leave it out")
+        return None, None
+    if pool is None or goal is None:
         raise TeleopError(
             "a controller to hand over to needs a state and a goal: give --pool-file and --goal"
         )
-    other = make_pilot(policy, body) if policy is not None else None
-    with ExitStack() as stack:
-        hands, keys = _open_device(device, key_hold, stack)
-        transport = open_transport(POOL if robot == "pool" else robot, bind)
-        stack.callback(transport.close)
-        source = None if pool is None else _open_pictures(pictures, robot, body, pool, stack)
-        recorder = _recorder(record, body, pool_file, robot, stack)
-        print(keys, file=sys.stderr)
-        drive(
-            body,
-            hands,
-            transport,
-            pool=pool,
-            pictures=source,
-            recorder=recorder,
-            other=other,
-            guide=station_of(goal) if goal is not None else None,
-            rate=rate,
-            duration=math.inf if duration is None else duration,
-            show=_Line(),
-        )
-        print(f"\n{transport.describe()}", file=sys.stderr)
+    station = station_of(goal)
+    check_reachable(station, vehicle)
+    return make_pilot(policy, vehicle), station
 
 
 def _open_device(name: str, key_hold: float, stack: ExitStack) -> tuple[Device, str]:
@@ -171,18 +175,6 @@ def _open_device(name: str, key_hold: float, stack: ExitStack) -> tuple[Device, 
 
         return stack.enter_context(gamepad.Gamepad()), gamepad.HELP
     raise TeleopError(f"unknown device '{name}': expected gamepad or keyboard")
-
-
-def _open_pictures(
-    address: str | None, robot: str, vehicle: Vehicle, pool: Pool, stack: ExitStack
-) -> PictureSource:
-    """The camera's wire, with tags found beside the loop."""
-    source = open_pictures(address or (f"udp://{DEFAULT_CAMERA}" if robot == "pool" else "none"))
-    if not isinstance(source, NoPictures):
-        lens = pool.camera.lens
-        source = TagFinder(source, vehicle, size=(lens.height, lens.width))
-    stack.callback(source.close)
-    return source
 
 
 def _recorder(

@@ -16,8 +16,8 @@ from finssim.robot.intake import Intake
 from finssim.robot.link.frames import encode_command
 from finssim.robot.link.transports import DEFAULT_BIND, open_transport
 from finssim.robot.messages import CommandEcho, Telemetry
-from finssim.robot.run import POOL_ADDRESS
 from finssim.robot.unlocated import Unlocated
+from finssim.robot.wiring import POOL_ADDRESS
 from finssim.ros2.nodes.bridge_topics import BridgeTopics
 from finssim.ros2.nodes.robot_node import RobotNode, run
 

@@ -1,0 +1,104 @@
+"""How a robot is connected: to a motor controller and a camera in real time, or to a virtual pool in lock-step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Protocol
+
+from finssim.localization.pool import Pool
+from finssim.robot.link.layout import LinkError
+from finssim.robot.link.transports import DEFAULT_BIND, host_port, open_transport
+from finssim.robot.lockstep import DEFAULT_PORT, LockstepClient, run_lockstep
+from finssim.robot.picture_source import DEFAULT_CAMERA, NoPictures, PictureSource, open_pictures
+from finssim.robot.realtime import run_realtime
+from finssim.robot.runtime import Runtime
+from finssim.robot.tag_finder import TagFinder
+from finssim.vehicles import Vehicle
+
+__all__ = ["POOL_ADDRESS", "Drive", "Wiring", "connected", "open_camera"]
+
+POOL_ADDRESS = "udp://127.0.0.1:58766"
+"""Where the motor controller of a virtual pool on this machine listens."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wiring:
+    """How the robot is connected."""
+
+    robot: str = "pool"
+    """Address of the motor controller, or `pool`."""
+    bind: str = DEFAULT_BIND
+    """Own end, for UDP; pictures come to the port after it."""
+    pictures: str | None = None
+    """Address of the camera; that of the virtual pool for `pool`, else none, if None."""
+    lockstep: bool = False
+    """Take turns with a virtual pool."""
+
+
+class Drive(Protocol):
+    """Runs a robot on what it is connected to, until the time is over or `until` says so; returns how long [s]."""
+
+    def __call__(
+        self,
+        runtime: Runtime,
+        *,
+        duration: float,
+        show: Callable[[Runtime], None],
+        until: Callable[[Runtime], bool],
+    ) -> float: ...
+
+
+@contextmanager
+def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool) -> Iterator[Drive]:
+    """Everything open, for as long as it is needed.
+
+    Args:
+        wiring: What to open.
+        vehicle: Its tags are looked for.
+        pool: Its camera tells the size of pictures.
+
+    Raises:
+        LinkError, LockstepError: Something cannot be opened.
+    """
+    with ExitStack() as stack:
+        if wiring.lockstep:
+            world = stack.enter_context(LockstepClient(_lockstep_address(wiring)))
+            yield lambda runtime, **how: run_lockstep(runtime, world, **how)
+            return
+        transport = open_transport(POOL_ADDRESS if wiring.robot == "pool" else wiring.robot, wiring.bind)
+        stack.callback(transport.close)
+        camera = open_camera(wiring, vehicle, pool)
+        stack.callback(camera.close)
+        yield lambda runtime, **how: run_realtime(runtime, transport, camera, **how)
+
+
+def open_camera(wiring: Wiring, vehicle: Vehicle, pool: Pool) -> PictureSource:
+    """The camera's wire, with tags found beside the loop.
+
+    Raises:
+        LinkError: It names no source, or the source cannot be opened.
+    """
+    default = f"udp://{DEFAULT_CAMERA}" if wiring.robot == "pool" else "none"
+    host, port = host_port(wiring.bind, "--bind")
+    source = open_pictures(wiring.pictures or default, f"{host}:{port + 1 if port else 0}")
+    if isinstance(source, NoPictures):
+        return source
+    lens = pool.camera.lens
+    return TagFinder(source, vehicle, size=(lens.height, lens.width))
+
+
+def _lockstep_address(wiring: Wiring) -> str:
+    """HOST:PORT of the pool."""
+    if wiring.bind != DEFAULT_BIND or wiring.pictures is not None:
+        raise LinkError("in lock-step all comes over one connection: leave --bind and --pictures out")
+    if wiring.robot == "pool":
+        return f"127.0.0.1:{DEFAULT_PORT}"
+    address = wiring.robot.removeprefix("tcp://")
+    if "/" in address or address.startswith("serial:"):
+        raise LinkError(
+            f"--robot {wiring.robot} is no world in lock-step: give HOST:PORT of finssim pool --lockstep, "
+            "or leave --lockstep out"
+        )
+    return address
