@@ -173,6 +173,28 @@ def test_a_silent_estimator_ends_commands(wire):
     assert not stage.heard["command"]
 
 
+def test_a_silent_bridge_ends_commands_but_begins_nothing_anew(wire):
+    """A trajectory goes on where its time is when the bridge speaks again; only disarming starts it over."""
+    stage = wire(Controller, "-p", "goal:='0.6,0.1,-0.5,0'")
+    stage.state = "armed"
+    assert stage.until(lambda: stage.heard["command"])
+    began, publish = stage.node.runtime.started, stage.send
+    stage.send = lambda key, *message, **fields: (
+        None if key == "thrusters" else publish(key, *message, **fields)
+    )
+    assert stage.until(lambda: stage.node.bridge.silent)
+    stage.turns(10)
+    stage.heard["command"].clear()
+    stage.turns(10)
+    assert not stage.heard["command"]
+    stage.send = publish
+    assert stage.until(lambda: stage.heard["command"]) and stage.node.runtime.started == began
+    stage.state = "disarmed"
+    assert stage.until(lambda: not stage.node.armed)
+    stage.state = "armed"
+    assert stage.until(lambda: stage.node.runtime.started > began)
+
+
 def test_a_person_takes_over_by_mode_and_wrench(wire):
     """The wrench becomes thrusts; one that is not finite, or has grown stale, is none; unknown modes are refused."""
     stage = wire(Controller)

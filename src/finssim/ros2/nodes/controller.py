@@ -53,6 +53,8 @@ class Controller(RobotNode):
         self.create_timer(1.0, self._tell)
 
     def _turn(self) -> None:
+        if self.bridge.silent:  # which is no word of disarming: a trajectory goes on when it speaks again
+            return
         now, armed = self.now(), self.bridge.state in ("armed", "hold")
         begins, self.armed = armed and not self.armed, armed
         if begins:

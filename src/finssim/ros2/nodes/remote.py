@@ -101,7 +101,12 @@ class RemoteBridge:
     @property
     def state(self) -> str:
         """As the bridge last said; disarmed where it is silent."""
-        return self._state if self._node.now() - self._at <= SILENT else "disarmed"
+        return "disarmed" if self.silent else self._state
+
+    @property
+    def silent(self) -> bool:
+        """Whether nothing has been heard of it for too long."""
+        return self._node.now() - self._at > SILENT
 
     def arm(self, now: float, source: str) -> str:
         """Ask for arming; whether it is granted shows in the state."""
