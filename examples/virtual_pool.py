@@ -2,8 +2,8 @@
 
     python examples/virtual_pool.py
 
-Both take turns, as fast as they compute. The pool's vehicle, water and camera are drawn around the file: no controller has
-seen them. Needs the extra "vision".
+Both take turns, as fast as they compute. The pool's vehicle, water and camera are drawn around the file: no controller
+has seen them. Needs the extra "vision".
 """
 
 from __future__ import annotations
