@@ -11,7 +11,7 @@ from finssim.control.allocator import Allocator
 from finssim.control.errors import ControlError
 from finssim.control.pole_placement import AxisModel, Gains, axis_model, place_poles
 from finssim.control.tracking import Goal, Measured, tracking_error, velocity_at
-from finssim.geometry.rotations import quat_inverse_rotate, quat_rotate
+from finssim.geometry.rotations import cross, quat_inverse_rotate, quat_rotate
 from finssim.vehicles import Vehicle
 
 __all__ = ["Pid", "PidMemory"]
@@ -176,7 +176,7 @@ class Pid:
         up, up_goal = (quat_inverse_rotate(q, [0.0, 0.0, 1.0]) for q in (quaternion, goal))
         lever = self.buoyancy * (self.center_of_buoyancy - self.reference)
         lever = lever - self.weight * (self.center_of_gravity - self.reference)
-        force, moment = np.broadcast_arrays((self.weight - self.buoyancy) * up, -np.cross(lever, up_goal))
+        force, moment = np.broadcast_arrays((self.weight - self.buoyancy) * up, -cross(lever, up_goal))
         return np.concatenate([force, moment], axis=-1)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.control.errors import ControlError
+from finssim.geometry.rotations import cross
 from finssim.vehicles import HydrodynamicSet, Vehicle
 from finssim.vehicles.body import moved_to_origin
 
@@ -46,8 +47,8 @@ class AxisModel:
         """
         nu = np.asarray(nu, float)
         v, omega, momentum = nu[..., :3], nu[..., 3:], self.inertia * nu
-        turning = np.cross(omega, momentum[..., 3:]) + np.cross(v, momentum[..., :3])
-        return np.concatenate([np.cross(omega, momentum[..., :3]), turning], axis=-1)
+        turning = cross(omega, momentum[..., 3:]) + cross(v, momentum[..., :3])
+        return np.concatenate([cross(omega, momentum[..., :3]), turning], axis=-1)
 
 
 @dataclass(frozen=True)

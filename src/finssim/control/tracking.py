@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.geometry.rotations import (
+    cross,
     quat_conjugate,
     quat_inverse_rotate,
     quat_multiply,
@@ -106,6 +107,4 @@ def tracking_error(measured: Measured, goal: Goal, point: npt.ArrayLike) -> Trac
 def velocity_at(nu: npt.ArrayLike, point: npt.ArrayLike) -> Array:
     """Twist of the body at a body point: v + omega x r and omega, body frame, (..., 6)."""
     nu = np.asarray(nu, float)
-    return np.concatenate(
-        [nu[..., :3] + np.cross(nu[..., 3:], np.asarray(point, float)), nu[..., 3:]], axis=-1
-    )
+    return np.concatenate([nu[..., :3] + cross(nu[..., 3:], np.asarray(point, float)), nu[..., 3:]], axis=-1)

@@ -67,7 +67,7 @@ class Shutter:
                 self._opened = pose_at(max(opens, t0))
             if self._opened is None or closes > t1:
                 return done
-            late = float(np.clip(self._random.normal(), -WIDEST, WIDEST)) * self._jitter
+            late = max(-WIDEST, min(float(self._random.normal()), WIDEST)) * self._jitter
             lost = float(self._random.random()) < self._dropout
             arrival = max(middle + self._latency + late, closes, self._last_arrival)
             if not lost:

@@ -59,7 +59,7 @@ class Estimate:
 
     def std(self) -> Array:
         """Standard deviations of position, velocity and yaw, (7,)."""
-        return np.sqrt(np.array([*self.P.diagonal().tolist(), self.yaw_variance]))
+        return np.asarray(np.sqrt(np.array([*self.P.diagonal().tolist(), self.yaw_variance])))
 
 
 @dataclass(frozen=True)

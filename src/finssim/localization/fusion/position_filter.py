@@ -159,10 +159,10 @@ def _inverse(S: Array) -> Array:
     if S.shape[-1] == 1:
         return np.asarray(1.0 / S)
     if S.shape != (2, 2):
-        return np.linalg.inv(S)
+        return np.asarray(np.linalg.inv(S), np.float64)
     (a, b), (_, c) = S.tolist()
     determinant = a * c - b * b
-    return np.array([[c, -b], [-b, a]]) / determinant
+    return np.asarray(np.array([[c, -b], [-b, a]]) / determinant)
 
 
 def correct(state: PositionState, found: Innovation, H: Array, R: Array) -> PositionState:
