@@ -34,6 +34,10 @@ class Panel:
         self._gui.set_panel_label("FinsSim")
         self._gui.main_panel.dock_right()
         self._gui.add_markdown(f"**{stage.title}**  \n{_legend()}")
+        self._slider: Any = None
+        self._button: Any = None
+        self._speed: Any = None
+        self._shown = 0.0
         self._controls(playback)
         self._status = self._gui.add_markdown("")
         self._image: Any = None
@@ -103,8 +107,6 @@ class Panel:
 
     def _controls(self, playback: Playback) -> None:
         gui = self._gui
-        self._slider: Any = None
-        self._shown = 0.0
         if playback.live:
             self._clock = gui.add_markdown("0.0 s")
         else:
@@ -115,10 +117,7 @@ class Panel:
         first = f"{playback.speed:g}x"
         options = speeds if first in speeds else (first, *speeds)
         self._speed = gui.add_dropdown("speed", options, initial_value=first)
-
-        @self._button.on_click
-        def _(_: Any) -> None:
-            playback.play(not playback.playing)
+        self._button.on_click(lambda _: playback.play(not playback.playing))
 
 
 def _legend() -> str:

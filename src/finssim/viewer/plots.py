@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -33,9 +34,9 @@ class Plot:
             columns += [curve.value, np.where(past, curve.value, np.nan)]
         return tuple(np.ascontiguousarray(column, float) for column in columns)
 
-    def series(self) -> tuple[dict[str, object], ...]:
+    def series(self) -> tuple[Any, ...]:
         """How they are drawn: all of a curve faintly, what has been in full."""
-        drawn: list[dict[str, object]] = [{"label": "t [s]"}]
+        drawn: list[Any] = [{"label": "t [s]"}]
         for curve, colour in zip(self.curves, LINES, strict=False):
             drawn += [{"label": "", "stroke": f"{colour}40", "width": 1}]
             drawn += [{"label": curve.label, "stroke": colour, "width": 2}]

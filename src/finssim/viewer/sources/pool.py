@@ -144,13 +144,12 @@ class PoolSource:
     def _status(self, runtime: Runtime) -> dict[str, str]:
         bridge, reading, plant = runtime.bridge, runtime.reading, self._world.plant
         why = bridge.reason or runtime.refusal
-        to_goal, turned, off, _ = self._errors.latest
         status: dict[str, Any] = {"bridge": bridge.state + (f" ({why})" if why else "")}
         if reading is not None:
             status["vision"] = reading.mode
             status["state"] = "ready" if reading.ready else f"not ready: {reading.reason}"
-        status["to the goal"] = f"{100.0 * to_goal:.1f} cm, {turned:.1f}°"
-        status["estimate error"] = "-" if math.isnan(off) else f"{100.0 * off:.1f} cm"
+        status["to the goal"] = self._errors.to_goal
+        status["estimate error"] = self._errors.of_estimate
         status["battery"] = f"{float(plant.electric[0]):.2f} V"
         rpm = np.asarray(plant.shaft_speed) * 60.0 / (2.0 * math.pi)
         status["shafts [rpm]"] = " ".join(f"{r:.0f}" for r in rpm)

@@ -104,6 +104,17 @@ class Errors:
         """Errors to the goal [m, deg] and of the estimate [m, deg]; NaN where not known."""
         return self._rows[-1][1:] if self._rows else (math.nan,) * 4
 
+    @property
+    def to_goal(self) -> str:
+        """Distance and turn to the goal, in words."""
+        distance, turn, *_ = self.latest
+        return "-" if math.isnan(distance) else f"{100.0 * distance:.1f} cm, {turn:.1f}°"
+
+    @property
+    def of_estimate(self) -> str:
+        """Distance of the estimate from the truth, in words."""
+        return "-" if math.isnan(self.latest[2]) else f"{100.0 * self.latest[2]:.1f} cm"
+
     def curves(self) -> list[Curve]:
         """Those that have a value."""
         rows = np.array(self._rows).reshape(-1, 5)

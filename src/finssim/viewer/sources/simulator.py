@@ -83,7 +83,6 @@ class SimulatorSource:
             self._step()
         now, pose = self._steps * STEP, self._pose()
         goal = goal_pose(self._guide, now)
-        to_goal, turned, *_ = self._errors.latest
         return Frame(
             time=now,
             truth=pose,
@@ -92,7 +91,7 @@ class SimulatorSource:
             trail=self._errors.trail,
             status={
                 "controller": self._pilot.name,
-                "to the goal": f"{100.0 * to_goal:.1f} cm, {turned:.1f}°",
+                "to the goal": self._errors.to_goal,
                 "progress": f"{100.0 * float(self._guide.at(now).progress):.0f} %",
                 "thrust [N]": " ".join(f"{f:.1f}" for f in self._thrust()),
             },
