@@ -1,70 +1,131 @@
-"""`finssim demo`: identify a vehicle from trials, train in what was identified, evaluate beside two PIDs, report."""
+"""`finssim demo`: the whole loop on one machine, from a vehicle nobody measured to a policy in a pool."""
 
 from __future__ import annotations
 
-import csv
-import json
-import os
 import shutil
 import sys
 import time
 import webbrowser
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from os import environ
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
+from finssim.calibration.excitation.programmes import programmes
+from finssim.calibration.trials.trial import Trial
 from finssim.control.policy import Policy
 from finssim.control.policy_description import DESCRIPTION_FILE
-from finssim.experiments.evaluate import Evaluation, evaluate_controller
-from finssim.experiments.identify import PLANT_FILE, Identification, commands, identify, vehicle_files
+from finssim.experiments.camera_view import camera_view
+from finssim.experiments.demo_files import PLANT_FILE, TRIALS_FOLDER, command_lines, write_demo
+from finssim.experiments.evaluate import Evaluation
+from finssim.experiments.excitation.pool_trials import pool_trials
+from finssim.experiments.excitation.shuttle import shuttles
+from finssim.experiments.excitation.terminal import compare_steps
+from finssim.experiments.identify import HELD_OUT, Identification, Record, identify, vehicle_files
+from finssim.experiments.pool_evaluation import pool_evaluation, pool_jobs
 from finssim.experiments.results_table import print_comparison
+from finssim.experiments.running import Say
+from finssim.experiments.setpoints import T1_SETPOINTS
+from finssim.experiments.transfer.campaign import run_jobs
+from finssim.experiments.transfer.job import Job
+from finssim.experiments.transfer.pool_trial import play
 from finssim.files import atomic_directory
 from finssim.learning.train import train
+from finssim.pool import draw_plant
+from finssim.quiet import start_warp
+from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["demo"]
+__all__ = ["FULL", "Scope", "demo"]
 
 REPORT_FILE = "report.html"
 SEED = 1
-TASK, VEHICLE = "t1", "finsrov"
+VEHICLE, PLANT, SEVERITY, RANGES = "finsrov", 1, "realistic", "pool"
+CONTROLLERS = ("policy", "pid", "pid-paper")
+VIEW_AT = 12.0
+"""Time of a trial from which the report shows a picture [s]."""
+COAST = 4.0
+"""Longest, after a dive [s]: the pool is shallow, and this vehicle hardly rises."""
 
 
-def demo(out: Path, *, steps: int | None = None, seed: int = SEED, console: Console | None = None) -> Path:
-    """Identify FinsROV from trials, train T1 in what was identified, try it in the plant that the trials came from.
+@dataclass(frozen=True, kw_only=True)
+class Scope:
+    """How much of everything a demonstration does."""
 
-    Beside the policy, `pid` and `pid-paper` try the eight setpoints, tuned from the identified vehicle too.
+    levels: dict[str, list[float]]
+    """Axis -> levels of the steps and pulses that the fit is made from [N, N m]."""
+    shuttles: dict[str, list[float]]
+    """The same of the square waves."""
+    held_out: dict[str, list[float]]
+    """The same of those that are replayed."""
+    setpoints: tuple[str, ...]
+    """Tried by every controller, with the tags' corners computed."""
+    pictures: tuple[str, ...]
+    """Tried by the policy with pictures drawn and searched."""
+    duration: float = 60.0
+    """Of a trial [s]."""
+
+
+FULL = Scope(
+    levels={
+        "surge": [6.0, 18.0],
+        "sway": [4.5, 13.5],
+        "heave": [4.5, 13.5],
+        "roll": [0.5, 1.0],
+        "pitch": [0.5, 1.0],
+        "yaw": [0.6, 1.8],
+    },
+    shuttles={"surge": [9.0, 18.0], "sway": [9.0, 13.5], "heave": [9.0, 13.5]},
+    held_out=HELD_OUT,
+    setpoints=tuple(T1_SETPOINTS),
+    pictures=("P02",),
+)
+"""What `finssim demo` does."""
+
+
+def demo(
+    out: Path,
+    *,
+    steps: int | None = None,
+    seed: int = SEED,
+    console: Console | None = None,
+    scope: Scope = FULL,
+    processes: int | None = None,
+) -> Path:
+    """Identify FinsROV in the virtual pool, train T1 in what was identified, and let the policy hold setpoints there.
+
+    Trials are recorded and controllers deployed through the robot's whole software: camera, localization, fusion,
+    controller, allocation, bridge and the motor controller's protocol. Beside the policy, `pid` and `pid-paper` try
+    the same setpoints in the same pool, `pid` tuned from the identified vehicle.
 
     Args:
         out: Directory for trials, vehicle, policy, results and `report.html`; an earlier one there is replaced.
-        steps: Control steps to train; as `finssim train` if None.
-        seed: Of the trials and of the training.
+        steps: Control steps to train; as `finssim train --randomize pool` if None.
+        seed: Of the noise and of the training.
         console: Where progress is shown; standard error if None.
+        scope: How much of it.
+        processes: As many as there are processors if None.
 
     Returns:
         Path of the report.
 
     Raises:
-        KeyboardInterrupt: After Ctrl-C. The policy so far is then in `OUT-training/interrupted`, and `out` as it was.
+        KeyboardInterrupt: After Ctrl-C. A policy so far is then in `OUT-training/interrupted`, and `out` as it was.
     """
     console = console or Console(stderr=True)
+    start_warp()
     rescue = out.with_name(f"{out.name}-training") / "interrupted"
     with atomic_directory(out, replaces=REPORT_FILE) as folder:
-        with console.status("identifying the vehicle from trials"):
-            found = identify(folder, VEHICLE, seed=seed, shown=out)
-        told = sum(e.identifiable for e in found.fit.estimates.values())
-        console.print(
-            f"identified from {len(found.fit.trials)} trials in {found.seconds:.0f} s: {told} of "
-            f"{len(found.fit.estimates)} parameters told, NRMSE on {len(found.replay.pairs)} other trials "
-            f"{found.replay.aggregate('calibrated').value:.3f}",
-            highlight=False,
-        )
+        found = _identified(folder, out, seed, scope, processes, console)
         began = time.perf_counter()
         policy = train(
-            TASK,
+            "t1",
             out=folder / "policy",
             vehicle=found.vehicle,
+            randomize=RANGES,
             seed=seed,
             steps=steps,
             console=console,
@@ -75,23 +136,100 @@ def demo(out: Path, *, steps: int | None = None, seed: int = SEED, console: Cons
             "seconds": time.perf_counter() - began,
             "seed": seed,
             "steps": Policy.load(policy).description.training["steps"],
-            "task": TASK,
-            "vehicle": out / vehicle_files(VEHICLE)[1],
-            "plant": out / PLANT_FILE,
-            "before": commands(out, VEHICLE, seed),
         }
         with _rescued(policy, rescue, console):
-            evaluations = [
-                evaluate_controller(controller, found.plant, task=TASK, vehicle=found.vehicle)
-                for controller in (policy, "pid", "pid-paper")
-            ]
-            _write(folder, found, evaluations, policy, training)
-    print_comparison([e.result for e in evaluations], Console())
+            evaluations, picture = _deployed(folder, policy, seed, scope, processes, console)
+            commands = command_lines(out, VEHICLE, PLANT, SEVERITY, RANGES, training)
+            write_demo(folder, found, evaluations, policy, training, commands, picture)
+    print_comparison([e.result for e in evaluations if e.result["camera"] == "corners"], Console())
     report = Path(out) / REPORT_FILE
     print(f"report: {report}")
     if _has_display():
         webbrowser.open(report.resolve().as_uri())
     return report
+
+
+def _identified(
+    folder: Path, out: Path, seed: int, scope: Scope, processes: int | None, console: Console
+) -> Identification:
+    """Trials in the pool, the vehicle they tell of, and how its speeds compare with the plant's."""
+    standing = load_vehicle(VEHICLE)
+    spec = draw_plant(standing, PLANT, SEVERITY)
+    spec.write(folder / PLANT_FILE)
+    with console.status("recording trials in the virtual pool") as status:
+
+        def say(part: float, what: str) -> None:
+            status.update(f"recording trials in the virtual pool: {what}")
+
+        record = _recorder(standing, scope, processes, say)
+        found = identify(folder, VEHICLE, seed=seed, shown=out, record=record)
+        linear = {axis: levels for axis, levels in scope.levels.items() if axis not in ("roll", "pitch")}
+        found = found.with_steps(compare_steps(found.vehicle, standing, spec, linear))
+    told = sum(e.identifiable for e in found.fit.estimates.values())
+    console.print(
+        f"identified from {len(found.fit.trials)} trials in {found.seconds:.0f} s: {told} of "
+        f"{len(found.fit.estimates)} parameters told, NRMSE on {len(found.replay.pairs)} other trials "
+        f"{found.replay.aggregate('calibrated').value:.3f}",
+        highlight=False,
+    )
+    return found
+
+
+def _recorder(standing: Vehicle, scope: Scope, processes: int | None, say: Say) -> Record:
+    """Trials of the virtual pool."""
+
+    def record(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
+        plans = {
+            role: programmes(tuple(levels), standing, levels=levels, coast=COAST)
+            for role, levels in (("fit", scope.levels), ("held-out", scope.held_out))
+        }
+        plans["fit"] += shuttles(scope.shuttles, standing) if scope.shuttles else []
+        return pool_trials(
+            plans,
+            folder,
+            vehicle=str(rough),
+            pool_vehicle=VEHICLE,
+            plant=PLANT,
+            severity=SEVERITY,
+            seed=seed,
+            processes=processes,
+            say=say,
+        )
+
+    return record
+
+
+def _deployed(
+    folder: Path, policy: Path, seed: int, scope: Scope, processes: int | None, console: Console
+) -> tuple[list[Evaluation], bytes | None]:
+    """All controllers in the pool, the policy with pictures too, and one of those pictures."""
+    common: dict[str, Any] = {
+        "vehicle": str(folder / vehicle_files(VEHICLE)[1]),
+        "pool_vehicle": VEHICLE,
+        "plant": PLANT,
+        "severity": SEVERITY,
+        "seed": seed,
+        "duration": scope.duration,
+    }
+    names = {name: str(policy) if name == "policy" else name for name in CONTROLLERS}
+    # Pictures first: they take longest, and the other processor has time for the rest.
+    jobs = pool_jobs({"policy-with-pictures": str(policy)}, scope.pictures, camera="pictures", **common)
+    seen = jobs[:1]
+    jobs += pool_jobs(names, scope.setpoints, camera="corners", **common)
+    place = folder / TRIALS_FOLDER
+    with console.status("holding setpoints in the virtual pool") as status:
+        say: Say = lambda part, what: status.update(f"holding setpoints in the virtual pool: {what}")  # noqa: E731
+        results = run_jobs(jobs, place, play, processes=processes, say=say)
+        evaluations = _by_row(jobs, results, place)
+        picture = camera_view(seen[0], place / seen[0].key(), VIEW_AT, seed) if seen else None
+    return evaluations, picture
+
+
+def _by_row(jobs: Sequence[Job], results: Sequence[dict[str, Any]], place: Path) -> list[Evaluation]:
+    """One evaluation for each row, the policy's first."""
+    rows = sorted({job.row for job in jobs}, key=lambda row: [*CONTROLLERS, row].index(row))
+    chosen = [[i for i, job in enumerate(jobs) if job.row == row] for row in rows]
+    return [pool_evaluation([jobs[i] for i in those], [results[i] for i in those], place) for those in chosen]
 
 
 @contextmanager
@@ -106,31 +244,10 @@ def _rescued(policy: Path, rescue: Path, console: Console) -> Iterator[None]:
         raise
 
 
-def _write(
-    folder: Path,
-    found: Identification,
-    evaluations: list[Evaluation],
-    policy: Path,
-    training: dict[str, Any],
-) -> None:
-    from finssim.experiments.identification_report import identification_section
-    from finssim.experiments.report import report_html
-
-    for evaluation in evaluations:
-        name = evaluation.result["controller"]["name"]
-        text = json.dumps(evaluation.result, indent=2, allow_nan=False) + "\n"
-        (folder / f"{name}.json").write_text(text, encoding="utf-8")
-    with (policy / "curves.csv").open(encoding="utf-8", newline="") as file:
-        curves = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
-    (folder / REPORT_FILE).write_text(
-        report_html(evaluations, curves, training, identification_section(found)), encoding="utf-8"
-    )
-
-
 def _has_display() -> bool:
     """Whether a person sits in front of a screen where a browser could open."""
     if not sys.stdout.isatty():
         return False
     return sys.platform in ("darwin", "win32") or bool(
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        environ.get("DISPLAY") or environ.get("WAYLAND_DISPLAY")
     )

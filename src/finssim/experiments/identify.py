@@ -5,12 +5,9 @@ from __future__ import annotations
 import io
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
-
-import yaml
 
 from finssim.calibration.excitation.programmes import Programme, programmes
 from finssim.calibration.excitation.synthetic import simulate_programme
@@ -23,19 +20,31 @@ from finssim.calibration.replay.figure import draw_response_envelopes
 from finssim.calibration.replay.replay import Replay, replay
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import write_trial
-from finssim.experiments.plants import Plant, load_plant
 from finssim.quiet import start_warp
-from finssim.vehicles import HydrodynamicSet, Provenance, Vehicle, load_vehicle
+from finssim.vehicles import Provenance, Vehicle, load_vehicle
 
-__all__ = ["PLANT_FILE", "Identification", "commands", "identify", "rough_vehicle", "vehicle_files"]
+__all__ = [
+    "HELD_OUT",
+    "TRIALS",
+    "Identification",
+    "Record",
+    "commands",
+    "identify",
+    "rough_vehicle",
+    "simulated_trials",
+    "vehicle_files",
+]
 
-TRIALS, PLANT_FILE = "trials", "pool.yaml"
+TRIALS = "trials"
 SET = "hydrodynamics.calibrated"
 
 COAST = 10.0
 """Of a dive [s]; a third of the published, to be quick."""
-HELD_OUT = {"surge": [9.0], "sway": [6.0], "heave": [9.0], "yaw": [1.0]}
+HELD_OUT = {"surge": [9.0], "sway": [6.0], "heave": [7.0], "yaw": [1.0]}
 """Levels that no trial of the fit has [N, N m]."""
+
+Record = Callable[[Path, Path, int], dict[str, list[Trial]]]
+"""Makes trials: folder that takes ROLE/NAME, file of the rough vehicle, seed -> trials by role (fit, held-out)."""
 
 
 @dataclass(frozen=True)
@@ -47,14 +56,18 @@ class Identification:
     fit: Fit
     replay: Replay
     """On the held-out trials, of the identified vehicle."""
-    plant: Plant
-    """The plant that the trials came from, as it differs from the identified vehicle."""
     truth: Vehicle
-    """The vehicle in that plant."""
+    """The vehicle of the catalogue that made the trials, or around which the pool's own was drawn."""
     picture: bytes
     """PNG of the held-out trials, measured and replayed."""
     warnings: tuple[str, ...]
     seconds: float
+    steps: tuple[dict[str, float | str], ...] = ()
+    """Terminal speeds and time constants beside those of a plant, of `excitation.terminal.compare_steps`."""
+
+    def with_steps(self, steps: Sequence[dict[str, float | str]]) -> Identification:
+        """The same with the comparison to a plant."""
+        return replace(self, steps=tuple(steps))
 
 
 def rough_vehicle(truth: Vehicle) -> Vehicle:
@@ -79,18 +92,20 @@ def _named(vehicle: Vehicle, title: str, description: str) -> Vehicle:
     return vehicle.model_copy(update={"title": title, "description": description})
 
 
-def identify(folder: Path, name: str, *, seed: int, shown: Path | None = None) -> Identification:
-    """Make trials of a vehicle in the pool, identify it from some, replay the others; write all of it.
+def identify(
+    folder: Path, name: str, *, seed: int, shown: Path | None = None, record: Record | None = None
+) -> Identification:
+    """Make trials of a vehicle, identify it from some, replay the others; write all of it.
 
     Into the folder go `NAME_rough.yaml` (the vehicle before), `trials/fit` and `trials/held-out`,
-    `NAME_identified.yaml`, `calibration` (the report), `replay.json` with `replay.png`, and `pool.yaml` (for
-    `finssim evaluate --plant`).
+    `NAME_identified.yaml`, `calibration` (the report), and `replay.json` with `replay.png`.
 
     Args:
         folder: Existing directory.
-        name: Vehicle of the catalogue that stands in the pool.
+        name: Vehicle of the catalogue.
         seed: Of initial conditions and noise of the trials.
         shown: Name of the folder in the report, where `folder` is a temporary one.
+        record: Makes the trials; in the simulator if None.
 
     Returns:
         What was found.
@@ -98,25 +113,14 @@ def identify(folder: Path, name: str, *, seed: int, shown: Path | None = None) -
     began = time.perf_counter()
     start_warp()
     truth = load_vehicle(name)
-    rough = rough_vehicle(truth)
     start_file, vehicle_file = vehicle_files(name)
-    write_vehicle(rough, folder / start_file)
-    rough = load_vehicle(folder / start_file)
-    plans = {
-        "fit": programmes("all", truth, coast=COAST),
-        "held-out": programmes(tuple(HELD_OUT), truth, levels=HELD_OUT, coast=COAST),
-    }
-    recorded = _trials(plans, truth, seed)
-    for role, trials in recorded.items():
-        for trial in trials:
-            write_trial(trial, folder / TRIALS / role / trial.name, format="parquet")
-    fit = regress(recorded["fit"], rough, seed=seed)
+    write_vehicle(rough_vehicle(truth), folder / start_file)
+    recorded = (record or simulated_trials(truth))(folder / TRIALS, folder / start_file, seed)
+    fit = regress(recorded["fit"], load_vehicle(folder / start_file), seed=seed)
     found = calibrated(fit)
     warnings = tuple(doubts(fit, found))
     found = _named(
-        found,
-        f"{name} as identified",
-        "Hydrodynamics from simulated trials where they tell it, else guesses.",
+        found, f"{name} as identified", "Hydrodynamics from trials where they tell it, else guesses."
     )
     write_vehicle(found, folder / vehicle_file)
     vehicle = load_vehicle(folder / vehicle_file)
@@ -130,15 +134,12 @@ def identify(folder: Path, name: str, *, seed: int, shown: Path | None = None) -
         out=place / vehicle_file,
     )
     scored = replay(recorded["held-out"], vehicle, seed=seed)
-    picture = _write_replay(scored, folder)
-    _write_plant(truth, folder / PLANT_FILE)
     return Identification(
         vehicle=vehicle,
         fit=fit,
         replay=scored,
-        plant=load_plant(folder / PLANT_FILE),
         truth=truth,
-        picture=picture,
+        picture=_write_replay(scored, folder),
         warnings=warnings,
         seconds=time.perf_counter() - began,
     )
@@ -160,8 +161,25 @@ def commands(place: Path, name: str, seed: int) -> list[str]:
     ]
 
 
-def _trials(plans: Mapping[str, Sequence[Programme]], truth: Vehicle, seed: int) -> dict[str, list[Trial]]:
-    """All programmes run at once; each trial's header says what it is for."""
+def simulated_trials(truth: Vehicle) -> Record:
+    """Trials of a vehicle in the simulator, with the noise of its sensors; all programmes run at once."""
+
+    def record(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
+        plans = {
+            "fit": programmes("all", truth, coast=COAST),
+            "held-out": programmes(tuple(HELD_OUT), truth, levels=HELD_OUT, coast=COAST),
+        }
+        recorded = _simulated(plans, truth, seed)
+        for role, trials in recorded.items():
+            for trial in trials:
+                write_trial(trial, folder / role / trial.name, format="parquet")
+        return recorded
+
+    return record
+
+
+def _simulated(plans: Mapping[str, Sequence[Programme]], truth: Vehicle, seed: int) -> dict[str, list[Trial]]:
+    """Each trial's header says what it is for."""
     every = [programme for plan in plans.values() for programme in plan]
     trials = iter(simulate_programme(every, truth, noise="sensors", seed=seed))
     return {
@@ -181,13 +199,3 @@ def _write_replay(scored: Replay, folder: Path) -> bytes:
     draw_response_envelopes(scored.pairs).savefig(buffer, format="png", dpi=120)
     (folder / "replay.png").write_bytes(buffer.getvalue())
     return buffer.getvalue()
-
-
-def _write_plant(truth: Vehicle, path: Path) -> None:
-    chosen = truth.hydrodynamic_set("calibrated")
-    assert isinstance(chosen, HydrodynamicSet)
-    plant: dict[str, Any] = {
-        "title": f"the plant that the trials came from: {truth.title}",
-        "vehicle": {"body": truth.body.values(), SET: chosen.values()},
-    }
-    path.write_text(yaml.safe_dump(plant, sort_keys=False, allow_unicode=True), encoding="utf-8")

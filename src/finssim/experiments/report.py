@@ -21,8 +21,9 @@ from finssim.page import html_page, html_picture, html_table
 __all__ = ["report_html"]
 
 NOTE = (
-    "e_y is the vertical error. Gray rows are the paper's own, measured on its real vehicle in its pool; the others "
-    "are simulated. They stand here for orientation: a simulated trial has no cable, no camera and no model error."
+    "e_y is the vertical error. Gray rows are the paper's own, on hardware: its real vehicle in its pool. The others "
+    "are of the virtual pool: the robot's whole software, from the camera's tags to the motor controller's frames, "
+    "against a plant that no training has seen. Errors are those of the true pose."
 )
 
 
@@ -30,23 +31,27 @@ def report_html(
     evaluations: Sequence[Evaluation],
     curves: Sequence[Mapping[str, Any]],
     training: Mapping[str, Any],
+    commands: Sequence[str],
     first: Sequence[str] = (),
+    picture: bytes | None = None,
 ) -> str:
     """The report.
 
     Args:
         evaluations: The policy first, then what it is compared with, all on the same trials.
         curves: Rows of the policy's `curves.csv`.
-        training: `seconds` (of the training), `seed`, `steps`, `task`; `vehicle` and `plant`, the files; `before`, the
-            commands that lead to the vehicle.
+        training: `seconds` (of the training), `seed`, `steps`.
+        commands: That repeat it by hand.
         first: HTML of what comes before the results.
+        picture: PNG of what the camera saw; none if None.
     """
     policy = evaluations[0]
     result = policy.result
-    envelopes = {e.label: error_envelope(_series(e)) for e in evaluations}
+    compared = [e for e in evaluations if e.result["trials"] == result["trials"]]
+    envelopes = {e.label: error_envelope(_series(e)) for e in compared}
     sections = [
         f"<h1>{escape(_title(result))}</h1>",
-        f'<p class="lead">{_lead(evaluations, training)}</p>',
+        f'<p class="lead">{_lead(compared, training)}</p>',
         *first,
         "<h2>Results</h2>",
         _comparison(evaluations),
@@ -55,12 +60,13 @@ def report_html(
         _picture(draw_envelopes(envelopes), "Position and yaw error against time, median and middle half"),
         "<h2>Paths of the policy</h2>",
         _picture(draw_paths(policy.trials), "Paths of the eight trials from above and from the side"),
+        *_view(picture),
         "<h2>Training</h2>",
         _picture(draw_training_curve(curves), "Mean return and share of episodes held while training"),
         "<h2>Every setpoint</h2>",
         *(_per_setpoint(e) for e in evaluations),
         "<h2>How to repeat it</h2>",
-        _commands(training),
+        f"<pre>{escape(chr(10).join(commands))}</pre>",
         "<h2>Provenance</h2>",
         f"<pre>{escape(json.dumps(_provenance(result, training), indent=2))}</pre>",
     ]
@@ -79,7 +85,8 @@ def _lead(evaluations: Sequence[Evaluation], training: Mapping[str, Any]) -> str
     others = " and ".join(f"{e.label} {e.result['success']}" for e in evaluations[1:])
     return escape(
         f"A policy trained here in {training['seconds']:.0f} s, from nothing to a file that runs on the vehicle, holds "
-        f"{r['success']} of {r['trials']} published setpoints{errors}. On the same trials, successes: {others}."
+        f"{r['success']} of {r['trials']} published setpoints in the virtual pool{errors}. On the same trials, "
+        f"successes: {others}."
     )
 
 
@@ -117,16 +124,16 @@ def _picture(figure: Figure, text: str) -> str:
     return html_picture(buffer.getvalue(), text)
 
 
-def _commands(training: Mapping[str, Any]) -> str:
-    vehicle = f"--vehicle {training['vehicle']}"
-    plant = f"{vehicle} --plant {training['plant']}"
-    lines = [
-        *training["before"],
-        f"finssim train {training['task']} {vehicle} --seed {training['seed']} --steps {training['steps']}"
-        " --out policy",
-        *(f"finssim evaluate {controller} {plant}" for controller in ("policy", "pid", "pid-paper")),
+def _view(picture: bytes | None) -> list[str]:
+    """What the camera saw."""
+    if picture is None:
+        return []
+    note = "Drawn again from the true pose of a trial of the policy with pictures, by that trial's camera and water."
+    return [
+        "<h2>What the camera sees</h2>",
+        html_picture(picture, "A picture of the overhead camera with the tags found in it"),
+        f'<p class="note">{note}</p>',
     ]
-    return f"<pre>{escape(chr(10).join(lines))}</pre>"
 
 
 def _provenance(result: Mapping[str, Any], training: Mapping[str, Any]) -> dict[str, Any]:

@@ -29,8 +29,8 @@ HELD_IN_TURNS = ("heave",)
 class ProgrammePilot:
     """Commands a programme open-loop on its axes. The other axes a PID keeps at the guide's pose.
 
-    Without that, propellers that are not alike turn a vehicle by a radian on a way of two metres, and it ends at the
-    side of the pool. What a fit needs is the wrench that acted, whoever asked for it.
+    Without that, propellers that are not alike turn a vehicle around on a way of two metres. What a fit needs is the
+    wrench that acted, whoever asked for it.
     """
 
     needs_state = True

@@ -1,0 +1,113 @@
+"""Station keeping in the virtual pool in the form of an evaluation: the robot's whole software on every setpoint."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.control.controllers import CONTROLLERS
+from finssim.control.policy import Policy
+from finssim.experiments.evaluate import Evaluation
+from finssim.experiments.metrics import summarize
+from finssim.experiments.setpoints import T1_SETPOINTS
+from finssim.experiments.transfer.job import Job
+from finssim.experiments.transfer.series import read_series
+from finssim.experiments.trials import DURATION, Trials
+from finssim.vehicles import load_vehicle
+
+__all__ = ["pool_evaluation", "pool_jobs"]
+
+Array = NDArray[np.float64]
+
+PERIOD = 0.1
+"""Between the samples of the series [s]."""
+
+
+def pool_jobs(controllers: Mapping[str, str], targets: Sequence[str], **settings: Any) -> list[Job]:
+    """A trial of every controller on every setpoint.
+
+    Args:
+        controllers: Name of the row -> policy directory or name of a PID.
+        targets: Setpoints of T1.
+        settings: What all jobs have in common.
+    """
+    return [
+        Job(row=name, controller=controller, target=target, **settings)
+        for name, controller in controllers.items()
+        for target in targets
+    ]
+
+
+def pool_evaluation(jobs: Sequence[Job], results: Sequence[Mapping[str, Any]], folder: Path) -> Evaluation:
+    """The trials of one controller as an evaluation.
+
+    Args:
+        jobs: Of one row, on setpoints.
+        results: Of `run_jobs`, in the same order.
+        folder: Where `run_jobs` left the series.
+    """
+    first = jobs[0]
+    vehicle = load_vehicle(first.vehicle)
+    goals = {job.target: T1_SETPOINTS[job.target] for job in jobs}
+    measures = [
+        {
+            "trial": i,
+            "setpoint": job.target,
+            "goal": [*goals[job.target][:3].tolist(), math.degrees(goals[job.target][3])],
+            **{key: value for key, value in result.items() if key not in ("job", "key", "provenance")},
+        }
+        for i, (job, result) in enumerate(zip(jobs, results, strict=True))
+    ]
+    result = {
+        "controller": _described(first),
+        "task": "t1",
+        "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
+        "hydrodynamics": "calibrated",
+        "plant": {
+            "name": "pool",
+            "title": f"virtual pool {first.plant}, {first.severity}, around {first.pool_vehicle}",
+        },
+        "camera": first.camera,
+        "seed": first.seed,
+        **summarize(measures),
+        "provenance": dict(results[0]["provenance"]),
+    }
+    return Evaluation(result, _trials(jobs, [folder / str(r["key"]) for r in results]))
+
+
+def _described(job: Job) -> dict[str, Any]:
+    """The controller as evaluations describe it."""
+    if job.controller in CONTROLLERS:
+        return {"name": job.row, "kind": "pid", "action": "wrench6"}
+    d = Policy.load(job.controller).description
+    randomization = d.training.get("randomization")
+    return {
+        "name": job.row,
+        "kind": "policy",
+        "action": d.action["mode"],
+        "hydrodynamics": d.hydrodynamics,
+        "randomization": randomization["name"] if randomization else None,
+        "files": dict(d.files),
+    }
+
+
+def _trials(jobs: Sequence[Job], paths: Sequence[Path]) -> Trials:
+    """The true motion on one grid; NaN after a trial that ended early."""
+    t = np.arange(round(DURATION / PERIOD) + 1) * PERIOD
+    position, yaw = np.full((len(t), len(jobs), 3), np.nan), np.full((len(t), len(jobs)), np.nan)
+    for i, path in enumerate(paths):
+        series = read_series(path)
+        if not len(series["t"]):
+            continue
+        # The series' own first and last samples lie within a period of the grid's.
+        inside = (t >= series["t"][0] - PERIOD) & (t <= series["t"][-1] + PERIOD)
+        for axis in range(3):
+            position[inside, i, axis] = np.interp(t[inside], series["t"], series["position"][:, axis])
+        yaw[inside, i] = np.interp(t[inside], series["t"], np.unwrap(series["yaw"]))
+    goals = np.array([T1_SETPOINTS[job.target] for job in jobs])
+    return Trials(tuple(job.target for job in jobs), goals, t, position, yaw)
