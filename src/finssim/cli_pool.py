@@ -37,7 +37,11 @@ def pool(
     ] = "pictures",
     pictures: Annotated[
         str,
-        typer.Option(help="How pictures travel in real time: udp, or shm (shared memory).", metavar="WAY"),
+        typer.Option(
+            help="How pictures travel in real time: udp, or shm:NAME (shared memory; shm alone: pool, and pool-PORT "
+            "on another port than the default).",
+            metavar="WAY",
+        ),
     ] = "udp",
     port: Annotated[
         int,
@@ -52,7 +56,7 @@ def pool(
     robot: Annotated[
         str,
         typer.Option(
-            help="The only robot that may command; its pictures go to the port after this.",
+            help="The only robot that may command in real time; its pictures go to the port after this.",
             metavar="HOST:PORT",
         ),
     ] = "127.0.0.1:54321",
@@ -89,7 +93,7 @@ def pool(
         severity=severity,  # type: ignore[arg-type]
         lockstep=lockstep,
         camera=camera,  # type: ignore[arg-type]
-        pictures=pictures,  # type: ignore[arg-type]
+        pictures=pictures,
         port=port,
         bind=bind,
         robot=robot,

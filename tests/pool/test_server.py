@@ -3,6 +3,7 @@
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import time
@@ -12,7 +13,7 @@ import pytest
 
 from finssim.localization.pool import load_pool
 from finssim.pool.draw_plant import draw_plant
-from finssim.pool.run import make_plan
+from finssim.pool.run import make_plan, memory_of
 from finssim.pool.server import LockstepServer, serve_realtime
 from finssim.pool.truth import read_truth
 from finssim.pool.virtual_pool import VirtualPool
@@ -249,7 +250,7 @@ def test_the_command_in_real_time(tmp_path, way):
     with Process("--camera", "corners", "--pictures", way, "--truth", truth) as pool:
         link = UdpTransport((HERE, pool.robot), (HERE, pool.port))
         over_udp = UdpPictures((HERE, pool.robot + 1), (HERE, pool.port + 1))
-        source = over_udp if way == "udp" else SharedMemoryPictures("pool")
+        source = over_udp if way == "udp" else SharedMemoryPictures(f"pool-{pool.port}")
         pool.until("pictures")
         frames, pictures, end = [], [], time.monotonic() + 30.0
         while (len(frames) < 200 or len(pictures) < 60) and time.monotonic() < end:
@@ -294,13 +295,17 @@ def test_the_command_draws_pictures():
     ("words", "sentence"),
     [
         (["--camera", "film"], "unknown camera 'film'"),
-        (["--pictures", "post"], "give udp or shm"),
+        (["--pictures", "post"], "give udp, shm or shm:NAME"),
         (["--severity", "easy"], "easy"),
         (["--camera", "none", "--pool-file", "x.yaml"], "leave one out"),
         (["--start", "0,0"], "0,0"),
         (["--plant", "nowhere.yaml"], "nowhere.yaml"),
         (["--port", "70000"], "70000"),
         (["--robot", "elsewhere"], "elsewhere"),
+        (["--start", "9,0,-0.5,0"], "outside the pool"),
+        (["--start", "0,0,0.5,0"], "outside the pool"),
+        (["--pictures", "shm:../x"], "shm:../x"),
+        (["--pictures", "shm", "--lockstep"], "leave --pictures out"),
     ],
 )
 def test_the_command_refuses_in_one_sentence(capsys, tmp_path, monkeypatch, words, sentence):
@@ -311,6 +316,38 @@ def test_the_command_refuses_in_one_sentence(capsys, tmp_path, monkeypatch, word
     monkeypatch.chdir(tmp_path)
     assert boundary.run(app, ["pool", *words]) == 2
     assert sentence in capsys.readouterr().err
+
+
+def test_a_pool_that_finds_its_port_taken_leaves_the_files_of_the_other_alone(tmp_path, capsys):
+    """Pool file and truth are written only when every wire is open."""
+    from finssim import boundary
+    from finssim.cli import app
+
+    files = tmp_path / "pool.yaml", tmp_path / "truth.fst"
+    for file in files:
+        file.write_text("of the pool that is running")
+    port, _ = ports()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind((HERE, port))
+        words = ["--port", port, "--camera", "corners", "--pool-file", files[0], "--truth", files[1]]
+        assert boundary.run(app, ["pool", *map(str, words)]) == 2
+    assert str(port) in capsys.readouterr().err
+    assert [file.read_text() for file in files] == ["of the pool that is running"] * 2
+
+
+def test_shared_memory_has_the_name_asked_for_or_one_of_its_port():
+    """So that two pools on their own ports do not meet."""
+    assert memory_of("udp", 58766) == "" and memory_of("shm", 58766) == "pool"
+    assert memory_of("shm", 40000) == "pool-40000" and memory_of("shm:left", 40000) == "left"
+
+
+def test_a_robot_that_sends_garbage_and_leaves_ends_lockstep_without_an_error():
+    """The refusal finds nobody."""
+    server = LockstepServer((HERE, 0))
+    with socket.create_connection(server.address) as rude:
+        rude.sendall(b"garbage of some length")
+        rude.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    assert server.serve(VirtualPool(FINSROV, draw_plant(FINSROV, 1, "nominal"))) != ""
 
 
 def test_a_port_that_is_taken_is_named():

@@ -178,6 +178,19 @@ def test_shared_memory_gives_the_newest_pictures_once():
     assert not camera.path.exists()
 
 
+def test_shared_memory_belongs_to_one_camera_at_a_time():
+    """A second one is refused while the first lives, and leaves no file."""
+    key = name()
+    first = SharedMemorySender(key, slots=4, slot_bytes=8192)
+    before = sorted(first.path.parent.glob(f"*{key}*"))
+    with pytest.raises(LinkError, match="belongs to a camera that is running"):
+        SharedMemorySender(key, slots=4, slot_bytes=8192)
+    assert sorted(first.path.parent.glob(f"*{key}*")) == before
+    first.close()
+    SharedMemorySender(key, slots=4, slot_bytes=8192).close()
+    assert not first.path.exists()
+
+
 def test_shared_memory_outlives_either_side():
     """A camera killed in the middle and started anew is found again; so is the picture after a reader's restart."""
     key = name()

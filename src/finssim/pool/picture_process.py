@@ -6,8 +6,10 @@ import multiprocessing
 import os
 import queue
 import signal
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -103,7 +105,8 @@ class PictureProcess:
             name="pool camera",
             daemon=True,
         )
-        self._process.start()
+        with _deaf():
+            self._process.start()
         theirs.close()
         self._await(ready)
 
@@ -115,6 +118,13 @@ class PictureProcess:
             except queue.Full:
                 self.dropped += 1
         return ()
+
+    @property
+    def complaint(self) -> str:
+        """Why pictures are missing, and what helps."""
+        if self._process.exitcode is not None:
+            return f"the process that draws ended (status {self._process.exitcode}): start the pool again"
+        return f"{self.dropped} pictures could not be drawn in time: --camera corners needs no drawing"
 
     def close(self) -> None:
         """End the process and let go of the wire."""
@@ -136,6 +146,19 @@ class PictureProcess:
         if problem:
             self.close()
             raise LinkError(problem)
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """A process started meanwhile ignores Ctrl-C, which goes to all of a terminal, from its first moment on."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _draw(plan: CameraPlan, wire: PictureWire, undrawn: Any, ready: Any, parent: int) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import socket
 import struct
 import tempfile
 import zlib
+from pathlib import Path
 from typing import Protocol
 
 from finssim.robot.link.layout import LinkError
@@ -77,7 +79,10 @@ class UdpSender:
 
 
 class SharedMemorySender:
-    """A ring in memory under a name: made anew at every start, taken away at the end."""
+    """A ring in memory under a name: made anew at every start, taken away at the end.
+
+    Its file is locked for as long as its writer lives: no other camera can take the name meanwhile.
+    """
 
     def __init__(self, name: str, *, slots: int = SLOTS, slot_bytes: int = SLOT_BYTES) -> None:
         """
@@ -87,20 +92,16 @@ class SharedMemorySender:
             slot_bytes: Longest picture [bytes].
 
         Raises:
-            LinkError: It is not a plain name, or the memory cannot be had.
+            LinkError: It is not a plain name, another camera has it, or the memory cannot be had.
         """
         self.path = memory_path(name)
         self.sent = self.lost = 0
         self._slots, self._size = slots, slot_bytes
-        temporary = ""
+        if _taken(self.path):
+            raise LinkError(f"shm:{name} belongs to a camera that is running: end it, or give another name")
         try:
-            self._file, temporary = tempfile.mkstemp(prefix=f".{self.path.name}-", dir=self.path.parent)
-            os.truncate(self._file, HEAD.size + slots * slot_bytes)
-            os.pwrite(self._file, HEAD.pack(MAGIC, VERSION, slots, slot_bytes, 0), 0)
-            os.replace(temporary, self.path)
+            self._file = _ring(self.path, HEAD.pack(MAGIC, VERSION, slots, slot_bytes, 0), slots * slot_bytes)
         except OSError as problem:
-            if temporary and os.path.exists(temporary):
-                os.unlink(temporary)
             raise LinkError(f"shared memory {self.path}: {problem.strerror}: free some or use udp") from None
 
     def send(self, picture: Picture, now: float) -> None:
@@ -128,3 +129,33 @@ class SharedMemorySender:
         except OSError:
             pass
         os.close(self._file)
+
+
+def _taken(path: Path) -> bool:
+    """Whether a camera that lives has the file. A lock ends with its process, however that ends."""
+    try:
+        file = os.open(path, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(file)
+    return False
+
+
+def _ring(path: Path, head: bytes, size: int) -> int:
+    """A new file under the name, locked and empty but for its head; returns its descriptor."""
+    file, temporary = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.truncate(file, len(head) + size)
+        os.pwrite(file, head, 0)
+        os.replace(temporary, path)
+    except OSError:
+        os.close(file)
+        os.unlink(temporary)
+        raise
+    return file

@@ -7,7 +7,7 @@ import math
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +21,7 @@ from finssim.localization.pool import Pool, write_pool
 from finssim.pool.draw_plant import draw_plant
 from finssim.pool.picture_process import CameraPlan, PictureProcess, PictureWire
 from finssim.pool.picture_wire import PictureSink
-from finssim.pool.plant_spec import PlantSpec, PlantSpecError, Severity, load_plant_spec
+from finssim.pool.plant_spec import Basin, PlantSpec, PlantSpecError, Severity, load_plant_spec
 from finssim.pool.server import LockstepServer, serve_realtime
 from finssim.pool.site import camera_of
 from finssim.pool.virtual_pool import VirtualPool
@@ -29,6 +29,7 @@ from finssim.robot.goals import station_of
 from finssim.robot.link.layout import LinkError
 from finssim.robot.link.transports import host_port
 from finssim.robot.link.udp import UdpTransport
+from finssim.robot.picture_memory import memory_path
 from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["MCU_PORT", "PoolPlan", "make_plan", "run"]
@@ -36,7 +37,7 @@ __all__ = ["MCU_PORT", "PoolPlan", "make_plan", "run"]
 MCU_PORT = 58766
 """Of the motor controller; pictures come from the next port, lock-step is the one after."""
 MEMORY = "pool"
-"""Name of the shared memory."""
+"""Name of the shared memory of a pool on the default port; on others the port follows: pool-40000."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +101,7 @@ def run(
     severity: Severity,
     lockstep: bool,
     camera: Literal["pictures", "corners", "none"],
-    pictures: Literal["udp", "shm"],
+    pictures: str,
     port: int,
     bind: str,
     robot: str,
@@ -114,70 +115,97 @@ def run(
     logging.basicConfig(level=logging.WARNING, format="finssim: %(message)s", stream=sys.stderr)
     begin = station_of(start)
     plan = make_plan(vehicle, plant, severity, camera=camera, seed=seed)
-    if pictures not in ("udp", "shm"):
-        raise LinkError(f"pictures over '{pictures}': give udp or shm")
+    _check_start(begin, plan.spec.basin, start)
     if not 0 < port <= 65533:
         raise LinkError(f"port {port}: expected 1 to 65533, as the two after it are taken too")
-    if pool_file is not None:
-        if plan.calibrated is None:
-            raise PlantSpecError("--pool-file tells of the camera, and --camera none has none: leave one out")
-        write_pool(plan.calibrated, pool_file)
-    _tell_plant(plan, pool_file, truth)
-    world: Callable[[Any], VirtualPool] = lambda eye: plan.world(eye, start=begin, seed=seed, truth=truth)  # noqa: E731
+    if pool_file is not None and plan.calibrated is None:
+        raise PlantSpecError("--pool-file tells of the camera, and --camera none has none: leave one out")
+    memory = memory_of(pictures, port)
+    if lockstep and memory:
+        raise LinkError("in lock-step pictures come with the telemetry: leave --pictures out")
+
+    def make_world(eye: Any) -> VirtualPool:
+        """Begins to write files: only when every wire is open, lest those of a pool that is running are replaced."""
+        world = plan.world(eye, start=begin, seed=seed, truth=truth)
+        if pool_file is not None and plan.calibrated is not None:
+            write_pool(plan.calibrated, pool_file)
+        _tell_plant(plan, pool_file, truth)
+        return world
+
     longest = math.inf if duration is None else duration
     if lockstep:
-        _lockstep(plan, world, (bind, port + 2), longest)
+        _lockstep(plan, make_world, (bind, port + 2), longest)
     else:
-        wire = PictureWire((bind, port + 1), _next(robot), MEMORY if pictures == "shm" else "")
-        _realtime(plan, world, UdpTransport((bind, port), host_port(robot, "--robot")), wire, longest)
+        wire = PictureWire((bind, port + 1), _next(robot), memory)
+        _realtime(plan, make_world, (bind, port), host_port(robot, "--robot"), wire, longest)
+
+
+def memory_of(pictures: str, port: int) -> str:
+    """Name of the shared memory that `--pictures` asks for; empty for UDP.
+
+    Raises:
+        LinkError: It asks for neither.
+    """
+    kind, _, name = pictures.partition(":")
+    if pictures == "udp":
+        return ""
+    if kind != "shm" or pictures == "shm:":
+        raise LinkError(f"pictures over '{pictures}': give udp, shm or shm:NAME")
+    memory_path(name or MEMORY)  # refuses what is no name
+    return name or (MEMORY if port == MCU_PORT else f"{MEMORY}-{port}")
+
+
+def _check_start(start: Station, basin: Basin, text: str) -> None:
+    x, y, z = start.position
+    if abs(x) > 0.5 * basin.length or abs(y) > 0.5 * basin.width or not -basin.depth <= z <= 0.0:
+        raise PlantSpecError(
+            f"--start {text} is outside the pool: expected x within ±{0.5 * basin.length:g} m, "
+            f"y within ±{0.5 * basin.width:g} m and z from {-basin.depth:g} to 0 m"
+        )
 
 
 def _lockstep(
     plan: PoolPlan, make_world: Callable[[Any], VirtualPool], address: tuple[str, int], duration: float
 ) -> None:
-    server = LockstepServer(address)
-    world, why = make_world(plan.camera.camera() if plan.camera is not None else None), "stopped"
-    try:
+    with ExitStack() as stack:
+        server = LockstepServer(address)
+        stack.callback(server.close)
+        world = make_world(plan.camera.camera() if plan.camera is not None else None)
+        stack.callback(world.close)
+        why = "stopped"
         _say(f"lock-step: {_name(server.address)}")
-        with _stoppable(at_once=True):
+        with suppress(KeyboardInterrupt), _stoppable(at_once=True):
             why = server.serve(world, duration=duration)
-    except KeyboardInterrupt:
-        pass
-    finally:
-        server.close()
-        world.close()
     _say(f"{why} at {world.time:.1f} s")
 
 
 def _realtime(
     plan: PoolPlan,
     make_world: Callable[[Any], VirtualPool],
-    transport: UdpTransport,
+    bind: tuple[str, int],
+    robot: tuple[str, int],
     wire: PictureWire,
     duration: float,
 ) -> None:
-    with _stoppable() as asked:
+    with _stoppable() as asked, ExitStack() as stack:
+        transport = UdpTransport(bind, robot)
+        stack.callback(transport.close)
         drawn, sink, eye = _camera(plan, wire)
+        for end in (drawn, sink):
+            if end is not None:
+                stack.callback(end.close)
         world = make_world(eye)
-        try:
-            _say(f"motor controller: {_name(transport.address)}, for {_name(transport.peer)} alone")
-            if eye is not None:
-                where = f"shm:{wire.memory}" if wire.memory else f"{_name(wire.bind)}, for {_name(wire.peer)}"
-                _say(f"pictures: {where}")
-            pace = serve_realtime(
-                world, transport, sink=sink, camera=drawn, duration=duration, until=lambda _: asked()
-            )
-            _say(pace.sentence)
-            if drawn is not None and drawn.dropped:
-                _say(
-                    f"{drawn.dropped} pictures could not be drawn in time: --camera corners needs no drawing"
-                )
-        finally:
-            world.close()
-            transport.close()
-            for end in (drawn, sink):
-                if end is not None:
-                    end.close()
+        stack.callback(world.close)
+        _say(f"motor controller: {_name(transport.address)}, for {_name(transport.peer)} alone")
+        if eye is not None:
+            where = f"shm:{wire.memory}" if wire.memory else f"{_name(wire.bind)}, for {_name(wire.peer)}"
+            _say(f"pictures: {where}")
+        pace = serve_realtime(
+            world, transport, sink=sink, camera=drawn, duration=duration, until=lambda _: asked()
+        )
+        _say(pace.sentence)
+        if drawn is not None and drawn.dropped:
+            _say(drawn.complaint)
 
 
 def _camera(plan: PoolPlan, wire: PictureWire) -> tuple[PictureProcess | None, PictureSink | None, Any]:

@@ -6,6 +6,7 @@ import math
 import socket
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -156,7 +157,8 @@ class LockstepServer:
                         return "the time is over"
                     connection.sendall(encode_delivery(world.exchange(until, sent)))
             except (LockstepError, PoolClockError) as problem:
-                connection.sendall(encode_refusal(str(problem)))
+                with suppress(OSError):  # it may not wait for the answer
+                    connection.sendall(encode_refusal(str(problem)))
                 return f"{robot[0]}:{robot[1]} was refused: {problem}"
             except OSError as problem:
                 return f"the robot has gone: {problem.strerror or problem}"
