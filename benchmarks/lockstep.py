@@ -1,4 +1,4 @@
-"""Cost of the whole stack in lock-step: `python benchmarks/lockstep.py [corners] [pictures] [--seconds 30] [--profile]`.
+"""Cost of the stack in lock-step: `python benchmarks/lockstep.py [corners] [pictures] [--seconds 30] [--profile]`.
 
 Plays station P02 of T1 against a realistic pool: motor controller, instruments, camera and plant below the wire;
 decoder, localization, fusion, PID (or `--controller DIR` of a policy), bridge and encoder above it. Processor time of
