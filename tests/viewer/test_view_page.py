@@ -105,8 +105,13 @@ def test_the_vehicle_is_drawn_where_it_is_and_moves_with_the_slider(view, page):
     page.get_by_role("slider").first.press("End")
     last = place_of(view, view.source.frame(view.source.duration).truth.position)
     assert np.linalg.norm(last - first) > 40.0
-    after = until(view, page, lambda picture: view.playback.time > 5.0 and orange_near(picture, last) > 150)
-    assert orange_near(after, first, reach=20) < 0.5 * orange_near(before, first, reach=20)
+    left = 0.5 * orange_near(before, first, reach=20)
+
+    def moved(picture):
+        there, here = orange_near(picture, last, reach=20), orange_near(picture, first, reach=20)
+        return view.playback.time > 5.0 and there > 100 and here < left
+
+    after = until(view, page, moved)
     # The camera's picture in the panel follows, too.
     panel = np.s_[200:, int(0.7 * after.shape[1]) :]
     assert (np.abs(after[panel].astype(int) - before[panel]) > 40).sum() > 500
