@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tempfile
 import threading
 import zlib
 from collections.abc import Iterator
@@ -59,18 +60,21 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
 
     Args:
         job: Which fault, in what motion, in which pool.
-        path: PATH.mcap takes the record, which is removed once it has been read.
+        path: Not used: the record is read, and gone, before this ends.
 
     Returns:
         The measures of `verdict.measured`; `state` and `reason` of the bridge at the end; `raised`, what broke through,
         or empty; `record_lost_s` and `record_problem`; `ok`.
     """
     start_warp()
+    with tempfile.TemporaryDirectory() as folder:
+        return _play(job, Path(folder) / "run.mcap")
+
+
+def _play(job: FaultJob, record: Path) -> dict[str, Any]:
     scenario = SCENARIOS[job.scenario]
     fault, (start, goal, when) = scenario.faults[job.variant], MOTIONS[job.motion]
-    vehicle, record = load_vehicle(job.vehicle), path.with_suffix(".mcap")
-    record.parent.mkdir(parents=True, exist_ok=True)
-    record.unlink(missing_ok=True)
+    vehicle = load_vehicle(job.vehicle)
     assert vehicle.safety is not None  # FaultJob.key was asked before
     box = inset(vehicle.safety.workspace_lower, vehicle.safety.workspace_upper)
     settings = BridgeSettings.of(
@@ -104,7 +108,6 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
         **check_record(record, script.steps if fault.cuts_record else runtime.counters.steps, RATE),
         "provenance": provenance(),
     }
-    record.unlink(missing_ok=True)
     return {**result, "ok": passed(result)}
 
 

@@ -33,7 +33,7 @@ __all__ = ["memory_mib", "run", "soak", "verdict"]
 
 Array = NDArray[np.float64]
 
-SAMPLED = 30.0
+SAMPLED = 10.0
 """Vehicle time between two samples [s]."""
 WARM = 0.25
 """The first part of a run does not count: caches fill [-]."""
