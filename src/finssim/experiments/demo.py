@@ -78,7 +78,7 @@ FULL = Scope(
         "pitch": [0.5, 1.0],
         "yaw": [0.6, 1.8],
     },
-    shuttles={"surge": [9.0, 18.0], "sway": [9.0, 13.5], "heave": [9.0, 13.5]},
+    shuttles={"surge": [12.0, 18.0], "sway": [9.0, 13.5], "heave": [9.0, 13.5]},
     held_out=HELD_OUT,
     setpoints=tuple(T1_SETPOINTS),
     pictures=("P02",),
