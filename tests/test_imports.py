@@ -75,6 +75,7 @@ HOMES = {
         "experiments/localization_figure.py",
         "experiments/report.py",
         "experiments/t2_figure.py",
+        "experiments/transfer/t2_figure.py",
         "vehicles/picture.py",
     },
     "pymavlink": {"calibration/importers/ardupilot_log.py"},
