@@ -1,5 +1,7 @@
 """Plays for campaigns: quick, and known beforehand."""
 
+import os
+import time
 from pathlib import Path
 
 
@@ -15,3 +17,9 @@ def failing(job, path: Path):
     if job.target == "P02":
         raise RuntimeError("P02 broke")
     return known(job, path)
+
+
+def endless(job, path: Path):
+    """Tells its process, and never ends by itself."""
+    path.with_name("pid.txt").write_text(str(os.getpid()))
+    time.sleep(600.0)

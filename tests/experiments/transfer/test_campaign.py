@@ -1,6 +1,12 @@
 """A campaign plays each trial once, keeps what is finished, and returns results in the order of its jobs."""
 
 import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from signal import SIGINT, SIGKILL, SIGTERM
 
 import pytest
 
@@ -8,6 +14,7 @@ from finssim.experiments.transfer.campaign import run_jobs
 from finssim.experiments.transfer.job import Job
 from reference import played
 
+ROOT = Path(__file__).resolve().parents[3]
 JOBS = [Job(row="pid", controller="pid", target=target) for target in ("P01", "P02", "P03")]
 
 
@@ -38,6 +45,47 @@ def test_a_trial_that_breaks_loses_no_other(tmp_path):
         run_jobs(JOBS, tmp_path, played.failing, processes=1)
     kept = [json.loads(path.read_text()) for path in tmp_path.glob("*.json")]
     assert [r["job"]["target"] for r in kept] == ["P01"]
+
+
+def gone(pid):
+    """Whether a process has ended."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    return Path(f"/proc/{pid}/stat").read_text().split()[2] == "Z"
+
+
+@pytest.mark.parametrize("signal", [SIGTERM, SIGKILL, SIGINT], ids=lambda signal: signal.name)
+def test_workers_do_not_outlive_a_campaign(tmp_path, signal):
+    """However it ends: nobody is left playing trials that nobody waits for."""
+    program = (
+        "import sys; sys.path.insert(0, 'tests')\n"
+        "from pathlib import Path\nfrom reference import played\n"
+        "from finssim.experiments.transfer.campaign import run_jobs\n"
+        "from finssim.experiments.transfer.job import Job\n"
+        "if __name__ == '__main__':\n"
+        "    jobs = [Job(row='pid', controller='pid', target='P01')]\n"
+        f"    run_jobs(jobs, Path({str(tmp_path)!r}), played.endless, processes=1)\n"
+    )
+    script = tmp_path / "campaign_of_one.py"
+    script.write_text(program)
+    campaign = subprocess.Popen([sys.executable, script], cwd=ROOT, stderr=subprocess.DEVNULL)
+    mark = tmp_path / "pid.txt"
+    wait_until(lambda: mark.is_file() and mark.read_text())
+    worker = int(mark.read_text())
+    campaign.send_signal(signal)
+    campaign.wait(60.0)
+    wait_until(lambda: gone(worker))
+
+
+def wait_until(true):
+    """Wait for something that comes soon, or fail."""
+    for _ in range(1200):
+        if true():
+            return
+        time.sleep(0.1)
+    raise AssertionError("nothing happened for two minutes")
 
 
 def test_a_key_names_everything_that_decides_the_result():

@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import signal
+import threading
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from pathlib import Path
@@ -15,6 +18,9 @@ from finssim.experiments.transfer.job import Job
 from finssim.files import atomic_write
 
 __all__ = ["Play", "run_jobs"]
+
+WATCH = 1.0
+"""Time between two looks of a worker at its parent [s]."""
 
 Play = Callable[[Job, Path], dict[str, Any]]
 """Plays a job, leaves its series in files that begin with the given path, and returns its result as plain data."""
@@ -53,10 +59,11 @@ def run_jobs(
 def _play_all(
     missing: dict[str, Job], folder: Path, play: Play, processes: int, total: int, say: Say
 ) -> None:
-    context = multiprocessing.get_context(
-        "spawn"
-    )  # a fork would copy the threads of Warp and torch half-alive
-    executor = ProcessPoolExecutor(min(processes, len(missing)), mp_context=context, initializer=_one_thread)
+    # A fork would copy the threads of Warp and torch half-alive.
+    context = multiprocessing.get_context("spawn")
+    executor = ProcessPoolExecutor(
+        min(processes, len(missing)), mp_context=context, initializer=_prepare, initargs=(os.getpid(),)
+    )
     try:
         running: set[Future[None]] = {
             executor.submit(_play_one, key, job, folder, play) for key, job in missing.items()
@@ -80,12 +87,18 @@ def _stop(executor: ProcessPoolExecutor) -> None:
         worker.terminate()
 
 
-def _one_thread() -> None:
-    """Of a worker: there are as many workers as processors."""
-    import signal
-
+def _prepare(parent: int) -> None:
+    """Of a worker: one thread, since there are as many workers as processors; no life without its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears Ctrl-C and ends its workers
     os.environ["OMP_NUM_THREADS"] = "1"
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    """End this process when its parent has gone, however that ended."""
+    while os.getppid() == parent:
+        time.sleep(WATCH)
+    os._exit(1)
 
 
 def _play_one(key: str, job: Job, folder: Path, play: Play) -> None:
