@@ -99,7 +99,7 @@ def demo(
     seed: Seed = 1,
     steps: Steps = None,
 ) -> None:
-    """Identify a vehicle from trials, train a policy in it, evaluate it beside two PIDs, write a report.
+    """Identify a vehicle in the virtual pool, train in it, deploy there beside two PIDs, write a report.
 
     Example: finssim demo --out demo
     """
