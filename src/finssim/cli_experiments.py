@@ -223,6 +223,4 @@ def timing(
     """
     from finssim.experiments.reliability.timing import run
 
-    run(
-        out=out, minutes=minutes, camera=camera, policy=policy, seed=seed, vehicle=vehicle, as_json=as_json
-    )
+    run(out=out, minutes=minutes, camera=camera, policy=policy, seed=seed, vehicle=vehicle, as_json=as_json)

@@ -16,6 +16,7 @@ from finssim.vehicles import load_vehicle
 FINSROV = load_vehicle("finsrov")
 PLANT = load_replay_plant()
 
+
 def test_the_plant_couples_axes_that_every_model_of_the_file_keeps_apart():
     """Sway with roll, surge with heave and pitch."""
     for matrix in (PLANT.added_mass.matrix(), PLANT.linear_damping.matrix()):

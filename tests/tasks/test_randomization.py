@@ -235,7 +235,9 @@ def test_without_thruster_dynamics_thrust_follows_in_one_physics_step():
     """The ranges of the paper's ablation take lag and delay away; nominally a step does not suffice."""
 
     def reached(ranges):
-        environment = Environment(StationKeeping(), worlds=4, action="thruster8", randomization=ranges, seed=3)
+        environment = Environment(
+            StationKeeping(), worlds=4, action="thruster8", randomization=ranges, seed=3
+        )
         environment.step(np.full((4, 8), 0.5, dtype=np.float32))
         thrust = environment.simulator.numpy("actuator")[:, 0]
         return thrust / (0.5 * environment.simulator.vehicles[0].force_limits[1])
