@@ -228,7 +228,7 @@ class Bridge:
 
     def _hold(self, why: str) -> None:
         self._held_at = self._clock.now
-        self._enter("hold", why, f"holding: {why}")
+        self._enter("hold", why, why)
 
     def _period(self, now: float) -> float:
         """Time since the last tick [s], 0 at the first."""
@@ -263,7 +263,7 @@ class Bridge:
         if self.state == "fault":
             self.log.repeat(self._clock.now, "also", why)
         else:
-            self._enter("fault", why, f"fault: {why}")
+            self._enter("fault", why, why)
 
     def _enter(self, state: str, reason: str, text: str) -> None:
         """Changes state; no thrust is carried over."""

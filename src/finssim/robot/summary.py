@@ -69,7 +69,7 @@ class Summary:
             "position_rms_m": None if rms[0] is None else float(rms[0]),
             "yaw_rms_deg": None if rms[1] is None else math.degrees(rms[1]),
             "faults": faults,
-            "refused": runtime.perception.health().counts,
+            "samples": runtime.perception.health().counts,
             **runtime.counters.summary(),
         }
 
