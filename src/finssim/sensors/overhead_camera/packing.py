@@ -14,7 +14,7 @@ from finssim.geometry.rotations import quat_to_matrix
 from finssim.sensors.overhead_camera.materials import BasinData, BodyData, TagData
 from finssim.sensors.overhead_camera.scene import Basin, Body, Light, Pose, Scene, TagInScene
 from finssim.sensors.overhead_camera.scene_data import LampData, SceneData
-from finssim.sensors.overhead_camera.surface import Wave, Waves, pack_waves
+from finssim.sensors.overhead_camera.surface import Wave, Waves, layout_of, pack_waves
 from finssim.sensors.overhead_camera.view import SurfaceFrame
 
 
@@ -73,7 +73,7 @@ def _poses(table: NDArray[Any], i: int, pose: Pose, end: Pose | None, frame: Sur
 
 
 def _tags(tags: Sequence[TagInScene], frame: SurfaceFrame) -> NDArray[Any]:
-    table = np.zeros(len(tags), dtype=TagData.numpy_dtype())
+    table = np.zeros(len(tags), dtype=layout_of(TagData))
     offset = 0
     for i, tag in enumerate(tags):
         _poses(table, i, tag.pose, tag.end, frame)
@@ -85,7 +85,7 @@ def _tags(tags: Sequence[TagInScene], frame: SurfaceFrame) -> NDArray[Any]:
 
 
 def _bodies(bodies: Sequence[Body], frame: SurfaceFrame) -> NDArray[Any]:
-    table = np.zeros(len(bodies), dtype=BodyData.numpy_dtype())
+    table = np.zeros(len(bodies), dtype=layout_of(BodyData))
     for i, body in enumerate(bodies):
         _poses(table, i, body.pose, body.end, frame)
         table["half"][i], table["colour"][i] = 0.5 * np.asarray(body.size), body.colour
@@ -93,7 +93,7 @@ def _bodies(bodies: Sequence[Body], frame: SurfaceFrame) -> NDArray[Any]:
 
 
 def _lamps(light: Light, frame: SurfaceFrame) -> NDArray[Any]:
-    table = np.zeros(len(light.lamps), dtype=LampData.numpy_dtype())
+    table = np.zeros(len(light.lamps), dtype=layout_of(LampData))
     for i, lamp in enumerate(light.lamps):
         table["centre"][i], table["half"][i] = frame.point(lamp.centre), 0.5 * np.asarray(lamp.size)
         table["radiance"][i] = lamp.radiance
