@@ -25,7 +25,6 @@ from std_srvs.srv import SetBool
 
 PEER = Path(__file__).with_name("peer.py")
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-pytestmark = pytest.mark.xdist_group("ros2")  # one peer at a time on this domain
 PATIENCE = 10.0  # [s] on a busy machine; nothing here takes a tenth of it
 
 

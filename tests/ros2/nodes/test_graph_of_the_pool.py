@@ -19,7 +19,6 @@ from finssim.ros2.nodes.ros_messages import ros_type
 from finssim.ros2.topics import TOPICS, quality_profile
 
 PATIENCE = 150.0  # [s] for seven processes to start on a machine that does much else
-pytestmark = pytest.mark.xdist_group("ros2")  # one graph, which the last test ends
 GOAL = np.array([0.4, 0.2, -0.5])
 DISARMED, ARMED, HOLD, FAULT = range(4)
 
