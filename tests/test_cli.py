@@ -277,17 +277,6 @@ def test_validate_takes_the_model_it_is_given(capfd):
 
 
 @pytest.mark.long
-def test_demo_writes_its_report(capfd, tmp_path):
-    """The whole loop, cut short: a policy, its evaluation and those of both PIDs, and a report that names them."""
-    assert finssim("demo", "--steps", "20000", "--out", tmp_path / "demo") == 0
-    assert "report" in capfd.readouterr().out
-    report = (tmp_path / "demo" / "report.html").read_text(encoding="utf-8")
-    assert "pid-paper" in report and "http://" not in report.replace("http://www.w3.org", "")
-    assert (tmp_path / "demo" / "policy" / "policy.onnx").exists()
-    assert [path.name for path in tmp_path.iterdir()] == ["demo"]
-
-
-@pytest.mark.long
 def test_bench_as_json(capfd):
     """The rates by model or action and world count, and the machine they were measured on."""
     assert finssim("bench", "--json") == 0

@@ -5,7 +5,9 @@ import re
 
 import pytest
 
+from finssim import boundary
 from finssim.calibration.trials.trial_files import load_trials
+from finssim.cli import app
 from finssim.control.policy import Policy
 from finssim.experiments import demo as demo_module
 from finssim.experiments.demo import FULL, Scope, demo
@@ -31,12 +33,13 @@ SMALL = Scope(
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A demonstration with a policy that had no time to learn: its folder, and what was identified."""
+    """The command, with a policy that had no time to learn: its folder, and what was identified."""
     out, found = tmp_path_factory.mktemp("demo") / "demo", []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demo_module, "VIEW_AT", 1.0)
         patch.setattr(demo_module, "identify", lambda *a, **k: found.append(identify(*a, **k)) or found[0])
-        assert demo(out, steps=8192, scope=SMALL) == out / "report.html"
+        patch.setattr(demo_module, "FULL", SMALL)
+        assert boundary.run(app, ["demo", "--steps", "8192", "--seed", "1", "--out", str(out)]) == 0
     return out, found[0]
 
 
@@ -46,6 +49,9 @@ def folder(made):
 
 
 def test_policy_results_and_report_are_there(folder):
+    """And the training was as long as the command was told."""
+    assert Policy.load(folder / "policy").description.training["steps"] == 8192
+    assert [path.name for path in folder.parent.iterdir()] == ["demo"]
     assert {p.name for p in folder.iterdir()} == {
         "trials",
         "finsrov_rough.yaml",

@@ -92,7 +92,7 @@ def demo(
     steps: int | None = None,
     seed: int = SEED,
     console: Console | None = None,
-    scope: Scope = FULL,
+    scope: Scope | None = None,
     processes: int | None = None,
 ) -> Path:
     """Identify FinsROV in the virtual pool, train T1 in what was identified, and let the policy hold setpoints there.
@@ -106,7 +106,7 @@ def demo(
         steps: Control steps to train; as `finssim train --randomize pool` if None.
         seed: Of the noise and of the training.
         console: Where progress is shown; standard error if None.
-        scope: How much of it.
+        scope: How much of it; `FULL` if None.
         processes: As many as there are processors if None.
 
     Returns:
@@ -115,7 +115,7 @@ def demo(
     Raises:
         KeyboardInterrupt: After Ctrl-C. A policy so far is then in `OUT-training/interrupted`, and `out` as it was.
     """
-    console = console or Console(stderr=True)
+    console, scope = console or Console(stderr=True), scope or FULL
     start_warp()
     rescue = out.with_name(f"{out.name}-training") / "interrupted"
     with atomic_directory(out, replaces=REPORT_FILE) as folder:
