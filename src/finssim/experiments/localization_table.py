@@ -10,6 +10,7 @@ from typing import Any
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from finssim.experiments.localization_calibration import Calibrated, write_survey
 from finssim.experiments.localization_campaign import Campaign
@@ -77,7 +78,7 @@ def print_table(result: Mapping[str, Any], console: Console) -> None:
             title_style="bold",
         )  # fmt: skip
         for k, head in enumerate(HEADS):
-            table.add_column(head, justify="right" if k else "left", no_wrap=True, min_width=0 if k else 20)
+            table.add_column(Text(head), justify="right" if k else "left", no_wrap=True, min_width=0 if k else 20)
         for row in rows:
             table.add_row(*row, style="dim" if words.startswith("the paper") else None)
         console.print(table)

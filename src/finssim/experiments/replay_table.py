@@ -10,6 +10,7 @@ from typing import Any
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.calibration.replay.as_json import DEFINITION
@@ -62,7 +63,7 @@ def print_table(result: Mapping[str, Any], console: Console) -> None:
             title_style="bold",
         )
         for k, head in enumerate(heads):
-            table.add_column(head, justify="right" if k else "left", no_wrap=True, min_width=0 if k else 24)
+            table.add_column(Text(head), justify="right" if k else "left", no_wrap=True, min_width=0 if k else 24)
         for row in rows:
             table.add_row(*row, style="dim" if row[0].startswith("paper") else None)
         console.print(table)

@@ -8,6 +8,7 @@ from typing import Any
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from finssim.experiments.metrics import summarize
 from finssim.experiments.paper_results import paper_row
@@ -87,12 +88,7 @@ def print_plants(results: Sequence[Mapping[str, Any]], console: Console) -> None
 
 def print_comparison(results: Sequence[Mapping[str, Any]], console: Console, by: str = "controller") -> None:
     """Print a row for each evaluation, named by its controller or plant, and the paper's rows that answer to them."""
-    table = Table(
-        caption=f"{CAPTION} paper: its real vehicle in its pool.", caption_justify="left", box=box.SIMPLE_HEAD
-    )
-    table.add_column(by, no_wrap=True)
-    for heading in COLUMNS.values():
-        table.add_column(heading, justify="right")
+    table = _table(by, f"{CAPTION} paper: its real vehicle in its pool.")
     for result in results:
         table.add_row(result[by]["name"], *cells(result))
     table.add_section()
@@ -102,8 +98,10 @@ def print_comparison(results: Sequence[Mapping[str, Any]], console: Console, by:
 
 
 def _table(first: str, caption: str) -> Table:
-    table = Table(caption=caption, caption_justify="left", box=box.SIMPLE_HEAD)
+    table = Table(
+        caption=caption, caption_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
+    )
     table.add_column(first, no_wrap=True)
-    for heading in COLUMNS.values():
-        table.add_column(heading, justify="right")
+    for heading in COLUMNS.values():  # units below: 80 columns of a terminal are enough then
+        table.add_column(Text(heading.replace(" [", "\n[")), justify="right", no_wrap=True)
     return table

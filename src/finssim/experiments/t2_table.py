@@ -8,6 +8,7 @@ from typing import Any
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from finssim.experiments.paper_results import PAPER_T2, paper_t2_row
 from finssim.experiments.t2_metrics import ERRORS, summarize_tracking
@@ -84,8 +85,11 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
 
 
 def _table(first: str, caption: str) -> Table:
-    table = Table(caption=caption, caption_justify="left", box=box.SIMPLE_HEAD)
+    table = Table(
+        caption=caption, caption_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
+    )
     table.add_column(first, no_wrap=True)
     for key, (heading, _) in COLUMNS.items():
-        table.add_column(heading, justify="right", style="bold" if key in ERRORS else None)
+        style = "bold" if key in ERRORS else ""
+        table.add_column(Text(heading), justify="right", style=style, no_wrap=True)
     return table

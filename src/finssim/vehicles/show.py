@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from finssim.vehicles.capability import restoring, terminal_speeds, time_constants, wrench_capability
 from finssim.vehicles.check import check_vehicle
@@ -35,7 +36,7 @@ def print_catalogue(console: Console) -> None:
         ("thrusters", "right"),
         ("axes", "right"),
     ):
-        table.add_column(column, justify=justify, no_wrap=True)  # type: ignore[arg-type]
+        table.add_column(Text(column), justify=justify, no_wrap=True)  # type: ignore[arg-type]
     table.add_column("hydrodynamics")
     table.add_column("what it is", overflow="fold")
     for name in catalogue():
@@ -86,7 +87,7 @@ def print_vehicle(vehicle: Vehicle, console: Console, picture: Path | None = Non
 def _table(title: str, *columns: str) -> Table:
     table = Table(title=title, title_justify="left", box=None, pad_edge=False, title_style="bold")
     for index, column in enumerate(columns):
-        table.add_column(column, justify="left" if index == 0 else "right")
+        table.add_column(Text(column), justify="left" if index == 0 else "right")
     return table
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from finssim.calibration.replay.as_json import DEFINITION
 from finssim.calibration.replay.figure import MODEL_LABELS, draw_ahead, draw_overlay, draw_response_envelopes
@@ -173,7 +174,7 @@ def _interval(a: Aggregate) -> str:
 def _print_table(console: Console, heads: Sequence[str], rows: Rows) -> None:
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for k, head in enumerate(heads):
-        table.add_column(head, justify="left" if k == 0 else "right", no_wrap=k == 0)
+        table.add_column(Text(head), justify="left" if k == 0 else "right", no_wrap=k == 0)
     for row in rows:
         table.add_row(*row, style="bold" if row[0].startswith("aggregate") else None)
     console.print(table)

@@ -11,6 +11,7 @@ from typing import Any
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from finssim.page import html_table
 
@@ -42,10 +43,10 @@ def print_shown(shown: Shown, console: Console) -> None:
     console.print(shown.headline, highlight=False)
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for k, head in enumerate(shown.heads):
-        table.add_column(head, justify="right" if k else "left")
+        table.add_column(Text(head), justify="right" if k else "left")
     for row, whose in shown.rows:
         cells = row if console.width >= WIDE else [re.sub(r" \[.+\]$", "", cell) for cell in row]
-        table.add_row(*cells, style="dim" if whose == THEIRS else None)
+        table.add_row(*map(Text, cells), style="dim" if whose == THEIRS else None)
     console.print(table)
     console.print(shown.note, highlight=False)
     for sentence in shown.sentences:
