@@ -100,7 +100,7 @@ def run(
 ) -> None:
     """Run a controller on a vehicle: estimate, decide, command; print how it went. Ctrl-C stops the thrusters.
 
-    Exit status 3: the run ended in a fault of the vehicle.
+    Exit status 3: the run ended in a fault of the vehicle; 4: the vehicle said nothing.
 
     Example: finssim run --policy runs/hold --goal 0.5,0,-0.5,90 --pool-file pool.yaml --duration 60 --arm
     """

@@ -137,8 +137,11 @@ def excite(
         ),
     ] = None,
     severity: Annotated[
-        str, typer.Option(help="Of that pool: nominal, realistic or hard.", metavar="NAME")
-    ] = "realistic",
+        str | None,
+        typer.Option(
+            help="Of that pool: nominal, realistic or hard; realistic if not given.", metavar="NAME"
+        ),
+    ] = None,
     pool_vehicle: Annotated[
         str | None,
         typer.Option(
@@ -185,7 +188,7 @@ def excite(
             out=out,
             plant=pool,
             pool_vehicle=pool_vehicle,
-            severity=severity,
+            severity=severity or "realistic",
             kind=kind,
             levels=wanted,
             repeats=repeats,
@@ -195,6 +198,10 @@ def excite(
         )
         _print_folders(made, as_json)
         return
+    if severity is not None or pool_vehicle is not None:
+        raise typer.BadParameter(
+            "--severity and --pool-vehicle tell of a virtual pool: name one with --pool SEED"
+        )
     from finssim.calibration.excitation.excite import excite as run
 
     folders = run(

@@ -177,3 +177,30 @@ def test_tags_are_found_beside_the_loop():
     finder.close()
     assert {tag.tag_id for tag in found[0].tags} == set(corners) and found[1].tags == ()
     assert found[1].image is None and source.closed
+
+
+def test_a_picture_that_the_detector_chokes_on_is_one_without_tags(caplog):
+    """Told once; the finder lives on, and closes."""
+    image = np.zeros((20, 20), np.uint8)
+
+    class Source:
+        def receive(self, now):
+            return [Picture(0.0, 1, image=image)]
+
+        def describe(self):
+            return "a camera"
+
+        def close(self):
+            pass
+
+    finder = TagFinder(Source(), VEHICLE, size=image.shape)
+    finder._tracker.detect = lambda *a: 1 / 0
+    found, come = [], threading.Event()
+    for _ in range(1000):
+        found += finder.receive(0.0)
+        if sum(picture.image is None for picture in found) >= 3:
+            break
+        come.wait(0.01)
+    finder.close()
+    assert found[-1].image is None and found[-1].tags == ()
+    assert caplog.text.count("ZeroDivisionError") == 1 and "tags cannot be sought" in finder.describe()

@@ -135,14 +135,14 @@ def test_on_a_wire_with_nobody_at_its_end_nothing_is_armed(capsys, pool_file):
     status, summary = told(
         capsys, *words, "--robot", "udp://127.0.0.1:9", "--bind", free, "--duration", 0.3, "--arm"
     )
-    assert status == 0 and summary["state"] == "disarmed" and summary["decisions"] == 0
+    assert status == 4 and summary["state"] == "disarmed" and summary["decisions"] == 0
     assert summary["reason"] == "no inertial data"
 
 
 def test_a_vehicle_that_says_nothing_is_told_of(capsys, pool_file):
     """Once, after three seconds."""
     words = ("--policy", "pid", "--goal", "0.5,0.2,-0.5,30", "--pool-file", pool_file, "--pictures", "none")
-    assert finssim(*words, "--robot", "udp://127.0.0.1:9", "--bind", "127.0.0.1:0", "--duration", 3.5) == 0
+    assert finssim(*words, "--robot", "udp://127.0.0.1:9", "--bind", "127.0.0.1:0", "--duration", 3.5) == 4
     assert capsys.readouterr().err.count("no telemetry from udp://127.0.0.1:9") == 1
 
 

@@ -78,7 +78,9 @@ def print_table(result: Mapping[str, Any], console: Console) -> None:
             title_style="bold",
         )  # fmt: skip
         for k, head in enumerate(HEADS):
-            table.add_column(Text(head), justify="right" if k else "left", no_wrap=True, min_width=0 if k else 20)
+            table.add_column(
+                Text(head), justify="right" if k else "left", no_wrap=True, min_width=0 if k else 20
+            )
         for row in rows:
             table.add_row(*row, style="dim" if words.startswith("the paper") else None)
         console.print(table)

@@ -63,7 +63,9 @@ def print_table(result: Mapping[str, Any], console: Console) -> None:
             title_style="bold",
         )
         for k, head in enumerate(heads):
-            table.add_column(Text(head), justify="right" if k else "left", no_wrap=True, min_width=0 if k else 24)
+            table.add_column(
+                Text(head), justify="right" if k else "left", no_wrap=True, min_width=0 if k else 24
+            )
         for row in rows:
             table.add_row(*row, style="dim" if row[0].startswith("paper") else None)
         console.print(table)

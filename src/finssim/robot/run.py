@@ -26,10 +26,12 @@ from finssim.robot.summary import Summary, show
 from finssim.robot.wiring import POOL_ADDRESS, Drive, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["FAULT", "POOL_ADDRESS", "Wiring", "run"]
+__all__ = ["FAULT", "POOL_ADDRESS", "UNHEARD", "Wiring", "run"]
 
 FAULT = 3
 """Exit status of a run that ended in a fault of the vehicle."""
+UNHEARD = 4
+"""Exit status of a run in which the vehicle said nothing."""
 AFTERWARDS = 2.0
 """A trajectory's end is held for so long before the run ends [s]."""
 MUTE = 3.0
@@ -70,7 +72,7 @@ def run(
         as_json: Print one JSON object.
 
     Returns:
-        Exit status: 0, or `FAULT`.
+        Exit status: 0, `FAULT` or `UNHEARD`.
     """
     wiring, console = wiring or Wiring(), Console(stderr=True)
     ours, guide = load_vehicle(vehicle), guide_of(goal, trajectory)
@@ -99,7 +101,9 @@ def run(
         print(json.dumps(told))
     else:
         show(told, Console())
-    return FAULT if watch.state == "fault" else 0
+    if watch.state == "fault":
+        return FAULT
+    return 0 if runtime.counters.telemetry else UNHEARD
 
 
 def _pilot(policy: str, vehicle: Vehicle, task: str | None, trim: bool, *, follows: bool) -> Pilot:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections import deque
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["TagFinder"]
 
+LOG = logging.getLogger(__name__)
 POLL = 0.002
 """Time between two looks for a new picture [s]."""
 WAITING = 8
@@ -55,6 +57,8 @@ class TagFinder:
         )
         self._found: deque[Picture] = deque(maxlen=WAITING)
         self._over = threading.Event()
+        self.problem = ""
+        """Why a picture could not be searched, as the detector said it first; it passed as one without tags."""
         self.skipped = 0
         """Pictures that were left out because newer ones had come meanwhile."""
         self._thread = threading.Thread(target=self._look, name="tag finder", daemon=True)
@@ -69,7 +73,8 @@ class TagFinder:
 
     def describe(self) -> str:
         """The source and how it fares, in a few words."""
-        return f"{self._source.describe()}, {self.skipped} skipped"
+        problem = f", {self.problem}" if self.problem else ""
+        return f"{self._source.describe()}, {self.skipped} skipped{problem}"
 
     def close(self) -> None:
         """Stop looking and let go of the source."""
@@ -88,6 +93,12 @@ class TagFinder:
         image = picture.image
         if image is None or picture.tags or image.shape != self._size or image.dtype != np.uint8:
             return picture
-        found = self._tracker.detect(image, picture.time)
+        try:
+            found = self._tracker.detect(image, picture.time)
+        except Exception as error:  # whatever it is: the next picture may be better
+            if not self.problem:
+                self.problem = f"tags cannot be sought: {type(error).__name__}: {error}"
+                LOG.warning(self.problem)
+            return replace(picture, image=None)
         tags = tuple(TagCorners(d.tag, d.corners) for d in found)
         return replace(picture, tags=tags, image=image if tags else None)

@@ -131,3 +131,11 @@ def test_a_pool_goes_with_no_other_simulation(tmp_path):
     command = ["excite", "roll", "--vehicle", "finsrov", "--out", str(tmp_path / "t"), "--pool", "1"]
     for other in (["--simulate"], ["--room", "2"]):
         assert CliRunner().invoke(app, [*command, *other]).exit_code == 2
+
+
+@pytest.mark.parametrize("option", [["--severity", "hard"], ["--pool-vehicle", "bluerov2"]])
+def test_what_tells_of_a_pool_needs_one(tmp_path, option):
+    """Refused, not left unheeded."""
+    command = ["excite", "roll", "--vehicle", "finsrov", "--out", str(tmp_path / "t"), *option]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 2 and "--pool SEED" in done.output and not (tmp_path / "t").exists()
