@@ -103,7 +103,7 @@ def run(
         show(told, Console())
     if watch.state == "fault":
         return FAULT
-    return 0 if runtime.counters.telemetry else UNHEARD
+    return UNHEARD if runtime.counters.steps and not runtime.counters.telemetry else 0
 
 
 def _pilot(policy: str, vehicle: Vehicle, task: str | None, trim: bool, *, follows: bool) -> Pilot:
