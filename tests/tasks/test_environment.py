@@ -185,7 +185,7 @@ def _relative(q, q_true):
 
 @pytest.mark.parametrize("std", [-0.1, np.nan, np.inf])
 def test_impossible_noise_is_refused(std):
-    with pytest.raises(ValueError, match="expected finite standard deviations"):
+    with pytest.raises(ValueError, match="expected finite numbers of 0 or more"):
         MeasurementNoise(position_std=std)
 
 

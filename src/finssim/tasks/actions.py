@@ -20,43 +20,58 @@ ACTION_MODES = ("thruster8", *WRENCH_AXES)
 """Names of the action modes."""
 
 
+@wp.func
+def action_of(arrays: TaskArrays, w: int, v: int, agents: int, size: int, i: int) -> float:
+    """Component i of the action of a vehicle, limited: an agent's own, or what the task says for one of the others."""
+    a = float(0.0)
+    if v < agents:
+        a = arrays.action[w, v * size + i]
+    else:
+        a = arrays.scripted[w, (v - agents) * size + i]
+    return wp.clamp(a, -1.0, 1.0)
+
+
 @wp.kernel(enable_backward=False)
 def thruster_action(
     arrays: TaskArrays,
     command: wp.array2d(dtype=VehicleCommand),
-    lower: vec8,
-    upper: vec8,
+    lower: wp.array(dtype=vec8),
+    upper: wp.array(dtype=vec8),
+    agents: int,
     count: int,
     world_offset: int,
 ):
     """Each action component is a part of its thruster's force limit: a ≥ 0 of the upper one, a < 0 of the lower."""
-    w = world_offset + wp.tid()
+    i, v = wp.tid()
+    w = world_offset + i
     force = vec8()
-    for i in range(MAX_THRUSTERS):
-        if i < count:
-            a = wp.clamp(arrays.action[w, i], -1.0, 1.0)
-            force[i] = wp.where(a >= 0.0, a * upper[i], -a * lower[i])
-    command[w, 0].thrust = force
+    for k in range(MAX_THRUSTERS):
+        if k < count:
+            a = action_of(arrays, w, v, agents, count, k)
+            force[k] = wp.where(a >= 0.0, a * upper[v][k], -a * lower[v][k])
+    command[w, v].thrust = force
 
 
 @wp.kernel(enable_backward=False)
 def wrench_action(
     arrays: TaskArrays,
     command: wp.array2d(dtype=VehicleCommand),
-    scale: wp.array(dtype=vec6),
+    scale: wp.array2d(dtype=vec6),
+    agents: int,
     count: int,
     data: AllocationData,
     world_offset: int,
 ):
     """Each action component is a part of one axis' wrench limit; the wrench is allocated to the thrusters exactly.
 
-    `scale[i]` is the wrench [N, N m] of action component i at 1.
+    `scale[v, i]` is the wrench [N, N m] of action component i of vehicle v at 1.
     """
-    w = world_offset + wp.tid()
+    i, v = wp.tid()
+    w = world_offset + i
     tau = vec6()
-    for i in range(count):
-        tau += wp.clamp(arrays.action[w, i], -1.0, 1.0) * scale[i]
-    command[w, 0].thrust = allocate(tau, 0, data)
+    for k in range(count):
+        tau += action_of(arrays, w, v, agents, count, k) * scale[v, k]
+    command[w, v].thrust = allocate(tau, v, data)
 
 
 def action_size(mode: str, thrusters: int) -> int:
@@ -65,34 +80,47 @@ def action_size(mode: str, thrusters: int) -> int:
 
 
 def add_action(
-    mode: str, simulator: Simulator, arrays: TaskArrays, wrench_scale: np.ndarray
+    mode: str, simulator: Simulator, arrays: TaskArrays, agents: int, wrench_scale: np.ndarray
 ) -> Callable[..., None]:
     """The stage that turns actions into thruster commands.
 
     Args:
         mode: thruster8, wrench6 or wrench4.
-        simulator: Whose vehicle 0 is commanded.
-        arrays: Holds the action.
+        simulator: Whose vehicles are commanded.
+        arrays: Holds the actions.
+        agents: How many of the vehicles are agents: the first ones.
         wrench_scale: Part of each wrench limit that action 1 stands for, (6,).
 
     Returns:
         A function that appends the stage to a pipeline.
     """
-    vehicle = simulator.vehicles[0]
-    lower, upper = vehicle.force_limits
-    n = len(vehicle.thrusters)
+    vehicles, device = simulator.vehicles, simulator.device
+    limits = [vehicle.force_limits for vehicle in vehicles]
     if mode == "thruster8":
-        pad = [0.0] * (MAX_THRUSTERS - n)
-        bounds = [vec8(*lower, *pad), vec8(*upper, *pad)]
-        return lambda pipeline: pipeline.add(thruster_action, [arrays, simulator.command.array, *bounds, n])
-    limits = vehicle.wrench_limits
+        count = len(vehicles[0].thrusters)
+        bounds = [_padded([ends[k] for ends in limits], device) for k in range(2)]
+        inputs = [arrays, simulator.command.array, *bounds, agents, count]
+        return lambda pipeline: pipeline.add(thruster_action, inputs, vehicles=len(vehicles))
+    reach = [vehicle.wrench_limits for vehicle in vehicles]
     data = allocation_data(
-        [vehicle.control_matrix], [lower], [upper], [axis_weights(limits)], device=simulator.device
+        [vehicle.control_matrix for vehicle in vehicles],
+        [lower for lower, _ in limits],
+        [upper for _, upper in limits],
+        [axis_weights(most) for most in reach],
+        device=device,
     )
     axes = WRENCH_AXES[mode]
-    rows = np.zeros((len(axes), 6), dtype=np.float32)
-    rows[np.arange(len(axes)), axes] = (limits * wrench_scale)[list(axes)]
-    scale = wp.array(rows, dtype=vec6, device=simulator.device)
-    return lambda pipeline: pipeline.add(
-        wrench_action, [arrays, simulator.command.array, scale, len(axes), data]
-    )
+    rows = np.zeros((len(vehicles), len(axes), 6), dtype=np.float32)
+    for v, most in enumerate(reach):
+        rows[v, np.arange(len(axes)), axes] = (most * wrench_scale)[list(axes)]
+    scale = wp.array(rows, dtype=vec6, device=device)
+    inputs = [arrays, simulator.command.array, scale, agents, len(axes), data]
+    return lambda pipeline: pipeline.add(wrench_action, inputs, vehicles=len(vehicles))
+
+
+def _padded(forces: list[np.ndarray], device: wp.Device) -> wp.array:
+    """Force limits of every vehicle, with zeros for the thrusters that it does not have."""
+    table = np.zeros((len(forces), MAX_THRUSTERS), dtype=np.float32)
+    for row, force in zip(table, forces, strict=True):
+        row[: len(force)] = force
+    return wp.array(table, dtype=vec8, device=device)

@@ -19,13 +19,19 @@ class ReferenceTable:
 
 @wp.struct
 class TaskArrays:
-    """Inputs and outputs of a task for every world; vehicle 0 of a world is the one that acts."""
+    """Inputs and outputs of a task for every world.
 
-    action: wp.array2d(dtype=float)  # (worlds, size), each in [-1, 1]
+    The first vehicles of a world are the agents, those that learn; the task itself commands the others. Where there are
+    several agents, their numbers lie one after the other: number i of agent a is [w, a * size + i].
+    """
+
+    action: wp.array2d(dtype=float)  # (worlds, agents * size), each in [-1, 1]
     previous_action: wp.array2d(dtype=float)
-    observation: wp.array2d(dtype=float)
+    scripted: wp.array2d(dtype=float)  # (worlds, others * size): actions of the vehicles that do not learn
+    observation: wp.array2d(dtype=float)  # (worlds, agents * size)
     final_observation: wp.array2d(dtype=float)  # last observation of the episode that ended in this step
-    reward: wp.array(dtype=float)
+    reward: wp.array(dtype=float)  # of all agents together: their mean
+    agent_reward: wp.array2d(dtype=float)  # (worlds, agents); of a single agent the same memory as `reward`
     terminated: wp.array(dtype=int)  # 1: ended by the task (left the pool, broke)
     truncated: wp.array(dtype=int)  # 1: ended by the time limit
     done: wp.array(dtype=int)  # terminated or truncated: reset in this step
@@ -37,23 +43,38 @@ class TaskArrays:
     goal_position: wp.array(dtype=wp.vec3)  # world frame [m]
     goal_quaternion: wp.array(dtype=wp.quat)  # body to world
     reference: ReferenceTable  # of tasks that follow one
-    position: wp.array2d(dtype=wp.vec3)  # as measured: the truth, or the truth with noise
+    position: wp.array2d(dtype=wp.vec3)  # (worlds, vehicles), as measured: the truth, or the truth with noise
     quaternion: wp.array2d(dtype=wp.quat)
     velocity: wp.array2d(dtype=vec6)
 
 
-def task_arrays(worlds: int, observation: int, action: int, device: wp.Device) -> TaskArrays:
-    """Zero arrays of the right size; the measured ones are left for the environment to fill or alias."""
+def task_arrays(
+    worlds: int, agents: int, others: int, observation: int, action: int, device: wp.Device
+) -> TaskArrays:
+    """Zero arrays of the right size; the measured ones are left for the environment to fill or alias.
+
+    Args:
+        worlds: How many.
+        agents: Vehicles that learn.
+        others: Vehicles that the task commands.
+        observation: Numbers in the observation of an agent.
+        action: Numbers in the action of a vehicle.
+        device: Where.
+    """
     out = TaskArrays()
     for name, columns in {
-        "action": action,
-        "previous_action": action,
-        "observation": observation,
-        "final_observation": observation,
+        "action": agents * action,
+        "previous_action": agents * action,
+        "scripted": others * action,
+        "observation": agents * observation,
+        "final_observation": agents * observation,
+        "agent_reward": agents,
     }.items():
         setattr(out, name, wp.zeros((worlds, columns), dtype=wp.float32, device=device))
     for name in ("reward", "episode_return", "final_return", "held", "final_held"):
         setattr(out, name, wp.zeros(worlds, dtype=wp.float32, device=device))
+    if agents == 1:
+        out.reward = out.agent_reward.reshape(worlds)
     for name in ("terminated", "truncated", "done", "final_length"):
         setattr(out, name, wp.zeros(worlds, dtype=wp.int32, device=device))
     out.goal_position = wp.zeros(worlds, dtype=wp.vec3, device=device)

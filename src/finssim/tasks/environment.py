@@ -1,6 +1,7 @@
 """The batched environment: any task, any vehicle, thousands of worlds, with automatic reset."""
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from finssim.engine.randomize import Randomization
 from finssim.physics.types import vec6
 from finssim.tasks.actions import ACTION_MODES, action_size, add_action
 from finssim.tasks.arrays import task_arrays
-from finssim.tasks.measurement import MeasurementNoise, measure
+from finssim.tasks.measurement import MeasurementNoise, measure, measurement
 from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle, load_vehicle
 
@@ -34,9 +35,9 @@ class Step:
     """What one step gave; NumPy views of the environment's own arrays, valid until the next step."""
 
     observation: NDArray[np.float32]
-    """(worlds, size); the first of the new episode where one ended."""
+    """(worlds, size), or (worlds, agents, size) of several agents; the first of the new episode where one ended."""
     reward: NDArray[np.float32]
-    """(worlds,)"""
+    """(worlds,), or (worlds, agents)."""
     terminated: NDArray[np.bool_]
     """Ended by the task, (worlds,)."""
     truncated: NDArray[np.bool_]
@@ -46,9 +47,10 @@ class Step:
 
 
 class Environment:
-    """Vehicle 0 of every world acts; the others, if any, keep their last command.
+    """The task's agents, which are the first vehicles of every world, act; the task commands the others.
 
     Attributes:
+        agents: How many agents a world has.
         simulator: The worlds.
         arrays: Actions, observations, rewards and goals, as Warp arrays by world.
     """
@@ -56,11 +58,11 @@ class Environment:
     def __init__(
         self,
         task: Task,
-        vehicle: Vehicle | str = "finsrov",
+        vehicle: Vehicle | str | Sequence[Vehicle | str] = "finsrov",
         *,
         worlds: int = 1,
         hydrodynamics: str = "calibrated",
-        action: str = "wrench6",
+        action: str | None = None,
         wrench_scale: ArrayLike = 1.0,
         randomization: Randomization | None = None,
         noise: MeasurementNoise | None = None,
@@ -78,15 +80,15 @@ class Environment:
 
         Args:
             task: What to do.
-            vehicle: Who does it: a vehicle, a catalogue name or a file.
+            vehicle: Who does it: a vehicle, a catalogue name or a file; or one for each of the task's vehicles.
             worlds: How many at once.
             hydrodynamics: calibrated, mesh or simplified.
-            action: thruster8, wrench6 or wrench4.
+            action: thruster8, wrench6 or wrench4; the task's own if None.
             wrench_scale: Part of each wrench limit that action 1 stands for, one number or (6,).
             randomization: Drawn anew for every episode; none if None.
             noise: On what the controller sees; none if None.
             water: Currents and waves.
-            pool: Walls and floor; the paper's 4 × 2 × 1 m pool if None.
+            pool: Walls and floor; the task's own if None.
             tether: On the vehicle.
             integrator: euler or rk4.
             device: cpu or cuda.
@@ -96,25 +98,28 @@ class Environment:
             auto_reset: Start a new episode where one ended, in the same step.
 
         Raises:
-            EnvironmentSetupError: unknown action mode, or a seed out of range.
+            EnvironmentSetupError: unknown action mode, vehicles that do not fit the task, or a seed out of range.
         """
-        self.task, self.action_mode, self.seed = task, action, _checked_seed(seed)
+        self.task, self.action_mode, self.seed = task, action or task.action, _checked_seed(seed)
         self.crash_directory, self.auto_reset = crash_directory, auto_reset
-        if action not in ACTION_MODES:
+        if self.action_mode not in ACTION_MODES:
             raise EnvironmentSetupError(
-                f"unknown action mode '{action}'; available: {', '.join(ACTION_MODES)}"
+                f"unknown action mode '{self.action_mode}'; available: {', '.join(ACTION_MODES)}"
             )
-        chosen = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
-        longest = max((t.delay for t in chosen.thrusters.values()), default=0.0)
+        vehicles = _crew(vehicle, task, self.action_mode)
+        longest = max((t.delay for one in vehicles for t in one.thrusters.values()), default=0.0)
         extra = randomization.simulator_arguments(longest) if randomization else {}
         self.simulator = Simulator(
-            chosen, worlds=worlds, hydrodynamics=hydrodynamics, control_step=task.control_step,
-            substeps=task.substeps, integrator=integrator, water=water, pool=pool or Pool(), tether=tether,
+            vehicles, worlds=worlds, hydrodynamics=hydrodynamics, control_step=task.control_step,
+            substeps=task.substeps, integrator=integrator, water=water, pool=pool or task.pool, tether=tether,
             device=device, threads=threads, seed=self.seed, **extra,
         )  # fmt: skip
-        self.worlds, self.device = worlds, self.simulator.device
-        size = action_size(action, len(self.simulator.vehicles[0].thrusters))
-        self.arrays = task_arrays(worlds, task.observation_size, size, self.device)
+        self.worlds, self.agents, self.device = worlds, len(task.agents), self.simulator.device
+        self.action_size = action_size(self.action_mode, len(vehicles[0].thrusters))
+        """Numbers in the action of an agent."""
+        self.arrays = task_arrays(
+            worlds, self.agents, len(task.others), task.observation_size, self.action_size, self.device
+        )
         task.allocate(self.arrays, worlds, self.device)
         self.wrench_scale = np.broadcast_to(np.asarray(wrench_scale, dtype=float), (6,))
         self.noise = noise or MeasurementNoise()
@@ -127,13 +132,8 @@ class Environment:
 
     @property
     def observation_size(self) -> int:
-        """Numbers in an observation."""
+        """Numbers in the observation of an agent."""
         return self.task.observation_size
-
-    @property
-    def action_size(self) -> int:
-        """Numbers in an action."""
-        return int(self.arrays.action.shape[1])
 
     def _connect_measurement(self) -> None:
         state, a = self.simulator.state, self.arrays
@@ -141,7 +141,7 @@ class Environment:
             # The controller sees the truth: no copy, the same arrays.
             a.position, a.quaternion, a.velocity = state.position, state.quaternion, state.velocity
             return
-        shape = (self.worlds, 1)
+        shape = (self.worlds, len(self.simulator.vehicles))
         a.position = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         a.quaternion = wp.zeros(shape, dtype=wp.quat, device=self.device)
         a.velocity = wp.zeros(shape, dtype=vec6, device=self.device)
@@ -149,7 +149,10 @@ class Environment:
     def _build(self) -> None:
         self._step = self.simulator.pipeline()
         parameters = self.task.parameters()
-        add_action(self.action_mode, self.simulator, self.arrays, self.wrench_scale)(self._step)
+        if self.task.others:
+            inputs = [self.simulator.state, self.arrays, parameters, self.seed]
+            self._step.add(self.task.script, inputs)
+        add_action(self.action_mode, self.simulator, self.arrays, self.agents, self.wrench_scale)(self._step)
         self.simulator.add_step(self._step)
         self._add_measure(self._step)
         self._step.add(self.task.evaluate, [self.simulator.state, self.arrays, parameters])
@@ -160,9 +163,9 @@ class Environment:
 
     def _add_measure(self, pipeline: Any) -> None:
         if self.noise.present:
-            n = self.noise
-            std = [n.position_std, n.yaw_std, n.velocity_std, n.rate_std]
-            pipeline.add(measure, [self.simulator.state, self.arrays, *std, self.seed])
+            how = measurement(self.noise, self.task.control_step)
+            inputs = [self.simulator.state, self.arrays, how, self.seed]
+            pipeline.add(measure, inputs, vehicles=len(self.simulator.vehicles))
 
     def _add_start(self, pipeline: Any, mask: wp.array, parameters: Any) -> None:
         simulator = self.simulator
@@ -182,7 +185,7 @@ class Environment:
             seed: Start the random streams over with this seed, as if the environment had just been made.
 
         Returns:
-            Observations, (worlds, size).
+            Observations, (worlds, size), or (worlds, agents, size) of several agents.
 
         Raises:
             EnvironmentSetupError: the seed is out of range.
@@ -196,12 +199,16 @@ class Environment:
             np.ones(self.worlds, np.int32) if mask is None else np.asarray(mask, dtype=np.int32)
         )
         self._start.run()
-        return self.arrays.observation.numpy()
+        return self._by_agent(self.arrays.observation.numpy())
+
+    def _by_agent(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Rows of a world as rows of its agents, where there are several; a view."""
+        return rows if self.agents == 1 else rows.reshape(self.worlds, self.agents, -1)
 
     def start(
         self, position: ArrayLike, quaternion: ArrayLike, goal_position: ArrayLike, goal_quaternion: ArrayLike
     ) -> NDArray[np.float32]:
-        """Start an episode in every world from given poses at rest, towards given goals.
+        """Start an episode in every world with vehicle 0 at given poses at rest, towards given goals.
 
         Args:
             position: World frame [m], broadcastable to (worlds, 3).
@@ -236,16 +243,19 @@ class Environment:
         """Act for one control step.
 
         Args:
-            action: (worlds, size), each in [-1, 1]; beyond is limited.
+            action: (worlds, size), or (worlds, agents, size) of several agents, each in [-1, 1]; beyond is limited.
 
         Raises:
             EnvironmentSetupError: the shape is wrong or a number is not finite.
         """
         a = np.asarray(action, dtype=np.float32)
-        if a.shape != (self.worlds, self.action_size):
+        agents = () if self.agents == 1 else (self.agents,)
+        expected = (self.worlds, *agents, self.action_size)
+        if a.shape != expected:
             raise EnvironmentSetupError(
-                f"action has shape {a.shape}, expected {(self.worlds, self.action_size)}: one row per world"
+                f"action has shape {a.shape}, expected {expected}: one row per {'agent' if agents else 'world'}"
             )
+        a = a.reshape(self.worlds, -1)
         if not np.isfinite(a).all():
             world = int(np.flatnonzero(~np.isfinite(a).all(axis=1))[0])
             raise EnvironmentSetupError(
@@ -278,10 +288,29 @@ class Environment:
     def outcome(self) -> Step:
         """The result of the last step."""
         a = self.arrays
+        reward = a.reward if self.agents == 1 else a.agent_reward
         return Step(
-            a.observation.numpy(), a.reward.numpy(), a.terminated.numpy() != 0, a.truncated.numpy() != 0,
-            a.final_observation.numpy(),
+            self._by_agent(a.observation.numpy()), reward.numpy(), a.terminated.numpy() != 0,
+            a.truncated.numpy() != 0, self._by_agent(a.final_observation.numpy()),
         )  # fmt: skip
+
+
+def _crew(vehicle: Vehicle | str | Sequence[Vehicle | str], task: Task, mode: str) -> list[Vehicle]:
+    """The vehicles of a world: those that are given, or one of a kind for every place."""
+    given = [vehicle] * len(task.vehicles) if isinstance(vehicle, Vehicle | str) else list(vehicle)
+    if len(given) != len(task.vehicles):
+        names = ", ".join(task.vehicles)
+        raise EnvironmentSetupError(
+            f"{len(given)} vehicles are given, expected {len(task.vehicles)} for task '{task.name}': {names}"
+        )
+    crew = [one if isinstance(one, Vehicle) else load_vehicle(one) for one in given]
+    counts = {len(one.thrusters) for one in crew}
+    if mode == "thruster8" and len(counts) > 1:
+        raise EnvironmentSetupError(
+            f"vehicles have {', '.join(map(str, sorted(counts)))} thrusters, expected equal numbers for actions by "
+            "thruster: take wrench6 or wrench4"
+        )
+    return crew
 
 
 def _checked_seed(seed: int) -> int:

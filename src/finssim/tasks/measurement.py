@@ -1,60 +1,116 @@
-"""What the controller is told of the state: the truth, or the truth with localization noise."""
+"""What the controller is told of the state: the truth, or what localization would make of it."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import warp as wp
 
-from finssim.engine.state import State
+from finssim.engine.state import HISTORY, State
 from finssim.tasks.arrays import TaskArrays
+
+
+LONGEST_DELAY = 2.0
+"""Of what a controller sees [s]; states are kept for 50 control steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeasurementNoise:
-    """White noise on the pose a controller sees, drawn anew every control step."""
+    """How what a controller sees differs from the truth: white noise, an offset by episode, and a delay."""
 
     position_std: float = 0.0
-    """Per axis [m]."""
+    """Of the noise, drawn anew every control step, per axis [m]."""
     yaw_std: float = 0.0
     """[rad]"""
     velocity_std: float = 0.0
     """Per axis of the linear velocity [m/s]."""
     rate_std: float = 0.0
     """Per axis of the angular velocity [rad/s]."""
+    position_bias: float = 0.0
+    """Standard deviation of an offset that lasts an episode, per axis [m]."""
+    yaw_bias: float = 0.0
+    """The same of the heading [rad]."""
+    delay: float = 0.0
+    """How old it is [s], taken to the nearest control step; nothing is older than the episode."""
 
     def __post_init__(self) -> None:
-        values = (self.position_std, self.yaw_std, self.velocity_std, self.rate_std)
+        values = tuple(getattr(self, field.name) for field in fields(self))
         if not all(math.isfinite(x) and x >= 0.0 for x in values):
-            raise ValueError(f"measurement noise {values}: expected finite standard deviations of 0 or more")
+            raise ValueError(f"measurement noise {values}: expected finite numbers of 0 or more")
+        if self.delay > LONGEST_DELAY:
+            raise ValueError(
+                f"delay of the measurement is {self.delay} s, expected at most {LONGEST_DELAY:g} s"
+            )
 
     @property
     def present(self) -> bool:
-        """Whether anything is added at all."""
-        return any((self.position_std, self.yaw_std, self.velocity_std, self.rate_std))
+        """Whether it differs at all."""
+        return any(getattr(self, field.name) for field in fields(self))
+
+
+ESTIMATOR = MeasurementNoise(
+    position_std=0.003,
+    yaw_std=math.radians(0.15),
+    velocity_std=0.015,
+    rate_std=0.01,
+    position_bias=0.01,
+    yaw_bias=math.radians(0.2),
+    delay=0.1,
+)
+"""About what the robot's own localization and fusion are off by in a virtual pool of severity realistic."""
+
+OBSERVED = {"truth": MeasurementNoise(), "estimator": ESTIMATOR}
+"""What a controller may see, by name."""
+
+
+@wp.struct
+class Measurement:
+    """`MeasurementNoise` for the kernel."""
+
+    position_std: float
+    yaw_std: float
+    velocity_std: float
+    rate_std: float
+    position_bias: float
+    yaw_bias: float
+    steps: int  # of delay
+
+
+def measurement(noise: MeasurementNoise, control_step: float) -> Measurement:
+    """The struct that the kernel takes."""
+    m = Measurement()
+    for name in ("position_std", "yaw_std", "velocity_std", "rate_std", "position_bias", "yaw_bias"):
+        setattr(m, name, getattr(noise, name))
+    m.steps = min(round(noise.delay / control_step), HISTORY - 1)
+    return m
 
 
 @wp.kernel(enable_backward=False)
-def measure(
-    state: State,
-    arrays: TaskArrays,
-    position_std: float,
-    yaw_std: float,
-    velocity_std: float,
-    rate_std: float,
-    seed: int,
-    world_offset: int,
-):
-    """Copy the state of vehicle 0 with noise; the draw depends on seed, world, episode and step alone."""
-    w = world_offset + wp.tid()
-    stream = wp.rand_init(seed + 104729 * state.episode[w] + 1, w)
-    rng = wp.rand_init(wp.randi(stream), state.steps[w])
+def measure(state: State, arrays: TaskArrays, m: Measurement, seed: int, world_offset: int):
+    """What is seen of every vehicle; the draw depends on seed, world, vehicle, episode and step alone."""
+    i, v = wp.tid()
+    w = world_offset + i
+    x = state.position[w, v]
+    q = state.quaternion[w, v]
+    nu = state.velocity[w, v]
+    step = state.steps[w]
+    if m.steps > 0 and step > 0:
+        # The history's slot k holds the state after step k + 1; the start of an episode is not in it.
+        past = state.history[wp.max(step - 1 - m.steps, 0) % wp.static(HISTORY), w, v]
+        x = wp.vec3(past[0], past[1], past[2])
+        q = wp.quat(past[3], past[4], past[5], past[6])
+        for k in range(6):
+            nu[k] = past[7 + k]
+    # Wrapping around at 32 bits is what makes streams of neighbours differ.
+    own = wp.rand_init(seed + 104729 * state.episode[w] + 1 + 15485867 * v, w)
+    bias = wp.rand_init(wp.randi(own), -1)
+    rng = wp.rand_init(wp.randi(own), step)
     n = wp.vec3(wp.randn(rng), wp.randn(rng), wp.randn(rng))
-    arrays.position[w, 0] = state.position[w, 0] + position_std * n
-    turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw_std * wp.randn(rng))
-    arrays.quaternion[w, 0] = turn * state.quaternion[w, 0]
-    nu = state.velocity[w, 0]
-    for i in range(3):
-        nu[i] = nu[i] + velocity_std * wp.randn(rng)
-    for i in range(3):
-        nu[i + 3] = nu[i + 3] + rate_std * wp.randn(rng)
-    arrays.velocity[w, 0] = nu
+    lasting = wp.vec3(wp.randn(bias), wp.randn(bias), wp.randn(bias))
+    arrays.position[w, v] = x + m.position_std * n + m.position_bias * lasting
+    angle = m.yaw_std * wp.randn(rng) + m.yaw_bias * wp.randn(bias)
+    arrays.quaternion[w, v] = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angle) * q
+    for k in range(3):
+        nu[k] = nu[k] + m.velocity_std * wp.randn(rng)
+    for k in range(3):
+        nu[k + 3] = nu[k + 3] + m.rate_std * wp.randn(rng)
+    arrays.velocity[w, v] = nu

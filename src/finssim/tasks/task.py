@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 
 import warp as wp
 
+from finssim.engine import Pool
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.measurement import MeasurementNoise
 
@@ -25,8 +26,19 @@ class Task:
     """Base of every task: plain data; its kernels are class attributes.
 
     `evaluate(state, arrays, parameters, world_offset)` after each step, `spawn(state, arrays, parameters, seed, mask,
-    world_offset)` where an episode starts, `observe(arrays, mask, world_offset)` for its first observation.
+    world_offset)` where an episode starts, `observe(arrays, mask, world_offset)` for its first observation. A task with
+    `others` has `script(state, arrays, parameters, seed, world_offset)` too: it runs before each step and writes
+    `arrays.scripted`.
     """
+
+    agents: ClassVar[tuple[str, ...]] = ("vehicle",)
+    """Names of the vehicles that learn, in the order of the world's vehicles."""
+    others: ClassVar[tuple[str, ...]] = ()
+    """Names of the vehicles after them, which the task commands."""
+    action: ClassVar[str] = "wrench6"
+    """Action mode, unless another is asked for."""
+    pool: ClassVar[Pool | None] = Pool()
+    """Walls and floor, unless others are asked for; None is open water."""
 
     name: str
     observation: tuple[ObservationPart, ...] = field(repr=False)
@@ -41,11 +53,17 @@ class Task:
     evaluate: ClassVar[Any]
     spawn: ClassVar[Any]
     observe: ClassVar[Any]
+    script: ClassVar[Any] = None
 
     @property
     def observation_size(self) -> int:
-        """Numbers in the observation."""
+        """Numbers in the observation of an agent."""
         return sum(part.size for part in self.observation)
+
+    @property
+    def vehicles(self) -> tuple[str, ...]:
+        """Names of all vehicles in a world: agents, then others."""
+        return (*self.agents, *self.others)
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """Give `arrays` what only this task uses; nothing unless the task says so."""

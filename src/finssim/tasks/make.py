@@ -1,0 +1,79 @@
+"""`finssim.make`: any task's batched environment, from names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from finssim.engine.randomize import Randomization
+from finssim.tasks.catalogue import TASKS
+from finssim.tasks.environment import Environment, EnvironmentSetupError
+from finssim.tasks.measurement import OBSERVED, MeasurementNoise
+from finssim.tasks.task import Task
+from finssim.vehicles import Vehicle
+
+__all__ = ["make", "task_named"]
+
+
+def task_named(task: str | Task, **settings: Any) -> Task:
+    """A task by its name, with settings of its own.
+
+    Raises:
+        EnvironmentSetupError: There is none of that name.
+    """
+    if isinstance(task, Task):
+        return task
+    if task not in TASKS:
+        raise EnvironmentSetupError(f"unknown task '{task}'; available: {', '.join(TASKS)}")
+    made: Task = TASKS[task](**settings)
+    return made
+
+
+def make(
+    task: str | Task = "t1",
+    *,
+    worlds: int = 1,
+    vehicle: Vehicle | str | Sequence[Vehicle | str] = "finsrov",
+    hydrodynamics: str = "calibrated",
+    action: str | None = None,
+    randomize: Randomization | str | Path | None = None,
+    observe: MeasurementNoise | str = "truth",
+    **options: Any,
+) -> Environment:
+    """The batched environment of a task; every adapter takes the same arguments.
+
+    Args:
+        task: A task or its name.
+        worlds: How many at once.
+        vehicle: A vehicle, a catalogue name or a file; or one for each of the task's vehicles.
+        hydrodynamics: calibrated, mesh or simplified.
+        action: thruster8, wrench6 or wrench4; the task's own if None.
+        randomize: Ranges, or the name or file of some, from which vehicle and water are drawn in every episode.
+        observe: What the controller sees: truth, estimator (noise, offset and delay of the robot's own localization),
+            training (the noise that the task is trained with), or a noise.
+        options: The rest of what `Environment` takes: seed, device, threads, water, pool, tether, ...
+
+    Returns:
+        The environment.
+
+    Raises:
+        EnvironmentSetupError: A name that does not exist, or vehicles that do not fit the task.
+    """
+    chosen = task_named(task)
+    if isinstance(observe, str):
+        known = {**OBSERVED, "training": chosen.training_noise}
+        if observe not in known:
+            raise EnvironmentSetupError(f"observe is '{observe}', expected {', '.join(known)} or a noise")
+        observe = known[observe]
+    ranges = Randomization(randomize) if isinstance(randomize, str | Path) else randomize
+    return Environment(
+        chosen,
+        vehicle,
+        worlds=worlds,
+        hydrodynamics=hydrodynamics,
+        action=action,
+        randomization=ranges,
+        noise=observe,
+        **options,
+    )
