@@ -40,6 +40,8 @@ class TaskArrays:
     final_length: wp.array(dtype=int)  # its control steps
     held: wp.array(dtype=float)  # time inside the success tolerance so far [s]
     final_held: wp.array(dtype=float)  # the same when the last episode ended [s]
+    totals: wp.array2d(dtype=float)  # (worlds, task.totals): what the task counts in the running episode, from 0
+    final_totals: wp.array2d(dtype=float)  # the same when the last episode ended
     goal_position: wp.array(dtype=wp.vec3)  # world frame [m]
     goal_quaternion: wp.array(dtype=wp.quat)  # body to world
     reference: ReferenceTable  # of tasks that follow one
@@ -49,7 +51,7 @@ class TaskArrays:
 
 
 def task_arrays(
-    worlds: int, agents: int, others: int, observation: int, action: int, device: wp.Device
+    worlds: int, agents: int, others: int, observation: int, action: int, device: wp.Device, totals: int = 0
 ) -> TaskArrays:
     """Zero arrays of the right size; the measured ones are left for the environment to fill or alias.
 
@@ -60,6 +62,7 @@ def task_arrays(
         observation: Numbers in the observation of an agent.
         action: Numbers in the action of a vehicle.
         device: Where.
+        totals: Numbers that the task counts in an episode.
     """
     out = TaskArrays()
     for name, columns in {
@@ -69,6 +72,8 @@ def task_arrays(
         "observation": agents * observation,
         "final_observation": agents * observation,
         "agent_reward": agents,
+        "totals": totals,
+        "final_totals": totals,
     }.items():
         setattr(out, name, wp.zeros((worlds, columns), dtype=wp.float32, device=device))
     for name in ("reward", "episode_return", "final_return", "held", "final_held"):

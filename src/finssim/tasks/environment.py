@@ -118,8 +118,9 @@ class Environment:
         self.action_size = action_size(self.action_mode, len(vehicles[0].thrusters))
         """Numbers in the action of an agent."""
         self.arrays = task_arrays(
-            worlds, self.agents, len(task.others), task.observation_size, self.action_size, self.device
-        )
+            worlds, self.agents, len(task.others), task.observation_size, self.action_size, self.device,
+            len(task.totals),
+        )  # fmt: skip
         task.allocate(self.arrays, worlds, self.device)
         self.wrench_scale = np.broadcast_to(np.asarray(wrench_scale, dtype=float), (6,))
         self.noise = noise or MeasurementNoise()

@@ -20,6 +20,8 @@ def open_episode(arrays: TaskArrays, w: int):
     """Start the totals of an episode over."""
     arrays.held[w] = 0.0
     arrays.episode_return[w] = 0.0
+    for i in range(arrays.totals.shape[1]):
+        arrays.totals[w, i] = 0.0
     for i in range(arrays.action.shape[1]):
         arrays.previous_action[w, i] = 0.0
 
@@ -48,6 +50,8 @@ def close_episode(state: State, arrays: TaskArrays, w: int):
     arrays.final_return[w] = arrays.episode_return[w]
     arrays.final_length[w] = state.steps[w]
     arrays.final_held[w] = arrays.held[w]
+    for i in range(arrays.totals.shape[1]):
+        arrays.final_totals[w, i] = arrays.totals[w, i]
 
 
 @wp.func

@@ -4,7 +4,9 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from finssim.engine.state import State
 from finssim.tasks.arrays import TaskArrays
@@ -237,6 +239,12 @@ class StationKeeping(Task):
     evaluate = staticmethod(evaluate)
     spawn = staticmethod(spawn)
     observe = staticmethod(observe)
+
+    def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
+        """As every task's, and success: held for `hold` seconds when the episode ended."""
+        measured = super().metrics(arrays)
+        enough = measured["held"] >= self.hold - 0.5 * self.control_step
+        return {**measured, "success": np.where(enough, 1.0, 0.0)}
 
     def parameters(self) -> Any:
         """The struct that the kernels take."""

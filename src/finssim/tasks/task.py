@@ -3,7 +3,9 @@
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from finssim.engine import Pool
 from finssim.tasks.arrays import TaskArrays
@@ -39,6 +41,8 @@ class Task:
     """Action mode, unless another is asked for."""
     pool: ClassVar[Pool | None] = Pool()
     """Walls and floor, unless others are asked for; None is open water."""
+    totals: ClassVar[tuple[str, ...]] = ()
+    """Names of what the kernels count in `arrays.totals`; zero at the start of an episode, and a part of `metrics`."""
 
     name: str
     observation: tuple[ObservationPart, ...] = field(repr=False)
@@ -71,3 +75,19 @@ class Task:
     def parameters(self) -> Any:
         """The struct that the kernels take."""
         raise TypeError(f"task '{self.name}' does not say what its kernels take: define parameters()")
+
+    def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
+        """How the episode that ended last went, by world.
+
+        Returns:
+            Name to numbers (worlds,): return, length in control steps, time held inside the tolerance at the end [s],
+            the task's `totals`, and what the task makes of them, such as success (0 or 1).
+        """
+        totals = arrays.final_totals.numpy()
+        columns = {
+            "return": arrays.final_return.numpy(),
+            "length": arrays.final_length.numpy(),
+            "held": arrays.final_held.numpy(),
+            **{name: totals[:, i] for i, name in enumerate(self.totals)},
+        }
+        return {name: np.array(values, dtype=np.float64) for name, values in columns.items()}

@@ -4,7 +4,9 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.measurement import MeasurementNoise
@@ -137,6 +139,12 @@ class TrajectoryTracking(Task):
         """Room for every world's reference, from the start to what is seen at the end."""
         knots = math.ceil((self.time_limit + 3.0 * LOOK_AHEAD) / self.knot_spacing) + 2
         arrays.reference = reference_table(worlds, knots, self.knot_spacing, device)
+
+    def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
+        """As every task's, and success: held for `hold` seconds when the episode ended."""
+        measured = super().metrics(arrays)
+        enough = measured["held"] >= self.hold - 0.5 * self.control_step
+        return {**measured, "success": np.where(enough, 1.0, 0.0)}
 
     def parameters(self) -> Any:
         """The struct that the kernels take."""
