@@ -18,6 +18,16 @@ class ReferenceTable:
 
 
 @wp.struct
+class TargetMotion:
+    """How the target of every world moves; where it is stands in `goal_position`."""
+
+    velocity: wp.array(dtype=wp.vec3)  # world frame [m/s]
+    wanted: wp.array(dtype=wp.vec3)  # what the velocity goes to [m/s]
+    until: wp.array(dtype=float)  # time in the episode at which another is drawn [s]
+    rng: wp.array(dtype=wp.uint32)  # the world's own random stream
+
+
+@wp.struct
 class TaskArrays:
     """Inputs and outputs of a task for every world.
 
@@ -45,6 +55,7 @@ class TaskArrays:
     goal_position: wp.array(dtype=wp.vec3)  # world frame [m]
     goal_quaternion: wp.array(dtype=wp.quat)  # body to world
     reference: ReferenceTable  # of tasks that follow one
+    target: TargetMotion  # of tasks whose goal moves
     position: wp.array2d(dtype=wp.vec3)  # (worlds, vehicles), as measured: the truth, or the truth with noise
     quaternion: wp.array2d(dtype=wp.quat)
     velocity: wp.array2d(dtype=vec6)

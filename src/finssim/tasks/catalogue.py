@@ -1,10 +1,11 @@
 """Every task by name."""
 
+from finssim.tasks.moving_target import MovingTarget
 from finssim.tasks.station_keeping import StationKeeping
 from finssim.tasks.task import Task
 from finssim.tasks.trajectory_tracking import TrajectoryTracking
 
 __all__ = ["TASKS"]
 
-TASKS: dict[str, type[Task]] = {"t1": StationKeeping, "t2": TrajectoryTracking}
+TASKS: dict[str, type[Task]] = {"t1": StationKeeping, "t2": TrajectoryTracking, "t3": MovingTarget}
 """Every task by the name that commands take; call it for the task with its default settings."""

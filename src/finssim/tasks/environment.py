@@ -50,6 +50,7 @@ class Environment:
     """The task's agents, which are the first vehicles of every world, act; the task commands the others.
 
     Attributes:
+        task: What is done, fitted to the vehicles.
         agents: How many agents a world has.
         simulator: The worlds.
         arrays: Actions, observations, rewards and goals, as Warp arrays by world.
@@ -100,18 +101,19 @@ class Environment:
         Raises:
             EnvironmentSetupError: unknown action mode, vehicles that do not fit the task, or a seed out of range.
         """
-        self.task, self.action_mode, self.seed = task, action or task.action, _checked_seed(seed)
+        self.action_mode, self.seed = action or task.action, _checked_seed(seed)
         self.crash_directory, self.auto_reset = crash_directory, auto_reset
         if self.action_mode not in ACTION_MODES:
             raise EnvironmentSetupError(
                 f"unknown action mode '{self.action_mode}'; available: {', '.join(ACTION_MODES)}"
             )
         vehicles = _crew(vehicle, task, self.action_mode)
+        self.task = task = task.fitted(vehicles)
         longest = max((t.delay for one in vehicles for t in one.thrusters.values()), default=0.0)
         extra = randomization.simulator_arguments(longest) if randomization else {}
         self.simulator = Simulator(
             vehicles, worlds=worlds, hydrodynamics=hydrodynamics, control_step=task.control_step,
-            substeps=task.substeps, integrator=integrator, water=water, pool=pool or task.pool, tether=tether,
+            substeps=task.substeps, integrator=integrator, water=water, pool=pool or task.arena(), tether=tether,
             device=device, threads=threads, seed=self.seed, **extra,
         )  # fmt: skip
         self.worlds, self.agents, self.device = worlds, len(task.agents), self.simulator.device

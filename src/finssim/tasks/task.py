@@ -1,5 +1,6 @@
 """What a task is: an observation schema, times, and the kernels that score, start and observe an episode."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from finssim.engine import Pool
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.measurement import MeasurementNoise
+from finssim.vehicles import Vehicle
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,14 @@ class Task:
     def vehicles(self) -> tuple[str, ...]:
         """Names of all vehicles in a world: agents, then others."""
         return (*self.agents, *self.others)
+
+    def fitted(self, vehicles: Sequence[Vehicle]) -> "Task":
+        """The task as these vehicles do it: itself, unless sizes and speeds follow from the vehicles."""
+        return self
+
+    def arena(self) -> Pool | None:
+        """Walls and floor, unless others are asked for; None is open water."""
+        return self.pool
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """Give `arrays` what only this task uses; nothing unless the task says so."""

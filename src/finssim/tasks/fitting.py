@@ -1,0 +1,63 @@
+"""How large and how fast a task is for a vehicle: lengths and speeds that are the published ones for the paper's."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.control.pole_placement import axis_model
+from finssim.vehicles import HydrodynamicSet, Vehicle
+
+__all__ = ["Fit", "coefficients_of", "driven_axes", "fit", "terminal_speeds"]
+
+LENGTH = 0.6
+"""Vehicles up to this long have the published pool, which FinsROV (0.56 m) fits [m]; for others everything grows."""
+
+SLOWEST_SPEED = 0.22
+"""Terminal speed of FinsROV's slowest direction, heave [m/s]: the published speeds are a part of it."""
+
+MASS = 12.11
+"""FinsROV's [kg]."""
+
+
+class Fit(NamedTuple):
+    """Factors on what a task is for FinsROV."""
+
+    size: float = 1.0
+    """On lengths."""
+    pace: float = 1.0
+    """On speeds and accelerations."""
+    weight: float = 1.0
+    """On masses and stiffnesses."""
+
+
+def driven_axes(vehicle: Vehicle) -> tuple[int, ...]:
+    """Which of surge, sway and heave the thrusters control."""
+    names = ("surge", "sway", "heave")
+    limits = vehicle.wrench_limits
+    return tuple(i for i, name in enumerate(names) if limits[i] > 0.0 and name in vehicle.controlled_axes)
+
+
+def coefficients_of(vehicle: Vehicle) -> str:
+    """Name of the hydrodynamic set whose coefficients stand for the vehicle: the calibrated one, if its file has it."""
+    sets = [name for name, one in vehicle.hydrodynamics.items() if isinstance(one, HydrodynamicSet)]
+    return sets[0] if sets and "calibrated" not in sets else "calibrated"
+
+
+def terminal_speeds(vehicle: Vehicle) -> NDArray[np.float64]:
+    """Speed along each axis at the wrench limit, d1 v + d2 v² = tau, (6,) [m/s, rad/s]; infinite without damping."""
+    model = axis_model(vehicle, coefficients_of(vehicle))
+    d1, d2, tau = model.linear_damping, model.quadratic_damping, vehicle.wrench_limits
+    with np.errstate(divide="ignore", invalid="ignore"):
+        speed = 2.0 * tau / (d1 + np.sqrt(d1**2 + 4.0 * d2 * tau))
+    return np.asarray(np.where(d1 + d2 > 0.0, speed, np.inf))
+
+
+def fit(vehicle: Vehicle) -> Fit:
+    """Room in proportion to the vehicle's length, speeds in proportion to the room or to what it can do, the lesser."""
+    size = max(1.0, max(vehicle.body.size) / LENGTH)
+    speeds = terminal_speeds(vehicle)[list(driven_axes(vehicle))]
+    slowest = float(speeds.min()) if len(speeds) else 0.0
+    return Fit(size, min(size, slowest / SLOWEST_SPEED), max(1.0, vehicle.body.mass / MASS))
