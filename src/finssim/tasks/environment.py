@@ -1,8 +1,7 @@
 """The batched environment: any task, any vehicle, thousands of worlds, with automatic reset."""
 
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,48 +11,36 @@ from numpy.typing import ArrayLike, NDArray
 
 from finssim.engine import Pool, Simulator, TetherLine, Water
 from finssim.engine.randomize import Randomization
-from finssim.physics.types import vec6
 from finssim.tasks.actions import ACTION_MODES, action_size, add_action
 from finssim.tasks.arrays import task_arrays
-from finssim.tasks.measurement import MeasurementNoise, measure, measurement
+from finssim.tasks.given import (
+    GREATEST_SEED,
+    EnvironmentSetupError,
+    Step,
+    checked_action,
+    checked_seed,
+    crew,
+)
+from finssim.tasks.measurement import MeasurementNoise, connect_measured, measure, measurement
+from finssim.tasks.placing import place
+from finssim.tasks.saved_state import load_state, save_state
 from finssim.tasks.task import Task
-from finssim.vehicles import Vehicle, load_vehicle
+from finssim.vehicles import Vehicle
+
+__all__ = ["GREATEST_SEED", "Environment", "EnvironmentSetupError", "Step"]
 
 GPU_FROZEN_CHECK = 100
 """Steps between looks for frozen worlds on a GPU."""
-
-GREATEST_SEED = 2**31 - 1
-"""Kernels take seeds as 32-bit integers."""
-
-
-class EnvironmentSetupError(ValueError):
-    """An environment that cannot be set up, or an action it cannot take."""
-
-
-@dataclass(frozen=True)
-class Step:
-    """What one step gave; NumPy views of the environment's own arrays, valid until the next step."""
-
-    observation: NDArray[np.float32]
-    """(worlds, size), or (worlds, agents, size) of several agents; the first of the new episode where one ended."""
-    reward: NDArray[np.float32]
-    """(worlds,), or (worlds, agents)."""
-    terminated: NDArray[np.bool_]
-    """Ended by the task, (worlds,)."""
-    truncated: NDArray[np.bool_]
-    """Ended by the time limit, (worlds,)."""
-    final_observation: NDArray[np.float32]
-    """Last observation of the episodes that ended in this step; older rows elsewhere."""
 
 
 class Environment:
     """The task's agents, which are the first vehicles of every world, act; the task commands the others.
 
     Attributes:
-        task: What is done, fitted to the vehicles.
         agents: How many agents a world has.
         simulator: The worlds.
         arrays: Actions, observations, rewards and goals, as Warp arrays by world.
+        parameters: The struct of the task's settings that its kernels take.
     """
 
     def __init__(
@@ -101,19 +88,18 @@ class Environment:
         Raises:
             EnvironmentSetupError: unknown action mode, vehicles that do not fit the task, or a seed out of range.
         """
-        self.action_mode, self.seed = action or task.action, _checked_seed(seed)
+        self.task, self.action_mode, self.seed = task, action or task.action, checked_seed(seed)
         self.crash_directory, self.auto_reset = crash_directory, auto_reset
         if self.action_mode not in ACTION_MODES:
             raise EnvironmentSetupError(
                 f"unknown action mode '{self.action_mode}'; available: {', '.join(ACTION_MODES)}"
             )
-        vehicles = _crew(vehicle, task, self.action_mode)
-        self.task = task = task.fitted(vehicles)
+        vehicles = crew(vehicle, task, self.action_mode)
         longest = max((t.delay for one in vehicles for t in one.thrusters.values()), default=0.0)
         extra = randomization.simulator_arguments(longest) if randomization else {}
         self.simulator = Simulator(
             vehicles, worlds=worlds, hydrodynamics=hydrodynamics, control_step=task.control_step,
-            substeps=task.substeps, integrator=integrator, water=water, pool=pool or task.arena(), tether=tether,
+            substeps=task.substeps, integrator=integrator, water=water, pool=pool or task.pool, tether=tether,
             device=device, threads=threads, seed=self.seed, **extra,
         )  # fmt: skip
         self.worlds, self.agents, self.device = worlds, len(task.agents), self.simulator.device
@@ -129,7 +115,7 @@ class Environment:
         self.randomization = randomization
         self._mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
         self._steps = 0
-        self._connect_measurement()
+        connect_measured(self.noise, self.simulator.state, self.arrays)
         self._build()
         self.reset(seed=self.seed)
 
@@ -138,20 +124,9 @@ class Environment:
         """Numbers in the observation of an agent."""
         return self.task.observation_size
 
-    def _connect_measurement(self) -> None:
-        state, a = self.simulator.state, self.arrays
-        if not self.noise.present:
-            # The controller sees the truth: no copy, the same arrays.
-            a.position, a.quaternion, a.velocity = state.position, state.quaternion, state.velocity
-            return
-        shape = (self.worlds, len(self.simulator.vehicles))
-        a.position = wp.zeros(shape, dtype=wp.vec3, device=self.device)
-        a.quaternion = wp.zeros(shape, dtype=wp.quat, device=self.device)
-        a.velocity = wp.zeros(shape, dtype=vec6, device=self.device)
-
     def _build(self) -> None:
         self._step = self.simulator.pipeline()
-        parameters = self.task.parameters()
+        self.parameters = parameters = self.task.parameters()
         if self.task.others:
             inputs = [self.simulator.state, self.arrays, parameters, self.seed]
             self._step.add(self.task.script, inputs)
@@ -194,7 +169,7 @@ class Environment:
             EnvironmentSetupError: the seed is out of range.
         """
         if seed is not None:
-            if _checked_seed(seed) != self.seed:
+            if checked_seed(seed) != self.seed:
                 self.seed = self.simulator.seed = int(seed)
                 self._build()
             self.simulator.restart_episodes(mask)
@@ -223,19 +198,7 @@ class Environment:
             Observations, (worlds, size).
         """
         self.reset()
-        for array, value, width in (
-            (self.simulator.state.position, position, 3),
-            (self.simulator.state.quaternion, quaternion, 4),
-        ):
-            everyone = array.numpy().copy()
-            everyone[:, 0] = np.broadcast_to(np.asarray(value, dtype=np.float32), (self.worlds, width))
-            array.assign(everyone)
-        self.simulator.state.velocity.zero_()
-        for array, value, width in (
-            (self.arrays.goal_position, goal_position, 3),
-            (self.arrays.goal_quaternion, goal_quaternion, 4),
-        ):
-            array.assign(np.array(np.broadcast_to(np.asarray(value, dtype=np.float32), (self.worlds, width))))
+        place(self, position, quaternion, goal_position, goal_quaternion)
         again = self.simulator.pipeline()
         self._add_measure(again)
         again.add(self.task.observe, [self.arrays, self._mask])
@@ -251,20 +214,7 @@ class Environment:
         Raises:
             EnvironmentSetupError: the shape is wrong or a number is not finite.
         """
-        a = np.asarray(action, dtype=np.float32)
-        agents = () if self.agents == 1 else (self.agents,)
-        expected = (self.worlds, *agents, self.action_size)
-        if a.shape != expected:
-            raise EnvironmentSetupError(
-                f"action has shape {a.shape}, expected {expected}: one row per {'agent' if agents else 'world'}"
-            )
-        a = a.reshape(self.worlds, -1)
-        if not np.isfinite(a).all():
-            world = int(np.flatnonzero(~np.isfinite(a).all(axis=1))[0])
-            raise EnvironmentSetupError(
-                f"action of world {world} has a number that is not finite: {a[world].tolist()}"
-            )
-        self.arrays.action.assign(a)
+        self.arrays.action.assign(checked_action(action, self.worlds, self.agents, self.action_size))
         self.advance()
         return self.outcome()
 
@@ -297,27 +247,14 @@ class Environment:
             a.truncated.numpy() != 0, self._by_agent(a.final_observation.numpy()),
         )  # fmt: skip
 
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Everything that decides what comes next, as copies; see `load_state`."""
+        return save_state(self)
 
-def _crew(vehicle: Vehicle | str | Sequence[Vehicle | str], task: Task, mode: str) -> list[Vehicle]:
-    """The vehicles of a world: those that are given, or one of a kind for every place."""
-    given = [vehicle] * len(task.vehicles) if isinstance(vehicle, Vehicle | str) else list(vehicle)
-    if len(given) != len(task.vehicles):
-        names = ", ".join(task.vehicles)
-        raise EnvironmentSetupError(
-            f"{len(given)} vehicles are given, expected {len(task.vehicles)} for task '{task.name}': {names}"
-        )
-    crew = [one if isinstance(one, Vehicle) else load_vehicle(one) for one in given]
-    counts = {len(one.thrusters) for one in crew}
-    if mode == "thruster8" and len(counts) > 1:
-        raise EnvironmentSetupError(
-            f"vehicles have {', '.join(map(str, sorted(counts)))} thrusters, expected equal numbers for actions by "
-            "thruster: take wrench6 or wrench4"
-        )
-    return crew
+    def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from where `state()` of an environment made with the same arguments was taken, bit for bit.
 
-
-def _checked_seed(seed: int) -> int:
-    """The seed, if the kernels can take it."""
-    if not 0 <= seed <= GREATEST_SEED:
-        raise EnvironmentSetupError(f"seed is {seed}, expected 0 to {GREATEST_SEED}")
-    return int(seed)
+        Raises:
+            EnvironmentSetupError: It was made with other arguments.
+        """
+        load_state(self, state)

@@ -6,8 +6,8 @@ from dataclasses import dataclass, fields
 import warp as wp
 
 from finssim.engine.state import HISTORY, State
+from finssim.physics.types import vec6
 from finssim.tasks.arrays import TaskArrays
-
 
 LONGEST_DELAY = 2.0
 """Of what a controller sees [s]; states are kept for 50 control steps."""
@@ -73,6 +73,17 @@ class Measurement:
     position_bias: float
     yaw_bias: float
     steps: int  # of delay
+
+
+def connect_measured(noise: MeasurementNoise, state: State, arrays: TaskArrays) -> None:
+    """Give the task arrays for what is measured: without noise those of the state itself, so that nothing is copied."""
+    if not noise.present:
+        arrays.position, arrays.quaternion, arrays.velocity = state.position, state.quaternion, state.velocity
+        return
+    shape, device = state.position.shape, state.position.device
+    arrays.position = wp.zeros(shape, dtype=wp.vec3, device=device)
+    arrays.quaternion = wp.zeros(shape, dtype=wp.quat, device=device)
+    arrays.velocity = wp.zeros(shape, dtype=vec6, device=device)
 
 
 def measurement(noise: MeasurementNoise, control_step: float) -> Measurement:

@@ -1,0 +1,80 @@
+"""A run that goes on from a saved state is bitwise the run that was not interrupted."""
+
+import numpy as np
+import pytest
+
+import finssim
+from finssim.engine import Water
+from finssim.tasks import TASKS, EnvironmentSetupError, MeasurementNoise
+
+NOISE = MeasurementNoise(
+    position_std=0.02, yaw_std=0.1, velocity_std=0.02, rate_std=0.02, position_bias=0.01, delay=0.2
+)
+WATER = Water(current=(0.05, 0.0, 0.0), drift_std=(0.05, 0.05, 0.02), drift_time=5.0)
+
+
+def made(task, **options):
+    """A few worlds in which everything is random, at episodes of random age, so that some end soon."""
+    options = {"worlds": 6, "seed": 4, "observe": NOISE, "water": WATER, **options}
+    environment = finssim.make(task, randomize="fossen_learn_to_swim", **options)
+    limit = round(environment.task.time_limit / environment.task.control_step)
+    age = np.linspace(0, limit - 12, environment.worlds).astype(np.int32)
+    environment.simulator.state.steps.assign(age)
+    return environment
+
+
+def act(environment, steps, seed):
+    """Everything that comes out of random actions."""
+    rng, seen = np.random.default_rng(seed), []
+    for _ in range(steps):
+        action = rng.uniform(-1.0, 1.0, environment.arrays.action.shape).astype(np.float32)
+        environment.arrays.action.assign(action)
+        environment.advance()
+        out = environment.outcome()
+        seen += [
+            np.array(x) for x in (out.observation, out.reward, out.terminated, out.truncated, out.final_observation)
+        ]
+    return seen
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_run_that_goes_on_is_the_run_that_was_not_interrupted(task):
+    """Through ends of episodes, new draws and the delay lines: outputs and states afterwards."""
+    whole, other = made(task), made(task)
+    act(whole, 7, seed=0)
+    saved = whole.state()
+    act(other, 3, seed=9)  # whatever it did before is forgotten
+    other.reset(seed=77)
+    other.load_state(saved)
+    first, second = act(whole, 12, seed=1), act(other, 12, seed=1)
+    assert any(done.any() for done in first[3::5]), "no episode ended: the test proves less than it says"
+    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+    after, again = whole.state(), other.state()
+    assert after.keys() == again.keys() and all(np.array_equal(after[k], again[k], equal_nan=True) for k in after)
+
+
+def test_a_saved_state_is_a_copy():
+    """What happens afterwards does not change it."""
+    environment = made("t1")
+    saved = environment.state()
+    before = {name: array.copy() for name, array in saved.items()}
+    act(environment, 5, seed=2)
+    assert all(np.array_equal(saved[name], before[name], equal_nan=True) for name in saved)
+    assert not np.array_equal(saved["state.position"], environment.state()["state.position"])
+
+
+def test_loading_keeps_the_memory_of_the_arrays():
+    """Tensors that look at the arrays go on seeing them."""
+    environment = made("t1")
+    place = environment.arrays.observation.ptr
+    environment.load_state(environment.state())
+    assert environment.arrays.observation.ptr == place
+
+
+def test_a_state_of_another_environment_is_refused():
+    """Other numbers of worlds, or another task."""
+    saved = made("t1").state()
+    with pytest.raises(EnvironmentSetupError, match=r"has shape \(6, .*expected \(5, .*same arguments"):
+        made("t1", worlds=5).load_state(saved)
+    with pytest.raises(EnvironmentSetupError, match="'task.reference.duration' is not in the saved state"):
+        made("t2").load_state(saved)
