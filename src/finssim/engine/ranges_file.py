@@ -1,20 +1,25 @@
 """Ranges of domain randomisation: one YAML file, checked when it is read."""
 
 import difflib
-import math
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ValidationError,
-    model_validator,
-)
+import numpy as np
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError, model_validator
 
+from finssim.engine.distributions import (
+    Above0,
+    Distribution,
+    Interval,
+    Part,
+    Scale,
+    Share,
+    bounds_of,
+    checked,
+    sentence,
+)
+from finssim.engine.ranges_schedule import Automatic, Curriculum
 from finssim.engine.surroundings import SurroundingsError, Wave
 from finssim.yaml_file import read_mapping
 
@@ -22,38 +27,28 @@ SHIPPED = Path(__file__).parent / "ranges"
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 MOST_WAVES = 8
 """Most waves that may be drawn for a world: every one costs time in every step."""
+LONGEST = 2.0
+"""Longest delay that may be drawn, of a command or of what is seen [s]."""
 
 
 class RangesError(ValueError):
     """A ranges file that cannot be used."""
 
 
-def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
-    if not all(math.isfinite(x) for x in pair) or pair[0] > pair[1]:
-        raise ValueError(f"is {list(pair)}, expected two finite numbers [low, high] with low <= high")
-    return pair
+def _either(part: type[BaseModel]) -> Callable[[Any], Any]:
+    """Reads a mapping that has a key of `part` as that part; leaves everything else to the distributions."""
 
+    def read(value: Any) -> Any:
+        named = isinstance(value, Mapping) and not set(value) & set(Distribution.model_fields)
+        return checked(part, value) if named else value
 
-def _positive(pair: tuple[float, float]) -> tuple[float, float]:
-    if pair[0] < 0.0:
-        raise ValueError(f"is {list(pair)}, expected numbers of 0 or more")
-    return pair
-
-
-def _above_zero(pair: tuple[float, float]) -> tuple[float, float]:
-    if pair[0] <= 0.0:
-        raise ValueError(f"is {list(pair)}, expected numbers above 0")
-    return pair
+    return read
 
 
 def _factor_or_with_mass(value: Any) -> Any:
     if isinstance(value, str) and value != "with_mass":
         raise ValueError(f"is '{value}', expected two numbers [low, high] or with_mass")
     return value
-
-
-def _positive_or_with_mass(value: Any) -> Any:
-    return value if value == "with_mass" else _above_zero(_ordered(value))
 
 
 def _count(pair: tuple[int, int]) -> tuple[int, int]:
@@ -64,39 +59,48 @@ def _count(pair: tuple[int, int]) -> tuple[int, int]:
     return pair
 
 
-Interval = Annotated[tuple[float, float], AfterValidator(_ordered)]
-Scale = Annotated[Interval, AfterValidator(_positive)]
-Above0 = Annotated[Interval, AfterValidator(_above_zero)]
-Volume = Annotated[
-    tuple[float, float] | Literal["with_mass"],
-    BeforeValidator(_factor_or_with_mass),
-    AfterValidator(_positive_or_with_mass),
-]
+def _short(drawn: Any) -> Any:
+    if bounds_of(drawn)[1] > LONGEST:
+        raise ValueError(f"reaches {bounds_of(drawn)[1]:g} s, expected at most {LONGEST:g} s")
+    return drawn
 
 
-class Part(BaseModel):
-    """Frozen, and no unknown keys."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
+Time = Annotated[Scale, AfterValidator(_short)]
+ONE, NONE = (1.0, 1.0), (0.0, 0.0)
 
 
 class AxisScales(Part):
     """A common factor and one factor per axis; an axis not named keeps its own factor at 1."""
 
-    all: Scale = (1.0, 1.0)
+    all: Scale = ONE
     axes: dict[Literal["surge", "sway", "heave", "roll", "pitch", "yaw"], Scale] = Field(default_factory=dict)
 
     def bounds(self) -> tuple[list[float], list[float]]:
         """Low and high factor of each axis, six each."""
-        pairs = [self.axes.get(axis, (1.0, 1.0)) for axis in AXES]  # type: ignore[call-overload]
+        pairs = [bounds_of(self.axes.get(axis, ONE)) for axis in AXES]  # type: ignore[call-overload]
         return [p[0] for p in pairs], [p[1] for p in pairs]
 
 
-class ThrustScales(Part):
+class Offsets(Part):
+    """An offset along each axis [m]."""
+
+    x: Interval = NONE
+    y: Interval = NONE
+    z: Interval = NONE
+
+
+class EachScales(Part):
     """A factor common to all thrusters and one for each."""
 
-    all: Scale = (1.0, 1.0)
-    each: Scale = (1.0, 1.0)
+    all: Scale = ONE
+    each: Scale = ONE
+
+
+class ThrustScales(EachScales):
+    """Factors on the thrust; and thrusters that fail."""
+
+    failure: Scale = ONE
+    """What is left of a thruster's thrust; give it a probability, by which each thruster fails on its own."""
 
 
 class WaveRanges(Part):
@@ -110,14 +114,83 @@ class WaveRanges(Part):
 
     @model_validator(mode="after")
     def _unbroken(self) -> "WaveRanges":
-        highest, shortest = self.amplitude[1], self.wavelength[0]
+        highest, shortest = bounds_of(self.amplitude)[1], bounds_of(self.wavelength)[0]
         try:
             Wave(amplitude=highest, wavelength=shortest)
         except SurroundingsError:
             raise ValueError(
-                f"amplitude is {list(self.amplitude)}, expected less than 0.07 of the shortest wavelength, "
+                f"amplitude is {list(bounds_of(self.amplitude))}, expected less than 0.07 of the shortest wavelength, "
                 f"{0.07 * shortest:.3g} m here: a linear wave breaks above it"
             ) from None
+        return self
+
+
+class DriftRanges(Part):
+    """A slow random part of the current, along each horizontal axis."""
+
+    deviation: Scale
+    """Its standard deviation [m/s]."""
+    time: Above0 = (15.0, 15.0)
+    """Its correlation time [s]."""
+
+
+class TetherRanges(Part):
+    """The line to the vehicle; a line of the environment's own keeps what is not named here."""
+
+    diameter: Above0 | None = None
+    """[m]"""
+    drag_coefficient: Scale | None = None
+    wet_weight: Interval | None = None
+    """In water, per length [N/m]; negative floats."""
+
+
+class SensorRanges(Part):
+    """What the controller sees, in place of the environment's own noise; what is not named keeps that."""
+
+    position_std: Scale | None = None
+    """Of the noise, per axis [m]."""
+    yaw_std: Scale | None = None
+    """[rad]"""
+    velocity_std: Scale | None = None
+    """[m/s]"""
+    rate_std: Scale | None = None
+    """[rad/s]"""
+    position_bias: Scale | None = None
+    """Standard deviation of an offset that lasts an episode, per axis [m]."""
+    yaw_bias: Scale | None = None
+    """[rad]"""
+    velocity_bias: Scale | None = None
+    """[m/s]"""
+    rate_bias: Scale | None = None
+    """[rad/s]"""
+    dropout: Share | None = None
+    """Probability that a control step brings nothing new."""
+    delay: Time | None = None
+    """Age of what is seen [s]."""
+
+
+class Correlated(Part):
+    """Entries whose draws go together: by rank, so that each keeps the distribution of its own."""
+
+    entries: tuple[str, ...] = Field(min_length=2)
+    """Names as in the table of entries, such as linear_damping.surge."""
+    correlation: tuple[tuple[float, ...], ...]
+    """Of the normal numbers behind them, (n, n); of the draws themselves where these are normal and hardly cut."""
+
+    @model_validator(mode="after")
+    def _positive(self) -> "Correlated":
+        n = len(self.entries)
+        if any(len(row) != n for row in self.correlation) or len(self.correlation) != n:
+            raise ValueError(f"correlation is not {n} by {n}, expected a row and a column for every entry")
+        R = np.array(self.correlation)
+        if not np.isfinite(R).all() or abs(R - R.T).max() > 1e-6 or abs(np.diag(R) - 1.0).max() > 1e-6:
+            raise ValueError("correlation: expected a symmetric matrix with 1 on its diagonal")
+        if np.linalg.eigvalsh(R).min() < -1e-6:
+            raise ValueError(
+                "correlation: expected a matrix without negative eigenvalues: these cannot go together"
+            )
+        if len(set(self.entries)) != n:
+            raise ValueError("entries: one is named twice")
         return self
 
 
@@ -126,26 +199,54 @@ class Ranges(Part):
 
     name: str
     source: str = ""
-    mass: Above0 = (1.0, 1.0)
-    volume: Volume = (1.0, 1.0)
+    mass: Above0 = ONE
+    volume: Annotated[Above0 | Literal["with_mass"], BeforeValidator(_factor_or_with_mass)] = ONE
     """A factor, or `with_mass`: the volume follows the mass, so that the trim is kept."""
-    inertia: Above0 = (1.0, 1.0)
-    center_of_gravity: Interval = (0.0, 0.0)
+    inertia: Above0 = ONE
+    center_of_gravity: Annotated[Interval | Offsets, BeforeValidator(_either(Offsets))] = NONE
     """Offset along each axis [m]."""
-    center_of_buoyancy: Interval = (0.0, 0.0)
+    center_of_buoyancy: Annotated[Interval | Offsets, BeforeValidator(_either(Offsets))] = NONE
     """Offset along each axis [m]."""
     added_mass: AxisScales = AxisScales()
     linear_damping: AxisScales = AxisScales()
     quadratic_damping: AxisScales = AxisScales()
-    mesh_drag: Scale = (1.0, 1.0)
+    surge_damping: Scale = ONE
+    """Factor on the damping that is coupled to surge."""
+    mesh_drag: Scale = ONE
     """Factor on form and skin drag of the mesh model."""
     thrust: ThrustScales = ThrustScales()
-    time_constant: Scale = (1.0, 1.0)
-    delay: Scale = (1.0, 1.0)
-    slew: Scale = (1.0, 1.0)
-    current: Scale = (0.0, 0.0)
+    time_constant: Annotated[Scale | EachScales, BeforeValidator(_either(EachScales))] = ONE
+    added_time_constant: Time = NONE
+    """[s]"""
+    delay: Scale = ONE
+    added_delay: Time = NONE
+    """[s]"""
+    command_jitter: Time = NONE
+    """A command comes later by up to this, drawn anew every control step [s]."""
+    slew: Scale = ONE
+    dead_zone: Scale = ONE
+    added_dead_zone: Scale = NONE
+    """To either side [N]."""
+    current: Scale = NONE
     """Horizontal speed [m/s], in a random direction."""
+    vertical_current: Interval = NONE
+    """Upwards [m/s]."""
+    current_drift: DriftRanges | None = None
     waves: WaveRanges | None = None
+    tether: TetherRanges | None = None
+    sensors: SensorRanges | None = None
+    correlated: tuple[Correlated, ...] = ()
+    curriculum: Curriculum | None = None
+    automatic: Automatic | None = None
+
+    @model_validator(mode="after")
+    def _together(self) -> "Ranges":
+        from finssim.engine.ranges_table import check_correlated  # the table is made of this file's parts
+
+        check_correlated(self)
+        if self.curriculum is not None and self.automatic is not None:
+            raise ValueError("curriculum and automatic both say how ranges grow: give one of them")
+        return self
 
 
 def available() -> list[str]:
@@ -172,10 +273,10 @@ def load_ranges(name_or_path: str | Path) -> Ranges:
             f"no ranges '{name_or_path}': give a YAML file or one of {', '.join(available())}{hint}"
         )
     data = read_mapping(path, RangesError, such_as="mass: [0.98, 1.02]")
+    if not all(isinstance(key, str) for key in data):
+        key = next(key for key in data if not isinstance(key, str))
+        raise RangesError(f"{path}: {key}: expected the name of an entry, such as mass")
     try:
         return Ranges.model_validate({"name": path.stem, **data})
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(x) for x in first["loc"] if "[" not in str(x))  # not pydantic's names of types
-        message = first["msg"].removeprefix("Value error, ")
-        raise RangesError(f"{path}: {where}: {message}") from None
+        raise RangesError(f"{path}: {sentence(error, Ranges)}") from None

@@ -37,6 +37,7 @@ class Simulator:
         command: Thruster force commands [N] and disturbance wrenches; write them before `step`.
         plant: Parameters by (world, vehicle); after writing any of them call `refresh`.
         water: Water by world.
+        tether: Lines by (world, vehicle).
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class Simulator:
         max_delay: float | None = None,
         max_waves: int = 0,
         water_moves: bool = False,
+        water_drifts: bool = False,
     ) -> None:
         """Set up the worlds.
 
@@ -76,6 +78,7 @@ class Simulator:
             max_delay: Longest thruster delay that randomisation may set [s]; twice the vehicles' own if None.
             max_waves: Room for this many randomised waves besides those of `water`.
             water_moves: Simulate moving water even if `water` stands still: somebody will write currents or waves.
+            water_drifts: Let currents drift by world, even if those of `water` do not: somebody will write how far.
 
         Raises:
             SimulatorError: a name or number is out of its range; it says which.
@@ -94,7 +97,8 @@ class Simulator:
             raise SimulatorError(f"threads is {threads}, expected at least 1")
         self.worlds, self.control_step, self.substeps, self.seed = worlds, control_step, substeps, seed
         self.device = find_device(device)
-        self._surround(water or Water(), pool, tether, max_waves, water_moves)
+        self._drifts = water_drifts or (water is not None and water.drifting)
+        self._surround(water or Water(), pool, tether, max_waves, water_moves or water_drifts)
         self._hulls()
         n = len(self.vehicles)
         self.plant = build_plant(self.vehicles, hydrodynamics, worlds, self._hull_index, self.device)
@@ -122,7 +126,8 @@ class Simulator:
         self.water = water.arrays(self.worlds, fluid.density, fluid.gravity, self.device, max_waves)
         self.water.moving = int(moves or bool(self.water.moving))
         self.walls = pool.walls() if pool else PoolWalls()
-        self.tether = tether.struct() if tether else Tether()
+        line, shape = tether.struct() if tether else Tether(), (self.worlds, len(self.vehicles))
+        self.tether = wp.full(shape, value=line, dtype=Tether, device=self.device)
 
     def _hulls(self) -> None:
         meshes: list[tuple[NDArray[Any], NDArray[Any]]] = []
@@ -153,7 +158,7 @@ class Simulator:
 
     def add_step(self, pipeline: Pipeline) -> None:
         """Append the kernels of one control step."""
-        if self.surroundings[0].drifting:
+        if self._drifts:
             s = self.state
             pipeline.add(advance_drift, [self.water, s.steps, self.control_step, self.seed, s.episode])
         kernel = physics_kernel(

@@ -65,7 +65,7 @@ def physics_kernel(
         hull: HullMesh,
         water: WaterArrays,
         walls: PoolWalls,
-        tether: Tether,
+        tether: wp.array2d(dtype=Tether),
         w: int,
         v: int,
         position: wp.vec3,
@@ -116,7 +116,7 @@ def physics_kernel(
         if wp.static(walls_present):
             tau += contact_wrench(walls, position, q, nu, plant[w, v].half_size)
         if wp.static(tether_present):
-            tau += tether_wrench(tether, water.density, position, q, nu, flow.velocity)
+            tau += tether_wrench(tether[w, v], water.density, position, q, nu, flow.velocity)
         return symmetric_times(plant[w, v].M_inv, tau - coriolis_wrench(momentum, nu))
 
     @wp.kernel(enable_backward=False, module="unique", module_options=MODULE_OPTIONS)
@@ -132,7 +132,7 @@ def physics_kernel(
         hull: HullMesh,
         water: WaterArrays,
         walls: PoolWalls,
-        tether: Tether,
+        tether: wp.array2d(dtype=Tether),
         control_step: float,
         substeps: int,
         world_offset: int,

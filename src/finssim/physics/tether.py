@@ -9,7 +9,7 @@ from finssim.physics.types import join, vec6
 
 @wp.struct
 class Tether:
-    """A tether shared by all worlds; a diameter of 0 means none."""
+    """The tether of one vehicle; a diameter of 0 means none."""
 
     anchor: wp.vec3  # where it enters the water, world frame [m]
     attachment: wp.vec3  # on the vehicle, body frame [m]

@@ -59,6 +59,8 @@ class TaskArrays:
     position: wp.array2d(dtype=wp.vec3)  # (worlds, vehicles), as measured: the truth, or the truth with noise
     quaternion: wp.array2d(dtype=wp.quat)
     velocity: wp.array2d(dtype=vec6)
+    privileged: wp.array2d(dtype=float)  # (worlds, agents * P): what was drawn, from nominal, about unit scale
+    final_privileged: wp.array2d(dtype=float)  # the same of the episode that ended last
 
 
 def task_arrays(

@@ -13,6 +13,7 @@ from finssim.engine import Pool, Simulator, TetherLine, Water
 from finssim.engine.randomize import Randomization
 from finssim.tasks.actions import ACTION_MODES, action_size, add_action
 from finssim.tasks.arrays import task_arrays
+from finssim.tasks.drawing import Drawing
 from finssim.tasks.given import (
     GREATEST_SEED,
     EnvironmentSetupError,
@@ -21,7 +22,7 @@ from finssim.tasks.given import (
     checked_seed,
     crew,
 )
-from finssim.tasks.measurement import MeasurementNoise, connect_measured, measure, measurement
+from finssim.tasks.measurement import MeasurementNoise, connect_measured, measure, measurements
 from finssim.tasks.placing import place
 from finssim.tasks.saved_state import load_state, save_state
 from finssim.tasks.task import Task
@@ -41,6 +42,7 @@ class Environment:
         simulator: The worlds.
         arrays: Actions, observations, rewards and goals, as Warp arrays by world.
         parameters: The struct of the task's settings that its kernels take.
+        drawing: What randomisation draws, how its ranges grow, and a log of it.
     """
 
     def __init__(
@@ -63,6 +65,7 @@ class Environment:
         seed: int = 0,
         crash_directory: Path = Path("finssim-frozen"),
         auto_reset: bool = True,
+        privileged: bool = False,
     ) -> None:
         """Set up the worlds and start an episode in each.
 
@@ -84,6 +87,7 @@ class Environment:
             seed: Of goals, starts, randomisation and noise; 0 to 2³¹ - 1.
             crash_directory: Where the last states of a world that froze are written.
             auto_reset: Start a new episode where one ended, in the same step.
+            privileged: Tell in `arrays.privileged` what was drawn, for critics that may know it; `privileged_names`.
 
         Raises:
             EnvironmentSetupError: unknown action mode, vehicles that do not fit the task, or a seed out of range.
@@ -96,10 +100,10 @@ class Environment:
             )
         vehicles = crew(vehicle, task, self.action_mode)
         longest = max((t.delay for one in vehicles for t in one.thrusters.values()), default=0.0)
-        extra = randomization.simulator_arguments(longest) if randomization else {}
+        extra = randomization.simulator_arguments(longest, tether) if randomization else {"tether": tether}
         self.simulator = Simulator(
             vehicles, worlds=worlds, hydrodynamics=hydrodynamics, control_step=task.control_step,
-            substeps=task.substeps, integrator=integrator, water=water, pool=pool or task.pool, tether=tether,
+            substeps=task.substeps, integrator=integrator, water=water, pool=pool or task.pool,
             device=device, threads=threads, seed=self.seed, **extra,
         )  # fmt: skip
         self.worlds, self.agents, self.device = worlds, len(task.agents), self.simulator.device
@@ -115,7 +119,10 @@ class Environment:
         self.randomization = randomization
         self._mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
         self._steps = 0
-        connect_measured(self.noise, self.simulator.state, self.arrays)
+        self._seen = measurements(self.noise, (worlds, len(vehicles)), self.device)
+        self._measured = self.noise.present or bool(randomization and randomization.changes_sensors)
+        connect_measured(self._measured, self.simulator.state, self.arrays)
+        self.drawing = Drawing(randomization, self.simulator, self.arrays, self._seen, task, privileged)
         self._build()
         self.reset(seed=self.seed)
 
@@ -124,6 +131,11 @@ class Environment:
         """Numbers in the observation of an agent."""
         return self.task.observation_size
 
+    @property
+    def privileged_names(self) -> list[str]:
+        """Names of the privileged numbers of an agent, in order; empty unless they were asked for."""
+        return self.drawing.names
+
     def _build(self) -> None:
         self._step = self.simulator.pipeline()
         self.parameters = parameters = self.task.parameters()
@@ -131,26 +143,25 @@ class Environment:
             inputs = [self.simulator.state, self.arrays, parameters, self.seed]
             self._step.add(self.task.script, inputs)
         add_action(self.action_mode, self.simulator, self.arrays, self.agents, self.wrench_scale)(self._step)
+        self.drawing.add_step(self._step, self.seed)
         self.simulator.add_step(self._step)
         self._add_measure(self._step)
         self._step.add(self.task.evaluate, [self.simulator.state, self.arrays, parameters])
+        self.drawing.add_end(self._step)
         if self.auto_reset:
             self._add_start(self._step, self.arrays.done, parameters)
         self._start = self.simulator.pipeline()
         self._add_start(self._start, self._mask, parameters)
 
     def _add_measure(self, pipeline: Any) -> None:
-        if self.noise.present:
-            how = measurement(self.noise, self.task.control_step)
-            inputs = [self.simulator.state, self.arrays, how, self.seed]
+        if self._measured:
+            inputs = [self.simulator.state, self.arrays, self._seen.array, self.task.control_step, self.seed]
             pipeline.add(measure, inputs, vehicles=len(self.simulator.vehicles))
 
     def _add_start(self, pipeline: Any, mask: wp.array, parameters: Any) -> None:
         simulator = self.simulator
         simulator.add_reset(pipeline, mask)
-        if self.randomization is not None:
-            self.randomization.add(pipeline, simulator, mask, self.seed)
-            simulator.add_refresh(pipeline, mask)
+        self.drawing.add_start(pipeline, mask, self.seed)
         pipeline.add(self.task.spawn, [simulator.state, self.arrays, parameters, self.seed, mask])
         self._add_measure(pipeline)
         pipeline.add(self.task.observe, [self.arrays, mask])
@@ -173,10 +184,13 @@ class Environment:
                 self.seed = self.simulator.seed = int(seed)
                 self._build()
             self.simulator.restart_episodes(mask)
+            if mask is None:
+                self.drawing.restart()
         self._mask.assign(
             np.ones(self.worlds, np.int32) if mask is None else np.asarray(mask, dtype=np.int32)
         )
         self._start.run()
+        self.drawing.after_reset()
         return self._by_agent(self.arrays.observation.numpy())
 
     def _by_agent(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -222,10 +236,16 @@ class Environment:
         """One control step with the actions that are in `arrays.action` already (no check, no copy)."""
         self._step.run()
         self._steps += 1
+        self.drawing.after_step()
         # On a GPU the look costs a copy, so frozen worlds wait there for a while, reported as terminated meanwhile.
         look = self.device.is_cpu or self._steps % GPU_FROZEN_CHECK == 0
         if look and self.simulator.state.frozen.numpy().any():
             self._revive()
+
+    def set_progress(self, done: float) -> None:
+        """Tell how much of the training is done, in [0, 1]: ranges may grow with it; without effect where none do."""
+        if self.drawing.schedule is not None:
+            self.drawing.schedule.progress(done)
 
     def _revive(self) -> None:
         """Report the worlds that froze, then start new episodes there; their step counts as terminated."""

@@ -3,8 +3,11 @@
 import math
 from dataclasses import dataclass, fields
 
+import numpy as np
 import warp as wp
 
+from finssim.engine.measured import Measurement
+from finssim.engine.packed import Packed
 from finssim.engine.state import HISTORY, State
 from finssim.physics.types import vec6
 from finssim.tasks.arrays import TaskArrays
@@ -15,7 +18,7 @@ LONGEST_DELAY = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class MeasurementNoise:
-    """How what a controller sees differs from the truth: white noise, an offset by episode, and a delay."""
+    """How what a controller sees differs from the truth: white noise, an offset by episode, gaps and a delay."""
 
     position_std: float = 0.0
     """Of the noise, drawn anew every control step, per axis [m]."""
@@ -29,6 +32,12 @@ class MeasurementNoise:
     """Standard deviation of an offset that lasts an episode, per axis [m]."""
     yaw_bias: float = 0.0
     """The same of the heading [rad]."""
+    velocity_bias: float = 0.0
+    """The same of the linear velocity, per axis [m/s]."""
+    rate_bias: float = 0.0
+    """The same of the angular velocity, per axis [rad/s]."""
+    dropout: float = 0.0
+    """Probability that a control step brings nothing new, below 1."""
     delay: float = 0.0
     """How old it is [s], taken to the nearest control step; nothing is older than the episode."""
 
@@ -36,6 +45,8 @@ class MeasurementNoise:
         values = tuple(getattr(self, field.name) for field in fields(self))
         if not all(math.isfinite(x) and x >= 0.0 for x in values):
             raise ValueError(f"measurement noise {values}: expected finite numbers of 0 or more")
+        if self.dropout >= 1.0:
+            raise ValueError(f"dropout of the measurement is {self.dropout}, expected a probability below 1")
         if self.delay > LONGEST_DELAY:
             raise ValueError(
                 f"delay of the measurement is {self.delay} s, expected at most {LONGEST_DELAY:g} s"
@@ -62,22 +73,9 @@ OBSERVED = {"truth": MeasurementNoise(), "estimator": ESTIMATOR}
 """What a controller may see, by name."""
 
 
-@wp.struct
-class Measurement:
-    """`MeasurementNoise` for the kernel."""
-
-    position_std: float
-    yaw_std: float
-    velocity_std: float
-    rate_std: float
-    position_bias: float
-    yaw_bias: float
-    steps: int  # of delay
-
-
-def connect_measured(noise: MeasurementNoise, state: State, arrays: TaskArrays) -> None:
+def connect_measured(present: bool, state: State, arrays: TaskArrays) -> None:
     """Give the task arrays for what is measured: without noise those of the state itself, so that nothing is copied."""
-    if not noise.present:
+    if not present:
         arrays.position, arrays.quaternion, arrays.velocity = state.position, state.quaternion, state.velocity
         return
     shape, device = state.position.shape, state.position.device
@@ -86,27 +84,35 @@ def connect_measured(noise: MeasurementNoise, state: State, arrays: TaskArrays) 
     arrays.velocity = wp.zeros(shape, dtype=vec6, device=device)
 
 
-def measurement(noise: MeasurementNoise, control_step: float) -> Measurement:
-    """The struct that the kernel takes."""
-    m = Measurement()
-    for name in ("position_std", "yaw_std", "velocity_std", "rate_std", "position_bias", "yaw_bias"):
-        setattr(m, name, getattr(noise, name))
-    m.steps = min(round(noise.delay / control_step), HISTORY - 1)
-    return m
+def measurements(noise: MeasurementNoise, shape: tuple[int, int], device: wp.Device) -> Packed:
+    """The same errors for every vehicle of every world, (worlds, vehicles); randomisation writes others."""
+    seen = Packed(Measurement, shape, device)
+    for name, array in seen.fields.items():
+        array.assign(np.full(shape, getattr(noise, name), dtype=np.float32))
+    return seen
 
 
 @wp.kernel(enable_backward=False)
-def measure(state: State, arrays: TaskArrays, m: Measurement, seed: int, world_offset: int):
+def measure(
+    state: State,
+    arrays: TaskArrays,
+    seen: wp.array2d(dtype=Measurement),
+    control_step: float,
+    seed: int,
+    world_offset: int,
+):
     """What is seen of every vehicle; the draw depends on seed, world, vehicle, episode and step alone."""
     i, v = wp.tid()
     w = world_offset + i
+    m = seen[w, v]
     x = state.position[w, v]
     q = state.quaternion[w, v]
     nu = state.velocity[w, v]
     step = state.steps[w]
-    if m.steps > 0 and step > 0:
+    late = wp.min(int(wp.rint(m.delay / control_step)), wp.static(HISTORY - 1))
+    if late > 0 and step > 0:
         # The history's slot k holds the state after step k + 1; the start of an episode is not in it.
-        past = state.history[wp.max(step - 1 - m.steps, 0) % wp.static(HISTORY), w, v]
+        past = state.history[wp.max(step - 1 - late, 0) % wp.static(HISTORY), w, v]
         x = wp.vec3(past[0], past[1], past[2])
         q = wp.quat(past[3], past[4], past[5], past[6])
         for k in range(6):
@@ -117,11 +123,13 @@ def measure(state: State, arrays: TaskArrays, m: Measurement, seed: int, world_o
     rng = wp.rand_init(wp.randi(own), step)
     n = wp.vec3(wp.randn(rng), wp.randn(rng), wp.randn(rng))
     lasting = wp.vec3(wp.randn(bias), wp.randn(bias), wp.randn(bias))
-    arrays.position[w, v] = x + m.position_std * n + m.position_bias * lasting
     angle = m.yaw_std * wp.randn(rng) + m.yaw_bias * wp.randn(bias)
+    for k in range(3):
+        nu[k] = nu[k] + m.velocity_std * wp.randn(rng) + m.velocity_bias * wp.randn(bias)
+    for k in range(3):
+        nu[k + 3] = nu[k + 3] + m.rate_std * wp.randn(rng) + m.rate_bias * wp.randn(bias)
+    if step > 0 and wp.randf(rng) < m.dropout:
+        return  # what was seen last is seen again
+    arrays.position[w, v] = x + m.position_std * n + m.position_bias * lasting
     arrays.quaternion[w, v] = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angle) * q
-    for k in range(3):
-        nu[k] = nu[k] + m.velocity_std * wp.randn(rng)
-    for k in range(3):
-        nu[k + 3] = nu[k + 3] + m.rate_std * wp.randn(rng)
     arrays.velocity[w, v] = nu

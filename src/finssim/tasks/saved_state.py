@@ -66,6 +66,7 @@ def _arrays(environment: "Environment") -> Iterator[tuple[str, wp.array]]:
     simulator = environment.simulator
     for name, packed in (("plant", simulator.plant), ("command", simulator.command)):
         yield from ((f"{name}.{field}", array) for field, array in packed.fields.items())
+    yield from ((f"drawing.{name}", array) for name, array in environment.drawing.arrays())
     for name, struct in (
         ("state", simulator.state),
         ("water", simulator.water),

@@ -1,0 +1,23 @@
+"""How what a controller sees differs from the truth, for every vehicle of every world."""
+
+import warp as wp
+
+
+@wp.struct
+class Measurement:
+    """Errors of what is seen of one vehicle; all 0 is the truth."""
+
+    position_std: float  # of noise drawn anew every control step, per axis [m]
+    yaw_std: float  # [rad]
+    velocity_std: float  # per axis of the linear velocity [m/s]
+    rate_std: float  # per axis of the angular velocity [rad/s]
+    position_bias: float  # standard deviation of an offset that lasts an episode, per axis [m]
+    yaw_bias: float  # [rad]
+    velocity_bias: float  # [m/s]
+    rate_bias: float  # [rad/s]
+    dropout: float  # probability that a control step brings nothing new
+    delay: float  # age of what is seen [s], taken to the nearest control step
+
+
+SENSORS = tuple(Measurement.cls.__annotations__)
+"""Names of its fields."""
