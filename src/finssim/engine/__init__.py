@@ -1,5 +1,6 @@
 """The batched simulator and what surrounds its vehicles."""
 
+from finssim.engine.dock import Dock
 from finssim.engine.plant_arrays import SimulatorError
 from finssim.engine.recorder import Recorder, read_run
 from finssim.engine.scene import Contact, Scene
@@ -9,6 +10,7 @@ from finssim.engine.surroundings import Pool, SurroundingsError, TetherLine, Wat
 
 __all__ = [
     "Contact",
+    "Dock",
     "PictureError",
     "Pool",
     "Recorder",

@@ -10,6 +10,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.engine.arguments import broadcast, find_device, one_of, shared_water
+from finssim.engine.dock import Dock
 from finssim.engine.launch import Pipeline
 from finssim.engine.packed import Packed
 from finssim.engine.plant_arrays import SimulatorError, build_plant
@@ -18,6 +19,7 @@ from finssim.engine.state import HISTORY, State, VehicleState, clear_actuators, 
 from finssim.engine.step import physics_kernel, tick
 from finssim.engine.surroundings import Pool, TetherLine, Water
 from finssim.physics.contact import PoolWalls
+from finssim.physics.funnel import Funnel
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
 from finssim.physics.hydrodynamics.mesh import HullMesh, hull_mesh
 from finssim.physics.plant import VehicleCommand, refresh_plant
@@ -37,6 +39,7 @@ class Simulator:
         command: Thruster force commands [N] and disturbance wrenches; write them before `step`.
         plant: Parameters by (world, vehicle); after writing any of them call `refresh`.
         water: Water by world.
+        funnel: Poses of the docks, and how hard vehicles touched them, by world.
         tether: Lines by (world, vehicle).
     """
 
@@ -52,6 +55,7 @@ class Simulator:
         water: Water | None = None,
         pool: Pool | None = None,
         tether: TetherLine | None = None,
+        dock: Dock | None = None,
         device: str = "cpu",
         threads: int | None = None,
         seed: int = 0,
@@ -72,6 +76,7 @@ class Simulator:
             water: Currents and waves; still water if None.
             pool: Walls and floor; open water if None.
             tether: On every vehicle; none if None.
+            dock: One in every world, which touches every vehicle; none if None.
             device: Warp device, `cpu` or `cuda`.
             threads: Threads on a CPU; all processors if None.
             seed: Of everything random in the worlds.
@@ -101,6 +106,8 @@ class Simulator:
         self._surround(water or Water(), pool, tether, max_waves, water_moves or water_drifts)
         self._hulls()
         n = len(self.vehicles)
+        self.dock = dock
+        self.funnel = dock.struct(worlds, n, self.device) if dock else Funnel()
         self.plant = build_plant(self.vehicles, hydrodynamics, worlds, self._hull_index, self.device)
         self.command = Packed(VehicleCommand, (worlds, n), self.device)
         longest = 2.0 * float(self.plant.delay.numpy().max()) if max_delay is None else max_delay
@@ -169,11 +176,12 @@ class Simulator:
             tether_present=self.surroundings[2] is not None,
             speed_lag=bool(self.plant.speed_lag.numpy().any()),
             surge_coupled=bool(self.plant.Du.numpy().any()),
+            funnel_present=self.dock is not None,
         )
-        fixed = [self.hull, self.water, self.walls, self.tether, self.control_step, self.substeps]
+        around = [self.hull, self.water, self.walls, self.tether, self.funnel]
         s = self.state
         clocks = [s.commands, s.history, s.steps, s.broken, s.frozen]
-        inputs = [s.vehicle, self.command.array, *clocks, self.plant.array, *fixed]
+        inputs = [s.vehicle, self.command.array, *clocks, self.plant.array, *around, self.control_step, self.substeps]
         pipeline.add(kernel, inputs, vehicles=len(self.vehicles))
         pipeline.add(tick, [self.state])
 

@@ -8,6 +8,7 @@ from finssim.engine.actuation import delayed_command, delivered_thrust, lag_targ
 from finssim.engine.state import HISTORY, State, VehicleState, is_finite, snapshot, vec13
 from finssim.physics.contact import PoolWalls, contact_wrench
 from finssim.physics.damping import surge_coupled_wrench, twist_at, wrench_from
+from finssim.physics.funnel import Funnel, funnel_wrench
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
 from finssim.physics.hydrodynamics.mesh import HullMesh
 from finssim.physics.inertia import coriolis_wrench, rigid_body_momentum, water_acceleration_wrench
@@ -34,6 +35,7 @@ def physics_kernel(
     tether_present: bool = True,
     speed_lag: bool = True,
     surge_coupled: bool = True,
+    funnel_present: bool = False,
 ) -> wp.Kernel:
     """The kernel for one hydrodynamic model and one integrator, without the code that a simulation does not need.
 
@@ -45,6 +47,7 @@ def physics_kernel(
         tether_present: Whether there is a tether.
         speed_lag: Whether some vehicle's motors lag in speed rather than in force.
         surge_coupled: Whether some vehicle's damping is coupled to surge (Du is not zero).
+        funnel_present: Whether there is a dock to enter.
 
     Returns:
         A kernel over (worlds of the slice, vehicles).
@@ -66,6 +69,7 @@ def physics_kernel(
         water: WaterArrays,
         walls: PoolWalls,
         tether: wp.array2d(dtype=Tether),
+        funnel: Funnel,
         w: int,
         v: int,
         position: wp.vec3,
@@ -115,6 +119,8 @@ def physics_kernel(
             tau += wet.wet * wrench_from(surge_coupled_wrench(nu_h, plant[w, v].Du), r_h)
         if wp.static(walls_present):
             tau += contact_wrench(walls, position, q, nu, plant[w, v].half_size)
+        if wp.static(funnel_present and runge_kutta):
+            tau += funnel_wrench(funnel, w, position, q, nu, plant[w, v].half_size)
         if wp.static(tether_present):
             tau += tether_wrench(tether[w, v], water.density, position, q, nu, flow.velocity)
         return symmetric_times(plant[w, v].M_inv, tau - coriolis_wrench(momentum, nu))
@@ -133,6 +139,7 @@ def physics_kernel(
         water: WaterArrays,
         walls: PoolWalls,
         tether: wp.array2d(dtype=Tether),
+        funnel: Funnel,
         control_step: float,
         substeps: int,
         world_offset: int,
@@ -169,6 +176,8 @@ def physics_kernel(
         head = step % commands.shape[2]
         commands[w, v, head] = newest
         max_change = h * plant[w, v].slew
+        greatest = float(0.0)
+        impulse = float(0.0)
         for k in range(substeps):
             elapsed = float(k) * h
             t = float(step) * control_step + elapsed
@@ -176,19 +185,27 @@ def physics_kernel(
             before = thrust_of(plant, w, v, actuator)
             actuator = first_order(actuator, target, plant[w, v].alpha, max_change)
             thrust = thrust_of(plant, w, v, actuator)
+            outer = other
+            if wp.static(funnel_present):
+                contact = funnel_wrench(funnel, w, position, q, nu, plant[w, v].half_size)
+                push = wp.length(linear(contact))
+                greatest = wp.max(greatest, push)
+                impulse += h * push
+                if wp.static(not runge_kutta):
+                    outer = other + contact
             if wp.static(runge_kutta):
                 tau = plant[w, v].B * (0.5 * (before + thrust))
                 x1 = position_rate(q, nu)
                 q1 = quaternion_rate(q, wp.vec3(nu[3], nu[4], nu[5]))
                 n1 = nu_dot_of(
-                    plant, hull, water, walls, tether, w, v, position, q, nu, tau, other, t, elapsed
+                    plant, hull, water, walls, tether, funnel, w, v, position, q, nu, tau, other, t, elapsed
                 )
                 nu2 = nu + 0.5 * h * n1
                 qm = wp.normalize(q + 0.5 * h * q1)
                 x2 = position_rate(qm, nu2)
                 q2 = quaternion_rate(qm, wp.vec3(nu2[3], nu2[4], nu2[5]))
                 n2 = nu_dot_of(
-                    plant, hull, water, walls, tether, w, v, position + 0.5 * h * x1, qm, nu2, tau, other,
+                    plant, hull, water, walls, tether, funnel, w, v, position + 0.5 * h * x1, qm, nu2, tau, other,
                     t + 0.5 * h, elapsed + 0.5 * h,
                 )  # fmt: skip
                 nu3 = nu + 0.5 * h * n2
@@ -196,7 +213,7 @@ def physics_kernel(
                 x3 = position_rate(qn, nu3)
                 q3 = quaternion_rate(qn, wp.vec3(nu3[3], nu3[4], nu3[5]))
                 n3 = nu_dot_of(
-                    plant, hull, water, walls, tether, w, v, position + 0.5 * h * x2, qn, nu3, tau, other,
+                    plant, hull, water, walls, tether, funnel, w, v, position + 0.5 * h * x2, qn, nu3, tau, other,
                     t + 0.5 * h, elapsed + 0.5 * h,
                 )  # fmt: skip
                 nu4 = nu + h * n3
@@ -204,7 +221,8 @@ def physics_kernel(
                 x4 = position_rate(qe, nu4)
                 q4 = quaternion_rate(qe, wp.vec3(nu4[3], nu4[4], nu4[5]))
                 n4 = nu_dot_of(
-                    plant, hull, water, walls, tether, w, v, position + h * x3, qe, nu4, tau, other, t + h, elapsed + h
+                    plant, hull, water, walls, tether, funnel, w, v, position + h * x3, qe, nu4, tau, other, t + h,
+                    elapsed + h,
                 )  # fmt: skip
                 nu_dot = (n1 + 2.0 * n2 + 2.0 * n3 + n4) / 6.0
                 position = position + (h / 6.0) * (x1 + 2.0 * x2 + 2.0 * x3 + x4)
@@ -213,7 +231,7 @@ def physics_kernel(
             else:
                 tau = plant[w, v].B * thrust
                 nu_dot = nu_dot_of(
-                    plant, hull, water, walls, tether, w, v, position, q, nu, tau, other, t, elapsed
+                    plant, hull, water, walls, tether, funnel, w, v, position, q, nu, tau, outer, t, elapsed
                 )
                 nu = nu + h * nu_dot
                 position = position + h * position_rate(q, nu)
@@ -229,6 +247,9 @@ def physics_kernel(
         state[w, v].acceleration = nu_dot
         state[w, v].actuator = actuator
         state[w, v].thrust = thrust
+        if wp.static(funnel_present):
+            funnel.force[w, v] = greatest
+            funnel.impulse[w, v] = impulse
 
     return physics_step
 

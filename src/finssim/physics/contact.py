@@ -21,6 +21,32 @@ class PoolWalls:
 
 
 @wp.func
+def penalty_force(
+    penetration: float, v: wp.vec3, n: wp.vec3, stiffness: float, damping: float, friction: float, slip: float
+) -> wp.vec3:
+    """Force of a surface on a point behind it: spring, damper against approach, and friction that never pulls.
+
+    Args:
+        penetration: Depth of the point behind the surface [m]; no force unless positive.
+        v: Velocity of the point [m/s].
+        n: Normal of the surface, out of the solid, in the same axes.
+        stiffness: [N/m].
+        damping: [N s/m].
+        friction: Coulomb coefficient.
+        slip: Speed below which friction is linear, so that it stays dissipative and has no step at rest [m/s].
+
+    Returns:
+        Force on the point, in the same axes [N].
+    """
+    if penetration <= 0.0:
+        return wp.vec3(0.0)
+    v_n = wp.dot(v, n)
+    normal = stiffness * penetration - damping * wp.min(v_n, 0.0)
+    v_t = v - v_n * n
+    return normal * n - friction * normal * v_t / wp.max(wp.length(v_t), slip)
+
+
+@wp.func
 def wall_force(penetration: float, v: wp.vec3, n: wp.vec3, walls: PoolWalls) -> wp.vec3:
     """Force of one wall on one corner: spring, damper against approach, and friction that never pulls.
 
@@ -33,13 +59,7 @@ def wall_force(penetration: float, v: wp.vec3, n: wp.vec3, walls: PoolWalls) -> 
     Returns:
         Force on the corner, world frame [N].
     """
-    if penetration <= 0.0:
-        return wp.vec3(0.0)
-    v_n = wp.dot(v, n)
-    normal = walls.stiffness * penetration - walls.damping * wp.min(v_n, 0.0)
-    v_t = v - v_n * n
-    # Friction is linear below 1 cm/s: it stays dissipative and has no step at rest.
-    return normal * n - walls.friction * normal * v_t / wp.max(wp.length(v_t), 0.01)
+    return penalty_force(penetration, v, n, walls.stiffness, walls.damping, walls.friction, 0.01)
 
 
 @wp.func

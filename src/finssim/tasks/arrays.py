@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from finssim.physics.funnel import Funnel
 from finssim.physics.types import vec6
 
 
@@ -25,6 +26,14 @@ class TargetMotion:
     wanted: wp.array(dtype=wp.vec3)  # what the velocity goes to [m/s]
     until: wp.array(dtype=float)  # time in the episode at which another is drawn [s]
     rng: wp.array(dtype=wp.uint32)  # the world's own random stream
+
+
+@wp.struct
+class Berth:
+    """Where a vehicle comes to rest in a dock."""
+
+    nose: float  # of the vehicle, from its origin along body x [m]
+    depth: float  # where the nose rests, from the throat along the dock's x [m]
 
 
 @wp.struct
@@ -56,6 +65,8 @@ class TaskArrays:
     goal_quaternion: wp.array(dtype=wp.quat)  # body to world
     reference: ReferenceTable  # of tasks that follow one
     target: TargetMotion  # of tasks whose goal moves
+    berth: Berth  # of tasks with a dock
+    funnel: Funnel  # of tasks with a dock: the simulator's; its pose is the goal's
     position: wp.array2d(dtype=wp.vec3)  # (worlds, vehicles), as measured: the truth, or the truth with noise
     quaternion: wp.array2d(dtype=wp.quat)
     velocity: wp.array2d(dtype=vec6)

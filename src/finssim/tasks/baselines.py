@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.tasks.docking_baseline import DockingPid
 from finssim.tasks.pid_baselines import StationPid, TargetPid, TrackingPid
 from finssim.vehicles import Vehicle, load_vehicle
 
@@ -37,6 +38,7 @@ BASELINES: dict[str, dict[str, Callable[..., Baseline]]] = {
     "t1": {"pid": StationPid.for_vehicle},
     "t2": {"pid": TrackingPid.for_vehicle},
     "t3": {"pid": TargetPid.for_vehicle},
+    "docking": {"align-insert": DockingPid.for_vehicle},
 }
 """Task -> name -> maker of the baseline for a vehicle; its `period` is the task's control step."""
 

@@ -1,5 +1,6 @@
 """Every task by name."""
 
+from finssim.tasks.docking import Docking
 from finssim.tasks.moving_target import MovingTarget
 from finssim.tasks.station_keeping import StationKeeping
 from finssim.tasks.task import Task
@@ -7,5 +8,10 @@ from finssim.tasks.trajectory_tracking import TrajectoryTracking
 
 __all__ = ["TASKS"]
 
-TASKS: dict[str, type[Task]] = {"t1": StationKeeping, "t2": TrajectoryTracking, "t3": MovingTarget}
+TASKS: dict[str, type[Task]] = {
+    "t1": StationKeeping,
+    "t2": TrajectoryTracking,
+    "t3": MovingTarget,
+    "docking": Docking,
+}
 """Every task by the name that commands take; call it for the task with its default settings."""

@@ -38,6 +38,7 @@ class Environment:
     """The task's agents, which are the first vehicles of every world, act; the task commands the others.
 
     Attributes:
+        task: What is done, fitted to the vehicles.
         agents: How many agents a world has.
         simulator: The worlds.
         arrays: Actions, observations, rewards and goals, as Warp arrays by world.
@@ -92,19 +93,20 @@ class Environment:
         Raises:
             EnvironmentSetupError: unknown action mode, vehicles that do not fit the task, or a seed out of range.
         """
-        self.task, self.action_mode, self.seed = task, action or task.action, checked_seed(seed)
+        self.action_mode, self.seed = action or task.action, checked_seed(seed)
         self.crash_directory, self.auto_reset = crash_directory, auto_reset
         if self.action_mode not in ACTION_MODES:
             raise EnvironmentSetupError(
                 f"unknown action mode '{self.action_mode}'; available: {', '.join(ACTION_MODES)}"
             )
         vehicles = crew(vehicle, task, self.action_mode)
+        self.task = task = task.fitted(vehicles)
         longest = max((t.delay for one in vehicles for t in one.thrusters.values()), default=0.0)
         extra = randomization.simulator_arguments(longest, tether) if randomization else {"tether": tether}
         self.simulator = Simulator(
             vehicles, worlds=worlds, hydrodynamics=hydrodynamics, control_step=task.control_step,
-            substeps=task.substeps, integrator=integrator, water=water, pool=pool or task.pool,
-            device=device, threads=threads, seed=self.seed, **extra,
+            substeps=task.substeps, integrator=integrator, water=water, pool=pool or task.arena(),
+            dock=task.dock(), device=device, threads=threads, seed=self.seed, **extra,
         )  # fmt: skip
         self.worlds, self.agents, self.device = worlds, len(task.agents), self.simulator.device
         self.action_size = action_size(self.action_mode, len(vehicles[0].thrusters))
@@ -113,6 +115,10 @@ class Environment:
             worlds, self.agents, len(task.others), task.observation_size, self.action_size, self.device,
             len(task.totals),
         )  # fmt: skip
+        if self.simulator.dock is not None:
+            # The dock is the goal: the same memory.
+            self.arrays.funnel = funnel = self.simulator.funnel
+            self.arrays.goal_position, self.arrays.goal_quaternion = funnel.position, funnel.quaternion
         task.allocate(self.arrays, worlds, self.device)
         self.wrench_scale = np.broadcast_to(np.asarray(wrench_scale, dtype=float), (6,))
         self.noise = noise or MeasurementNoise()

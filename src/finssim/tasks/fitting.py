@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,8 @@ MASS = 12.11
 """FinsROV's [kg]."""
 
 
-class Fit(NamedTuple):
+@dataclass(frozen=True)
+class Fit:
     """Factors on what a task is for FinsROV."""
 
     size: float = 1.0

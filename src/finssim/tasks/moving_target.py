@@ -123,7 +123,7 @@ class MovingTarget(Task):
 
     def arena(self) -> Pool:
         """The paper's pool, in proportion, with walls as stiff for the vehicle as they are for FinsROV."""
-        size, _, weight = self.fit
+        size, weight = self.fit.size, self.fit.weight
         return Pool(
             length=4.0 * size, width=2.0 * size, depth=size, stiffness=4000.0 * weight, damping=100.0 * weight
         )
@@ -151,7 +151,7 @@ class MovingTarget(Task):
     def parameters(self) -> Any:
         """The struct that the kernels take."""
         p, r = TargetParameters(), self.reward
-        size, pace, _ = self.fit
+        size, pace = self.fit.size, self.fit.pace
         for name in ("low", "high", "spawn_low", "spawn_high"):
             setattr(p, name, size * wp.vec3(*getattr(self, name)))
         p.bounds = size * wp.vec3(*self.bounds, 0.0)

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.engine import Pool
+from finssim.engine import Dock, Pool
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.measurement import MeasurementNoise
 from finssim.vehicles import Vehicle
@@ -78,6 +78,10 @@ class Task:
     def arena(self) -> Pool | None:
         """Walls and floor, unless others are asked for; None is open water."""
         return self.pool
+
+    def dock(self) -> Dock | None:
+        """What stands in every world for the vehicle to enter; its pose is the goal's. None: nothing does."""
+        return None
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """Give `arrays` what only this task uses; nothing unless the task says so."""
