@@ -55,9 +55,27 @@ TOP = {
 """What may import anything, and what only they import."""
 
 HOMES = {
-    "torch": {"learning/export.py", "learning/ppo.py", "learning/train.py"},
+    "torch": {
+        "learning/export.py",
+        "learning/ppo.py",
+        "learning/rsl_rl_env.py",
+        "learning/skrl_env.py",
+        "learning/tensors.py",
+        "learning/torchrl_env.py",
+        "learning/train.py",
+    },
     "stable_baselines3": {"learning/ppo.py", "learning/sb3.py"},
-    "gymnasium": {"learning/gymnasium_env.py", "learning/spaces.py"},
+    "gymnasium": {
+        "learning/gymnasium_env.py",
+        "learning/pettingzoo_env.py",
+        "learning/skrl_env.py",
+        "learning/spaces.py",
+    },
+    "torchrl": {"learning/torchrl_env.py"},
+    "tensordict": {"learning/rsl_rl_env.py", "learning/torchrl_env.py"},
+    "rsl_rl": {"learning/rsl_rl_env.py"},
+    "skrl": {"learning/skrl_env.py"},
+    "pettingzoo": {"learning/pettingzoo_env.py"},
     "onnx": {"learning/export.py"},
     "onnxruntime": {"control/policy.py"},
     "mujoco": {"engine/scene_model.py", "engine/scene_picture.py", "experiments/bench.py"},

@@ -1,5 +1,7 @@
 """The Gymnasium adapters pass Gymnasium's own checks and keep ends and final observations apart."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import gymnasium
@@ -9,24 +11,42 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from finssim.learning.gymnasium_env import Env, VectorEnv
-from finssim.tasks import StationKeeping
+from finssim.tasks import TASKS, EnvironmentSetupError, StationKeeping
 
 SHORT = StationKeeping(time_limit=0.5)
+ALONE = [name for name, kind in TASKS.items() if len(kind.agents) == 1]
+UNBOUNDED = pytest.mark.filterwarnings("ignore:.*infinity.*")
+"""Offsets have no bound, and the space says so."""
 
 
-@pytest.mark.parametrize("action", ["wrench6", "thruster8"])
-@pytest.mark.filterwarnings("ignore:.*infinity.*")  # offsets have no bound, and the space says so
-def test_the_single_environment_passes_the_checker(action):
-    check_env(Env("t1", action=action), skip_render_check=True)
+@UNBOUNDED
+@pytest.mark.parametrize(("task", "action"), [*((name, None) for name in ALONE), ("t1", "thruster8")])
+def test_the_single_environment_passes_the_checker(task, action):
+    check_env(Env(task, action=action), skip_render_check=True)
 
 
-@pytest.mark.filterwarnings("ignore:.*infinity.*")
-def test_it_can_be_made_by_name():
-    """`gymnasium.make` and `make_vec` know the task, and pass options on."""
-    env = gymnasium.make("finssim/StationKeeping-v0", action="thruster8")
-    assert env.reset(seed=1)[0].shape == (16,) and env.action_space.shape == (8,)
-    batch = gymnasium.make_vec("finssim/StationKeeping-v0", num_envs=3)
-    assert batch.reset(seed=1)[0].shape == (3, 16)
+@UNBOUNDED
+@pytest.mark.parametrize("task", ALONE)
+def test_every_task_of_one_agent_can_be_made_by_name(task):
+    """`gymnasium.make` and `make_vec` know it by its class, and pass options on."""
+    name, size = f"finssim/{TASKS[task].__name__}-v0", TASKS[task]().observation_size
+    env = gymnasium.make(name, action="thruster8")
+    assert env.reset(seed=1)[0].shape == (size,) and env.action_space.shape == (8,)
+    assert env.unwrapped.environment.task.name == task
+    batch = gymnasium.make_vec(name, num_envs=3, hydrodynamics="simplified")
+    assert batch.reset(seed=1)[0].shape == (3, size)
+
+
+def test_nothing_needs_to_be_imported_where_the_name_says_from_where():
+    script = """
+import gymnasium
+name = "finssim.learning.gymnasium_env:finssim/StationKeeping-v0"
+print(gymnasium.make(name).reset(seed=1)[0].shape, gymnasium.make_vec(name, num_envs=2).reset(seed=1)[0].shape)
+"""
+    out = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", script], capture_output=True, text=True, check=True
+    )
+    assert out.stdout.strip() == "(16,) (2, 16)"
 
 
 def test_observations_lie_in_their_space():
@@ -38,7 +58,7 @@ def test_observations_lie_in_their_space():
         assert env.observation_space.contains(observation)
         assert info["position_error"] >= 0.0
         if terminated or truncated:
-            assert info["episode"]["l"] == 5
+            assert info["episode"]["l"] == 5 and info["episode"]["success"] == 0.0
             env.reset()
 
 
@@ -70,6 +90,7 @@ def test_the_batch_says_how_it_resets_and_gives_final_observations():
     assert batch.single_observation_space.contains(info["final_obs"][3])
     assert not np.allclose(info["final_obs"][3], observation[3])
     assert info["final_info"]["episode_length"].tolist() == [0, 0, 5, 5, 5, 5]
+    assert info["final_info"]["success"].tolist() == [0.0] * 6 and info["_final_info"][5]
     assert batch.observation_space.contains(observation) and reward.shape == (6,)
 
 
@@ -94,8 +115,10 @@ def test_seeds_repeat():
 
 
 def test_an_unknown_task_is_refused():
-    with pytest.raises(ValueError, match="unknown task 't9'; available: t1"):
+    with pytest.raises(EnvironmentSetupError, match="unknown task 't9'; available: t1"):
         Env("t9")
+    with pytest.raises(EnvironmentSetupError, match="worlds is 2, expected 1: several are a VectorEnv"):
+        Env("t1", worlds=2)
 
 
 def test_a_task_with_other_settings_is_taken():

@@ -5,11 +5,13 @@ import pytest
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.vec_env import VecCheckNan
 
 from finssim.engine import Pool
 from finssim.learning.gymnasium_env import Env
 from finssim.learning.sb3 import Sb3VecEnv
-from finssim.tasks import Environment, StationKeeping
+from finssim.tasks import TASKS, Environment, EnvironmentSetupError, StationKeeping
+from reference.pair import Pair
 
 SHORT = StationKeeping(time_limit=0.5)
 
@@ -18,9 +20,40 @@ def adapter(worlds=4, task=SHORT, stagger=False, **options):
     return Sb3VecEnv(Environment(task, worlds=worlds, **options), stagger=stagger)
 
 
+@pytest.mark.parametrize("task", [name for name, kind in TASKS.items() if len(kind.agents) == 1])
 @pytest.mark.filterwarnings("ignore:.*infinity.*")
-def test_the_single_environment_passes_sb3s_checker():
-    check_env(Env("t1"))
+def test_the_single_environment_passes_sb3s_checker(task):
+    check_env(Env(task))
+
+
+@pytest.mark.parametrize("task", [*TASKS, Pair()], ids=[*TASKS, "pair"])
+def test_sb3_learns_on_every_task(task):
+    """PPO takes the batch of every task, through SB3's own check that no number is NaN or infinite."""
+    venv = VecCheckNan(Sb3VecEnv(task, worlds=4, seed=1), raise_exception=True)
+    model = PPO("MlpPolicy", venv, n_steps=4, batch_size=8, n_epochs=1, device="cpu")
+    before = [p.detach().clone() for p in model.policy.parameters()]
+    model.learn(16)
+    assert any(not torch.equal(a, b) for a, b in zip(before, model.policy.parameters(), strict=True))
+
+
+def test_agents_are_rows():
+    """Row 2 w + a is agent a of world w; a world's rows end together, with the last observations of their agents."""
+    venv = Sb3VecEnv(Pair(time_limit=0.3), worlds=3, seed=1)
+    assert venv.num_envs == 6 and venv.reset()[:, 6].tolist() == [0.0, 1.0] * 3
+    push = np.zeros((6, 6), np.float32)
+    push[0, 0] = 1.0
+    for _ in range(3):
+        observation, reward, done, infos = venv.step(push)
+    a = venv.environment.arrays
+    np.testing.assert_array_equal(reward, a.agent_reward.numpy().ravel())
+    np.testing.assert_array_equal(observation, a.observation.numpy().reshape(6, 7))
+    np.testing.assert_array_equal(
+        [info["terminal_observation"] for info in infos], a.final_observation.numpy().reshape(6, 7)
+    )
+    assert done.all() and infos[0]["terminal_observation"][3] > 0.05 > abs(
+        infos[1]["terminal_observation"][3]
+    )
+    assert [info["episode"]["l"] for info in infos] == [3] * 6
 
 
 def test_an_end_by_time_is_a_truncation_with_its_observation():
@@ -110,5 +143,5 @@ def test_a_seed_given_to_sb3_is_the_environments():
 
 
 def test_an_environment_that_does_not_reset_itself_is_refused():
-    with pytest.raises(ValueError, match="auto_reset=True"):
+    with pytest.raises(EnvironmentSetupError, match="needs auto_reset=True"):
         Sb3VecEnv(Environment(SHORT, auto_reset=False))

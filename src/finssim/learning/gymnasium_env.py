@@ -1,6 +1,8 @@
 """The environment in Gymnasium's two forms: one world as an `Env`, a batch as a `VectorEnv`.
 
-Importing this module registers T1: `gymnasium.make("finssim/StationKeeping-v0")`, and `make_vec` likewise.
+Importing this module registers every task of one agent by its class: `gymnasium.make("finssim/StationKeeping-v0")`, and
+`make_vec` likewise. Gymnasium imports it by itself where the name says so:
+`gymnasium.make("finssim.learning.gymnasium_env:finssim/StationKeeping-v0")`.
 """
 
 from __future__ import annotations
@@ -13,20 +15,13 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from finssim.learning.served import one_agent, served
 from finssim.learning.spaces import action_space, observation_space
-from finssim.tasks import TASKS, Environment, Task
+from finssim.tasks import TASKS, Environment, EnvironmentSetupError, Task
 
 __all__ = ["Env", "VectorEnv"]
 
 Observation = NDArray[np.float32]
-
-
-def _task(task: str | Task) -> Task:
-    if isinstance(task, Task):
-        return task
-    if task not in TASKS:
-        raise ValueError(f"unknown task '{task}'; available: {', '.join(TASKS)}")
-    return TASKS[task]()
 
 
 class Env(gymnasium.Env[Any, Any]):
@@ -36,21 +31,28 @@ class Env(gymnasium.Env[Any, Any]):
     and reward 0. On a CPU a new episode has begun there when `step` returns, and the rest of `info` is of that one; on
     a GPU it may take up to 100 steps, each reported as terminated.
 
-    `info` holds, in SI units, `position_error` [m], `held` (time within the success tolerance without a break [s]) and,
-    at the end, `episode` with its return `r` and length `l`.
+    `info` holds, in SI units, `position_error` (distance to the task's goal [m]), `held` (time within the success
+    tolerance without a break [s]) and, at the end, `episode` with return `r`, length `l` and the task's other metrics.
     """
 
     metadata = {"render_modes": []}
 
-    def __init__(self, task: str | Task = "t1", **options: Any) -> None:
+    def __init__(self, task: str | Task | Environment = "t1", **options: Any) -> None:
         """Set up one world.
 
         Args:
-            task: A task, or its name.
-            options: Of `finssim.tasks.Environment`: vehicle, hydrodynamics, action, randomization, noise, ...
+            task: A task or its name; or an environment of one world made with auto_reset=False.
+            options: The other arguments of `finssim.make`: vehicle, hydrodynamics, action, randomize, seed, ...
+
+        Raises:
+            EnvironmentSetupError: As `finssim.make`; or the task has several agents, or there are several worlds.
         """
         self.render_mode = options.pop("render_mode", None)
-        self.environment = Environment(_task(task), worlds=1, auto_reset=False, **options)
+        self.environment = one_agent(served(task, options, auto_reset=False), "Gymnasium")
+        if self.environment.worlds != 1:
+            raise EnvironmentSetupError(
+                f"worlds is {self.environment.worlds}, expected 1: several are a VectorEnv"
+            )
         self.observation_space = observation_space(self.environment)
         self.action_space = action_space(self.environment)
 
@@ -68,7 +70,8 @@ class Env(gymnasium.Env[Any, Any]):
         info = self._info()
         if terminated or truncated:
             a = self.environment.arrays
-            info["episode"] = {"r": float(a.final_return.numpy()[0]), "l": int(a.final_length.numpy()[0])}
+            metrics = {key: float(value[0]) for key, value in self.environment.task.metrics(a).items()}
+            info["episode"] = {"r": metrics.pop("return"), "l": int(metrics.pop("length")), **metrics}
             return step.final_observation[0].copy(), float(step.reward[0]), terminated, truncated, info
         return step.observation[0].copy(), float(step.reward[0]), terminated, truncated, info
 
@@ -82,26 +85,34 @@ class VectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any
     """A batch of worlds. Where an episode ends, the next starts in the same step (`AutoresetMode.SAME_STEP`).
 
     `info` then has `final_obs` (an array of observations, None elsewhere) and `final_info` (`episode_return`,
-    `episode_length`, and `held`: time within the success tolerance when it ended [s]), with their masks.
+    `episode_length` and the task's other metrics, such as `held`: time within the success tolerance when it ended [s]),
+    with their masks.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
 
-    def __init__(self, num_envs: int = 1, task: str | Task = "t1", **options: Any) -> None:
+    def __init__(
+        self, num_envs: int | None = None, task: str | Task | Environment = "t1", **options: Any
+    ) -> None:
         """Set up the worlds.
 
         Args:
-            num_envs: How many.
-            task: A task, or its name.
-            options: Of `finssim.tasks.Environment`: vehicle, hydrodynamics, action, randomization, noise, ...
+            num_envs: How many, Gymnasium's word for `worlds`; 1 if neither is given.
+            task: A task or its name; or an environment.
+            options: The other arguments of `finssim.make`: vehicle, hydrodynamics, action, randomize, seed, ...
+
+        Raises:
+            EnvironmentSetupError: As `finssim.make`; or the task has several agents.
         """
         self.render_mode = options.pop("render_mode", None)
-        self.num_envs = num_envs
-        self.environment = Environment(_task(task), worlds=num_envs, **options)
+        if num_envs is not None:
+            options["worlds"] = num_envs
+        self.environment = one_agent(served(task, options), "Gymnasium")
+        self.num_envs = self.environment.worlds
         self.single_observation_space = observation_space(self.environment)
         self.single_action_space = action_space(self.environment)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -124,14 +135,10 @@ class VectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any
         final = np.full(self.num_envs, None, dtype=object)
         for w in np.flatnonzero(ended):
             final[w] = observation[w].copy()
-        a = self.environment.arrays
         totals: dict[str, Any] = {}
-        for name, array in (
-            ("episode_return", a.final_return),
-            ("episode_length", a.final_length),
-            ("held", a.final_held),
-        ):
-            totals |= {name: np.where(ended, array.numpy(), 0), f"_{name}": ended.copy()}
+        for key, value in self.environment.task.metrics(self.environment.arrays).items():
+            name = f"episode_{key}" if key in ("return", "length") else key
+            totals |= {name: np.where(ended, value, 0), f"_{name}": ended.copy()}
         return {
             "final_obs": final,
             "_final_obs": ended.copy(),
@@ -140,9 +147,11 @@ class VectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any
         }
 
 
-gymnasium.register(
-    id="finssim/StationKeeping-v0",
-    entry_point="finssim.learning.gymnasium_env:Env",
-    vector_entry_point="finssim.learning.gymnasium_env:VectorEnv",
-    kwargs={"task": "t1"},
-)
+for _name, _kind in TASKS.items():
+    if len(_kind.agents) == 1:
+        gymnasium.register(
+            id=f"finssim/{_kind.__name__}-v0",
+            entry_point="finssim.learning.gymnasium_env:Env",
+            vector_entry_point="finssim.learning.gymnasium_env:VectorEnv",
+            kwargs={"task": _name},
+        )

@@ -10,59 +10,55 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
+from finssim.learning.served import age_episodes, served
 from finssim.learning.spaces import action_space, observation_space
-from finssim.tasks import Environment
+from finssim.tasks import Environment, Task
 
 __all__ = ["Sb3VecEnv"]
 
 
 class Sb3VecEnv(VecEnv):
-    """One SB3 environment per world, stepped together.
+    """One SB3 environment per agent, stepped together: a world's agents are rows one after the other, and end together.
 
     Where an episode ends, `info` has `terminal_observation`, `TimeLimit.truncated` (SB3 then adds the value of the
-    terminal observation to the reward) and `episode` (return, length, and `held`: time within the success tolerance,
-    without a break, when it ended [s]).
+    terminal observation to the reward) and `episode` (return, of a world's agents together, length, and the task's
+    metrics, such as `held`: time within the success tolerance, without a break, when it ended [s]).
     """
 
-    def __init__(self, environment: Environment, stagger: bool = False) -> None:
-        """Adapt an environment that resets itself.
+    def __init__(self, task: str | Task | Environment = "t1", stagger: bool = False, **options: Any) -> None:
+        """Set up the worlds.
 
         Args:
-            environment: The worlds.
+            task: A task or its name; or an environment.
             stagger: Let the first episodes start at random ages, so that from then on some end in every step: learning
                 from all stages of an episode at once is steadier. A shortened episode has no `episode` in its info.
+            options: The other arguments of `finssim.make`: worlds, vehicle, hydrodynamics, randomize, seed, ...
         """
-        if not environment.auto_reset:
-            raise ValueError("SB3 never resets an environment that ended: make it with auto_reset=True")
-        self.environment = environment
-        super().__init__(environment.worlds, observation_space(environment), action_space(environment))
+        self.environment = environment = served(task, options)
+        rows = environment.worlds * environment.agents
+        super().__init__(rows, observation_space(environment), action_space(environment))
         self._actions: NDArray[np.float32] | None = None
         self._stagger = stagger
-        self._whole = np.ones(self.num_envs, dtype=np.bool_)
+        self._whole = np.ones(environment.worlds, dtype=np.bool_)
 
     def reset(self) -> NDArray[np.float32]:
         """Start new episodes everywhere; with the seed given to `seed`, if any.
 
         Returns:
-            Observations, (worlds, size).
+            Observations, (rows, size).
         """
         first = self._seeds[0]
-        observation = self.environment.reset(seed=first).copy()
+        observation = self._rows(self.environment.reset(seed=first)).copy()
+        self._whole[:] = not self._stagger
         if self._stagger:
-            self._age_episodes()
+            age_episodes(self.environment)
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]
         return observation
 
-    def _age_episodes(self) -> None:
-        task, rng = self.environment.task, np.random.default_rng(self.environment.seed)
-        limit = max(1, round(task.time_limit / task.control_step))
-        self.environment.simulator.state.steps.assign(rng.integers(0, limit, self.num_envs).astype(np.int32))
-        self._whole[:] = False
-
     def step_async(self, actions: NDArray[np.float32]) -> None:
-        """Keep the actions for `step_wait`, (worlds, size)."""
+        """Keep the actions for `step_wait`, (rows, size)."""
         self._actions = actions
 
     def step_wait(
@@ -70,31 +66,54 @@ class Sb3VecEnv(VecEnv):
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         """Observations, rewards, ends and infos; new arrays, which SB3 keeps and changes."""
         assert self._actions is not None, "step_wait without step_async"
-        step = self.environment.step(self._actions)
+        agents = self.environment.agents
+        whole = (
+            self._actions if agents == 1 else self._actions.reshape(-1, agents, self.environment.action_size)
+        )
+        step = self.environment.step(whole)
         done = step.terminated | step.truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         ended = np.flatnonzero(done)
         if len(ended):
-            a = self.environment.arrays
-            totals = a.final_return.numpy(), a.final_length.numpy(), a.final_held.numpy()
+            last, episodes = self._rows(step.final_observation), self._episodes(ended)
             for w in ended:
-                infos[w] = {
-                    "terminal_observation": step.final_observation[w].copy(),
-                    "TimeLimit.truncated": bool(step.truncated[w] and not step.terminated[w]),
-                }
-                if self._whole[w]:
-                    names = ("r", float), ("l", int), ("held", float)
-                    infos[w]["episode"] = {
-                        n: kind(total[w]) for (n, kind), total in zip(names, totals, strict=True)
+                for row in range(w * agents, (w + 1) * agents):
+                    infos[row] = {
+                        "terminal_observation": last[row].copy(),
+                        "TimeLimit.truncated": bool(step.truncated[w] and not step.terminated[w]),
                     }
+                    if w in episodes:
+                        infos[row]["episode"] = episodes[w]
             self._whole[ended] = True
-        return step.observation.copy(), step.reward.copy(), done, infos
+        return (
+            self._rows(step.observation).copy(),
+            step.reward.reshape(-1).copy(),
+            np.repeat(done, agents),
+            infos,
+        )
+
+    def _rows(self, array: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(worlds, size) or (worlds, agents, size) as rows; a view."""
+        return array.reshape(self.num_envs, -1)
+
+    def _episodes(self, ended: NDArray[np.intp]) -> dict[int, dict[str, float]]:
+        """World to what SB3 notes of an episode, where one ended that was not shortened."""
+        short = {"return": "r", "length": "l"}
+        metrics = self.environment.task.metrics(self.environment.arrays)
+        columns = {short.get(key, key): value for key, value in metrics.items()}
+        return {
+            int(w): {
+                key: int(column[w]) if key == "l" else float(column[w]) for key, column in columns.items()
+            }
+            for w in ended
+            if self._whole[w]
+        }
 
     def close(self) -> None:
         """Nothing to release: the arrays go with the environment."""
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of the environment, once per asked world."""
+        """An attribute of the environment, once per asked row."""
         return [getattr(self.environment, attr_name, None)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:

@@ -1,0 +1,114 @@
+"""One world as a PettingZoo `ParallelEnv`: observations, rewards and actions in dictionaries by agent."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+
+from finssim.learning.served import served
+from finssim.learning.spaces import action_space, observation_space
+from finssim.tasks import Environment, EnvironmentSetupError, Task
+
+__all__ = ["PettingZooEnv"]
+
+Observation = NDArray[np.float32]
+
+
+class PettingZooEnv(ParallelEnv[str, Observation, Observation]):
+    """The task's agents by their names; a task of one agent is a world with one. Agents end together.
+
+    With the end come the last observations and, in every agent's info, `episode`: the task's metrics.
+    """
+
+    metadata = {"render_modes": [], "is_parallelizable": True}
+
+    def __init__(self, task: str | Task | Environment = "t1", **options: Any) -> None:
+        """Set up one world.
+
+        Args:
+            task: A task or its name; or an environment of one world made with auto_reset=False.
+            options: The other arguments of `finssim.make`: vehicle, hydrodynamics, action, randomize, seed, ...
+        """
+        self.render_mode = options.pop("render_mode", None)
+        self.environment = environment = served(task, options, auto_reset=False)
+        if environment.worlds != 1:
+            raise EnvironmentSetupError(
+                f"worlds is {environment.worlds}, expected 1: PettingZoo steps one world"
+            )
+        self.metadata = {**self.metadata, "name": f"finssim/{environment.task.name}"}
+        self.possible_agents = list(environment.task.agents)
+        self.agents: list[str] = []
+        # PettingZoo asks for the same object every time: it has the random stream of sampled actions.
+        self.observation_spaces = {name: observation_space(environment) for name in self.possible_agents}
+        self.action_spaces = {name: action_space(environment) for name in self.possible_agents}
+        whole = observation_space(environment)
+        self.state_space = spaces.Box(
+            np.tile(whole.low, environment.agents), np.tile(whole.high, environment.agents), dtype=np.float32
+        )
+
+    def observation_space(self, agent: str) -> spaces.Box:
+        """Bounds of an agent's observation."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Box:
+        """An agent's action: each component in [-1, 1]."""
+        return self.action_spaces[agent]
+
+    def state(self) -> Observation:
+        """The observations of all agents, one after the other, for critics that see everything."""
+        return self.environment.arrays.observation.numpy()[0].copy()
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
+        """Start an episode; with a seed the random streams start over. There are no options."""
+        self.environment.reset(seed=seed)
+        self.agents = list(self.possible_agents)
+        return self._observations(self.environment.arrays.observation), {name: {} for name in self.agents}
+
+    def step(
+        self, actions: dict[str, Observation]
+    ) -> tuple[
+        dict[str, Observation],
+        dict[str, float],
+        dict[str, bool],
+        dict[str, bool],
+        dict[str, dict[str, Any]],
+    ]:
+        """Act for one control step; an action for every agent, each component in [-1, 1].
+
+        Raises:
+            EnvironmentSetupError: An agent has no action, or the episode is over.
+        """
+        if not self.agents:
+            raise EnvironmentSetupError("step without a running episode: call reset first")
+        missing = [name for name in self.agents if name not in actions]
+        if missing:
+            raise EnvironmentSetupError(f"no action for {', '.join(missing)}: every agent acts in every step")
+        rows = np.stack([np.asarray(actions[name], dtype=np.float32) for name in self.agents])
+        step = self.environment.step(rows if self.environment.agents == 1 else rows[None])
+        names, ended = self.agents, bool(step.terminated[0] or step.truncated[0])
+        arrays = self.environment.arrays
+        rewards = arrays.agent_reward.numpy()[0]
+        info: dict[str, Any] = {}
+        if ended:
+            totals = self.environment.task.metrics(arrays)
+            info, self.agents = {"episode": {key: float(value[0]) for key, value in totals.items()}}, []
+        return (
+            self._observations(arrays.final_observation if ended else arrays.observation),
+            {name: float(reward) for name, reward in zip(names, rewards, strict=True)},
+            dict.fromkeys(names, bool(step.terminated[0])),
+            dict.fromkeys(names, bool(step.truncated[0])),
+            {name: dict(info) for name in names},
+        )
+
+    def _observations(self, array: Any) -> dict[str, Observation]:
+        rows = array.numpy()[0].reshape(self.environment.agents, -1).copy()
+        return dict(zip(self.possible_agents, rows, strict=True))
+
+    def close(self) -> None:
+        """Nothing to release: the arrays go with the environment."""

@@ -1,0 +1,96 @@
+"""The batched environment as an RSL-RL `VecEnv`: torch tensors on the environment's device, one row per agent."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import warp as wp
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+from finssim.learning.served import served
+from finssim.learning.tensors import Tensors
+from finssim.tasks import Environment, Task
+
+__all__ = ["RslRlVecEnv"]
+
+
+class RslRlVecEnv(VecEnv):
+    """Observation groups "policy", what the agent sees, and "critic".
+
+    Several agents of a world are as many rows, one after the other, which end together: RSL-RL trains one network for
+    all of them.
+
+    Where an episode ends, the observation is the next one's first, `extras["time_outs"]` says where time ended it
+    (RSL-RL then adds the discounted value of the state before to the reward), `extras["final_observations"]` has the
+    last ones, and `extras["log"]` the mean of the task's metrics over the episodes that ended.
+    """
+
+    def __init__(self, task: str | Task | Environment = "t1", **options: Any) -> None:
+        """Set up the worlds.
+
+        Args:
+            task: A task or its name; or an environment.
+            options: The other arguments of `finssim.make`: worlds, vehicle, hydrodynamics, randomize, seed, device, ...
+        """
+        self.environment = environment = served(task, options)
+        self._tensors = Tensors(environment)
+        self._steps = wp.to_torch(environment.simulator.state.steps)
+        self.device = str(self._tensors.device)
+        self.num_envs = environment.worlds * environment.agents
+        self.num_actions = environment.action_size
+        self.max_episode_length = round(environment.task.time_limit / environment.task.control_step)
+        self.cfg = {
+            "task": environment.task.name,
+            "action": environment.action_mode,
+            "worlds": environment.worlds,
+            "seed": environment.seed,
+        }
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        """Control steps since the episode began, (num_envs,); assigned to, it ages them. A world has one age."""
+        return self._by_row(self._steps.long())
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, steps: torch.Tensor) -> None:
+        self._steps.copy_(steps.view(-1, self.environment.agents)[:, 0])
+
+    def get_observations(self) -> TensorDict:
+        """Observations as they are now."""
+        return self._groups(self._tensors.observation)
+
+    def reset(self, seed: int | None = None) -> TensorDict:
+        """Start new episodes everywhere; with a seed the random streams start over."""
+        self.environment.reset(seed=seed)
+        return self.get_observations()
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Act for one control step; actions (num_envs, num_actions), each in [-1, 1].
+
+        Returns:
+            Observations, rewards, dones and extras; new tensors, (num_envs, ...).
+        """
+        terminated, truncated = self._tensors.step(actions)
+        done = terminated | truncated
+        extras: dict[str, Any] = {"time_outs": self._by_row(truncated & ~terminated)}
+        if done.any():
+            extras["final_observations"] = self._groups(self._tensors.final_observation)
+            extras["log"] = self._metrics(done)
+        reward = self._tensors.reward.flatten().clone()
+        return self.get_observations(), reward, self._by_row(done), extras
+
+    def _by_row(self, of_world: torch.Tensor) -> torch.Tensor:
+        return (
+            of_world if self.environment.agents == 1 else of_world.repeat_interleave(self.environment.agents)
+        )
+
+    def _groups(self, observation: torch.Tensor) -> TensorDict:
+        seen = observation.reshape(self.num_envs, -1).clone()
+        return TensorDict({"policy": seen, "critic": seen}, batch_size=[self.num_envs], device=self.device)
+
+    def _metrics(self, done: torch.Tensor) -> dict[str, float]:
+        ended = done.cpu().numpy()
+        measured = self.environment.task.metrics(self.environment.arrays)
+        return {f"Episode/{name}": float(values[ended].mean()) for name, values in measured.items()}

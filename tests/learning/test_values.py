@@ -1,0 +1,180 @@
+"""Bootstrapping, library by library, against a value that is known in closed form.
+
+Where every step gives the reward r, the value of any state under any policy is V = r / (1 - γ) if episodes are only cut
+by a time limit, since the task goes on, and r if the task ends in every step. A critic that says V everywhere must find
+V as the target of every step: if a library took the cut for an end, or the end for a cut, targets would be off by γ V.
+"""
+
+import numpy as np
+import pytest
+import torch
+from rsl_rl.runners import OnPolicyRunner
+from stable_baselines3 import PPO as Sb3Ppo
+from torch import nn
+from torchrl.modules import ValueOperator
+from torchrl.objectives.value import GAE
+
+from finssim.learning.gymnasium_env import Env, VectorEnv
+from finssim.learning.pettingzoo_env import PettingZooEnv
+from finssim.learning.rsl_rl_env import RslRlVecEnv
+from finssim.learning.sb3 import Sb3VecEnv
+from finssim.learning.skrl_env import SkrlEnv, SkrlTeamEnv
+from finssim.learning.torchrl_env import TorchRlEnv
+from finssim.tasks import StationKeeping
+from finssim.tasks.station_keeping import Reward
+from reference.learners import mappo, ppo, rsl_rl_settings
+from reference.pair import constant
+
+GAMMA = 0.9
+FLAT = Reward(
+    position_scale=1e9, distance=0.0, heading=0.0, turn=0.0, action=0.0, change=0.0, rate=0.0, loss=0.0
+)
+"""1 in every step, wherever the vehicle is."""
+CUT = StationKeeping(time_limit=0.5, reward=FLAT)
+"""Cut after five steps: the value is 10."""
+ENDS = StationKeeping(bounds=(0.0, 0.0), reward=FLAT)
+"""Ends in every step: the value is 1."""
+CASES = pytest.mark.parametrize(("task", "value"), [(CUT, 10.0), (ENDS, 1.0)], ids=["cut", "ends"])
+STEPS = 8
+
+
+def says(layer: nn.Linear, value: float) -> None:
+    """Make a critic's last layer say this everywhere."""
+    with torch.no_grad():
+        layer.weight.zero_()
+        layer.bias.fill_(value)
+
+
+@CASES
+def test_stable_baselines3(task, value):
+    env = Sb3VecEnv(task, worlds=3)
+    model = Sb3Ppo(
+        "MlpPolicy", env, n_steps=STEPS, batch_size=STEPS * 3, n_epochs=1, learning_rate=0.0, gamma=GAMMA
+    )
+    says(model.policy.value_net, value)
+    model.learn(STEPS * 3)
+    np.testing.assert_allclose(model.rollout_buffer.returns, value, rtol=1e-5)
+
+
+@CASES
+def test_rsl_rl(task, value, capsys):
+    env = RslRlVecEnv(task, worlds=3)
+    algorithm = OnPolicyRunner(env, rsl_rl_settings(steps=STEPS, gamma=GAMMA)).alg
+    says(algorithm.critic.mlp[-1], value)
+    observation = env.get_observations()
+    with torch.inference_mode():
+        for _ in range(STEPS):
+            observation, reward, done, extras = env.step(algorithm.act(observation))
+            algorithm.process_env_step(observation, reward, done, extras)
+        algorithm.compute_returns(observation)
+    np.testing.assert_allclose(algorithm.storage.returns, value, rtol=1e-5)
+
+
+@CASES
+def test_torchrl(task, value):
+    critic = ValueOperator(nn.Linear(16, 1))
+    says(critic.module, value)
+    data = TorchRlEnv(task, worlds=3).rollout(STEPS, break_when_any_done=False)
+    GAE(gamma=GAMMA, lmbda=0.95, value_network=critic)(data)
+    np.testing.assert_allclose(data["value_target"], value, rtol=1e-5)
+
+
+def test_torchrl_with_agents():
+    """Agent a gets a + 1 in every step: 10 and 20."""
+    critic = ValueOperator(
+        nn.Linear(7, 1), in_keys=[("agents", "observation")], out_keys=[("agents", "state_value")]
+    )
+    with torch.no_grad():
+        critic.module.weight.copy_(torch.tensor([[0.0] * 6 + [10.0]]))
+        critic.module.bias.fill_(10.0)
+    data = TorchRlEnv(constant(time_limit=0.5), worlds=3).rollout(STEPS, break_when_any_done=False)
+    for end in ("done", "terminated"):  # TorchRL wants the ends of a group beside its rewards
+        shape = data["next", "agents", "reward"].shape
+        data["next", "agents", end] = data["next", end].unsqueeze(-1).expand(shape)
+    estimator = GAE(gamma=GAMMA, lmbda=0.95, value_network=critic)
+    estimator.set_keys(
+        **{key: ("agents", key) for key in ("reward", "done", "terminated", "advantage", "value_target")},
+        value=("agents", "state_value"),
+    )
+    estimator(data)
+    np.testing.assert_allclose(data["agents", "value_target"][..., 0, 0], 10.0, rtol=1e-5)
+    np.testing.assert_allclose(data["agents", "value_target"][..., 1, 0], 20.0, rtol=1e-5)
+
+
+def skrl_targets(env, agent):
+    """Play a rollout and let the agent compute its returns."""
+    agent.init(trainer_cfg=None)
+    agent.enable_training_mode(True)
+    observations, _ = env.reset()
+    for k in range(STEPS):
+        with torch.no_grad():
+            states = env.state()
+            actions, _ = agent.act(observations, states, timestep=k, timesteps=STEPS)
+            after, rewards, terminated, truncated, infos = env.step(actions)
+            agent.record_transition(
+                observations=observations, states=states, actions=actions, rewards=rewards, next_observations=after,
+                next_states=env.state(), terminated=terminated, truncated=truncated, infos=infos, timestep=k,
+                timesteps=STEPS,
+            )  # fmt: skip
+        observations = after
+        agent.post_interaction(timestep=k, timesteps=STEPS)
+
+
+@CASES
+def test_skrl(task, value):
+    env = SkrlEnv(task, worlds=3)
+    agent = ppo(env, rollouts=STEPS, discount_factor=GAMMA, learning_rate=0.0)
+    says(agent.value.net, value)
+    skrl_targets(env, agent)
+    np.testing.assert_allclose(agent.memory.get_tensor_by_name("returns"), value, rtol=1e-5)
+
+
+def test_skrl_with_agents():
+    env = SkrlTeamEnv(constant(time_limit=0.5), worlds=3)
+    agent = mappo(env, rollouts=STEPS, discount_factor=GAMMA, learning_rate=0.0)
+    for name, value in (("left", 10.0), ("right", 20.0)):
+        says(agent.values[name].net, value)
+    skrl_targets(env, agent)
+    for name, value in (("left", 10.0), ("right", 20.0)):
+        np.testing.assert_allclose(agent.memories[name].get_tensor_by_name("returns"), value, rtol=1e-5)
+
+
+def target(reward, value, done, after):
+    """The one-step target of a textbook: the reward, and the value of what followed unless the task ended."""
+    return reward + GAMMA * value(after) * (1.0 - done)
+
+
+def place(observation):
+    """A value that tells states apart: 10 and a little of the goal's offset."""
+    return 10.0 + observation[..., 0]
+
+
+@CASES
+def test_gymnasiums_batch(task, value):
+    """What follows is `final_obs` where an episode ended: with it the target is V, without it that of another state."""
+    batch, single = VectorEnv(3, task), Env(task)
+    batch.reset(seed=1), single.reset(seed=1)
+    for _ in range(5):
+        observation, reward, terminated, truncated, info = batch.step(np.zeros((3, 6), np.float32))
+        if (terminated | truncated).any():
+            observation = np.stack(info["final_obs"])
+        np.testing.assert_allclose(target(reward, lambda o: value, terminated, observation), value, rtol=1e-5)
+        after, alone, over, _, _ = single.step(np.zeros(6, np.float32))
+        np.testing.assert_array_equal(
+            target(alone, place, over, after), target(reward, place, terminated, observation)[0]
+        )
+        if over:
+            single.reset()
+
+
+def test_pettingzoo():
+    env = PettingZooEnv(constant(time_limit=0.5))
+    env.reset()
+    while env.agents:
+        actions = {name: env.action_space(name).sample() for name in env.agents}
+        after, rewards, terminated, truncated, _ = env.step(actions)
+        for name, value in (("left", 10.0), ("right", 20.0)):
+            assert target(
+                rewards[name], lambda o, v=value: v, terminated[name], after[name]
+            ) == pytest.approx(value)
+    assert all(truncated.values())
