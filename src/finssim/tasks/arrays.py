@@ -29,6 +29,35 @@ class TargetMotion:
 
 
 @wp.struct
+class MessageTable:
+    """What the agents of a world have heard of each other, and what is under way; see `communication`."""
+
+    on: int  # 0: everybody sees everybody
+    period: int  # control steps between two messages of an agent
+    slots: int  # messages of one agent that can be under way at once
+    processing: float  # [s]
+    speed_of_sound: float  # [m/s]
+    loss: float  # probability, for every receiver
+    control_step: float  # [s]
+    key: wp.array(dtype=int)  # of the world's random stream in this episode
+    sent_position: wp.array2d(dtype=wp.vec3)  # (worlds, sender * slots + slot), world frame [m]
+    sent_velocity: wp.array2d(dtype=wp.vec3)  # world frame [m/s]
+    sent_step: wp.array2d(dtype=int)
+    arrival: wp.array3d(dtype=int)  # (worlds, sender * slots + slot, receiver): control step; -1: never
+    position: wp.array2d(dtype=wp.vec3)  # (worlds, receiver * agents + sender): of the newest that arrived
+    velocity: wp.array2d(dtype=wp.vec3)
+    step: wp.array2d(dtype=int)  # control step at which that was sent
+
+
+@wp.struct
+class NetTable:
+    """A net that agents hold, and what drifts in the water to be caught with it."""
+
+    target: wp.array(dtype=wp.vec3)  # world frame [m]
+    drift: wp.array(dtype=wp.vec3)  # its velocity while nothing holds it [m/s]
+
+
+@wp.struct
 class Berth:
     """Where a vehicle comes to rest in a dock."""
 
@@ -67,6 +96,8 @@ class TaskArrays:
     target: TargetMotion  # of tasks whose goal moves
     berth: Berth  # of tasks with a dock
     funnel: Funnel  # of tasks with a dock: the simulator's; its pose is the goal's
+    messages: MessageTable  # of tasks whose agents talk to each other
+    net: NetTable  # of tasks whose agents hold a net
     position: wp.array2d(dtype=wp.vec3)  # (worlds, vehicles), as measured: the truth, or the truth with noise
     quaternion: wp.array2d(dtype=wp.quat)
     velocity: wp.array2d(dtype=vec6)

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from finssim.tasks.docking_baseline import DockingPid
 from finssim.tasks.pid_baselines import StationPid, TargetPid, TrackingPid
+from finssim.tasks.pursuit_baselines import LeadPursuit
+from finssim.tasks.team_pursuit_baselines import FormationPursuit
 from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["BASELINES", "Baseline", "BaselineError", "baseline", "restarted"]
@@ -39,6 +41,8 @@ BASELINES: dict[str, dict[str, Callable[..., Baseline]]] = {
     "t2": {"pid": TrackingPid.for_vehicle},
     "t3": {"pid": TargetPid.for_vehicle},
     "docking": {"align-insert": DockingPid.for_vehicle},
+    "pursuit": {"lead": LeadPursuit.for_vehicle},
+    "team-pursuit": {"formation": FormationPursuit.for_vehicle},
 }
 """Task -> name -> maker of the baseline for a vehicle; its `period` is the task's control step."""
 

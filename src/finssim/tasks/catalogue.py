@@ -2,8 +2,10 @@
 
 from finssim.tasks.docking import Docking
 from finssim.tasks.moving_target import MovingTarget
+from finssim.tasks.pursuit import Pursuit
 from finssim.tasks.station_keeping import StationKeeping
 from finssim.tasks.task import Task
+from finssim.tasks.team_pursuit import TeamPursuit
 from finssim.tasks.trajectory_tracking import TrajectoryTracking
 
 __all__ = ["TASKS"]
@@ -13,5 +15,7 @@ TASKS: dict[str, type[Task]] = {
     "t2": TrajectoryTracking,
     "t3": MovingTarget,
     "docking": Docking,
+    "pursuit": Pursuit,
+    "team-pursuit": TeamPursuit,
 }
 """Every task by the name that commands take; call it for the task with its default settings."""

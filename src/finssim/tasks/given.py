@@ -46,6 +46,11 @@ def crew(vehicle: Vehicle | str | Sequence[Vehicle | str], task: Task, mode: str
             f"{len(given)} vehicles are given, expected {len(task.vehicles)} for task '{task.name}': {names}"
         )
     vehicles = [one if isinstance(one, Vehicle) else load_vehicle(one) for one in given]
+    if mode == "thruster8" and task.others:
+        raise EnvironmentSetupError(
+            f"actions of task '{task.name}' are by thruster, expected wrench4 or wrench6: {', '.join(task.others)} is "
+            "commanded by wrench"
+        )
     counts = {len(one.thrusters) for one in vehicles}
     if mode == "thruster8" and len(counts) > 1:
         raise EnvironmentSetupError(

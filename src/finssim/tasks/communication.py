@@ -1,0 +1,172 @@
+"""Acoustic messages between agents: sent every so often, under way at the speed of sound, sometimes lost."""
+
+import math
+from dataclasses import dataclass
+
+import warp as wp
+
+from finssim.engine.state import State
+from finssim.tasks.arrays import MessageTable, TaskArrays
+from finssim.tasks.given import EnvironmentSetupError
+
+MOST_UNDER_WAY = 32
+"""Messages of one agent that can be under way at once."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Communication:
+    """How agents tell each other where they are. A message holds the sender's measured position and velocity."""
+
+    period: float = 1.0
+    """Time between two messages of an agent [s]; agents take turns within it."""
+    processing: float = 0.1
+    """From the measurement to its use, besides the way through the water [s]."""
+    loss: float = 0.1
+    """Probability that a receiver misses a message; each receiver by itself."""
+    speed_of_sound: float = 1500.0
+    """[m/s]"""
+
+    def __post_init__(self) -> None:
+        for name in ("period", "speed_of_sound"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise EnvironmentSetupError(
+                    f"communication: {name} is {getattr(self, name)}, expected more than 0"
+                )
+        if not 0.0 <= self.processing < math.inf:
+            raise EnvironmentSetupError(
+                f"communication: processing is {self.processing} s, expected 0 or more"
+            )
+        if not 0.0 <= self.loss <= 1.0:
+            raise EnvironmentSetupError(f"communication: loss is {self.loss}, expected a probability, 0 to 1")
+
+
+def message_table(
+    communication: Communication | None,
+    worlds: int,
+    agents: int,
+    control_step: float,
+    reach: float,
+    device: wp.Device,
+) -> MessageTable:
+    """Room for the messages of every world; without communication, everybody sees everybody.
+
+    Args:
+        communication: How they talk, or None.
+        worlds: How many.
+        agents: In each world.
+        control_step: [s]
+        reach: Greatest distance between two agents [m].
+        device: Where.
+
+    Raises:
+        EnvironmentSetupError: More messages would be under way at once than there is room for.
+    """
+    table = MessageTable()
+    if communication is None:
+        return table
+    c = communication
+    table.on, table.control_step = 1, control_step
+    table.period = max(1, round(c.period / control_step))
+    longest = (c.processing + reach / c.speed_of_sound) / control_step
+    table.slots = math.ceil(longest / table.period) + 1
+    if table.slots > MOST_UNDER_WAY:
+        raise EnvironmentSetupError(
+            f"communication: a message takes up to {longest * control_step:.3g} s, one is sent every {c.period:g} s, "
+            f"expected at most {MOST_UNDER_WAY} under way: give a longer period or a shorter way"
+        )
+    table.processing, table.loss, table.speed_of_sound = c.processing, c.loss, c.speed_of_sound
+    table.key = wp.zeros(worlds, dtype=wp.int32, device=device)
+    for name in ("position", "velocity"):
+        setattr(table, name, wp.zeros((worlds, agents**2), dtype=wp.vec3, device=device))
+        sent = wp.zeros((worlds, agents * table.slots), dtype=wp.vec3, device=device)
+        setattr(table, f"sent_{name}", sent)
+    table.sent_step = wp.zeros((worlds, agents * table.slots), dtype=wp.int32, device=device)
+    table.step = wp.zeros((worlds, agents**2), dtype=wp.int32, device=device)
+    table.arrival = wp.full((worlds, agents * table.slots, agents), value=-1, dtype=wp.int32, device=device)
+    return table
+
+
+@wp.func
+def measured_velocity(arrays: TaskArrays, w: int, v: int) -> wp.vec3:
+    """Measured velocity of a vehicle, world frame [m/s]."""
+    nu = arrays.velocity[w, v]
+    return wp.quat_rotate(arrays.quaternion[w, v], wp.vec3(nu[0], nu[1], nu[2]))
+
+
+@wp.func
+def mate_position(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
+    """Where agent a takes agent b to be, world frame [m]: where it was when it sent the newest message heard."""
+    x = arrays.position[w, b]
+    if arrays.messages.on != 0 and a != b:
+        x = arrays.messages.position[w, a * arrays.agent_reward.shape[1] + b]
+    return x
+
+
+@wp.func
+def mate_velocity(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
+    """How agent a takes agent b to move, world frame [m/s]."""
+    v = measured_velocity(arrays, w, b)
+    if arrays.messages.on != 0 and a != b:
+        v = arrays.messages.velocity[w, a * arrays.agent_reward.shape[1] + b]
+    return v
+
+
+@wp.func
+def key_messages(state: State, arrays: TaskArrays, seed: int, w: int):
+    """Give the episode's losses a random stream of their own; a part of spawning."""
+    if arrays.messages.on != 0:
+        arrays.messages.key[w] = seed + 15485863 * state.episode[w] + 11
+
+
+@wp.func
+def open_messages(arrays: TaskArrays, w: int):
+    """Start an episode: everybody knows where the others start, and nothing is under way; a part of observing."""
+    if arrays.messages.on == 0:
+        return
+    agents = arrays.agent_reward.shape[1]
+    for a in range(agents):
+        for b in range(agents):
+            arrays.messages.position[w, a * agents + b] = arrays.position[w, b]
+            arrays.messages.velocity[w, a * agents + b] = measured_velocity(arrays, w, b)
+            arrays.messages.step[w, a * agents + b] = 0
+        for k in range(arrays.messages.arrival.shape[1]):
+            arrays.messages.arrival[w, k, a] = -1
+
+
+@wp.func
+def send(state: State, arrays: TaskArrays, w: int, b: int, step: int):
+    """Agent b sends what it measures of itself; when it arrives at each of the others is settled here."""
+    m = arrays.messages
+    agents = arrays.agent_reward.shape[1]
+    k = b * m.slots + (step // m.period) % m.slots
+    m.sent_position[w, k] = arrays.position[w, b]
+    m.sent_velocity[w, k] = measured_velocity(arrays, w, b)
+    m.sent_step[w, k] = step
+    for a in range(agents):
+        way = wp.length(state.position[w, a] - state.position[w, b])
+        delay = (way / m.speed_of_sound + m.processing) / m.control_step
+        own = wp.rand_init(wp.randi(wp.rand_init(m.key[w], w)), (step * agents + b) * agents + a)
+        lost = wp.randf(own) < m.loss
+        m.arrival[w, k, a] = wp.where(lost or a == b, -1, step + int(wp.ceil(delay - 1.0e-3)))
+
+
+@wp.func
+def exchange_messages(state: State, arrays: TaskArrays, w: int):
+    """After a control step: those whose turn it is send, and what arrives now is heard; a part of evaluating."""
+    if arrays.messages.on == 0:
+        return
+    m = arrays.messages
+    agents = arrays.agent_reward.shape[1]
+    step = state.steps[w]
+    for b in range(agents):
+        if step % m.period == (b * m.period) // agents:
+            send(state, arrays, w, b, step)
+    for b in range(agents):
+        for slot in range(m.slots):
+            k = b * m.slots + slot
+            for a in range(agents):
+                # A message that a newer one overtook is left unread.
+                if m.arrival[w, k, a] == step and m.sent_step[w, k] > m.step[w, a * agents + b]:
+                    m.position[w, a * agents + b] = m.sent_position[w, k]
+                    m.velocity[w, a * agents + b] = m.sent_velocity[w, k]
+                    m.step[w, a * agents + b] = m.sent_step[w, k]

@@ -1,0 +1,182 @@
+"""Following a wanted velocity with a vehicle's own thrust: for vehicles that a script commands, and for baselines."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from finssim.physics.types import vec6
+from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.given import EnvironmentSetupError
+from finssim.vehicles import HydrodynamicSet, Vehicle
+from finssim.vehicles.capability import terminal_speeds
+
+Array = NDArray[Any]
+
+RATE = 1.2
+"""How fast an error of the velocity goes [1/s]: as fast as motors and a control step of 0.1 s allow."""
+YAW_RATE = 3.0
+"""The same of the yaw rate [1/s]: three times as fast as the heading, or the heading swings."""
+TURN = 1.0
+"""Yaw rate asked for at a heading error of 1 rad [1/s]."""
+MOST_TURN = 0.8
+"""Largest yaw rate asked for [rad/s]."""
+NEEDED = ("surge", "sway", "heave", "yaw")
+"""Axes that a vehicle of these tasks must control ..."""
+ROWS = [0, 1, 2, 5]
+"""... and their places in a wrench."""
+
+
+@wp.struct
+class Drive:
+    """What following a velocity takes: on surge, sway, heave and yaw."""
+
+    d1: wp.vec4  # linear damping [N s/m, N m s]
+    d2: wp.vec4  # quadratic damping
+    mass: wp.vec4  # with added mass [kg, kg m²]
+    limit: wp.vec4  # wrench of an action of 1 [N, N m]
+    terminal: wp.vec4  # steady speed at the limit [m/s, rad/s]
+    sink: float  # weight less buoyancy [N]
+
+
+@wp.func
+def drive(d: Drive, q: wp.quat, nu: vec6, wanted: wp.vec4) -> wp.vec4:
+    """Action that brings the velocity to a wanted one.
+
+    tau = d1 v* + d2 |v*| v* + RATE m (v* - v) + (weight - buoyancy) up,  action = shared(tau / limit)
+
+    Args:
+        d: The vehicle's numbers.
+        q: Body to world.
+        nu: Velocity, body frame [m/s, rad/s].
+        wanted: v*: surge, sway, heave and yaw rate, body frame [m/s, rad/s].
+
+    Returns:
+        Parts of the limits on surge, sway, heave and yaw, each in [-1, 1].
+    """
+    v = wp.vec4(nu[0], nu[1], nu[2], nu[5])
+    up = wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
+    tau = d.sink * wp.vec4(up[0], up[1], up[2], 0.0)
+    a = wp.vec4()
+    for i in range(4):
+        tau[i] = tau[i] + (d.d1[i] + d.d2[i] * wp.abs(wanted[i])) * wanted[i]
+        tau[i] = tau[i] + wp.where(i == 3, YAW_RATE, RATE) * d.mass[i] * (wanted[i] - v[i])
+        a[i] = tau[i] / d.limit[i]
+    return shared(a)
+
+
+@wp.func
+def shared(a: wp.vec4) -> wp.vec4:
+    """Surge, sway and yaw limited together, for the same thrusters give them: yaw up to half, the others the rest."""
+    yaw = wp.clamp(a[3], -0.5, 0.5)
+    part = wp.min(1.0, (1.0 - wp.abs(yaw)) / wp.max(wp.abs(a[0]) + wp.abs(a[1]), 1.0e-6))
+    return wp.vec4(part * a[0], part * a[1], wp.clamp(a[2], -1.0, 1.0), yaw)
+
+
+@wp.func
+def towards(q: wp.quat, velocity: wp.vec3) -> wp.vec4:
+    """A velocity of the world as one of the body, with a yaw rate that turns the body's x axis along it.
+
+    Returns:
+        Surge, sway, heave and yaw rate [m/s, rad/s].
+    """
+    v = wp.quat_rotate_inv(q, velocity)
+    ahead = wp.quat_rotate_inv(q, wp.vec3(velocity[0], velocity[1], 0.0))
+    moving = ahead[0] * ahead[0] + ahead[1] * ahead[1] > 1.0e-8
+    error = wp.where(moving, wp.atan2(ahead[1], ahead[0]), 0.0)
+    return wp.vec4(v[0], v[1], v[2], wp.clamp(TURN * error, -MOST_TURN, MOST_TURN))
+
+
+@wp.func
+def write_scripted(arrays: TaskArrays, w: int, action: wp.vec4):
+    """Write the action of the only vehicle that the task commands, as wrench4 or as wrench6 without roll and pitch."""
+    size = arrays.scripted.shape[1]
+    for i in range(size):
+        arrays.scripted[w, i] = 0.0
+    for i in range(3):
+        arrays.scripted[w, i] = action[i]
+    arrays.scripted[w, size - 1] = action[3]
+
+
+@dataclass(frozen=True)
+class DriveNumbers:
+    """`Drive` of a vehicle as plain numbers; rows are surge, sway, heave, yaw."""
+
+    d1: tuple[float, ...]
+    """Linear damping [N s/m, N m s]."""
+    d2: tuple[float, ...]
+    """Quadratic damping."""
+    mass: tuple[float, ...]
+    """With added mass [kg, kg m²]."""
+    limit: tuple[float, ...]
+    """Wrench of an action of 1 [N, N m]."""
+    terminal: tuple[float, ...]
+    """Steady speed at the limit [m/s, rad/s]."""
+    sink: float
+    """Weight less buoyancy [N]."""
+
+    @classmethod
+    def of(cls, vehicle: Vehicle) -> "DriveNumbers":
+        """The numbers of a vehicle, from its first hydrodynamic set with coefficients.
+
+        Raises:
+            EnvironmentSetupError: It does not control one of the axes, or has no coefficients.
+        """
+        missing = [axis for axis in NEEDED if axis not in vehicle.controlled_axes]
+        sets = [name for name, one in vehicle.hydrodynamics.items() if isinstance(one, HydrodynamicSet)]
+        if missing or not sets:
+            lacks = f"does not control {', '.join(missing)}" if missing else "has no damping coefficients"
+            raise EnvironmentSetupError(
+                f"vehicle '{vehicle.name}' {lacks}: pursuit and formation need {', '.join(NEEDED)} and known damping; "
+                "take another vehicle"
+            )
+        hydro: Any = vehicle.hydrodynamics[sets[0]]
+        quadratic = np.diag(hydro.quadratic_damping).copy()
+        quadratic[0] += hydro.surge_damping[0, 0]
+        columns = (
+            np.diag(hydro.linear_damping), quadratic, np.diag(vehicle.mass_matrix(sets[0])),
+            vehicle.wrench_limits, terminal_speeds(vehicle, sets[0]),
+        )  # fmt: skip
+        return cls(
+            *(tuple(column[ROWS].tolist()) for column in columns), sink=vehicle.weight - vehicle.buoyancy
+        )
+
+    def action(self, velocity: Array, wanted: Array) -> NDArray[np.float32]:
+        """As `drive`, of a level vehicle.
+
+        Args:
+            velocity: Surge, sway, heave, yaw rate [m/s, rad/s], (n, 4).
+            wanted: The same, wanted.
+
+        Returns:
+            Parts of the limits on the four axes, (n, 4), each in [-1, 1].
+        """
+        d1, d2, mass, limit = (np.array(row) for row in (self.d1, self.d2, self.mass, self.limit))
+        rate = np.array([RATE, RATE, RATE, YAW_RATE])
+        tau = (d1 + d2 * np.abs(wanted)) * wanted + rate * mass * (wanted - velocity)
+        tau[:, 2] += self.sink
+        a = tau / limit
+        a[:, 2:] = np.clip(a[:, 2:], [-1.0, -0.5], [1.0, 0.5])
+        left = 1.0 - np.abs(a[:, 3])
+        a[:, :2] *= np.minimum(1.0, left / np.maximum(np.abs(a[:, :2]).sum(axis=1), 1e-6))[:, None]
+        return a.astype(np.float32)
+
+    def turned(self, error: Array) -> Array:
+        """Yaw rate that takes a heading error away [rad/s], from the error [rad]."""
+        return np.clip(TURN * error, -MOST_TURN, MOST_TURN)
+
+    def struct(self) -> Drive:
+        """The struct that kernels take."""
+        out = Drive()
+        for name in ("d1", "d2", "mass", "limit", "terminal"):
+            setattr(out, name, wp.vec4(*getattr(self, name)))
+        out.sink = self.sink
+        return out
+
+
+def slowest(vehicles: Sequence[Vehicle]) -> float:
+    """The smallest steady surge speed among vehicles [m/s]: what the speed of their prey is tied to."""
+    return min(DriveNumbers.of(vehicle).terminal[0] for vehicle in vehicles)
