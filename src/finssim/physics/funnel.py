@@ -3,7 +3,7 @@
 Dock axes: the origin is the middle of the throat, where cone and tube meet; x points into the tube.
 """
 
-# mypy: disable-error-code="arg-type,call-overload,index,no-any-return,operator"
+# mypy: disable-error-code="arg-type,call-overload,index,no-any-return,operator,return-value,valid-type"
 
 import warp as wp
 

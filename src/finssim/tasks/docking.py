@@ -48,18 +48,21 @@ class Hull:
     """From the body's x axis to a corner of its envelope [m]."""
     inertia: float = 27.1
     """In surge, with the water that goes along [kg]."""
-    speed: float = 0.5
+    speed: float = 0.476
     """That the dock is built for, forwards [m/s]."""
+    thrust: float = 19.8
+    """Greatest, forwards [N]."""
 
     @classmethod
     def of(cls, vehicle: Vehicle) -> "Hull":
         """Of a vehicle's file."""
-        length, width, height = vehicle.body.size
+        length, width, height = map(float, vehicle.body.size)
         return cls(
             length,
             0.5 * math.hypot(width, height),
             float(axis_model(vehicle, coefficients_of(vehicle)).inertia[0]),
             min(float(terminal_speeds(vehicle)[0]), BRISK * length),
+            float(vehicle.wrench_limits[0]),
         )
 
 
@@ -138,14 +141,15 @@ class Docking(Task):
     """... turned away from it by this at most [rad]."""
     tilt: float = math.radians(10.0)
     """Largest roll and pitch at the start [rad]."""
-    tank: tuple[float, float] = (16.0, 5.0)
+    tank: tuple[float, float] = (18.0, 6.0)
     """Width and depth of the tank."""
     slow: float = 0.1
     """Success: the nose inside, at most this fast, in parts of the speed the dock is built for, ..."""
     hold: float = 2.0
     """... for this long [s]."""
     hard: float = 0.5
-    """A contact force ends the episode above that of a hit at this part of the speed the dock is built for."""
+    """A contact force ends the episode above that of a hit at this part of the speed the dock is built for, and of a
+    press with all the vehicle's thrust on top."""
     reward: DockingReward = field(default_factory=DockingReward)
     training_noise: MeasurementNoise = MeasurementNoise(
         position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02
@@ -162,8 +166,8 @@ class Docking(Task):
     @property
     def force_limit(self) -> float:
         """Contact force above which an episode ends [N]: a spring stops a mass m at speed v with √(k m) v."""
-        dock = self.dock()
-        return self.hard * self.hull.speed * math.sqrt(dock.stiffness * self.hull.inertia)
+        hit = self.hard * self.hull.speed * math.sqrt(self.dock().stiffness * self.hull.inertia)
+        return self.hull.thrust + hit
 
     def dock(self) -> Dock:
         """The dock's shape and stiffness [m, N/m, N s/m]."""

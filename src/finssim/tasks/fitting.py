@@ -58,7 +58,7 @@ def terminal_speeds(vehicle: Vehicle) -> NDArray[np.float64]:
 
 def fit(vehicle: Vehicle) -> Fit:
     """Room in proportion to the vehicle's length, speeds in proportion to the room or to what it can do, the lesser."""
-    size = max(1.0, max(vehicle.body.size) / LENGTH)
+    size = max(1.0, float(max(vehicle.body.size)) / LENGTH)
     speeds = terminal_speeds(vehicle)[list(driven_axes(vehicle))]
     slowest = float(speeds.min()) if len(speeds) else 0.0
-    return Fit(size, min(size, slowest / SLOWEST_SPEED), max(1.0, vehicle.body.mass / MASS))
+    return Fit(size, min(size, slowest / SLOWEST_SPEED), max(1.0, float(vehicle.body.mass) / MASS))

@@ -1,0 +1,122 @@
+"""Claims about every task and every vehicle of the catalogue: the same again, bounded, reset, counted."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from finssim.tasks import TASKS, EnvironmentSetupError, make
+from finssim.tasks.fitting import coefficients_of, driven_axes
+from finssim.vehicles import catalogue, load_vehicle
+
+NAMES = list(TASKS)
+SHORT = 1.0
+"""Length of an episode [s]: several end in a test."""
+
+
+def environment(name, vehicle="finsrov", worlds=4, **options):
+    model = coefficients_of(load_vehicle(vehicle))
+    return make(
+        replace(TASKS[name](), time_limit=SHORT),
+        worlds=worlds,
+        vehicle=vehicle,
+        hydrodynamics=model,
+        **options,
+    )
+
+
+def actions(env, steps, seed=0):
+    """Actions of the first worlds do not depend on how many there are."""
+    agents = () if env.agents == 1 else (env.agents,)
+    shape = (env.worlds, steps, *agents, env.action_size)
+    return np.random.default_rng(seed).uniform(-1.5, 1.5, shape).astype(np.float32).swapaxes(0, 1)
+
+
+def played(env, steps=25, given=None):
+    """Observations, rewards and ends of every step, as copies."""
+    out = []
+    for action in actions(env, steps) if given is None else given:
+        step = env.step(action)
+        out.append(
+            (step.observation.copy(), step.reward.copy(), step.terminated.copy(), step.truncated.copy())
+        )
+    return [np.array(column) for column in zip(*out, strict=True)]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_equal_seeds_give_equal_runs(name):
+    """Bit for bit, over several episodes; another seed gives another run."""
+    first, again, other = (played(environment(name, seed=seed)) for seed in (3, 3, 4))
+    for a, b in zip(first, again, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(first[0], other[0])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_number_of_worlds_changes_nothing(name):
+    """The first worlds of many, on two threads, are those of few, bit for bit."""
+    few, many = environment(name, worlds=3, seed=5), environment(name, worlds=130, threads=2, seed=5)
+    given = actions(many, 25)
+    for a, b in zip(played(few, given=given[:, :3]), played(many, given=given), strict=True):
+        np.testing.assert_array_equal(a, b[:, :3])
+
+
+@pytest.mark.parametrize("vehicle", catalogue())
+@pytest.mark.parametrize("name", NAMES)
+def test_observations_stay_bounded_whatever_the_vehicle(name, vehicle):
+    """Full thrusts this way and that: every number finite and of order one, rewards finite, episodes end.
+
+    A task may refuse a vehicle that cannot push every way, with a sentence that says so.
+    """
+    try:
+        env = environment(name, vehicle)
+    except EnvironmentSetupError as refusal:
+        assert "does not control" in str(refusal) and len(driven_axes(load_vehicle(vehicle))) < 3
+        return
+    observation, reward, terminated, truncated = played(env)
+    assert np.isfinite(observation).all() and np.abs(observation).max() < 12.0
+    assert np.isfinite(reward).all()
+    assert (terminated | truncated).any(axis=0).all() and not (terminated & truncated).any()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_reset_starts_over_and_leaves_the_others_alone(name):
+    """With a seed, everything as it was; with a mask, only the masked worlds."""
+    env = environment(name, seed=1)
+    first = env.reset(seed=1).copy()
+    played(env, 5)
+    np.testing.assert_array_equal(env.reset(seed=1), first)
+    played(env, 5)
+    before = env.arrays.observation.numpy().copy()
+    after = env.reset(mask=[True, False, True, False]).reshape(4, -1)
+    np.testing.assert_array_equal(after[[1, 3]], before[[1, 3]])
+    assert np.all(np.any(after[[0, 2]] != before[[0, 2]], axis=1))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_metrics_tell_how_the_last_episode_went(name):
+    """Return and length are those of the steps, success is 0 or 1, all by world."""
+    env = environment(name)
+    total, length = np.zeros(4), np.zeros(4)
+    last = {}
+    for action in actions(env, 12):
+        step = env.step(action)
+        total += step.reward.reshape(4, -1).mean(axis=1)
+        length += 1
+        for w in np.flatnonzero(step.terminated | step.truncated):
+            last[w] = (total[w], length[w])
+            total[w] = length[w] = 0.0
+    measured = env.task.metrics(env.arrays)
+    assert sorted(last) == [0, 1, 2, 3]
+    np.testing.assert_allclose(measured["return"], [last[w][0] for w in range(4)], atol=1e-3)
+    np.testing.assert_array_equal(measured["length"], [last[w][1] for w in range(4)])
+    assert all(values.shape == (4,) for values in measured.values())
+    assert set(measured["success"].tolist()) <= {0.0, 1.0}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_episodes_differ_from_each_other_and_between_worlds(name):
+    """Every start is drawn anew."""
+    env = environment(name, worlds=8)
+    starts = np.concatenate([env.reset().reshape(8, -1).copy() for _ in range(4)])
+    assert len({row.tobytes() for row in starts}) == 32
