@@ -16,6 +16,7 @@ from finssim import (
     cli_learn,
     cli_localization,
     cli_pool,
+    cli_randomize,
     cli_record,
     cli_robot,
     cli_ros2,
@@ -60,6 +61,7 @@ app.command()(cli_localization.localize)
 app.command()(cli_localization.fuse)
 app.command()(cli_localization.project)
 app.command()(cli_localization.backproject)
+app.add_typer(cli_randomize.randomize_app, name="randomize")
 app.add_typer(cli_record.record_app, name="record")
 app.command()(cli_record.play)
 app.command()(cli_record.teleop)

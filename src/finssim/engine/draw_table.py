@@ -109,6 +109,8 @@ def widened(
         down, up = (math.log(end / anchor) for end in (low, high))
         return [anchor * math.exp(low_part * down), anchor * math.exp(high_part * up), 0.0, 0.0], 1.0
     ends = [anchor + low_part * (low - anchor), anchor + high_part * (high - anchor)]
+    if distribution.normal is None:
+        return [*ends, 0.0, 0.0], 1.0
     return [*ends, anchor + high_part * (mean - anchor), high_part * std], 1.0
 
 

@@ -9,7 +9,8 @@ import warp as wp
 from numpy.typing import NDArray
 
 from finssim.engine.distributions import bounds_of
-from finssim.engine.draw_kernels import DrawnArrays, Nominal, draw_episode, jitter_commands
+from finssim.engine.draw_kernels import DrawnArrays, draw_episode, jitter_commands
+from finssim.engine.draw_places import Nominal
 from finssim.engine.draw_table import draw_table, widened
 from finssim.engine.launch import Pipeline
 from finssim.engine.measured import SENSORS, Measurement

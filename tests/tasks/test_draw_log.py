@@ -1,0 +1,96 @@
+"""The log says of every episode what it had and how it went."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+
+from finssim.engine.randomize import Randomization
+from finssim.engine.ranges_file import Ranges
+from finssim.tasks import Environment, EnvironmentSetupError, StationKeeping
+from finssim.tasks.draw_log import LogError, read_draws
+
+RANGES = Ranges(name="test", mass=(0.9, 1.3), current=(0.0, 0.2))
+
+
+@pytest.fixture(scope="module")
+def logged():
+    """Three episodes of four steps in five worlds, with what a look at the plant says of each."""
+    env = Environment(StationKeeping(time_limit=0.4), worlds=5, randomization=Randomization(RANGES), seed=6)
+    log, seen = env.drawing.start_log(), []
+    for step in range(13):
+        if step % 4 == 0:
+            seen.append(env.simulator.plant.mass.numpy()[:, 0] / env.simulator.vehicles[0].body.mass)
+        env.step(np.full((5, 6), 0.1))
+        if step % 4 == 3:
+            seen.append((env.arrays.final_return.numpy().copy(), env.arrays.final_held.numpy().copy()))
+    return log, seen
+
+
+def test_every_episode_that_ended_has_its_row(logged):
+    log, seen = logged
+    e = log.episodes()
+    assert e.names == ("mass", "current", "current.direction") and e.units == ("1", "m/s", "rad")
+    assert e.values.shape == (15, 1, 3)
+    np.testing.assert_array_equal(e.world, np.tile(np.arange(5), 3))
+    np.testing.assert_array_equal(e.episode, np.repeat([1, 2, 3], 5))
+    assert (e.length == 4).all()
+    np.testing.assert_allclose(e.column("mass"), np.concatenate(seen[0:6:2]), rtol=1e-6)
+    np.testing.assert_allclose(e.episode_return, np.concatenate([x[0] for x in seen[1:6:2]]), rtol=1e-6)
+    np.testing.assert_allclose(e.held, np.concatenate([x[1] for x in seen[1:6:2]]), rtol=1e-6)
+
+
+def test_what_is_written_is_read_back(logged, tmp_path):
+    log, _ = logged
+    e, back = log.episodes(), read_draws(log.save(tmp_path / "draws.npz"))
+    for name in ("values", "world", "episode", "length", "episode_return", "held"):
+        np.testing.assert_array_equal(getattr(e, name), getattr(back, name))
+    assert back.names == e.names and back.units == e.units
+    assert back.about["ranges"]["mass"] == [0.9, 1.3] and back.about["seed"] == 6
+    assert back.about["vehicles"][0]["name"] == "finsrov" and "revision" in back.about["provenance"]
+
+
+def test_the_table_has_a_row_for_each_vehicle_of_each_episode(logged, tmp_path):
+    log, _ = logged
+    with log.save(tmp_path / "draws.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    e = log.episodes()
+    assert len(rows) == 15 and list(rows[0])[:6] == [
+        "world",
+        "episode",
+        "length",
+        "episode_return",
+        "held",
+        "vehicle",
+    ]
+    np.testing.assert_allclose([float(row["mass"]) for row in rows], e.column("mass"), rtol=1e-6)
+
+
+def test_episodes_that_are_cut_off_are_left_out():
+    env = Environment(StationKeeping(time_limit=0.4), worlds=3, randomization=Randomization(RANGES), seed=6)
+    log = env.drawing.start_log()
+    env.step(np.zeros((3, 6)))
+    env.reset()
+    mass = env.drawing.draws.numpy(["mass"])[:, 0, 0]
+    assert len(log.episodes().world) == 0
+    for _ in range(4):
+        env.step(np.zeros((3, 6)))
+    np.testing.assert_array_equal(log.episodes().column("mass"), mass)
+    assert (log.episodes().episode == 2).all()
+
+
+def test_what_cannot_be_logged_or_read_is_refused(logged, tmp_path):
+    log, _ = logged
+    with pytest.raises(LogError, match="ends in '.txt', expected .npz or .csv"):
+        log.save(tmp_path / "draws.txt")
+    with pytest.raises(LogError, match="'slew' was not drawn; drawn were: mass"):
+        log.episodes().column("slew")
+    with pytest.raises(LogError, match="no such file"):
+        read_draws(tmp_path / "none.npz")
+    (tmp_path / "bad.npz").write_bytes(b"no")
+    with pytest.raises(LogError, match="not a log of draws"):
+        read_draws(tmp_path / "bad.npz")
+    with pytest.raises(EnvironmentSetupError, match="nothing is drawn that could be logged"):
+        Environment(StationKeeping()).drawing.start_log()
