@@ -23,11 +23,22 @@ def train(
     out: Annotated[
         Path, typer.Option(help="Directory of the policy; an earlier policy there is replaced when done.")
     ],
+    learner: Annotated[
+        str,
+        typer.Option(
+            help="Who learns: sb3-ppo, sb3-sac, rsl-rl, torchrl-ppo; several agents also torchrl-ippo, torchrl-mappo.",
+            metavar="NAME",
+        ),
+    ] = "sb3-ppo",
     vehicle: Vehicle = "finsrov",
     hydrodynamics: Hydrodynamics = "calibrated",
     action: Annotated[
-        str, typer.Option(help="What the policy commands: wrench6, wrench4 or thruster8.", metavar="MODE")
-    ] = "wrench6",
+        str | None,
+        typer.Option(
+            help="What the policy commands: wrench6, wrench4 or thruster8; the task's own if not given.",
+            metavar="MODE",
+        ),
+    ] = None,
     randomize: Annotated[
         str | None,
         typer.Option(
@@ -39,17 +50,36 @@ def train(
     seed: Seed = 42,
     worlds: Annotated[int | None, typer.Option(help="Worlds simulated at once.", min=1)] = None,
     steps: Steps = None,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            help="Change of a setting of the learner, such as learning_rate=1e-3 or hidden=128,128. May be given "
+            "several times.",
+            metavar="NAME=VALUE",
+        ),
+    ] = None,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Go on from the last checkpoint of a training that was killed."),
+    ] = False,
     device: Device = "cpu",
 ) -> None:
     """Train a policy and write it to a directory that runs without the learner.
 
     Example: finssim train t1 --vehicle finsrov --seed 1 --out runs/hold
+
+    Example: finssim train t2 --learner rsl-rl --randomize hold_for_position --set epochs=8 --out runs/track
     """
     start_warp()
+    from finssim.learning.train import settings_of_words
     from finssim.learning.train import train as run
 
     run(
         task,
+        learner=learner,
+        settings=settings_of_words(changes or ()),
+        resume=resume,
         vehicle=vehicle,
         hydrodynamics=hydrodynamics,
         action=action,

@@ -3,6 +3,8 @@
 import csv
 import hashlib
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +18,12 @@ from finssim.engine.ranges_file import RangesError
 from finssim.experiments.evaluate import evaluate_controller
 from finssim.experiments.plants import load_plant
 from finssim.files import OutputError
-from finssim.learning import ppo
 from finssim.learning.description import observation_schema
+from finssim.learning.learners import LEARNERS, LearningError
+from finssim.learning.resume import ResumeError
 from finssim.learning.train import TrainingError, train
-from finssim.tasks import StationKeeping
+from finssim.learning.training_loop import Loop
+from finssim.tasks import EnvironmentSetupError, StationKeeping
 from finssim.vehicles import VehicleError, load_vehicle
 
 TINY = {"worlds": 16, "steps": 8192}
@@ -67,6 +71,7 @@ def test_curves_and_log_are_written(trained):
         rows = list(csv.DictReader(file))
     assert [int(row["steps"]) for row in rows] == [8192]
     assert {"seconds", "steps_per_s", "mean_return", "held", "action_std"} <= rows[0].keys()
+    assert 0.0 <= float(rows[0]["evaluation_success"]) <= 1.0 and float(rows[0]["evaluation_return"]) < 0.0
     assert list((trained.parent / "tiny-training" / "tensorboard").glob("events.out.tfevents*"))
     assert sorted(p.name for p in trained.iterdir()) == ["curves.csv", "policy.onnx", "policy.yaml"]
 
@@ -92,20 +97,20 @@ def test_options_reach_the_policy(tmp_path):
     assert told.hydrodynamics == "simplified" and told.training["randomization"]["mass"] == [0.98, 1.02]
 
 
-def interrupt_after(rollouts, monkeypatch):
-    """Ctrl-C at the end of that rollout, before the update that follows it."""
-    record = ppo._Watch._on_rollout_end
+def interrupt_after(updates, monkeypatch):
+    """Ctrl-C in the update that follows so many."""
+    update = Loop._update
 
-    def interrupt(self):
-        record(self)
-        if len(self.curves) == rollouts:
+    def interrupt(self, total):
+        if len(self.curves) == updates:
             raise KeyboardInterrupt
+        return update(self, total)
 
-    monkeypatch.setattr(ppo._Watch, "_on_rollout_end", interrupt)
+    monkeypatch.setattr(Loop, "_update", interrupt)
 
 
 def test_an_interrupted_training_writes_the_policy_so_far(tmp_path, monkeypatch):
-    """Ctrl-C in the third update: a whole policy directory, that says so, then the interrupt goes on."""
+    """Ctrl-C in the fourth update: a whole policy directory, that says so, then the interrupt goes on."""
     interrupt_after(3, monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         train("t1", out=tmp_path / "p", worlds=16, steps=100_000)
@@ -128,7 +133,7 @@ def test_an_interrupted_training_leaves_an_earlier_policy_alone(trained, tmp_pat
 
 def test_a_training_interrupted_before_it_learned_writes_no_policy(trained, tmp_path, monkeypatch, capsys):
     """Neither anew nor over an earlier one: the network would be the random one that it started as."""
-    interrupt_after(1, monkeypatch)
+    interrupt_after(0, monkeypatch)
     shutil.copytree(trained, tmp_path / "earlier")
     for name in ("new", "earlier"):
         with pytest.raises(KeyboardInterrupt):
@@ -138,13 +143,87 @@ def test_a_training_interrupted_before_it_learned_writes_no_policy(trained, tmp_
     assert not (tmp_path / "new").exists() and network(tmp_path / "earlier") == network(trained)
 
 
-def test_checkpoints_are_policies(tmp_path, monkeypatch):
+SMALL = {"worlds": 16, "steps": 4096, "seed": 5, "settings": {"rollout": 32, "batch": 128, "epochs": 2}}
+"""Eight updates; a checkpoint after every second one."""
+
+
+def test_the_last_two_checkpoints_are_kept_and_are_policies(tmp_path):
     """Each stands beside the policy, under the steps it had seen, and loads."""
-    monkeypatch.setattr(ppo, "CHECKPOINT_STEPS", 8192)
-    train("t1", out=tmp_path / "p", worlds=16, steps=16_384)
+    train("t1", out=tmp_path / "p", **SMALL)
     folders = sorted((tmp_path / "p-training").glob("checkpoint-*"))
-    assert [folder.name for folder in folders] == ["checkpoint-000008192", "checkpoint-000016384"]
-    assert Policy.load(folders[0]).description.training["steps_done"] == 8192
+    assert [folder.name for folder in folders] == ["checkpoint-000003072", "checkpoint-000004096"]
+    assert Policy.load(folders[0]).description.training["steps_done"] == 3072
+
+
+DYING = """
+import os, signal, sys
+from pathlib import Path
+from finssim.learning.train import train
+from finssim.learning.training_loop import Loop
+
+update = Loop._update
+
+def dying(self, total):
+    if len(self.curves) == 5:
+        for p in self.learner.network().parameters():
+            p.data.zero_()  # what is in memory now must not matter
+        os.kill(os.getpid(), signal.SIGKILL)
+    return update(self, total)
+
+Loop._update = dying
+train("t1", out=Path(sys.argv[1]), learner=sys.argv[2], **eval(sys.argv[3]))
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("learner", [name for name, kind in LEARNERS.items() if kind.agents != "several"])
+def test_a_killed_training_goes_on_to_the_same_policy(tmp_path, learner):
+    """kill -9 in the sixth of eight updates, then --resume: network and curves as if nothing had been."""
+    options = dict(SMALL)
+    if learner == "sb3-sac":
+        options["settings"] = {"rollout": 32, "batch": 64, "warm_up": 600, "gradient_steps": 4}
+    whole = train("t1", out=tmp_path / "whole", learner=learner, **options)
+    words = [sys.executable, "-c", DYING, str(tmp_path / "p"), learner, repr(options)]
+    run = subprocess.run(words, capture_output=True, text=True)
+    assert run.returncode == -9, run.stderr
+    assert not (tmp_path / "p").exists() and (tmp_path / "p-training" / "checkpoint-000002048").is_dir()
+    resumed = train("t1", out=tmp_path / "p", learner=learner, resume=True, **options)
+    assert network(resumed) == network(whole)
+    clock = {"seconds", "steps_per_s"}
+    rows = [
+        [
+            {k: v for k, v in row.items() if k not in clock}
+            for row in csv.DictReader((folder / "curves.csv").open())
+        ]
+        for folder in (whole, resumed)
+    ]
+    assert rows[0] == rows[1] and len(rows[0]) == 8
+
+
+def test_only_the_same_training_is_resumed(tmp_path, capsys):
+    """Other arguments are named; where nothing was begun that is said; before the first checkpoint it begins anew."""
+    with pytest.raises(ResumeError, match="nothing to resume: there is no folder .*leave out --resume"):
+        train("t1", out=tmp_path / "p", resume=True, **SMALL)
+    first = network(train("t1", out=tmp_path / "p", **SMALL))
+    with pytest.raises(ResumeError, match="seed was 5 and is 6 now: give what the training began with"):
+        train("t1", out=tmp_path / "p", resume=True, **{**SMALL, "seed": 6})
+    side = tmp_path / "p-training"
+    for state in side.glob("checkpoint-*/resume.pt"):
+        state.write_bytes(state.read_bytes()[:1000])
+    with pytest.raises(ResumeError, match="checkpoint-000003072/resume.pt: cannot be resumed from"):
+        train("t1", out=tmp_path / "p", resume=True, **SMALL)
+    for folder in side.glob("checkpoint-*"):
+        shutil.rmtree(folder)
+    assert network(train("t1", out=tmp_path / "p", resume=True, **SMALL)) == first
+    assert "yet: starting from the beginning" in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_a_learner_whose_numbers_run_away_is_stopped(tmp_path):
+    """One sentence, and no policy."""
+    options = {**SMALL, "settings": {**SMALL["settings"], "learning_rate": 1e30}}
+    with pytest.raises((LearningError, EnvironmentSetupError), match="diverged"):
+        train("t1", out=tmp_path / "p", learner="torchrl-ppo", **options)
+    assert not (tmp_path / "p").exists()
 
 
 @pytest.mark.parametrize(
@@ -157,6 +236,13 @@ def test_checkpoints_are_policies(tmp_path, monkeypatch):
         ({"hydrodynamics": "fosen"}, ValueError, "unknown hydrodynamic model 'fosen'"),
         ({"worlds": 0}, TrainingError, "worlds is 0, expected 1 or more"),
         ({"steps": -5}, TrainingError, "steps is -5, expected 1 or more"),
+        ({"learner": "sb3"}, LearningError, "unknown learner 'sb3'; available: sb3-ppo"),
+        (
+            {"learner": "torchrl-mappo"},
+            LearningError,
+            "task 't1' has one agent, and this learner trains several",
+        ),
+        ({"settings": {"gamma": 0.9}}, LearningError, "unknown setting 'gamma'; available: worlds"),
         ({"device": "tpu"}, ValueError, "device 'tpu' is not available"),
     ],
 )
@@ -195,9 +281,10 @@ def test_trajectory_tracking_is_trained_too(tmp_path):
     policy = Policy.load(folder, task={"name": "t2", "observation": SCHEMA_T2.model_dump(mode="json")})
     assert policy.act(np.zeros((2, 30))).shape == (2, 6)
     training = yaml.safe_load((folder / "policy.yaml").read_text(encoding="utf-8"))["training"]
-    assert training["discount"] == ppo.SETTINGS["t2"].discount != ppo.SETTINGS["t1"].discount
+    assert training["discount"] == 0.9 and training["learner"] == "sb3-ppo"
     assert training["task"]["training_noise"]["position_std"] == 0.01
-    assert ppo.settings_for("t2", randomized=True).steps > ppo.settings_for("t2").steps
+    kind, task = LEARNERS["sb3-ppo"], StationKeeping()
+    assert kind.settings(task, randomized=True).steps > kind.settings(task).steps
 
 
 @pytest.mark.long

@@ -5,6 +5,9 @@ import pytest
 
 import finssim
 from finssim.engine import Water
+from finssim.engine.randomize import Randomization
+from finssim.engine.ranges_file import load_ranges
+from finssim.engine.ranges_schedule import Curriculum
 from finssim.tasks import TASKS, EnvironmentSetupError, MeasurementNoise
 
 NOISE = MeasurementNoise(
@@ -15,8 +18,8 @@ WATER = Water(current=(0.05, 0.0, 0.0), drift_std=(0.05, 0.05, 0.02), drift_time
 
 def made(task, **options):
     """A few worlds in which everything is random, at episodes of random age, so that some end soon."""
-    options = {"worlds": 6, "seed": 4, "observe": NOISE, "water": WATER, **options}
-    environment = finssim.make(task, randomize="fossen_learn_to_swim", **options)
+    usual = {"worlds": 6, "seed": 4, "observe": NOISE, "water": WATER, "randomize": "fossen_learn_to_swim"}
+    environment = finssim.make(task, **{**usual, **options})
     limit = round(environment.task.time_limit / environment.task.control_step)
     age = np.linspace(0, limit - 12, environment.worlds).astype(np.int32)
     environment.simulator.state.steps.assign(age)
@@ -32,7 +35,8 @@ def act(environment, steps, seed):
         environment.advance()
         out = environment.outcome()
         seen += [
-            np.array(x) for x in (out.observation, out.reward, out.terminated, out.truncated, out.final_observation)
+            np.array(x)
+            for x in (out.observation, out.reward, out.terminated, out.truncated, out.final_observation)
         ]
     return seen
 
@@ -50,7 +54,24 @@ def test_a_run_that_goes_on_is_the_run_that_was_not_interrupted(task):
     assert any(done.any() for done in first[3::5]), "no episode ended: the test proves less than it says"
     assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
     after, again = whole.state(), other.state()
-    assert after.keys() == again.keys() and all(np.array_equal(after[k], again[k], equal_nan=True) for k in after)
+    assert after.keys() == again.keys() and all(
+        np.array_equal(after[k], again[k], equal_nan=True) for k in after
+    )
+
+
+@pytest.mark.parametrize("by", ["steps", "success"])
+def test_ranges_that_grow_go_on_growing(by):
+    """A look at the successes falls into the second part only if the steps before are counted."""
+    growing = load_ranges("fossen_learn_to_swim").model_copy(
+        update={"curriculum": Curriculum(by=by, episodes=1, narrow_at=0.0, widen_at=0.0, over=(0.0, 1000.0))}
+    )
+    whole, other = (made("t1", randomize=Randomization(growing)) for _ in range(2))
+    act(whole, 45, seed=0)
+    before = whole.drawing.schedule.width
+    other.load_state(whole.state())
+    first, second = act(whole, 12, seed=1), act(other, 12, seed=1)
+    assert other.drawing.schedule.width == whole.drawing.schedule.width > before
+    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
 
 
 def test_a_saved_state_is_a_copy():

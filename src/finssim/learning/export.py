@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from datetime import datetime, timezone
 from importlib.util import find_spec
@@ -51,6 +51,7 @@ def export_policy(
     *,
     curves: Sequence[Mapping[str, Any]] = (),
     evaluation: Mapping[str, Any] | None = None,
+    also: Callable[[Path], None] | None = None,
     tolerance: float = 1e-6,
 ) -> Path:
     """Writes a policy directory whole or not at all, after checking that onnxruntime computes what torch does.
@@ -61,6 +62,7 @@ def export_policy(
         description: What it was trained with; `files`, `provenance` and `created` are filled in here.
         curves: Rows of `curves.csv`, with equal keys.
         evaluation: Content of `evaluation.json`.
+        also: Writes more files into the folder before it takes its place.
         tolerance: Largest difference allowed between the actions of torch and onnxruntime, beyond float32 rounding [1].
 
     Returns:
@@ -92,6 +94,8 @@ def export_policy(
         if evaluation is not None:
             text = json.dumps(evaluation, indent=2, allow_nan=False) + "\n"
             (folder / EVALUATION_FILE).write_text(text, encoding="utf-8")
+        if also is not None:
+            also(folder)
         _check_agreement(network, Policy.load(folder), tolerance)
     return Path(directory)
 

@@ -1,24 +1,32 @@
-"""`finssim train`: from a task and a vehicle to a policy directory."""
+"""`finssim train`: from a task and a vehicle to a policy directory, with any learner."""
 
 from __future__ import annotations
 
 import time
 import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from finssim.control.modes import action_mode
-from finssim.control.policy_description import DESCRIPTION_FILE, PolicyDescription, VehicleIdentity
+from finssim.control.policy_description import (
+    DESCRIPTION_FILE,
+    PolicyDescription,
+    VehicleIdentity,
+    plain_data,
+)
 from finssim.engine.randomize import Randomization
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.learning.description import observation_schema, task_record
+from finssim.learning.learners import learner_named
 from finssim.quiet import start_warp
-from finssim.tasks import TASKS, Environment
+from finssim.tasks import TASKS, Environment, Task, make, task_named
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["TrainingError", "train"]
+__all__ = ["TrainingError", "settings_of_words", "train"]
 
 
 class TrainingError(ValueError):
@@ -26,36 +34,43 @@ class TrainingError(ValueError):
 
 
 def train(
-    task: str,
+    task: str | Task,
     *,
     out: Path,
+    learner: str = "sb3-ppo",
     vehicle: str | Vehicle = "finsrov",
     hydrodynamics: str = "calibrated",
-    action: str = "wrench6",
+    action: str | None = None,
     randomize: str | Path | None = None,
     seed: int = 42,
     worlds: int | None = None,
     steps: int | None = None,
+    settings: Mapping[str, Any] | None = None,
     device: str = "cpu",
+    resume: bool = False,
     console: Console | None = None,
     shown: Path | None = None,
     interrupted: Path | None = None,
 ) -> Path:
     """Train a policy and write its directory.
 
-    The folder `OUT-training` beside it takes the TensorBoard log and the checkpoints, each a policy directory too.
+    The folder `OUT-training` beside it takes the TensorBoard log and the last two checkpoints: policy directories from
+    which a killed training goes on to the same result.
 
     Args:
-        task: Key of `TASKS`.
+        task: Key of `TASKS`, or a task.
         out: Policy directory to write; an earlier policy there is replaced.
+        learner: Key of `LEARNERS`.
         vehicle: A vehicle, a catalogue name or a file.
         hydrodynamics: calibrated, mesh or simplified.
-        action: wrench6, wrench4 or thruster8.
+        action: wrench6, wrench4 or thruster8; the task's own if None.
         randomize: Name or file of ranges that vehicle and water are drawn from in every episode.
         seed: Of everything random.
         worlds: Worlds at once; the settings' own if None.
         steps: Control steps of all worlds together; the settings' own if None.
+        settings: Changes of the learner's settings by name.
         device: cpu or cuda.
+        resume: Go on from the last checkpoint of a training that was started with the same arguments.
         console: Where progress is shown; standard error if None.
         shown: Name of the directory in messages, where `out` is a temporary one.
         interrupted: Where the policy so far goes after Ctrl-C; if None, `out`, or `OUT-training/interrupted` where
@@ -66,91 +81,114 @@ def train(
 
     Raises:
         TrainingError: Unknown task, or numbers that do not fit.
+        LearningError: Unknown learner or setting, a task that the learner cannot train, or numbers that ran away.
+        ResumeError: Nothing to go on from, or another training.
         KeyboardInterrupt: After Ctrl-C, when the policy so far, if there is one, has been written.
     """
     console = console or Console(stderr=True)
     for name, number in (("worlds", worlds), ("steps", steps)):
         if number is not None and number < 1:
             raise TrainingError(f"{name} is {number}, expected 1 or more")
-    if task not in TASKS:
+    if isinstance(task, str) and task not in TASKS:
         raise TrainingError(f"unknown task '{task}'; available: {', '.join(TASKS)}")
+    kind, the_task = learner_named(learner), task_named(task)
+    kind.check(the_task)
     chosen = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
     randomization = Randomization(randomize) if randomize is not None else None
     refuse_unwritable(atomic_directory(out, replaces=DESCRIPTION_FILE))
     start_warp()
-    environment_task = TASKS[task]()
-    mode = action_mode(action, chosen)
+    mode = action_mode(action or the_task.action, chosen)
+    side = Path(out).with_name(f"{Path(out).name}-training")
 
     import torch
 
-    from finssim.learning.export import export_policy
-    from finssim.learning.ppo import settings_for, settings_record, train_ppo
+    from finssim.learning.held_evaluation import HELD_WORLDS, HeldEvaluation, held_seed
     from finssim.learning.progress import TrainingView
-    from finssim.learning.sb3 import Sb3VecEnv
+    from finssim.learning.training_loop import Loop, last_checkpoint
 
-    settings = settings_for(task, randomized=randomization is not None, worlds=worlds, steps=steps)
+    checkpoint = last_checkpoint(side) if resume else None
+    randomized = randomization is not None
+    values = kind.settings(the_task, randomized=randomized, worlds=worlds, steps=steps, changes=settings)
     # A second thread gains little on so small a network, and loses much where anything else computes.
     torch.set_num_threads(1)
-    environment = Environment(
-        environment_task,
-        chosen,
-        worlds=settings.worlds,
-        hydrodynamics=hydrodynamics,
-        action=action,
-        randomization=randomization,
-        noise=environment_task.training_noise,
-        device=device,
-        seed=seed,
-    )
+
+    def worlds_of(count: int, ranges: Randomization | None, its_seed: int, **more: Any) -> Environment:
+        return make(
+            the_task, worlds=count, vehicle=chosen, hydrodynamics=hydrodynamics, action=action,
+            randomize=ranges, observe="training", device=device, seed=its_seed, **more,
+        )  # fmt: skip
+
+    asymmetric = randomized and getattr(values, "asymmetric", False)
+    environment = worlds_of(values.worlds, randomization, seed, privileged=asymmetric)
+    the_task = environment.task  # fitted to the vehicle
     description = PolicyDescription(
-        task=environment_task.name,
-        observation=observation_schema(environment_task),
+        task=the_task.name,
+        observation=observation_schema(the_task),
         action=mode.describe(),
-        control_period=environment_task.control_step,
+        control_period=the_task.control_step,
         vehicle=VehicleIdentity(name=chosen.name, sha256=chosen.sha256),
         hydrodynamics=hydrodynamics,
         seed=seed,
         training={
-            **settings_record(settings),
+            "learner": learner,
+            "algorithm": kind.what,
+            **asdict(values),
             "device": device,
             "randomization": randomization.ranges.model_dump(mode="json") if randomization else None,
-            "task": task_record(environment_task),
+            "task": task_record(the_task),
+            "agents": list(the_task.agents),
         },
     )
-    side = Path(out).with_name(f"{Path(out).name}-training")
-
-    def checkpoint(network: Any, done: int, curves: list[dict[str, Any]]) -> None:
-        export_policy(
-            network, side / f"checkpoint-{done:09d}", _after(description, done, False), curves=curves
-        )
-
     began = time.perf_counter()
-    with TrainingView(settings.steps, console) as view, warnings.catch_warnings():
+    with TrainingView(values.steps, console) as view, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*mini-batch.*")  # a last small batch does no harm
         warnings.filterwarnings("ignore", message=".*on the GPU.*")
-        run = train_ppo(
-            Sb3VecEnv(environment, stagger=True),
-            settings,
-            seed=seed,
-            device=device,
-            log=side / "tensorboard",
-            show=view.update,
-            checkpoint=checkpoint,
-        )
-    place, what, where = Path(out), "policy", shown or Path(out)
-    if run.interrupted:
-        if not run.learned:
-            console.print("no policy: interrupted before anything was learned", soft_wrap=True)
-            raise KeyboardInterrupt
-        place = where = interrupted or _place_beside(place, side)
-        what = "policy so far"
-    done = run.curves[-1]["steps"]
-    export_policy(run.network, place, _after(description, done, not run.interrupted), curves=run.curves)
-    took = time.perf_counter() - began
-    console.print(f"{what}: {where}  ({done:,} steps in {took:.1f} s)", highlight=False, soft_wrap=True)
-    if run.interrupted:
-        raise KeyboardInterrupt
+        loop = Loop(
+            kind(environment, values, seed=seed, device=device), description, side,
+            evaluate=HeldEvaluation(worlds_of(HELD_WORLDS, _whole(randomization), held_seed(seed)), device),
+            show=view.update, progress=environment.set_progress, identity=_identity(description),
+        )  # fmt: skip
+        if checkpoint is not None:
+            loop.resume(checkpoint)
+        elif resume:
+            console.print(f"no checkpoint in {side} yet: starting from the beginning", soft_wrap=True)
+        stopped = loop.run()
+    place = (interrupted or _place_beside(Path(out), side)) if stopped else Path(out)
+    _finish(loop, place, stopped, console, place if stopped else shown or place, time.perf_counter() - began)
     return place
+
+
+def settings_of_words(words: Sequence[str]) -> dict[str, Any]:
+    """Changes of settings from NAME=VALUE; a value with commas is a list.
+
+    Raises:
+        TrainingError: A word has no name or no value.
+    """
+    changes: dict[str, Any] = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        if not name or not value:
+            raise TrainingError(f"setting '{word}': expected NAME=VALUE, such as learning_rate=1e-3")
+        changes[name] = value.split(",") if "," in value else value
+    return changes
+
+
+def _finish(loop: Any, place: Path, stopped: bool, console: Console, where: Path, took: float) -> None:
+    """Write the policy, or the policy so far; after Ctrl-C the interrupt goes on."""
+    from finssim.learning.export import export_policy
+    from finssim.learning.training_loop import after
+
+    if not loop.curves:
+        console.print("no policy: interrupted before anything was learned", soft_wrap=True)
+        raise KeyboardInterrupt
+    done = loop.curves[-1]["steps"]
+    export_policy(
+        loop.learner.network(), place, after(loop.description, done, not stopped), curves=loop.curves
+    )
+    what = "policy so far" if stopped else "policy"
+    console.print(f"{what}: {where}  ({done:,} steps in {took:.1f} s)", highlight=False, soft_wrap=True)
+    if stopped:
+        raise KeyboardInterrupt
 
 
 def _place_beside(out: Path, side: Path) -> Path:
@@ -158,7 +196,17 @@ def _place_beside(out: Path, side: Path) -> Path:
     return side / "interrupted" if (out / DESCRIPTION_FILE).is_file() else out
 
 
-def _after(description: PolicyDescription, steps: int, complete: bool) -> PolicyDescription:
-    """The description of the network as it is after so many steps."""
-    record = {**description.training, "steps_done": steps, "complete": complete}
-    return description.model_copy(update={"training": record})
+def _whole(randomization: Randomization | None) -> Randomization | None:
+    """The ranges as they are when grown: what a policy is trained for is what it is measured in."""
+    if randomization is None:
+        return None
+    return Randomization(randomization.ranges.model_copy(update={"curriculum": None, "automatic": None}))
+
+
+def _identity(description: PolicyDescription) -> dict[str, Any]:
+    """What must be equal for a training to go on to the same result, by the name it has in a sentence."""
+    said = plain_data(
+        description.model_dump(mode="json", include={"task", "action", "hydrodynamics", "seed"})
+    )
+    training = plain_data(description.training)
+    return {**said, "vehicle": description.vehicle.sha256[:12], **training}

@@ -24,6 +24,8 @@ def save_state(environment: "Environment") -> dict[str, NDArray[Any]]:
     saved["counters.seed"] = np.array(environment.seed)
     saved["counters.steps"] = np.array(environment._steps)
     reported = sorted(simulator._reported)
+    if environment.drawing.schedule is not None:
+        saved["counters.schedule"] = np.array(environment.drawing.schedule._steps)
     saved["counters.reported"] = np.array(reported, dtype=np.int64).reshape(-1, 2)
     return saved
 
@@ -53,6 +55,8 @@ def load_state(environment: "Environment", saved: Mapping[str, NDArray[Any]]) ->
     for name, array in arrays.items():
         array.assign(np.ascontiguousarray(saved[name]))
     environment._steps = int(saved["counters.steps"])
+    if environment.drawing.schedule is not None:
+        environment.drawing.schedule._steps = int(saved["counters.schedule"])
     environment.simulator._reported = {(int(w), int(e)) for w, e in saved["counters.reported"]}
 
 

@@ -1,0 +1,68 @@
+"""How well the mean policy does while it is being trained: on episodes that it never learns from, always the same."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from finssim.tasks import Environment
+from finssim.tasks.environment import GREATEST_SEED
+
+__all__ = ["HELD_WORLDS", "HeldEvaluation", "held_seed"]
+
+HELD_WORLDS = 32
+"""Episodes of an evaluation: a share of successes to some 9 %, for less time than two updates take."""
+
+
+def held_seed(seed: int) -> int:
+    """Seed of the held episodes, far from the training's own."""
+    return (seed + 1_000_003) % (GREATEST_SEED + 1)
+
+
+class HeldEvaluation:
+    """Runs a network through the first episode of every world of an environment of its own."""
+
+    def __init__(self, environment: Environment, device: str = "cpu") -> None:
+        """Take an environment that resets itself, and torch's device."""
+        self.environment, self.device = environment, device
+        task = environment.task
+        self._limit = max(1, round(task.time_limit / task.control_step))
+
+    def __call__(self, network: nn.Module) -> dict[str, float]:
+        """Means over the episodes.
+
+        Args:
+            network: Observation of one agent to its action; its mode (train, eval) is left as it is.
+
+        Returns:
+            The task's metrics by `evaluation_` and their name, such as evaluation_return and evaluation_success.
+        """
+        e = self.environment
+        e.reset(seed=e.seed)
+        waiting, found = np.ones(e.worlds, dtype=np.bool_), {}
+        memory = network.empty_memory(e.worlds * e.agents) if hasattr(network, "empty_memory") else None
+        for _ in range(self._limit):
+            memory = self._act(network, memory)
+            ended = (e.arrays.terminated.numpy() | e.arrays.truncated.numpy()) != 0
+            for name, values in e.task.metrics(e.arrays).items() if (ended & waiting).any() else ():
+                found.setdefault(name, np.zeros(e.worlds))[ended & waiting] = values[ended & waiting]
+            waiting &= ~ended
+            if not waiting.any():
+                break
+        done = ~waiting
+        return {f"evaluation_{name}": float(values[done].mean()) for name, values in found.items()}
+
+    def _act(self, network: nn.Module, memory: Any) -> Any:
+        """One control step of all worlds; the network's memory afterwards."""
+        e = self.environment
+        seen = torch.as_tensor(
+            e.arrays.observation.numpy().reshape(e.worlds * e.agents, -1), device=self.device
+        )
+        with torch.no_grad():
+            action, memory = (network(seen), None) if memory is None else network(seen, memory)
+        e.arrays.action.assign(action.cpu().numpy().reshape(e.worlds, -1))
+        e.advance()
+        return memory

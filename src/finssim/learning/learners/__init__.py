@@ -1,0 +1,5 @@
+"""The learners by name: each turns an environment into a network, whichever library it is made of."""
+
+from finssim.learning.learners.catalogue import LEARNERS, Learner, LearnerKind, LearningError, learner_named
+
+__all__ = ["LEARNERS", "Learner", "LearnerKind", "LearningError", "learner_named"]

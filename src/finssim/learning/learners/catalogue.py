@@ -1,0 +1,173 @@
+"""What a learner is, and every one by name. Nothing here imports a library of learning: a kind does when it is used."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Protocol
+
+from finssim.tasks import Environment, Task
+
+if TYPE_CHECKING:
+    from torch import nn
+
+__all__ = ["LEARNERS", "Learner", "LearnerKind", "LearningError", "learner_named"]
+
+
+class LearningError(ValueError):
+    """A learner that there is not, that cannot do what is asked, or whose numbers ran away."""
+
+
+class Learner(Protocol):
+    """Learns in an environment, one update at a time; who calls `update` owns progress, checkpoints and export."""
+
+    settings: Any
+    """A frozen dataclass with at least `worlds` and `steps`; recorded in policy.yaml."""
+    steps: int
+    """Control steps of all worlds together so far."""
+
+    def update(self) -> dict[str, float]:
+        """One rollout and what is learnt from it.
+
+        Returns:
+            A row of the training curve with the same keys every time: mean_return, mean_length, held (share of the
+            last episodes that succeeded), mean_reward, and the learner's own numbers.
+        """
+
+    def network(self) -> nn.Module:
+        """Observation of one agent to its mean action, for evaluation and export."""
+
+    def state(self) -> dict[str, Any]:
+        """Everything that decides what comes next: parameters, optimisers, random streams, the environment."""
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Go on from a state of a learner that was made alike, bit for bit."""
+
+
+@dataclass(frozen=True)
+class LearnerKind:
+    """A learner that can be made: call it for one."""
+
+    module: str
+    """Where its class and `settings_for` are."""
+    name: str
+    """Its class."""
+    what: str
+    """In a few words."""
+    extra: str = "learn"
+    """What of FinsSim must be installed, as pip takes it."""
+    agents: str = "any"
+    """How many agents of a task it can train: one, several, or any."""
+
+    def settings(
+        self,
+        task: Task,
+        *,
+        randomized: bool = False,
+        worlds: int | None = None,
+        steps: int | None = None,
+        changes: Mapping[str, Any] | None = None,
+    ) -> Any:
+        """The settings of a training; what is None keeps its default for the task.
+
+        Raises:
+            LearningError: A change names no setting, or has another type than the setting's own.
+        """
+        make = self._module().settings_for
+        chosen = make(task, self.name, randomized=randomized, worlds=worlds, steps=steps)
+        return replace(
+            chosen, **{name: _fitting(chosen, name, value) for name, value in (changes or {}).items()}
+        )
+
+    def __call__(self, environment: Environment, settings: Any, *, seed: int, device: str = "cpu") -> Learner:
+        """A learner in an environment; it owns the environment's episodes from then on.
+
+        Raises:
+            LearningError: It cannot train the task's number of agents.
+        """
+        self.check(environment.task)
+        learner: Learner = getattr(self._module(), self.name)(environment, settings, seed=seed, device=device)
+        return learner
+
+    def check(self, task: Task) -> None:
+        """Refuse a task with a number of agents that it cannot train.
+
+        Raises:
+            LearningError: It cannot.
+        """
+        n = len(task.agents)
+        if (self.agents == "one" and n > 1) or (self.agents == "several" and n == 1):
+            able = [
+                name
+                for name, kind in LEARNERS.items()
+                if kind.agents in ("any", "one" if n == 1 else "several")
+            ]
+            has = "one agent" if n == 1 else f"{n} agents"
+            raise LearningError(
+                f"task '{task.name}' has {has}, and this learner trains {self.agents}: take {', '.join(able)}"
+            )
+
+    def _module(self) -> Any:
+        try:
+            return import_module(f"finssim.learning.learners.{self.module}")
+        except ModuleNotFoundError as error:
+            if str(error.name).startswith("finssim"):
+                raise
+            raise LearningError(
+                f"this learner needs {error.name}: pip install 'finssim[learn,{self.extra}]'"
+            ) from error
+
+
+LEARNERS: dict[str, LearnerKind] = {
+    "sb3-ppo": LearnerKind("sb3_ppo", "Sb3Ppo", "PPO of Stable-Baselines3"),
+    "sb3-sac": LearnerKind("sb3_sac", "Sb3Sac", "SAC of Stable-Baselines3"),
+    "rsl-rl": LearnerKind("rsl_rl_ppo", "RslRlPpo", "PPO of RSL-RL", extra="rsl-rl"),
+    "torchrl-ppo": LearnerKind("torchrl_ppo", "TorchRlPpo", "PPO of TorchRL", extra="torchrl", agents="one"),
+    "torchrl-ippo": LearnerKind(
+        "torchrl_ppo",
+        "TorchRlIppo",
+        "independent PPO of TorchRL: each agent's value from what it sees",
+        extra="torchrl",
+        agents="several",
+    ),
+    "torchrl-mappo": LearnerKind(
+        "torchrl_ppo",
+        "TorchRlMappo",
+        "multi-agent PPO of TorchRL: values from what all agents see",
+        extra="torchrl",
+        agents="several",
+    ),
+}
+"""Learner by the name that commands take."""
+
+
+def learner_named(name: str) -> LearnerKind:
+    """The kind of that name.
+
+    Raises:
+        LearningError: There is none.
+    """
+    if name not in LEARNERS:
+        raise LearningError(f"unknown learner '{name}'; available: {', '.join(LEARNERS)}")
+    return LEARNERS[name]
+
+
+def _fitting(settings: Any, name: str, value: Any) -> Any:
+    """The value, as the type of the setting of that name."""
+    known = {field.name: getattr(settings, field.name) for field in fields(settings)}
+    if name not in known:
+        raise LearningError(f"unknown setting '{name}'; available: {', '.join(known)}")
+    kind = type(known[name])
+    try:
+        if kind is tuple:
+            return tuple(int(v) for v in ([value] if isinstance(value, str | int) else value))
+        if kind is bool:
+            return {"true": True, "false": False}[str(value).lower()]
+        if kind is int and float(value) != int(value):
+            raise ValueError
+        return kind(value)
+    except (KeyError, TypeError, ValueError) as error:
+        raise LearningError(
+            f"setting {name} is {value!r}, expected {kind.__name__} such as {known[name]!r}"
+        ) from error

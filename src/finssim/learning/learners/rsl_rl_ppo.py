@@ -1,0 +1,153 @@
+"""PPO of RSL-RL on the batched environment, with a critic that sees the plant's parameters where they are drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+from torch import nn
+
+from finssim.learning.learners.acting import ActingLearner
+from finssim.learning.learners.networks import privileged_rows, stack
+from finssim.learning.learners.on_policy import OnPolicySettings, fitted
+from finssim.learning.served import age_episodes
+from finssim.learning.tensors import Tensors
+from finssim.tasks import Environment, Task
+
+__all__ = ["RslRlPpo", "RslRlSettings", "settings_for"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RslRlSettings(OnPolicySettings):
+    """As PPO's. RSL-RL shortens the gradients of policy and value each by itself."""
+
+    value_weight: float = 1.0
+    """Policy and value share no weights: it scales the value's learning rate alone."""
+    clip_values: bool = False
+    """Values here are of the order of tens; steps limited to `clip` would take long to reach them."""
+    asymmetric: bool = True
+    """Whether the critic sees the drawn parameters of vehicle and water, where the environment tells them."""
+
+
+def settings_for(task: Task, learner: str = "RslRlPpo", **given: Any) -> RslRlSettings:
+    """The settings of a training; `given` as `on_policy.fitted` takes it."""
+    return fitted(RslRlSettings(), task, **given)
+
+
+class RslRlPpo(ActingLearner):
+    """PPO; several agents of a world are rows of their own and share the networks."""
+
+    settings: RslRlSettings
+
+    def __init__(
+        self, environment: Environment, settings: RslRlSettings, *, seed: int, device: str = "cpu"
+    ) -> None:
+        """Set up PPO and age the first episodes."""
+        super().__init__(environment, settings)
+        torch.manual_seed(seed)
+        age_episodes(environment)
+        self._worlds = Tensors(environment)
+        self._rows = environment.worlds * environment.agents
+        seen = self._seen()
+        groups = {"actor": ["policy"], "critic": list(seen.keys())}
+        noise = {
+            "class_name": "GaussianDistribution",
+            "init_std": float(torch.tensor(settings.log_std).exp()),
+        }
+        sizes = {"hidden_dims": list(settings.hidden), "activation": "elu"}
+        actor = MLPModel(seen, groups, "actor", environment.action_size, distribution_cfg=noise, **sizes)
+        critic = MLPModel(seen, groups, "critic", 1, **sizes)
+        _begin(actor.mlp, 0.01)
+        _begin(critic.mlp, 1.0)
+        storage = RolloutStorage("rl", self._rows, settings.rollout, seen, [environment.action_size], device)
+        self.ppo = PPO(
+            actor,
+            critic,
+            storage,
+            num_learning_epochs=settings.epochs,
+            num_mini_batches=max(1, self._rows * settings.rollout // settings.batch),
+            clip_param=settings.clip,
+            gamma=settings.discount,
+            lam=settings.gae_lambda,
+            value_loss_coef=settings.value_weight,
+            entropy_coef=settings.entropy_weight,
+            learning_rate=settings.learning_rate,
+            max_grad_norm=settings.largest_gradient,
+            use_clipped_value_loss=settings.clip_values,
+            schedule="fixed",  # what is set before each update falls linearly to zero
+            normalize_advantage_per_mini_batch=True,
+            device=device,
+        )
+
+    def update(self) -> dict[str, float]:
+        """One rollout, and `epochs` passes over it."""
+        self.ppo.train_mode()
+        seen = self._seen()
+        with torch.inference_mode():
+            for _ in range(self.settings.rollout):
+                action = self.ppo.act(seen)
+                terminated, truncated = self._worlds.step(action)
+                self.tally.look()
+                seen = self._seen()
+                reward = self._worlds.reward.flatten().clone()
+                self._add_last_values(reward, truncated & ~terminated)
+                self.ppo.process_env_step(seen, reward, self._by_row(terminated | truncated), {})
+            self.ppo.compute_returns(seen)
+        self.steps += self.environment.worlds * self.settings.rollout
+        self._set_rate(self.settings.learning_rate * self.left)
+        losses = self.ppo.update()
+        row = {"value_loss": losses["value"], "policy_gradient_loss": losses["surrogate"]}
+        return {**self.tally.row(), "action_std": self.ppo.actor.output_std.mean().item(), **row}
+
+    def network(self) -> nn.Module:
+        """Observation to mean action, as a plain stack of layers."""
+        return nn.Sequential(*self.ppo.actor.mlp)
+
+    def learned(self) -> dict[str, Any]:
+        """Networks and optimiser."""
+        saved: dict[str, Any] = self.ppo.save()
+        return saved
+
+    def load_learned(self, state: dict[str, Any]) -> None:
+        """Take what `learned` gave."""
+        self.ppo.load(state, None, True)
+
+    def _seen(self, final: bool = False) -> TensorDict:
+        """Copies of what actor and critic see now, or saw at the end of the episodes that ended in this step."""
+        e, w = self.environment, self._worlds
+        groups = {"policy": (w.final_observation if final else w.observation).reshape(self._rows, -1).clone()}
+        told = privileged_rows(e, "final_privileged" if final else "privileged")
+        if told is not None and self.settings.asymmetric:
+            groups["privileged"] = told.clone()
+        return TensorDict(groups, batch_size=[self._rows])
+
+    def _add_last_values(self, reward: torch.Tensor, timed_out: torch.Tensor) -> None:
+        """Where time ended an episode, the discounted value of its last observation belongs to the reward.
+
+        RSL-RL's own way takes the value of the observation before.
+        """
+        rows = self._by_row(timed_out).nonzero().flatten()
+        if len(rows):
+            reward[rows] += self.settings.discount * self.ppo.critic(self._seen(final=True)[rows]).flatten()
+
+    def _by_row(self, worlds: torch.Tensor) -> torch.Tensor:
+        return worlds.repeat_interleave(self.environment.agents)
+
+    def _set_rate(self, rate: float) -> None:
+        self.ppo.learning_rate = rate
+        for group in self.ppo.optimizer.param_groups:
+            group["lr"] = rate
+
+
+def _begin(mlp: Any, last_gain: float) -> None:
+    """Give a network of RSL-RL the first weights that the other learners start from."""
+    linear = [layer for layer in mlp if isinstance(layer, nn.Linear)]
+    sizes = [layer.out_features for layer in linear]
+    model = stack(linear[0].in_features, sizes[:-1], sizes[-1], last_gain)
+    for ours, theirs in zip((x for x in model if isinstance(x, nn.Linear)), linear, strict=True):
+        theirs.load_state_dict(ours.state_dict())

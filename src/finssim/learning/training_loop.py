@@ -1,0 +1,185 @@
+"""The loop around a learner: progress, curves, held evaluation, checkpoints, Ctrl-C, and going on after a kill."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from torch.utils.tensorboard import SummaryWriter
+
+from finssim.control.policy_description import DESCRIPTION_FILE, PolicyDescription
+from finssim.learning.export import export_policy
+from finssim.learning.learners import Learner, LearningError
+from finssim.learning.resume import RESUME_FILE, ResumeError, read_state, write_state
+
+__all__ = ["CHECKPOINTS", "Loop", "after", "last_checkpoint"]
+
+CHECKPOINTS = 4
+"""In a training, at least: after each such part, or `CHECKPOINT_STEPS`, whichever comes first."""
+CHECKPOINT_STEPS = 500_000
+"""Control steps of all worlds together between two checkpoints, at most."""
+KEPT = 2
+"""Checkpoints that stay: should the newest be damaged, there is one before it."""
+EVALUATIONS = 10
+"""Held evaluations in a training; each takes about as long as an update."""
+
+
+@dataclass
+class Loop:
+    """Trains a learner to its end, or until Ctrl-C."""
+
+    learner: Learner
+    description: PolicyDescription
+    """Of the policy as it will be."""
+    side: Path
+    """Folder of checkpoints and log."""
+    evaluate: Callable[[Any], Mapping[str, float]]
+    """Measures a network on held episodes."""
+    show: Callable[[Mapping[str, Any]], None]
+    """Called with every row of the curves."""
+    progress: Callable[[float], None]
+    """Told the share of the training that is done, before each update: ranges may grow with it."""
+    identity: Mapping[str, Any]
+    """What must be equal for a training to go on from a checkpoint."""
+    curves: list[dict[str, Any]] = field(default_factory=list)
+    seconds: float = 0.0
+    """Time of the updates and evaluations so far [s], over all the pieces of a training that was resumed."""
+
+    def run(self) -> bool:
+        """Update until the steps are done.
+
+        Returns:
+            Whether it was interrupted by Ctrl-C.
+
+        Raises:
+            LearningError: A number of the learner stopped being finite.
+        """
+        log = SummaryWriter(str(self.side / "tensorboard"), purge_step=self.learner.steps or None)
+        total = self.learner.settings.steps
+        try:
+            while self.learner.steps < total:
+                row = self._update(total)
+                self.curves.append(row)
+                for name, value in row.items():
+                    log.add_scalar(_tag(name), value, row["steps"])
+                self.show(row)
+                every = min(CHECKPOINT_STEPS, math.ceil(total / CHECKPOINTS))
+                if self._passed(every):
+                    self._save()
+        except KeyboardInterrupt:
+            return True
+        finally:
+            log.close()
+        return False
+
+    def _update(self, total: int) -> dict[str, Any]:
+        began = time.perf_counter()
+        self.progress(self.learner.steps / total)
+        learned = self.learner.update()
+        bad = [name for name, value in learned.items() if not math.isfinite(value)]
+        if bad:
+            raise LearningError(
+                f"{bad[0]} stopped being finite after {self.learner.steps:,} steps: the learner has diverged; "
+                "take a smaller learning rate, or another seed"
+            )
+        if self._passed(math.ceil(total / EVALUATIONS)) or self.learner.steps >= total or not self.curves:
+            held = dict(self.evaluate(self.learner.network()))
+        else:
+            held = {name: value for name, value in self.curves[-1].items() if name.startswith("evaluation_")}
+        self.seconds += time.perf_counter() - began
+        steps = self.learner.steps
+        counted = {
+            "steps": steps,
+            "seconds": round(self.seconds, 3),
+            "steps_per_s": round(steps / self.seconds),
+        }
+        return {**counted, **learned, **held}
+
+    def _passed(self, every: int) -> bool:
+        """Whether the last update went past a multiple of so many steps."""
+        rows = (
+            self.curves if self.curves and self.curves[-1]["steps"] < self.learner.steps else self.curves[:-1]
+        )
+        before = rows[-1]["steps"] if rows else 0
+        return bool(self.learner.steps // every > before // every)
+
+    def _save(self) -> None:
+        """Write a checkpoint: a policy that can be run, and the state to go on from; older ones go."""
+        steps = self.learner.steps
+        state = {
+            "identity": dict(self.identity),
+            "learner": self.learner.state(),
+            "curves": self.curves,
+            "seconds": self.seconds,
+        }
+        export_policy(
+            self.learner.network(),
+            self.side / f"checkpoint-{steps:09d}",
+            after(self.description, steps, False),
+            curves=self.curves,
+            also=lambda folder: write_state(state, folder / RESUME_FILE),
+        )
+        for old in _checkpoints(self.side)[:-KEPT]:
+            shutil.rmtree(old)
+
+    def resume(self, state: Mapping[str, Any]) -> None:
+        """Go on from what `last_checkpoint` found.
+
+        Raises:
+            ResumeError: It is of another training.
+        """
+        for name, value in self.identity.items():
+            found = state["identity"].get(name)
+            if found != value:
+                raise ResumeError(
+                    f"cannot go on in {self.side}: {name} was {found!r} and is {value!r} now: "
+                    "give what the training began with, or leave out --resume"
+                )
+        self.learner.load(state["learner"])
+        self.curves, self.seconds = list(state["curves"]), float(state["seconds"])
+
+
+def _checkpoints(side: Path) -> list[Path]:
+    """Checkpoints in a folder, the newest last; half-written ones have other names."""
+    return sorted(path for path in side.glob("checkpoint-*") if (path / DESCRIPTION_FILE).is_file())
+
+
+def last_checkpoint(side: Path) -> dict[str, Any] | None:
+    """The newest state that can be read; None if no checkpoint was written yet.
+
+    Raises:
+        ResumeError: There was no training, or none of its checkpoints can be read.
+    """
+    if not side.is_dir():
+        raise ResumeError(f"nothing to resume: there is no folder {side}: leave out --resume")
+    failure: ResumeError | None = None
+    for path in reversed(_checkpoints(side)):
+        try:
+            return read_state(path / RESUME_FILE)
+        except ResumeError as error:
+            failure = error
+    if failure is not None:
+        raise failure
+    return None
+
+
+def after(description: PolicyDescription, steps: int, complete: bool) -> PolicyDescription:
+    """The description of the network as it is after so many steps."""
+    record = {**description.training, "steps_done": steps, "complete": complete}
+    return description.model_copy(update={"training": record})
+
+
+def _tag(name: str) -> str:
+    """Name of a curve in TensorBoard, in groups."""
+    for group, names in {
+        "time": ("seconds", "steps_per_s", "steps"),
+        "episodes": ("mean_return", "mean_length", "held", "mean_reward"),
+    }.items():
+        if name in names:
+            return f"{group}/{name}"
+    return name.replace("evaluation_", "evaluation/") if name.startswith("evaluation_") else f"learner/{name}"

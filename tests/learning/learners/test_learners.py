@@ -1,0 +1,157 @@
+"""Every learner: learns what is known, on every task, goes on bitwise, and refuses what it cannot do."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import finssim
+from finssim.learning.held_evaluation import HeldEvaluation
+from finssim.learning.learners import LEARNERS, LearningError, learner_named
+from finssim.learning.resume import read_state, write_state
+from finssim.tasks import TASKS, task_named
+from reference.guess import BEST, Guess, GuessTogether
+
+ONE = [name for name, kind in LEARNERS.items() if kind.agents != "several"]
+SEVERAL = [name for name, kind in LEARNERS.items() if kind.agents != "one"]
+PAIRS = [(name, Guess) for name in ONE] + [(name, GuessTogether) for name in SEVERAL]
+
+
+def small(name, task, **changes):
+    """Settings with which an update takes a fraction of a second."""
+    kind = learner_named(name)
+    few = {"worlds": 8, "rollout": 16, "hidden": (16, 16), **changes}
+    if name == "sb3-sac":
+        few = {"warm_up": 100, "memory": 4000, "gradient_steps": 4, **few, "batch": 64}
+    else:
+        few = {"batch": 64, "epochs": 2, **few}
+    return replace(kind.settings(task), **few)
+
+
+def made(name, task, seed=3, **changes):
+    """A learner in a small environment of its own."""
+    task = task_named(task) if isinstance(task, str) else task
+    settings = small(name, task, **changes)
+    ranges = "fossen_learn_to_swim" if task.name in TASKS else None
+    environment = finssim.make(task, worlds=settings.worlds, seed=seed, observe="training", randomize=ranges)
+    return learner_named(name)(environment, settings, seed=seed)
+
+
+def flat(value):
+    """All numbers of a state, in order."""
+    if isinstance(value, dict):
+        return [x for key in sorted(value, key=str) for x in flat(value[key])]
+    if isinstance(value, list | tuple):
+        return [x for item in value for x in flat(item)]
+    if isinstance(value, torch.Tensor):
+        return [value.detach().cpu().numpy()]
+    return [value]
+
+
+def same(first, second):
+    first, second = flat(first), flat(second)
+    return len(first) == len(second) and all(
+        np.array_equal(a, b, equal_nan=True)
+        if isinstance(a, np.ndarray) and a.dtype.kind == "f"
+        else np.array_equal(a, b)
+        for a, b in zip(first, second, strict=True)
+    )
+
+
+@pytest.mark.parametrize(("name", "task"), PAIRS)
+def test_it_finds_the_best_action(name, task):
+    """Of a task of one step: c where +1 is seen and -c where -1, by every agent; the held evaluation says success."""
+    steps = 6000 if name == "sb3-sac" else 10_000
+    changes = {"worlds": 32, "learning_rate": 1e-2, "steps": steps, "discount": 0.5}
+    changes |= {"gradient_steps": 40} if name == "sb3-sac" else {}
+    learner = made(name, task(), **changes)
+    before = learner.update()
+    while learner.steps < steps:
+        row = learner.update()
+    with torch.no_grad():
+        action = learner.network()(torch.tensor([[1.0], [-1.0]])).numpy()
+    tolerance = (
+        0.2 if name == "sb3-sac" else 0.1
+    )  # SAC is paid for noise too, and keeps away from the limits for it
+    assert np.abs(action - BEST * np.array([[1.0], [-1.0]])).max() < tolerance
+    assert (
+        row.keys() == before.keys()
+        and row["held"] > before["held"]
+        and row["mean_return"] > (0.7 if name == "sb3-sac" else 0.9)
+    )
+    held = HeldEvaluation(finssim.make(task(), worlds=8, seed=77))(learner.network())
+    assert held["evaluation_success"] == 1.0 and held["evaluation_return"] > 0.96
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("name", LEARNERS)
+def test_it_learns_on_every_task_and_goes_on_bitwise(tmp_path, name, task):
+    """Two updates, a state through a file into another learner, two more: parameters, rows and worlds are equal."""
+    kind, agents = learner_named(name), len(task_named(task).agents)
+    if agents > 1 and kind.agents == "one" or agents == 1 and kind.agents == "several":
+        with pytest.raises(LearningError, match="has .* and this learner trains .*: take "):
+            made(name, task)
+        return
+    whole = made(name, task, steps=1000)
+    first = whole.state()["learner"]
+    for _ in range(2):
+        whole.update()
+    assert not same(first, whole.state()["learner"]), "nothing was learnt"
+    write_state(whole.state(), tmp_path / "state")
+    rows = [whole.update() for _ in range(2)]
+    other = made(name, task, seed=8, steps=1000)
+    other.update()
+    other.load(read_state(tmp_path / "state"))
+    assert rows == [other.update() for _ in range(2)] and other.steps == whole.steps == 4 * 8 * 16
+    assert same(whole.state(), other.state())
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_equal_seeds_are_equal_learners(name):
+    """And another seed is another."""
+    task = Guess() if name in ONE else GuessTogether()
+    ends = []
+    for seed in (1, 1, 2):
+        learner = made(name, task, seed=seed)
+        learner.update()
+        learner.update()
+        ends.append(learner.state()["learner"])
+    assert same(ends[0], ends[1]) and not same(ends[0], ends[2])
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(LearningError, match="unknown learner 'sb3'; available: sb3-ppo, sb3-sac"):
+        learner_named("sb3")
+    kind, task = learner_named("sb3-ppo"), Guess()
+    with pytest.raises(LearningError, match="unknown setting 'gamma'; available: worlds, steps, rollout"):
+        kind.settings(task, changes={"gamma": 0.9})
+    with pytest.raises(LearningError, match="setting epochs is 'many', expected int such as 5"):
+        kind.settings(task, changes={"epochs": "many"})
+    with pytest.raises(LearningError, match="setting batch is 0.5, expected int"):
+        kind.settings(task, changes={"batch": 0.5})
+
+
+def test_a_library_that_is_missing_is_named(monkeypatch):
+    """With what to install."""
+    monkeypatch.setitem(sys.modules, "rsl_rl.algorithms", None)
+    monkeypatch.delitem(sys.modules, "finssim.learning.learners.rsl_rl_ppo", raising=False)
+    with pytest.raises(
+        LearningError, match=r"needs rsl_rl.algorithms: pip install 'finssim\[learn,rsl-rl\]'"
+    ):
+        learner_named("rsl-rl").settings(Guess())
+
+
+def test_settings_are_changed_by_name():
+    """As numbers or as words, in the setting's own type."""
+    changes = {"learning_rate": "1e-3", "hidden": [32, 16], "epochs": 3}
+    settings = learner_named("torchrl-ppo").settings(Guess(), worlds=64, steps=5, changes=changes)
+    assert (settings.learning_rate, settings.hidden, settings.epochs) == (1e-3, (32, 16), 3)
+    assert (settings.worlds, settings.steps, settings.rollout) == (64, 5, 128)
+    assert learner_named("rsl-rl").settings(task_named("t2")).discount == 0.9
+
+
+def test_a_memory_smaller_than_the_warm_up_is_refused():
+    with pytest.raises(LearningError, match="warm_up is 5000, expected less than the memory of 100 steps"):
+        made("sb3-sac", Guess(), memory=100, warm_up=5000)
