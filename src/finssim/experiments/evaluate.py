@@ -1,4 +1,4 @@
-"""`finssim evaluate`: trials of a controller on the published setpoints or trajectories; table, JSON, figure."""
+"""`finssim evaluate`: trials of a controller, on published setpoints and trajectories or in a task's own episodes."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from rich.progress import Progress
 
 from finssim.control.trajectories import load_trajectory
 from finssim.control.trim import Trim
+from finssim.experiments.episodes import EPISODES, run_episodes, summarize_episodes
+from finssim.experiments.episodes_table import draw_episodes, print_episodes, print_episodes_by_plant
 from finssim.experiments.metrics import summarize
 from finssim.experiments.plants import Plant, load_plant
 from finssim.experiments.players import PolicyPlayer, make_player
@@ -256,10 +258,16 @@ FORMS = {
         _draw_paths,
     ),
 }
-"""Tasks that can be evaluated."""
+"""Tasks that are measured as in the paper."""
+
+
+EPISODIC = Form(
+    EPISODES, run_episodes, summarize_episodes, print_episodes, print_episodes_by_plant, draw_episodes
+)
+"""Of every other task: episodes as in training, measured by the task."""
 
 
 def _form(task: str) -> Form:
-    if task not in FORMS:
-        raise EvaluationError(f"unknown task '{task}'; available: {', '.join(FORMS)}")
-    return FORMS[task]
+    if task not in TASKS:
+        raise EvaluationError(f"unknown task '{task}'; available: {', '.join(TASKS)}")
+    return FORMS.get(task, EPISODIC)

@@ -16,9 +16,13 @@ from finssim.control.tracking import Controller, Goal
 from finssim.control.trim import Trim
 from finssim.learning.description import observation_schema
 from finssim.tasks import Task
+from finssim.tasks.baselines import BASELINES, baseline
 from finssim.vehicles import Vehicle
 
-__all__ = ["PidPlayer", "Player", "PolicyPlayer", "make_player"]
+__all__ = ["BaselinePlayer", "PidPlayer", "Player", "PolicyPlayer", "make_player"]
+
+TASKS_OF_PIDS = ("t1", "t2")
+"""Tasks that the robot's own PIDs do."""
 
 
 class Player(Protocol):
@@ -65,8 +69,8 @@ class PolicyPlayer:
         return self.trim.reset(n) if self.trim else None
 
     def act(self, memory: Any, arrays: Any, goal: Goal) -> tuple[NDArray[np.float32], Any]:
-        """Actions for the environment's observations."""
-        observation = arrays.observation.numpy()
+        """Actions for the environment's observations, a row for each agent of each world."""
+        observation = arrays.observation.numpy().reshape(-1, self.policy.description.observation.size)
         if self.trim is not None:
             measured = _read(arrays)
             memory = self.trim.update(memory, measured, goal.position, self.period)
@@ -131,10 +135,40 @@ class PidPlayer:
         return {"name": self.name, "kind": "pid", "action": self.action, "period_s": self.period}
 
 
+class BaselinePlayer:
+    """A baseline of a task, which sees the observation alone."""
+
+    wrench_scale = 1.0
+
+    def __init__(self, name: str, vehicle: Vehicle, task: Task) -> None:
+        """Make the task's baseline of that name for a vehicle."""
+        self.name, self.action = name, task.action
+        self.baseline = baseline(task.name, name, vehicle)
+        self.period = self.baseline.period
+        self._size = task.observation_size
+
+    def reset(self, n: int) -> Any:
+        """Memory before the first of n episodes' actions."""
+        return self.baseline.reset(n)
+
+    def act(self, memory: Any, arrays: Any, goal: Goal) -> tuple[NDArray[np.float32], Any]:
+        """Actions, a row for each agent of each world."""
+        return self.baseline.act(memory, arrays.observation.numpy().reshape(-1, self._size))
+
+    def describe(self) -> dict[str, Any]:
+        """Name and rate."""
+        return {"name": self.name, "kind": "baseline", "action": self.action, "period_s": self.period}
+
+
 def make_player(
     name_or_directory: str | Path, vehicle: Vehicle, task: Task, trim: Trim | None = None
-) -> PolicyPlayer | PidPlayer:
-    """A PID by its name, or the policy of a directory; a PID has an integral of its own and takes no trim."""
-    if str(name_or_directory) in CONTROLLERS:
+) -> PolicyPlayer | PidPlayer | BaselinePlayer:
+    """A PID or another baseline by its name, or the policy of a directory; only a policy takes a trim.
+
+    The PIDs of T1 and T2 are the robot's, which know the goal; a baseline of another task sees what a policy sees.
+    """
+    if task.name in TASKS_OF_PIDS and str(name_or_directory) in CONTROLLERS:
         return PidPlayer(str(name_or_directory), vehicle, task.name)
+    if str(name_or_directory) in BASELINES.get(task.name, {}):
+        return BaselinePlayer(str(name_or_directory), vehicle, task)
     return PolicyPlayer(name_or_directory, vehicle, task, trim)

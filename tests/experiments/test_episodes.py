@@ -1,0 +1,97 @@
+"""Episodes of any task: measured by the task, each world's first to its end, means with intervals."""
+
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from finssim.experiments.episodes import EpisodeError, run_episodes, summarize_episodes
+from finssim.experiments.evaluate import evaluate
+from finssim.experiments.plants import load_plant
+from finssim.experiments.players import make_player
+from finssim.tasks import TASKS, task_named
+from finssim.tasks.baselines import BASELINES
+from finssim.vehicles import load_vehicle
+
+FINSROV, NOMINAL = load_vehicle("finsrov"), load_plant("nominal")
+EPISODIC = [task for task in TASKS if task not in ("t1", "t2") and BASELINES.get(task)]
+
+
+class Still:
+    """Does nothing, for any task."""
+
+    wrench_scale = 1.0
+
+    def __init__(self, task, period=None):
+        self.task, self.action, self.period = task, task.action, period or task.control_step
+
+    def reset(self, n):
+        self.rows = n
+
+    def act(self, memory, arrays, goal):
+        size = arrays.action.shape[1] // len(self.task.agents)
+        return np.zeros((self.rows, size), np.float32), None
+
+    def describe(self):
+        return {"name": "still", "kind": "still"}
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_every_task_can_be_played_to_its_end(name):
+    """By a controller that does nothing: whatever the task measures is there for each of three short episodes."""
+    task = task_named(name, time_limit=1.0)
+    found = run_episodes(Still(task), task, FINSROV, NOMINAL, trials=3)
+    assert all(values.shape == (3,) for values in found.metrics.values())
+    assert np.isfinite(found.metrics["return"]).all()  # a time that is never reached is none
+    assert [row["trial"] for row in found.measures()] == [0, 1, 2]
+    assert np.all(found.metrics["length"] <= 10.0 + 1e-6)
+
+
+def test_each_world_counts_its_first_episode():
+    """T1 in 1 s episodes: a return that is the sum of the rewards of ten steps, as the environment gives them alone."""
+    task = task_named("t1", time_limit=1.0)
+    found = run_episodes(Still(task), task, FINSROV, NOMINAL, trials=2, seed=5)
+    from finssim.tasks import make
+
+    alone = make(task, worlds=2, seed=5)
+    total = sum(alone.step(np.zeros((2, 6))).reward.copy() for _ in range(10))
+    assert found.metrics["return"] == pytest.approx(total, rel=1e-5)
+
+
+def test_equal_seeds_are_equal_episodes():
+    task = task_named("t3", time_limit=1.0)
+    runs = [run_episodes(Still(task), task, FINSROV, NOMINAL, trials=4, seed=seed) for seed in (1, 1, 2)]
+    returns = [run.metrics["return"] for run in runs]
+    assert np.array_equal(returns[0], returns[1]) and not np.array_equal(returns[0], returns[2])
+
+
+def test_another_rate_is_refused():
+    task = task_named("t3")
+    with pytest.raises(EpisodeError, match="acts every 0.05 s, expected 0.1 s"):
+        run_episodes(Still(task, period=0.05), task, FINSROV, NOMINAL, trials=1)
+
+
+def test_means_have_intervals_and_what_is_missing_is_counted():
+    trials = [{"trial": i, "return": float(i), "time": None if i == 3 else 1.0} for i in range(4)]
+    trials.append({"trial": 4, "return": None, "time": None})
+    row = summarize_episodes(trials)
+    low, high = row["metrics"]["return"]["ci95"]
+    assert row["metrics"]["return"]["value"] == 1.5 and 0.0 <= low < 1.5 < high <= 3.0
+    assert row["metrics"]["time"] == {"value": 1.0, "ci95": [1.0, 1.0]} and (row["trials"], row["valid"]) == (5, 4)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", EPISODIC)
+def test_baselines_are_evaluated_by_name(name, tmp_path):
+    """Table, JSON and figure; a row for each plant where there are two."""
+    who = next(iter(BASELINES[name]))
+    assert make_player(who, FINSROV, task_named(name)).describe()["kind"] == "baseline"
+    with (tmp_path / "screen").open("w", encoding="utf-8") as file:
+        console = Console(file=file, width=100)
+        evaluate(who, task=name, plant=["nominal", "noise"], trials=2, out=tmp_path / "out", console=console)
+    document = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
+    assert [plant["plant"]["name"] for plant in document["plants"]] == ["nominal", "noise"]
+    assert document["plants"][0]["metrics"]["return"]["value"] is not None
+    assert (tmp_path / "out" / "episodes.png").is_file()
+    assert "return" in (tmp_path / "screen").read_text(encoding="utf-8")
