@@ -20,6 +20,7 @@ from finssim import (
     cli_record,
     cli_robot,
     cli_ros2,
+    cli_study,
     cli_trials,
     cli_view,
     cli_vision,
@@ -41,6 +42,8 @@ vehicles_app = typer.Typer(invoke_without_command=True, rich_markup_mode=None, a
 app.add_typer(vehicles_app, name="vehicles")
 app.command()(cli_learn.train)
 app.command()(cli_learn.evaluate)
+app.command()(cli_study.compare)
+app.command()(cli_study.sweep)
 app.add_typer(cli_trials.trials_app, name="trials")
 app.command()(cli_trials.excite)
 app.add_typer(cli_calibrate.calibrate_app, name="calibrate")

@@ -1,0 +1,1 @@
+"""`finssim compare`: what trainings over seeds are worth, beside each other."""

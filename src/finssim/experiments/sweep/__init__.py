@@ -1,0 +1,1 @@
+"""`finssim sweep`: many trainings over settings and seeds, on one machine or many."""

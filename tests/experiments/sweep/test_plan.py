@@ -1,0 +1,64 @@
+"""Sweep files: every setting with every seed, and one sentence for what cannot be."""
+
+import pytest
+import yaml
+
+from finssim.experiments.sweep.plan import SweepError, load_sweep
+
+PLAIN = {"task": "t1", "seeds": 2, "train": {"steps": 1000}}
+
+
+def written(folder, **changes):
+    path = folder / "sweep.yaml"
+    path.write_text(yaml.safe_dump({**PLAIN, **changes}), encoding="utf-8")
+    return path
+
+
+def test_settings_times_grid_times_seeds(tmp_path):
+    """Seeds outermost, so that every setting has a result early; what is more special wins."""
+    file = written(
+        tmp_path,
+        seeds=[5, 7],
+        settings={"plain": {}, "small": {"worlds": 64, "steps": 10}},
+        grid={"action": ["wrench6", "wrench4"], "randomize": [None, "pool"]},
+    )
+    jobs = load_sweep(file).jobs()
+    assert len(jobs) == 2 * 2 * 4 and [job.seed for job in jobs] == [5] * 8 + [7] * 8
+    small = [job for job in jobs if job.name == "small_action-wrench4_randomize-pool"]
+    assert [job.options for job in small] == [
+        {"steps": 10, "worlds": 64, "action": "wrench4", "randomize": "pool"}
+    ] * 2
+    assert len({job.key for job in jobs}) == len(jobs)
+
+
+def test_a_number_of_seeds_counts_from_one(tmp_path):
+    assert [job.seed for job in load_sweep(written(tmp_path, seeds=3)).jobs()] == [1, 2, 3]
+
+
+def test_files_are_looked_for_beside_the_sweep(tmp_path):
+    """And their whole paths go to the workers."""
+    (tmp_path / "mine.yaml").write_text("{}", encoding="utf-8")
+    job = load_sweep(written(tmp_path, vehicle="mine.yaml", train={"randomize": "mine.yaml"})).jobs()[0]
+    assert job.vehicle == str(tmp_path / "mine.yaml") == job.options["randomize"]
+
+
+@pytest.mark.parametrize(
+    "changes, sentence",
+    [
+        ({"task": "t9"}, "task is 't9', expected one of t1"),
+        ({"train": {"stepz": 1}}, "'stepz' is no option of a training; available: learner"),
+        ({"settings": {"a": {"out": "x"}}}, "'out' is no option"),
+        ({"seeds": []}, "expected at least one, each once"),
+        ({"seeds": [1, 1]}, "expected at least one, each once"),
+        ({"evaluate": {"trials": 0}}, "evaluate.trials: Input should be greater than or equal to 1"),
+        ({"tusk": "t1"}, "tusk: Extra inputs are not permitted"),
+    ],
+)
+def test_what_cannot_be_is_refused(tmp_path, changes, sentence):
+    with pytest.raises(SweepError, match=sentence):
+        load_sweep(written(tmp_path, **changes))
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(SweepError, match="cannot be read"):
+        load_sweep(tmp_path / "nothing.yaml")
