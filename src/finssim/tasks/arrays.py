@@ -53,8 +53,11 @@ class MessageTable:
 class NetTable:
     """A net that agents hold, and what drifts in the water to be caught with it."""
 
+    side: float  # of the triangle at rest [m]
+    stretch: float  # longest edge that does not tear it, in sides
     target: wp.array(dtype=wp.vec3)  # world frame [m]
     drift: wp.array(dtype=wp.vec3)  # its velocity while nothing holds it [m/s]
+    motion: wp.array(dtype=wp.vec3)  # its velocity now [m/s]
 
 
 @wp.struct

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.tasks.docking_baseline import DockingPid
+from finssim.tasks.formation_baselines import ConsensusFormation
 from finssim.tasks.pid_baselines import StationPid, TargetPid, TrackingPid
 from finssim.tasks.pursuit_baselines import LeadPursuit
 from finssim.tasks.team_pursuit_baselines import FormationPursuit
@@ -43,6 +44,7 @@ BASELINES: dict[str, dict[str, Callable[..., Baseline]]] = {
     "docking": {"align-insert": DockingPid.for_vehicle},
     "pursuit": {"lead": LeadPursuit.for_vehicle},
     "team-pursuit": {"formation": FormationPursuit.for_vehicle},
+    "formation": {"consensus": ConsensusFormation.for_vehicle},
 }
 """Task -> name -> maker of the baseline for a vehicle; its `period` is the task's control step."""
 

@@ -1,6 +1,7 @@
 """Every task by name."""
 
 from finssim.tasks.docking import Docking
+from finssim.tasks.formation import Formation
 from finssim.tasks.moving_target import MovingTarget
 from finssim.tasks.pursuit import Pursuit
 from finssim.tasks.station_keeping import StationKeeping
@@ -17,5 +18,6 @@ TASKS: dict[str, type[Task]] = {
     "docking": Docking,
     "pursuit": Pursuit,
     "team-pursuit": TeamPursuit,
+    "formation": Formation,
 }
 """Every task by the name that commands take; call it for the task with its default settings."""
