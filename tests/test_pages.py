@@ -52,6 +52,15 @@ def test_the_ranges_and_the_plant_on_the_pages_load(tmp_path):
         load(tmp_path / f"{page}.yaml")
 
 
+def test_every_range_on_the_page_of_randomisation_loads(tmp_path):
+    """Whole files, and the schedules line by line, of which a file has one."""
+    path = tmp_path / "ranges.yaml"
+    first, tied, schedules = blocks(ROOT / "docs" / "randomisation.md", "yaml")
+    for example in (first, tied, *(f"mass: [0.9, 1.1]\n{line}" for line in schedules.splitlines())):
+        path.write_text(example, encoding="utf-8")
+        load_ranges(path)
+
+
 def test_pages_build_without_a_warning(tmp_path):
     """Every link between pages leads to a page and to a heading of it."""
     words = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", tmp_path / "site"]

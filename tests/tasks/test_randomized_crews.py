@@ -1,0 +1,39 @@
+"""Randomisation of every task, and of worlds with several vehicles: each is drawn on its own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from finssim.tasks import TASKS, make
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_runs_with_drawn_vehicles_and_privileged_numbers(task):
+    """Each agent's numbers are those of its own vehicle; runs of equal seeds are equal."""
+    found = []
+    for _ in range(2):
+        env = make(task, worlds=20, randomize="fossen_learn_to_swim", privileged=True, seed=5, threads=1)
+        shape = (20, env.action_size) if env.agents == 1 else (20, env.agents, env.action_size)
+        for _ in range(3):
+            step = env.step(np.full(shape, 0.2, np.float32))
+        assert np.isfinite(step.observation).all()
+        found.append(step.observation.copy())
+    np.testing.assert_array_equal(*found)
+    told = env.arrays.privileged.numpy().reshape(20, env.agents, -1)
+    assert told.shape[2] == len(env.privileged_names)
+    plant, k = env.simulator.plant, env.privileged_names.index("mass")
+    for a in range(env.agents):
+        mass = plant.mass.numpy()[:, a] / env.simulator.vehicles[a].body.mass
+        np.testing.assert_allclose(told[:, a, k], (mass - 1.0) / 0.02, atol=1e-4)
+    if len(env.simulator.vehicles) > 1:
+        mass = plant.mass.numpy() / [vehicle.body.mass for vehicle in env.simulator.vehicles]
+        assert np.ptp(mass, axis=1).min() > 0.0
+
+
+def test_the_vehicles_of_a_world_share_its_water():
+    """And nothing else: chaser and prey have thrusters of their own."""
+    env = make("pursuit", worlds=30, randomize="pool", seed=5)
+    drawn = env.drawing.draws.numpy(["current", "thrust.all"])
+    np.testing.assert_array_equal(drawn[:, 0, 0], drawn[:, 1, 0])
+    assert (drawn[:, 0, 1] != drawn[:, 1, 1]).all()
