@@ -138,6 +138,11 @@ LEARNERS: dict[str, LearnerKind] = {
         extra="torchrl",
         agents="several",
     ),
+    "bc": LearnerKind("imitation", "Bc", "behaviour cloning of demonstrations", extra="imitation"),
+    "dagger": LearnerKind(
+        "imitation", "Dagger", "DAgger: an expert says what it would have done", extra="imitation"
+    ),
+    "gail": LearnerKind("gail", "Gail", "GAIL: PPO judged against demonstrations", extra="imitation,torchrl"),
 }
 """Learner by the name that commands take."""
 

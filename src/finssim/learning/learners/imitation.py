@@ -1,0 +1,247 @@
+"""Imitation on torch: behaviour cloning from demonstrations, and DAgger, which asks the expert on the learner's way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from finssim.learning.demonstrations import Demonstrations, load
+from finssim.learning.experts import expert_for
+from finssim.learning.learners.acting import ActingLearner
+from finssim.learning.learners.catalogue import LearningError
+from finssim.learning.learners.networks import stack
+from finssim.learning.served import age_episodes
+from finssim.learning.tensors import Tensors
+from finssim.tasks import Environment, Task
+
+__all__ = ["Bc", "Dagger", "demonstrations_for", "settings_for"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BcSettings:
+    """Settings of behaviour cloning: regression of the expert's action on the observation."""
+
+    demonstrations: str = ""
+    """Folder of a data set, from `finssim collect`."""
+    worlds: int = 32
+    """In which the policy is tried while it learns; it learns nothing from them."""
+    steps: int = 4_000_000
+    """Demonstrated steps that are looked at, all passes together."""
+    rollout: int = 8192 * 8
+    """Looked at between two rows of the curve."""
+    batch: int = 512
+    learning_rate: float = 1.0e-3
+    """At the start; falls linearly to zero."""
+    weight_decay: float = 1.0e-5
+    hidden: tuple[int, ...] = (64, 64)
+    """Units of the hidden layers, ELU."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DaggerSettings:
+    """Settings of DAgger (Ross et al. 2011): the learner drives, the expert says what it would have done."""
+
+    expert: str = "pid"
+    """A baseline of the task by name, or a policy directory."""
+    demonstrations: str = ""
+    """A data set to begin with; none if empty."""
+    worlds: int = 64
+    steps: int = 300_000
+    """Control steps of all worlds together."""
+    rollout: int = 100
+    """Control steps of each world between two rounds of learning."""
+    expert_rounds: int = 2
+    """Rounds in which the expert drives itself; after them the learner does."""
+    kept: int = 500_000
+    """Samples that are kept, the newest."""
+    passes: float = 2.0
+    """Over what is kept, in each round."""
+    batch: int = 512
+    learning_rate: float = 1.0e-3
+    """At the start; falls linearly to zero."""
+    weight_decay: float = 1.0e-5
+    hidden: tuple[int, ...] = (64, 64)
+
+
+def settings_for(
+    task: Task, learner: str, *, randomized: bool = False, worlds: int | None = None, steps: int | None = None
+) -> BcSettings | DaggerSettings:
+    """The settings of a training; what is None keeps its default."""
+    settings = BcSettings() if learner == "Bc" else DaggerSettings()
+    return replace(settings, worlds=worlds or settings.worlds, steps=steps or settings.steps)
+
+
+def demonstrations_for(environment: Environment, place: str) -> Demonstrations:
+    """A data set that fits an environment.
+
+    Raises:
+        LearningError: None is named, or it is of another task, vehicle or action mode.
+        DatasetError: It cannot be read.
+    """
+    if not place:
+        raise LearningError(
+            "no demonstrations are named: collect some with finssim collect, and give --setting demonstrations=DIR"
+        )
+    found = load(place)
+    vehicle = environment.simulator.vehicles[0]
+    for what, has, wanted in (
+        ("task", found.about["task"], environment.task.name),
+        ("action mode", found.about["action"]["mode"], environment.action_mode),
+        ("vehicle", found.about["vehicle"]["sha256"], vehicle.sha256),
+        ("observation", found.observation.shape[1], environment.observation_size),
+    ):
+        if has != wanted:
+            raise LearningError(f"{place} is of {what} {has}, expected {wanted}: collect for what is trained")
+    return found
+
+
+class _Cloner(ActingLearner):
+    """What both share: a network that is fitted to actions, and worlds in which it drives."""
+
+    settings: Any
+
+    def __init__(self, environment: Environment, settings: Any, *, seed: int, device: str = "cpu") -> None:
+        super().__init__(environment, settings)
+        torch.manual_seed(seed)
+        age_episodes(environment)
+        self.device = device
+        self._worlds = Tensors(environment)
+        self.policy = stack(environment.observation_size, settings.hidden, environment.action_size, 0.01).to(
+            device
+        )
+        self.optimizer = torch.optim.Adam(
+            self.policy.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
+        )
+
+    def _fit(self, observation: torch.Tensor, action: torch.Tensor, count: int) -> float:
+        """Regression on batches drawn with replacement; the mean squared error over all of them."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.settings.learning_rate * self.left
+        total, rounds = 0.0, max(1, count // self.settings.batch)
+        for _ in range(rounds):
+            index = torch.randint(len(observation), (self.settings.batch,))
+            loss = nn.functional.mse_loss(self.policy(observation[index]), action[index])
+            self.optimizer.zero_grad()
+            loss.backward()
+            self.optimizer.step()
+            total += float(loss.detach())
+        return total / rounds
+
+    def _drive(self, steps: int) -> None:
+        with torch.no_grad():
+            for _ in range(steps):
+                seen = self._worlds.observation.to(self.device, copy=True)
+                self._worlds.step(self.policy(seen).clamp(-1.0, 1.0))
+                self.tally.look()
+
+    def network(self) -> nn.Module:
+        """Observation of one agent to its action."""
+        return self.policy
+
+    def learned(self) -> dict[str, Any]:
+        """Network and optimiser."""
+        return {"policy": self.policy.state_dict(), "optimizer": self.optimizer.state_dict()}
+
+    def load_learned(self, state: dict[str, Any]) -> None:
+        """Take what `learned` gave."""
+        self.policy.load_state_dict(state["policy"])
+        self.optimizer.load_state_dict(state["optimizer"])
+
+
+class Bc(_Cloner):
+    """Behaviour cloning."""
+
+    settings: BcSettings
+
+    def __init__(
+        self, environment: Environment, settings: BcSettings, *, seed: int, device: str = "cpu"
+    ) -> None:
+        """Load the demonstrations and set up the network."""
+        super().__init__(environment, settings, seed=seed, device=device)
+        found = demonstrations_for(environment, settings.demonstrations)
+        self._observation = torch.from_numpy(found.observation).to(device)
+        self._action = torch.from_numpy(found.action).to(device)
+
+    def update(self) -> dict[str, float]:
+        """One round of regression, then a while of driving, which only measures."""
+        count = min(self.settings.rollout, self.settings.steps - self.steps)
+        loss = self._fit(self._observation, self._action, count)
+        self.steps += max(count, 1)
+        self._drive(10)
+        return {**self.tally.row(), "imitation_loss": loss}
+
+
+class Dagger(_Cloner):
+    """Dataset aggregation."""
+
+    settings: DaggerSettings
+
+    def __init__(
+        self, environment: Environment, settings: DaggerSettings, *, seed: int, device: str = "cpu"
+    ) -> None:
+        """Find the expert and what it has shown already."""
+        super().__init__(environment, settings, seed=seed, device=device)
+        self._expert = expert_for(environment, settings.expert)
+        rows = environment.worlds * environment.agents
+        self._fresh = self._expert.reset(rows)
+        self._memory = self._fresh
+        self._rounds = 0
+        n, m = environment.observation_size, environment.action_size
+        self._observation, self._action = torch.empty(0, n), torch.empty(0, m)
+        if settings.demonstrations:
+            found = demonstrations_for(environment, settings.demonstrations)
+            self._keep(torch.from_numpy(found.observation), torch.from_numpy(found.action))
+
+    def _keep(self, observation: torch.Tensor, action: torch.Tensor) -> None:
+        kept = self.settings.kept
+        self._observation = torch.cat([self._observation, observation])[-kept:]
+        self._action = torch.cat([self._action, action])[-kept:]
+
+    def update(self) -> dict[str, float]:
+        """One rollout, labelled by the expert, and regression on all that is kept."""
+        with torch.no_grad():
+            self._keep(*self._rollout())
+        self._rounds += 1
+        self.steps += self.environment.worlds * self.settings.rollout
+        count = round(self.settings.passes * len(self._observation))
+        loss = self._fit(self._observation.to(self.device), self._action.to(self.device), count)
+        row = {"imitation_loss": loss, "kept": float(len(self._observation))}
+        return {**self.tally.row(), **row}
+
+    def _rollout(self) -> tuple[torch.Tensor, torch.Tensor]:
+        seen, told = [], []
+        agents, expert_drives = self.environment.agents, self._rounds < self.settings.expert_rounds
+        for _ in range(self.settings.rollout):
+            rows = self._worlds.observation.flatten(0, 1).cpu().clone()
+            wanted, self._memory = self._expert.act(self._memory, rows.numpy())
+            label = torch.from_numpy(np.clip(wanted, -1.0, 1.0).astype(np.float32))
+            seen.append(rows)
+            told.append(label)
+            done = label if expert_drives else self.policy(rows.to(self.device)).clamp(-1.0, 1.0)
+            terminated, truncated = self._worlds.step(done.to(self._worlds.device))
+            self.tally.look()
+            ended = (terminated | truncated).cpu().numpy()
+            if ended.any():
+                mask = np.repeat(ended, agents)
+                self._memory = self._expert.restarted(self._memory, self._fresh, mask)
+        return torch.cat(seen), torch.cat(told)
+
+    def learned(self) -> dict[str, Any]:
+        """Network, optimiser, what is kept, and the expert's memory."""
+        return {
+            **super().learned(),
+            "observation": self._observation,
+            "action": self._action,
+            "memory": self._memory,
+            "rounds": self._rounds,
+        }
+
+    def load_learned(self, state: dict[str, Any]) -> None:
+        """Take what `learned` gave."""
+        super().load_learned(state)
+        self._observation, self._action = state["observation"], state["action"]
+        self._memory, self._rounds = state["memory"], state["rounds"]
