@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from finssim.engine.plant_arrays import SimulatorError
+from finssim.physics.types import MAX_THRUSTERS
 from finssim.quiet import start_warp
 from finssim.vehicles import Vehicle
 from finssim.vehicles.body import Water as Fluid
@@ -55,3 +56,34 @@ def broadcast(array: NDArray[Any], shape: tuple[int, int, int], what: str) -> ND
         raise SimulatorError(
             f"{what} has shape {array.shape}, expected (worlds, vehicles, numbers) = {shape} or the last of these alone"
         ) from None
+
+
+def placed_at(name: str, value: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """A position, quaternion or velocity to place vehicles at, for every world and vehicle; quaternions of length 1."""
+    array = np.asarray(value, dtype=np.float32)
+    if not np.isfinite(array).all():
+        raise SimulatorError(f"{name} to place a vehicle at has a number that is not finite")
+    if name == "quaternion":
+        length = np.linalg.norm(array, axis=-1, keepdims=True)
+        if not (length > 0.0).all():
+            raise SimulatorError("quaternion to place a vehicle at has length 0, expected 1 (xyzw)")
+        array = array / length
+    full = broadcast(array, (*shape, {"position": 3, "quaternion": 4, "velocity": 6}[name]), name)
+    return np.ascontiguousarray(full, dtype=np.float32)
+
+
+def thrust_table(force: ArrayLike, vehicles: Sequence[Vehicle], worlds: int) -> NDArray[np.float32]:
+    """Thruster forces [N] for every world and vehicle, zero for the thrusters that a vehicle does not have."""
+    f = np.asarray(force, dtype=np.float32)
+    n = max(len(v.thrusters) for v in vehicles)
+    if f.ndim == 0 or f.shape[-1] != n:
+        got = f.shape[-1] if f.ndim else 0
+        most = " of the vehicle that has most" if len(vehicles) > 1 else ""
+        raise SimulatorError(f"thrust command has {got} numbers, expected {n}: one per thruster{most}")
+    if not np.isfinite(f).all():
+        raise SimulatorError(
+            "thrust command has a number that is not finite: send a force in N for every thruster"
+        )
+    full = np.zeros((worlds, len(vehicles), MAX_THRUSTERS), dtype=np.float32)
+    full[..., :n] = broadcast(f, (*full.shape[:2], n), "thrust command")
+    return full

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.engine.arguments import broadcast, find_device, one_of, shared_water
+from finssim.engine.arguments import find_device, one_of, placed_at, shared_water, thrust_table
 from finssim.engine.dock import Dock
 from finssim.engine.launch import Pipeline
 from finssim.engine.packed import Packed
@@ -181,7 +181,15 @@ class Simulator:
         around = [self.hull, self.water, self.walls, self.tether, self.funnel]
         s = self.state
         clocks = [s.commands, s.history, s.steps, s.broken, s.frozen]
-        inputs = [s.vehicle, self.command.array, *clocks, self.plant.array, *around, self.control_step, self.substeps]
+        inputs = [
+            s.vehicle,
+            self.command.array,
+            *clocks,
+            self.plant.array,
+            *around,
+            self.control_step,
+            self.substeps,
+        ]
         pipeline.add(kernel, inputs, vehicles=len(self.vehicles))
         pipeline.add(tick, [self.state])
 
@@ -244,16 +252,7 @@ class Simulator:
         shape = (self.worlds, len(self.vehicles))
         given = {"position": position, "quaternion": quaternion, "velocity": velocity}
         for name, value in given.items():
-            array = np.asarray(value, dtype=np.float32)
-            if not np.isfinite(array).all():
-                raise SimulatorError(f"{name} to place a vehicle at has a number that is not finite")
-            if name == "quaternion":
-                length = np.linalg.norm(array, axis=-1, keepdims=True)
-                if not (length > 0.0).all():
-                    raise SimulatorError("quaternion to place a vehicle at has length 0, expected 1 (xyzw)")
-                array = array / length
-            full = broadcast(array, (*shape, {"position": 3, "quaternion": 4, "velocity": 6}[name]), name)
-            getattr(self.state, name).assign(np.ascontiguousarray(full, dtype=np.float32))
+            getattr(self.state, name).assign(placed_at(name, value, shape))
         self.reset()
 
     def numpy(self, name: str) -> NDArray[Any]:
@@ -274,19 +273,7 @@ class Simulator:
         Raises:
             SimulatorError: the shape is wrong or a number is not finite.
         """
-        f = np.asarray(force, dtype=np.float32)
-        n = max(len(v.thrusters) for v in self.vehicles)
-        if f.ndim == 0 or f.shape[-1] != n:
-            got = f.shape[-1] if f.ndim else 0
-            most = " of the vehicle that has most" if len(self.vehicles) > 1 else ""
-            raise SimulatorError(f"thrust command has {got} numbers, expected {n}: one per thruster{most}")
-        if not np.isfinite(f).all():
-            raise SimulatorError(
-                "thrust command has a number that is not finite: send a force in N for every thruster"
-            )
-        full = np.zeros((self.worlds, len(self.vehicles), 8), dtype=np.float32)
-        full[..., : f.shape[-1]] = broadcast(f, (*full.shape[:2], f.shape[-1]), "thrust command")
-        self.command.thrust.assign(full)
+        self.command.thrust.assign(thrust_table(force, self.vehicles, self.worlds))
 
     def restart_episodes(self, mask: ArrayLike | None = None) -> None:
         """Count episodes from zero again, so that the random streams repeat: where mask is true, everywhere if None."""
