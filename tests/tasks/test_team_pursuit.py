@@ -174,7 +174,8 @@ def test_the_formation_captures_and_a_still_team_does_not(level):
 
 def test_the_formation_captures_on_messages_alone():
     talk = Communication(period=2.0, loss=0.3, processing=0.5)
-    assert rate(TeamPursuit(communication=talk, prey=Prey(mode="line-of-sight")), "formation") > 0.9
+    task = TeamPursuit(level=2, communication=talk, prey=Prey(mode="line-of-sight"))
+    assert rate(task, "formation") > 0.9
 
 
 def test_vehicles_may_differ_in_type():
@@ -205,6 +206,22 @@ def test_a_world_does_not_know_how_many_there_are():
 
     assert np.array_equal(one(5), one(200))
     assert not np.array_equal(one(5), one(5, seed=4))
+
+
+def test_a_run_goes_on_from_a_saved_state():
+    """Bit for bit, with messages under way."""
+
+    def made():
+        task = TeamPursuit(communication=Communication(period=0.3, loss=0.3, processing=0.7))
+        return Environment(task, worlds=6, seed=2)
+
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (40, 6, 3, 4))
+    whole, other = made(), made()
+    for a in actions[:20]:
+        whole.step(a)
+    other.load_state(whole.state())
+    for a in actions[20:]:
+        np.testing.assert_array_equal(whole.step(a).observation, other.step(a).observation)
 
 
 def test_what_does_not_exist_is_refused():
