@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import nn
@@ -43,9 +41,8 @@ class HeldEvaluation:
         e = self.environment
         e.reset(seed=e.seed)
         waiting, found = np.ones(e.worlds, dtype=np.bool_), {}
-        memory = network.empty_memory(e.worlds * e.agents) if hasattr(network, "empty_memory") else None
         for _ in range(self._limit):
-            memory = self._act(network, memory)
+            self._act(network)
             ended = (e.arrays.terminated.numpy() | e.arrays.truncated.numpy()) != 0
             for name, values in e.task.metrics(e.arrays).items() if (ended & waiting).any() else ():
                 found.setdefault(name, np.zeros(e.worlds))[ended & waiting] = values[ended & waiting]
@@ -55,14 +52,11 @@ class HeldEvaluation:
         done = ~waiting
         return {f"evaluation_{name}": float(values[done].mean()) for name, values in found.items()}
 
-    def _act(self, network: nn.Module, memory: Any) -> Any:
-        """One control step of all worlds; the network's memory afterwards."""
+    def _act(self, network: nn.Module) -> None:
+        """One control step of all worlds."""
         e = self.environment
-        seen = torch.as_tensor(
-            e.arrays.observation.numpy().reshape(e.worlds * e.agents, -1), device=self.device
-        )
+        rows = e.arrays.observation.numpy().reshape(e.worlds * e.agents, -1)
         with torch.no_grad():
-            action, memory = (network(seen), None) if memory is None else network(seen, memory)
+            action = network(torch.as_tensor(rows, device=self.device))
         e.arrays.action.assign(action.cpu().numpy().reshape(e.worlds, -1))
         e.advance()
-        return memory

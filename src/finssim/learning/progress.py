@@ -35,7 +35,9 @@ def summary(row: Mapping[str, Any]) -> str:
     if not row.get("steps_per_s"):
         return ""
     rate, held = row["steps_per_s"] / 1e3, 100.0 * row["held"]
-    return f"{rate:.0f} k steps/s  return {row['mean_return']:.1f}  held {held:.0f} %"
+    words = f"{rate:.0f} k steps/s  return {row['mean_return']:.1f}  held {held:.0f} %"
+    success = row.get("evaluation_success")
+    return words if success is None else f"{words}  evaluated {100.0 * success:.0f} %"
 
 
 class TrainingView:
@@ -56,7 +58,7 @@ class TrainingView:
         )
         self._progress = Progress(*columns, console=self.console, disable=not self._live)
         self._task = self._progress.add_task("train", total=total)
-        self._start = time.perf_counter()
+        self._start, self._first = time.perf_counter(), 0
 
     def __enter__(self) -> TrainingView:
         self._progress.start()
@@ -67,13 +69,20 @@ class TrainingView:
     ) -> None:
         self._progress.stop()
 
+    def go_on(self, steps: int) -> None:
+        """Begin where so many steps were done before: they took no time of this training's."""
+        self._first = steps
+        self._next = (int(steps / self.total * 10.0) + 1) / 10.0
+        self._progress.reset(self._task, completed=steps)
+
     def update(self, row: Mapping[str, Any]) -> None:
-        """Show a row of the training curve: steps, steps_per_s, mean_return, held."""
+        """Show a row of the training curve: steps, steps_per_s, mean_return, held, evaluation_success if there."""
         self._progress.update(self._task, completed=row["steps"], **row)
         part = row["steps"] / self.total
         if not self._live and part >= self._next:
             elapsed = time.perf_counter() - self._start
-            left = elapsed * max(1.0 / part - 1.0, 0.0)
+            done = max(row["steps"] - self._first, 1)
+            left = elapsed * max(self.total - row["steps"], 0) / done
             self.console.print(
                 f"training {min(part, 1.0):4.0%}  {summary(row)}  {left:.0f} s left", highlight=False
             )
