@@ -13,6 +13,7 @@ from finssim import (
     boundary,
     cli_calibrate,
     cli_experiments,
+    cli_imitation,
     cli_learn,
     cli_localization,
     cli_pool,
@@ -42,6 +43,8 @@ vehicles_app = typer.Typer(invoke_without_command=True, rich_markup_mode=None, a
 app.add_typer(vehicles_app, name="vehicles")
 app.command()(cli_learn.train)
 app.command()(cli_learn.evaluate)
+app.command()(cli_imitation.collect)
+app.command()(cli_imitation.datasets)
 app.command()(cli_study.compare)
 app.command()(cli_study.sweep)
 app.add_typer(cli_trials.trials_app, name="trials")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from finssim.files import atomic_directory
 
-__all__ = ["DATASET_FILE", "DatasetError", "Demonstrations", "Episode", "about", "load", "save"]
+__all__ = ["DATASET_FILE", "DatasetError", "Demonstrations", "Episode", "about", "found_in", "load", "save"]
 
 DATASET_FILE = METADATA_FILE_NAME
 OURS = "finssim"
@@ -147,6 +147,23 @@ def about(place: str | Path) -> dict[str, Any]:
         )
     described: dict[str, Any] = json.loads(found[OURS])
     return {**described, "episodes": found["total_episodes"], "steps": found["total_steps"]}
+
+
+def found_in(place: str | Path) -> list[Path]:
+    """The data sets at a place: itself, or those right under it.
+
+    Raises:
+        DatasetError: There is none.
+    """
+    here = Path(place)
+    found = (
+        [here]
+        if (here / DATASET_FILE).is_file()
+        else sorted(p.parent for p in here.glob(f"*/{DATASET_FILE}"))
+    )
+    if not found:
+        raise DatasetError(f"{place}: no data set there: make one with finssim collect")
+    return found
 
 
 def _word(name: str) -> str:

@@ -84,7 +84,7 @@ def demonstrations_for(environment: Environment, place: str) -> Demonstrations:
     """
     if not place:
         raise LearningError(
-            "no demonstrations are named: collect some with finssim collect, and give --setting demonstrations=DIR"
+            "no demonstrations are named: collect some with finssim collect, and give --set demonstrations=DIR"
         )
     found = load(place)
     vehicle = environment.simulator.vehicles[0]
