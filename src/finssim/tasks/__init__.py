@@ -1,9 +1,11 @@
 """Tasks, and the batched environment that runs any of them."""
 
 from finssim.tasks.catalogue import TASKS
+from finssim.tasks.docking import Docking
 from finssim.tasks.environment import Environment, EnvironmentSetupError, Step
 from finssim.tasks.make import make, task_named
 from finssim.tasks.measurement import MeasurementNoise
+from finssim.tasks.moving_target import MovingTarget
 from finssim.tasks.reference import follow
 from finssim.tasks.station_keeping import StationKeeping
 from finssim.tasks.task import ObservationPart, Task
@@ -11,9 +13,11 @@ from finssim.tasks.trajectory_tracking import TrajectoryTracking
 
 __all__ = [
     "TASKS",
+    "Docking",
     "Environment",
     "EnvironmentSetupError",
     "MeasurementNoise",
+    "MovingTarget",
     "ObservationPart",
     "StationKeeping",
     "Step",

@@ -1,0 +1,196 @@
+"""`check_task`: the usual mistakes in a task of one's own, found by playing it for a few short episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.tasks.environment import Environment
+from finssim.tasks.task import Task
+from finssim.vehicles import Vehicle
+
+__all__ = ["TaskError", "check_task"]
+
+LARGEST = 20.0
+"""An observation beyond this is called unbounded: networks want numbers of order one."""
+
+WORLDS = 8
+"""Worlds that are played."""
+
+EPISODE = 10
+"""Control steps of an episode in a check; as many episodes are played as `EPISODES`."""
+
+EPISODES = 3
+
+
+class TaskError(ValueError):
+    """A task with mistakes; one sentence for each."""
+
+
+class Played(NamedTuple):
+    """What the steps gave, by step and world."""
+
+    observation: NDArray[np.float32]
+    """(steps, worlds, numbers of all agents)"""
+    reward: NDArray[np.float32]
+    """(steps, worlds, agents)"""
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    metrics: dict[str, NDArray[np.float64]]
+    """At the end."""
+
+    @property
+    def ended(self) -> NDArray[np.bool_]:
+        """Which episodes ended, (steps, worlds)."""
+        return self.terminated | self.truncated
+
+
+def check_task(
+    task: Task, vehicle: Vehicle | str | Sequence[Vehicle | str] = "finsrov", **options: Any
+) -> None:
+    """Play a task with random actions and look for mistakes.
+
+    Observations that are not finite, grow without bound or leave their clip; runs that differ under equal seeds or with
+    the number of worlds; episodes that do not end, or end twice; rewards and observations that know of the episode
+    before; starts that are all the same; metrics that are not those of the steps.
+
+    Args:
+        task: The task.
+        vehicle: Who does it: one for all, or one for each of the task's vehicles.
+        options: More arguments of `Environment`.
+
+    Raises:
+        TaskError: There are mistakes.
+        EnvironmentSetupError: The task does not run with these vehicles.
+    """
+    short = replace(task, time_limit=EPISODE * task.control_step)
+
+    def environment(worlds: int) -> Environment:
+        return Environment(short, vehicle, worlds=worlds, **{"seed": 1, **options})
+
+    env = environment(WORLDS)
+    agents = () if env.agents == 1 else (env.agents,)
+    shape = (EPISODES * EPISODE, 9 * WORLDS, *agents, env.action_size)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, shape).astype(np.float32)
+    first = _play(env, actions[:, :WORLDS])
+    again = _play(environment(WORLDS), actions[:, :WORLDS])
+    many = _play(environment(9 * WORLDS), actions)
+    otherwise = actions[:, :WORLDS].copy()
+    otherwise[:EPISODE] *= -1.0
+    past = _play(environment(WORLDS), otherwise)
+
+    found = [
+        *_observation(first, short, env.agents),
+        *_ends(first),
+        *_repeats(first, again, many),
+        *_leaks(first, past),
+        *_starts(first),
+        *_metrics(first),
+    ]
+    if found:
+        raise TaskError(f"task '{task.name}': " + "; ".join(found))
+
+
+def _play(environment: Environment, actions: NDArray[np.float32]) -> Played:
+    rows: list[tuple[Any, ...]] = []
+    worlds = environment.worlds
+    for action in actions:
+        step = environment.step(action)
+        rows.append(
+            (
+                step.observation.reshape(worlds, -1).copy(),
+                step.reward.reshape(worlds, -1).copy(),
+                step.terminated.copy(),
+                step.truncated.copy(),
+            )
+        )
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    return Played(*columns, environment.task.metrics(environment.arrays))
+
+
+def _observation(played: Played, task: Task, agents: int) -> Iterator[str]:
+    """Finite and of order one, part by part; rewards finite."""
+    if not np.isfinite(played.reward).all():
+        yield "a reward is not finite"
+    first, table = 0, played.observation.reshape(*played.observation.shape[:2], agents, -1)
+    for part in task.observation:
+        numbers = table[..., first : first + part.size]
+        first += part.size
+        if not np.isfinite(numbers).all():
+            yield f"observation '{part.name}' is not finite"
+            continue
+        largest = float(np.abs(numbers).max())
+        if part.clip is not None and largest > part.clip * (1.0 + 1e-6):
+            yield f"observation '{part.name}' reaches {largest:.3g}, expected at most its clip of {part.clip:g}"
+        elif largest > LARGEST:
+            yield f"observation '{part.name}' reaches {largest:.3g}: give it a scale or a clip"
+
+
+def _ends(played: Played) -> Iterator[str]:
+    """Every episode ends by its time limit, as one thing or the other."""
+    if (played.terminated & played.truncated).any():
+        yield "an episode is terminated and truncated at once: a failure at the time limit is a failure"
+    for world in range(played.ended.shape[1]):
+        ends = np.flatnonzero(played.ended[:, world])
+        if len(ends) == 0 or np.diff([-1, *ends]).max() > EPISODE:
+            yield f"an episode goes on after its time limit of {EPISODE} control steps"
+            return
+
+
+def _repeats(first: Played, again: Played, many: Played) -> Iterator[str]:
+    """Equal seeds, equal numbers, for any number of worlds."""
+    pairs = [(a, b) for a, b in zip(first[:4], again[:4], strict=True)]
+    if not all(np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in pairs):
+        yield "equal seeds give other numbers: draw from wp.rand_init(seed and episode, world) alone"
+        return
+    if not all(
+        np.array_equal(a, b[:, :WORLDS], equal_nan=a.dtype.kind == "f")
+        for a, b in zip(first[:4], many[:4], strict=True)
+    ):
+        yield "a world's numbers depend on how many worlds there are: index by the world's number, with world_offset"
+
+
+def _leaks(first: Played, past: Played) -> Iterator[str]:
+    """An episode after another one that went differently is the same episode."""
+    full = [p.ended[EPISODE - 1] & ~p.ended[: EPISODE - 1].any(axis=0) for p in (first, past)]
+    worlds = full[0] & full[1]
+    second = slice(EPISODE, 2 * EPISODE)
+    start = slice(EPISODE - 1, 2 * EPISODE - 1)
+    if not np.array_equal(first.observation[start][:, worlds], past.observation[start][:, worlds]):
+        yield "an observation depends on the episode before: set everything in spawn"
+    elif not np.array_equal(first.reward[second][:, worlds], past.reward[second][:, worlds]):
+        yield "a reward depends on the episode before: start totals and the last action over with open_episode in spawn"
+
+
+def _starts(played: Played) -> Iterator[str]:
+    """What is seen after a reset differs between worlds and episodes."""
+    starts = played.observation[played.ended]
+    if len(starts) > 1 and len({row.tobytes() for row in starts}) == 1:
+        yield "every episode starts alike: draw something in spawn, from the seed, the episode and the world"
+
+
+def _metrics(played: Played) -> Iterator[str]:
+    """Return and length are those of the last episode; all are by world."""
+    steps, worlds = played.ended.shape
+    for name, values in played.metrics.items():
+        if np.shape(values) != (worlds,):
+            yield f"metric '{name}' has shape {np.shape(values)}, expected ({worlds},): one number a world"
+            return
+    for world in range(worlds):
+        ends = [-1, *np.flatnonzero(played.ended[:, world])]
+        if len(ends) < 2:
+            return
+        last = slice(ends[-2] + 1, ends[-1] + 1)
+        total = float(played.reward[last, world].mean(axis=1).sum())
+        if last.stop - last.start != played.metrics["length"][world] or not np.isclose(
+            total, played.metrics["return"][world], rtol=1e-3, atol=1e-3
+        ):
+            yield (
+                "return and length are not those of the last episode: add each reward to episode_return once, and call "
+                "close_episode at the end"
+            )
+            return
