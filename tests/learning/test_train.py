@@ -176,7 +176,7 @@ train("t1", out=Path(sys.argv[1]), learner=sys.argv[2], **eval(sys.argv[3]))
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("learner", [name for name, kind in LEARNERS.items() if kind.agents != "several"])
+@pytest.mark.parametrize("learner", ["sb3-ppo", "sb3-sac", "rsl-rl", "torchrl-ppo"])
 def test_a_killed_training_goes_on_to_the_same_policy(tmp_path, learner):
     """kill -9 in the sixth of eight updates, then --resume: network and curves as if nothing had been."""
     options = dict(SMALL)

@@ -1,7 +1,11 @@
-"""Tasks of one step whose best action is known: a constant, or one that depends on what is observed.
+"""Tasks whose best action, or whose value, is known.
+
+Guess has one step, and its best action depends on what is observed.
 
 An agent sees a sign s, +1 or -1, drawn anew (agents of a world: +1 for the first, -1 for the second), and is paid
 r = 1 - mean((a - s c)²) for action a, with c = 0.5 in every component. The best mean action is s c, and pays 1.
+
+Steady pays 1 for ever: its value is 1 / (1 - discount) everywhere, if an end by time is none.
 """
 
 from dataclasses import dataclass
@@ -96,4 +100,35 @@ class GuessTogether(Guess):
     """Two agents."""
 
     name: str = "guess_together"
+    agents = ("first", "second")
+
+
+@wp.kernel(enable_backward=False)
+def pay(state: State, arrays: TaskArrays, p: Guessing, world_offset: int):
+    w = world_offset + wp.tid()
+    for a in range(arrays.agent_reward.shape[1]):
+        arrays.agent_reward[w, a] = 1.0
+    arrays.reward[w] = 1.0
+    arrays.episode_return[w] = arrays.episode_return[w] + 1.0
+    arrays.terminated[w] = 0
+    arrays.truncated[w] = wp.where(state.steps[w] >= 5, 1, 0)
+    arrays.done[w] = arrays.truncated[w]
+    if arrays.done[w] != 0:
+        close_episode(state, arrays, w)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Steady(Guess):
+    """Pays 1 in every step, whatever is done; time ends an episode after five steps, and nothing else does."""
+
+    name: str = "steady"
+    time_limit: float = 0.5
+    evaluate = staticmethod(pay)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SteadyTogether(Steady):
+    """Two agents."""
+
+    name: str = "steady_together"
     agents = ("first", "second")

@@ -14,8 +14,11 @@ from finssim.learning.resume import read_state, write_state
 from finssim.tasks import TASKS, task_named
 from reference.guess import BEST, Guess, GuessTogether
 
-ONE = [name for name, kind in LEARNERS.items() if kind.agents != "several"]
-SEVERAL = [name for name, kind in LEARNERS.items() if kind.agents != "one"]
+IMITATING = ("bc", "dagger", "gail")
+"""Tested where demonstrations are."""
+REINFORCED = [name for name in LEARNERS if name not in IMITATING]
+ONE = [name for name in REINFORCED if LEARNERS[name].agents != "several"]
+SEVERAL = [name for name in REINFORCED if LEARNERS[name].agents != "one"]
 PAIRS = [(name, Guess) for name in ONE] + [(name, GuessTogether) for name in SEVERAL]
 
 
@@ -86,7 +89,7 @@ def test_it_finds_the_best_action(name, task):
 
 
 @pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize("name", REINFORCED)
 def test_it_learns_on_every_task_and_goes_on_bitwise(tmp_path, name, task):
     """Two updates, a state through a file into another learner, two more: parameters, rows and worlds are equal."""
     kind, agents = learner_named(name), len(task_named(task).agents)
@@ -108,7 +111,7 @@ def test_it_learns_on_every_task_and_goes_on_bitwise(tmp_path, name, task):
     assert same(whole.state(), other.state())
 
 
-@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize("name", REINFORCED)
 def test_equal_seeds_are_equal_learners(name):
     """And another seed is another."""
     task = Guess() if name in ONE else GuessTogether()

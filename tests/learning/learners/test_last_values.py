@@ -1,0 +1,70 @@
+"""An episode that time ends is worth what its last observation is: with a value known in closed form.
+
+Where every step pays 1 and only time ends an episode, V = 1 / (1 - discount) everywhere. A critic that says so is
+right: all returns that a learner computes are V, in the steps in which an episode ends too.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import finssim
+from finssim.learning.learners import learner_named
+from reference.guess import Guess, Steady, SteadyTogether
+
+DISCOUNT = 0.9
+
+
+def made(name, task):
+    kind = learner_named(name)
+    few = {"worlds": 4, "rollout": 12, "batch": 16, "epochs": 1, "hidden": (8,), "discount": DISCOUNT}
+    settings = replace(kind.settings(task), steps=1000, **few)
+    return kind(finssim.make(task, worlds=4, seed=2), settings, seed=2)
+
+
+def answer(critic, value):
+    """Let a network's last layer say `value` whatever it is shown."""
+    last = [layer for layer in critic.modules() if isinstance(layer, nn.Linear)][-1]
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias.fill_(value)
+
+
+def returns(name, learner, value):
+    """The returns that an update learns from, where the critic says `value`."""
+    if name == "sb3-ppo":
+        answer(learner.model.policy.value_net, value)
+        learner.update()
+        return learner.model.rollout_buffer.returns
+    if name == "rsl-rl":
+        answer(learner.ppo.critic, value)
+        learner.update()
+        return learner.ppo.storage.returns.numpy()
+    answer(learner.critic, value)
+    with torch.no_grad():
+        return learner._rollout()[learner.loss.tensor_keys.value_target].numpy()
+
+
+@pytest.mark.parametrize(
+    ("name", "task"),
+    [
+        *((name, Steady) for name in ("sb3-ppo", "rsl-rl", "torchrl-ppo")),
+        *((name, SteadyTogether) for name in ("torchrl-ippo", "torchrl-mappo")),
+    ],
+)
+def test_time_ends_no_value(name, task):
+    """Four worlds over twelve steps, with an end by time at least twice in each."""
+    learner = made(name, task())
+    value = 1.0 / (1.0 - DISCOUNT)
+    np.testing.assert_allclose(returns(name, learner, value), value, rtol=1e-5)
+    assert learner.environment.simulator.state.episode.numpy().min() >= 3
+
+
+@pytest.mark.parametrize("name", ["sb3-ppo", "rsl-rl", "torchrl-ppo"])
+def test_an_end_by_the_task_ends_the_value(name):
+    """Of a task of one step the return is its reward, whatever the critic says of what comes after."""
+    learner = made(name, Guess())
+    assert returns(name, learner, 10.0).max() <= 1.0 + 1e-5
