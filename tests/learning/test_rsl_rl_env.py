@@ -68,3 +68,11 @@ def test_a_seed_starts_over():
     first = env.get_observations()["policy"].clone()
     env.step(torch.ones(3, 6))
     assert torch.equal(env.reset(seed=7)["policy"], first) and env.max_episode_length == 5
+
+
+def test_a_critic_may_know_what_was_drawn():
+    """Its group has the privileged numbers behind the observation; the policy's has not."""
+    env = RslRlVecEnv(SHORT, worlds=3, randomize="hold_for_position", privileged=True)
+    groups, drawn = env.get_observations(), env.environment.arrays.privileged.numpy()
+    assert groups["policy"].shape == (3, 16) and drawn.shape[1] == len(env.environment.privileged_names) > 0
+    np.testing.assert_array_equal(groups["critic"], np.concatenate([groups["policy"], drawn], axis=1))

@@ -17,7 +17,7 @@ __all__ = ["RslRlVecEnv"]
 
 
 class RslRlVecEnv(VecEnv):
-    """Observation groups "policy", what the agent sees, and "critic".
+    """Observation groups "policy", what the agent sees, and "critic": that, and with privileged=True what was drawn.
 
     Several agents of a world are as many rows, one after the other, which end together: RSL-RL trains one network for
     all of them.
@@ -37,6 +37,8 @@ class RslRlVecEnv(VecEnv):
         self.environment = environment = served(task, options)
         self._tensors = Tensors(environment)
         self._steps = wp.to_torch(environment.simulator.state.steps)
+        a, told = environment.arrays, bool(environment.privileged_names)
+        self._drawn = (wp.to_torch(a.privileged), wp.to_torch(a.final_privileged)) if told else None
         self.device = str(self._tensors.device)
         self.num_envs = environment.worlds * environment.agents
         self.num_actions = environment.action_size
@@ -76,7 +78,7 @@ class RslRlVecEnv(VecEnv):
         done = terminated | truncated
         extras: dict[str, Any] = {"time_outs": self._by_row(truncated & ~terminated)}
         if done.any():
-            extras["final_observations"] = self._groups(self._tensors.final_observation)
+            extras["final_observations"] = self._groups(self._tensors.final_observation, final=True)
             extras["log"] = self._metrics(done)
         reward = self._tensors.reward.flatten().clone()
         return self.get_observations(), reward, self._by_row(done), extras
@@ -86,9 +88,12 @@ class RslRlVecEnv(VecEnv):
             of_world if self.environment.agents == 1 else of_world.repeat_interleave(self.environment.agents)
         )
 
-    def _groups(self, observation: torch.Tensor) -> TensorDict:
+    def _groups(self, observation: torch.Tensor, final: bool = False) -> TensorDict:
         seen = observation.reshape(self.num_envs, -1).clone()
-        return TensorDict({"policy": seen, "critic": seen}, batch_size=[self.num_envs], device=self.device)
+        known = seen
+        if self._drawn is not None:
+            known = torch.cat([seen, self._drawn[final].reshape(self.num_envs, -1)], dim=1)
+        return TensorDict({"policy": seen, "critic": known}, batch_size=[self.num_envs], device=self.device)
 
     def _metrics(self, done: torch.Tensor) -> dict[str, float]:
         ended = done.cpu().numpy()
