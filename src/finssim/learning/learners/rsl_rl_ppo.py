@@ -57,6 +57,7 @@ class RslRlPpo(ActingLearner):
         groups = {"actor": ["policy"], "critic": list(seen.keys())}
         noise = {
             "class_name": "GaussianDistribution",
+            "std_type": "log",  # a step of the optimiser cannot take it to zero
             "init_std": float(torch.tensor(settings.log_std).exp()),
         }
         sizes = {"hidden_dims": list(settings.hidden), "activation": "elu"}
