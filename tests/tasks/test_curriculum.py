@@ -7,6 +7,7 @@ import pytest
 
 from finssim.engine.randomize import Randomization
 from finssim.engine.ranges_file import Ranges
+from finssim.experiments.plants import load_plant
 from finssim.tasks import Environment, EnvironmentSetupError, StationKeeping
 from finssim.tasks.curriculum import LOOK
 
@@ -165,6 +166,14 @@ def test_a_saved_environment_goes_on_with_its_schedule():
     np.testing.assert_array_equal(one.drawing.schedule.parts, other.drawing.schedule.parts)
     np.testing.assert_array_equal(one.arrays.observation.numpy(), other.arrays.observation.numpy())
     np.testing.assert_array_equal(masses(one), masses(other))
+
+
+def test_an_evaluation_draws_from_the_whole_ranges(tmp_path):
+    """A plant has no training that its ranges could grow with."""
+    path = tmp_path / "plant.yaml"
+    path.write_text("ranges: {name: test, mass: [0.6, 1.8], curriculum: {}}\n", encoding="utf-8")
+    env = Environment(StationKeeping(), worlds=200, **load_plant(path).environment_arguments())
+    assert env.drawing.schedule is None and masses(env).min() < 0.65 and masses(env).max() > 1.7
 
 
 @pytest.mark.parametrize(

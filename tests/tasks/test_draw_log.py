@@ -81,6 +81,25 @@ def test_episodes_that_are_cut_off_are_left_out():
     assert (log.episodes().episode == 2).all()
 
 
+def test_a_world_that_waits_for_its_reset_has_one_row():
+    """Without automatic reset an episode stays done until somebody starts the next."""
+    env = Environment(
+        StationKeeping(time_limit=0.2),
+        worlds=3,
+        randomization=Randomization(RANGES),
+        seed=6,
+        auto_reset=False,
+    )
+    log = env.drawing.start_log()
+    for _ in range(4):
+        env.step(np.zeros((3, 6)))
+    assert log.episodes().world.tolist() == [0, 1, 2]
+    env.reset(mask=[True, False, False])
+    for _ in range(3):
+        env.step(np.zeros((3, 6)))
+    assert log.episodes().world.tolist() == [0, 1, 2, 0] and log.episodes().episode.tolist() == [1, 1, 1, 2]
+
+
 def test_what_cannot_be_logged_or_read_is_refused(logged, tmp_path):
     log, _ = logged
     with pytest.raises(LogError, match="ends in '.txt', expected .npz or .csv"):

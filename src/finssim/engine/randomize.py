@@ -34,6 +34,10 @@ class Randomization:
         self.drawn = drawn_entries(self.ranges)
         """Entry of the table -> its distribution, of those that vary."""
 
+    def at_full_width(self) -> "Randomization":
+        """The same ranges without a schedule, for an evaluation: from the whole width at once."""
+        return Randomization(self.ranges.model_copy(update={"curriculum": None, "automatic": None}))
+
     def _draws(self, *beginnings: str) -> bool:
         return any(name.startswith(beginnings) for name in self.drawn)
 

@@ -88,7 +88,7 @@ class Plant(BaseModel):
         return {
             "water": _water(self.water) if self.water else None,
             "noise": MeasurementNoise(**self.noise) if self.noise else None,
-            "randomization": Randomization(self.ranges) if self.ranges else None,
+            "randomization": Randomization(self.ranges).at_full_width() if self.ranges else None,
         }
 
 

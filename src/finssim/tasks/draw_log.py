@@ -67,17 +67,20 @@ class DrawLog:
         self._draws, self._arrays = draws, arrays
         self._values: list[NDArray[np.float32]] = []
         self._rows: list[NDArray[np.float64]] = []
-        self.look()
+        self._now = self._draws.numpy()
+        self._episode = np.array(draws.simulator.state.episode.numpy())
+        self._open = np.ones(len(self._episode), bool)
 
     def look(self) -> None:
         """Take what the running episodes have; episodes that were cut off from outside are left out."""
-        self._now = self._draws.numpy()
-        self._episode = np.array(self._draws.simulator.state.episode.numpy())
+        episode = np.array(self._draws.simulator.state.episode.numpy())
+        self._open |= episode != self._episode
+        self._now, self._episode = self._draws.numpy(), episode
 
     def after_step(self) -> None:
         """Take the episodes that ended in this step."""
         a = self._arrays
-        ended = np.flatnonzero(a.done.numpy())
+        ended = np.flatnonzero((a.done.numpy() != 0) & self._open)
         if not len(ended):
             return
         columns = (a.final_length, a.final_return, a.final_held)
@@ -85,7 +88,9 @@ class DrawLog:
         self._values.append(self._now[ended])
         self._rows.append(np.column_stack([ended, self._episode[ended], outcome]))
         self._now[ended] = self._draws.values.numpy()[ended][..., [INDEX[n] for n in self._draws.names]]
-        self._episode[ended] = self._draws.simulator.state.episode.numpy()[ended]
+        episode = self._draws.simulator.state.episode.numpy()[ended]
+        self._open[ended] = episode != self._episode[ended]  # without automatic reset a world waits for one
+        self._episode[ended] = episode
 
     def episodes(self) -> DrawnEpisodes:
         """All that ended so far."""
