@@ -59,12 +59,20 @@ def test_the_observation():
 
 @pytest.mark.parametrize("name", ["finsrov", "bluerov2_heavy"])
 def test_the_preys_speed_is_a_part_of_what_the_pursuer_can_do(name):
-    """Steady speed under full surge from d1 v + d2 v² = tau, solved here; a straight prey settles at its part of it."""
+    """Steady speed under full surge from d1 v + d2 v² = tau, or where the Munk moment takes over, if that is slower.
+
+    FinsROV is held by its thrust, BlueROV2 Heavy by its stiffness. A straight prey settles at its part of it.
+    """
     vehicle = load_vehicle(name)
     hydro = vehicle.hydrodynamics["calibrated"]
     d1 = hydro.linear_damping[0, 0]
     d2 = hydro.quadratic_damping[0, 0] + hydro.surge_damping[0, 0]
     top = brentq(lambda v: d1 * v + d2 * v * v - vehicle.wrench_limits[0], 0.0, 20.0)
+    arm = vehicle.body.center_of_buoyancy[2] - vehicle.body.center_of_gravity[2]
+    mass = np.diag(vehicle.mass_matrix("calibrated"))
+    munk = math.sqrt(vehicle.buoyancy * arm / (mass[2] - mass[0]))
+    assert (munk < top) == (name == "bluerov2_heavy")
+    top = min(top, munk)
     env = environment(hunted("straight", prey_speed=0.5, farthest=2.5), vehicle=vehicle)
     assert env.task.speed == pytest.approx(0.5 * top, rel=1e-6)
     for _ in range(100):
@@ -74,10 +82,28 @@ def test_the_preys_speed_is_a_part_of_what_the_pursuer_can_do(name):
 
 
 def test_a_prey_is_no_faster_than_its_own_thrusters():
-    """A slow prey before a fast pursuer keeps within nine tenths of its own steady speed."""
-    fast, slow = load_vehicle("bluerov2_heavy"), load_vehicle("finsrov")
+    """A slow prey before a fast pursuer keeps within nine tenths of the speed that it can hold."""
+    fast, slow = load_vehicle("finsrov"), load_vehicle("bluerov2_heavy")
     speed = Pursuit(prey_speed=1.0).fitted([fast, slow]).speed
-    assert speed == pytest.approx(0.9 * DriveNumbers.of(slow).terminal[0])
+    assert speed == pytest.approx(0.9 * DriveNumbers.of(slow).top)
+
+
+def test_at_the_speed_it_can_hold_a_vehicle_stays_level():
+    """BlueROV2 at nine tenths of `level_speed` stays within 30° of level; at full thrust, for 2.5 m/s, it tips over."""
+    env = environment(hunted("straight", prey_speed=1.0), vehicle="bluerov2")
+    assert env.task.speed < 0.5
+    tilt = np.zeros(2)
+    for _ in range(80):
+        env.step(np.tile([1.0, 0.0, 0.0, 0.0], (8, 1)))
+        up = [
+            Rotation.from_quat(env.simulator.state.quaternion.numpy()[:, v])
+            .apply([0.0, 0.0, 1.0])[:, 2]
+            .min()
+            for v in (0, 1)
+        ]
+        tilt = np.maximum(tilt, np.degrees(np.arccos(up)))
+    assert tilt[1] < 30.0
+    assert tilt[0] > 45.0
 
 
 @pytest.mark.parametrize("mode", PREY_MODES)

@@ -186,7 +186,8 @@ def test_vehicles_may_differ_in_type():
     )
     crew = [heavy, finsrov, finsrov, heavy]
     env = environment(TeamPursuit(), vehicle=crew)
-    assert env.task.speed == pytest.approx(0.8 * DriveNumbers.of(load_vehicle("finsrov")).terminal[0])
+    assert env.task.speed == pytest.approx(0.8 * DriveNumbers.of(heavy).top)
+    assert DriveNumbers.of(heavy).top < DriveNumbers.of(finsrov).top
     assert env.task.prey_radius == pytest.approx(0.25 * (0.457 + 0.575), rel=1e-3)
     assert np.isfinite(still(env).observation).all()
 
@@ -206,6 +207,19 @@ def test_a_world_does_not_know_how_many_there_are():
 
     assert np.array_equal(one(5), one(200))
     assert not np.array_equal(one(5), one(5, seed=4))
+
+
+def test_a_world_that_breaks_is_terminated_and_rewards_nobody(tmp_path, capsys):
+    env = Environment(TeamPursuit(), worlds=4, crash_directory=tmp_path)
+    still(env)
+    broken = env.simulator.state.velocity.numpy().copy()
+    broken[1, 2, 0] = np.nan
+    env.simulator.state.velocity.assign(broken)
+    step = still(env)
+    assert step.terminated.tolist() == [False, True, False, False]
+    assert (step.reward[1] == 0.0).all() and (step.reward[0] != 0.0).all()
+    assert np.isfinite(step.observation).all()
+    assert "stopped being finite" in capsys.readouterr().err
 
 
 def test_a_run_goes_on_from_a_saved_state():

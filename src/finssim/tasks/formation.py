@@ -106,7 +106,7 @@ class Formation(OpenWater):
     grace: float = 1.0
     """[s]"""
     drift: float = 0.05
-    """Speed of a target that nobody holds, as a part of the slowest vehicle's steady speed ahead."""
+    """Speed of a target that nobody holds, as a part of the speed that the slowest vehicle can hold."""
     collision: float = 0.6
     """Vehicles nearer to each other than this bump [m]; nothing stops them."""
     jitter: float = 0.05

@@ -76,7 +76,7 @@ class ConsensusFormation:
         has = (NEAR * o[:, 32] <= self.reach) & (o[:, 33] >= 0.0)
         way = np.where(has[:, None], goal - target + 0.5 * (target - middle), target - middle)
         speed = self.go * np.linalg.norm(way, axis=1, keepdims=True)
-        top = self.cruise * min(self.drive.terminal[:3])
+        top = self.cruise * min(self.drive.top, *self.drive.terminal[1:3])
         going = self.go * way * np.minimum(1.0, top / np.maximum(speed, 1e-6))
         loose = np.abs(o[:, 29:32]).max(axis=1) > self.loose
         return np.asarray(np.where(loose[:, None], 0.0, going))

@@ -97,7 +97,7 @@ class Pursuit(OpenWater):
     prey: Prey = field(default_factory=Prey)
     """What the prey does."""
     prey_speed: float = 0.6
-    """Its speed, as a part of the pursuer's steady speed ahead (published: 2 m/s, four times that speed)."""
+    """Its speed, as a part of what the pursuer can hold (published: 2 m/s, four times that speed)."""
     nearest: float = 2.0
     """The prey starts this far from the pursuer ..."""
     farthest: float = 5.0

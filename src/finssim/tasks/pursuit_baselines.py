@@ -56,7 +56,7 @@ class LeadPursuit:
         error = np.arctan2(aim[:, 1], aim[:, 0])
         distance = np.maximum(np.linalg.norm(gap, axis=1, keepdims=True), 1e-6)
         wanted = own + relative + self.approach * (distance - self.stand_off) * aim / distance
-        top = np.array(self.drive.terminal[:3])
+        top = np.array([self.drive.top, *self.drive.terminal[1:3]])
         wanted = np.clip(wanted, -top, top)
         velocity = np.column_stack([own, o[:, 5]])
         action = self.drive.action(velocity, np.column_stack([wanted, self.drive.turned(error)]))

@@ -1,5 +1,6 @@
 """Following a wanted velocity with a vehicle's own thrust: for vehicles that a script commands, and for baselines."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +13,7 @@ from finssim.physics.types import vec6
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.vehicles import HydrodynamicSet, Vehicle
-from finssim.vehicles.capability import terminal_speeds
+from finssim.vehicles.capability import restoring, terminal_speeds
 
 Array = NDArray[Any]
 
@@ -117,6 +118,13 @@ class DriveNumbers:
     """Steady speed at the limit [m/s, rad/s]."""
     sink: float
     """Weight less buoyancy [N]."""
+    level: float
+    """Speed ahead up to which the vehicle's stiffness in pitch outweighs the Munk moment [m/s]; see `level_speed`."""
+
+    @property
+    def top(self) -> float:
+        """Speed ahead that the vehicle can hold, by thrust and without pitching over [m/s]."""
+        return min(self.terminal[0], self.level)
 
     @classmethod
     def of(cls, vehicle: Vehicle) -> "DriveNumbers":
@@ -140,9 +148,8 @@ class DriveNumbers:
             np.diag(hydro.linear_damping), quadratic, np.diag(vehicle.mass_matrix(sets[0])),
             vehicle.wrench_limits, terminal_speeds(vehicle, sets[0]),
         )  # fmt: skip
-        return cls(
-            *(tuple(column[ROWS].tolist()) for column in columns), sink=vehicle.weight - vehicle.buoyancy
-        )
+        rows = (tuple(column[ROWS].tolist()) for column in columns)
+        return cls(*rows, sink=vehicle.weight - vehicle.buoyancy, level=level_speed(vehicle, sets[0]))
 
     def action(self, velocity: Array, wanted: Array) -> NDArray[np.float32]:
         """As `drive`, of a level vehicle.
@@ -177,6 +184,21 @@ class DriveNumbers:
         return out
 
 
+def level_speed(vehicle: Vehicle, name: str) -> float:
+    """Speed ahead at which a small pitch angle θ begins to grow by itself [m/s]; inf where it never does.
+
+    Stiffness k θ against the Munk moment (m_z - m_x) u² θ, masses with added mass: u² = k / (m_z - m_x). Damping in
+    heave and pitch lets a vehicle go somewhat faster; it is left out.
+
+    Args:
+        vehicle: The vehicle.
+        name: Of its hydrodynamic set.
+    """
+    mass = np.diag(vehicle.mass_matrix(name))
+    excess, stiffness = float(mass[2] - mass[0]), float(restoring(vehicle, name).stiffness[1])
+    return math.sqrt(stiffness / excess) if excess > 0.0 and stiffness > 0.0 else math.inf
+
+
 def slowest(vehicles: Sequence[Vehicle]) -> float:
-    """The smallest steady surge speed among vehicles [m/s]: what the speed of their prey is tied to."""
-    return min(DriveNumbers.of(vehicle).terminal[0] for vehicle in vehicles)
+    """The smallest speed ahead that vehicles can hold [m/s]: what the speed of their prey is tied to."""
+    return min(DriveNumbers.of(vehicle).top for vehicle in vehicles)

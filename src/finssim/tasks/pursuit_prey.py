@@ -20,7 +20,7 @@ nearest, always. mixed: one of the four, drawn for the episode.
 """
 
 RESERVE = 0.9
-"""A prey is never told to go faster than this part of its own steady speed: the rest is for steering."""
+"""A prey is never told to go faster than this part of the speed it can hold: the rest is for steering."""
 
 
 @wp.struct
@@ -41,7 +41,7 @@ class PreyParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class Prey:
-    """The prey's behaviour. Its speed is a part of what the slowest pursuer reaches, never a number of its own."""
+    """The prey's behaviour. Its speed is a part of what the slowest pursuer can hold, never a number of its own."""
 
     mode: str = "mixed"
     """One of `PREY_MODES`."""
@@ -79,12 +79,12 @@ class Prey:
 
 
 def prey_speed(part: float, pursuers: Sequence[Vehicle], prey: Vehicle) -> float:
-    """Speed of a prey: `part` of the slowest pursuer's steady surge speed, within what the prey itself can do [m/s]."""
+    """Speed of a prey: `part` of what the slowest pursuer can hold, within what the prey itself can do [m/s]."""
     if not 0.0 <= part <= 1.0:
         raise EnvironmentSetupError(
             f"prey_speed is {part}, expected 0 to 1: a part of the slowest pursuer's speed"
         )
-    return min(part * slowest(pursuers), RESERVE * DriveNumbers.of(prey).terminal[0])
+    return min(part * slowest(pursuers), RESERVE * DriveNumbers.of(prey).top)
 
 
 @wp.func

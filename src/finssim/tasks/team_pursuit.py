@@ -46,7 +46,7 @@ class Level:
     hold: float
     """[s]"""
     prey_speed: float
-    """Part of the slowest agent's steady speed ahead."""
+    """Part of the speed that the slowest agent can hold."""
     stake: float
     """Reward for a capture, and what an agent out of bounds costs everybody."""
     from_step: int

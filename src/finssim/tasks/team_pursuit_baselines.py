@@ -72,7 +72,7 @@ class FormationPursuit:
         place = self.places(o)
         wanted = own + relative + self.gain * place
         # Faster than the vehicle goes is the same direction as fast as it goes.
-        level = np.maximum(np.linalg.norm(wanted[:, :2], axis=1, keepdims=True) / self.drive.terminal[0], 1.0)
+        level = np.maximum(np.linalg.norm(wanted[:, :2], axis=1, keepdims=True) / self.drive.top, 1.0)
         wanted[:, :2] /= level
         wanted[:, 2] = np.clip(wanted[:, 2], -self.drive.terminal[2], self.drive.terminal[2])
         error = np.where(
