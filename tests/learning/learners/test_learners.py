@@ -158,3 +158,16 @@ def test_settings_are_changed_by_name():
 def test_a_memory_smaller_than_the_warm_up_is_refused():
     with pytest.raises(LearningError, match="warm_up is 5000, expected less than the memory of 100 steps"):
         made("sb3-sac", Guess(), memory=100, warm_up=5000)
+
+
+@pytest.mark.parametrize("asymmetric", [True, False])
+def test_a_critic_may_see_what_was_drawn(asymmetric):
+    """RSL-RL's critic has an input for each privileged number, its policy none; without `asymmetric` neither has."""
+    settings = small("rsl-rl", Guess(), asymmetric=asymmetric)
+    ranges = {"randomize": "fossen_learn_to_swim", "privileged": True}
+    environment = finssim.make(Guess(), worlds=settings.worlds, seed=3, **ranges)
+    learner = learner_named("rsl-rl")(environment, settings, seed=3)
+    told = len(environment.privileged_names)
+    assert told > 0 and learner.network()[0].in_features == environment.observation_size
+    assert learner.ppo.critic.mlp[0].in_features == environment.observation_size + told * asymmetric
+    learner.update()
