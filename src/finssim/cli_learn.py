@@ -17,7 +17,9 @@ def train(
     task: Annotated[
         str,
         typer.Argument(
-            help="Task to learn: t1 (station keeping) or t2 (trajectory tracking).", metavar="TASK"
+            help="Task to learn: t1 (station keeping), t2 (trajectory tracking), t3 (moving target), docking, pursuit, "
+            "team-pursuit or formation.",
+            metavar="TASK",
         ),
     ],
     out: Annotated[
