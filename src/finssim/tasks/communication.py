@@ -40,6 +40,22 @@ class Communication:
             raise EnvironmentSetupError(f"communication: loss is {self.loss}, expected a probability, 0 to 1")
 
 
+def most_under_way(c: Communication, period: float, reach: float) -> int:
+    """Messages of one agent that can be under way at once, sent every `period` seconds over up to `reach` metres.
+
+    Raises:
+        EnvironmentSetupError: There is no room for as many.
+    """
+    longest = c.processing + reach / c.speed_of_sound
+    slots = math.ceil(longest / period) + 1
+    if slots > MOST_UNDER_WAY:
+        raise EnvironmentSetupError(
+            f"communication: a message takes up to {longest:.3g} s, one is sent every {period:g} s, "
+            f"expected at most {MOST_UNDER_WAY} under way: give a longer period or a shorter way"
+        )
+    return slots
+
+
 def message_table(
     communication: Communication | None,
     worlds: int,
@@ -67,13 +83,7 @@ def message_table(
     c = communication
     table.on, table.control_step = 1, control_step
     table.period = max(1, round(c.period / control_step))
-    longest = (c.processing + reach / c.speed_of_sound) / control_step
-    table.slots = math.ceil(longest / table.period) + 1
-    if table.slots > MOST_UNDER_WAY:
-        raise EnvironmentSetupError(
-            f"communication: a message takes up to {longest * control_step:.3g} s, one is sent every {c.period:g} s, "
-            f"expected at most {MOST_UNDER_WAY} under way: give a longer period or a shorter way"
-        )
+    table.slots = most_under_way(c, table.period * control_step, reach)
     table.processing, table.loss, table.speed_of_sound = c.processing, c.loss, c.speed_of_sound
     table.key = wp.zeros(worlds, dtype=wp.int32, device=device)
     for name in ("position", "velocity"):
