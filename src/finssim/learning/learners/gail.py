@@ -23,7 +23,11 @@ class GailSettings(TorchRlSettings):
 
     demonstrations: str = ""
     """Folder of a data set, from `finssim collect`."""
-    clone_passes: int = 5
+    learning_rate: float = 3.0e-4
+    """Less than PPO's: the reward is another one after every round."""
+    log_std: float = -2.0
+    """Less noise than PPO's: the discriminator knows the learner by it, whatever else it does."""
+    clone_passes: int = 100
     """Passes of behaviour cloning over the demonstrations before the first rollout; 0: begin from nothing."""
     discriminator_batch: int = 256
     """Demonstrated steps in one of its gradient steps, and as many of the learner's."""
