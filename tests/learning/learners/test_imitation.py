@@ -1,0 +1,159 @@
+"""Behaviour cloning, DAgger and GAIL: they become the expert, go on bitwise, and refuse what they cannot imitate."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from finssim.learning.collect import collect
+from finssim.learning.demonstrations import Episode, save
+from finssim.learning.learners import LearningError, learner_named
+from finssim.learning.resume import read_state, write_state
+from finssim.tasks import make, task_named
+from finssim.vehicles import load_vehicle
+
+FINSROV = load_vehicle("finsrov")
+SMALL = {
+    "bc": {"worlds": 4, "steps": 4000, "rollout": 1000, "batch": 50},
+    "dagger": {"worlds": 4, "steps": 4000, "rollout": 20, "batch": 50, "expert_rounds": 1},
+    "gail": {"worlds": 4, "steps": 4000, "rollout": 20, "batch": 40, "epochs": 1, "clone_passes": 2},
+}
+
+
+def environment(seed=3, **options):
+    return make(task_named("t1", time_limit=2.0), worlds=4, seed=seed, observe="training", **options)
+
+
+def made(name, seed=3, **changes):
+    settings = replace(learner_named(name).settings(task_named("t1")), **{**SMALL[name], **changes})
+    return learner_named(name)(environment(seed), settings, seed=seed)
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory):
+    """Four whole episodes of the PID on T1."""
+    out = tmp_path_factory.mktemp("shown") / "pid"
+    collect("pid", "t1", episodes=4, out=out, seed=2)
+    return str(out)
+
+
+def linear(folder, rows=4000):
+    """A set of which the truth is known: the action is a linear function of the observation, inside the limits."""
+    rng = np.random.default_rng(0)
+    observation = rng.normal(size=(rows + 1, 16)).astype(np.float32)
+    W = rng.uniform(-0.1, 0.1, (16, 6)).astype(np.float32)
+    action = np.clip(observation[:-1] @ W, -1.0, 1.0)
+    episode = Episode(observation, action, np.zeros(rows, np.float32), False, {"return": 0.0})
+    about = {
+        "task": "t1",
+        "expert": "linear",
+        "vehicle": {"name": "finsrov", "sha256": FINSROV.sha256},
+        "action": {"mode": "wrench6"},
+    }
+    return str(save(folder, [episode], about)), observation[:-1], action
+
+
+def test_cloning_finds_the_function_that_was_shown(tmp_path):
+    """To a tenth of its spread after forty passes; more steps, less error."""
+    place, observation, action = linear(tmp_path / "set")
+    learner = made("bc", demonstrations=place, steps=160_000, rollout=16_000, learning_rate=3e-3)
+    losses = []
+    while learner.steps < learner.settings.steps:
+        losses.append(learner.update()["imitation_loss"])
+    with torch.no_grad():
+        error = learner.network()(torch.from_numpy(observation)).numpy() - action
+    assert np.sqrt(np.mean(error**2)) < 0.1 * np.std(action)
+    assert losses[-1] < 0.1 * losses[0] and learner.steps == 160_000
+
+
+def test_dagger_keeps_what_the_expert_says_of_where_the_learner_came(shown):
+    """The PID's action for every kept observation, with its memory along the learner's own way."""
+    learner = made("dagger", expert_rounds=0)
+    learner.update()
+    rows, told = learner._observation.numpy(), learner._action.numpy()
+    assert rows.shape == (20 * 4, 16) and told.shape == (20 * 4, 6)
+    memory = learner._expert.reset(4)
+    for k in range(20):  # 2 s episodes: none ends before its first is over, but shortened ones do
+        wanted, memory = learner._expert.act(memory, rows[4 * k : 4 * k + 4])
+        if k == 0:
+            assert np.allclose(told[:4], np.clip(wanted, -1.0, 1.0), atol=1e-6)
+    assert np.abs(told).max() <= 1.0
+
+
+def test_dagger_begins_with_the_expert_at_the_helm():
+    """In the first round what is done is what the expert says; afterwards it is not."""
+    learner = made("dagger", expert_rounds=1)
+    actions = []
+    step = learner._worlds.step
+    learner._worlds.step = lambda action: (actions.append(action.flatten(0, -2).clone()), step(action))[1]
+    learner.update()
+    assert torch.equal(torch.cat(actions), learner._action)
+    actions.clear()
+    learner.update()
+    assert not torch.allclose(torch.cat(actions), learner._action[-80:], atol=1e-3)
+
+
+def test_dagger_takes_demonstrations_to_begin_with(shown):
+    learner = made("dagger", demonstrations=shown)
+    assert len(learner._observation) == 800  # four episodes of 200 steps
+    learner.update()
+    assert len(learner._observation) == 880
+    few = made("dagger", demonstrations=shown, kept=100)
+    assert len(few._observation) == 100
+
+
+def test_a_judge_tells_the_expert_from_noise(shown):
+    """After some rounds the reward of what was shown is above that of random actions in the same places."""
+    learner = made("gail", demonstrations=shown, discriminator_updates=50, discriminator_rate=3e-3)
+    rows = [learner.update() for _ in range(4)]
+    pairs = learner._shown
+    noise = torch.cat([pairs[:, :16], torch.empty(len(pairs), 6).uniform_(-1.0, 1.0)], dim=-1)
+    with torch.no_grad():
+        assert learner.judge(pairs).mean() > learner.judge(noise).mean() + 0.5
+    assert rows[-1]["discriminator_loss"] < rows[0]["discriminator_loss"]
+    assert all(0.0 <= row["passes_for_expert"] <= 1.0 for row in rows)
+
+
+def test_the_reward_of_gail_is_the_judges_and_not_the_tasks(shown):
+    """log(1 + exp(logit)) of what was seen and done, while the tally counts the task's own."""
+    learner = made("gail", demonstrations=shown)
+    seen = learner._worlds.observation.clone()
+    action = torch.full((4, 1, 6), 0.3)
+    learner._worlds.step(action)
+    with torch.no_grad():
+        expected = torch.nn.functional.softplus(learner.judge(torch.cat([seen, action], dim=-1)))
+    assert torch.allclose(learner._worlds.reward, expected)
+    assert not np.allclose(learner.environment.arrays.reward.numpy(), expected.numpy()[:, 0])
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_training_goes_on_bitwise(name, shown, tmp_path):
+    """Two updates, a state on disk, two more in another learner: the same numbers."""
+    changes = {} if name == "dagger" else {"demonstrations": shown}
+    whole = made(name, **changes)
+    for _ in range(2):
+        whole.update()
+    write_state({"learner": whole.state()}, tmp_path / "state")
+    expected = [whole.update() for _ in range(2)]
+    other = made(name, **changes)
+    other.load(read_state(tmp_path / "state")["learner"])
+    assert [other.update() for _ in range(2)] == expected
+    for a, b in zip(whole.network().parameters(), other.network().parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("name", ["bc", "gail"])
+def test_what_does_not_fit_is_refused(name, shown):
+    """No set, another task, vehicle or mode."""
+    with pytest.raises(LearningError, match="no demonstrations are named: collect some with finssim collect"):
+        made(name)
+    kind = learner_named(name)
+    for other, sentence in (
+        (make("t2", worlds=4), "is of task t1, expected t2"),
+        (make("t1", worlds=4, vehicle="bluerov2_heavy"), "is of vehicle"),
+        (make("t1", worlds=4, action="wrench4"), "is of action mode wrench6, expected wrench4"),
+    ):
+        settings = replace(kind.settings(other.task), **SMALL[name], demonstrations=shown)
+        with pytest.raises(LearningError, match=sentence):
+            kind(other, settings, seed=1)
