@@ -1,9 +1,13 @@
 """What every test shares: one thread per process, reproducible examples, the errors of a whole run at a glance."""
 
 import os
+import signal
 
 # Before any numeric library starts: OpenMP on busy cores slows torch tens of times.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# A run in the background inherits an ignored Ctrl-C, and so would the processes that tests interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 from hypothesis import HealthCheck, settings
 
