@@ -18,7 +18,7 @@ demo: $(STAMP)  ## identify, train, evaluate and report: the whole loop, result 
 	$(BIN)/finssim demo
 
 test: check  ## check, then run every test
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --durations 25
 
 check: $(STAMP)  ## lint, format and types
 	$(BIN)/ruff check .

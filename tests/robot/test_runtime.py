@@ -1,6 +1,7 @@
 """One turn of the loop after the other: decides on its grid, arms once, stops when the pilot fails."""
 
 import math
+import signal
 
 import numpy as np
 import pytest
@@ -89,6 +90,21 @@ def test_a_late_loop_misses_decisions_and_counts_them():
         runtime.step(now, delivery.frames, delivery.pictures)
     assert runtime.counters.missed == 3
     assert pilot.times[-1] % 0.1 == pytest.approx(0.0, abs=0.02) or pilot.times[-1] % 0.1 > 0.08
+
+
+def test_ctrl_c_interrupts_a_trial_and_ends_a_gentle_run_in_good_order():
+    """A trial cut short raises; a run of the robot ends with frames that stop its thrusters."""
+
+    def press(runtime):
+        if runtime.counters.decisions == 5:
+            signal.raise_signal(signal.SIGINT)
+
+    runtime, world = Runtime(VEHICLE, POOL, Constant(), STATION, arm=True), Shown()
+    with pytest.raises(KeyboardInterrupt):
+        run_lockstep(runtime, world, 2.0, show=press)
+    runtime, world = Runtime(VEHICLE, POOL, Constant(), STATION, arm=True), Shown()
+    assert run_lockstep(runtime, world, 2.0, gentle=True, show=press) < 1.0
+    assert not any(world.commands()[-1][1].normalised)
 
 
 def test_without_arming_no_thruster_is_ever_enabled():

@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 
 QUARTILES = (0.25, 0.5, 0.75)
 
+LONGEST_OF_THREE = 28
+"""Letters of a label; where one is longer, the legend has two columns."""
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Okabe and Ito's palette: tells controllers apart for the colour-blind too."""
 
@@ -99,9 +101,9 @@ def draw_envelopes(envelopes: Mapping[str, Envelope], title: str = "") -> Figure
         axes.axvspan(*EVALUATION_WINDOW, color="0.92", zorder=0)
         axes.grid(True, which="major", color="0.85", linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(
-        *above.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=9
-    )
+    handles, labels = above.get_legend_handles_labels()
+    columns = 3 if max(map(len, labels), default=0) <= LONGEST_OF_THREE else 2
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
     if title:
         figure.suptitle(title, fontsize=11)
     return figure

@@ -66,7 +66,7 @@ def print_results(result: Mapping[str, Any], console: Console) -> None:
         highlight=False,
     )
     paper = paper_name(result)
-    table = _table("setpoint", f"{CAPTION} paper: its vehicle in its pool, {paper}, for orientation.")
+    table = _table("setpoint")
     trials = result["per_trial"]
     for name in sorted({trial["setpoint"] for trial in trials}):
         table.add_row(name, *cells(summarize([trial for trial in trials if trial["setpoint"] == name])))
@@ -75,6 +75,7 @@ def print_results(result: Mapping[str, Any], console: Console) -> None:
     table.add_section()
     table.add_row("paper", *cells(paper_row(paper)), style="dim")
     console.print(table)
+    console.print(f"{CAPTION} paper: its vehicle in its pool, {paper}, for orientation.", highlight=False)
 
 
 def print_plants(results: Sequence[Mapping[str, Any]], console: Console) -> None:
@@ -88,19 +89,18 @@ def print_plants(results: Sequence[Mapping[str, Any]], console: Console) -> None
 
 def print_comparison(results: Sequence[Mapping[str, Any]], console: Console, by: str = "controller") -> None:
     """Print a row for each evaluation, named by its controller or plant, and the paper's rows that answer to them."""
-    table = _table(by, f"{CAPTION} paper: its real vehicle in its pool.")
+    table = _table(by)
     for result in results:
         table.add_row(result[by]["name"], *cells(result))
     table.add_section()
     for name in dict.fromkeys(paper_name(result) for result in results):
         table.add_row(f"paper, {name}", *cells(paper_row(name)), style="dim")
     console.print(table)
+    console.print(f"{CAPTION} paper: its real vehicle in its pool.", highlight=False)
 
 
-def _table(first: str, caption: str) -> Table:
-    table = Table(
-        caption=caption, caption_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
-    )
+def _table(first: str) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column(first, no_wrap=True)
     for heading in COLUMNS.values():  # units below: 80 columns of a terminal are enough then
         table.add_column(Text(heading.replace(" [", "\n[")), justify="right", no_wrap=True)

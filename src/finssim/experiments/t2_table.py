@@ -54,7 +54,7 @@ def print_tracking(result: Mapping[str, Any], console: Console) -> None:
         highlight=False,
     )
     kind = paper_kind(result)
-    table = _table("trajectory", f"{CAPTION} paper: its vehicle in its pool, {kind}, for orientation.")
+    table = _table("trajectory")
     for name, row in by_trajectory(result["per_trial"]).items():
         table.add_row(name, *_cells(row))
     table.add_section()
@@ -63,6 +63,7 @@ def print_tracking(result: Mapping[str, Any], console: Console) -> None:
     for name in PAPER_T2[kind]:
         table.add_row(f"paper, {name}", *_cells(paper_t2_row(kind, name)), style="dim")
     console.print(table)
+    console.print(f"{CAPTION} paper: its vehicle in its pool, {kind}, for orientation.", highlight=False)
 
 
 def print_tracking_plants(results: Sequence[Mapping[str, Any]], console: Console) -> None:
@@ -71,12 +72,13 @@ def print_tracking_plants(results: Sequence[Mapping[str, Any]], console: Console
     console.print(
         f"{first['task']} · {first['controller']['name']} · {first['vehicle']['name']}", highlight=False
     )
-    table = _table("plant, trajectory", CAPTION)
+    table = _table("plant, trajectory")
     for result in results:
         for name, row in by_trajectory(result["per_trial"]).items():
             table.add_row(f"{result['plant']['name']}, {name}", *_cells(row))
         table.add_section()
     console.print(table)
+    console.print(CAPTION, highlight=False)
 
 
 def _cells(row: Mapping[str, Any]) -> list[str]:
@@ -84,10 +86,8 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
     return ["–" if row.get(key) is None else format(row[key], spec) for key, (_, spec) in COLUMNS.items()]
 
 
-def _table(first: str, caption: str) -> Table:
-    table = Table(
-        caption=caption, caption_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
-    )
+def _table(first: str) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column(first, no_wrap=True)
     for key, (heading, _) in COLUMNS.items():
         style = "bold" if key in ERRORS else ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import socket
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from typing import Protocol
 
 from finssim.robot.interrupt import interruptible
@@ -100,10 +101,11 @@ def run_lockstep(
     *,
     rate: float = 60.0,
     start: float = 0.0,
+    gentle: bool = False,
     show: Callable[[Runtime], None] | None = None,
     until: Callable[[Runtime], bool] | None = None,
 ) -> float:
-    """Run a robot against a world until the time is over, `until` says so, or Ctrl-C; then stop its thrusters.
+    """Run a robot against a world until the time is over or `until` says so; then stop its thrusters.
 
     Args:
         runtime: The robot.
@@ -111,6 +113,8 @@ def run_lockstep(
         duration: How long [s].
         rate: Steps a second [Hz].
         start: Robot's clock at the beginning [s].
+        gentle: Ctrl-C and SIGTERM end the run as its time does. Else they interrupt it, so that a trial that was
+            cut short is not taken for a whole one.
         show: Called after every step.
         until: Ends the run early where it says so; asked after every step.
 
@@ -119,7 +123,7 @@ def run_lockstep(
     """
     now: float = start
     sent: list[bytes] = []
-    with interruptible() as interrupted:
+    with interruptible() if gentle else nullcontext(_never) as interrupted:
         for k in itertools.count(1):
             if interrupted() or k > duration * rate + 1e-6:
                 break
@@ -133,3 +137,7 @@ def run_lockstep(
                 break
     # A world that broke off above stands still: only one that goes on needs to hear of the end.
     return world.exchange(now + 1.0 / rate, runtime.stop(now, LAST_FRAMES)).time
+
+
+def _never() -> bool:
+    return False

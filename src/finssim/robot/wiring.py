@@ -65,7 +65,7 @@ def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool) -> Iterator[Drive]:
     with ExitStack() as stack:
         if wiring.lockstep:
             world = stack.enter_context(LockstepClient(_lockstep_address(wiring)))
-            yield lambda runtime, **how: run_lockstep(runtime, world, **how)
+            yield lambda runtime, **how: run_lockstep(runtime, world, gentle=True, **how)
             return
         transport = open_transport(POOL_ADDRESS if wiring.robot == "pool" else wiring.robot, wiring.bind)
         stack.callback(transport.close)

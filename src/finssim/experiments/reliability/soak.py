@@ -85,7 +85,9 @@ def soak(
     began = time.perf_counter()
     with (folder / "soak.csv").open("w", newline="", encoding="utf-8") as file:
         samples = _Samples(file, pool, lambda t, words: say(min(t / duration, 1.0), words))
-        run_lockstep(runtime, pool, duration, show=samples, until=lambda r: r.bridge.state == "fault")
+        run_lockstep(
+            runtime, pool, duration, gentle=True, show=samples, until=lambda r: r.bridge.state == "fault"
+        )
     took = time.perf_counter() - began
     rows = np.array([row[:4] for row in samples.rows], float)
     result = {
