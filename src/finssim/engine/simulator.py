@@ -15,7 +15,7 @@ from finssim.engine.launch import Pipeline
 from finssim.engine.packed import Packed
 from finssim.engine.plant_arrays import SimulatorError, build_plant
 from finssim.engine.post_mortem import write_post_mortem
-from finssim.engine.state import HISTORY, State, VehicleState, clear_actuators, vec13
+from finssim.engine.state import VehicleState, clear_actuators, new_state
 from finssim.engine.step import physics_kernel, tick
 from finssim.engine.surroundings import Pool, TetherLine, Water
 from finssim.physics.contact import PoolWalls
@@ -24,7 +24,6 @@ from finssim.physics.hydrodynamics import HYDRODYNAMICS
 from finssim.physics.hydrodynamics.mesh import HullMesh, hull_mesh
 from finssim.physics.plant import VehicleCommand, refresh_plant
 from finssim.physics.tether import Tether
-from finssim.physics.types import vec8
 from finssim.physics.water import advance_drift
 from finssim.vehicles import Vehicle, load_vehicle
 
@@ -111,7 +110,8 @@ class Simulator:
         self.plant = build_plant(self.vehicles, hydrodynamics, worlds, self._hull_index, self.device)
         self.command = Packed(VehicleCommand, (worlds, n), self.device)
         longest = 2.0 * float(self.plant.delay.numpy().max()) if max_delay is None else max_delay
-        self.state = self._state(n, slots=math.ceil(longest / control_step) + 2)
+        slots = math.ceil(longest / control_step) + 2
+        self.state = new_state(Packed(VehicleState, (worlds, n), self.device), slots)
         self._all = wp.ones(worlds, dtype=wp.int32, device=self.device)
         self._mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
         self._threads = threads
@@ -144,20 +144,6 @@ class Simulator:
                 self._hull_index[i] = i
                 meshes.append(vehicle.hull_mesh())
         self.hull = hull_mesh(meshes, self.device) if meshes else HullMesh()
-
-    def _state(self, vehicles: int, slots: int) -> State:
-        shape = (self.worlds, vehicles)
-        state = State()
-        self._vehicle_states = Packed(VehicleState, shape, self.device)
-        state.vehicle = self._vehicle_states.array
-        for name, view in self._vehicle_states.fields.items():
-            setattr(state, name, view)
-        state.quaternion.fill_(wp.quat(0.0, 0.0, 0.0, 1.0))
-        state.commands = wp.zeros((*shape, slots), dtype=vec8, device=self.device)
-        state.history = wp.zeros((HISTORY, *shape), dtype=vec13, device=self.device)
-        for name in ("steps", "episode", "broken", "frozen"):
-            setattr(state, name, wp.zeros(self.worlds, dtype=wp.int32, device=self.device))
-        return state
 
     def pipeline(self) -> Pipeline:
         """An empty pipeline over the simulator's worlds, for a caller that adds its own kernels around the step."""

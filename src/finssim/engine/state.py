@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from finssim.engine.packed import Packed
 from finssim.physics.types import vec6, vec8
 
 HISTORY = 50
@@ -39,6 +40,26 @@ class State:
     broken: wp.array(dtype=int)  # 1: a number stopped being finite in this control step
     frozen: wp.array(dtype=int)  # 1: the world stands still since that happened
     history: wp.array3d(dtype=vec13)  # (slot, world, vehicle): position, quaternion, velocity
+
+
+def new_state(vehicles: Packed, slots: int) -> State:
+    """State of vehicles that stand upright at the origin.
+
+    Args:
+        vehicles: Memory of their `VehicleState`s, by (world, vehicle).
+        slots: Length of the delay line, in control steps.
+    """
+    shape, device = vehicles.array.shape, vehicles.array.device
+    state = State()
+    state.vehicle = vehicles.array
+    for name, view in vehicles.fields.items():
+        setattr(state, name, view)
+    state.quaternion.fill_(wp.quat(0.0, 0.0, 0.0, 1.0))
+    state.commands = wp.zeros((*shape, slots), dtype=vec8, device=device)
+    state.history = wp.zeros((HISTORY, *shape), dtype=vec13, device=device)
+    for name in ("steps", "episode", "broken", "frozen"):
+        setattr(state, name, wp.zeros(shape[0], dtype=wp.int32, device=device))
+    return state
 
 
 @wp.kernel(enable_backward=False)
