@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Protocol
 
+from finssim.learning.learners.task_settings import own_settings
 from finssim.tasks import Environment, Task
 
 if TYPE_CHECKING:
@@ -74,8 +75,9 @@ class LearnerKind:
         Raises:
             LearningError: A change names no setting, or has another type than the setting's own.
         """
-        make = self._module().settings_for
-        chosen = make(task, self.name, randomized=randomized, worlds=worlds, steps=steps)
+        learner = next(name for name, kind in LEARNERS.items() if kind == self)
+        own = own_settings(task.name, learner, randomized)
+        chosen = self._module().settings_for(task, self.name, own=own, worlds=worlds, steps=steps)
         return replace(
             chosen, **{name: _fitting(chosen, name, value) for name, value in (changes or {}).items()}
         )

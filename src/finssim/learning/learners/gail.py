@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -10,6 +10,7 @@ from torch import nn
 
 from finssim.learning.learners.imitation import demonstrations_for
 from finssim.learning.learners.networks import stack
+from finssim.learning.learners.task_settings import applied
 from finssim.learning.learners.torchrl_ppo import TorchRlPpo, TorchRlSettings
 from finssim.learning.tensors import Tensors
 from finssim.tasks import Environment, Task
@@ -39,17 +40,9 @@ class GailSettings(TorchRlSettings):
     """Weight of its squared slope at the demonstrations (Mescheder et al. 2018): the reward must not become a cliff."""
 
 
-def settings_for(
-    task: Task,
-    learner: str = "Gail",
-    *,
-    randomized: bool = False,
-    worlds: int | None = None,
-    steps: int | None = None,
-) -> GailSettings:
-    """The settings of a training; what is None keeps its default."""
-    settings = GailSettings()
-    return replace(settings, worlds=worlds or settings.worlds, steps=steps or settings.steps)
+def settings_for(task: Task, learner: str = "Gail", **given: Any) -> GailSettings:
+    """The settings of a training; `given` as `task_settings.applied` takes it."""
+    return applied(GailSettings(), **given)
 
 
 class Discriminator(nn.Module):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from finssim.learning.experts import expert_for
 from finssim.learning.learners.acting import ActingLearner
 from finssim.learning.learners.catalogue import LearningError
 from finssim.learning.learners.networks import stack
+from finssim.learning.learners.task_settings import applied
 from finssim.learning.served import age_episodes
 from finssim.learning.tensors import Tensors
 from finssim.tasks import Environment, Task
@@ -67,12 +68,9 @@ class DaggerSettings:
     hidden: tuple[int, ...] = (64, 64)
 
 
-def settings_for(
-    task: Task, learner: str, *, randomized: bool = False, worlds: int | None = None, steps: int | None = None
-) -> BcSettings | DaggerSettings:
-    """The settings of a training; what is None keeps its default."""
-    settings = BcSettings() if learner == "Bc" else DaggerSettings()
-    return replace(settings, worlds=worlds or settings.worlds, steps=steps or settings.steps)
+def settings_for(task: Task, learner: str, **given: Any) -> BcSettings | DaggerSettings:
+    """The settings of a training; `given` as `task_settings.applied` takes it."""
+    return applied(BcSettings() if learner == "Bc" else DaggerSettings(), **given)
 
 
 def demonstrations_for(environment: Environment, place: str) -> Demonstrations:

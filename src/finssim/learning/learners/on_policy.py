@@ -6,21 +6,13 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
+from finssim.learning.learners.task_settings import applied
 from finssim.tasks import Task
 
 __all__ = ["OnPolicySettings", "fitted"]
 
 ROLLOUT_SAMPLES = 8192
 """Fewest samples between two updates: with few worlds, rollouts are longer."""
-
-RANDOMIZED_STEPS = {"t1": 3_000_000, "t2": 2_000_000}
-"""Control steps when every episode has another vehicle: what must be learnt is more."""
-
-CHANGES: dict[str, dict[str, Any]] = {
-    # A reference is close all the time: one second of foresight is enough, and learns faster than five.
-    "t2": {"discount": 0.9},
-}
-"""By task; any other task learns as T1 does."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,11 +49,8 @@ class OnPolicySettings:
 S = TypeVar("S", bound=OnPolicySettings)
 
 
-def fitted(settings: S, task: Task, *, randomized: bool, worlds: int | None, steps: int | None) -> S:
-    """The settings for a task; what is None keeps its default."""
-    settings = replace(settings, **CHANGES.get(task.name, {}))
-    if randomized:
-        settings = replace(settings, steps=RANDOMIZED_STEPS.get(task.name, RANDOMIZED_STEPS["t1"]))
-    settings = replace(settings, steps=steps or settings.steps, worlds=worlds or settings.worlds)
+def fitted(settings: S, task: Task, **given: Any) -> S:
+    """The settings for a task, with rollouts long enough; `given` as `task_settings.applied` takes it."""
+    settings = applied(settings, **given)
     rows = settings.worlds * len(task.agents)
     return replace(settings, rollout=max(settings.rollout, math.ceil(ROLLOUT_SAMPLES / rows)))

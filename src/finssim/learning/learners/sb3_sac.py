@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from torch import nn
 
 from finssim.learning.learners.catalogue import LearningError
 from finssim.learning.learners.sb3_worlds import Sb3Learner, TalliedWorlds
+from finssim.learning.learners.task_settings import applied
 from finssim.tasks import Environment, Task
 
 __all__ = ["SacSettings", "Sb3Sac", "settings_for"]
@@ -44,23 +45,9 @@ class SacSettings:
     """Units of the hidden layers, ELU, of the policy and of each of the two values."""
 
 
-RANDOMIZED_STEPS = 400_000
-"""Control steps when every episode has another vehicle."""
-
-
-def settings_for(
-    task: Task,
-    learner: str = "Sb3Sac",
-    *,
-    randomized: bool = False,
-    worlds: int | None = None,
-    steps: int | None = None,
-) -> SacSettings:
-    """The settings of a training; what is None keeps its default."""
-    settings = SacSettings(steps=RANDOMIZED_STEPS) if randomized else SacSettings()
-    if task.name == "t2":
-        settings = replace(settings, discount=0.9)  # as PPO: a reference is close all the time
-    return replace(settings, worlds=worlds or settings.worlds, steps=steps or settings.steps)
+def settings_for(task: Task, learner: str = "Sb3Sac", **given: Any) -> SacSettings:
+    """The settings of a training; `given` as `task_settings.applied` takes it."""
+    return applied(SacSettings(), **given)
 
 
 MEMORY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")

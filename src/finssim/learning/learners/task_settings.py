@@ -1,0 +1,53 @@
+"""What a learner's settings are for a task, where they are not the defaults, which are T1's: the one place for them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, TypeVar
+
+__all__ = ["PPO", "RANDOMIZED", "SETTINGS", "applied", "own_settings"]
+
+PPO = ("sb3-ppo", "rsl-rl", "torchrl-ppo", "torchrl-ippo", "torchrl-mappo")
+"""The learners that `ppo` means below."""
+
+Table = dict[str, dict[str, dict[str, Any]]]
+"""Task -> `ppo` or a learner's name, which outranks it -> changes of the defaults. `*` is every task, which the task's
+own lines outrank."""
+
+SETTINGS: Table = {
+    "t2": {
+        # A reference is close all the time: one second of foresight is enough, and learns faster than five.
+        "ppo": {"discount": 0.9},
+        "sb3-sac": {"discount": 0.9},
+    },
+}
+"""Of every training."""
+
+RANDOMIZED: Table = {
+    # What must be learnt is more.
+    "*": {"ppo": {"steps": 3_000_000}, "sb3-sac": {"steps": 400_000}},
+    "t2": {"ppo": {"steps": 2_000_000}},
+}
+"""On top of those, where every episode has another vehicle (`--randomize`)."""
+
+
+def own_settings(task: str, learner: str, randomized: bool) -> dict[str, Any]:
+    """Changes of a learner's defaults for a task; none for a task that no table names."""
+    found: dict[str, Any] = {}
+    for name in ("*", task):
+        for table in (SETTINGS, RANDOMIZED) if randomized else (SETTINGS,):
+            rows = table.get(name, {})
+            found |= rows.get("ppo", {}) if learner in PPO else {}
+            found |= rows.get(learner, {})
+    return found
+
+
+S = TypeVar("S")
+
+
+def applied(settings: S, own: Mapping[str, Any], worlds: int | None, steps: int | None) -> S:
+    """Defaults with the task's own changes; then worlds and steps, unless None."""
+    given = {name: value for name, value in (("worlds", worlds), ("steps", steps)) if value is not None}
+    changed: S = replace(settings, **{**own, **given})  # type: ignore[type-var]
+    return changed

@@ -1,0 +1,50 @@
+"""Settings by task: what outranks what, and every line of the tables is of something that there is."""
+
+import sys
+
+import pytest
+
+from finssim.learning.learners import LEARNERS, learner_named, task_settings
+from finssim.learning.learners.task_settings import PPO, RANDOMIZED, SETTINGS, own_settings
+from finssim.tasks import TASKS, task_named
+from reference.guess import Guess
+
+
+def test_the_tasks_own_lines_outrank_the_others(monkeypatch):
+    """Every task, then the task; `ppo`, then the learner; plain, then randomised."""
+    plain = {"*": {"ppo": {"a": 1, "b": 1}}, "t1": {"ppo": {"b": 2, "c": 2}, "rsl-rl": {"c": 3}}}
+    drawn = {"*": {"ppo": {"a": 4, "b": 4}}, "t1": {"ppo": {"d": 5}}}
+    monkeypatch.setattr(task_settings, "SETTINGS", plain)
+    monkeypatch.setattr(task_settings, "RANDOMIZED", drawn)
+    assert own_settings("other", "sb3-sac", True) == {}
+    assert own_settings("other", "sb3-ppo", False) == {"a": 1, "b": 1}
+    assert own_settings("other", "sb3-ppo", True) == {"a": 4, "b": 4}
+    assert own_settings("t1", "sb3-ppo", False) == {"a": 1, "b": 2, "c": 2}
+    assert own_settings("t1", "rsl-rl", True) == {"a": 4, "b": 2, "c": 3, "d": 5}
+
+
+@pytest.mark.parametrize("randomized", [False, True])
+@pytest.mark.parametrize("name", LEARNERS)
+def test_a_training_begins_with_its_tasks_settings(name, randomized):
+    """And what the command says outranks them."""
+    kind = learner_named(name)
+    for task in TASKS:
+        settings = kind.settings(task_named(task), randomized=randomized)
+        for setting, value in own_settings(task, name, randomized).items():
+            assert setting == "rollout" or getattr(settings, setting) == value
+        given = kind.settings(task_named(task), randomized=randomized, steps=7, worlds=3)
+        assert (given.steps, given.worlds) == (7, 3)
+
+
+def test_every_line_is_of_something_that_exists():
+    assert set(PPO) <= set(LEARNERS)
+    for table in (SETTINGS, RANDOMIZED):
+        assert set(table) <= {"*", *TASKS}
+        assert {learner for rows in table.values() for learner in rows} <= {"ppo", *LEARNERS}
+
+
+def test_a_task_of_ones_own_has_the_defaults():
+    """Its name is in no table."""
+    kind = learner_named("sb3-ppo")
+    module = sys.modules[type(kind.settings(Guess())).__module__]
+    assert kind.settings(Guess(), worlds=256) == module.OnPolicySettings()
