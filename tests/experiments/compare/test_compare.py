@@ -118,6 +118,19 @@ def test_a_curve_is_the_middle_of_its_runs(tmp_path):
     assert steps[-1] == 1000.0 and middle[-1] == pytest.approx(20.0) and low[-1] < 20.0 < high[-1]
 
 
+def test_a_row_of_a_curve_without_a_number_is_left_out(tmp_path):
+    """As before the first episode ended: the curve goes on as a straight line between its neighbours."""
+    folder = policy(tmp_path / "run1", 1)
+    curves = folder / "curves.csv"
+    head, first, second, third = curves.read_text(encoding="utf-8").splitlines()
+    gap = ",".join(
+        "" if name == "mean_return" else x for name, x in zip(head.split(","), second.split(","), strict=True)
+    )
+    curves.write_text("\n".join([head, first, gap, third]) + "\n", encoding="utf-8")
+    steps, (_, middle, _) = curve_of(groups_of([str(folder)])[0], "mean_return")
+    np.testing.assert_allclose(middle, np.maximum(steps, 100.0) / 100.0, rtol=1e-9)
+
+
 @pytest.mark.long
 def test_the_command_evaluates_once_and_writes(tmp_path, capsys):
     """Table, JSON, Markdown and figure; a second call takes the trials that are there, and gives the same."""

@@ -11,15 +11,31 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from finssim.experiments.compare.runs import Group
+from finssim.experiments.compare.runs import Group, Run
 from finssim.experiments.compare.statistics import interquartile_mean, with_bootstrap
 from finssim.experiments.envelope import COLORS
 from finssim.files import atomic_write
 
 __all__ = ["CURVES", "curve_of", "draw_comparison"]
 
-CURVES = ("evaluated_success", "held", "mean_return")
-"""Columns of a training's curves, the first two that every run has are drawn."""
+CURVES = {
+    "evaluation_success": "success, evaluated",
+    "evaluation_return": "return, evaluated",
+    "held": "share that held at the end",
+    "mean_return": "return in training",
+}
+"""Columns of a training's curves and what they are; the first two that every run has are drawn."""
+TITLES = {
+    "e_p_m": "position error [m]",
+    "e_psi_deg": "heading error [°]",
+    "t_s_s": "settling time [s]",
+    "horizontal_rmse_m": "horizontal error, rms [m]",
+    "vertical_rmse_m": "vertical error, rms [m]",
+    "p95_m": "95th percentile of the error [m]",
+}
+"""What measures are; others are called by their names."""
+DARK = 0.3
+"""A chance so far from a half stands on a dark square."""
 POINTS = 60
 """Of a curve."""
 CURVE_RESAMPLES = 200
@@ -27,22 +43,27 @@ CURVE_RESAMPLES = 200
 
 def draw_comparison(groups: Sequence[Group], result: Mapping[str, Any], path: Path) -> None:
     """Write the figure."""
-    curves = [name for name in CURVES if all(name in run.curves for group in groups for run in group.runs)][
-        :2
-    ]
-    measures = list(result["measures"])
-    columns = max(len(measures), len(curves) + 1)
-    height = 0.45 * len(groups) + 1.2
-    figure = Figure(figsize=(3.2 * columns, height + 3.4), layout="constrained")
-    grid = figure.add_gridspec(2, columns, height_ratios=(height, 3.2))
-    for k, name in enumerate(measures):
-        _intervals(figure.add_subplot(grid[0, k]), groups, result, name, labels=k == 0)
+    runs = [run for group in groups for run in group.runs]
+    curves = [name for name in CURVES if all(_drawable(run, name) for run in runs)][:2]
+    measures, pairs = list(result["measures"]), len(groups) > 1
+    height = 0.42 * len(groups) + 0.9
+    columns = max(len(measures), len(curves) + pairs)
+    figure = Figure(figsize=(2.4 + 2.6 * columns, height + 3.4), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=(height, 3.4))
+    above.suptitle("interquartile means, with 95 % intervals over the seeds", fontsize=9)
+    for k, axes in enumerate(_row(above, len(measures))):
+        _intervals(axes, groups, result, measures[k], labels=k == 0)
+    panels = _row(below, len(curves) + pairs)
     for k, name in enumerate(curves):
-        _curves(figure.add_subplot(grid[1, k]), groups, name)
-    if len(groups) > 1:
-        _matrix(figure.add_subplot(grid[1, len(curves)]), groups, result, measures[0])
+        _curves(panels[k], groups, name, legend=k == 0)
+    if pairs:
+        _matrix(panels[-1], groups, result, measures[0])
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=130)
+
+
+def _row(figure: Any, n: int) -> list[Axes]:
+    return list(figure.subplots(1, n, squeeze=False)[0]) if n else []
 
 
 def _intervals(
@@ -54,7 +75,12 @@ def _intervals(
         low, high = found["ci95"]
         if found["value"] is None:
             axes.annotate(
-                "not reached", (0.02, y), xycoords=("axes fraction", "data"), fontsize=8, color=color
+                "not reached",
+                (0.04, y),
+                xycoords=("axes fraction", "data"),
+                fontsize=8,
+                color=color,
+                va="center",
             )
             continue
         if low is not None and high is not None:
@@ -62,8 +88,17 @@ def _intervals(
         axes.plot([found["value"]] * 2, [y - 0.25, y + 0.25], color=color, linewidth=2.5)
     axes.set_yticks(range(len(groups)), [g.name for g in reversed(groups)] if labels else [""] * len(groups))
     axes.set_ylim(-0.6, len(groups) - 0.4)
-    axes.set_title(name, fontsize=10)
+    axes.use_sticky_edges = False  # an interval that ends at the least value is not to lie on the axis
+    axes.margins(x=0.08)
+    if name == "success":
+        axes.set_xlim(-0.04, 1.04)
+    axes.set_title(TITLES.get(name, name), fontsize=10)
+    axes.set_xlabel("less is better" if result["measures"][name] else "more is better", fontsize=8)
     _plain(axes)
+
+
+def _drawable(run: Run, name: str) -> bool:
+    return bool(np.isfinite(run.curves.get(name, np.empty(0))).any())
 
 
 def curve_of(group: Group, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -73,7 +108,7 @@ def curve_of(group: Group, name: str) -> tuple[NDArray[np.float64], NDArray[np.f
     """
     last = min(float(run.curves["steps"][-1]) for run in group.runs)
     steps = np.linspace(last / POINTS, last, POINTS)
-    rows = np.array([np.interp(steps, run.curves["steps"], run.curves[name]) for run in group.runs])
+    rows = np.array([_at(steps, run, name) for run in group.runs])
     band = np.empty((3, POINTS))
     for k in range(POINTS):
         found = with_bootstrap([rows[:, k : k + 1]], interquartile_mean, CURVE_RESAMPLES)
@@ -82,15 +117,22 @@ def curve_of(group: Group, name: str) -> tuple[NDArray[np.float64], NDArray[np.f
     return steps, band
 
 
-def _curves(axes: Axes, groups: Sequence[Group], name: str) -> None:
+def _at(steps: NDArray[np.float64], run: Run, name: str) -> NDArray[np.float64]:
+    """A column between its rows; one without a number, as before the first episode ended, is left out."""
+    known = np.isfinite(run.curves[name])
+    return np.interp(steps, run.curves["steps"][known], run.curves[name][known])
+
+
+def _curves(axes: Axes, groups: Sequence[Group], name: str, *, legend: bool) -> None:
     for i, group in enumerate(groups):
         steps, (low, middle, high) = curve_of(group, name)
         color = COLORS[i % len(COLORS)]
         axes.fill_between(steps / 1e6, low, high, color=color, alpha=0.2, linewidth=0.0)
         axes.plot(steps / 1e6, middle, color=color, label=group.name)
-    axes.set_xlabel("control steps, all worlds [million]")
-    axes.set_title(name, fontsize=10)
-    axes.legend(frameon=False, fontsize=8)
+    axes.set_xlabel("control steps [million]", fontsize=8)
+    axes.set_title(CURVES[name], fontsize=10)
+    if legend:
+        axes.legend(frameon=False, fontsize=8)
     _plain(axes)
 
 
@@ -104,10 +146,13 @@ def _matrix(axes: Axes, groups: Sequence[Group], result: Mapping[str, Any], name
     axes.imshow(table, vmin=0.0, vmax=1.0, cmap="PuOr")
     for (i, j), value in np.ndenumerate(table):
         if np.isfinite(value):
-            axes.annotate(f"{value:.2f}", (j, i), ha="center", va="center", fontsize=8)
-    axes.set_xticks(range(n), [g.name for g in groups], fontsize=8, rotation=20)
+            color = "white" if abs(value - 0.5) > DARK else "black"
+            axes.annotate(f"{value:.2f}", (j, i), ha="center", va="center", fontsize=9, color=color)
+    axes.set_xticks(
+        range(n), [g.name for g in groups], fontsize=8, rotation=30, ha="right", rotation_mode="anchor"
+    )
     axes.set_yticks(range(n), [g.name for g in groups], fontsize=8)
-    axes.set_title(f"chance that the row is better:\n{name}", fontsize=10)
+    axes.set_title(f"chance that the row is better:\n{TITLES.get(name, name)}", fontsize=10)
 
 
 def _plain(axes: Axes) -> None:
