@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from finssim.learning.demonstrations import Demonstrations, load
+from finssim.learning.expert_memory import memory_from, memory_numbers
 from finssim.learning.experts import expert_for
 from finssim.learning.learners.acting import ActingLearner
 from finssim.learning.learners.catalogue import LearningError
@@ -234,7 +235,7 @@ class Dagger(_Cloner):
             **super().learned(),
             "observation": self._observation,
             "action": self._action,
-            "memory": self._memory,
+            "memory": memory_numbers(self._memory),
             "rounds": self._rounds,
         }
 
@@ -242,4 +243,4 @@ class Dagger(_Cloner):
         """Take what `learned` gave."""
         super().load_learned(state)
         self._observation, self._action = state["observation"], state["action"]
-        self._memory, self._rounds = state["memory"], state["rounds"]
+        self._memory, self._rounds = memory_from(state["memory"], self._fresh), state["rounds"]

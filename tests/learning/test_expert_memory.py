@@ -1,0 +1,22 @@
+"""What an expert remembers goes into a state on disk and comes back as it was."""
+
+import numpy as np
+import pytest
+
+from finssim.learning.expert_memory import memory_from, memory_numbers
+from finssim.learning.resume import read_state, write_state
+from finssim.tasks import TASKS, make
+from finssim.tasks.baselines import BASELINES, baseline
+
+
+@pytest.mark.parametrize("task", [task for task in TASKS if BASELINES.get(task)])
+def test_every_baselines_memory_survives(task, tmp_path):
+    """After one action of three rows: from disk it gives the same second action."""
+    who = baseline(task, next(iter(BASELINES[task])))
+    environment = make(task, worlds=3, seed=1)
+    seen = environment.arrays.observation.numpy().reshape(3 * environment.agents, -1)
+    fresh = who.reset(len(seen))
+    _, memory = who.act(fresh, seen)
+    write_state({"memory": memory_numbers(memory)}, tmp_path / "state")
+    again = memory_from(read_state(tmp_path / "state")["memory"], fresh)
+    assert np.array_equal(who.act(again, seen)[0], who.act(memory, seen)[0])
