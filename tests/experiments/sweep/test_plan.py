@@ -29,6 +29,8 @@ def test_settings_times_grid_times_seeds(tmp_path):
         {"steps": 10, "worlds": 64, "action": "wrench4", "randomize": "pool"}
     ] * 2
     assert len({job.key for job in jobs}) == len(jobs)
+    settings = {job.key.removesuffix(str(job.seed)) for job in jobs}  # what finssim compare takes together
+    assert len(settings) == len(jobs) // 2
 
 
 def test_a_number_of_seeds_counts_from_one(tmp_path):

@@ -45,8 +45,11 @@ class Job:
 
     @property
     def key(self) -> str:
-        """Name of its folder, with a digest of everything that decides what comes of it."""
-        about = [self.task, self.vehicle, dict(self.options), self.plants, self.trials, self.seed]
+        """Name of its folder: with a digest of everything that decides what comes of it, then the seed.
+
+        Those of a setting differ in the number at their end alone, so that `finssim compare` takes them together.
+        """
+        about = [self.task, self.vehicle, dict(self.options), self.plants, self.trials]
         digest = hashlib.sha256(json.dumps(about, sort_keys=True, default=str).encode()).hexdigest()
         return f"{self.name}-{digest[:8]}-seed{self.seed}"
 
