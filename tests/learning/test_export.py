@@ -21,7 +21,8 @@ from finssim.control.policy_description import (
     VehicleIdentity,
 )
 from finssim.files import OutputError
-from finssim.learning.export import ACTIVATIONS, ExportError, export_policy
+from finssim.learning.export import ExportError, export_policy
+from finssim.learning.onnx_graph import ACTIVATIONS
 
 
 def description(n: int = 16, m: int = 6) -> PolicyDescription:

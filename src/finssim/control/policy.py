@@ -30,6 +30,9 @@ from finssim.control.policy_description import (
 
 __all__ = ["Policy"]
 
+OUTPUTS = ["action", "memory_after"]
+"""Of the network; the second only of one with memory."""
+
 
 class Identified(Protocol):
     """What a policy compares of a vehicle: its name and the SHA-256 of its file. A `Vehicle` has both."""
@@ -94,7 +97,7 @@ class Policy:
         return cls(description, _open_network(folder, description))
 
     def act(self, observation: ArrayLike) -> NDArray[np.float32]:
-        """Action for each observation.
+        """Action for each observation, of a policy without memory.
 
         Args:
             observation: Scaled and clipped as the schema says, shape (..., n); taken as float32.
@@ -103,8 +106,46 @@ class Policy:
             Action in [-1, 1], shape (..., m); its meaning is `description.action`.
 
         Raises:
-            PolicyError: An observation has another length than n, or an element that is not finite.
+            PolicyError: An observation has another length than n, or an element that is not finite; or the policy has a
+                memory.
         """
+        return self.step(None, observation)[0]
+
+    def reset(self, n: int) -> NDArray[np.float32] | None:
+        """What it remembers at the start of n episodes, (n, k); None of a policy without memory."""
+        k = self.description.memory
+        return np.zeros((n, k), dtype=np.float32) if k else None
+
+    def step(
+        self, memory: NDArray[Any] | None, observation: ArrayLike
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """Actions, and the memory to give with the next observations.
+
+        Args:
+            memory: From `reset`, or from the step before, with a row for each observation.
+            observation: As `act` takes it.
+
+        Returns:
+            Actions as of `act`, and the memory after.
+
+        Raises:
+            PolicyError: As of `act`; or the memory is not this policy's.
+        """
+        x = self._checked(observation)
+        rows, k = x.reshape(-1, self._size), self.description.memory
+        expected = (len(rows), k) if k else None
+        shape = None if memory is None else np.shape(memory)
+        if shape != expected:
+            said = [f"one of shape {s}" if s else "no memory" for s in (shape, expected)]
+            raise PolicyError(
+                f"the policy is given {said[0]}, expected {said[1]}: begin with what reset gives"
+            )
+        given = {"memory": np.asarray(memory, dtype=np.float32)} if k else {}
+        action, *after = self._session.run(OUTPUTS[: 1 + bool(k)], {"observation": rows, **given})
+        return action.reshape(*x.shape[:-1], action.shape[-1]), after[0] if after else None
+
+    def _checked(self, observation: ArrayLike) -> NDArray[np.float32]:
+        """The observation, if it is of the right length and finite."""
         x = np.asarray(observation, dtype=np.float32)
         if x.ndim == 0 or x.shape[-1] != self._size:
             length = x.shape[-1] if x.ndim else "no"
@@ -118,9 +159,7 @@ class Policy:
             raise PolicyError(
                 f"observation element {index} ({name}) is {x[~finite][0]}, expected a finite number"
             )
-        rows = x.reshape(-1, self._size)
-        action: NDArray[np.float32] = self._session.run(None, {"observation": rows})[0]
-        return action.reshape(*x.shape[:-1], action.shape[-1])
+        return x
 
 
 def _open_network(folder: Path, description: PolicyDescription) -> Any:
@@ -146,11 +185,14 @@ def _open_network(folder: Path, description: PolicyDescription) -> Any:
     except Exception as error:  # onnxruntime raises a class per error code, with no common base but Exception
         reason = " ".join(str(error).split())
         raise PolicyError(f"{path}: not a network onnxruntime can run ({reason})") from error
-    shapes = [tensor.shape[-1] for tensor in (*session.get_inputs(), *session.get_outputs())]
-    if shapes != [description.observation.size, description.action_size]:
+    k = [description.memory] if description.memory else []
+    described = [[description.observation.size, *k], [description.action_size, *k]]
+    found = [[tensor.shape[-1] for tensor in side] for side in (session.get_inputs(), session.get_outputs())]
+    if found != described:
+        told = [[" and ".join(map(str, side)) for side in sides] for sides in (found, described)]
         raise PolicyError(
-            f"{path}: maps {shapes[0]} values to {shapes[-1]}, but {DESCRIPTION_FILE} describes "
-            f"{description.observation.size} to {description.action_size}"
+            f"{path}: maps {told[0][0]} values to {told[0][1]}, but {DESCRIPTION_FILE} describes "
+            f"{told[1][0]} to {told[1][1]}"
         )
     return session
 

@@ -92,6 +92,8 @@ class PolicyDescription(_Record):
     """The action mode, as its `describe()` gives it: at least `mode` (name), `size`, and its limits and scale."""
     control_period: float = Field(gt=0.0)
     """Time between two actions [s]."""
+    memory: int = Field(default=0, ge=0)
+    """Numbers that the network hands on to its next action, zeros at an episode's start; 0: it remembers nothing."""
     vehicle: VehicleIdentity
     hydrodynamics: str
     """Hydrodynamic set or model it was trained in."""

@@ -64,18 +64,20 @@ class PolicyPlayer:
         self.trim = trim
         self._directory = Path(directory)
 
-    def reset(self, n: int) -> NDArray[np.float64] | None:
-        """A policy remembers nothing; a trim its shift."""
-        return self.trim.reset(n) if self.trim else None
+    def reset(self, n: int) -> tuple[Any, Any]:
+        """Memory of the policy, if it has one, and shift of the trim."""
+        return self.policy.reset(n), self.trim.reset(n) if self.trim else None
 
     def act(self, memory: Any, arrays: Any, goal: Goal) -> tuple[NDArray[np.float32], Any]:
         """Actions for the environment's observations, a row for each agent of each world."""
         observation = arrays.observation.numpy().reshape(-1, self.policy.description.observation.size)
+        remembered, shift = memory
         if self.trim is not None:
             measured = _read(arrays)
-            memory = self.trim.update(memory, measured, goal.position, self.period)
-            observation = self.trim.shown(observation, measured, memory, self.policy.description.observation)
-        return self.policy.act(observation), memory
+            shift = self.trim.update(shift, measured, goal.position, self.period)
+            observation = self.trim.shown(observation, measured, shift, self.policy.description.observation)
+        action, remembered = self.policy.step(remembered, observation)
+        return action, (remembered, shift)
 
     def describe(self) -> dict[str, Any]:
         """Name, network, and what it was trained in."""

@@ -69,13 +69,13 @@ class _PolicyExpert:
             )
 
     def reset(self, n: int) -> Any:
-        return None
+        return self._policy.reset(n)
 
     def act(self, memory: Any, observation: NDArray[Any]) -> tuple[NDArray[np.float32], Any]:
-        return self._policy.act(observation).astype(np.float32), None
+        return self._policy.step(memory, observation)
 
     def restarted(self, memory: Any, fresh: Any, mask: NDArray[np.bool_]) -> Any:
-        return None
+        return restarted(memory, fresh, mask)
 
 
 def expert_for(environment: Environment, name: str | Path) -> Expert:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from datetime import datetime, timezone
 from importlib.util import find_spec
@@ -13,31 +13,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import torch
 import yaml
 from numpy.typing import NDArray
-from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
 from finssim.control.policy import Policy
 from finssim.control.policy_description import DESCRIPTION_FILE, NETWORK_FILE, PolicyDescription
 from finssim.files import atomic_directory
+from finssim.learning.onnx_graph import IR_VERSION, OPSET, can_write, write_graph
+from finssim.learning.recurrent import asked, first_memory
 from finssim.provenance import provenance
 
 __all__ = ["CURVES_FILE", "EVALUATION_FILE", "ExportError", "export_policy"]
 
 CURVES_FILE = "curves.csv"
 EVALUATION_FILE = "evaluation.json"
-
-OPSET = 18
-"""ONNX operator set of every exported network."""
-
-IR_VERSION = 10
-"""ONNX file version; the newest that the onnxruntime of 2024 reads."""
-
-ACTIVATIONS = {nn.Tanh: "Tanh", nn.ReLU: "Relu", nn.ELU: "Elu", nn.Identity: "Identity"}
-"""Activations with one ONNX operator of the same meaning, for networks written out layer by layer."""
 
 
 class ExportError(ValueError):
@@ -57,9 +48,10 @@ def export_policy(
     """Writes a policy directory whole or not at all, after checking that onnxruntime computes what torch does.
 
     Args:
-        network: Maps observations (N, n) float32 to the mean action (N, m); the written one clips it to [-1, 1].
+        network: Maps observations (N, n) float32 to the mean action (N, m), or, as a `RecurrentNetwork`, observations
+            and memory to action and memory; the written one clips the action to [-1, 1].
         directory: Folder to write. An earlier policy directory is replaced; any other folder with files is refused.
-        description: What it was trained with; `files`, `provenance` and `created` are filled in here.
+        description: What it was trained with; `memory`, `files`, `provenance` and `created` are filled in.
         curves: Rows of `curves.csv`, with equal keys.
         evaluation: Content of `evaluation.json`.
         also: Writes more files into the folder before it takes its place.
@@ -75,6 +67,7 @@ def export_policy(
     content = _onnx_bytes(network, description)
     complete = description.model_copy(
         update={
+            "memory": int(getattr(network, "memory_size", 0)),
             "files": {NETWORK_FILE: hashlib.sha256(content).hexdigest()},
             "provenance": provenance(),
             "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),
@@ -104,54 +97,20 @@ def _onnx_bytes(network: nn.Module, description: PolicyDescription) -> bytes:
     n, m = description.observation.size, description.action_size
     try:
         with torch.no_grad():
-            shape = tuple(deepcopy(network).cpu().eval()(torch.zeros(2, n)).shape)
+            copy = deepcopy(network).cpu().eval()
+            shape = tuple(asked(copy, torch.zeros(2, n), first_memory(copy, 2))[0].shape)
     except RuntimeError as error:  # torch's way of saying that matrix sizes do not fit
         raise ExportError(f"the network does not take observations of {n} elements ({error})") from error
     if shape != (2, m):
         raise ExportError(f"the network maps (2, {n}) to {shape}, but the description says (2, {m})")
-    layers = list(_layers(network))
-    if all(isinstance(layer, nn.Linear) or type(layer) in ACTIVATIONS for layer in layers):
-        return _write_layers(layers, n, m)
+    if can_write(network):
+        return write_graph(network, n, m)
+    if hasattr(network, "memory_size"):
+        raise ExportError(
+            "a network that remembers is written as an LSTM of one layer before linear layers and tanh, ReLU or ELU, "
+            "a RecurrentNetwork: this is another"
+        )
     return _trace(network, n)
-
-
-def _layers(module: nn.Module) -> Iterable[nn.Module]:
-    """The layers of nested `nn.Sequential`s, in order."""
-    if isinstance(module, nn.Sequential):
-        for child in module:
-            yield from _layers(child)
-    else:
-        yield module
-
-
-def _write_layers(layers: Sequence[nn.Module], n: int, m: int) -> bytes:
-    """The graph of a multi-layer perceptron, written operator by operator.
-
-    torch's own exporter traces and decomposes the network, which takes seconds for a handful of operators.
-    """
-    limits = [("low", np.full((), -1.0, np.float32)), ("high", np.full((), 1.0, np.float32))]
-    weights = [numpy_helper.from_array(value, name) for name, value in limits]
-    nodes, x = [], "observation"
-    for i, layer in enumerate(layers):
-        if isinstance(layer, nn.Linear):
-            tensors = {
-                f"{name}_{i}": parameter for name, parameter in layer.named_parameters()
-            }  # weight, then bias
-            weights += [numpy_helper.from_array(_float32(tensor), name) for name, tensor in tensors.items()]
-            nodes.append(helper.make_node("Gemm", [x, *tensors], [f"x_{i}"], transB=1))
-        elif isinstance(layer, nn.ELU):
-            nodes.append(helper.make_node("Elu", [x], [f"x_{i}"], alpha=float(layer.alpha)))
-        else:
-            nodes.append(helper.make_node(ACTIVATIONS[type(layer)], [x], [f"x_{i}"]))
-        x = f"x_{i}"
-    nodes.append(helper.make_node("Clip", [x, "low", "high"], ["action"]))
-    inputs = [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["N", n])]
-    outputs = [helper.make_tensor_value_info("action", TensorProto.FLOAT, ["N", m])]
-    graph = helper.make_graph(nodes, "policy", inputs, outputs, weights)
-    opsets = [helper.make_opsetid("", OPSET)]
-    model = helper.make_model(graph, opset_imports=opsets, ir_version=IR_VERSION, producer_name="finssim")
-    onnx.checker.check_model(model)
-    return bytes(model.SerializeToString())
 
 
 class _Clipped(nn.Module):
@@ -193,22 +152,30 @@ def _check_agreement(network: nn.Module, policy: Policy, tolerance: float) -> No
     That rounding, seen between torch in float32 and in float64, is 1e-7 for a fresh network and above 1e-6 for a
     trained one with large gains; a wrong graph is off by far more.
     """
-    copy = deepcopy(network).cpu().eval()
-    shape = (512, policy.description.observation.size)
-    observation = torch.as_tensor(np.random.default_rng(0).normal(size=shape))
-    with torch.no_grad():
-        single = copy(observation.float()).clamp(-1.0, 1.0).numpy()
-        double = copy.double()(observation).clamp(-1.0, 1.0).numpy()
+    copy, rng = deepcopy(network).cpu().eval(), np.random.default_rng(0)
+    observation = rng.normal(size=(512, policy.description.observation.size))
+    k = policy.description.memory
+    memory = rng.uniform(-1.0, 1.0, size=(512, k)) if k else None
+    single = _answer(copy, observation, memory, torch.float32)
+    double = _answer(copy.double(), observation, memory, torch.float64)
+    answer = np.concatenate([part for part in policy.step(memory, observation) if part is not None], axis=1)
     allowed = tolerance + 4.0 * float(np.max(np.abs(single - double)))
-    error = float(np.max(np.abs(policy.act(observation.numpy()) - double)))
+    error = float(np.max(np.abs(answer - double)))
     if not error <= allowed:
         sentence = f"onnxruntime and torch differ by {error:.2g} in an action, expected at most {allowed:.2g}"
         raise ExportError(f"{sentence}: look for weights that are not finite or huge")
 
 
-def _float32(tensor: torch.Tensor) -> NDArray[np.float32]:
-    array: NDArray[np.float32] = tensor.detach().to("cpu", torch.float32).numpy()
-    return array
+def _answer(
+    network: nn.Module, observation: NDArray[Any], memory: NDArray[Any] | None, kind: torch.dtype
+) -> NDArray[Any]:
+    """Action in [-1, 1] and, beside it, the memory after, (N, m + k)."""
+    given = None if memory is None else torch.as_tensor(memory, dtype=kind)
+    with torch.no_grad():
+        action, after = asked(network, torch.as_tensor(observation, dtype=kind), given)
+    parts = [action.clamp(-1.0, 1.0), *([] if after is None else [after])]
+    answer: NDArray[Any] = torch.cat(parts, dim=1).numpy()
+    return answer
 
 
 def _write_curves(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from finssim.learning.recurrent import asked, first_memory
 from finssim.tasks import Environment
 from finssim.tasks.environment import GREATEST_SEED
 
@@ -33,16 +34,17 @@ class HeldEvaluation:
         """Means over the episodes.
 
         Args:
-            network: Observation of one agent to its action; its mode (train, eval) is left as it is.
+            network: Observation of one agent to its action, or a `RecurrentNetwork`; its mode (train, eval) stays.
 
         Returns:
             The task's metrics by `evaluation_` and their name, such as evaluation_return and evaluation_success.
         """
         e = self.environment
         e.reset(seed=e.seed)
+        memory = first_memory(network, e.worlds * e.agents, self.device)
         waiting, found = np.ones(e.worlds, dtype=np.bool_), {}
         for _ in range(self._limit):
-            self._act(network)
+            memory = self._act(network, memory)
             ended = (e.arrays.terminated.numpy() | e.arrays.truncated.numpy()) != 0
             for name, values in e.task.metrics(e.arrays).items() if (ended & waiting).any() else ():
                 found.setdefault(name, np.zeros(e.worlds))[ended & waiting] = values[ended & waiting]
@@ -52,11 +54,12 @@ class HeldEvaluation:
         done = ~waiting
         return {f"evaluation_{name}": float(values[done].mean()) for name, values in found.items()}
 
-    def _act(self, network: nn.Module) -> None:
-        """One control step of all worlds."""
+    def _act(self, network: nn.Module, memory: torch.Tensor | None) -> torch.Tensor | None:
+        """One control step of all worlds; the memory after it, which in worlds that start over is of no interest."""
         e = self.environment
         rows = e.arrays.observation.numpy().reshape(e.worlds * e.agents, -1)
         with torch.no_grad():
-            action = network(torch.as_tensor(rows, device=self.device))
+            action, memory = asked(network, torch.as_tensor(rows, device=self.device), memory)
         e.arrays.action.assign(action.cpu().numpy().reshape(e.worlds, -1))
         e.advance()
+        return memory

@@ -133,7 +133,8 @@ class PolicyPilot:
         )
         self._mode = mode_from_dict(self.policy.description.action, vehicle)
         self.name = Path(directory).resolve().name
-        self._trim, self._shift = trim, np.zeros(3)
+        self._trim = trim
+        self.reset()
 
     @property
     def period(self) -> float:
@@ -156,7 +157,8 @@ class PolicyPilot:
         }
 
     def reset(self) -> None:
-        """A policy remembers nothing; a trim its shift."""
+        """Forget what a policy with memory has seen, and the trim's shift."""
+        self._memory = self.policy.reset(1)
         self._shift = np.zeros(3)
 
     def act(self, reading: Measured, guide: Guide, t: float) -> Array:
@@ -166,7 +168,8 @@ class PolicyPilot:
             self._shift = self._trim.update(self._shift, reading, guide.at(t).position, self.period)
             schema = self.policy.description.observation
             observation = self._trim.shown(observation, reading, self._shift, schema)
-        return self._mode.to_thrusters(self.policy.act(observation))
+        action, self._memory = self.policy.step(self._memory, observation)
+        return self._mode.to_thrusters(action)
 
 
 class WrenchPilot:

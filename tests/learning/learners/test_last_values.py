@@ -35,7 +35,7 @@ def answer(critic, value):
 
 def returns(name, learner, value):
     """The returns that an update learns from, where the critic says `value`."""
-    if name == "sb3-ppo":
+    if name.startswith("sb3-"):
         answer(learner.model.policy.value_net, value)
         learner.update()
         return learner.model.rollout_buffer.returns
@@ -51,7 +51,7 @@ def returns(name, learner, value):
 @pytest.mark.parametrize(
     ("name", "task"),
     [
-        *((name, Steady) for name in ("sb3-ppo", "rsl-rl", "torchrl-ppo")),
+        *((name, Steady) for name in ("sb3-ppo", "sb3-recurrent-ppo", "rsl-rl", "torchrl-ppo")),
         *((name, SteadyTogether) for name in ("torchrl-ippo", "torchrl-mappo")),
     ],
 )

@@ -10,6 +10,7 @@ import torch
 import finssim
 from finssim.learning.held_evaluation import HeldEvaluation
 from finssim.learning.learners import LEARNERS, LearningError, learner_named
+from finssim.learning.recurrent import asked, first_memory
 from finssim.learning.resume import read_state, write_state
 from finssim.tasks import TASKS, task_named
 from reference.guess import BEST, Guess, GuessTogether
@@ -30,6 +31,7 @@ def small(name, task, **changes):
         few = {"warm_up": 100, "memory": 4000, "gradient_steps": 4, **few, "batch": 64}
     else:
         few = {"batch": 64, "epochs": 2, **few}
+    few |= {"lstm": 16} if name == "sb3-recurrent-ppo" else {}
     return replace(kind.settings(task), **few)
 
 
@@ -73,8 +75,9 @@ def test_it_finds_the_best_action(name, task):
     before = learner.update()
     while learner.steps < steps:
         row = learner.update()
+    network, seen = learner.network(), torch.tensor([[1.0], [-1.0]])
     with torch.no_grad():
-        action = learner.network()(torch.tensor([[1.0], [-1.0]])).numpy()
+        action = asked(network, seen, first_memory(network, 2))[0].numpy()
     tolerance = (
         0.2 if name == "sb3-sac" else 0.1
     )  # SAC is paid for noise too, and keeps away from the limits for it
@@ -84,7 +87,7 @@ def test_it_finds_the_best_action(name, task):
         and row["held"] > before["held"]
         and row["mean_return"] > (0.7 if name == "sb3-sac" else 0.9)
     )
-    held = HeldEvaluation(finssim.make(task(), worlds=8, seed=77))(learner.network())
+    held = HeldEvaluation(finssim.make(task(), worlds=8, seed=77))(network)
     assert held["evaluation_success"] == 1.0 and held["evaluation_return"] > 0.96
 
 
@@ -125,7 +128,9 @@ def test_equal_seeds_are_equal_learners(name):
 
 
 def test_unknown_names_are_refused():
-    with pytest.raises(LearningError, match="unknown learner 'sb3'; available: sb3-ppo, sb3-sac"):
+    with pytest.raises(
+        LearningError, match="unknown learner 'sb3'; available: sb3-ppo, sb3-sac, sb3-recurrent-ppo"
+    ):
         learner_named("sb3")
     kind, task = learner_named("sb3-ppo"), Guess()
     with pytest.raises(LearningError, match="unknown setting 'gamma'; available: worlds, steps, rollout"):
@@ -136,14 +141,19 @@ def test_unknown_names_are_refused():
         kind.settings(task, changes={"batch": 0.5})
 
 
-def test_a_library_that_is_missing_is_named(monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "library", "extra"),
+    [("rsl-rl", "rsl_rl.algorithms", "rsl-rl"), ("sb3-recurrent-ppo", "sb3_contrib", "sb3-contrib")],
+)
+def test_a_library_that_is_missing_is_named(monkeypatch, name, library, extra):
     """With what to install."""
-    monkeypatch.setitem(sys.modules, "rsl_rl.algorithms", None)
-    monkeypatch.delitem(sys.modules, "finssim.learning.learners.rsl_rl_ppo", raising=False)
+    kind = learner_named(name)
+    monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.delitem(sys.modules, f"finssim.learning.learners.{kind.module}", raising=False)
     with pytest.raises(
-        LearningError, match=r"needs rsl_rl.algorithms: pip install 'finssim\[learn,rsl-rl\]'"
+        LearningError, match=rf"this learner needs {library}: pip install 'finssim\[learn,{extra}\]'$"
     ):
-        learner_named("rsl-rl").settings(Guess())
+        kind.settings(Guess())
 
 
 def test_settings_are_changed_by_name():

@@ -37,7 +37,7 @@ class Learner(Protocol):
         """
 
     def network(self) -> nn.Module:
-        """Observation of one agent to its mean action, for evaluation and export."""
+        """Observation of one agent to its mean action, for evaluation and export; or a `RecurrentNetwork`."""
 
     def state(self) -> dict[str, Any]:
         """Everything that decides what comes next: parameters, optimisers, random streams, the environment."""
@@ -124,6 +124,12 @@ class LearnerKind:
 LEARNERS: dict[str, LearnerKind] = {
     "sb3-ppo": LearnerKind("sb3_ppo", "Sb3Ppo", "PPO of Stable-Baselines3"),
     "sb3-sac": LearnerKind("sb3_sac", "Sb3Sac", "SAC of Stable-Baselines3"),
+    "sb3-recurrent-ppo": LearnerKind(
+        "sb3_recurrent_ppo",
+        "Sb3RecurrentPpo",
+        "recurrent PPO of SB3-Contrib: the policy remembers with an LSTM",
+        extra="sb3-contrib",
+    ),
     "rsl-rl": LearnerKind("rsl_rl_ppo", "RslRlPpo", "PPO of RSL-RL", extra="rsl-rl"),
     "torchrl-ppo": LearnerKind("torchrl_ppo", "TorchRlPpo", "PPO of TorchRL", extra="torchrl", agents="one"),
     "torchrl-ippo": LearnerKind(

@@ -40,20 +40,23 @@ class Sb3Ppo(Sb3Learner):
     """PPO; several agents of a world are rows of their own and share the network."""
 
     settings: OnPolicySettings
+    algorithm: Any = PPO
+    policy = "MlpPolicy"
 
     def __init__(
         self, environment: Environment, settings: OnPolicySettings, *, seed: int, device: str = "cpu"
     ) -> None:
         """Set up PPO and start its first episodes."""
         super().__init__(environment, settings)
-        policy = {
-            "net_arch": list(settings.hidden),
-            "activation_fn": nn.ELU,
-            "log_std_init": settings.log_std,
-        }
-        worlds = TalliedWorlds(self.tally)
-        arguments = ppo_arguments(settings)
-        self.start(PPO("MlpPolicy", worlds, seed=seed, device=device, policy_kwargs=policy, **arguments))
+        arguments = {**ppo_arguments(settings), "policy_kwargs": self.policy_arguments()}
+        self.start(
+            self.algorithm(self.policy, TalliedWorlds(self.tally), seed=seed, device=device, **arguments)
+        )
+
+    def policy_arguments(self) -> dict[str, Any]:
+        """The networks' settings as SB3 takes them."""
+        s = self.settings
+        return {"net_arch": list(s.hidden), "activation_fn": nn.ELU, "log_std_init": s.log_std}
 
     def update(self) -> dict[str, float]:
         """One rollout, and `epochs` passes over it."""

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 __all__ = ["PPO", "RANDOMIZED", "SETTINGS", "applied", "own_settings"]
 
-PPO = ("sb3-ppo", "rsl-rl", "torchrl-ppo", "torchrl-ippo", "torchrl-mappo")
+PPO = ("sb3-ppo", "sb3-recurrent-ppo", "rsl-rl", "torchrl-ppo", "torchrl-ippo", "torchrl-mappo")
 """The learners that `ppo` means below."""
 
 Table = dict[str, dict[str, dict[str, Any]]]

@@ -129,8 +129,8 @@ class _Observed:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._policy, name)
 
-    def act(self, observation: Any) -> Any:
-        """The policy's action."""
-        action = self._policy.act(observation)
+    def step(self, memory: Any, observation: Any) -> Any:
+        """The policy's action, and its memory after."""
+        action, memory = self._policy.step(memory, observation)
         self.observation, self.action = np.asarray(observation, float), np.asarray(action, float)
-        return action
+        return action, memory

@@ -1,0 +1,181 @@
+"""A policy that remembers: exported as learnt, carried from action to action, and begun anew in every episode."""
+
+import hashlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from torch import nn
+
+import finssim
+from finssim.control.guidance import Station
+from finssim.control.modes import action_mode
+from finssim.control.observations import OBSERVERS
+from finssim.control.policy import Policy
+from finssim.control.policy_description import PolicyDescription, PolicyError, VehicleIdentity
+from finssim.experiments.episodes import NOWHERE
+from finssim.experiments.players import make_player
+from finssim.learning.description import observation_schema
+from finssim.learning.experts import expert_for
+from finssim.learning.export import ExportError, export_policy
+from finssim.learning.held_evaluation import HeldEvaluation
+from finssim.learning.learners import learner_named
+from finssim.learning.recurrent import RecurrentNetwork
+from finssim.robot.pilots import PolicyPilot
+from finssim.robot.robot import Reading
+from finssim.tasks import StationKeeping
+from finssim.tasks.baselines import restarted
+from finssim.vehicles import load_vehicle
+from reference.guess import Guess
+
+FINSROV = load_vehicle("finsrov")
+STATION = Station((1.0, -0.3, -0.5), 0.6)
+READING = Reading(5.0, np.array([0.2, 0.1, -0.4]), np.array([0.0, 0.0, 0.1, 0.995]), np.full(6, 0.05), True)
+
+
+def written(network, folder, task, size):
+    """A policy directory of a network."""
+    description = PolicyDescription(
+        task=task.name,
+        observation=observation_schema(task),
+        action={**action_mode("wrench6", FINSROV).describe(), "size": size},
+        control_period=task.control_step,
+        vehicle=VehicleIdentity(name=FINSROV.name, sha256=FINSROV.sha256),
+        hydrodynamics="calibrated",
+        seed=0,
+        training={"randomization": None},
+    )
+    return export_policy(network, folder, description)
+
+
+def large(module):
+    """Weights as large as a trained network's: fresh ones answer almost nothing."""
+    with torch.no_grad():
+        for i, parameter in enumerate(module.parameters()):
+            parameter.copy_(torch.randn(parameter.shape, generator=torch.Generator().manual_seed(i)) * 0.6)
+    return module
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+    """Of station keeping, with weights from a hat."""
+    network = large(
+        RecurrentNetwork(nn.LSTM(16, 8), nn.Sequential(nn.Linear(8, 8), nn.ELU(), nn.Linear(8, 6)))
+    )
+    return written(network, tmp_path_factory.mktemp("policies") / "remembers", StationKeeping(), 6)
+
+
+def test_it_acts_as_sb3_contrib_predicts(tmp_path):
+    """Step by step with memory, each in its own row, and through the start of an episode in some rows."""
+    kind, task = learner_named("sb3-recurrent-ppo"), Guess()
+    settings = replace(kind.settings(task), worlds=4, rollout=4, batch=8, epochs=1, hidden=(8,), lstm=8)
+    learner = kind(finssim.make(task, worlds=4, seed=1), settings, seed=1)
+    large(learner.model.policy)
+    size = learner.environment.action_size
+    run = Policy.load(written(learner.network(), tmp_path / "p", task, size))
+    rng, state, memory = np.random.default_rng(2), None, run.reset(5)
+    distinct = set()
+    for k in range(12):
+        starts = np.array([k == 0, k == 0, k in (0, 4), k in (0, 4, 5), k in (0, 11)])
+        observation = rng.uniform(-1.0, 1.0, (5, 1)).astype(np.float32)
+        expected, state = learner.model.predict(observation, state, starts, deterministic=True)
+        action, memory = run.step(restarted(memory, run.reset(5), starts), observation)
+        np.testing.assert_allclose(action, expected, rtol=0, atol=2e-6)
+        np.testing.assert_allclose(memory, np.concatenate([s[0] for s in state], axis=1), rtol=0, atol=2e-6)
+        distinct |= {round(float(value), 4) for value in action[:, 0]}
+    assert len(distinct) > 30
+
+
+def test_a_memory_that_is_not_the_policys_is_refused(policy, tmp_path):
+    """None, or other rows; one for a policy that has none; and a network that remembers otherwise than is said."""
+    run, seen = Policy.load(policy), np.zeros((2, 16))
+    with pytest.raises(
+        PolicyError, match=r"given no memory, expected one of shape \(2, 16\): begin with what reset"
+    ):
+        run.act(seen)
+    with pytest.raises(PolicyError, match=r"given one of shape \(3, 16\), expected one of shape \(2, 16\)"):
+        run.step(run.reset(3), seen)
+    plain = Policy.load(written(nn.Sequential(nn.Linear(16, 6)), tmp_path / "plain", StationKeeping(), 6))
+    with pytest.raises(PolicyError, match=r"given one of shape \(2, 16\), expected no memory"):
+        plain.step(run.reset(2), seen)
+    told = yaml.safe_load((policy / "policy.yaml").read_text())
+    assert told["memory"] == 16 and plain.description.memory == 0
+    other = tmp_path / "other"
+    other.mkdir()
+    content = (policy / "policy.onnx").read_bytes()
+    (other / "policy.onnx").write_bytes(content)
+    told |= {"memory": 4, "files": {"policy.onnx": hashlib.sha256(content).hexdigest()}}
+    (other / "policy.yaml").write_text(yaml.safe_dump(told))
+    with pytest.raises(
+        PolicyError, match="maps 16 and 16 values to 6 and 16, but policy.yaml describes 16 and 4 to 6 and 4"
+    ):
+        Policy.load(other)
+
+
+def test_a_network_that_remembers_otherwise_is_not_exported(tmp_path):
+    """Here with an activation that no operator stands for; torch's exporter knows nothing of memories."""
+    network = RecurrentNetwork(nn.LSTM(16, 8), nn.Sequential(nn.Softplus(), nn.Linear(8, 6)))
+    with pytest.raises(ExportError, match="a network that remembers is written as an LSTM of one layer"):
+        written(network, tmp_path / "p", StationKeeping(), 6)
+
+
+def test_a_pilot_remembers_until_it_is_reset(policy):
+    """The thrusts of the policy's own steps; after `reset` the first ones again."""
+    pilot, run = PolicyPilot(policy, FINSROV), Policy.load(policy)
+    mode, seen = action_mode("wrench6", FINSROV), OBSERVERS["t1"].observe(READING, STATION, 0.0)
+    memory, given = run.reset(1), []
+    for _ in range(3):
+        action, memory = run.step(memory, seen)
+        given.append(pilot.act(READING, STATION, 0.0))
+        np.testing.assert_allclose(given[-1], mode.to_thrusters(action), atol=1e-9)
+    assert np.abs(given[2] - given[0]).max() > 0.1
+    pilot.reset()
+    np.testing.assert_array_equal(pilot.act(READING, STATION, 0.0), given[0])
+
+
+def test_a_player_and_an_expert_remember(policy):
+    """Both are the policy's own steps, row by row; the expert begins anew where an episode does."""
+    environment = finssim.make("t1", worlds=3, seed=4)
+    player, expert, run = (
+        make_player(policy, FINSROV, StationKeeping()),
+        expert_for(environment, policy),
+        Policy.load(policy),
+    )
+    played, shown, memory = player.reset(3), expert.reset(3), run.reset(3)
+    anew = np.array([False, True, False])
+    for k in range(3):
+        seen = environment.arrays.observation.numpy().copy()
+        expected, memory = run.step(memory, seen)
+        action, played = player.act(played, environment.arrays, NOWHERE)
+        np.testing.assert_array_equal(action, expected)
+        if k == 2:
+            expected[1] = run.step(run.reset(3), seen)[0][1]
+            shown = expert.restarted(shown, expert.reset(3), anew)
+        wanted, shown = expert.act(shown, seen)
+        np.testing.assert_array_equal(wanted, expected)
+        environment.step(action)
+
+
+class Counting(nn.Module):
+    """Remembers how often it was asked."""
+
+    memory_size = 1
+
+    def __init__(self):
+        super().__init__()
+        self.seen = []
+
+    def forward(self, observation, memory):
+        self.seen.append(memory[0].item())
+        return torch.zeros(len(observation), 6), memory + 1.0
+
+
+def test_a_held_evaluation_begins_without_memory():
+    """And carries it from step to step."""
+    held = HeldEvaluation(finssim.make(replace(StationKeeping(), time_limit=1.0), worlds=2, seed=5))
+    network = Counting()
+    for _ in range(2):
+        held(network)
+    assert network.seen == [*range(10), *range(10)]
