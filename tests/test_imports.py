@@ -59,6 +59,9 @@ TOP = {
 
 HOMES = {
     "torch": {
+        "tasks/torch_rotations.py",
+        "tasks/torch_task.py",
+        "tasks/torch_worlds.py",
         "learning/export.py",
         "learning/held_evaluation.py",
         "learning/learners/catalogue.py",

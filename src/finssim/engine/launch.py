@@ -7,7 +7,7 @@ and each thread takes its slice through all stages. Nothing crosses worlds: the 
 import os
 import queue
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import warp as wp
@@ -69,65 +69,36 @@ def default_threads() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
-class Pipeline:
-    """A fixed sequence of kernels over all worlds, recorded once and run every step.
+class _Kernels:
+    """Kernels that follow each other without anything between them, recorded by slice."""
 
-    Every kernel takes `world_offset` as its last argument and is launched over its slice's worlds, or over (worlds,
-    vehicles).
-    """
+    def __init__(self, slices: int) -> None:
+        self.recorded: list[list[wp.Launch]] = [[] for _ in range(slices)]
+        self.graph: Any = None
 
-    def __init__(self, worlds: int, device: wp.Device, threads: int | None = None) -> None:
-        """Cut `worlds` into slices: one per thread on a CPU (`threads`, default all processors), one on a GPU."""
-        self.worlds = worlds
-        self.device = device
-        count = 1
-        if device.is_cpu:
-            count = max(1, min(threads or default_threads(), worlds // MIN_SLICE))
-        edges = [worlds * i // count for i in range(count + 1)]
-        self.slices = [(a, b - a) for a, b in zip(edges, edges[1:], strict=False)]
-        self._recorded: list[list[wp.Launch]] = [[] for _ in self.slices]
-        self._graph: Any = None
-
-    def add(self, kernel: wp.Kernel, inputs: Sequence[Any], vehicles: int | None = None) -> None:
-        """Append a kernel.
-
-        Args:
-            kernel: Its last parameter is `world_offset`.
-            inputs: All arguments but `world_offset`.
-            vehicles: Launch over (worlds, vehicles) if given, else over worlds.
-        """
-        for (offset, count), commands in zip(self.slices, self._recorded, strict=True):
-            dim = count if vehicles is None else (count, vehicles)
-            command = wp.launch(
-                kernel, dim=dim, inputs=[*inputs, offset], device=self.device, record_cmd=True
-            )
-            commands.append(command)
-        self._graph = None
-
-    def run(self) -> None:
-        """Run all kernels in order and, on a CPU, return when they have finished."""
-        if self.device.is_cuda:
-            self._run_graph()
-        elif len(self._recorded) == 1:
-            for command in self._recorded[0]:
+    def run(self, device: wp.Device) -> None:
+        if device.is_cuda:
+            self._run_graph(device)
+        elif len(self.recorded) == 1:
+            for command in self.recorded[0]:
                 command.launch()
         else:
             self._run_threads()
 
-    def _run_graph(self) -> None:
-        if self._graph is None:
-            with wp.ScopedCapture(device=self.device) as capture:
-                for command in self._recorded[0]:
+    def _run_graph(self, device: wp.Device) -> None:
+        if self.graph is None:
+            with wp.ScopedCapture(device=device) as capture:
+                for command in self.recorded[0]:
                     command.launch()
-            self._graph = capture.graph
-        wp.capture_launch(self._graph)
+            self.graph = capture.graph
+        wp.capture_launch(self.graph)
 
     def _run_threads(self) -> None:
         # One pipeline at a time: the workers are shared by every simulator of the process.
         with _pool_lock:
-            while len(_workers) < len(self._recorded) - 1:
+            while len(_workers) < len(self.recorded) - 1:
                 _workers.append(_Worker())
-            jobs = [_Job(commands) for commands in self._recorded]
+            jobs = [_Job(commands) for commands in self.recorded]
             interrupt: BaseException | None = None
             try:
                 for worker, job in zip(_workers, jobs[1:], strict=False):
@@ -145,6 +116,57 @@ class Pipeline:
         for failure in (interrupt, *(job.error for job in jobs)):
             if failure is not None:
                 raise failure
+
+
+class Pipeline:
+    """A fixed sequence of kernels over all worlds, recorded once and run every step.
+
+    Every kernel takes `world_offset` as its last argument and is launched over its slice's worlds, or over (worlds,
+    vehicles). Between kernels a function may be called, once for all worlds.
+    """
+
+    def __init__(self, worlds: int, device: wp.Device, threads: int | None = None) -> None:
+        """Cut `worlds` into slices: one per thread on a CPU (`threads`, default all processors), one on a GPU."""
+        self.worlds = worlds
+        self.device = device
+        count = 1
+        if device.is_cpu:
+            count = max(1, min(threads or default_threads(), worlds // MIN_SLICE))
+        edges = [worlds * i // count for i in range(count + 1)]
+        self.slices = [(a, b - a) for a, b in zip(edges, edges[1:], strict=False)]
+        self._parts: list[_Kernels | Callable[[], None]] = []
+
+    def add(self, kernel: wp.Kernel, inputs: Sequence[Any], vehicles: int | None = None) -> None:
+        """Append a kernel.
+
+        Args:
+            kernel: Its last parameter is `world_offset`.
+            inputs: All arguments but `world_offset`.
+            vehicles: Launch over (worlds, vehicles) if given, else over worlds.
+        """
+        last = self._parts[-1] if self._parts else None
+        if not isinstance(last, _Kernels):
+            last = _Kernels(len(self.slices))
+            self._parts.append(last)
+        last.graph = None
+        for (offset, count), commands in zip(self.slices, last.recorded, strict=True):
+            dim = count if vehicles is None else (count, vehicles)
+            command = wp.launch(
+                kernel, dim=dim, inputs=[*inputs, offset], device=self.device, record_cmd=True
+            )
+            commands.append(command)
+
+    def call(self, function: Callable[[], None]) -> None:
+        """Append a function: it runs when the kernels before it have, on a GPU have been queued."""
+        self._parts.append(function)
+
+    def run(self) -> None:
+        """Run all kernels in order and, on a CPU, return when they have finished."""
+        for part in self._parts:
+            if isinstance(part, _Kernels):
+                part.run(self.device)
+            else:
+                part()
 
 
 def _finish(jobs: list[_Job]) -> BaseException | None:

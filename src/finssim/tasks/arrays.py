@@ -69,6 +69,24 @@ class Berth:
 
 
 @wp.struct
+class Answers:
+    """What the functions of a task in plain torch answered, for the kernels that go on with it; see `torch_task`."""
+
+    reward: wp.array2d(dtype=float)  # (worlds, agents)
+    terminated: wp.array(dtype=int)
+    inside: wp.array(dtype=int)  # 1: within the tolerance of success
+    counted: wp.array2d(dtype=float)  # (worlds, task.totals): what this step adds to them
+    observation: wp.array2d(dtype=float)  # (worlds, agents * size)
+    position: wp.array2d(dtype=wp.vec3)  # (worlds, vehicles), where an episode would start; world frame [m]
+    quaternion: wp.array2d(dtype=wp.quat)
+    velocity: wp.array2d(dtype=vec6)
+    goal_position: wp.array(dtype=wp.vec3)
+    goal_quaternion: wp.array(dtype=wp.quat)
+    begun: wp.array2d(dtype=float)  # (worlds, numbers): memory at the start
+    memory: wp.array2d(dtype=float)  # (worlds, numbers): what the task keeps within an episode
+
+
+@wp.struct
 class TaskArrays:
     """Inputs and outputs of a task for every world.
 
@@ -101,6 +119,7 @@ class TaskArrays:
     funnel: Funnel  # of tasks with a dock: the simulator's; its pose is the goal's
     messages: MessageTable  # of tasks whose agents talk to each other
     net: NetTable  # of tasks whose agents hold a net
+    answers: Answers  # of tasks in plain torch
     position: wp.array2d(dtype=wp.vec3)  # (worlds, vehicles), as measured: the truth, or the truth with noise
     quaternion: wp.array2d(dtype=wp.quat)
     velocity: wp.array2d(dtype=vec6)

@@ -25,7 +25,7 @@ from finssim.tasks.given import (
 from finssim.tasks.measurement import MeasurementNoise, connect_measured, measure, measurements
 from finssim.tasks.placing import place
 from finssim.tasks.saved_state import load_state, save_state
-from finssim.tasks.task import Task
+from finssim.tasks.task import Batch, Task
 from finssim.vehicles import Vehicle
 
 __all__ = ["GREATEST_SEED", "Environment", "EnvironmentSetupError", "Step"]
@@ -144,33 +144,32 @@ class Environment:
 
     def _build(self) -> None:
         self._step = self.simulator.pipeline()
-        self.parameters = parameters = self.task.parameters()
+        self.parameters = self.task.parameters()
+        self._batch = batch = Batch(self.simulator.state, self.arrays, self.parameters, self.seed)
         if self.task.others:
-            inputs = [self.simulator.state, self.arrays, parameters, self.seed]
-            self._step.add(self.task.script, inputs)
+            self.task.add_script(self._step, batch)
         add_action(self.action_mode, self.simulator, self.arrays, self.agents, self.wrench_scale)(self._step)
         self.drawing.add_step(self._step, self.seed)
         self.simulator.add_step(self._step)
         self._add_measure(self._step)
-        self._step.add(self.task.evaluate, [self.simulator.state, self.arrays, parameters])
+        self.task.add_evaluate(self._step, batch)
         self.drawing.add_end(self._step)
         if self.auto_reset:
-            self._add_start(self._step, self.arrays.done, parameters)
+            self._add_start(self._step, self.arrays.done)
         self._start = self.simulator.pipeline()
-        self._add_start(self._start, self._mask, parameters)
+        self._add_start(self._start, self._mask)
 
     def _add_measure(self, pipeline: Any) -> None:
         if self._measured:
             inputs = [self.simulator.state, self.arrays, self._seen.array, self.task.control_step, self.seed]
             pipeline.add(measure, inputs, vehicles=len(self.simulator.vehicles))
 
-    def _add_start(self, pipeline: Any, mask: wp.array, parameters: Any) -> None:
-        simulator = self.simulator
-        simulator.add_reset(pipeline, mask)
+    def _add_start(self, pipeline: Any, mask: wp.array) -> None:
+        self.simulator.add_reset(pipeline, mask)
         self.drawing.add_start(pipeline, mask, self.seed)
-        pipeline.add(self.task.spawn, [simulator.state, self.arrays, parameters, self.seed, mask])
+        self.task.add_spawn(pipeline, self._batch, mask)
         self._add_measure(pipeline)
-        pipeline.add(self.task.observe, [self.arrays, mask])
+        self.task.add_observe(pipeline, self._batch, mask)
 
     def reset(self, mask: ArrayLike | None = None, seed: int | None = None) -> NDArray[np.float32]:
         """Start new episodes.
@@ -221,7 +220,7 @@ class Environment:
         place(self, position, quaternion, goal_position, goal_quaternion)
         again = self.simulator.pipeline()
         self._add_measure(again)
-        again.add(self.task.observe, [self.arrays, self._mask])
+        self.task.add_observe(again, self._batch, self._mask)
         again.run()
         return self.arrays.observation.numpy()
 

@@ -2,13 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
 from finssim.engine import Dock, Pool
+from finssim.engine.launch import Pipeline
+from finssim.engine.state import State
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.measurement import MeasurementNoise
 from finssim.vehicles import Vehicle
@@ -25,6 +27,16 @@ class ObservationPart:
     clip: float | None = None
 
 
+class Batch(NamedTuple):
+    """What the parts of a task work on in one environment."""
+
+    state: State
+    arrays: TaskArrays
+    parameters: Any
+    """What `Task.parameters` gave."""
+    seed: int
+
+
 @dataclass(frozen=True, kw_only=True)
 class Task:
     """Base of every task: plain data; its kernels are class attributes.
@@ -32,7 +44,7 @@ class Task:
     `evaluate(state, arrays, parameters, world_offset)` after each step, `spawn(state, arrays, parameters, seed, mask,
     world_offset)` where an episode starts, `observe(arrays, mask, world_offset)` for its first observation. A task with
     `others` has `script(state, arrays, parameters, seed, world_offset)` too: it runs before each step and writes
-    `arrays.scripted`.
+    `arrays.scripted`. The `add_` methods put them where they belong; a task that is not of kernels has its own.
     """
 
     agents: ClassVar[tuple[str, ...]] = ("vehicle",)
@@ -89,6 +101,22 @@ class Task:
     def parameters(self) -> Any:
         """The struct that the kernels take."""
         raise TypeError(f"task '{self.name}' does not say what its kernels take: define parameters()")
+
+    def add_script(self, pipeline: Pipeline, batch: Batch) -> None:
+        """Append what commands the `others`, before each step."""
+        pipeline.add(self.script, [batch.state, batch.arrays, batch.parameters, batch.seed])
+
+    def add_evaluate(self, pipeline: Pipeline, batch: Batch) -> None:
+        """Append what comes after each step: reward, ends, observation."""
+        pipeline.add(self.evaluate, [batch.state, batch.arrays, batch.parameters])
+
+    def add_spawn(self, pipeline: Pipeline, batch: Batch, mask: wp.array) -> None:
+        """Append the start of an episode where mask (by world, int32) is not 0."""
+        pipeline.add(self.spawn, [batch.state, batch.arrays, batch.parameters, batch.seed, mask])
+
+    def add_observe(self, pipeline: Pipeline, batch: Batch, mask: wp.array) -> None:
+        """Append the first observation of the episodes that start where mask is not 0."""
+        pipeline.add(self.observe, [batch.arrays, mask])
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
         """How the episode that ended last went, by world.

@@ -1,0 +1,98 @@
+"""Rotations as torch tensors over a leading `...` batch: unit quaternions xyzw, as everywhere here.
+
+On a CPU `torch.atan2`, `hypot` and general powers round the last rows of a batch otherwise than the rest: a world would
+depend on how many there are. Nothing here uses them; `arctangent` stands for the first.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+__all__ = [
+    "about_axis",
+    "angle",
+    "arctangent",
+    "conjugate",
+    "heading",
+    "matrix",
+    "multiply",
+    "rotate",
+    "rotate_inverse",
+    "wrapped",
+]
+
+
+def multiply(p: Tensor, q: Tensor) -> Tensor:
+    """The rotation q, then p, (..., 4)."""
+    px, py, pz, pw = p.unbind(-1)
+    qx, qy, qz, qw = q.unbind(-1)
+    return torch.stack(
+        (
+            pw * qx + px * qw + py * qz - pz * qy,
+            pw * qy - px * qz + py * qw + pz * qx,
+            pw * qz + px * qy - py * qx + pz * qw,
+            pw * qw - px * qx - py * qy - pz * qz,
+        ),
+        dim=-1,
+    )
+
+
+def conjugate(q: Tensor) -> Tensor:
+    """The rotation back, (..., 4)."""
+    return torch.cat((-q[..., :3], q[..., 3:]), dim=-1)
+
+
+def rotate(q: Tensor, v: Tensor) -> Tensor:
+    """A vector of the body written in the world frame, (..., 3); q is body to world."""
+    axis, w = q[..., :3], q[..., 3:]
+    twice = 2.0 * torch.linalg.cross(axis, v)
+    return v + w * twice + torch.linalg.cross(axis, twice)
+
+
+def rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
+    """A vector of the world written in the body frame, (..., 3); q is body to world."""
+    return rotate(conjugate(q), v)
+
+
+def matrix(q: Tensor) -> Tensor:
+    """Rotation matrix, (..., 3, 3)."""
+    x, y, z, w = q.unbind(-1)
+    rows = (
+        *(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
+        *(2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)),
+        *(2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)),
+    )
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+def about_axis(axis: int, angle: Tensor) -> Tensor:
+    """Rotation about x (0), y (1) or z (2) by an angle [rad], (..., 4)."""
+    parts = [torch.zeros_like(angle)] * 3
+    parts[axis] = torch.sin(0.5 * angle)
+    return torch.stack((*parts, torch.cos(0.5 * angle)), dim=-1)
+
+
+def angle(q: Tensor) -> Tensor:
+    """Of a rotation, whatever its axis, in [0, π] [rad], (...)."""
+    return 2.0 * torch.atan(torch.linalg.vector_norm(q[..., :3], dim=-1) / q[..., 3].abs())
+
+
+def heading(q: Tensor) -> Tensor:
+    """Yaw of the body x axis about world z [rad], (...)."""
+    x, y, z, w = q.unbind(-1)
+    return arctangent(2.0 * (x * y + z * w), 1.0 - 2.0 * (y * y + z * z))
+
+
+def arctangent(y: Tensor, x: Tensor) -> Tensor:
+    """Angle of the point (x, y), in [-π, π] [rad]; 0 at the origin."""
+    r = torch.sqrt(x * x + y * y)
+    half = torch.atan(y / (r + x.abs()).clamp(min=torch.finfo(y.dtype).tiny))
+    return torch.where(x >= 0.0, 2.0 * half, torch.copysign(torch.full_like(y, math.pi), y) - 2.0 * half)
+
+
+def wrapped(angle: Tensor) -> Tensor:
+    """An angle brought to [-π, π] [rad]."""
+    return angle - 2.0 * math.pi * torch.round(angle / (2.0 * math.pi))

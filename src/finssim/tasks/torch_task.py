@@ -1,0 +1,247 @@
+"""A task in plain torch: four functions over all worlds at once; everything else is as with a task in Warp."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+from torch import Tensor
+
+from finssim.engine.launch import Pipeline
+from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.given import EnvironmentSetupError
+from finssim.tasks.task import Batch, Task
+from finssim.tasks.torch_kernels import Times, answers, begin_episode, finish_step, first_observation
+from finssim.tasks.torch_worlds import Worlds
+
+__all__ = ["Start", "TorchTask", "Worlds"]
+
+RESET, OBSERVE, SCORE, SCRIPT = range(4)
+"""Stages, each with draws of its own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """How an episode would begin in every world; it is taken where one begins.
+
+    Rows are (worlds, ...), of several vehicles (worlds, vehicles, ...); what is None is zero, or no rotation.
+    """
+
+    position: Tensor
+    """Body origin, world frame [m], (..., 3)."""
+    quaternion: Tensor | None = None
+    """Body to world, xyzw, (..., 4); of any length above 0."""
+    velocity: Tensor | None = None
+    """Body frame, linear and then angular [m/s, rad/s], (..., 6)."""
+    goal_position: Tensor | None = None
+    """World frame [m], (worlds, 3)."""
+    goal_quaternion: Tensor | None = None
+    """(worlds, 4)"""
+    memory: Mapping[str, Tensor] = field(default_factory=dict)
+    """The task's own numbers that do not begin at zero, (worlds, size)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TorchTask(Task):
+    """Base of tasks in plain torch. Give `name`, `observation`, and the functions; `w` is always all worlds.
+
+    Called in each step: `reward`, `terminated`, `inside`, `counted`, which see the truth, then `observe`, which sees
+    what is measured; where episodes begin `reset`, and `observe` again. Gradients are off.
+    """
+
+    memory: ClassVar[Mapping[str, int]] = {}
+    """Numbers that the task keeps within an episode: name and size. `reward` may write `w.memory[name][:] = ...`."""
+
+    hold: float = 0.0
+    """Success: inside for so long, without a break, when the episode ends [s]; at least one step."""
+
+    def reset(self, w: Worlds) -> Start:
+        """How an episode begins; what is drawn comes from `w.uniform` and `w.normal`."""
+        raise NotImplementedError(f"task '{self.name}': define reset(self, w) -> Start")
+
+    def observe(self, w: Worlds) -> Sequence[Tensor]:
+        """What an agent sees: a tensor for each part of `observation`, in the part's unit.
+
+        They are divided by the part's scale and limited to its clip here. Shapes: (worlds, size), or (worlds, agents,
+        size) of several agents; a size of 1 may be left out.
+        """
+        raise NotImplementedError(f"task '{self.name}': define observe(self, w) -> tensors")
+
+    def reward(self, w: Worlds) -> Tensor:
+        """Of the step just done: (worlds,), or (worlds, agents) of several agents."""
+        raise NotImplementedError(f"task '{self.name}': define reward(self, w) -> tensor")
+
+    def terminated(self, w: Worlds) -> Tensor:
+        """Where the episode failed, bool, (worlds,): nothing of worth could follow. Time ends it anyway."""
+        return w.zeros()
+
+    def inside(self, w: Worlds) -> Tensor:
+        """Where success has its tolerance kept, bool, (worlds,); nowhere unless defined."""
+        return w.zeros()
+
+    def counted(self, w: Worlds) -> Mapping[str, Tensor]:
+        """What this step adds to the `totals` of the episode, (worlds,) by name."""
+        return {}
+
+    def script(self, w: Worlds) -> Tensor:  # type: ignore[override]
+        """Actions of the `others` in the step to come, (worlds, others, size), each in [-1, 1]."""
+        raise NotImplementedError(f"task '{self.name}' has others: define script(self, w) -> tensor")
+
+    def parameters(self) -> Times:
+        """The times that the kernels take."""
+        times = Times()
+        times.time_limit, times.control_step = self.time_limit, self.control_step
+        return times
+
+    def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
+        """Room for what the functions answer."""
+        arrays.answers = answers(
+            worlds, len(self.vehicles), len(self.agents), self.observation_size, len(self.totals),
+            sum(self.memory.values()), device,
+        )  # fmt: skip
+
+    def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
+        """As every task's, and success."""
+        measured = super().metrics(arrays)
+        enough = max(self.hold, self.control_step) - 0.5 * self.control_step
+        return {**measured, "success": np.where(measured["held"] >= enough, 1.0, 0.0)}
+
+    def add_script(self, pipeline: Pipeline, batch: Batch) -> None:
+        """Append what commands the `others`."""
+        w, out = self._worlds(batch, SCRIPT), batch.arrays.scripted
+        pipeline.call(
+            partial(_run, batch, lambda: self._answer("script", self.script(w.begin()).flatten(1), out))
+        )
+
+    def add_evaluate(self, pipeline: Pipeline, batch: Batch) -> None:
+        """Append reward, ends and observation."""
+        true, seen = self._worlds(batch, SCORE), self._worlds(batch, OBSERVE, measured=True)
+
+        def score() -> None:
+            self._score(true.begin(), batch.arrays)
+            self._look(seen.begin(), batch.arrays)
+
+        pipeline.call(partial(_run, batch, score))
+        pipeline.add(finish_step, [batch.state, batch.arrays, batch.parameters])
+
+    def add_spawn(self, pipeline: Pipeline, batch: Batch, mask: wp.array) -> None:
+        """Append the start of an episode where mask is not 0."""
+        w = self._worlds(batch, RESET)
+        pipeline.call(partial(_run, batch, lambda: self._begin(w.begin(), batch.arrays), mask))
+        pipeline.add(begin_episode, [batch.state, batch.arrays, mask])
+
+    def add_observe(self, pipeline: Pipeline, batch: Batch, mask: wp.array) -> None:
+        """Append the first observation where mask is not 0."""
+        seen = self._worlds(batch, OBSERVE, measured=True)
+        pipeline.call(partial(_run, batch, lambda: self._look(seen.begin(), batch.arrays), mask))
+        pipeline.add(first_observation, [batch.arrays, mask])
+
+    def _worlds(self, batch: Batch, stage: int, measured: bool = False) -> Worlds:
+        return Worlds(batch, self.memory, self.control_step, stage=stage, measured=measured)
+
+    def _score(self, w: Worlds, arrays: TaskArrays) -> None:
+        given = arrays.answers
+        self._answer("reward", self.reward(w), given.reward)
+        self._answer("terminated", self.terminated(w), given.terminated)
+        self._answer("inside", self.inside(w), given.inside)
+        counted = self.counted(w)
+        if counted.keys() != set(self.totals):
+            raise EnvironmentSetupError(
+                f"task '{self.name}': counted gives {', '.join(counted) or 'nothing'}, expected the totals: "
+                f"{', '.join(self.totals) or 'none'}"
+            )
+        if counted:
+            rows = [counted[name].reshape(w.count, 1) for name in self.totals]
+            self._answer("counted", torch.cat(rows, dim=1), given.counted)
+
+    def _look(self, w: Worlds, arrays: TaskArrays) -> None:
+        parts, agents = self.observe(w), len(self.agents)
+        if len(parts) != len(self.observation):
+            raise EnvironmentSetupError(
+                f"task '{self.name}': observe gives {len(parts)} tensors, expected {len(self.observation)}: one for "
+                "each part of the observation"
+            )
+        rows = wp.to_torch(arrays.answers.observation, requires_grad=False).view(w.count, agents, -1)
+        first = 0
+        for part, given in zip(self.observation, parts, strict=True):
+            if given.numel() != w.count * agents * part.size or given.shape[0] != w.count:
+                raise EnvironmentSetupError(
+                    f"task '{self.name}': observe gives '{part.name}' of shape {tuple(given.shape)}, expected "
+                    f"{_shape(w.count, agents, part.size)}"
+                )
+            values = given.reshape(w.count, agents, part.size)
+            values = values if part.scale == 1.0 else values / part.scale
+            rows[..., first : first + part.size] = (
+                values if part.clip is None else values.clamp(-part.clip, part.clip)
+            )
+            first += part.size
+
+    def _begin(self, w: Worlds, arrays: TaskArrays) -> None:
+        given, start = arrays.answers, self.reset(w)
+        upright = w.full((0.0, 0.0, 0.0, 1.0))
+        each = upright if len(self.vehicles) == 1 else upright[:, None].expand(-1, len(self.vehicles), -1)
+        self._answer("reset: position", start.position, given.position)
+        self._answer(
+            "reset: quaternion", each if start.quaternion is None else start.quaternion, given.quaternion
+        )
+        for name, value, out in (
+            ("velocity", start.velocity, given.velocity),
+            ("goal_position", start.goal_position, given.goal_position),
+        ):
+            if value is None:
+                out.zero_()
+            else:
+                self._answer(f"reset: {name}", value, out)
+        goal = upright if start.goal_quaternion is None else start.goal_quaternion
+        self._answer("reset: goal_quaternion", goal, given.goal_quaternion)
+        unknown = start.memory.keys() - self.memory.keys()
+        if unknown:
+            raise EnvironmentSetupError(
+                f"task '{self.name}': reset gives memory '{min(unknown)}', expected of: "
+                f"{', '.join(self.memory) or 'none'}"
+            )
+        if self.memory:
+            rows = [start.memory.get(name, w.zeros(size)) for name, size in self.memory.items()]
+            whole = torch.cat([row.reshape(w.count, -1) for row in rows], dim=1)
+            self._answer("reset: memory", whole, given.begun)
+
+    def _answer(self, name: str, value: Any, out: wp.array) -> None:
+        """Copy what a function gave to where the kernels look for it."""
+        place = wp.to_torch(out, requires_grad=False)
+        if (
+            not isinstance(value, Tensor)
+            or value.numel() != place.numel()
+            or value.shape[0] != place.shape[0]
+        ):
+            got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+            wanted = tuple(n for i, n in enumerate(place.shape) if n > 1 or i != 1)
+            raise EnvironmentSetupError(f"task '{self.name}': {name} gives {got}, expected a tensor {wanted}")
+        place.copy_(value.reshape(place.shape))
+
+
+def _shape(worlds: int, agents: int, size: int) -> tuple[int, ...]:
+    return (worlds, size) if agents == 1 else (worlds, agents, size)
+
+
+def _run(batch: Batch, function: Callable[[], None], mask: wp.array | None = None) -> None:
+    """Call what works in torch, in the order of Warp's kernels; on a CPU only if mask, where given, is set anywhere."""
+    with _in_line(batch.state.steps.device), torch.no_grad():
+        if mask is None or mask.device.is_cuda or bool(wp.to_torch(mask).any()):
+            function()
+
+
+@contextmanager
+def _in_line(device: wp.Device) -> Iterator[None]:
+    """On a GPU: torch queues its work after the kernels that Warp queued."""
+    if device.is_cpu:
+        yield
+    else:
+        with torch.cuda.stream(wp.stream_to_torch(device)):
+            yield
