@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import socket
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -13,6 +14,8 @@ from finssim.experiments.sweep.worker import play
 
 __all__ = ["running", "spread"]
 
+PATIENCE = 10.0
+"""For an answer to a first knock [s]."""
 RETRIES = 3
 """How often a job is begun anew after its worker was lost."""
 
@@ -33,6 +36,9 @@ def running(address: str | None, processes: int | None) -> Iterator[int]:
     except ImportError as error:
         raise SweepError("a sweep needs Ray: pip install 'finssim[sweep]'") from error
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    if address is not None:
+        _knock(address)
     local: dict[str, Any] = {
         "num_cpus": processes,
         "include_dashboard": False,
@@ -51,6 +57,19 @@ def running(address: str | None, processes: int | None) -> Iterator[int]:
         yield int(ray.cluster_resources().get("CPU", 1))
     finally:
         ray.shutdown()
+
+
+def _knock(address: str) -> None:
+    """Refuse an address where nothing listens at once: Ray itself tries for minutes."""
+    if address == "auto":
+        return
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not host or not port.isdigit():
+        raise SweepError(f"address is '{address}', expected HOST:PORT or auto")
+    try:
+        socket.create_connection((host, int(port)), timeout=PATIENCE).close()
+    except (OSError, OverflowError) as error:
+        raise SweepError(f"no Ray cluster answers at {address}: {error}") from error
 
 
 def spread(jobs: Sequence[Job], done: Callable[[Job, dict[str, Any] | None, bytes, str], None]) -> None:
