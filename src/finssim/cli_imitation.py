@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -15,12 +15,18 @@ __all__ = ["collect", "datasets"]
 
 
 def collect(
-    expert: Annotated[
-        str, typer.Argument(help="A policy's directory, or a baseline of the task.", metavar="DIR|NAME")
+    experts: Annotated[
+        list[str],
+        typer.Argument(
+            help="A policy's directory or a baseline of the task; or records of driven vehicles (.mcap).",
+            metavar="DIR|NAME|RECORD...",
+        ),
     ],
     task: Annotated[str, typer.Option(help="Task to be shown; finssim tasks lists them.", metavar="TASK")],
-    episodes: Annotated[int, typer.Option(help="How many; each agent's is one of its own.", min=1)],
     out: Annotated[Path, typer.Option(help="Folder of the data set.", metavar="DATASET")],
+    episodes: Annotated[
+        int | None, typer.Option(help="How many; each agent's is one of its own. Not of records.", min=1)
+    ] = None,
     vehicle: Vehicle = "finsrov",
     hydrodynamics: Hydrodynamics = "calibrated",
     action: Annotated[
@@ -40,14 +46,45 @@ def collect(
             help="Noise on what is done, not on what is written, in parts of full action: shows recoveries."
         ),
     ] = 0.0,
+    goal: Annotated[
+        str | None,
+        typer.Option(
+            help="Of records: where to, in place of what they say: x,y,z,yaw_deg [m, deg], or end: where each stretch "
+            "ended; of t2 the trajectory.",
+            metavar="GOAL",
+        ),
+    ] = None,
     seed: Seed = 42,
     as_json: Json = False,
 ) -> None:
-    """Let an expert do a task and keep its episodes as a Minari data set.
+    """Keep episodes of a task as a Minari data set: let an expert do it, or take what was done with a vehicle.
 
     Example: finssim collect pid --task t1 --episodes 200 --out demonstrations/hold
     """
     start_warp()
+    records = [Path(word) for word in experts if word.endswith(".mcap")]
+    if records and (len(records) < len(experts) or episodes or randomize or disturb):
+        raise typer.BadParameter(
+            "records are taken as they are, and by themselves: leave out other experts, --episodes, --randomize and "
+            "--disturb"
+        )
+    if not records and (len(experts) > 1 or episodes is None or goal is not None):
+        raise typer.BadParameter("give one expert and --episodes, and no --goal, which is of records")
+    if records:
+        from finssim.experiments.driven.command import collect_records
+
+        told = collect_records(records, task, out=out, vehicle=vehicle, action=action, goal=goal)
+    else:
+        options = {
+            "vehicle": vehicle, "hydrodynamics": hydrodynamics, "action": action, "randomize": randomize,
+            "observe": observe, "disturb": disturb, "seed": seed,
+        }  # fmt: skip
+        told = _shown(experts[0], task, episodes or 0, out, options)
+    _tell(told, out, as_json)
+
+
+def _shown(expert: str, task: str, episodes: int, out: Path, options: dict[str, Any]) -> dict[str, Any]:
+    """Let an expert act in the simulator, with a bar."""
     from rich.console import Console
     from rich.progress import Progress
 
@@ -56,18 +93,24 @@ def collect(
     screen = Console(stderr=True)
     with Progress(console=screen, transient=True, disable=not screen.is_terminal) as progress:
         bar = progress.add_task("collecting", total=1.0)
-        told = run(
-            expert, task, episodes=episodes, out=out, vehicle=vehicle, hydrodynamics=hydrodynamics, action=action,
-            randomize=randomize, observe=observe, disturb=disturb, seed=seed,
-            show=lambda part: progress.update(bar, completed=part),
+        return run(
+            expert, task, episodes=episodes, out=out,
+            show=lambda part: progress.update(bar, completed=part), **options,
         )  # fmt: skip
+
+
+def _tell(told: dict[str, Any], out: Path, as_json: bool) -> None:
     if as_json:
         print(json.dumps(told, allow_nan=False))
         return
     measures = ", ".join(
-        f"{name} {value:.4g}" for name, value in told["metrics"].items() if value is not None
+        f"{name} {value:.4g}" for name, value in told.get("metrics", {}).items() if value is not None
     )
-    print(f"{told['episodes']} episodes, {told['steps']:,} steps; means: {measures}")
+    print(f"{told['episodes']} episodes, {told['steps']:,} steps{'; means: ' * bool(measures)}{measures}")
+    for source in told.get("records", ()):
+        print(
+            f"{source['file']}: {source['driver']}, {source['episodes']} episodes, {source['steps']:,} steps"
+        )
     print(f"written: {out}")
 
 

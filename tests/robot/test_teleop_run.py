@@ -1,5 +1,6 @@
 """A whole drive by hand over a wire: starts disarmed, drives while held, ends without thrust, and is on record."""
 
+import json
 import os
 import signal
 import socket
@@ -119,36 +120,52 @@ def test_a_drive_is_recorded(world, tmp_path):
     assert told["topics"]["/finsrov/thruster_cmd"]["messages"] > 100
 
 
+class Hold:
+    """Asks for the same everywhere."""
+
+    name, period, needs_state = "hold", 0.05, False
+
+    def describe(self):
+        return {"name": self.name}
+
+    def reset(self):
+        pass
+
+    def act(self, reading, guide, t):
+        return np.full(8, 1.0)
+
+
+class Modes(Script):
+    """The mode button at 1 s and at 2 s."""
+
+    def __init__(self):
+        super().__init__(drives=False)
+
+    def read(self, now):
+        return replace(super().read(now), mode=1.0 <= now < 1.1 or 2.0 <= now < 2.1)
+
+
 def test_the_mode_button_hands_over_to_a_controller_and_back(world):
     """The controller's thrust comes from 1 s on, the person's zeros again from 2 s on."""
-
-    class Hold:
-        name, period, needs_state = "hold", 0.05, False
-
-        def describe(self):
-            return {"name": self.name}
-
-        def reset(self):
-            pass
-
-        def act(self, reading, guide, t):
-            return np.full(8, 1.0)
-
-    class Modes(Script):
-        def read(self, now):
-            return replace(super().read(now), mode=1.0 <= now < 1.1 or 2.0 <= now < 2.1)
-
-    drive(
-        VEHICLE,
-        Modes(drives=False),
-        world.ours,
-        other=Hold(),
-        duration=3.0,
-        clock=world.clock,
-        wait=world.wait,
-    )
+    drive(VEHICLE, Modes(), world.ours, other=Hold(), duration=3.0, clock=world.clock, wait=world.wait)
     moving = [t for t, frame in world.frames if frame.enable and any(frame.normalised)]
     assert 1.0 <= moving[0] < 1.2 and 2.0 <= moving[-1] < 2.3
+
+
+def test_who_steers_is_on_record(world, tmp_path):
+    """An event at every press of the mode button."""
+    pytest.importorskip("mcap")
+    pytest.importorskip("rosbags")
+    from finssim.robot.record_reader import open_record
+    from finssim.robot.recorder import Recorder
+
+    how = {"other": Hold(), "duration": 3.0, "clock": world.clock, "wait": world.wait}
+    with Recorder(tmp_path / "drive.mcap", VEHICLE, {}) as recorder:
+        drive(VEHICLE, Modes(), world.ours, recorder=recorder, **how)
+    with open_record(tmp_path / "drive.mcap") as record:
+        told = [json.loads(entry.message.data) for entry in record.messages(["events"])]
+    modes = [(event["text"], event["time"]) for event in told if event["kind"] == "mode"]
+    assert modes == [("other", pytest.approx(1.0, abs=0.05)), ("person", pytest.approx(2.0, abs=0.05))]
 
 
 @pytest.mark.parametrize(

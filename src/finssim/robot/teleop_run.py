@@ -71,7 +71,10 @@ def drive(
 
     def turn(running: Runtime) -> bool:
         if running.reading is not None:
+            before = switch.mode
             operator.turn(running.reading.time, running.bridge)
+            if recorder is not None and switch.mode != before:
+                recorder.event(running.reading.time, "mode", switch.mode)
         if show is not None:
             show(running, operator)
         return False

@@ -1,0 +1,164 @@
+"""Episodes of a drive: its stretches at a task's period, seen by the task's own observation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.control.guidance import Guide, Station
+from finssim.control.modes import Thruster8, Wrench6
+from finssim.control.observations import Observer
+from finssim.control.trajectories import load_trajectory
+from finssim.experiments.driven.actions import actions_of
+from finssim.experiments.driven.drive import Drive, DriveError
+from finssim.geometry.rotations import quat_yaw
+from finssim.learning.demonstrations import Episode
+from finssim.vehicles import Vehicle
+
+__all__ = ["END", "episodes_of", "indices_of"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+END = "end"
+"""In place of a goal: where a stretch ended."""
+NEAR = 0.25
+"""A decision may lie so far from the task's grid of times, in parts of its period."""
+SAME_GOAL = 1.0e-3
+"""Recorded goals that differ by no more are one, or lie on the trajectory [m, rad]."""
+
+
+class _Seen(NamedTuple):
+    """The estimate at one decision."""
+
+    position: Array
+    quaternion: Array
+    nu: Array
+
+
+def episodes_of(
+    drive: Drive, task: str, observer: Observer, mode: Thruster8 | Wrench6, vehicle: Vehicle,
+    *, period: float, goal: Station | str | None = None,
+) -> list[Episode]:  # fmt: skip
+    """Demonstrations of a drive; none where it has no stretch of two decisions.
+
+    Rewards are not known: they are NaN. An episode is never `terminated`; its measures are its `length` in steps and
+    `began`, the robot's time of its first decision [s].
+
+    Args:
+        drive: What was done.
+        task: Its name.
+        observer: How it is observed.
+        mode: In which it is acted.
+        vehicle: Which was driven.
+        period: Between two actions of the task [s].
+        goal: In place of the recorded one: a station, or `END`; of a task that follows a trajectory its name or file.
+
+    Raises:
+        DriveError: Decisions further apart than the task's, no goal, or commands that the mode cannot ask for.
+    """
+    if drive.period > period * (1.0 + 1e-6):
+        raise DriveError(
+            f"{drive.path}: {drive.driver} decided every {drive.period:g} s, expected at most {period:g} s, the period "
+            f"of {task}: it cannot be taken for a controller of that task"
+        )
+    guide_of = _guides(drive, task, goal)
+    stretches = indices_of(drive, period, split_goals=task == "t1" and goal is None)
+    if not stretches:
+        return []
+    try:
+        actions = actions_of(drive.force[np.concatenate(stretches)], mode, vehicle)
+    except DriveError as error:
+        raise DriveError(f"{drive.path}: {error}") from None
+    found, first = [], 0
+    for rows in stretches:
+        guide = guide_of(rows)
+        seen = [_Seen(drive.position[i], drive.quaternion[i], drive.nu[i]) for i in rows]
+        times = np.nan_to_num(drive.since[rows])
+        observation = [observer.observe(s, guide, float(t)) for s, t in zip(seen, times, strict=True)]
+        found.append(
+            Episode(
+                observation=np.array(observation, dtype=np.float32),
+                action=actions[first : first + len(rows) - 1],
+                reward=np.full(len(rows) - 1, np.nan, dtype=np.float32),
+                terminated=False,
+                metrics={"length": float(len(rows) - 1), "began": float(drive.time[rows[0]])},
+            )
+        )
+        first += len(rows)
+    return found
+
+
+def indices_of(drive: Drive, period: float, *, split_goals: bool) -> list[Indices]:
+    """Decisions, one a period, of each stretch that has at least two.
+
+    Args:
+        drive: What was done.
+        period: [s]
+        split_goals: Whether another goal begins another stretch.
+    """
+    number = drive.stretch
+    changed = np.diff(number) != 0
+    if split_goals:
+        changed = changed | (np.abs(np.diff(drive.goal, axis=0)) > SAME_GOAL).any(axis=1)
+    runs = np.split(np.arange(len(number)), np.flatnonzero(changed) + 1)
+    pieces = [piece for run in runs if number[run[0]] >= 0 for piece in _on_grid(run, drive.time, period)]
+    return [piece for piece in pieces if len(piece) >= 2]
+
+
+def _on_grid(run: Indices, time: Array, period: float) -> list[Indices]:
+    """The decisions nearest to a grid of times that begins with the first; a new grid after every gap."""
+    t = time[run]
+    pieces, piece = [], [0]
+    while (wanted := t[piece[0]] + len(piece) * period) <= t[-1] + 1e-6:
+        after = int(np.searchsorted(t, wanted))
+        near = max(after - 1, 0) if after == len(t) or wanted - t[after - 1] < t[after] - wanted else after
+        if abs(t[near] - wanted) <= NEAR * period:
+            piece.append(near)
+        else:
+            pieces.append(piece)
+            piece = [after]
+    return [run[p] for p in (*pieces, piece)]
+
+
+def _guides(drive: Drive, task: str, goal: Station | str | None) -> Callable[[Indices], Guide]:
+    """What tells a stretch's guide from the indices of its decisions."""
+    if task != "t1":
+        trajectory = _trajectory(drive, str(goal or drive.guide))
+        return lambda rows: trajectory
+    if isinstance(goal, Station):
+        return lambda rows: goal
+    if goal == END:
+        return lambda rows: _ended(drive, rows)
+    if not drive.has_goal:
+        raise DriveError(
+            f"{drive.path}: was driven by hand to no goal: give --goal x,y,z,yaw_deg, where to, or --goal {END}: where "
+            "each stretch ended"
+        )
+    return lambda rows: _station(drive.goal[rows[0]])
+
+
+def _station(goal: Sequence[float] | Array) -> Station:
+    x, y, z, yaw = map(float, goal)
+    return Station((x, y, z), yaw)
+
+
+def _ended(drive: Drive, rows: Indices) -> Station:
+    return _station((*drive.position[rows[-1]], float(quat_yaw(drive.quaternion[rows[-1]]))))
+
+
+def _trajectory(drive: Drive, name: str) -> Guide:
+    """The trajectory that was followed, checked against the recorded goals."""
+    if np.isnan(drive.since).any():
+        raise DriveError(f"{drive.path}: does not say when its trajectory began: not a record of finssim run")
+    guide = load_trajectory(name)
+    off = float(np.linalg.norm(guide.at(drive.since).position - drive.goal[:, :3], axis=1).max())
+    if off > SAME_GOAL:
+        raise DriveError(
+            f"{drive.path}: its goals are up to {off:.3g} m off the trajectory '{name}': give --goal, the name or the "
+            "file of what was followed"
+        )
+    return guide
