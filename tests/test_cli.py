@@ -48,6 +48,8 @@ COMMANDS = [
     "backproject",
     "run",
     "pool",
+    "tasks",
+    "tasks show",
     "randomize",
     "randomize show",
     "randomize fit",

@@ -48,6 +48,7 @@ TOP = {
     "cli_robot",
     "cli_ros2",
     "cli_study",
+    "cli_tasks",
     "cli_trials",
     "cli_view",
     "cli_vision",

@@ -22,6 +22,7 @@ from finssim import (
     cli_robot,
     cli_ros2,
     cli_study,
+    cli_tasks,
     cli_trials,
     cli_view,
     cli_vision,
@@ -43,6 +44,7 @@ vehicles_app = typer.Typer(invoke_without_command=True, rich_markup_mode=None, a
 app.add_typer(vehicles_app, name="vehicles")
 app.command()(cli_learn.train)
 app.command()(cli_learn.evaluate)
+app.add_typer(cli_tasks.tasks_app, name="tasks")
 app.command()(cli_imitation.collect)
 app.command()(cli_imitation.datasets)
 app.command()(cli_study.compare)

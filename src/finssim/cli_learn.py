@@ -18,7 +18,7 @@ def train(
         str,
         typer.Argument(
             help="Task to learn: t1 (station keeping), t2 (trajectory tracking), t3 (moving target), docking, pursuit, "
-            "team-pursuit or formation.",
+            "team-pursuit or formation; or one's own, FILE.py:CLASS.",
             metavar="TASK",
         ),
     ],
@@ -100,7 +100,9 @@ def evaluate(
     ],
     task: Annotated[
         str,
-        typer.Option(help="Task to be tried on: t1 (station keeping) or t2 (trajectories).", metavar="TASK"),
+        typer.Option(
+            help="Task to be tried on; finssim tasks lists them. One's own: FILE.py:CLASS.", metavar="TASK"
+        ),
     ] = "t1",
     vehicle: Vehicle = "finsrov",
     hydrodynamics: Hydrodynamics = "calibrated",

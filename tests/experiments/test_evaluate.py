@@ -23,7 +23,7 @@ from finssim.experiments.trials import run_trials
 from finssim.files import OutputError
 from finssim.learning.description import observation_schema
 from finssim.learning.export import export_policy
-from finssim.tasks import StationKeeping
+from finssim.tasks import EnvironmentSetupError, StationKeeping
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")
@@ -210,7 +210,7 @@ def test_a_plant_may_change_what_a_policy_was_trained_for(policy, monkeypatch):
     ("controller", "options", "error", "sentence"),
     [
         ("no/such/policy", {}, PolicyError, "no such policy directory"),
-        ("pid", {"task": "t9"}, EvaluationError, "unknown task 't9'; available: t1"),
+        ("pid", {"task": "t9"}, EnvironmentSetupError, "unknown task 't9'; available: t1"),
         ("pid", {"trials": 0}, EvaluationError, "trials is 0, expected 1 or more"),
         ("pid", {"plant": "pool"}, PlantError, "no plant 'pool'"),
         ("pid", {"plant": ["lag", "pool"]}, PlantError, "no plant 'pool'"),

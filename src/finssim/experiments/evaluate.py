@@ -27,7 +27,7 @@ from finssim.experiments.trials import run_trials
 from finssim.files import atomic_directory
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
-from finssim.tasks import TASKS
+from finssim.tasks import task_named
 from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["EVALUATION_FILE", "Evaluation", "EvaluationError", "evaluate", "evaluate_controller"]
@@ -76,7 +76,7 @@ def evaluate(
 
     Args:
         controller: A policy directory, pid or pid-paper.
-        task: Key of `TASKS`.
+        task: Key of `TASKS`, or FILE.py:CLASS of one's own.
         vehicle: A vehicle, a catalogue name or a file.
         hydrodynamics: Model, unless the plant names one.
         plant: Name or file, or several.
@@ -171,7 +171,7 @@ def evaluate_controller(
         raise EvaluationError(f"trials is {trials}, expected 1 or more")
     start_warp()
     body = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
-    the_task = TASKS[task]()
+    the_task = task_named(task)
     guides = {"guides": [load_trajectory(x, vehicle=body) for x in trajectories]} if trajectories else {}
     player = make_player(controller, body, the_task, Trim() if trim else None)
     if trim and not isinstance(player, PolicyPlayer):
@@ -268,6 +268,5 @@ EPISODIC = Form(
 
 
 def _form(task: str) -> Form:
-    if task not in TASKS:
-        raise EvaluationError(f"unknown task '{task}'; available: {', '.join(TASKS)}")
+    task_named(task)  # which refuses one that there is not
     return FORMS.get(task, EPISODIC)

@@ -105,6 +105,7 @@ class Docking(Task):
     An episode goes on when it has succeeded: staying in is what pays. Sizes are ours: nothing is published.
     """
 
+    title: ClassVar[str] = "enter a funnel nose first, gently"
     name: str = "docking"
     totals: ClassVar[tuple[str, ...]] = ("success", "success_time", "contact_impulse", "peak_force", "crash")
     observation: tuple[ObservationPart, ...] = OBSERVATION
@@ -198,6 +199,10 @@ class Docking(Task):
         place = Berth()
         place.nose, place.depth = 0.5 * self.hull.length, self.berth * self.dock().tube_length
         arrays.berth = place
+
+    def success_rule(self) -> str:
+        """See `Task`."""
+        return f"nose in the tube, slow, for {self.hold:g} s, without a crash"
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
         """As every task's; success (docked for `hold` at any time, and no crash), its time [s], contact.

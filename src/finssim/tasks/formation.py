@@ -86,6 +86,7 @@ class Formation(OpenWater):
         *("success", "torn", "left", "held_time", "shape_error", "to_net", "to_goal", "stretched"),
     )
 
+    title: ClassVar[str] = "catch what drifts in a net and carry it, three together"
     name: str = "formation"
     observation: tuple[ObservationPart, ...] = field(default=OBSERVATION, repr=False)
     time_limit: float = 60.0
@@ -147,6 +148,10 @@ class Formation(OpenWater):
         arrays.messages = message_table(
             self.communication, worlds, len(self.agents), self.control_step, 2.0 * self.bounds, device
         )
+
+    def success_rule(self) -> str:
+        """See `Task`."""
+        return f"the target held within {self.goal_radius:g} m of the goal for {self.hold:g} s"
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
         """As every task's, and the time until it was delivered [s], nan where it was not."""

@@ -10,6 +10,7 @@ from finssim.engine.randomize import Randomization
 from finssim.tasks.catalogue import TASKS
 from finssim.tasks.environment import Environment, EnvironmentSetupError
 from finssim.tasks.measurement import OBSERVED, MeasurementNoise
+from finssim.tasks.own import own_task
 from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle
 
@@ -17,15 +18,19 @@ __all__ = ["make", "task_named"]
 
 
 def task_named(task: str | Task, **settings: Any) -> Task:
-    """A task by its name, with settings of its own.
+    """A task by its name, or one's own by FILE.py:CLASS or MODULE:CLASS, with settings of its own.
 
     Raises:
         EnvironmentSetupError: There is none of that name.
     """
     if isinstance(task, Task):
         return task
+    if task not in TASKS and ":" in task:
+        return own_task(task, **settings)
     if task not in TASKS:
-        raise EnvironmentSetupError(f"unknown task '{task}'; available: {', '.join(TASKS)}")
+        raise EnvironmentSetupError(
+            f"unknown task '{task}'; available: {', '.join(TASKS)}; or one's own: FILE.py:CLASS"
+        )
     made: Task = TASKS[task](**settings)
     return made
 

@@ -68,6 +68,7 @@ class MovingTarget(Task):
     and tolerances are the published ones; across the pool its box is what the walls leave (published: 2.5 m).
     """
 
+    title: ClassVar[str] = "stay with a target that changes its course"
     name: str = "t3"
     totals: ClassVar[tuple[str, ...]] = ("success", "success_time", "squared_error")
     observation: tuple[ObservationPart, ...] = OBSERVATION
@@ -136,6 +137,13 @@ class MovingTarget(Task):
         motion.until = wp.zeros(worlds, dtype=wp.float32, device=device)
         motion.rng = wp.zeros(worlds, dtype=wp.uint32, device=device)
         arrays.target = motion
+
+    def success_rule(self) -> str:
+        """See `Task`."""
+        return (
+            f"{self.tolerance:g} m, {self.slip_tolerance:g} m/s and {self.rate_tolerance:g} rad/s from the target for "
+            f"{self.hold:g} s"
+        )
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
         """As every task's; success (10 steps in tolerance at any time), its time [s], error after `settle` (RMS) [m].

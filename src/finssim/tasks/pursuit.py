@@ -91,6 +91,7 @@ class Pursuit(OpenWater):
     others: ClassVar[tuple[str, ...]] = ("prey",)
     totals: ClassVar[tuple[str, ...]] = ("captured", "left", "closest")
 
+    title: ClassVar[str] = "catch a prey, one against one"
     name: str = "pursuit"
     observation: tuple[ObservationPart, ...] = field(default=CHASE, repr=False)
     time_limit: float = 60.0
@@ -122,6 +123,10 @@ class Pursuit(OpenWater):
         """The prey's speed and thrust from the vehicles: pursuer, prey."""
         speed = prey_speed(self.prey_speed, vehicles[:1], vehicles[1])
         return replace(self, speed=speed, prey_drive=DriveNumbers.of(vehicles[1]))
+
+    def success_rule(self) -> str:
+        """See `Task`."""
+        return f"within {self.radius:g} m at no more than {self.relative_speed:g} m/s for {self.hold:g} s"
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
         """As every task's; success: captured; capture_time [s], nan where it was not."""

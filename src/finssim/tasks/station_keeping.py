@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -209,6 +209,7 @@ def observe(arrays: TaskArrays, mask: wp.array(dtype=int), world_offset: int):
 class StationKeeping(Task):
     """T1. Lengths in metres, angles in radians, world frame with z up and 0 on the water."""
 
+    title: ClassVar[str] = "reach a pose in the pool and hold it"
     name: str = "t1"
     observation: tuple[ObservationPart, ...] = OBSERVATION
     goal_low: tuple[float, float, float] = (-1.2, -0.5, -0.82)
@@ -239,6 +240,11 @@ class StationKeeping(Task):
     evaluate = staticmethod(evaluate)
     spawn = staticmethod(spawn)
     observe = staticmethod(observe)
+
+    def success_rule(self) -> str:
+        """See `Task`."""
+        turn = math.degrees(self.yaw_tolerance)
+        return f"{self.tolerance:g} m per axis and {turn:g}° in yaw for {self.hold:g} s, at the end"
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
         """As every task's, and success: held for `hold` seconds when the episode ended."""

@@ -51,10 +51,14 @@ class Task:
     """Names of the vehicles that learn, in the order of the world's vehicles."""
     others: ClassVar[tuple[str, ...]] = ()
     """Names of the vehicles after them, which the task commands."""
+    title: ClassVar[str] = ""
+    """What is to be done, in a few words."""
     action: ClassVar[str] = "wrench6"
     """Action mode, unless another is asked for."""
     pool: ClassVar[Pool | None] = Pool()
     """Walls and floor, unless others are asked for; None is open water."""
+    levels: ClassVar[int] = 0
+    """How many there are, of a task whose setting `level` says how hard it is; 0: it has none."""
     totals: ClassVar[tuple[str, ...]] = ()
     """Names of what the kernels count in `arrays.totals`; zero at the start of an episode, and a part of `metrics`."""
 
@@ -97,6 +101,11 @@ class Task:
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """Give `arrays` what only this task uses; nothing unless the task says so."""
+
+    def success_rule(self) -> str:
+        """What counts as a success, with its numbers, in a few words."""
+        hold = getattr(self, "hold", None)
+        return "as metrics tells" if hold is None else f"within its tolerance for {hold:g} s, at the end"
 
     def parameters(self) -> Any:
         """The struct that the kernels take."""

@@ -117,6 +117,8 @@ class TeamPursuit(OpenWater):
     others: ClassVar[tuple[str, ...]] = ("prey",)
     totals: ClassVar[tuple[str, ...]] = ("captured", "left", "closest", "closest_to_net", "gap")
 
+    levels: ClassVar[int] = len(LEVELS)
+    title: ClassVar[str] = "drive a prey into a net, three against one"
     name: str = "team-pursuit"
     observation: tuple[ObservationPart, ...] = field(default=(*CHASE, *MATE, *MATE), repr=False)
     spawn_radius: float = 1.5
@@ -187,6 +189,18 @@ class TeamPursuit(OpenWater):
         arrays.messages = message_table(
             self.communication, worlds, len(self.agents), self.control_step, 2.0 * self.bounds, device
         )
+
+    def success_rule(self) -> str:
+        """See `Task`."""
+        rules = self.rules
+        net = f"the prey within {rules.net_reach:g} m of the net for {rules.hold:g} s"
+        near = f"a vehicle within {rules.proximity:g} m of the prey"
+        return {
+            "net": net,
+            "touch": f"the net touches the prey, to {self.touch:g} m",
+            "proximity": near,
+            "either": f"{net}, or {near}",
+        }[rules.capture]
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
         """As every task's; success: captured; capture_time [s], nan where it was not."""

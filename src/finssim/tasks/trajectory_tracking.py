@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -86,6 +86,8 @@ class TrajectoryTracking(Task):
     beyond its walls) and that their speed is drawn, since what is to be followed is slow.
     """
 
+    levels: ClassVar[int] = len(LEVELS)
+    title: ClassVar[str] = "follow a moving reference, whatever the heading"
     name: str = "t2"
     observation: tuple[ObservationPart, ...] = OBSERVATION
     time_limit: float = 30.0
@@ -139,6 +141,10 @@ class TrajectoryTracking(Task):
         """Room for every world's reference, from the start to what is seen at the end."""
         knots = math.ceil((self.time_limit + 3.0 * LOOK_AHEAD) / self.knot_spacing) + 2
         arrays.reference = reference_table(worlds, knots, self.knot_spacing, device)
+
+    def success_rule(self) -> str:
+        """See `Task`."""
+        return f"{self.tolerance:g} m from the reference for {self.hold:g} s, at the end"
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
         """As every task's, and success: held for `hold` seconds when the episode ended."""

@@ -1,0 +1,119 @@
+"""A task as plain data: what is seen, done, rewarded and called a success, as vehicles do it."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Sequence
+from dataclasses import asdict, fields, is_dataclass
+from typing import Any
+
+from finssim.control.modes import Thruster8, action_mode
+from finssim.tasks.attribute_docs import attribute_docs
+from finssim.tasks.baselines import BASELINES
+from finssim.tasks.given import crew
+from finssim.tasks.make import task_named
+from finssim.tasks.task import Task
+from finssim.vehicles import Vehicle
+
+__all__ = ["describe_task"]
+
+APART = ("name", "observation", "control_step", "substeps", "time_limit", "training_noise")
+"""Fields that are told by themselves."""
+
+
+def describe_task(
+    task: str | Task, vehicle: Vehicle | str | Sequence[Vehicle | str] = "finsrov", action: str | None = None
+) -> dict[str, Any]:
+    """Everything about a task.
+
+    Args:
+        task: A task, its name, or FILE.py:CLASS of one's own.
+        vehicle: Whose numbers: one for all places, or one for each.
+        action: Mode; the task's own if None.
+
+    Returns:
+        Plain data: title, agents, others, observation, action, reward, success, settings, baselines, ...
+
+    Raises:
+        EnvironmentSetupError: There is no such task, or the vehicle cannot do it.
+        ControlError: There is no such action mode.
+        VehicleError: There is no such vehicle.
+    """
+    the_task = task_named(task)
+    mode = action or the_task.action
+    vehicles = crew(vehicle, the_task, mode)
+    the_task = the_task.fitted(vehicles)
+    noise = asdict(the_task.training_noise)
+    return {
+        "name": the_task.name,
+        "title": title_of(the_task),
+        "vehicles": {
+            place: {"name": one.name, "sha256": one.sha256}
+            for place, one in zip(the_task.vehicles, vehicles, strict=True)
+        },
+        "agents": list(the_task.agents),
+        "others": list(the_task.others),
+        "observation": {"size": the_task.observation_size, "parts": _observation(the_task)},
+        "action": _action(mode, vehicles[0]),
+        "period_s": the_task.control_step,
+        "substeps": the_task.substeps,
+        "time_limit_s": the_task.time_limit,
+        "levels": the_task.levels,
+        "reward": _reward(the_task),
+        "success": the_task.success_rule(),
+        "settings": _settings(the_task),
+        "training_noise": {name: value for name, value in noise.items() if value},
+        "baselines": list(BASELINES.get(the_task.name, {})),
+    }
+
+
+def title_of(task: Task) -> str:
+    """What is to be done, in a few words."""
+    return task.title or (inspect.getdoc(type(task)) or "").partition("\n")[0].rstrip(".")
+
+
+def _observation(task: Task) -> list[dict[str, Any]]:
+    parts, first = [], 0
+    for part in task.observation:
+        parts.append({"first": first, **asdict(part)})
+        first += part.size
+    return parts
+
+
+def _action(mode: str, vehicle: Vehicle) -> dict[str, Any]:
+    """What 1 and -1 of every component stand for."""
+    chosen = action_mode(mode, vehicle)
+    if isinstance(chosen, Thruster8):
+        ends = [
+            (low * k, high * k) for low, high, k in zip(chosen.lower, chosen.upper, chosen.scale, strict=True)
+        ]
+        units = ["N"] * len(ends)
+    else:
+        most = [chosen.limits[axis] * chosen.scale[axis] for axis in chosen.axes]
+        ends = [(-x, x) for x in most]
+        units = ["N" if axis < 3 else "N m" for axis in chosen.axes]
+    components = [
+        {"name": label, "low": low, "high": high, "unit": unit}
+        for label, (low, high), unit in zip(chosen.labels, ends, units, strict=True)
+    ]
+    return {"mode": mode, "size": len(components), "components": components}
+
+
+def _reward(task: Task) -> dict[str, Any]:
+    """Weights by name and what is written of them; or what is written of the function of a task in torch."""
+    own: Any = getattr(task, "reward", None)
+    if is_dataclass(own) and not isinstance(own, type):
+        return {"weights": asdict(own), "told": inspect.getdoc(type(own)) or ""}
+    return {"weights": {}, "told": (inspect.getdoc(own) or "") if callable(own) else ""}
+
+
+def _settings(task: Task) -> list[dict[str, Any]]:
+    """What can be changed, and what is drawn in every episode."""
+    docs, told = attribute_docs(type(task)), []
+    for field in fields(task):
+        value = getattr(task, field.name)
+        if field.name in APART or field.name == "reward":
+            continue
+        plain = asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
+        told.append({"name": field.name, "value": plain, "told": docs.get(field.name, "")})
+    return told
