@@ -229,7 +229,7 @@ def test_a_learner_whose_numbers_run_away_is_stopped(tmp_path):
 @pytest.mark.parametrize(
     ("options", "error", "sentence"),
     [
-        ({"task": "t9"}, TrainingError, "unknown task 't9'; available: t1"),
+        ({"task": "t9"}, EnvironmentSetupError, "unknown task 't9'; available: t1"),
         ({"vehicle": "finsro"}, VehicleError, "did you mean 'finsrov'"),
         ({"randomize": "hold"}, RangesError, "no ranges 'hold'"),
         ({"action": "wrench5"}, ValueError, "unknown action mode 'wrench5'"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,8 @@ from finssim.files import atomic_directory, refuse_unwritable
 from finssim.learning.description import observation_schema, task_record
 from finssim.learning.learners import learner_named
 from finssim.quiet import start_warp
-from finssim.tasks import TASKS, Environment, Task, make, task_named
+from finssim.tasks import Environment, Task, make, task_named
+from finssim.tasks.levels import LevelPlan, climb
 from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["TrainingError", "settings_of_words", "train"]
@@ -58,7 +59,7 @@ def train(
     which a killed training goes on to the same result.
 
     Args:
-        task: Key of `TASKS`, or a task.
+        task: Key of `TASKS`, FILE.py:CLASS of one's own, or a task.
         out: Policy directory to write; an earlier policy there is replaced.
         learner: Key of `LEARNERS`.
         vehicle: A vehicle, a catalogue name or a file.
@@ -80,7 +81,8 @@ def train(
         The policy directory.
 
     Raises:
-        TrainingError: Unknown task, or numbers that do not fit.
+        EnvironmentSetupError: Unknown task.
+        TrainingError: Numbers that do not fit.
         LearningError: Unknown learner or setting, a task that the learner cannot train, or numbers that ran away.
         ResumeError: Nothing to go on from, or another training.
         KeyboardInterrupt: After Ctrl-C, when the policy so far, if there is one, has been written.
@@ -89,8 +91,6 @@ def train(
     for name, number in (("worlds", worlds), ("steps", steps)):
         if number is not None and number < 1:
             raise TrainingError(f"{name} is {number}, expected 1 or more")
-    if isinstance(task, str) and task not in TASKS:
-        raise TrainingError(f"unknown task '{task}'; available: {', '.join(TASKS)}")
     kind, the_task = learner_named(learner), task_named(task)
     kind.check(the_task)
     chosen = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
@@ -108,6 +108,7 @@ def train(
 
     checkpoint = last_checkpoint(side) if resume else None
     randomized = randomization is not None
+    plan, settings = _level_plan(settings or {})
     values = kind.settings(the_task, randomized=randomized, worlds=worlds, steps=steps, changes=settings)
     # A second thread gains little on so small a network, and loses much where anything else computes.
     torch.set_num_threads(1)
@@ -121,6 +122,8 @@ def train(
     asymmetric = randomized and getattr(values, "asymmetric", False)
     environment = worlds_of(values.worlds, randomization, seed, privileged=asymmetric)
     the_task = environment.task  # fitted to the vehicle
+    if plan is not None:
+        climb(environment, plan)
     description = PolicyDescription(
         task=the_task.name,
         observation=observation_schema(the_task),
@@ -137,6 +140,7 @@ def train(
             "randomization": randomization.ranges.model_dump(mode="json") if randomization else None,
             "task": task_record(the_task),
             "agents": list(the_task.agents),
+            "levels": asdict(plan) if plan else None,
         },
     )
     began = time.perf_counter()
@@ -146,7 +150,8 @@ def train(
         loop = Loop(
             kind(environment, values, seed=seed, device=device), description, side,
             evaluate=HeldEvaluation(worlds_of(HELD_WORLDS, _whole(randomization), held_seed(seed)), device),
-            show=view.update, progress=environment.set_progress, identity=_identity(description),
+            show=view.update, progress=environment.set_progress, also=lambda: _level(environment),
+            identity=_identity(description),
         )  # fmt: skip
         if checkpoint is not None:
             loop.resume(checkpoint)
@@ -157,6 +162,21 @@ def train(
     place = (interrupted or _place_beside(Path(out), side)) if stopped else Path(out)
     _finish(loop, place, stopped, console, place if stopped else shown or place, time.perf_counter() - began)
     return place
+
+
+def _level_plan(settings: Mapping[str, Any]) -> tuple[LevelPlan | None, dict[str, Any]]:
+    """How the task's level rises, if a setting of it is given; and the settings of the learner."""
+    kinds = {field.name: type(field.default) for field in fields(LevelPlan)}
+    try:
+        own = {name: kinds[name](value) for name, value in settings.items() if name in kinds}
+    except (TypeError, ValueError) as error:
+        raise TrainingError(f"settings of levels: {error}; expected such as level_at=0.8") from error
+    rest = {name: value for name, value in settings.items() if name not in kinds}
+    return (LevelPlan(**own) if own else None), rest
+
+
+def _level(environment: Environment) -> dict[str, float]:
+    return {"level": environment.levels.level} if environment.levels else {}
 
 
 def settings_of_words(words: Sequence[str]) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -27,6 +27,9 @@ from finssim.tasks.placing import place
 from finssim.tasks.saved_state import load_state, save_state
 from finssim.tasks.task import Batch, Task
 from finssim.vehicles import Vehicle
+
+if TYPE_CHECKING:
+    from finssim.tasks.levels import Levels
 
 __all__ = ["GREATEST_SEED", "Environment", "EnvironmentSetupError", "Step"]
 
@@ -129,6 +132,8 @@ class Environment:
         self._measured = self.noise.present or bool(randomization and randomization.changes_sensors)
         connect_measured(self._measured, self.simulator.state, self.arrays)
         self.drawing = Drawing(randomization, self.simulator, self.arrays, self._seen, task, privileged)
+        self.levels: Levels | None = None
+        """How the task's level rises, after `climb` of `finssim.tasks.levels`."""
         self._build()
         self.reset(seed=self.seed)
 
@@ -242,15 +247,24 @@ class Environment:
         self._step.run()
         self._steps += 1
         self.drawing.after_step()
+        if self.levels is not None:
+            self.levels.after_step()
         # On a GPU the look costs a copy, so frozen worlds wait there for a while, reported as terminated meanwhile.
         look = self.device.is_cpu or self._steps % GPU_FROZEN_CHECK == 0
         if look and self.simulator.state.frozen.numpy().any():
             self._revive()
 
     def set_progress(self, done: float) -> None:
-        """Tell how much of the training is done, in [0, 1]: ranges may grow with it; without effect where none do."""
+        """Tell how much of the training is done, in [0, 1]: ranges may grow with it, and the level may rise now."""
         if self.drawing.schedule is not None:
             self.drawing.schedule.progress(done)
+        if self.levels is not None:
+            self.levels.rise()
+
+    def change(self, task: Task) -> None:
+        """Go on with other settings of the same task: the episodes that run end by them."""
+        self.task = task.fitted(self.simulator.vehicles)
+        self._build()
 
     def _revive(self) -> None:
         """Report the worlds that froze, then start new episodes there; their step counts as terminated."""

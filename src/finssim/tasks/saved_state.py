@@ -26,6 +26,8 @@ def save_state(environment: "Environment") -> dict[str, NDArray[Any]]:
     reported = sorted(simulator._reported)
     if environment.drawing.schedule is not None:
         saved["counters.schedule"] = np.array(environment.drawing.schedule._steps)
+    if environment.levels is not None:
+        saved.update(environment.levels.state())
     saved["counters.reported"] = np.array(reported, dtype=np.int64).reshape(-1, 2)
     return saved
 
@@ -37,6 +39,8 @@ def load_state(environment: "Environment", saved: Mapping[str, NDArray[Any]]) ->
         EnvironmentSetupError: The environment was made with other arguments: a name or shape does not fit.
     """
     _set_seed(environment, int(saved["counters.seed"]))
+    if environment.levels is not None:
+        environment.levels.load(saved)
     arrays = dict(_arrays(environment))
     wanted = {name for name in saved if not name.startswith("counters.")}
     if arrays.keys() != wanted:
