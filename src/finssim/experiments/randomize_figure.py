@@ -44,10 +44,12 @@ def draw_spread(
         axes.plot(t, nominal[axis], color=BLACK, linewidth=1.8, label="as the file has it")
         axes.set_ylabel(LABELS[axis])
         axes.grid(True, color="0.88", linewidth=0.6)
+        axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
         axes.set_xlim(0.0, float(t[-1]))
     for axes in figure.axes[2:]:
         axes.set_xlabel("time since the step [s]")
+    figure.align_ylabels()
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     figure.suptitle(title, fontsize=10)

@@ -49,7 +49,7 @@ def draw_comparison(groups: Sequence[Group], result: Mapping[str, Any], path: Pa
     height = 0.42 * len(groups) + 0.9
     columns = max(len(measures), len(curves) + pairs)
     figure = Figure(figsize=(2.4 + 2.6 * columns, height + 3.4), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(height, 3.4))
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(height, 3.4))[:, 0]
     above.suptitle("interquartile means, with 95 % intervals over the seeds", fontsize=9)
     for k, axes in enumerate(_row(above, len(measures))):
         _intervals(axes, groups, result, measures[k], labels=k == 0)
