@@ -160,7 +160,8 @@ def test_a_mistake_is_named(task, sentence):
         check_task(task())
 
 
-def test_the_page_shows_the_example():
+@pytest.mark.parametrize("name", ["own_task", "own_task_torch"])
+def test_the_page_shows_the_example(name):
     """Word for word, so that what is read is what runs."""
     page = (EXAMPLE.parents[1] / "docs" / "own_task.md").read_text(encoding="utf-8")
-    assert f"```py\n{EXAMPLE.read_text(encoding='utf-8')}```" in page
+    assert f"```py\n{(EXAMPLE.parent / f'{name}.py').read_text(encoding='utf-8')}```" in page

@@ -145,13 +145,16 @@ def _repeats(first: Played, again: Played, many: Played) -> Iterator[str]:
     """Equal seeds, equal numbers, for any number of worlds."""
     pairs = [(a, b) for a, b in zip(first[:4], again[:4], strict=True)]
     if not all(np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in pairs):
-        yield "equal seeds give other numbers: draw from wp.rand_init(seed and episode, world) alone"
+        yield "equal seeds give other numbers: draw from wp.rand_init(seed and episode, world) or w.uniform alone"
         return
     if not all(
         np.array_equal(a, b[:, :WORLDS], equal_nan=a.dtype.kind == "f")
         for a, b in zip(first[:4], many[:4], strict=True)
     ):
-        yield "a world's numbers depend on how many worlds there are: index by the world's number, with world_offset"
+        yield (
+            "a world's numbers depend on how many worlds there are: index by the world's number, with world_offset; in "
+            "torch, do not mix rows, and take arctangent of torch_rotations for atan2"
+        )
 
 
 def _leaks(first: Played, past: Played) -> Iterator[str]:
@@ -170,7 +173,7 @@ def _starts(played: Played) -> Iterator[str]:
     """What is seen after a reset differs between worlds and episodes."""
     starts = played.observation[played.ended]
     if len(starts) > 1 and len({row.tobytes() for row in starts}) == 1:
-        yield "every episode starts alike: draw something in spawn, from the seed, the episode and the world"
+        yield "every episode starts alike: draw something in spawn or reset, from the seed, the episode and the world"
 
 
 def _metrics(played: Played) -> Iterator[str]:
