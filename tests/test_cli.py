@@ -187,6 +187,7 @@ def test_an_interrupted_training_leaves_a_policy(tmp_path):
     ("words", "sentence"),
     [
         (["train", "t9"], "unknown task 't9'; available: t1"),
+        (["train", "nowhere.py:Mine"], "there is no file nowhere.py: give FILE.py:CLASS"),
         (["train", "t1", "--action", "wrench7"], "unknown action mode 'wrench7'"),
         (["train", "t1", "--vehicle", "finrov"], "did you mean 'finsrov'"),
         (["train", "t1", "--hydrodynamics", "fosen"], "unknown hydrodynamic model 'fosen'"),
