@@ -40,7 +40,8 @@ def play(job: Job) -> tuple[dict[str, Any], bytes]:
         trained = time.perf_counter() - began
         results = {
             name: evaluate_controller(
-                out, load_plant(name), task=job.task, vehicle=job.vehicle, trials=job.trials).result
+                out, load_plant(name), task=job.task, vehicle=job.vehicle, trials=job.trials
+            ).result
             for name in job.plants
         }
         row = {"training_s": trained, "machine": socket.gethostname(), "plants": results}
