@@ -157,7 +157,7 @@ def test_simulate_refuses_in_a_sentence(capsys, tmp_path):
 def test_an_interrupted_training_leaves_a_policy(tmp_path):
     """Control-C ends with 130, one sentence and no traceback; the policy so far is whole, and says it is not done."""
     out = tmp_path / "hold"
-    words = ["train", "t1", "--steps", "30000000", "--out", str(out)]
+    words = ["train", "t1", "--steps", "2000000", "--out", str(out)]
     run = subprocess.Popen([sys.executable, "-m", "finssim", *words], stderr=subprocess.PIPE, text=True)
     seen = next(line for line in run.stderr if "training" in line)
     run.send_signal(signal.SIGINT)
