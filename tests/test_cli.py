@@ -274,12 +274,3 @@ def test_validate_takes_the_model_it_is_given(capfd):
     assert [result["hydrodynamics"] for result in results] == ["calibrated", "simplified"]
     speeds = [[response["simulated"] for response in result["responses"]] for result in results]
     assert speeds[0] != speeds[1]
-
-
-@pytest.mark.long
-def test_bench_as_json(capfd):
-    """The rates by model or action and world count, and the machine they were measured on."""
-    assert finssim("bench", "--json") == 0
-    result = json.loads(capfd.readouterr().out)
-    assert {"physics_steps_per_s", "env_steps_per_s", "faces_per_s", "machine"} <= result.keys()
-    assert all(rate > 0 for rate in result["physics_steps_per_s"].values())
