@@ -166,7 +166,7 @@ def test_simulate_refuses_in_a_sentence(capsys, tmp_path):
 def test_an_interrupted_training_leaves_a_policy(tmp_path):
     """Control-C ends with 130, one sentence and no traceback; the policy so far is whole, and says it is not done."""
     out = tmp_path / "hold"
-    words = ["train", "t1", "--steps", "30000000", "--out", str(out)]
+    words = ["train", "t1", "--steps", "2000000", "--out", str(out)]
     run = subprocess.Popen([sys.executable, "-m", "finssim", *words], stderr=subprocess.PIPE, text=True)
     seen = next(line for line in run.stderr if "training" in line)
     run.send_signal(signal.SIGINT)
@@ -290,12 +290,3 @@ def test_validate_takes_the_model_it_is_given(capfd):
     assert [result["hydrodynamics"] for result in results] == ["calibrated", "simplified"]
     speeds = [[response["simulated"] for response in result["responses"]] for result in results]
     assert speeds[0] != speeds[1]
-
-
-@pytest.mark.long
-def test_bench_as_json(capfd):
-    """The rates by model or action and world count, and the machine they were measured on."""
-    assert finssim("bench", "--json") == 0
-    result = json.loads(capfd.readouterr().out)
-    assert {"physics_steps_per_s", "env_steps_per_s", "faces_per_s", "machine"} <= result.keys()
-    assert all(rate > 0 for rate in result["physics_steps_per_s"].values())
