@@ -92,14 +92,15 @@ LEVELS = (
 class TeamReward:
     """Weights of the reward besides the level's stake; each term has one reason.
 
-    team: progress · (way gained towards a capture)       by the rule of the level; adds up to the whole way [m]
+    team: progress · (way gained towards a capture)       by the rule of the level; over an episode it adds up to the
+                                                          whole way [m]; a small weight is lost beside the stake
         - distance · min(gap / 8 m, 1) - step             a slope everywhere, and sooner is better
     herder: + drive · cos(angle between the way to the prey and the way on to the net)     it stands behind the prey
     netters: - spread · | span - 0.7 net_length |         an open net, which is not torn
     each: - bump, nearer than `collision` to another      - action · mean(a²) - change · mean(Δa²)
     """
 
-    progress: float = 1.0
+    progress: float = 4.0
     distance: float = 0.05
     step: float = 0.005
     drive: float = 0.01

@@ -15,12 +15,23 @@ Table = dict[str, dict[str, dict[str, Any]]]
 """Task -> `ppo` or a learner's name, which outranks it -> changes of the defaults. `*` is every task, which the task's
 own lines outrank."""
 
+CHASE: dict[str, dict[str, Any]] = {
+    # A capture lies far ahead: ten seconds of foresight. It is worth so much more than a step that what the value is
+    # wrong by must not use up the gradient that policy and value share; RSL-RL's do not share one.
+    "ppo": {"discount": 0.99, "value_weight": 0.05, "learning_rate": 2.0e-3, "steps": 1_000_000},
+    "rsl-rl": {"value_weight": 1.0},
+}
+
 SETTINGS: Table = {
     "t2": {
         # A reference is close all the time: one second of foresight is enough, and learns faster than five.
         "ppo": {"discount": 0.9},
         "sb3-sac": {"discount": 0.9},
     },
+    # So is a target that moves, once it has been reached.
+    "t3": {"ppo": {"discount": 0.95}},
+    "pursuit": CHASE,
+    "team-pursuit": {**CHASE, "ppo": {**CHASE["ppo"], "learning_rate": 2.5e-3, "steps": 2_500_000}},
 }
 """Of every training."""
 
@@ -28,6 +39,8 @@ RANDOMIZED: Table = {
     # What must be learnt is more.
     "*": {"ppo": {"steps": 3_000_000}, "sb3-sac": {"steps": 400_000}},
     "t2": {"ppo": {"steps": 2_000_000}},
+    "pursuit": {"ppo": {"steps": 2_500_000}},
+    "team-pursuit": {"ppo": {"steps": 6_000_000}},
 }
 """On top of those, where every episode has another vehicle (`--randomize`)."""
 
