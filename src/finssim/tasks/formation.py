@@ -52,6 +52,7 @@ class FormationReward:
     """Weights of the reward; each term has one reason.
 
     team: net · (way of the net to the target) + goal · (way of the target to the goal)     adds up to the whole way [m]
+                                                          small weights are lost beside what success is worth
         - shape · (mean error of an edge, in sides)       a triangle with equal sides
         - step                                            sooner is better
         + success, once                                   more than all the rest
@@ -61,8 +62,8 @@ class FormationReward:
     Published are bonuses for holding and for the shape in every step; with them it pays to hold for ever.
     """
 
-    net: float = 1.0
-    goal: float = 1.5
+    net: float = 4.0
+    goal: float = 4.0
     shape: float = 0.05
     step: float = 0.005
     bump: float = 0.02

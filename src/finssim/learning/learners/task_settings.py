@@ -16,8 +16,8 @@ Table = dict[str, dict[str, dict[str, Any]]]
 own lines outrank."""
 
 CHASE: dict[str, dict[str, Any]] = {
-    # A capture lies far ahead: ten seconds of foresight. It is worth so much more than a step that what the value is
-    # wrong by must not use up the gradient that policy and value share; RSL-RL's do not share one.
+    # A capture or delivery lies far ahead: ten seconds of foresight. It is worth so much more than a step that what the
+    # value is wrong by must not use up the gradient that policy and value share; RSL-RL's do not share one.
     "ppo": {"discount": 0.99, "value_weight": 0.05, "learning_rate": 2.0e-3, "steps": 1_000_000},
     "rsl-rl": {"value_weight": 1.0},
 }
@@ -32,15 +32,17 @@ SETTINGS: Table = {
     "t3": {"ppo": {"discount": 0.95}},
     "pursuit": CHASE,
     "team-pursuit": {**CHASE, "ppo": {**CHASE["ppo"], "learning_rate": 2.5e-3, "steps": 2_500_000}},
+    "formation": {**CHASE, "ppo": {**CHASE["ppo"], "learning_rate": 2.5e-3, "steps": 1_800_000}},
 }
 """Of every training."""
 
 RANDOMIZED: Table = {
     # What must be learnt is more.
-    "*": {"ppo": {"steps": 3_000_000}, "sb3-sac": {"steps": 400_000}},
+    "*": {"ppo": {"steps": 3_000_000}, "sb3-sac": {"steps": 800_000, "memory": 800_000}},
     "t2": {"ppo": {"steps": 2_000_000}},
     "pursuit": {"ppo": {"steps": 2_500_000}},
     "team-pursuit": {"ppo": {"steps": 6_000_000}},
+    "formation": {"ppo": {"steps": 4_000_000}},
 }
 """On top of those, where every episode has another vehicle (`--randomize`)."""
 
