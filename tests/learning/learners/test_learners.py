@@ -28,7 +28,7 @@ def small(name, task, **changes):
     kind = learner_named(name)
     few = {"worlds": 8, "rollout": 16, "hidden": (16, 16), **changes}
     if name == "sb3-sac":
-        few = {"warm_up": 100, "memory": 4000, "gradient_steps": 4, **few, "batch": 64}
+        few = {"warm_up": 100, "memory": 4000, "gradient_steps": 4, "batch": 64, **few}
     else:
         few = {"batch": 64, "epochs": 2, **few}
     few |= {"lstm": 16} if name == "sb3-recurrent-ppo" else {}
@@ -70,7 +70,14 @@ def test_it_finds_the_best_action(name, task):
     """Of a task of one step: c where +1 is seen and -c where -1, by every agent; the held evaluation says success."""
     steps = 6000 if name == "sb3-sac" else 10_000
     changes = {"worlds": 32, "learning_rate": 1e-2, "steps": steps, "discount": 0.5}
-    changes |= {"gradient_steps": 40} if name == "sb3-sac" else {}
+    if name == "sb3-sac":  # what PPO gets from many rollouts, it gets from learning much from few
+        changes |= {
+            "gradient_steps": 80,
+            "learning_rate": 5e-3,
+            "warm_up": 1500,
+            "hidden": (32, 32),
+            "batch": 128,
+        }
     learner = made(name, task(), **changes)
     before = learner.update()
     while learner.steps < steps:
@@ -78,15 +85,8 @@ def test_it_finds_the_best_action(name, task):
     network, seen = learner.network(), torch.tensor([[1.0], [-1.0]])
     with torch.no_grad():
         action = asked(network, seen, first_memory(network, 2))[0].numpy()
-    tolerance = (
-        0.2 if name == "sb3-sac" else 0.1
-    )  # SAC is paid for noise too, and keeps away from the limits for it
-    assert np.abs(action - BEST * np.array([[1.0], [-1.0]])).max() < tolerance
-    assert (
-        row.keys() == before.keys()
-        and row["held"] > before["held"]
-        and row["mean_return"] > (0.7 if name == "sb3-sac" else 0.9)
-    )
+    assert np.abs(action - BEST * np.array([[1.0], [-1.0]])).max() < 0.1
+    assert row.keys() == before.keys() and row["held"] > before["held"] and row["mean_return"] > 0.9
     held = HeldEvaluation(finssim.make(task(), worlds=8, seed=77))(network)
     assert held["evaluation_success"] == 1.0 and held["evaluation_return"] > 0.96
 
@@ -168,6 +168,12 @@ def test_settings_are_changed_by_name():
 def test_a_memory_smaller_than_the_warm_up_is_refused():
     with pytest.raises(LearningError, match="warm_up is 5000, expected less than the memory of 100 steps"):
         made("sb3-sac", Guess(), memory=100, warm_up=5000)
+
+
+def test_entropy_without_weight_is_refused():
+    """It adapts by factors, and 0 would stay 0."""
+    with pytest.raises(LearningError, match="entropy_weight is 0.0, expected more than 0"):
+        made("sb3-sac", Guess(), entropy_weight=0.0)
 
 
 @pytest.mark.parametrize("asymmetric", [True, False])
