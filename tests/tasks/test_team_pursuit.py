@@ -1,6 +1,7 @@
 """3-v-1 pursuit: the net's geometry, every capture mode and level, rewards by agent, the formation baseline."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -137,13 +138,25 @@ def test_the_worlds_reward_is_the_mean_of_its_agents():
 
 def test_progress_adds_up_to_the_way():
     """The sum of the progress terms is what the gap has become smaller by."""
-    weights = dict.fromkeys(("distance", "step", "drive", "spread", "bump", "action", "change"), 0.0)
+    weights = dict.fromkeys(("distance", "step", "drive", "stray", "spread", "bump", "action", "change"), 0.0)
     task = TeamPursuit()
     env = environment(TeamPursuit(reward=type(task.reward)(progress=1.0, **weights)), worlds=8)
     before, total = env.arrays.totals.numpy()[:, 4].copy(), 0.0
     for _ in range(30):
         total = total + env.step(np.full((8, 3, 4), 0.5)).reward[:, 0]
     np.testing.assert_allclose(total, before - env.arrays.totals.numpy()[:, 4], atol=1e-4)
+
+
+def test_a_herder_that_strays_loses_by_its_distance_to_the_prey():
+    """By d / 8 m up to one, and nobody else does."""
+    reward = TeamPursuit().reward
+    near, far = (environment(TeamPursuit(reward=replace(reward, stray=x))) for x in (0.0, 0.8))
+    for x, part in (((2.0, 0.0, -3.0), 0.5), ((-5.0, 0.0, -3.0), 1.0)):
+        rows = []
+        for env in (near, far):
+            place(env, x, (3.0, 1.0, -3.0), (3.0, -1.0, -3.0), (6.0, 0.0, -3.0))
+            rows.append(still(env).reward[0])
+        np.testing.assert_allclose(rows[0] - rows[1], [0.8 * part, 0.0, 0.0], atol=5e-3)
 
 
 def test_one_agent_out_of_bounds_costs_everybody():

@@ -96,6 +96,7 @@ class TeamReward:
                                                           whole way [m]; a small weight is lost beside the stake
         - distance · min(gap / 8 m, 1) - step             a slope everywhere, and sooner is better
     herder: + drive · cos(angle between the way to the prey and the way on to the net)     it stands behind the prey
+            - stray · min(d / 8 m, 1)                     near the prey: one far away drives nothing, and gets lost
     netters: - spread · | span - 0.7 net_length |         an open net, which is not torn
     each: - bump, nearer than `collision` to another      - action · mean(a²) - change · mean(Δa²)
     """
@@ -104,6 +105,7 @@ class TeamReward:
     distance: float = 0.05
     step: float = 0.005
     drive: float = 0.01
+    stray: float = 0.05
     spread: float = 0.005
     bump: float = 0.05
     action: float = 0.001

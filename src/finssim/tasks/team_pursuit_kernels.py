@@ -39,6 +39,7 @@ class TeamParameters:
     progress: float
     distance: float
     drive: float
+    stray: float
     spread: float
     bump: float
     action: float
@@ -112,6 +113,7 @@ def own_reward(state: State, arrays: TaskArrays, p: TeamParameters, w: int, a: i
     if a == 0:
         ahead = wp.normalize(prey - x)
         r += p.drive * wp.dot(ahead, wp.normalize(middle - prey))
+        r -= p.stray * wp.min(wp.length(prey - x) / 8.0, 1.0)
     else:
         span = wp.length(state.position[w, 2] - state.position[w, 1])
         r -= p.spread * wp.min(wp.abs(span - 0.7 * p.net_length), p.net_length)
