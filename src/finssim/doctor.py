@@ -41,11 +41,14 @@ EXTRAS = {
         "train policies, use the Gymnasium environments, record runs, draw figures and reports",
     ),
     "torchrl": Extra(
-        {"tensordict": "tensordict", "torchrl": "torchrl"}, "learn with TorchRL: PPO, IPPO, MAPPO, TensorDicts"
+        {"tensordict": "tensordict", "torchrl": "torchrl"},
+        "learn with TorchRL: PPO, IPPO, MAPPO, TensorDicts",
     ),
     "rsl-rl": Extra({"rsl-rl-lib": "rsl_rl", "tensordict": "tensordict"}, "learn with RSL-RL"),
     "skrl": Extra({"skrl": "skrl"}, "learn with skrl"),
-    "pettingzoo": Extra({"pettingzoo": "pettingzoo"}, "use tasks of several agents as PettingZoo environments"),
+    "pettingzoo": Extra(
+        {"pettingzoo": "pettingzoo"}, "use tasks of several agents as PettingZoo environments"
+    ),
     "sb3-contrib": Extra({"sb3-contrib": "sb3_contrib"}, "learn with recurrent PPO of SB3-Contrib"),
     "imitation": Extra({"minari": "minari"}, "collect demonstrations and learn from them"),
     "sweep": Extra({"ray": "ray"}, "train over seeds and settings on many processors or machines"),

@@ -109,7 +109,7 @@ class TaskArrays:
     final_length: wp.array(dtype=int)  # its control steps
     held: wp.array(dtype=float)  # time inside the success tolerance so far [s]
     final_held: wp.array(dtype=float)  # the same when the last episode ended [s]
-    totals: wp.array2d(dtype=float)  # (worlds, task.totals): what the task counts in the running episode, from 0
+    totals: wp.array2d(dtype=float)  # (worlds, task.totals): what the task counts in the episode, from 0
     final_totals: wp.array2d(dtype=float)  # the same when the last episode ended
     goal_position: wp.array(dtype=wp.vec3)  # world frame [m]
     goal_quaternion: wp.array(dtype=wp.quat)  # body to world
@@ -123,7 +123,7 @@ class TaskArrays:
     position: wp.array2d(dtype=wp.vec3)  # (worlds, vehicles), as measured: the truth, or the truth with noise
     quaternion: wp.array2d(dtype=wp.quat)
     velocity: wp.array2d(dtype=vec6)
-    privileged: wp.array2d(dtype=float)  # (worlds, agents * P): what was drawn, from nominal, about unit scale
+    privileged: wp.array2d(dtype=float)  # (worlds, agents * P): what was drawn, from nominal, unit scale
     final_privileged: wp.array2d(dtype=float)  # the same of the episode that ended last
 
 
