@@ -10,7 +10,7 @@ from finssim.experiments.episodes import EpisodeError, run_episodes, summarize_e
 from finssim.experiments.evaluate import evaluate
 from finssim.experiments.plants import load_plant
 from finssim.experiments.players import make_player
-from finssim.tasks import TASKS, task_named
+from finssim.tasks import TASKS, Environment, task_named
 from finssim.tasks.baselines import BASELINES
 from finssim.vehicles import load_vehicle
 
@@ -57,6 +57,24 @@ def test_each_world_counts_its_first_episode():
     alone = make(task, worlds=2, seed=5)
     total = sum(alone.step(np.zeros((2, 6))).reward.copy() for _ in range(10))
     assert found.metrics["return"] == pytest.approx(total, rel=1e-5)
+
+
+def test_a_world_that_breaks_has_no_measures(monkeypatch, tmp_path):
+    """Neither its last return nor that of the episode that begins in its place; the others go on."""
+    step = Environment.step
+
+    def breaking(self, action):
+        if self._steps == 2:
+            position = self.simulator.state.position.numpy().copy()
+            position[1] = np.nan
+            self.simulator.state.position.assign(position)
+        return step(self, action)
+
+    monkeypatch.setattr(Environment, "step", breaking)
+    task = task_named("t1", time_limit=1.0)
+    found = run_episodes(Still(task), task, FINSROV, NOMINAL, trials=3, crash_directory=tmp_path)
+    assert np.isfinite(found.metrics["return"]).tolist() == [True, False, True]
+    assert summarize_episodes(found.measures())["valid"] == 2
 
 
 def test_equal_seeds_are_equal_episodes():

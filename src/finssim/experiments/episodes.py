@@ -116,12 +116,12 @@ def _play(
         shape = (
             (worlds, environment.action_size) if environment.agents == 1 else (worlds, environment.agents, -1)
         )
-        broken = environment.simulator.state.frozen.numpy() != 0
         step = environment.step(np.asarray(action, dtype=np.float32).reshape(shape))
         ended = running & (step.terminated | step.truncated)
         if ended.any():
+            # A world that broke is terminated but not done; having begun anew, it is not frozen any more.
+            whole = ended & (arrays.done.numpy() != 0)
             for name, values in task.metrics(arrays).items():
-                whole = ended & ~broken
                 found[name][whole] = values[whole]
             running &= ~ended
         show(max(k + 1, 1) / longest)
