@@ -139,7 +139,7 @@ def test_a_tethers_entry_replaces_its_own_number_and_keeps_the_others(name, give
     """A line is made where none is given."""
     simulator, draws = draw(parts_for(f"tether.{name}"), worlds=12, tether=given)
     line = given or TetherLine()
-    found = simulator.tether.numpy()[:, 0]
+    found = simulator.tether.array.numpy()[:, 0]
     for field in ("diameter", "drag_coefficient", "wet_weight"):
         expected = column(draws, f"tether.{name}") if field == name else getattr(line, field)
         np.testing.assert_allclose(found[field], expected, rtol=1e-6)

@@ -6,7 +6,7 @@ import pytest
 import finssim
 from finssim.engine import Water
 from finssim.engine.randomize import Randomization
-from finssim.engine.ranges_file import load_ranges
+from finssim.engine.ranges_file import Ranges, load_ranges
 from finssim.engine.ranges_schedule import Curriculum
 from finssim.tasks import TASKS, EnvironmentSetupError, MeasurementNoise
 
@@ -71,6 +71,16 @@ def test_ranges_that_grow_go_on_growing(by):
     other.load_state(whole.state())
     first, second = act(whole, 12, seed=1), act(other, 12, seed=1)
     assert other.drawing.schedule.width == whole.drawing.schedule.width > before
+    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+def test_tethers_that_were_drawn_are_kept():
+    """Another episode's draw, in worlds that never saw it."""
+    ranges = Ranges.model_validate({"name": "line", "tether": {"diameter": [0.005, 0.02]}})
+    whole, other = (finssim.make("t1", worlds=4, seed=1, randomize=Randomization(ranges)) for _ in range(2))
+    whole.reset()
+    other.load_state(whole.state())
+    first, second = act(whole, 12, seed=1), act(other, 12, seed=1)
     assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
 
 

@@ -190,7 +190,7 @@ class Draws:
     def add(self, pipeline: Pipeline, mask: wp.array, seed: int) -> None:
         """Append the draw for the worlds where mask (by world, int32) is not 0; refresh the plant afterwards."""
         s = self.simulator
-        places = [s.plant.array, s.tether, self._seen, s.water]
+        places = [s.plant.array, s.tether.array, self._seen, s.water]
         inputs = [*places, self._nominal, self.table, self._arrays, s.state, seed, mask]
         pipeline.add(draw_episode, inputs, vehicles=len(s.vehicles))
 

@@ -133,8 +133,8 @@ class Simulator:
         self.water = water.arrays(self.worlds, fluid.density, fluid.gravity, self.device, max_waves)
         self.water.moving = int(moves or bool(self.water.moving))
         self.walls = pool.walls() if pool else PoolWalls()
-        line, shape = tether.struct() if tether else Tether(), (self.worlds, len(self.vehicles))
-        self.tether = wp.full(shape, value=line, dtype=Tether, device=self.device)
+        self.tether = Packed(Tether, (self.worlds, len(self.vehicles)), self.device)
+        self.tether.array.fill_(tether.struct() if tether else Tether())
 
     def _hulls(self) -> None:
         meshes: list[tuple[NDArray[Any], NDArray[Any]]] = []
@@ -164,7 +164,7 @@ class Simulator:
             surge_coupled=bool(self.plant.Du.numpy().any()),
             funnel_present=self.dock is not None,
         )
-        around = [self.hull, self.water, self.walls, self.tether, self.funnel]
+        around = [self.hull, self.water, self.walls, self.tether.array, self.funnel]
         s = self.state
         clocks = [s.commands, s.history, s.steps, s.broken, s.frozen]
         inputs = [

@@ -113,6 +113,7 @@ class Drawing:
             return
         yield "values", self.draws.values
         yield "probe", self.draws.probe
-        yield from ((f"seen.{name}", array) for name, array in self._seen.fields.items())
+        for part, drawn in (("seen", self._seen), ("tether", self._simulator.tether)):
+            yield from ((f"{part}.{name}", array) for name, array in drawn.fields.items())
         if self.schedule is not None:
             yield from ((f"schedule.{name}", array) for name, array in self.schedule.arrays())
