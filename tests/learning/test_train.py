@@ -155,6 +155,14 @@ def test_the_last_two_checkpoints_are_kept_and_are_policies(tmp_path):
     assert Policy.load(folders[0]).description.training["steps_done"] == 3072
 
 
+def test_checkpoints_of_an_earlier_and_longer_training_go(tmp_path):
+    """Else they would be taken for the newest, and those of the training that runs would go."""
+    for steps in (4096, 2048):
+        train("t1", out=tmp_path / "p", **{**SMALL, "steps": steps})
+    names = sorted(folder.name for folder in (tmp_path / "p-training").glob("checkpoint-*"))
+    assert names == ["checkpoint-000001536", "checkpoint-000002048"]
+
+
 DYING = """
 import os, signal, sys
 from pathlib import Path

@@ -61,7 +61,9 @@ class Loop:
         Raises:
             LearningError: A number of the learner stopped being finite.
         """
-        log = SummaryWriter(str(self.side / "tensorboard"), purge_step=self.learner.steps or None)
+        steps = self.learner.steps
+        # TensorBoard forgets that step too: the row of the checkpoint is to stay.
+        log = SummaryWriter(str(self.side / "tensorboard"), purge_step=steps + 1 if steps else None)
         total = self.learner.settings.steps
         try:
             while self.learner.steps < total:
@@ -111,7 +113,10 @@ class Loop:
         return bool(self.learner.steps // every > before // every)
 
     def _save(self) -> None:
-        """Write a checkpoint: a policy that can be run, and the state to go on from; older ones go."""
+        """Write a checkpoint: a policy that can be run, and the state to go on from; older ones go.
+
+        So do those after more steps, which an earlier training has left: `last_checkpoint` would take them for newer.
+        """
         steps = self.learner.steps
         state = {
             "identity": dict(self.identity),
@@ -119,15 +124,18 @@ class Loop:
             "curves": self.curves,
             "seconds": self.seconds,
         }
+        place = self.side / f"checkpoint-{steps:09d}"
         export_policy(
             self.learner.network(),
-            self.side / f"checkpoint-{steps:09d}",
+            place,
             after(self.description, steps, False),
             curves=self.curves,
             also=lambda folder: write_state(state, folder / RESUME_FILE),
         )
-        for old in _checkpoints(self.side)[:-KEPT]:
-            shutil.rmtree(old)
+        found = _checkpoints(self.side)
+        after_this = found.index(place) + 1
+        for other in (*found[: max(after_this - KEPT, 0)], *found[after_this:]):
+            shutil.rmtree(other)
 
     def resume(self, state: Mapping[str, Any]) -> None:
         """Go on from what `last_checkpoint` found.
