@@ -241,3 +241,14 @@ def test_what_does_not_fit_is_refused():
         environment(Pursuit(prey_speed=1.5))
     with pytest.raises(EnvironmentSetupError, match="unknown prey mode 'lazy'"):
         Prey(mode="lazy")
+
+
+def test_a_prey_has_its_whole_thrust_however_gently_the_agents_act():
+    """What 1 stands for is the agents' own."""
+    speeds = []
+    for part in (1.0, 0.1):
+        env = Environment(Pursuit(prey=Prey(mode="straight")), worlds=2, seed=1, wrench_scale=part)
+        for _ in range(40):
+            env.step(np.zeros((2, 4)))
+        speeds.append(env.simulator.numpy("velocity")[:, 1])
+    np.testing.assert_array_equal(*speeds)

@@ -89,7 +89,7 @@ def add_action(
         simulator: Whose vehicles are commanded.
         arrays: Holds the actions.
         agents: How many of the vehicles are agents: the first ones.
-        wrench_scale: Part of each wrench limit that action 1 stands for, (6,).
+        wrench_scale: Part of each wrench limit that action 1 of an agent stands for, (6,).
 
     Returns:
         A function that appends the stage to a pipeline.
@@ -112,7 +112,9 @@ def add_action(
     axes = WRENCH_AXES[mode]
     rows = np.zeros((len(vehicles), len(axes), 6), dtype=np.float32)
     for v, most in enumerate(reach):
-        rows[v, np.arange(len(axes)), axes] = (most * wrench_scale)[list(axes)]
+        # What the task commands is in parts of the whole limits, however gently the agents are to act.
+        whole = most * wrench_scale if v < agents else most
+        rows[v, np.arange(len(axes)), axes] = whole[list(axes)]
     scale = wp.array(rows, dtype=vec6, device=device)
     inputs = [arrays, simulator.command.array, scale, agents, len(axes), data]
     return lambda pipeline: pipeline.add(wrench_action, inputs, vehicles=len(vehicles))

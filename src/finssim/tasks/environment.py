@@ -79,7 +79,7 @@ class Environment:
             worlds: How many at once.
             hydrodynamics: calibrated, mesh or simplified.
             action: thruster8, wrench6 or wrench4; the task's own if None.
-            wrench_scale: Part of each wrench limit that action 1 stands for, one number or (6,).
+            wrench_scale: Part of each wrench limit that action 1 of an agent stands for, one number or (6,).
             randomization: Drawn anew for every episode; none if None.
             noise: On what the controller sees; none if None.
             water: Currents and waves.
