@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, fields, is_dataclass
 from typing import Any
@@ -115,5 +116,14 @@ def _settings(task: Task) -> list[dict[str, Any]]:
         if field.name in APART or field.name == "reward":
             continue
         plain = asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
-        told.append({"name": field.name, "value": plain, "told": docs.get(field.name, "")})
+        told.append({"name": field.name, "value": _limited(plain), "told": docs.get(field.name, "")})
     return told
+
+
+def _limited(value: Any) -> Any:
+    """None for a limit that is infinite, such as the level speed of a vehicle that never tips over: JSON has no inf."""
+    if isinstance(value, dict):
+        return {name: _limited(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_limited(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
