@@ -3,6 +3,7 @@
 import pytest
 import yaml
 
+from finssim.experiments.plants import PlantError
 from finssim.experiments.sweep.plan import SweepError, load_sweep
 
 PLAIN = {"task": "t1", "seeds": 2, "train": {"steps": 1000}}
@@ -44,6 +45,22 @@ def test_files_are_looked_for_beside_the_sweep(tmp_path):
     assert job.vehicle == str(tmp_path / "mine.yaml") == job.options["randomize"]
 
 
+def test_a_changed_file_is_another_job(tmp_path):
+    """A plant is looked for beside the sweep too; what it says decides what comes of a job, so it is in the name."""
+    keys = []
+    for model in ("mesh", "simplified"):
+        (tmp_path / "mine.yaml").write_text(f"hydrodynamics: {model}", encoding="utf-8")
+        job = load_sweep(written(tmp_path, evaluate={"plants": ["mine.yaml"]})).jobs()[0]
+        assert job.plants == (str(tmp_path / "mine.yaml"),)
+        keys.append(job.key)
+    assert keys[0] != keys[1]
+
+
+def test_a_plant_that_is_not_there_is_told_before_any_training(tmp_path):
+    with pytest.raises(PlantError, match="no plant 'currant'.*did you mean 'current'"):
+        load_sweep(written(tmp_path, evaluate={"plants": ["nominal", "currant"]}))
+
+
 @pytest.mark.parametrize(
     "changes, sentence",
     [
@@ -53,6 +70,7 @@ def test_files_are_looked_for_beside_the_sweep(tmp_path):
         ({"seeds": []}, "expected at least one, each once"),
         ({"seeds": [1, 1]}, "expected at least one, each once"),
         ({"evaluate": {"trials": 0}}, "evaluate.trials: Input should be greater than or equal to 1"),
+        ({"evaluate": {"plants": []}}, "evaluate.plants: Tuple should have at least 1 item"),
         ({"tusk": "t1"}, "tusk: Extra inputs are not permitted"),
     ],
 )

@@ -7,12 +7,14 @@ import inspect
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from finssim.experiments.plants import load_plant
 from finssim.learning.train import train
 from finssim.tasks import TASKS
 from finssim.yaml_file import read_mapping
@@ -43,15 +45,18 @@ class Job:
     plants: tuple[str, ...]
     trials: int | None
 
-    @property
+    @cached_property  # a file that is changed while the sweep runs must not rename its jobs
     def key(self) -> str:
-        """Name of its folder: with a digest of everything that decides what comes of it, then the seed.
+        """Name of its folder: with a digest of everything that decides what comes of it, files too, then the seed.
 
         Those of a setting differ in the number at their end alone, so that `finssim compare` takes them together.
         """
         about = [self.task, self.vehicle, dict(self.options), self.plants, self.trials]
-        digest = hashlib.sha256(json.dumps(about, sort_keys=True, default=str).encode()).hexdigest()
-        return f"{self.name}-{digest[:8]}-seed{self.seed}"
+        digest = hashlib.sha256(json.dumps(about, sort_keys=True, default=str).encode())
+        for value in (self.vehicle, *self.plants, *self.options.values()):
+            if isinstance(value, str) and Path(value).is_absolute() and Path(value).is_file():
+                digest.update(Path(value).read_bytes())
+        return f"{self.name}-{digest.hexdigest()[:8]}-seed{self.seed}"
 
 
 class Evaluate(BaseModel):
@@ -59,7 +64,7 @@ class Evaluate(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    plants: tuple[str, ...] = ("nominal",)
+    plants: tuple[str, ...] = Field(default=("nominal",), min_length=1)
     trials: int | None = Field(default=None, ge=1)
 
 
@@ -125,6 +130,7 @@ def load_sweep(path: str | Path) -> Sweep:
 
     Raises:
         SweepError: It is not there, or something in it is not as expected; says where.
+        PlantError: A plant that it names is not there, or wrong: told now, and not after the first training.
     """
     data = read_mapping(Path(path), SweepError, such_as="task: t1")
     try:
@@ -134,7 +140,10 @@ def load_sweep(path: str | Path) -> Sweep:
         where = ".".join(str(part) for part in first["loc"])
         text = first["msg"].removeprefix("Value error, ")
         raise SweepError(f"{path}: {where + ': ' if where else ''}{text}") from error
-    return _with_paths(sweep, Path(path).parent)
+    sweep = _with_paths(sweep, Path(path).parent)
+    for name in sweep.evaluate.plants:
+        load_plant(name)
+    return sweep
 
 
 def _with_paths(sweep: Sweep, folder: Path) -> Sweep:
@@ -150,6 +159,9 @@ def _with_paths(sweep: Sweep, folder: Path) -> Sweep:
                 name: [_place(value, folder) for value in values] if name in FILES else values
                 for name, values in sweep.grid.items()
             },
+            "evaluate": sweep.evaluate.model_copy(
+                update={"plants": tuple(_place(name, folder) for name in sweep.evaluate.plants)}
+            ),
         }
     )
 

@@ -39,10 +39,10 @@ def play(job: Job) -> tuple[dict[str, Any], bytes]:
         train(job.task, out=out, vehicle=job.vehicle, seed=job.seed, console=quiet, **job.options)
         trained = time.perf_counter() - began
         results = {
-            name: evaluate_controller(
-                out, load_plant(name), task=job.task, vehicle=job.vehicle, trials=job.trials
+            plant.name: evaluate_controller(
+                out, plant, task=job.task, vehicle=job.vehicle, trials=job.trials
             ).result
-            for name in job.plants
+            for plant in map(load_plant, job.plants)
         }
         row = {"training_s": trained, "machine": socket.gethostname(), "plants": results}
         return row, _packed(out)
