@@ -40,6 +40,7 @@ def running(address: str | None, processes: int | None) -> Iterator[int]:
     if address is not None:
         _knock(address)
     local: dict[str, Any] = {
+        "address": "local",  # without it Ray joins a cluster that RAY_ADDRESS names, or the last one begun here
         "num_cpus": processes,
         "include_dashboard": False,
         "_node_ip_address": "127.0.0.1",
@@ -52,7 +53,8 @@ def running(address: str | None, processes: int | None) -> Iterator[int]:
             runtime_env={"env_vars": {"OMP_NUM_THREADS": "1"}},
         )
     except (ConnectionError, ValueError, RuntimeError) as error:
-        raise SweepError(f"no Ray cluster answers at {address}: {str(error).splitlines()[0]}") from error
+        what = f"no Ray cluster answers at {address}" if address else "a Ray of its own does not start here"
+        raise SweepError(f"{what}: {str(error).splitlines()[0]}") from error
     try:
         yield int(ray.cluster_resources().get("CPU", 1))
     finally:
