@@ -15,6 +15,7 @@ from finssim.experiments.compare.runs import CompareError, Group, Run
 from finssim.experiments.evaluate import evaluate_controller
 from finssim.experiments.plants import Plant
 from finssim.files import atomic_write
+from finssim.vehicles import load_vehicle
 
 __all__ = ["MEASURES", "evaluated", "less_is_better", "measures_of", "scores_of"]
 
@@ -75,7 +76,7 @@ def _trials(
 ) -> list[dict[str, Any]]:
     about = {
         "files": run.description.files,
-        "vehicle": vehicle,
+        "vehicle": load_vehicle(vehicle).sha256,
         "plant": plant.model_dump(mode="json"),
         "trials": trials,
         "seed": seed,
