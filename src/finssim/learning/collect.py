@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.control.modes import action_mode
-from finssim.learning.demonstrations import DatasetError, Episode, save
+from finssim.files import atomic_directory, refuse_unwritable
+from finssim.learning.demonstrations import DATASET_FILE, DatasetError, Episode, save
 from finssim.learning.description import observation_schema
 from finssim.learning.experts import Expert, expert_for
 from finssim.provenance import provenance
@@ -55,7 +56,7 @@ def collect(
         show: Called with the part done.
 
     Returns:
-        What the data set says of itself, with `episodes`, `steps`, `mean_return` and the means of the task's measures.
+        What the data set says of itself, with `episodes`, `steps`, and in `metrics` the means of the task's measures.
 
     Raises:
         DatasetError: A number does not fit.
@@ -63,6 +64,7 @@ def collect(
     """
     if episodes < 1 or not 0.0 <= disturb < 1.0:
         raise DatasetError(f"episodes {episodes} and disturb {disturb}: expected 1 or more, and 0 to below 1")
+    refuse_unwritable(atomic_directory(out, replaces=DATASET_FILE))
     environment = make(
         task, worlds=min(episodes, WORLDS), vehicle=vehicle, hydrodynamics=hydrodynamics, action=action,
         randomize=randomize, observe=observe, seed=seed,
