@@ -149,7 +149,8 @@ def _stretches(
         [
             states[t].state == armed and t in known and t in ready and bool(ready[t].ready)
             for t in steps.tolist()
-        ]
+        ],
+        dtype=np.bool_,
     )
     return [int(n) for n in np.where(fit, np.cumsum(~fit), -1)]
 
