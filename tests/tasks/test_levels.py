@@ -53,6 +53,22 @@ def test_a_level_rises_with_the_share_of_successes():
         assert episode(env, [1, 1, 1, 1]) == (2, 2)
 
 
+def test_worlds_that_end_early_do_not_speak_for_the_others():
+    """Where success ends an episode, the first to end are successes: the level waits for the rest."""
+    env = finssim.make(Scripted(level=1), worlds=4)
+    climb(env, LevelPlan(level_at=0.75, level_episodes=4))
+    assert episode(env, []) == (0, 0)
+    levels, late = env.levels, np.array([2, 2, 0, 0], np.int32)
+    env.simulator.state.steps.assign(late)  # two worlds are about to end
+    SUCCESSES[:] = [1, 1, 1, 1]
+    env.step(np.zeros((4, env.action_size)))
+    env.simulator.state.steps.assign(late)
+    SUCCESSES[:] = [1, 1, 1, 1]
+    env.step(np.zeros((4, env.action_size)))
+    levels.rise()
+    assert levels.level == 0 and levels.share == 1.0  # four episodes, all of two worlds
+
+
 def test_what_the_level_says_is_what_the_worlds_do():
     """The prey's speed and the rules of the capture are those of the level; shapes of references too."""
     env = finssim.make(TeamPursuit(level=3), worlds=2)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -25,7 +25,7 @@ class LevelPlan:
     level_at: float = 0.8
     """Share of successes at which it rises."""
     level_episodes: int = 200
-    """Episodes that the share is taken over; with more worlds, one of each. All begun at that level."""
+    """Episodes that the share is taken over, or a few more: as many of each world. All begun at that level."""
 
     def __post_init__(self) -> None:
         if self.level_from < 0 or not 0.0 < self.level_at <= 1.0 or self.level_episodes < 1:
@@ -57,7 +57,9 @@ class Levels:
             raise EnvironmentSetupError(
                 f"level_from is {plan.level_from}, expected at most the task's own level, {self.last}"
             )
-        self._recent: deque[float] = deque(maxlen=max(plan.level_episodes, environment.worlds))
+        # As many of each world: of the first to end, most are successes, where these end an episode early.
+        each = math.ceil(plan.level_episodes / environment.worlds)
+        self._recent = np.full((environment.worlds, each), np.nan)
         self._go(plan.level_from)
 
     @property
@@ -69,7 +71,8 @@ class Levels:
     @property
     def share(self) -> float:
         """Of successes among the episodes counted so far; 0 before the first."""
-        return float(np.mean(self._recent)) if self._recent else 0.0
+        counted = self._recent[~np.isnan(self._recent)]
+        return float(counted.mean()) if len(counted) else 0.0
 
     def after_step(self) -> None:
         """Count the episodes that ended in the step just done."""
@@ -77,12 +80,13 @@ class Levels:
         ended = (e.arrays.terminated.numpy() | e.arrays.truncated.numpy()) != 0
         counted = ended & self._whole
         if counted.any():
-            self._recent.extend(e.task.metrics(e.arrays)["success"][counted].tolist())
+            success = e.task.metrics(e.arrays)["success"]
+            self._recent[counted] = np.column_stack([self._recent[counted, 1:], success[counted]])
         self._whole |= ended
 
     def rise(self) -> None:
         """Take the next level if enough episodes succeeded; those that run end by its rules, and are not counted."""
-        full = len(self._recent) == self._recent.maxlen
+        full = not np.isnan(self._recent).any()
         if full and self.share >= self.plan.level_at and self.level < self.last:
             self._go(self.level + 1)
 
@@ -90,7 +94,7 @@ class Levels:
         """What decides how it goes on."""
         return {
             "counters.level": np.array(self.level),
-            "counters.level_recent": np.array(self._recent),
+            "counters.level_recent": self._recent.copy(),
             "counters.level_whole": self._whole.copy(),
         }
 
@@ -98,14 +102,13 @@ class Levels:
         """Go on from what `state` gave."""
         if int(saved["counters.level"]) != self.level:
             self._go(int(saved["counters.level"]))
-        self._recent.clear()
-        self._recent.extend(saved["counters.level_recent"].tolist())
+        self._recent = saved["counters.level_recent"].copy()
         self._whole = saved["counters.level_whole"].copy()
 
     def _go(self, level: int) -> None:
         task: Any = self._environment.task
         self._environment.change(replace(task, level=level))
-        self._recent.clear()
+        self._recent[:] = np.nan
         self._whole = np.zeros(self._environment.worlds, dtype=np.bool_)
 
 
