@@ -142,6 +142,22 @@ def test_unknown_names_are_refused():
 
 
 @pytest.mark.parametrize(
+    ("name", "value", "sentence"),
+    [
+        ("steps", "0", "setting steps is '0', expected 1 or more"),
+        ("hidden", ["64", "0"], "expected 1 or more"),
+        ("learning_rate", "nan", "setting learning_rate is 'nan', expected a finite number"),
+    ],
+)
+def test_settings_that_nothing_can_be_learnt_with_are_refused(name, value, sentence):
+    """Else they end in a division by zero, or after the first update; what may be left out may be 0."""
+    kind = learner_named("sb3-sac")
+    with pytest.raises(LearningError, match=sentence):
+        kind.settings(Guess(), changes={name: value})
+    assert kind.settings(Guess(), changes={"warm_up": 0}).warm_up == 0
+
+
+@pytest.mark.parametrize(
     ("name", "library", "extra"),
     [("rsl-rl", "rsl_rl.algorithms", "rsl-rl"), ("sb3-recurrent-ppo", "sb3_contrib", "sb3-contrib")],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
@@ -73,7 +74,7 @@ class LearnerKind:
         """The settings of a training; what is None keeps its default for the task.
 
         Raises:
-            LearningError: A change names no setting, or has another type than the setting's own.
+            LearningError: A change names no setting, has another type than the setting's own, or counts too few.
         """
         learner = next(name for name, kind in LEARNERS.items() if kind == self)
         own = own_settings(task.name, learner, randomized)
@@ -155,6 +156,10 @@ LEARNERS: dict[str, LearnerKind] = {
 """Learner by the name that commands take."""
 
 
+MAY_BE_ZERO = ("warm_up", "clone_passes", "expert_rounds")
+"""Settings that count what may be left out; of all others there is at least one."""
+
+
 def learner_named(name: str) -> LearnerKind:
     """The kind of that name.
 
@@ -173,14 +178,25 @@ def _fitting(settings: Any, name: str, value: Any) -> Any:
         raise LearningError(f"unknown setting '{name}'; available: {', '.join(known)}")
     kind = type(known[name])
     try:
-        if kind is tuple:
-            return tuple(int(v) for v in ([value] if isinstance(value, str | int) else value))
-        if kind is bool:
-            return {"true": True, "false": False}[str(value).lower()]
-        if kind is int and float(value) != int(value):
-            raise ValueError
-        return kind(value)
+        fitting = _as_kind(kind, value)
     except (KeyError, TypeError, ValueError) as error:
         raise LearningError(
             f"setting {name} is {value!r}, expected {kind.__name__} such as {known[name]!r}"
         ) from error
+    least = 0 if name in MAY_BE_ZERO else 1
+    counts = fitting if kind is tuple else (fitting,) if kind is int else ()
+    if any(count < least for count in counts):
+        raise LearningError(f"setting {name} is {value!r}, expected {least} or more")
+    if kind is float and not math.isfinite(fitting):
+        raise LearningError(f"setting {name} is {value!r}, expected a finite number")
+    return fitting
+
+
+def _as_kind(kind: type, value: Any) -> Any:
+    if kind is tuple:
+        return tuple(int(v) for v in ([value] if isinstance(value, str | int) else value))
+    if kind is bool:
+        return {"true": True, "false": False}[str(value).lower()]
+    if kind is int and float(value) != int(value):
+        raise ValueError
+    return kind(value)
