@@ -20,10 +20,11 @@ from finssim.tasks.docking_kernels import (
     observe_docking,
     spawn_docking,
 )
-from finssim.tasks.fitting import coefficients_of, terminal_speeds
+from finssim.tasks.fitting import coefficients_of
 from finssim.tasks.measurement import MeasurementNoise
 from finssim.tasks.task import ObservationPart, Task
 from finssim.vehicles import Vehicle
+from finssim.vehicles.capability import terminal_speeds
 
 OBSERVATION = (
     ObservationPart("nose to its berth, body frame", 3, "m", scale=DISTANCE_SCALE),
@@ -57,11 +58,12 @@ class Hull:
     def of(cls, vehicle: Vehicle) -> "Hull":
         """Of a vehicle's file."""
         length, width, height = map(float, vehicle.body.size)
+        model = coefficients_of(vehicle)
         return cls(
             length,
             0.5 * math.hypot(width, height),
-            float(axis_model(vehicle, coefficients_of(vehicle)).inertia[0]),
-            min(float(terminal_speeds(vehicle)[0]), BRISK * length),
+            float(axis_model(vehicle, model).inertia[0]),
+            min(float(terminal_speeds(vehicle, model)[0]), BRISK * length),
             float(vehicle.wrench_limits[0]),
         )
 

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-from finssim.control.pole_placement import axis_model
 from finssim.vehicles import HydrodynamicSet, Vehicle
+from finssim.vehicles.capability import terminal_speeds
 
-__all__ = ["Fit", "coefficients_of", "driven_axes", "fit", "terminal_speeds"]
+__all__ = ["Fit", "coefficients_of", "driven_axes", "fit"]
 
 LENGTH = 0.6
 """Vehicles up to this long have the published pool, which FinsROV (0.56 m) fits [m]; for others everything grows."""
@@ -47,18 +44,9 @@ def coefficients_of(vehicle: Vehicle) -> str:
     return sets[0] if sets and "calibrated" not in sets else "calibrated"
 
 
-def terminal_speeds(vehicle: Vehicle) -> NDArray[np.float64]:
-    """Speed along each axis at the wrench limit, d1 v + d2 v² = tau, (6,) [m/s, rad/s]; infinite without damping."""
-    model = axis_model(vehicle, coefficients_of(vehicle))
-    d1, d2, tau = model.linear_damping, model.quadratic_damping, vehicle.wrench_limits
-    with np.errstate(divide="ignore", invalid="ignore"):
-        speed = 2.0 * tau / (d1 + np.sqrt(d1**2 + 4.0 * d2 * tau))
-    return np.asarray(np.where(d1 + d2 > 0.0, speed, np.inf))
-
-
 def fit(vehicle: Vehicle) -> Fit:
     """Room in proportion to the vehicle's length, speeds in proportion to the room or to what it can do, the lesser."""
     size = max(1.0, float(max(vehicle.body.size)) / LENGTH)
-    speeds = terminal_speeds(vehicle)[list(driven_axes(vehicle))]
+    speeds = terminal_speeds(vehicle, coefficients_of(vehicle))[list(driven_axes(vehicle))]
     slowest = float(speeds.min()) if len(speeds) else 0.0
     return Fit(size, min(size, slowest / SLOWEST_SPEED), max(1.0, float(vehicle.body.mass) / MASS))
