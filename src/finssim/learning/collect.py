@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.control.modes import action_mode
+from finssim.control.policy_description import plain_data
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.learning.demonstrations import DATASET_FILE, DatasetError, Episode, save
 from finssim.learning.description import observation_schema
@@ -85,7 +86,7 @@ def collect(
         "seed": seed,
         "provenance": provenance(),
     }
-    save(out, found, _plain(described))
+    save(out, found, plain_data(described))
     means = {
         name: float(np.nanmean(values))
         if np.isfinite(values := np.array([e.metrics[name] for e in found])).any()
@@ -161,12 +162,3 @@ def _episode(
         terminated=terminated,
         metrics=metrics,
     )
-
-
-def _plain(value: Any) -> Any:
-    """Tuples as lists and arrays as lists, for JSON."""
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(v) for v in value]
-    return value.item() if isinstance(value, np.generic) else value
