@@ -118,7 +118,9 @@ class TeamPursuit(OpenWater):
 
     agents: ClassVar[tuple[str, ...]] = ("herder", "left_netter", "right_netter")
     others: ClassVar[tuple[str, ...]] = ("prey",)
-    totals: ClassVar[tuple[str, ...]] = ("captured", "left", "closest", "closest_to_net", "gap")
+    totals: ClassVar[tuple[str, ...]] = (
+        *("captured", "left", "closest", "closest_to_net", "gap", "to_net", "to_agent"),
+    )
 
     levels: ClassVar[int] = len(LEVELS)
     title: ClassVar[str] = "drive a prey into a net, three against one"

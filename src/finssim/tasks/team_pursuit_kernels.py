@@ -15,9 +15,9 @@ AGENTS = 3
 PREY = 3
 ROW = 30
 """Numbers in the observation of an agent."""
-CAPTURED, LEFT, CLOSEST, NET, GAP = 0, 1, 2, 3, 4
+CAPTURED, LEFT, CLOSEST, NET, GAP, TO_NET, TO_AGENT = 0, 1, 2, 3, 4, 5, 6
 """Places in `arrays.totals`: caught; an agent left (0 or 1); smallest distances so far from the prey to an agent and to
-the net [m]; what is still missing for a capture now [m]."""
+the net [m]; what is still missing for a capture now [m]; distances to the net and to the nearest agent now [m]."""
 
 
 @wp.struct
@@ -174,7 +174,9 @@ def evaluate_team(state: State, arrays: TaskArrays, p: TeamParameters, world_off
     late = float(state.steps[w]) * p.arena.control_step >= p.arena.time_limit - 0.5 * p.arena.control_step
 
     gap = wp.max(missing(p, net, near), 0.0)
-    team = p.progress * (arrays.totals[w, GAP] - gap) - p.distance * wp.min(gap / 8.0, 1.0) - p.step
+    # What was missing by the rules of now: a level that rises under a running episode is no way gained or lost.
+    before = wp.max(missing(p, arrays.totals[w, TO_NET], arrays.totals[w, TO_AGENT]), 0.0)
+    team = p.progress * (before - gap) - p.distance * wp.min(gap / 8.0, 1.0) - p.step
     team += wp.where(captured, p.stake, 0.0) - wp.where(lost, p.stake, 0.0)
     share_reward(state, arrays, p, w, team)
     arrays.totals[w, CAPTURED] = wp.where(captured, 1.0, 0.0)
@@ -182,6 +184,8 @@ def evaluate_team(state: State, arrays: TaskArrays, p: TeamParameters, world_off
     arrays.totals[w, CLOSEST] = wp.min(arrays.totals[w, CLOSEST], near)
     arrays.totals[w, NET] = wp.min(arrays.totals[w, NET], net)
     arrays.totals[w, GAP] = gap
+    arrays.totals[w, TO_NET] = net
+    arrays.totals[w, TO_AGENT] = near
 
     ended = captured or lost
     arrays.terminated[w] = wp.where(ended, 1, 0)
@@ -225,6 +229,8 @@ def spawn_team(
     arrays.totals[w, CLOSEST] = near
     arrays.totals[w, NET] = net
     arrays.totals[w, GAP] = wp.max(missing(p, net, near), 0.0)
+    arrays.totals[w, TO_NET] = net
+    arrays.totals[w, TO_AGENT] = near
 
 
 @wp.kernel(enable_backward=False)
