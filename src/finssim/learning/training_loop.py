@@ -61,9 +61,8 @@ class Loop:
         Raises:
             LearningError: A number of the learner stopped being finite.
         """
-        steps = self.learner.steps
-        # TensorBoard forgets that step too: the row of the checkpoint is to stay.
-        log = SummaryWriter(str(self.side / "tensorboard"), purge_step=steps + 1 if steps else None)
+        # What a killed or an earlier training logged after this step, TensorBoard is to forget.
+        log = SummaryWriter(str(self.side / "tensorboard"), purge_step=self.learner.steps + 1)
         total = self.learner.settings.steps
         try:
             while self.learner.steps < total:
