@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from finssim.learning.recurrent import asked, first_memory
@@ -31,7 +32,7 @@ class HeldEvaluation:
         self._limit = max(1, round(task.time_limit / task.control_step))
 
     def __call__(self, network: nn.Module) -> dict[str, float]:
-        """Means over the episodes.
+        """Means over the episodes, of each measure over those that have it: a time that was never reached is none.
 
         Args:
             network: Observation of one agent to its action, or a `RecurrentNetwork`; its mode (train, eval) stays.
@@ -51,8 +52,7 @@ class HeldEvaluation:
             waiting &= ~ended
             if not waiting.any():
                 break
-        done = ~waiting
-        return {f"evaluation_{name}": float(values[done].mean()) for name, values in found.items()}
+        return {f"evaluation_{name}": _mean(values[~waiting]) for name, values in found.items()}
 
     def _act(self, network: nn.Module, memory: torch.Tensor | None) -> torch.Tensor | None:
         """One control step of all worlds; the memory after it, which in worlds that start over is of no interest."""
@@ -63,3 +63,8 @@ class HeldEvaluation:
         e.arrays.action.assign(action.cpu().numpy().reshape(e.worlds, -1))
         e.advance()
         return memory
+
+
+def _mean(values: NDArray[np.float64]) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if len(known) else np.nan
