@@ -20,6 +20,9 @@ from finssim.physics.plant import VehicleParameters
 from finssim.physics.tether import Tether
 from finssim.physics.water import WaterArrays
 
+VEHICLE = wp.constant(122949823)
+"""Between the streams of two vehicles of a world: no seeds that people give are so far apart, so none meet there."""
+
 
 @wp.struct
 class DrawnArrays:
@@ -124,7 +127,7 @@ def draw_episode(
         d,
         w,
         v,
-        stream(seed + 32452843 * episode + 17 * v, w),
+        stream(seed + 32452843 * episode + VEHICLE * v, w),
         stream(seed + 49979687 * episode - 1, w),
     )
     finish_values(d, w, v)
@@ -152,6 +155,6 @@ def jitter_commands(
     """The delay of the coming step's command: the episode's, and a part of the jitter drawn for this step."""
     i, v = wp.tid()
     w = world_offset + i
-    rng = wp.rand_init(stream(seed + 86028121 * state.episode[w] + 13 * v, w), state.steps[w])
+    rng = wp.rand_init(stream(seed + 86028121 * state.episode[w] + VEHICLE * v, w), state.steps[w])
     late = wp.randf(rng) * values[w, v, wp.static(COLUMN["command_jitter"])]
     plant[w, v].delay = drawn_delay(values, w, v, nominal.plant[0, v].delay) + late
