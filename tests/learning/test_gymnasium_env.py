@@ -30,7 +30,8 @@ def test_the_single_environment_passes_the_checker(task, action):
 def test_every_task_of_one_agent_can_be_made_by_name(task):
     """`gymnasium.make` and `make_vec` know it by its class, and pass options on."""
     name, size = f"finssim/{TASKS[task].__name__}-v0", TASKS[task]().observation_size
-    action, wide = ("wrench6", 6) if TASKS[task]().others else ("thruster8", 8)  # a task commands others by wrench
+    # A task commands others by wrench.
+    action, wide = ("wrench6", 6) if TASKS[task]().others else ("thruster8", 8)
     env = gymnasium.make(name, action=action)
     assert env.reset(seed=1)[0].shape == (size,) and env.action_space.shape == (wide,)
     assert env.unwrapped.environment.task.name == task
