@@ -11,7 +11,7 @@ from finssim.cli import app
 from finssim.learning.collect import collect, record_episodes
 from finssim.learning.demonstrations import DatasetError, about, load, save
 from finssim.learning.experts import ExpertError, expert_for
-from finssim.tasks import make, task_named
+from finssim.tasks import Environment, make, task_named
 
 SHORT = {"time_limit": 1.0}
 
@@ -65,6 +65,24 @@ def test_what_is_disturbed_is_done_and_not_written():
     assert not np.array_equal(calm[0].observation, disturbed[0].observation)
     again = record_episodes(environment(), Constant(), 3, disturb=0.3, seed=1)
     assert np.array_equal(disturbed[0].observation, again[0].observation)
+
+
+def test_an_episode_of_a_world_that_breaks_is_no_demonstration(monkeypatch, tmp_path):
+    """Its world gives the one that begins in its place, whole."""
+    monkeypatch.chdir(tmp_path)  # where its last states are written
+    env, step = environment(), Environment.step
+
+    def breaking(self, action):
+        if self._steps == 2:
+            position = self.simulator.state.position.numpy().copy()
+            position[1] = np.nan
+            self.simulator.state.position.assign(position)
+        return step(self, action)
+
+    monkeypatch.setattr(Environment, "step", breaking)
+    found = record_episodes(env, Constant(), 3)
+    assert [len(e.action) for e in found] == [10, 10, 10]
+    assert all(np.isfinite(e.observation).all() and not e.terminated for e in found)
 
 
 def test_written_and_read_back(tmp_path):

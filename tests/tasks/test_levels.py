@@ -10,8 +10,8 @@ from finssim.tasks import EnvironmentSetupError, TrajectoryTracking
 from finssim.tasks.levels import LevelPlan, climb
 from finssim.tasks.team_pursuit import TeamPursuit
 
-SUCCESSES: list[float] = []
-"""What the episodes that end come to, one after the other."""
+SUCCESSES: list[float] | None = None
+"""What the episodes that end come to, one after the other; None where nobody may ask but `climb`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,14 +22,18 @@ class Scripted(TrajectoryTracking):
 
     def metrics(self, arrays):
         measured = super().metrics(arrays)
+        if SUCCESSES is None:
+            return measured
         return {**measured, "success": np.array([SUCCESSES.pop(0) for _ in measured["length"]])}
 
 
 def episode(environment, successes):
     """Every world's episode to its end, with these successes; the level before and after the next update begins."""
-    SUCCESSES[:] = successes
+    global SUCCESSES
+    SUCCESSES = list(successes)
     for _ in range(3):
         environment.step(np.zeros((environment.worlds, environment.action_size)))
+    SUCCESSES = None
     before = environment.levels.level
     environment.set_progress(0.5)
     return before, environment.levels.level
@@ -55,16 +59,18 @@ def test_a_level_rises_with_the_share_of_successes():
 
 def test_worlds_that_end_early_do_not_speak_for_the_others():
     """Where success ends an episode, the first to end are successes: the level waits for the rest."""
+    global SUCCESSES
     env = finssim.make(Scripted(level=1), worlds=4)
     climb(env, LevelPlan(level_at=0.75, level_episodes=4))
     assert episode(env, []) == (0, 0)
     levels, late = env.levels, np.array([2, 2, 0, 0], np.int32)
     env.simulator.state.steps.assign(late)  # two worlds are about to end
-    SUCCESSES[:] = [1, 1, 1, 1]
+    SUCCESSES = [1, 1, 1, 1]
     env.step(np.zeros((4, env.action_size)))
     env.simulator.state.steps.assign(late)
-    SUCCESSES[:] = [1, 1, 1, 1]
+    SUCCESSES = [1, 1, 1, 1]
     env.step(np.zeros((4, env.action_size)))
+    SUCCESSES = None
     levels.rise()
     assert levels.level == 0 and levels.share == 1.0  # four episodes, all of two worlds
 
@@ -95,12 +101,40 @@ def test_it_goes_on_from_a_saved_state():
     assert all(np.array_equal(before[name], after[name], equal_nan=True) for name in before)
 
 
+def test_a_seed_begins_at_the_first_level_again():
+    """As if the environment had just been made."""
+    env = finssim.make(Scripted(level=1), worlds=4)
+    climb(env, LevelPlan(level_at=0.75, level_episodes=4))
+    episode(env, [])
+    assert episode(env, [1, 1, 1, 1]) == (0, 1)
+    env.reset(seed=3)
+    assert env.levels.level == 0 and env.task.level == 0
+
+
+def test_a_state_without_levels_does_not_fit():
+    """Nor one with levels where there are none; a sentence says so."""
+    plain, climbing = (finssim.make(Scripted(level=1), worlds=4) for _ in range(2))
+    climb(climbing)
+    for environment, state in ((plain, climbing.state()), (climbing, plain.state())):
+        with pytest.raises(EnvironmentSetupError, match="saved state does not fit: the environment has"):
+            environment.load_state(state)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unjudged(TrajectoryTracking):
+    """T2 that does not tell success."""
+
+    def metrics(self, arrays):
+        return {name: values for name, values in super().metrics(arrays).items() if name != "success"}
+
+
 @pytest.mark.parametrize(
     ("task", "plan", "sentence"),
     [
         ("t1", {}, "task 't1' has no levels"),
         (replace(TrajectoryTracking(), level=1), {"level_from": 2}, "at most the task's own level, 1"),
         ("t2", {"level_at": 1.5}, "level_at 1.5"),
+        (Unjudged(level=1), {}, "no metric 'success'"),
     ],
 )
 def test_what_cannot_be_is_refused(task, plan, sentence):

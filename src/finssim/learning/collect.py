@@ -108,6 +108,8 @@ def record_episodes(
 ) -> list[Episode]:
     """Episodes of every agent; every world gives as many, one more or less, so that short ones are not favoured.
 
+    Those of a world in which a number stopped being finite are left out.
+
     Args:
         environment: Its episodes start over here.
         expert: Who acts.
@@ -139,11 +141,15 @@ def record_episodes(
         if ended.any():
             last = step.final_observation.reshape(rows, -1)
             measured = environment.task.metrics(environment.arrays)
+            broke = ended & (
+                environment.arrays.done.numpy() == 0
+            )  # began anew after a number that was not finite
             for w in np.flatnonzero(ended & (quota > 0)):
-                quota[w] -= 1
+                quota[w] -= not broke[w]
                 whole = {name: float(values[w]) for name, values in measured.items()}
                 for i in range(w * agents, (w + 1) * agents):
-                    found.append(_episode(running[i], last[i], bool(step.terminated[w]), whole))
+                    if not broke[w]:
+                        found.append(_episode(running[i], last[i], bool(step.terminated[w]), whole))
                     running[i] = []
             memory = expert.restarted(memory, fresh, np.repeat(ended, agents))
         seen = step.observation.reshape(rows, -1).copy()

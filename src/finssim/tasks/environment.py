@@ -196,9 +196,10 @@ class Environment:
             self.simulator.restart_episodes(mask)
             if mask is None:
                 self.drawing.restart()
-        self._mask.assign(
-            np.ones(self.worlds, np.int32) if mask is None else np.asarray(mask, dtype=np.int32)
-        )
+                if self.levels is not None:
+                    self.levels.restart()
+        where = np.ones(self.worlds, np.int32) if mask is None else np.asarray(mask, dtype=np.int32)
+        self._mask.assign(where)
         self._start.run()
         self.drawing.after_reset()
         return self._by_agent(self.arrays.observation.numpy())

@@ -53,6 +53,10 @@ class Levels:
         if not task.levels:
             raise EnvironmentSetupError(f"task '{task.name}' has no levels: leave level_... out")
         self.plan, self.last, self._environment = plan, int(task.level), environment
+        if "success" not in task.metrics(environment.arrays):
+            raise EnvironmentSetupError(
+                f"task '{task.name}' has no metric 'success', by which its levels rise"
+            )
         if plan.level_from > self.last:
             raise EnvironmentSetupError(
                 f"level_from is {plan.level_from}, expected at most the task's own level, {self.last}"
@@ -89,6 +93,10 @@ class Levels:
         full = not np.isnan(self._recent).any()
         if full and self.share >= self.plan.level_at and self.level < self.last:
             self._go(self.level + 1)
+
+    def restart(self) -> None:
+        """Begin at the first level again."""
+        self._go(self.plan.level_from)
 
     def state(self) -> dict[str, NDArray[Any]]:
         """What decides how it goes on."""

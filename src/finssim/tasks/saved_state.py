@@ -38,6 +38,11 @@ def load_state(environment: "Environment", saved: Mapping[str, NDArray[Any]]) ->
     Raises:
         EnvironmentSetupError: The environment was made with other arguments: a name or shape does not fit.
     """
+    if (environment.levels is None) == ("counters.level" in saved):
+        where = "has levels and the saved state has none" if environment.levels else "has no levels"
+        raise EnvironmentSetupError(
+            f"saved state does not fit: the environment {where}: make it with the same arguments"
+        )
     _set_seed(environment, int(saved["counters.seed"]))
     if environment.levels is not None:
         environment.levels.load(saved)
