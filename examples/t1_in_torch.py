@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+import finssim
 from finssim.tasks import ObservationPart
+from finssim.tasks.baselines import baseline
 from finssim.tasks.station_keeping import OBSERVATION, Reward
 from finssim.tasks.torch_rotations import (
     about_axis,
@@ -102,3 +104,14 @@ class TorchStationKeeping(TorchTask):
     def turn(self, w: Worlds) -> Tensor:
         """Rotation of the goal relative to the body, (worlds, 4)."""
         return multiply(conjugate(w.quaternion), w.goal_quaternion)
+
+
+if __name__ == "__main__":
+    environment = finssim.make(TorchStationKeeping(), worlds=64, seed=1)
+    pid = baseline("t1", "pid", "finsrov")  # it sees the same numbers
+    memory, observation = pid.reset(64), environment.reset()
+    for _ in range(round(environment.task.time_limit / environment.task.control_step)):
+        action, memory = pid.act(memory, observation)
+        observation = environment.step(action).observation
+    measured = environment.task.metrics(environment.arrays)
+    print(f"the PID held the pose in {measured['success'].mean():.0%} of the episodes")

@@ -15,7 +15,7 @@ from finssim.experiments.identify import identify
 from finssim.experiments.setpoints import T1_SETPOINTS
 from finssim.experiments.transfer.series import read_series
 from finssim.files import OutputError
-from finssim.learning import ppo
+from finssim.learning.training_loop import Loop
 from finssim.pool import load_plant_spec
 from finssim.vehicles import load_vehicle
 
@@ -149,15 +149,15 @@ def test_an_interrupted_demonstration_keeps_its_policy_where_it_says(
 ):
     """Ctrl-C in the second rollout, or in the pool: a whole policy beside the demonstration, and nothing else."""
     monkeypatch.setattr(demo_module, "identify", lambda *_, **__: made[1])
-    record = ppo._Watch._on_rollout_end
+    update = Loop._update
 
-    def stop(self):
-        record(self)
+    def stop(self, total):
         if len(self.curves) == 2:
             raise KeyboardInterrupt
+        return update(self, total)
 
     if when == "training":
-        monkeypatch.setattr(ppo._Watch, "_on_rollout_end", stop)
+        monkeypatch.setattr(Loop, "_update", stop)
     else:
         monkeypatch.setattr(demo_module, "run_jobs", interrupt)
     with pytest.raises(KeyboardInterrupt):
