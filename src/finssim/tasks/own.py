@@ -63,7 +63,7 @@ def _of_file(path: Path) -> ModuleType:
     sys.path.insert(0, str(whole.parent))
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except Exception as error:  # somebody's own file may raise anything as it is imported
         del sys.modules[name]
         raise EnvironmentSetupError(f"{path} fails: {type(error).__name__}: {error}") from error
     finally:
