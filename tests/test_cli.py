@@ -193,7 +193,7 @@ def test_an_interrupted_training_leaves_a_policy(tmp_path):
         (["train", "t1", "--hydrodynamics", "fosen"], "unknown hydrodynamic model 'fosen'"),
         (["train", "t1", "--randomize", "nowhere.yaml"], "nowhere.yaml"),
         (["train", "t1", "--device", "tpu"], "device 'tpu' is not available"),
-        (["train", "t1", "--learner", "sb4"], "unknown learner 'sb4'; available: sb3-ppo"),
+        (["train", "t1", "--learner", "sb4"], "unknown learner 'sb4'; available: ppo"),
         (["train", "t1", "--learner", "torchrl-mappo"], "task 't1' has one agent"),
         (["train", "t1", "--set", "gamma=0.9"], "unknown setting 'gamma'"),
         (["train", "t1", "--set", "epochs=many"], "setting epochs is 'many', expected int such as 5"),

@@ -60,11 +60,8 @@ TOP = {
 
 HOMES = {
     "torch": {
-        "tasks/torch_rotations.py",
-        "tasks/torch_task.py",
-        "tasks/torch_worlds.py",
         "learning/export.py",
-        "learning/held_evaluation.py",
+        "learning/layers.py",
         "learning/learners/catalogue.py",
         "learning/learners/gail.py",
         "learning/learners/imitation.py",
@@ -74,15 +71,16 @@ HOMES = {
         "learning/learners/sb3_recurrent_ppo.py",
         "learning/learners/sb3_sac.py",
         "learning/learners/torchrl_ppo.py",
-        "learning/onnx_graph.py",
+        "learning/network.py",
         "learning/recurrent.py",
         "learning/resume.py",
         "learning/rsl_rl_env.py",
         "learning/skrl_env.py",
         "learning/tensors.py",
         "learning/torchrl_env.py",
-        "learning/train.py",
-        "learning/training_loop.py",
+        "tasks/torch_rotations.py",
+        "tasks/torch_task.py",
+        "tasks/torch_worlds.py",
     },
     "stable_baselines3": {
         "learning/learners/sb3_ppo.py",

@@ -28,11 +28,11 @@ def train(
     learner: Annotated[
         str,
         typer.Option(
-            help="Who learns: sb3-ppo, sb3-sac, sb3-recurrent-ppo or rsl-rl; one agent also torchrl-ppo, several "
+            help="Who learns: ppo (FinsSim's own), sb3-ppo, sb3-sac, sb3-recurrent-ppo or rsl-rl; one agent also torchrl-ppo, several "
             "torchrl-ippo or torchrl-mappo; from demonstrations bc, dagger or gail.",
             metavar="NAME",
         ),
-    ] = "sb3-ppo",
+    ] = "ppo",
     vehicle: Vehicle = "finsrov",
     hydrodynamics: Hydrodynamics = "calibrated",
     action: Annotated[
@@ -53,6 +53,14 @@ def train(
     seed: Seed = 42,
     worlds: Annotated[int | None, typer.Option(help="Worlds simulated at once.", min=1)] = None,
     steps: Steps = None,
+    until: Annotated[
+        float | None,
+        typer.Option(
+            help="Share of successes, such as 0.95, at which the training is done before its steps are: of the held "
+            "episodes, in two evaluations one after the other.",
+            metavar="SHARE",
+        ),
+    ] = None,
     changes: Annotated[
         list[str] | None,
         typer.Option(
@@ -72,6 +80,8 @@ def train(
 
     Example: finssim train t1 --vehicle finsrov --seed 1 --out runs/hold
 
+    Example: finssim train docking --until 0.95 --out runs/dock
+
     Example: finssim train t2 --learner rsl-rl --randomize hold_for_position --set epochs=8 --out runs/track
     """
     start_warp()
@@ -90,6 +100,7 @@ def train(
         seed=seed,
         worlds=worlds,
         steps=steps,
+        until=until,
         device=device,
         out=out,
     )

@@ -22,7 +22,7 @@ from finssim.control.policy_description import (
 )
 from finssim.files import OutputError
 from finssim.learning.export import ExportError, export_policy
-from finssim.learning.onnx_graph import ACTIVATIONS
+from finssim.learning.recurrent import ACTIVATIONS
 
 
 def description(n: int = 16, m: int = 6) -> PolicyDescription:
@@ -129,7 +129,7 @@ def test_a_trained_network_with_large_gains_is_exported(tmp_path):
 
 def test_a_wrong_graph_is_refused_and_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.setitem(ACTIVATIONS, nn.Tanh, "Sigmoid")
-    with pytest.raises(ExportError, match="onnxruntime and torch differ by"):
+    with pytest.raises(ExportError, match="onnxruntime and the network differ by"):
         export_policy(perceptron(nn.Tanh), tmp_path / "run", description())
     assert list(tmp_path.iterdir()) == []
 

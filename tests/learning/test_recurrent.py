@@ -14,12 +14,11 @@ from finssim.control.guidance import Station
 from finssim.control.modes import action_mode
 from finssim.control.observations import OBSERVERS
 from finssim.control.policy import Policy
-from finssim.control.policy_description import PolicyDescription, PolicyError, VehicleIdentity
+from finssim.control.policy_description import PolicyError
 from finssim.experiments.episodes import NOWHERE
 from finssim.experiments.players import make_player
-from finssim.learning.description import observation_schema
 from finssim.learning.experts import expert_for
-from finssim.learning.export import ExportError, export_policy
+from finssim.learning.export import ExportError
 from finssim.learning.held_evaluation import HeldEvaluation
 from finssim.learning.learners import learner_named
 from finssim.learning.recurrent import RecurrentNetwork
@@ -27,27 +26,11 @@ from finssim.robot.pilots import PolicyPilot
 from finssim.robot.robot import Reading
 from finssim.tasks import StationKeeping
 from finssim.tasks.baselines import restarted
-from finssim.vehicles import load_vehicle
 from reference.guess import Guess
+from reference.policies import FINSROV, written
 
-FINSROV = load_vehicle("finsrov")
 STATION = Station((1.0, -0.3, -0.5), 0.6)
 READING = Reading(5.0, np.array([0.2, 0.1, -0.4]), np.array([0.0, 0.0, 0.1, 0.995]), np.full(6, 0.05), True)
-
-
-def written(network, folder, task, size):
-    """A policy directory of a network."""
-    description = PolicyDescription(
-        task=task.name,
-        observation=observation_schema(task),
-        action={**action_mode("wrench6", FINSROV).describe(), "size": size},
-        control_period=task.control_step,
-        vehicle=VehicleIdentity(name=FINSROV.name, sha256=FINSROV.sha256),
-        hydrodynamics="calibrated",
-        seed=0,
-        training={"randomization": None},
-    )
-    return export_policy(network, folder, description)
 
 
 def large(module):

@@ -1,4 +1,4 @@
-"""A torch network as a policy directory that runs without torch."""
+"""A trained network as a policy directory that runs without the library that learnt it."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from copy import deepcopy
 from datetime import datetime, timezone
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 import yaml
 from numpy.typing import NDArray
-from torch import nn
 
 from finssim.control.policy import Policy
 from finssim.control.policy_description import DESCRIPTION_FILE, NETWORK_FILE, PolicyDescription
 from finssim.files import atomic_directory
-from finssim.learning.onnx_graph import IR_VERSION, OPSET, can_write, write_graph
-from finssim.learning.recurrent import asked, first_memory
+from finssim.learning.network import Network, asked, first_memory
+from finssim.learning.onnx_graph import IR_VERSION, OPSET, write_graph
 from finssim.provenance import provenance
+
+if TYPE_CHECKING:
+    from torch import nn
 
 __all__ = ["CURVES_FILE", "EVALUATION_FILE", "ExportError", "export_policy"]
 
@@ -36,7 +37,7 @@ class ExportError(ValueError):
 
 
 def export_policy(
-    network: nn.Module,
+    network: nn.Module | Network,
     directory: str | Path,
     description: PolicyDescription,
     *,
@@ -45,17 +46,18 @@ def export_policy(
     also: Callable[[Path], None] | None = None,
     tolerance: float = 1e-6,
 ) -> Path:
-    """Writes a policy directory whole or not at all, after checking that onnxruntime computes what torch does.
+    """Writes a policy directory whole or not at all, after checking that onnxruntime computes what the network does.
 
     Args:
-        network: Maps observations (N, n) float32 to the mean action (N, m), or, as a `RecurrentNetwork`, observations
-            and memory to action and memory; the written one clips the action to [-1, 1].
+        network: A `Network`, or a torch module that maps observations (N, n) float32 to the mean action (N, m), or, as
+            a `RecurrentNetwork`, observations and memory to action and memory; the written one clips the action to
+            [-1, 1].
         directory: Folder to write. An earlier policy directory is replaced; any other folder with files is refused.
         description: What it was trained with; `memory`, `files`, `provenance` and `created` are filled in.
         curves: Rows of `curves.csv`, with equal keys.
         evaluation: Content of `evaluation.json`.
         also: Writes more files into the folder before it takes its place.
-        tolerance: Largest difference allowed between the actions of torch and onnxruntime, beyond float32 rounding [1].
+        tolerance: Largest difference allowed between the network's actions and onnxruntime's, beyond rounding [1].
 
     Returns:
         The folder.
@@ -93,18 +95,27 @@ def export_policy(
     return Path(directory)
 
 
-def _onnx_bytes(network: nn.Module, description: PolicyDescription) -> bytes:
+def _onnx_bytes(network: nn.Module | Network, description: PolicyDescription) -> bytes:
     n, m = description.observation.size, description.action_size
     try:
-        with torch.no_grad():
-            copy = deepcopy(network).cpu().eval()
-            shape = tuple(asked(copy, torch.zeros(2, n), first_memory(copy, 2))[0].shape)
-    except RuntimeError as error:  # torch's way of saying that matrix sizes do not fit
+        shape = _answer(network, np.zeros((2, n)), _memory(network, 2), np.float32, limited=False).shape
+    except (
+        RuntimeError,
+        ValueError,
+    ) as error:  # torch's and NumPy's ways of saying that matrix sizes do not fit
         raise ExportError(f"the network does not take observations of {n} elements ({error})") from error
-    if shape != (2, m):
-        raise ExportError(f"the network maps (2, {n}) to {shape}, but the description says (2, {m})")
-    if can_write(network):
+    k = int(getattr(network, "memory_size", 0))
+    if shape != (2, m + k):
+        raise ExportError(
+            f"the network maps (2, {n}) to (2, {shape[1] - k}), but the description says (2, {m})"
+        )
+    if isinstance(network, Network):
         return write_graph(network, n, m)
+    from finssim.learning.recurrent import plain_network
+
+    plain = plain_network(network)
+    if plain is not None:
+        return write_graph(plain, n, m)
     if hasattr(network, "memory_size"):
         raise ExportError(
             "a network that remembers is written as an LSTM of one layer before linear layers and tanh, ReLU or ELU, "
@@ -113,25 +124,18 @@ def _onnx_bytes(network: nn.Module, description: PolicyDescription) -> bytes:
     return _trace(network, n)
 
 
-class _Clipped(nn.Module):
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        action: torch.Tensor = self.network(observation).clamp(-1.0, 1.0)
-        return action
-
-
 def _trace(network: nn.Module, n: int) -> bytes:
     """The graph of any other network, from torch's exporter (seconds)."""
+    import torch
+    from torch import nn
+
     if find_spec("onnxscript") is None:
         raise ExportError(
             "exporting a network that is no plain stack of linear layers and tanh, ReLU or ELU needs onnxscript: "
             "pip install onnxscript"
         )
     program = torch.onnx.export(
-        _Clipped(deepcopy(network)).cpu().eval(),
+        nn.Sequential(deepcopy(network), nn.Hardtanh()).cpu().eval(),
         (torch.zeros(2, n),),
         dynamo=True,
         opset_version=OPSET,
@@ -146,36 +150,53 @@ def _trace(network: nn.Module, n: int) -> bytes:
     return bytes(model.SerializeToString())
 
 
-def _check_agreement(network: nn.Module, policy: Policy, tolerance: float) -> None:
-    """Compares onnxruntime with torch to `tolerance` beyond what float32 rounds off in this network.
+def _check_agreement(network: nn.Module | Network, policy: Policy, tolerance: float) -> None:
+    """Compares onnxruntime with the network to `tolerance` beyond what float32 rounds off in it.
 
-    That rounding, seen between torch in float32 and in float64, is 1e-7 for a fresh network and above 1e-6 for a
-    trained one with large gains; a wrong graph is off by far more.
+    That rounding, seen between float32 and float64, is 1e-7 for a fresh network and above 1e-6 for a trained one with
+    large gains; a wrong graph is off by far more.
     """
-    copy, rng = deepcopy(network).cpu().eval(), np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     observation = rng.normal(size=(512, policy.description.observation.size))
     k = policy.description.memory
     memory = rng.uniform(-1.0, 1.0, size=(512, k)) if k else None
-    single = _answer(copy, observation, memory, torch.float32)
-    double = _answer(copy.double(), observation, memory, torch.float64)
+    single = _answer(network, observation, memory, np.float32)
+    double = _answer(network, observation, memory, np.float64)
     answer = np.concatenate([part for part in policy.step(memory, observation) if part is not None], axis=1)
     allowed = tolerance + 4.0 * float(np.max(np.abs(single - double)))
     error = float(np.max(np.abs(answer - double)))
     if not error <= allowed:
-        sentence = f"onnxruntime and torch differ by {error:.2g} in an action, expected at most {allowed:.2g}"
+        sentence = (
+            f"onnxruntime and the network differ by {error:.2g} in an action, expected at most {allowed:.2g}"
+        )
         raise ExportError(f"{sentence}: look for weights that are not finite or huge")
 
 
+def _memory(network: nn.Module | Network, rows: int) -> NDArray[Any] | None:
+    memory: NDArray[Any] | None = first_memory(network, rows)
+    return memory
+
+
 def _answer(
-    network: nn.Module, observation: NDArray[Any], memory: NDArray[Any] | None, kind: torch.dtype
+    network: nn.Module | Network,
+    observation: NDArray[Any],
+    memory: NDArray[Any] | None,
+    kind: type[np.floating[Any]],
+    limited: bool = True,
 ) -> NDArray[Any]:
-    """Action in [-1, 1] and, beside it, the memory after, (N, m + k)."""
-    given = None if memory is None else torch.as_tensor(memory, dtype=kind)
-    with torch.no_grad():
-        action, after = asked(network, torch.as_tensor(observation, dtype=kind), given)
-    parts = [action.clamp(-1.0, 1.0), *([] if after is None else [after])]
-    answer: NDArray[Any] = torch.cat(parts, dim=1).numpy()
-    return answer
+    """Action, in [-1, 1] if `limited`, and, beside it, the memory after, (N, m + k), computed with that type."""
+    given = [None if x is None else np.asarray(x, dtype=kind) for x in (observation, memory)]
+    if isinstance(network, Network):
+        action, after = network.as_type(kind).step(*given)
+    else:
+        import torch
+
+        copy = deepcopy(network).cpu().eval().to(torch.float64 if kind is np.float64 else torch.float32)
+        with torch.no_grad():
+            parts = asked(copy, *(None if x is None else torch.from_numpy(x) for x in given))
+        action, after = (None if x is None else x.numpy() for x in parts)
+    action = np.clip(action, -1.0, 1.0) if limited else action
+    return action if after is None else np.concatenate([action, after], axis=1)
 
 
 def _write_curves(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import nn
+from typing import Any
 
-from finssim.learning.recurrent import asked, first_memory
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.learning.ends import EpisodeEnds
+from finssim.learning.layers import Arrays
+from finssim.learning.network import Network, asked, first_memory
 from finssim.tasks import Environment
 from finssim.tasks.environment import GREATEST_SEED
 
@@ -31,38 +33,34 @@ class HeldEvaluation:
         task = environment.task
         self._limit = max(1, round(task.time_limit / task.control_step))
 
-    def __call__(self, network: nn.Module) -> dict[str, float]:
+    def __call__(self, network: Any) -> dict[str, float]:
         """Means over the episodes, of each measure over those that have it: a time that was never reached is none.
 
         Args:
-            network: Observation of one agent to its action, or a `RecurrentNetwork`; its mode (train, eval) stays.
+            network: A `Network` in the library of the device (NumPy on `cpu`), or a torch module; of one agent.
 
         Returns:
             The task's metrics by `evaluation_` and their name, such as evaluation_return and evaluation_success.
         """
+        plain = isinstance(network, Network) and self.device == "cpu"
+        arrays = Arrays(0, None if plain else self.device)
         e = self.environment
         e.reset(seed=e.seed)
-        memory = first_memory(network, e.worlds * e.agents, self.device)
-        waiting, found = np.ones(e.worlds, dtype=np.bool_), {}
+        rows = e.worlds * e.agents
+        observation = arrays.view(e.arrays.observation).reshape(rows, -1)
+        action = arrays.view(e.arrays.action).reshape(rows, -1)
+        memory = first_memory(network, rows, None if plain else self.device)
+        ends = EpisodeEnds(e, arrays)
         for _ in range(self._limit):
-            memory = self._act(network, memory)
-            ended = (e.arrays.terminated.numpy() | e.arrays.truncated.numpy()) != 0
-            for name, values in e.task.metrics(e.arrays).items() if (ended & waiting).any() else ():
-                found.setdefault(name, np.zeros(e.worlds))[ended & waiting] = values[ended & waiting]
-            waiting &= ~ended
-            if not waiting.any():
+            with arrays.plain():
+                answer, memory = asked(network, observation, memory)
+            action[:] = answer
+            e.advance()
+            ends.look(ends.done() & ~ends.ended)
+            if e.device.is_cpu and ends.ended.all():
                 break
-        return {f"evaluation_{name}": _mean(values[~waiting]) for name, values in found.items()}
-
-    def _act(self, network: nn.Module, memory: torch.Tensor | None) -> torch.Tensor | None:
-        """One control step of all worlds; the memory after it, which in worlds that start over is of no interest."""
-        e = self.environment
-        rows = e.arrays.observation.numpy().reshape(e.worlds * e.agents, -1)
-        with torch.no_grad():
-            action, memory = asked(network, torch.as_tensor(rows, device=self.device), memory)
-        e.arrays.action.assign(action.cpu().numpy().reshape(e.worlds, -1))
-        e.advance()
-        return memory
+        ended, measured = ends.metrics()
+        return {f"evaluation_{name}": _mean(values[ended]) for name, values in measured.items()}
 
 
 def _mean(values: NDArray[np.float64]) -> float:

@@ -1,23 +1,20 @@
-"""Networks written out as ONNX, operator by operator: stacks of layers, with an LSTM in front of them or none.
+"""Networks written out as ONNX, operator by operator: layers, with what they remember in front of them or none.
 
 torch's own exporter traces and decomposes the network, which takes seconds for a handful of operators.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import onnx
-import torch
-from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
-from torch import nn
 
-from finssim.learning.recurrent import RecurrentNetwork
+from finssim.learning.network import Activation, Cell, Linear, Network
 
-__all__ = ["ACTIVATIONS", "IR_VERSION", "OPSET", "can_write", "write_graph"]
+__all__ = ["IR_VERSION", "OPSET", "write_graph"]
 
 OPSET = 18
 """ONNX operator set of every exported network."""
@@ -25,36 +22,42 @@ OPSET = 18
 IR_VERSION = 10
 """ONNX file version; the newest that the onnxruntime of 2024 reads."""
 
-ACTIVATIONS = {nn.Tanh: "Tanh", nn.ReLU: "Relu", nn.ELU: "Elu", nn.Identity: "Identity"}
-"""Activations with one ONNX operator of the same meaning."""
 
-
-def can_write(network: nn.Module) -> bool:
-    """Whether it is a stack of linear layers and these activations, behind an LSTM of one layer or not."""
-    if isinstance(network, RecurrentNetwork):
-        lstm, network = network.lstm, network.layers
-        if lstm.num_layers > 1 or lstm.bidirectional or lstm.proj_size:
-            return False
-    layers = _layers(network)
-    return all(isinstance(layer, nn.Linear) or type(layer) in ACTIVATIONS for layer in layers)
-
-
-def write_graph(network: nn.Module, n: int, m: int) -> bytes:
+def write_graph(network: Network, n: int, m: int) -> bytes:
     """An ONNX file: `observation` (N, n) to `action` (N, m) in [-1, 1].
 
     Of a network that remembers, `memory` (N, k) goes in too, and `memory_after` comes out.
     """
+    network = network.as_type(np.float32)
     graph, x = _Graph(), "observation"
-    values = [[("observation", n)], [("action", m)]]
-    if isinstance(network, RecurrentNetwork):
-        x = graph.lstm(network.lstm)
-        values = [
-            [*values[0], ("memory", network.memory_size)],
-            [*values[1], ("memory_after", network.memory_size)],
-        ]
-        network = network.layers
-    graph.stack(list(_layers(network)), x)
-    return graph.file(*values)
+    inputs, outputs = [("observation", n)], [("action", m)]
+    if network.mean is not None:
+        x = graph.node(
+            "Mul", [graph.node("Sub", [x, graph.weight(network.mean)]), graph.weight(network.scale)]
+        )
+    scaled, after, parts = x, [], {}
+    if network.memory_size:
+        inputs.append(("memory", network.memory_size))
+        outputs.append(("memory_after", network.memory_size))
+        sizes = {
+            "past": max(network.history - 1, 0) * n,
+            "oldest": n if network.history else 0,
+            "last": network.last_action,
+            "cell": network.cell.memory_size if network.cell else 0,
+        }
+        parts = graph.split("memory", {name: size for name, size in sizes.items() if size})
+    window = [parts[name] for name in ("past", "oldest", "last") if name in parts]
+    y = graph.node("Concat", [x, *window], axis=1) if window else x
+    if network.cell is not None:
+        y, state = graph.cell(network.cell, y, parts["cell"])
+        after = [state]
+    graph.stack(network.layers, y)
+    if window:
+        past = [scaled, *([parts["past"]] if "past" in parts else [])] if network.history else []
+        after = [*past, *(["action"] if network.last_action else []), *after]
+    if after:
+        graph.node("Concat", after, "memory_after", axis=1)
+    return graph.file(inputs, outputs)
 
 
 class _Graph:
@@ -64,72 +67,79 @@ class _Graph:
         self._nodes: list[Any] = []
         self._weights: list[Any] = []
 
-    def node(self, kind: str, inputs: Sequence[str], outputs: Sequence[str], **attributes: Any) -> None:
-        self._nodes.append(helper.make_node(kind, inputs, outputs, **attributes))
+    def node(self, kind: str, inputs: Sequence[str], output: str = "", **attributes: Any) -> str:
+        """Append an operator; the name of its output."""
+        output = output or f"{kind.lower()}_{len(self._nodes)}"
+        self._nodes.append(helper.make_node(kind, inputs, [output], **attributes))
+        return output
 
-    def gemm(self, x: str, weights: dict[str, torch.Tensor], y: str) -> None:
-        """y = x Wᵀ + b; a layer without b has one entry."""
-        self._weights += [numpy_helper.from_array(_float32(tensor), name) for name, tensor in weights.items()]
-        self.node("Gemm", [x, *weights], [y], transB=1)
+    def weight(self, values: Any) -> str:
+        """Append numbers; their name."""
+        name = f"weight_{len(self._weights)}"
+        self._weights.append(numpy_helper.from_array(np.ascontiguousarray(values), name))
+        return name
 
-    def lstm(self, lstm: nn.LSTM) -> str:
-        """One step of torch's LSTM, gates i, f, g, o: c' = f c + i g and h' = o tanh(c'), with h, c in `memory`."""
-        weights = dict(lstm.named_parameters())
-        for x, name in (("observation", "ih"), ("h", "hh")):
-            parts = {
-                f"{part}_{name}": weights[f"{part}_{name}_l0"] for part in ("weight", "bias")[: 1 + lstm.bias]
-            }
-            self.gemm(x, parts, f"from_{name}")
-        gates = {"i": "Sigmoid", "f": "Sigmoid", "g": "Tanh", "o": "Sigmoid"}
-        first = helper.make_node("Split", ["memory"], ["h", "c"], axis=1, num_outputs=2)
-        self._nodes.insert(0, first)
-        self.node("Add", ["from_ih", "from_hh"], ["gates"])
-        self.node("Split", ["gates"], [f"{gate}_in" for gate in gates], axis=1, num_outputs=4)
-        for gate, kind in gates.items():
-            self.node(kind, [f"{gate}_in"], [gate])
-        self.node("Mul", ["f", "c"], ["kept"])
-        self.node("Mul", ["i", "g"], ["taken"])
-        self.node("Add", ["kept", "taken"], ["c_after"])
-        self.node("Tanh", ["c_after"], ["c_said"])
-        self.node("Mul", ["o", "c_said"], ["h_after"])
-        self.node("Concat", ["h_after", "c_after"], ["memory_after"], axis=1)
-        return "h_after"
+    def split(self, x: str, sizes: dict[str, int]) -> dict[str, str]:
+        """Columns of a row by name."""
+        names = {name: f"{x}_{name}" for name in sizes}
+        lengths = self.weight(np.array(list(sizes.values()), np.int64))
+        self._nodes.append(helper.make_node("Split", [x, lengths], list(names.values()), axis=1))
+        return names
 
-    def stack(self, layers: Sequence[nn.Module], x: str) -> None:
+    def linear(self, layer: Linear, x: str) -> str:
+        """y = x W + b."""
+        bias = [] if layer.bias is None else [self.weight(layer.bias)]
+        return self.node("Gemm", [x, self.weight(layer.weight), *bias])
+
+    def cell(self, cell: Cell, x: str, memory: str) -> tuple[str, str]:
+        """One step of an LSTM or a GRU, as `Cell.step` has it: its outputs and its memory after."""
+        if cell.kind == "gru":
+            from_x, from_h = (
+                self.gates(self.linear(layer, row), "rzn")
+                for layer, row in ((cell.from_x, x), (cell.from_h, memory))
+            )
+            r, z = (self.node("Sigmoid", [self.node("Add", [from_x[g], from_h[g]])]) for g in "rz")
+            n = self.node("Tanh", [self.node("Add", [from_x["n"], self.node("Mul", [r, from_h["n"]])])])
+            change = self.node("Mul", [z, self.node("Sub", [memory, n])])
+            h = self.node("Add", [n, change])
+            return h, h
+        state = self.split(memory, {"h": cell.units, "c": cell.units})
+        total = self.node("Add", [self.linear(cell.from_x, x), self.linear(cell.from_h, state["h"])])
+        gates = self.gates(total, "ifgo")
+        i, f, o = (self.node("Sigmoid", [gates[name]]) for name in "ifo")
+        g = self.node("Tanh", [gates["g"]])
+        c = self.node("Add", [self.node("Mul", [f, state["c"]]), self.node("Mul", [i, g])])
+        h = self.node("Mul", [o, self.node("Tanh", [c])])
+        return h, self.node("Concat", [h, c], axis=1)
+
+    def gates(self, x: str, names: str) -> dict[str, str]:
+        """Equal parts of a row, a letter each."""
+        outputs = {name: f"{x}_{name}" for name in names}
+        self._nodes.append(
+            helper.make_node("Split", [x], list(outputs.values()), axis=1, num_outputs=len(names))
+        )
+        return outputs
+
+    def stack(self, layers: Sequence[Linear | Activation], x: str) -> None:
         """Layers one after the other, and the limits of the action."""
-        for i, layer in enumerate(layers):
-            if isinstance(layer, nn.Linear):  # weight, then bias
-                self.gemm(x, {f"{name}_{i}": p for name, p in layer.named_parameters()}, f"x_{i}")
-            elif isinstance(layer, nn.ELU):
-                self.node("Elu", [x], [f"x_{i}"], alpha=float(layer.alpha))
+        for layer in layers:
+            if isinstance(layer, Linear):
+                x = self.linear(layer, x)
+            elif layer.kind == "Elu":
+                x = self.node("Elu", [x], alpha=layer.alpha)
             else:
-                self.node(ACTIVATIONS[type(layer)], [x], [f"x_{i}"])
-            x = f"x_{i}"
-        for name, value in (("low", -1.0), ("high", 1.0)):
-            self._weights.append(numpy_helper.from_array(np.full((), value, np.float32), name))
-        self.node("Clip", [x, "low", "high"], ["action"])
+                x = self.node(layer.kind, [x])
+        low, high = (self.weight(np.full((), value, np.float32)) for value in (-1.0, 1.0))
+        self.node("Clip", [x, low, high], "action")
 
     def file(self, inputs: Sequence[tuple[str, int]], outputs: Sequence[tuple[str, int]]) -> bytes:
-        told = [
-            [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", size]) for name, size in values]
-            for values in (inputs, outputs)
+        """The graph as an ONNX file."""
+        rows = [
+            [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", size]) for name, size in side]
+            for side in (inputs, outputs)
         ]
-        graph = helper.make_graph(self._nodes, "policy", *told, self._weights)
+        graph = helper.make_graph(self._nodes, "policy", *rows, self._weights)
         opsets = [helper.make_opsetid("", OPSET)]
         model = helper.make_model(graph, opset_imports=opsets, ir_version=IR_VERSION, producer_name="finssim")
         onnx.checker.check_model(model)
         return bytes(model.SerializeToString())
-
-
-def _layers(module: nn.Module) -> Iterable[nn.Module]:
-    """The layers of nested `nn.Sequential`s, in order."""
-    if isinstance(module, nn.Sequential):
-        for child in module:
-            yield from _layers(child)
-    else:
-        yield module
-
-
-def _float32(tensor: torch.Tensor) -> NDArray[np.float32]:
-    array: NDArray[np.float32] = tensor.detach().to("cpu", torch.float32).numpy()
-    return array

@@ -1,11 +1,18 @@
-"""Networks that remember: what one hands on from an action to the next, and how any network is asked."""
+"""Torch's networks as they are learnt elsewhere: one that remembers, and any of them as a plain `Network`."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import torch
 from torch import nn
 
-__all__ = ["RecurrentNetwork", "asked", "first_memory"]
+from finssim.learning.network import Activation, Cell, Linear, Network
+
+__all__ = ["RecurrentNetwork", "plain_network"]
+
+ACTIVATIONS = {nn.Tanh: "Tanh", nn.ReLU: "Relu", nn.ELU: "Elu", nn.Identity: "Identity"}
+"""Activations with one ONNX operator of the same meaning."""
 
 
 class RecurrentNetwork(nn.Module):
@@ -28,17 +35,38 @@ class RecurrentNetwork(nn.Module):
         return self.layers(answer[0]), torch.cat([said[0], cells[0]], dim=1)
 
 
-def first_memory(network: nn.Module, rows: int, device: str = "cpu") -> torch.Tensor | None:
-    """What a network remembers at the start of so many episodes, (rows, k); None if it never does."""
-    size = getattr(network, "memory_size", 0)
-    return torch.zeros(rows, size, device=device) if size else None
+def plain_network(network: nn.Module) -> Network | None:
+    """The network as plain arrays; None unless it is linear layers and these activations, behind an LSTM or not."""
+    cell = None
+    if isinstance(network, RecurrentNetwork):
+        lstm, network = network.lstm, network.layers
+        if lstm.num_layers > 1 or lstm.bidirectional or lstm.proj_size:
+            return None
+        weights = dict(lstm.named_parameters())
+        from_x, from_h = (
+            Linear(
+                weights[f"weight_{name}_l0"].detach().T,
+                weights[f"bias_{name}_l0"].detach() if lstm.bias else None,
+            )
+            for name in ("ih", "hh")
+        )
+        cell = Cell("lstm", from_x, from_h)
+    layers: list[Linear | Activation] = []
+    for layer in _layers(network):
+        if isinstance(layer, nn.Linear):
+            bias = None if layer.bias is None else layer.bias.detach()
+            layers.append(Linear(layer.weight.detach().T, bias))
+        elif type(layer) in ACTIVATIONS:
+            layers.append(Activation(ACTIVATIONS[type(layer)], float(getattr(layer, "alpha", 1.0))))
+        else:
+            return None
+    return Network(tuple(layers), cell=cell)
 
 
-def asked(
-    network: nn.Module, observation: torch.Tensor, memory: torch.Tensor | None
-) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Action (N, m) and the memory after, of any network."""
-    if memory is None:
-        return network(observation), None
-    action, memory = network(observation, memory)
-    return action, memory
+def _layers(module: nn.Module) -> Iterable[nn.Module]:
+    """The layers of nested `nn.Sequential`s, in order."""
+    if isinstance(module, nn.Sequential):
+        for child in module:
+            yield from _layers(child)
+    else:
+        yield module

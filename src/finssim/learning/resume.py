@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import random
+import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from finssim.files import OutputError
 
 __all__ = ["RESUME_FILE", "ResumeError", "random_state", "read_state", "set_random_state", "write_state"]
 
-RESUME_FILE = "resume.pt"
+RESUME_FILE = "resume.npz"
 
-ARRAY = "numpy"
-"""Key that marks a NumPy array, written as a tensor so that reading runs no code of the file's."""
+ARRAY, TENSOR, PAIRS = "__array__", "__tensor__", "__pairs__"
+"""Keys that stand for a NumPy array or a torch tensor of the file, and for a dictionary whose keys are no strings."""
 
 
 class ResumeError(ValueError):
@@ -24,16 +26,17 @@ class ResumeError(ValueError):
 
 
 def random_state() -> dict[str, Any]:
-    """The global random streams of Python, NumPy and torch."""
+    """The global random streams of Python, NumPy, and torch where it was imported."""
     name, keys, position, has_gauss, gauss = np.random.get_state()  # noqa: NPY002  SB3 draws from it
-    cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
     version, words, extra = random.getstate()
-    return {
+    streams: dict[str, Any] = {
         "python": [version, list(words), extra],
         "numpy": [name, keys, position, has_gauss, gauss],
-        "torch": torch.get_rng_state(),
-        "cuda": list(cuda),
     }
+    if torch := sys.modules.get("torch"):
+        streams["torch"] = torch.get_rng_state()
+        streams["cuda"] = list(torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [])
+    return streams
 
 
 def set_random_state(state: dict[str, Any]) -> None:
@@ -41,16 +44,22 @@ def set_random_state(state: dict[str, Any]) -> None:
     version, words, extra = state["python"]
     random.setstate((version, tuple(words), extra))
     np.random.set_state(tuple(state["numpy"]))  # noqa: NPY002
-    torch.set_rng_state(state["torch"])
-    if state["cuda"]:
-        torch.cuda.set_rng_state_all(state["cuda"])
+    if "torch" in state:
+        import torch
+
+        torch.set_rng_state(state["torch"])
+        if state["cuda"]:
+            torch.cuda.set_rng_state_all(state["cuda"])
 
 
 def write_state(state: dict[str, Any], path: Path) -> None:
-    """Write a state: dictionaries, lists, numbers, strings, tensors and NumPy arrays."""
+    """Write a state: dictionaries, lists, numbers, strings, NumPy arrays and torch tensors."""
+    arrays: list[Any] = []
+    text = json.dumps(_packed(state, arrays))
     try:
-        torch.save(_packed(state), path)
-    except RuntimeError as error:  # torch's way of saying that a file cannot be written
+        with path.open("wb") as file:
+            np.savez(file, tree=np.array(text), **{f"array_{i}": array for i, array in enumerate(arrays)})
+    except OSError as error:
         raise OutputError(f"cannot write {path}: {error}: is the disk full?") from error
 
 
@@ -61,30 +70,45 @@ def read_state(path: Path) -> dict[str, Any]:
         ResumeError: It is not whole, or no such file.
     """
     try:
-        state: dict[str, Any] = _unpacked(torch.load(path, map_location="cpu", weights_only=True))
-    except Exception as error:  # a zip, pickle, key or value error, as the damage has it
+        with np.load(path, allow_pickle=False) as file:
+            state: dict[str, Any] = _unpacked(json.loads(str(file["tree"])), file)
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         reason = " ".join(str(error).split())[:200]
         raise ResumeError(f"{path}: cannot be resumed from ({reason}): remove its directory") from error
     return state
 
 
-def _packed(value: Any) -> Any:
+def _packed(value: Any, arrays: list[Any]) -> Any:
+    """What JSON can say of it; arrays go into the list, and their number stands for them."""
     if isinstance(value, np.ndarray):
-        return {ARRAY: torch.from_numpy(np.array(value, order="C"))}
+        arrays.append(value)
+        return {ARRAY: len(arrays) - 1}
+    torch = sys.modules.get("torch")
+    if torch is not None and isinstance(value, torch.Tensor):
+        arrays.append(value.detach().cpu().numpy())
+        return {TENSOR: len(arrays) - 1}
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, dict):
-        return {key: _packed(item) for key, item in value.items()}
+        if all(isinstance(key, str) for key in value):
+            return {key: _packed(item, arrays) for key, item in value.items()}
+        return {PAIRS: [[key, _packed(item, arrays)] for key, item in value.items()]}
     if isinstance(value, list | tuple):
-        return [_packed(item) for item in value]
+        return [_packed(item, arrays) for item in value]
     return value
 
 
-def _unpacked(value: Any) -> Any:
-    if isinstance(value, dict):
-        if value.keys() == {ARRAY}:
-            return value[ARRAY].numpy()
-        return {key: _unpacked(item) for key, item in value.items()}
+def _unpacked(value: Any, file: Any) -> Any:
     if isinstance(value, list):
-        return [_unpacked(item) for item in value]
-    return value
+        return [_unpacked(item, file) for item in value]
+    if not isinstance(value, dict):
+        return value
+    if value.keys() == {ARRAY}:
+        return file[f"array_{value[ARRAY]}"]
+    if value.keys() == {TENSOR}:
+        import torch
+
+        return torch.from_numpy(file[f"array_{value[TENSOR]}"])
+    if value.keys() == {PAIRS}:
+        return {key: _unpacked(item, file) for key, item in value[PAIRS]}
+    return {key: _unpacked(item, file) for key, item in value.items()}

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from finssim.learning.ends import EpisodeEnds
+from finssim.learning.layers import Arrays
 from finssim.tasks import Environment
 
 __all__ = ["EpisodeTally"]
@@ -16,48 +18,67 @@ SHORTEST_WINDOW = 100
 
 
 class EpisodeTally:
-    """Watches an environment whose first episodes may be shortened; those are not counted."""
+    """Watches an environment whose first episodes may be shortened; those are not counted.
 
-    def __init__(self, environment: Environment, shortened: bool = True) -> None:
-        """Watch the worlds; `shortened` says whether their present episodes began before."""
+    Of several episodes of a world that end between two rows, the last one counts.
+    """
+
+    def __init__(
+        self, environment: Environment, shortened: bool = True, arrays: Arrays | None = None
+    ) -> None:
+        """Watch the worlds.
+
+        Args:
+            environment: Theirs.
+            shortened: Whether their present episodes began before.
+            arrays: Library in which the ends are kept until a row is asked for; NumPy if None.
+        """
+        arrays = arrays or Arrays(0, None if environment.device.is_cpu else str(environment.device))
         self.environment = environment
-        self._whole = np.full(environment.worlds, not shortened)
+        self._arrays, self._ends = arrays, EpisodeEnds(environment, arrays)
+        self._rewards = arrays.view(environment.arrays.reward)
+        self._shortened = self._ends.done() | True if shortened else self._ends.done() & False
         self._episodes: deque[tuple[float, float, float]] = deque(
             maxlen=max(SHORTEST_WINDOW, environment.worlds)
         )
-        self._reward, self._looks = 0.0, 0
+        self._reward, self._looks = arrays.zeros(1), 0
 
     def look(self) -> None:
         """Count the episodes that ended in the step just done, and its reward."""
-        a = self.environment.arrays
-        self._reward += float(a.reward.numpy().mean())
+        self._reward += self._rewards.mean()
         self._looks += 1
-        ended = np.flatnonzero(a.terminated.numpy() | a.truncated.numpy())
-        if not len(ended):
-            return
-        whole = ended[self._whole[ended]]
-        if len(whole):
-            measured = self.environment.task.metrics(a)
-            success = measured.get("success", np.zeros(self.environment.worlds))
-            columns = [measured["return"][whole], measured["length"][whole], success[whole]]
-            self._episodes.extend(zip(*(column.tolist() for column in columns), strict=True))
-        self._whole[ended] = True
+        done = self._ends.done()
+        self._ends.look(done & ~self._shortened)
+        self._shortened &= ~done
 
     def row(self) -> dict[str, float]:
         """Means over the last episodes, and of the reward since the row before."""
+        ended, measured = self._ends.metrics()
+        if ended.any():
+            success = measured.get("success", np.zeros(self.environment.worlds))
+            columns = [measured["return"][ended], measured["length"][ended], success[ended]]
+            self._episodes.extend(zip(*(column.tolist() for column in columns), strict=True))
         means = np.mean(self._episodes, axis=0) if self._episodes else np.zeros(3)
-        reward = self._reward / max(self._looks, 1)
-        self._reward, self._looks = 0.0, 0
+        reward = float(self._arrays.numpy(self._reward)[0]) / max(self._looks, 1)
+        self._start_row()
         names = ("mean_return", "mean_length", "held")
         return {**dict(zip(names, means.tolist(), strict=True)), "mean_reward": reward}
 
+    def _start_row(self) -> None:
+        self._ends.clear()
+        self._reward[:] = 0.0
+        self._looks = 0
+
     def state(self) -> dict[str, Any]:
         """What `load` takes."""
-        return {"whole": self._whole.copy(), "episodes": np.array(self._episodes).reshape(-1, 3)}
+        return {
+            "shortened": self._arrays.numpy(self._shortened),
+            "episodes": np.array(self._episodes).reshape(-1, 3),
+        }
 
     def load(self, state: dict[str, Any]) -> None:
         """Go on from a state that was taken between two updates."""
-        self._whole = state["whole"].copy()
+        self._shortened[...] = self._arrays.bools(state["shortened"])
         self._episodes.clear()
         self._episodes.extend(tuple(row) for row in state["episodes"].tolist())
-        self._reward, self._looks = 0.0, 0
+        self._start_row()

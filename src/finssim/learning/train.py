@@ -38,7 +38,7 @@ def train(
     task: str | Task,
     *,
     out: Path,
-    learner: str = "sb3-ppo",
+    learner: str = "ppo",
     vehicle: str | Vehicle = "finsrov",
     hydrodynamics: str = "calibrated",
     action: str | None = None,
@@ -46,6 +46,7 @@ def train(
     seed: int = 42,
     worlds: int | None = None,
     steps: int | None = None,
+    until: float | None = None,
     settings: Mapping[str, Any] | None = None,
     device: str = "cpu",
     resume: bool = False,
@@ -69,6 +70,8 @@ def train(
         seed: Of everything random.
         worlds: Worlds at once; the settings' own if None.
         steps: Control steps of all worlds together; the settings' own if None.
+        until: Share of successes among the held episodes, in (0, 1], at which the training is done before its steps
+            are: reached in two evaluations one after the other.
         settings: Changes of the learner's settings by name.
         device: cpu or cuda.
         resume: Go on from the last checkpoint of a training that was started with the same arguments.
@@ -91,6 +94,8 @@ def train(
     for name, number in (("worlds", worlds), ("steps", steps)):
         if number is not None and number < 1:
             raise TrainingError(f"{name} is {number}, expected 1 or more")
+    if until is not None and not 0.0 < until <= 1.0:
+        raise TrainingError(f"until is {until}, expected a share of successes above 0, at most 1")
     kind, the_task = learner_named(learner), task_named(task)
     kind.check(the_task)
     chosen = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
@@ -100,9 +105,8 @@ def train(
     mode = action_mode(action or the_task.action, chosen)
     side = Path(out).with_name(f"{Path(out).name}-training")
 
-    import torch
-
     from finssim.learning.held_evaluation import HELD_WORLDS, HeldEvaluation, held_seed
+    from finssim.learning.layers import one_thread
     from finssim.learning.progress import TrainingView
     from finssim.learning.training_loop import Loop, last_checkpoint
 
@@ -110,8 +114,6 @@ def train(
     randomized = randomization is not None
     plan, settings = _level_plan(settings or {})
     values = kind.settings(the_task, randomized=randomized, worlds=worlds, steps=steps, changes=settings)
-    # A second thread gains little on so small a network, and loses much where anything else computes.
-    torch.set_num_threads(1)
 
     def worlds_of(count: int, ranges: Randomization | None, its_seed: int, **more: Any) -> Environment:
         return make(
@@ -122,6 +124,10 @@ def train(
     asymmetric = randomized and getattr(values, "asymmetric", False)
     environment = worlds_of(values.worlds, randomization, seed, privileged=asymmetric)
     the_task = environment.task  # fitted to the vehicle
+    if until is not None and "success" not in the_task.metrics(environment.arrays):
+        raise TrainingError(
+            f"until is {until}, but task '{the_task.name}' has no metric 'success': leave until out"
+        )
     if plan is not None:
         climb(environment, plan)
     description = PolicyDescription(
@@ -141,17 +147,18 @@ def train(
             "task": task_record(the_task),
             "agents": list(the_task.agents),
             "levels": asdict(plan) if plan else None,
+            "until": until,
         },
     )
     began = time.perf_counter()
-    with TrainingView(values.steps, console) as view, warnings.catch_warnings():
+    with one_thread(), TrainingView(values.steps, console) as view, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*mini-batch.*")  # a last small batch does no harm
         warnings.filterwarnings("ignore", message=".*on the GPU.*")
         loop = Loop(
             kind(environment, values, seed=seed, device=device), description, side,
             evaluate=HeldEvaluation(worlds_of(HELD_WORLDS, _whole(randomization), held_seed(seed)), device),
             show=view.update, progress=environment.set_progress, also=lambda: _level(environment),
-            identity=_identity(description),
+            identity=_identity(description), until=until,
         )  # fmt: skip
         if checkpoint is not None:
             loop.resume(checkpoint)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import shutil
 import time
 from collections.abc import Callable, Mapping
@@ -10,7 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from torch.utils.tensorboard import SummaryWriter
+from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
 from finssim.control.policy_description import DESCRIPTION_FILE, PolicyDescription
 from finssim.learning.export import export_policy
@@ -48,12 +51,14 @@ class Loop:
     """What else a row says, after each update: at which level it was."""
     identity: Mapping[str, Any]
     """What must be equal for a training to go on from a checkpoint."""
+    until: float | None = None
+    """Share of successes among the held episodes: reached in two evaluations in a row, the training is done."""
     curves: list[dict[str, Any]] = field(default_factory=list)
     seconds: float = 0.0
     """Time of the updates and evaluations so far [s], over all the pieces of a training that was resumed."""
 
     def run(self) -> bool:
-        """Update until the steps are done.
+        """Update until the steps are done, or the held episodes succeed as often as `until` says.
 
         Returns:
             Whether it was interrupted by Ctrl-C.
@@ -61,15 +66,13 @@ class Loop:
         Raises:
             LearningError: A number of the learner stopped being finite.
         """
-        # What a killed or an earlier training logged after this step, TensorBoard is to forget.
-        log = SummaryWriter(str(self.side / "tensorboard"), purge_step=self.learner.steps + 1)
+        log = _CurveLog(self.side / "tensorboard", self.learner.steps)
         total = self.learner.settings.steps
         try:
-            while self.learner.steps < total:
+            while self.learner.steps < total and not self.reached:
                 row = self._update(total)
                 self.curves.append(row)
-                for name, value in row.items():
-                    log.add_scalar(_tag(name), value, row["steps"])
+                log.add(row)
                 self.show(row)
                 every = min(CHECKPOINT_STEPS, math.ceil(total / CHECKPOINTS))
                 if self._passed(every):
@@ -79,6 +82,20 @@ class Loop:
         finally:
             log.close()
         return False
+
+    @property
+    def reached(self) -> bool:
+        """Whether the last two held evaluations reached `until`."""
+        if self.until is None:
+            return False
+        every = math.ceil(self.learner.settings.steps / EVALUATIONS)
+        measured = [0, *(row["steps"] // every for row in self.curves)]
+        shares = [
+            row["evaluation_success"]
+            for row, before, now in zip(self.curves, measured, measured[1:], strict=False)
+            if now > before
+        ]
+        return len(shares) >= 2 and min(shares[-2:]) >= self.until
 
     def _update(self, total: int) -> dict[str, Any]:
         began = time.perf_counter()
@@ -181,6 +198,26 @@ def after(description: PolicyDescription, steps: int, complete: bool) -> PolicyD
     """The description of the network as it is after so many steps."""
     record = {**description.training, "steps_done": steps, "complete": complete}
     return description.model_copy(update={"training": record})
+
+
+class _CurveLog:
+    """Rows of the curves as TensorBoard reads them, without torch."""
+
+    def __init__(self, folder: Path, steps: int) -> None:
+        """Go on after so many steps: what a killed or an earlier training logged later, TensorBoard is to forget."""
+        os.makedirs(folder, exist_ok=True)
+        self._writer = EventFileWriter(str(folder))
+        start = SessionLog(status=SessionLog.START)
+        self._writer.add_event(Event(wall_time=time.time(), step=steps + 1, session_log=start))
+
+    def add(self, row: Mapping[str, Any]) -> None:
+        """Log a row."""
+        values = [Summary.Value(tag=_tag(name), simple_value=value) for name, value in row.items()]
+        self._writer.add_event(Event(wall_time=time.time(), step=row["steps"], summary=Summary(value=values)))
+
+    def close(self) -> None:
+        """Write what is left."""
+        self._writer.close()
 
 
 def _tag(name: str) -> str:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from finssim.engine.state import State
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.episode import action_effort, close_episode, open_episode, report_frozen, uniform3
+from finssim.tasks.measurement import MeasurementNoise
 from finssim.tasks.task import ObservationPart, Task
 
 DISTANCE_SCALE = 3.0
@@ -236,6 +237,10 @@ class StationKeeping(Task):
     hold: float = 10.0
     """... for this long [s]."""
     reward: Reward = field(default_factory=Reward)
+    training_noise: MeasurementNoise = MeasurementNoise(
+        position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02, delay=0.1
+    )
+    """About what an estimate is off by, and how late it comes: with exact states, gains are learnt that chatter."""
 
     evaluate = staticmethod(evaluate)
     spawn = staticmethod(spawn)

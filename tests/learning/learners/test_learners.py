@@ -10,7 +10,7 @@ import torch
 import finssim
 from finssim.learning.held_evaluation import HeldEvaluation
 from finssim.learning.learners import LEARNERS, LearningError, learner_named
-from finssim.learning.recurrent import asked, first_memory
+from finssim.learning.network import Network, asked, first_memory
 from finssim.learning.resume import read_state, write_state
 from finssim.tasks import TASKS, task_named
 from reference.guess import BEST, Guess, GuessTogether
@@ -82,9 +82,12 @@ def test_it_finds_the_best_action(name, task):
     before = learner.update()
     while learner.steps < steps:
         row = learner.update()
-    network, seen = learner.network(), torch.tensor([[1.0], [-1.0]])
+    network, seen = learner.network(), np.array([[1.0], [-1.0]], np.float32)
+    if not isinstance(network, Network):
+        seen = torch.from_numpy(seen)
     with torch.no_grad():
-        action = asked(network, seen, first_memory(network, 2))[0].numpy()
+        device = None if isinstance(network, Network) else "cpu"
+        action = np.asarray(asked(network, seen, first_memory(network, 2, device))[0])
     assert np.abs(action - BEST * np.array([[1.0], [-1.0]])).max() < 0.1
     assert row.keys() == before.keys() and row["held"] > before["held"] and row["mean_return"] > 0.9
     held = HeldEvaluation(finssim.make(task(), worlds=8, seed=77))(network)
@@ -129,7 +132,7 @@ def test_equal_seeds_are_equal_learners(name):
 
 def test_unknown_names_are_refused():
     with pytest.raises(
-        LearningError, match="unknown learner 'sb3'; available: sb3-ppo, sb3-sac, sb3-recurrent-ppo"
+        LearningError, match="unknown learner 'sb3'; available: ppo, sb3-ppo, sb3-sac, sb3-recurrent-ppo"
     ):
         learner_named("sb3")
     kind, task = learner_named("sb3-ppo"), Guess()

@@ -5,15 +5,15 @@ import sys
 import pytest
 
 from finssim.learning.learners import LEARNERS, learner_named, task_settings
-from finssim.learning.learners.task_settings import PPO, RANDOMIZED, SETTINGS, own_settings
+from finssim.learning.learners.task_settings import ON_POLICY, RANDOMIZED, SETTINGS, own_settings
 from finssim.tasks import TASKS, task_named
 from reference.guess import Guess
 
 
 def test_the_tasks_own_lines_outrank_the_others(monkeypatch):
-    """Every task, then the task; `ppo`, then the learner; plain, then randomised."""
-    plain = {"*": {"ppo": {"a": 1, "b": 1}}, "t1": {"ppo": {"b": 2, "c": 2}, "rsl-rl": {"c": 3}}}
-    drawn = {"*": {"ppo": {"a": 4, "b": 4}}, "t1": {"ppo": {"d": 5}}}
+    """Every task, then the task; `on-policy`, then the learner; plain, then randomised."""
+    plain = {"*": {"on-policy": {"a": 1, "b": 1}}, "t1": {"on-policy": {"b": 2, "c": 2}, "rsl-rl": {"c": 3}}}
+    drawn = {"*": {"on-policy": {"a": 4, "b": 4}}, "t1": {"on-policy": {"d": 5}}}
     monkeypatch.setattr(task_settings, "SETTINGS", plain)
     monkeypatch.setattr(task_settings, "RANDOMIZED", drawn)
     assert own_settings("other", "sb3-sac", True) == {}
@@ -37,10 +37,10 @@ def test_a_training_begins_with_its_tasks_settings(name, randomized):
 
 
 def test_every_line_is_of_something_that_exists():
-    assert set(PPO) <= set(LEARNERS)
+    assert set(ON_POLICY) <= set(LEARNERS)
     for table in (SETTINGS, RANDOMIZED):
         assert set(table) <= {"*", *TASKS}
-        assert {learner for rows in table.values() for learner in rows} <= {"ppo", *LEARNERS}
+        assert {learner for rows in table.values() for learner in rows} <= {"on-policy", *LEARNERS}
 
 
 def test_a_task_of_ones_own_has_the_defaults():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from copy import deepcopy
 from typing import Any
 
+from finssim.learning.layers import Arrays
 from finssim.learning.resume import random_state, set_random_state
 from finssim.learning.tally import EpisodeTally
 from finssim.tasks import Environment
@@ -15,10 +16,10 @@ __all__ = ["ActingLearner"]
 class ActingLearner:
     """Base of the learners; `learned` and `load_learned` are its own part of the state."""
 
-    def __init__(self, environment: Environment, settings: Any) -> None:
-        """Take the environment, whose first episodes are going to be aged."""
+    def __init__(self, environment: Environment, settings: Any, arrays: Arrays | None = None) -> None:
+        """Take the environment, whose first episodes are going to be aged, and the library of the learner's arrays."""
         self.environment, self.settings = environment, settings
-        self.tally = EpisodeTally(environment)
+        self.tally = EpisodeTally(environment, arrays=arrays)
         self.steps = 0
 
     @property

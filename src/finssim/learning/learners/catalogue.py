@@ -14,6 +14,8 @@ from finssim.tasks import Environment, Task
 if TYPE_CHECKING:
     from torch import nn
 
+    from finssim.learning.network import Network
+
 __all__ = ["LEARNERS", "Learner", "LearnerKind", "LearningError", "learner_named"]
 
 
@@ -37,8 +39,8 @@ class Learner(Protocol):
             last episodes that succeeded), mean_reward, and the learner's own numbers.
         """
 
-    def network(self) -> nn.Module:
-        """Observation of one agent to its mean action, for evaluation and export; or a `RecurrentNetwork`."""
+    def network(self) -> nn.Module | Network:
+        """Observation of one agent to its mean action, for evaluation and export; a torch module or a `Network`."""
 
     def state(self) -> dict[str, Any]:
         """Everything that decides what comes next: parameters, optimisers, random streams, the environment."""
@@ -123,6 +125,7 @@ class LearnerKind:
 
 
 LEARNERS: dict[str, LearnerKind] = {
+    "ppo": LearnerKind("ppo", "Ppo", "PPO of our own, NumPy on a processor and torch on a GPU"),
     "sb3-ppo": LearnerKind("sb3_ppo", "Sb3Ppo", "PPO of Stable-Baselines3"),
     "sb3-sac": LearnerKind("sb3_sac", "Sb3Sac", "SAC of Stable-Baselines3"),
     "sb3-recurrent-ppo": LearnerKind(
@@ -156,7 +159,7 @@ LEARNERS: dict[str, LearnerKind] = {
 """Learner by the name that commands take."""
 
 
-MAY_BE_ZERO = ("warm_up", "clone_passes", "expert_rounds")
+MAY_BE_ZERO = ("warm_up", "clone_passes", "expert_rounds", "history", "memory")
 """Settings that count what may be left out; of all others there is at least one."""
 
 

@@ -1,0 +1,339 @@
+"""Networks with their gradients by hand, for NumPy and torch alike: linear layers with tanh, a GRU, and Adam.
+
+Every function is written once with what the two libraries share (`@`, `tanh`, `where`, `out=`), so that the same lines
+learn with NumPy on a processor, without torch, and with torch on a GPU, without a copy through the host. Rows are
+samples.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+__all__ = ["Adam", "Arrays", "Gru", "Parameters", "Row", "Stack", "one_thread"]
+
+Array = Any
+"""A NumPy array or a torch tensor, float32."""
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Matrix products on one thread: a second gains little on so small networks, and loses much on a busy machine."""
+    from threadpoolctl import threadpool_limits
+
+    if torch := sys.modules.get("torch"):
+        torch.set_num_threads(1)
+    with threadpool_limits(limits=1):
+        yield
+
+
+class Arrays:
+    """A library of arrays and a place for them: NumPy's, or torch's on one of its devices.
+
+    Attributes:
+        xp: The library.
+    """
+
+    def __init__(self, seed: int, torch_device: str | None = None) -> None:
+        """Take torch on a device such as `cuda`, or NumPy if that is None; everything random comes from `seed`."""
+        self.xp: ModuleType = np
+        self.device = torch_device
+        self._rng: Any = np.random.Generator(np.random.SFC64(seed))
+        """Of first weights and orders of samples; of noise too with NumPy."""
+        if torch_device is not None:
+            import torch
+
+            self.xp = torch
+            self._noise = torch.Generator(device=torch_device)
+            self._noise.manual_seed(seed)
+
+    def view(self, array: Any) -> Array:
+        """A Warp array in the same memory."""
+        if self.device is None:
+            return array.numpy()
+        import warp as wp
+
+        return wp.to_torch(array, requires_grad=False)
+
+    def empty(self, *shape: int) -> Array:
+        """Room for numbers."""
+        return (
+            np.empty(shape, np.float32) if self.device is None else self.xp.empty(shape, device=self.device)
+        )
+
+    def zeros(self, *shape: int) -> Array:
+        """Zeros."""
+        return (
+            np.zeros(shape, np.float32) if self.device is None else self.xp.zeros(shape, device=self.device)
+        )
+
+    def array(self, values: Any) -> Array:
+        """A copy of NumPy's numbers."""
+        if self.device is None:
+            return np.array(values, np.float32)
+        return self.xp.tensor(np.asarray(values, np.float32), device=self.device)
+
+    def bools(self, values: Any) -> Array:
+        """A copy of NumPy's truths."""
+        return np.array(values, bool) if self.device is None else self.xp.tensor(values, device=self.device)
+
+    def plain(self) -> Any:
+        """A context in which torch records no operations, and NumPy warns of none: who computes checks the results."""
+        return np.errstate(all="ignore") if self.device is None else self.xp.no_grad()
+
+    def numpy(self, array: Array) -> Any:
+        """A copy as NumPy."""
+        return np.array(array) if self.device is None else array.detach().cpu().numpy().copy()
+
+    def copy(self, array: Array) -> Array:
+        """A copy."""
+        return array.copy() if self.device is None else array.clone()
+
+    def noise(self, out: Array) -> Array:
+        """Fill with standard normal numbers."""
+        if self.device is None:
+            return self._rng.standard_normal(out=out, dtype=np.float32)
+        return out.normal_(generator=self._noise)
+
+    def order(self, n: int) -> Array:
+        """The numbers below n in random order, as indices."""
+        if self.device is None:
+            return self._rng.permutation(n)
+        return self.xp.randperm(n, generator=self._noise, device=self.device)
+
+    def orthogonal(self, rows: int, columns: int, gain: float) -> Any:
+        """An orthogonal matrix (Saxe et al. 2014), as NumPy."""
+        q, r = np.linalg.qr(self._rng.standard_normal((max(rows, columns), min(rows, columns))))
+        q *= np.sign(np.diag(r))
+        return (gain * (q if rows >= columns else q.T)).astype(np.float32)
+
+    def state(self) -> dict[str, Any]:
+        """The random streams, for `load`."""
+        saved: dict[str, Any] = {"numpy": self._rng.bit_generator.state}
+        if self.device is not None:
+            saved["torch"] = self._noise.get_state().cpu().numpy()
+        return saved
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Go on from `state`."""
+        self._rng.bit_generator.state = state["numpy"]
+        if self.device is not None:
+            self._noise.set_state(self.xp.from_numpy(np.asarray(state["torch"])))
+
+
+class Parameters:
+    """All numbers of some networks in one row, and their gradient in another: an optimiser needs no more."""
+
+    def __init__(self, arrays: Arrays, *networks: Any) -> None:
+        """Give the networks their memory: `shapes()` of each says what it needs, `bind` hands it over."""
+        sizes = [[math.prod(shape) for shape in network.shapes()] for network in networks]
+        total = sum(map(sum, sizes))
+        self.values, self.gradient = arrays.zeros(total), arrays.zeros(total)
+        first = 0
+        for network in networks:
+            views: list[list[Array]] = [[], []]
+            for shape in network.shapes():
+                size = math.prod(shape)
+                for row, found in zip((self.values, self.gradient), views, strict=True):
+                    found.append(row[first : first + size].reshape(shape))
+                first += size
+            network.bind(*views)
+
+
+class Row:
+    """Numbers that depend on no input."""
+
+    def __init__(self, size: int) -> None:
+        """Take how many."""
+        self.size = size
+
+    def shapes(self) -> list[tuple[int, ...]]:
+        """Of the numbers."""
+        return [(self.size,)]
+
+    def bind(self, weights: list[Array], gradients: list[Array]) -> None:
+        """Take memory for the numbers and for their gradient."""
+        self.values, self.gradient = weights[0], gradients[0]
+
+
+class Stack:
+    """Linear layers with tanh between them: tanh(... tanh(x W_1 + b_1) ...) W_n + b_n."""
+
+    def __init__(self, arrays: Arrays, sizes: Sequence[int]) -> None:
+        """Take the numbers of inputs, hidden units and outputs, in order."""
+        self.arrays, self.sizes = arrays, tuple(sizes)
+        self.weights: list[Array] = []
+        """W and b of each layer, one after the other."""
+        self._room: dict[tuple[int, ...], Array] = {}
+
+    def shapes(self) -> list[tuple[int, ...]]:
+        """Of W, (inputs, outputs), and b, (outputs,), of each layer."""
+        return [shape for a, b in zip(self.sizes, self.sizes[1:], strict=False) for shape in ((a, b), (b,))]
+
+    def bind(self, weights: list[Array], gradients: list[Array]) -> None:
+        """Take memory for the weights and for their gradients."""
+        self.weights, self._gradients = weights, gradients
+
+    def initialize(self, last_gain: float) -> None:
+        """Orthogonal weights of gain √2, `last_gain` in the last layer, and no bias."""
+        last = len(self.sizes) - 2
+        for i in range(last + 1):
+            gain = last_gain if i == last else math.sqrt(2.0)
+            self.weights[2 * i][:] = self.arrays.array(
+                self.arrays.orthogonal(self.sizes[i], self.sizes[i + 1], gain)
+            )
+            self.weights[2 * i + 1][:] = 0.0
+
+    def __call__(self, x: Array) -> Array:
+        """The outputs, (N, outputs), for inputs (N, inputs): memory that the next call of as many rows takes."""
+        self._inputs = [x]
+        last = len(self.sizes) - 2
+        for i in range(last + 1):
+            y = self._memory("y", i, len(x))
+            self.arrays.xp.matmul(x, self.weights[2 * i], out=y)
+            y += self.weights[2 * i + 1]
+            if i < last:
+                self.arrays.xp.tanh(y, out=y)
+                self._inputs.append(y)
+            x = y
+        return x
+
+    def backward(self, dy: Array, inputs: bool = False) -> Array | None:
+        """Write the gradient of the weights, from that of the last call's outputs; that of its inputs if asked for."""
+        xp = self.arrays.xp
+        for i in reversed(range(len(self.sizes) - 1)):
+            x = self._inputs[i]
+            xp.matmul(x.T, dy, out=self._gradients[2 * i])
+            self._gradients[2 * i + 1][:] = dy.sum(0)
+            if i == 0 and not inputs:
+                return None
+            dx = self._memory("d", i, len(x))
+            xp.matmul(dy, self.weights[2 * i].T, out=dx)
+            if i > 0:
+                slope = self._memory("s", i, len(x))
+                xp.multiply(x, x, out=slope)
+                xp.subtract(self._one, slope, out=slope)
+                dx *= slope
+            dy = dx
+        return dy
+
+    @property
+    def _one(self) -> Array:
+        if "one" not in self.__dict__:
+            self.__dict__["one"] = self.arrays.array(1.0)
+        return self.__dict__["one"]
+
+    def _memory(self, kind: str, layer: int, rows: int) -> Array:
+        """Room for a layer's numbers, the same every time: a new array costs more than what is computed."""
+        size = self.sizes[layer + 1] if kind == "y" else self.sizes[layer]
+        key = (kind, layer, rows)
+        if key not in self._room:
+            self._room[key] = self.arrays.empty(rows, size)
+        return self._room[key]
+
+
+class Gru:
+    """A gated recurrent unit (Cho et al. 2014) as torch and ONNX have it, over a piece of time.
+
+    r = σ(x W_xr + b_xr + h W_hr + b_hr), z likewise, n = tanh(x W_xn + b_xn + r (h W_hn + b_hn)), h' = (1 - z) n + z h
+    """
+
+    def __init__(self, arrays: Arrays, inputs: int, units: int) -> None:
+        """Take the number of inputs, and of units, whose outputs are also what it remembers."""
+        self.arrays, self.inputs, self.units = arrays, inputs, units
+        self.weights: list[Array] = []
+        """W_x (inputs, 3 units), b_x, W_h (units, 3 units), b_h, with r, z and n side by side."""
+
+    def shapes(self) -> list[tuple[int, ...]]:
+        """Of the weights."""
+        k = 3 * self.units
+        return [(self.inputs, k), (k,), (self.units, k), (k,)]
+
+    def bind(self, weights: list[Array], gradients: list[Array]) -> None:
+        """Take memory for the weights and for their gradients."""
+        self.weights, self._gradients = weights, gradients
+
+    def initialize(self) -> None:
+        """Orthogonal weights gate by gate, and no bias."""
+        for weight, rows in ((self.weights[0], self.inputs), (self.weights[2], self.units)):
+            gates = [self.arrays.orthogonal(rows, self.units, 1.0) for _ in range(3)]
+            weight[:] = self.arrays.array(np.concatenate(gates, axis=1))
+
+    def __call__(self, x: Array, h: Array, keep: Array) -> Array:
+        """Outputs of a piece of time.
+
+        Args:
+            x: Inputs, (time, rows, inputs).
+            h: What is remembered before it, (rows, units).
+            keep: 0 where an episode starts with these inputs, else 1, (time, rows).
+
+        Returns:
+            (time, rows, units).
+        """
+        xp, k = self.arrays.xp, self.units
+        W_x, b_x, W_h, b_h = self.weights
+        from_x = (x.reshape(-1, self.inputs) @ W_x + b_x).reshape(*x.shape[:2], 3 * k)
+        out = self.arrays.empty(*x.shape[:2], k)
+        self._x, self._keep, self._steps = x, keep, []
+        for t in range(len(x)):
+            h = h * keep[t][:, None]
+            from_h = h @ W_h + b_h
+            gates = 1.0 / (1.0 + xp.exp(-(from_x[t, :, : 2 * k] + from_h[:, : 2 * k])))
+            r, z = gates[:, :k], gates[:, k:]
+            n = xp.tanh(from_x[t, :, 2 * k :] + r * from_h[:, 2 * k :])
+            self._steps.append((h, r, z, n, from_h[:, 2 * k :]))
+            h = n + z * (h - n)
+            out[t] = h
+        return out
+
+    def backward(self, dy: Array) -> None:
+        """Write the gradient of the weights from that of the last call's outputs, (time, rows, units), through time."""
+        k, W_h = self.units, self.weights[2]
+        d_x = self.arrays.empty(*dy.shape[:2], 3 * k)
+        d_h = self.arrays.empty(*dy.shape[:2], 3 * k)
+        carried = self.arrays.zeros(*dy.shape[1:])
+        for t in reversed(range(len(dy))):
+            h, r, z, n, from_h = self._steps[t]
+            dh = dy[t] + carried
+            dn = dh * (1.0 - z) * (1.0 - n * n)
+            d_x[t, :, :k] = dn * from_h * r * (1.0 - r)
+            d_x[t, :, k : 2 * k] = dh * (h - n) * z * (1.0 - z)
+            d_x[t, :, 2 * k :] = dn
+            d_h[t, :, : 2 * k] = d_x[t, :, : 2 * k]
+            d_h[t, :, 2 * k :] = dn * r
+            carried = (dh * z + d_h[t] @ W_h.T) * self._keep[t][:, None]
+        from_x, from_h = d_x.reshape(-1, 3 * k), d_h.reshape(-1, 3 * k)
+        before = self.arrays.empty(*dy.shape)
+        for t, step in enumerate(self._steps):
+            before[t] = step[0]
+        for i, (inputs, d) in enumerate(((self._x, from_x), (before, from_h))):
+            self._gradients[2 * i][:] = inputs.reshape(len(d), -1).T @ d
+            self._gradients[2 * i + 1][:] = d.sum(0)
+
+
+class Adam:
+    """Adam (Kingma and Ba 2015), after shortening gradients that are longer than `largest`."""
+
+    def __init__(self, parameters: Parameters, arrays: Arrays, largest: float) -> None:
+        """Take what to optimise."""
+        self.parameters, self.xp, self.largest = parameters, arrays.xp, largest
+        n = len(parameters.values)
+        self.mean, self.square = arrays.zeros(n), arrays.zeros(n)
+        self.count = 0
+
+    def step(self, rate: float, b1: float = 0.9, b2: float = 0.999, epsilon: float = 1e-5) -> None:
+        """One step down the gradient."""
+        g = self.parameters.gradient
+        norm = self.xp.sqrt((g * g).sum())
+        g *= self.largest / self.xp.clip(norm, self.largest, None)
+        self.count += 1
+        self.mean += (1.0 - b1) * (g - self.mean)
+        self.square += (1.0 - b2) * (g * g - self.square)
+        c1, c2 = 1.0 - b1**self.count, 1.0 - b2**self.count
+        self.parameters.values -= (rate / c1) * self.mean / (self.xp.sqrt(self.square / c2) + epsilon)

@@ -1,0 +1,363 @@
+"""PPO (Schulman et al. 2017), the learner of `finssim train`: one file, with gradients by hand.
+
+NumPy on a processor, without torch; the same lines with torch on a GPU, on the environment's own memory. Several
+agents of a world are rows of their own and share the networks.
+
+    rollout     every row acts for T control steps: a ~ N(μ(x), σ²)
+    advantage   A_t = Σ (γ λ)^k δ_(t+k),  δ_t = r_t + γ V(x_(t+1)) - V(x_t)                     (Schulman et al. 2016)
+    policy      minimise -E min(ρ A, clip(ρ, 1 ± ε) A) - c H,  ρ = π(a|x) / π_old(a|x)
+    value       minimise E (V(x) - A - V_old(x))² / 2
+
+Where time ends an episode, the value of its last observation follows; where the task ends it, nothing does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+from finssim.learning.layers import Adam, Array, Arrays, Gru, Parameters, Row, Stack
+from finssim.learning.learners.acting import ActingLearner
+from finssim.learning.learners.task_settings import applied
+from finssim.learning.network import Activation, Cell, Linear, Network, advance_history
+from finssim.learning.served import age_episodes
+from finssim.tasks import Environment, Task
+
+__all__ = ["Ppo", "PpoSettings", "settings_for"]
+
+ROLLOUT_SAMPLES = 4096
+"""Fewest samples between two updates: with few worlds, rollouts are longer."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PpoSettings:
+    """The defaults; what a task has of its own stands in `task_settings`."""
+
+    worlds: int = 256
+    steps: int = 400_000
+    """Control steps of all worlds together."""
+    rollout: int = 16
+    """T, control steps of each world between two updates."""
+    batch: int = 512
+    """Samples in a gradient step. At equal arithmetic, many small steps learn faster here than few large ones."""
+    epochs: int = 3
+    """Passes over a rollout."""
+    learning_rate: float = 4.0e-3
+    """At the start; falls linearly to zero, which is what brings the last centimetres."""
+    discount: float = 0.98
+    """γ, per control step: 5 s of foresight at 10 Hz, a few time constants of the vehicle."""
+    gae_lambda: float = 0.95
+    clip: float = 0.2
+    """ε."""
+    largest_gradient: float = 0.5
+    """Longer gradients, of policy and value each, are shortened to this norm: an odd batch must not undo many."""
+    entropy_weight: float = 0.0
+    """c: no reward for noise, which would keep the vehicle from settling."""
+    log_std: float = -1.0
+    """Logarithm of the action noise at the start: more hides the goal's last centimetres."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Units of the hidden layers, tanh, of the policy and of the value each."""
+    normalize: bool = False
+    """Scale observations by their running mean and standard deviation; the scales become part of the policy."""
+    history: int = 0
+    """Observations of earlier control steps that the policy sees beside the newest."""
+    last_action: bool = False
+    """Whether the policy sees what it did last."""
+    memory: int = 0
+    """Units of a GRU in front of the policy's hidden layers, which remembers what cannot be seen; 0: none."""
+    asymmetric: bool = True
+    """Whether the value sees what randomisation has drawn, which the policy does not."""
+
+
+def settings_for(task: Task, learner: str = "Ppo", **given: Any) -> PpoSettings:
+    """The settings of a training, with rollouts long enough; `given` as `task_settings.applied` takes it."""
+    settings = applied(PpoSettings(), **given)
+    rows = settings.worlds * len(task.agents)
+    return replace(settings, rollout=max(settings.rollout, math.ceil(ROLLOUT_SAMPLES / rows)))
+
+
+class Ppo(ActingLearner):
+    """PPO on a batched environment. Arrays are (time, rows, ...), with a row for each agent of each world."""
+
+    def __init__(
+        self,
+        environment: Environment,
+        settings: PpoSettings,
+        *,
+        seed: int,
+        device: str = "cpu",
+        arrays: Arrays | None = None,
+    ) -> None:
+        """Set up networks and optimisers, and age the first episodes.
+
+        Args:
+            environment: Its episodes are the learner's from now on.
+            settings: Of the training.
+            seed: Of first weights, action noise and the order of samples.
+            device: cpu or cuda.
+            arrays: NumPy on a processor and torch on a GPU, unless given.
+        """
+        self.arrays = A = arrays or Arrays(seed, None if device == "cpu" else device)
+        super().__init__(environment, settings, A)
+        age_episodes(environment)
+        s, e = settings, environment
+        self._rows, n, m = e.worlds * e.agents, e.observation_size, e.action_size
+        self._observation, self._final = self._views("observation"), self._views("final_observation")
+        self._action, self._reward = self._views("action"), self._views("agent_reward").reshape(-1)
+        self._terminated, self._truncated = A.view(e.arrays.terminated), A.view(e.arrays.truncated)
+        informed = s.asymmetric and e.arrays.privileged.size > 0
+        self._drawn, self._final_drawn = (
+            self._views(name) if informed else None for name in ("privileged", "final_privileged")
+        )
+        self._window = s.history * n + (m if s.last_action else 0)
+        inputs = n + self._window
+        judged = inputs + s.memory + (self._drawn.shape[1] if informed else 0)
+        self.gru = Gru(A, inputs, s.memory) if s.memory else None
+        self.actor, self.noise = Stack(A, [s.memory or inputs, *s.hidden, m]), Row(m)
+        self.critic = Stack(A, [judged, *s.hidden, 1])
+        self._policy = Parameters(A, self.actor, self.noise, *([self.gru] if self.gru else []))
+        self._value = Parameters(A, self.critic)
+        self.actor.initialize(last_gain=0.01)  # begin at action 0, whatever is seen
+        self.critic.initialize(last_gain=1.0)
+        self.noise.values[:] = s.log_std
+        if self.gru:
+            self.gru.initialize()
+        self._optimizers = [Adam(p, A, s.largest_gradient) for p in (self._policy, self._value)]
+        self._mean, self._variance, self._seen = A.zeros(n), A.zeros(n) + 1.0, 0
+        self._memory = A.zeros(self._rows, self._window + s.memory)
+        self._x = A.empty(s.rollout + 1, self._rows, inputs)
+        """What the policy saw."""
+        self._c = self._x if judged == inputs else A.empty(s.rollout + 1, self._rows, judged)
+        """What the critic saw."""
+        self._u, self._noise = A.empty(s.rollout, self._rows, m), A.empty(self._rows, m)
+        self._r, self._go, self._density = (A.empty(s.rollout, self._rows) for _ in range(3))
+        """Rewards; 0 where an episode ended, else 1; logarithms of the actions' densities, but for what all share."""
+
+    def _views(self, name: str) -> Array:
+        """An array of the environment's, a row for each agent."""
+        return self.arrays.view(getattr(self.environment.arrays, name)).reshape(self._rows, -1)
+
+    def update(self) -> dict[str, float]:
+        """One rollout, and `epochs` passes over it; a row of the training curve."""
+        rate = self.settings.learning_rate * self.left
+        with self.arrays.plain():
+            before = self.arrays.copy(self._memory[:, self._window :])
+            self._roll_out()
+            losses = self._learn(*self._advantages(), before, rate)
+            if self.settings.normalize:
+                self._rescale()
+        self.steps += self.environment.worlds * self.settings.rollout
+        return {**self.tally.row(), **losses}
+
+    # Rollout
+
+    def _roll_out(self) -> None:
+        """Act for `rollout` control steps, and keep what was seen, done and earned."""
+        A, s = self.arrays, self.settings
+        sigma = A.xp.exp(self.noise.values)
+        for t in range(s.rollout):
+            x, self._x[t], h, judged = self._look(self._observation, self._drawn)
+            if self._c is not self._x:
+                self._c[t] = judged
+            action, noise = self._u[t], A.noise(self._noise)
+            self._density[t] = -0.5 * (noise * noise).sum(1)
+            A.xp.multiply(noise, sigma, out=action)
+            action += self.actor(self._x[t] if h is None else h)
+            self._action[:] = action
+            self._remember(x, action, h)
+            self.environment.advance()
+            self.tally.look()
+            self._close(t)
+        self._c[s.rollout] = self._look(self._observation, self._drawn)[3]
+
+    def _look(self, observation: Array, drawn: Array | None) -> tuple[Array, Array, Array | None, Array]:
+        """The scaled observation, what the policy sees, what its GRU makes of that, and what the critic sees."""
+        xp, k = self.arrays.xp, self._window
+        x = (observation - self._mean) * self._scale if self.settings.normalize else observation
+        seen = xp.concatenate([x, self._memory[:, :k]], 1) if k else x
+        h = self._cell.step(seen, self._memory[:, k:])[0] if self.gru else None
+        parts = [part for part in (seen, h, drawn) if part is not None]
+        return x, seen, h, xp.concatenate(parts, 1) if len(parts) > 1 else seen
+
+    def _remember(self, x: Array, action: Array, h: Array | None) -> None:
+        s, xp, k = self.settings, self.arrays.xp, self._window
+        if k:
+            last = xp.clip(action, -1.0, 1.0) if s.last_action else None
+            self._memory[:, :k] = advance_history(xp, self._memory[:, :k], x, last, s.history)
+        if h is not None:
+            self._memory[:, k:] = h
+
+    def _close(self, t: int) -> None:
+        """What came of step t; where time ended an episode, the value of its last observation is part of the reward."""
+        A, e = self.arrays, self.environment
+        self._r[t], self._go[t] = self._reward, 1.0
+        terminated, truncated = self._terminated != 0, self._truncated != 0
+        done = terminated | truncated
+        if A.device is None and not done.any():
+            return  # on a GPU, to look would take longer than to go on
+        late, done = (
+            A.xp.broadcast_to(mask[:, None], (e.worlds, e.agents)).reshape(-1)
+            for mask in (truncated & ~terminated, done)
+        )
+        value = self.critic(self._look(self._final, self._final_drawn)[3])[:, 0]
+        self._r[t] += self.settings.discount * A.xp.where(late, value, 0.0 * value)
+        self._go[t] = A.xp.where(done, 0.0 * value, 0.0 * value + 1.0)
+        self._memory *= self._go[t][:, None]
+
+    # Advantage
+
+    def _advantages(self) -> tuple[Array, Array]:
+        """Advantages and targets of the value, (time, rows)."""
+        A, s = self.arrays, self.settings
+        value = A.copy(self.critic(self._c.reshape(-1, self._c.shape[2]))).reshape(s.rollout + 1, self._rows)
+        advantage, after = A.empty(s.rollout, self._rows), A.zeros(self._rows)
+        for t in reversed(range(s.rollout)):
+            delta = self._r[t] + s.discount * self._go[t] * value[t + 1] - value[t]
+            after = advantage[t] = delta + s.discount * s.gae_lambda * self._go[t] * after
+        return advantage, advantage + value[:-1]
+
+    # Learning
+
+    def _learn(self, advantage: Array, target: Array, before: Array, rate: float) -> dict[str, float]:
+        """Gradient steps on samples in random order; of a policy with a GRU, on whole rows in random order."""
+        A, s, T = self.arrays, self.settings, self.settings.rollout
+        samples = [x[:T] for x in (self._x, self._c, self._u, advantage, target, self._density)]
+        if self.gru is None:
+            samples = [x.reshape(T * self._rows, *x.shape[2:]) for x in samples]
+        n, size = (self._rows, max(1, s.batch // T)) if self.gru else (T * self._rows, s.batch)
+        edges = [n * k // max(1, n // size) for k in range(max(1, n // size) + 1)]
+        log_std = A.copy(self.noise.values)
+        losses = A.zeros(4)
+        for _ in range(s.epochs):
+            order = A.order(n)
+            for first, last in zip(edges, edges[1:], strict=False):
+                i = order[first:last]
+                if self.gru is None:
+                    x, c, u, a, v, density = (part[i] for part in samples)
+                    y = self.actor(x)
+                else:
+                    x, c, u, a, v, density = (part[:, i] for part in samples)
+                    y = self.actor(self.gru(x, before[i], self._keep()[:, i]).reshape(-1, s.memory))
+                    c, u, a, v, density = (
+                        part.reshape(-1, *part.shape[2:]) for part in (c, u, a, v, density)
+                    )
+                losses[:3] += self._improve_policy(y, u, a, density - log_std.sum(), rate)
+                losses[3] += self._improve_value(c, v, rate)
+        means = A.numpy(losses / float(s.epochs * (len(edges) - 1))).tolist()
+        names = ("policy_gradient_loss", "approx_kl", "clip_fraction", "value_loss")
+        std = float(A.numpy(A.xp.exp(self.noise.values)).mean())
+        return {"action_std": std, **dict(zip(names, means, strict=True))}
+
+    def _improve_policy(self, mean: Array, u: Array, advantage: Array, old: Array, rate: float) -> Array:
+        """One gradient step, after the actor's answers `mean` to a batch.
+
+        Args:
+            mean: μ, (N, m).
+            u: What was done, (N, m).
+            advantage: A, (N,).
+            old: log π_old(u|x) but for its constant, (N,).
+            rate: Of learning.
+
+        Returns:
+            The loss, the mean divergence from the old policy, and the part of the batch that is clipped.
+        """
+        s, xp, log_std = self.settings, self.arrays.xp, self.noise.values
+        advantage = advantage - advantage.mean()
+        advantage /= xp.sqrt((advantage * advantage).mean()) + 1e-8
+        inverse = xp.exp(-log_std)
+        z = (u - mean) * inverse
+        log_ratio = -0.5 * (z * z).sum(1) - log_std.sum() - old
+        ratio = xp.exp(log_ratio)
+        free = xp.where(advantage >= 0.0, ratio < 1.0 + s.clip, ratio > 1.0 - s.clip)
+        slope = (ratio * advantage * free / -float(len(u)))[:, None]  # of the loss, by log π
+        self.noise.gradient[:] = (slope * (z * z - 1.0)).sum(0) - s.entropy_weight
+        slope = self.actor.backward(slope * z * inverse, inputs=self.gru is not None)
+        if self.gru:
+            self.gru.backward(slope.reshape(s.rollout, -1, s.memory))
+        self._optimizers[0].step(rate)
+        limited = xp.where(free, ratio, xp.clip(ratio, 1.0 - s.clip, 1.0 + s.clip))
+        numbers = self.arrays.empty(3)
+        numbers[0] = -(limited * advantage).mean()
+        numbers[1] = (ratio - 1.0 - log_ratio).mean()
+        numbers[2] = xp.where(free, 0.0 * ratio, 0.0 * ratio + 1.0).mean()
+        return numbers
+
+    def _improve_value(self, judged: Array, target: Array, rate: float) -> Array:
+        """One gradient step; the loss."""
+        error = self.critic(judged)[:, 0] - target
+        self.critic.backward((error / float(len(error)))[:, None])
+        self._optimizers[1].step(rate)
+        return 0.5 * (error * error).mean()
+
+    def _keep(self) -> Array:
+        """0 where an episode starts with a step of the rollout, else 1; the memory before it is right already."""
+        keep = self.arrays.zeros(*self._go.shape) + 1.0
+        keep[1:] = self._go[:-1]
+        return keep
+
+    def _rescale(self) -> None:
+        """Take the rollout's observations into the running mean and variance (Chan et al. 1979)."""
+        n = self.environment.observation_size
+        x = self._x[:-1, :, :n].reshape(-1, n)
+        centre = x.mean(0)
+        variance = ((x - centre) ** 2).mean(0) / self._scale**2
+        shift = centre / self._scale
+        new, total = len(x), self._seen + len(x)
+        self._mean += shift * (new / total)
+        self._variance *= self._seen / total
+        self._variance += variance * (new / total) + shift**2 * (self._seen * new / total**2)
+        self._seen = total
+
+    @property
+    def _scale(self) -> Array:
+        return 1.0 / self.arrays.xp.sqrt(self._variance + 1e-6)
+
+    @property
+    def _cell(self) -> Cell:
+        W_x, b_x, W_h, b_h = self.gru.weights  # type: ignore[union-attr]
+        return Cell("gru", Linear(W_x, b_x), Linear(W_h, b_h))
+
+    # What others need of a learner
+
+    def network(self) -> Network:
+        """Observation to mean action, with what the policy remembers; a copy."""
+        A, s = self.arrays, self.settings
+        weights = [A.copy(x) for x in self.actor.weights]
+        layers: list[Linear | Activation] = []
+        for W, b in zip(weights[::2], weights[1::2], strict=True):
+            layers += [Linear(W, b), Activation("Tanh")]
+        scaling = {"mean": A.copy(self._mean), "scale": self._scale} if s.normalize else {}
+        return Network(
+            tuple(layers[:-1]),
+            history=s.history,
+            last_action=self.environment.action_size if s.last_action else 0,
+            observation_size=self.environment.observation_size,
+            cell=self._cell if self.gru else None,
+            **scaling,
+        )
+
+    def _numbers(self) -> dict[str, Array]:
+        """Arrays that decide what comes next."""
+        numbers = {"mean": self._mean, "variance": self._variance, "memory": self._memory}
+        for name, optimizer in zip(("policy", "value"), self._optimizers, strict=True):
+            numbers[name] = optimizer.parameters.values
+            numbers |= {f"{name}_mean": optimizer.mean, f"{name}_square": optimizer.square}
+        return numbers
+
+    def learned(self) -> dict[str, Any]:
+        """Networks, optimisers, scales, memories and random streams."""
+        return {
+            "numbers": {name: self.arrays.numpy(array) for name, array in self._numbers().items()},
+            "counts": [self._seen, *(optimizer.count for optimizer in self._optimizers)],
+            "streams": self.arrays.state(),
+        }
+
+    def load_learned(self, state: dict[str, Any]) -> None:
+        """Take what `learned` gave."""
+        for name, array in self._numbers().items():
+            array[...] = self.arrays.array(state["numbers"][name])
+        self._seen, *counts = (int(count) for count in state["counts"])
+        for optimizer, count in zip(self._optimizers, counts, strict=True):
+            optimizer.count = count
+        self.arrays.load(state["streams"])

@@ -1,0 +1,203 @@
+"""A trained network as plain arrays: what is evaluated and exported, whichever library it was learnt with."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+__all__ = ["Activation", "Cell", "Linear", "Network", "advance_history", "asked", "first_memory"]
+
+Array = Any
+"""A NumPy array or a torch tensor."""
+
+
+@dataclass(frozen=True)
+class Linear:
+    """y = x W + b."""
+
+    weight: Array
+    """(inputs, outputs)."""
+    bias: Array | None
+    """(outputs,)."""
+
+
+@dataclass(frozen=True)
+class Activation:
+    """An ONNX operator that acts on each number: Tanh, Relu, Elu or Identity."""
+
+    kind: str
+    alpha: float = 1.0
+    """Of Elu alone."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """An LSTM of torch's equations (gates i, f, g, o), or a GRU (r, z, n), one step at a time."""
+
+    kind: str
+    """lstm or gru."""
+    from_x: Linear
+    """From its inputs to all gates side by side."""
+    from_h: Linear
+    """From what it put out before to all gates."""
+
+    @property
+    def units(self) -> int:
+        """Numbers that it puts out."""
+        return int(self.from_h.weight.shape[0])
+
+    @property
+    def memory_size(self) -> int:
+        """Numbers that it hands on: of an LSTM its outputs and its cells, of a GRU its outputs."""
+        return self.units * (2 if self.kind == "lstm" else 1)
+
+    def step(self, x: Array, memory: Array) -> tuple[Array, Array]:
+        """Outputs (N, k) and memory after."""
+        xp, k = _library(x), self.units
+        h = memory[:, :k]
+        a, b = _linear(self.from_x, x), _linear(self.from_h, h)
+        if self.kind == "gru":
+            r, z = _sigmoid(xp, a[:, :k] + b[:, :k]), _sigmoid(xp, a[:, k : 2 * k] + b[:, k : 2 * k])
+            n = xp.tanh(a[:, 2 * k :] + r * b[:, 2 * k :])
+            h = n + z * (h - n)
+            return h, h
+        i, f, g, o = ((a + b)[:, j * k : (j + 1) * k] for j in range(4))
+        c = _sigmoid(xp, f) * memory[:, k:] + _sigmoid(xp, i) * xp.tanh(g)
+        h = _sigmoid(xp, o) * xp.tanh(c)
+        return h, xp.concatenate([h, c], 1)
+
+
+@dataclass(frozen=True)
+class Network:
+    """Observation to mean action: scaling, what is remembered, layers.
+
+    What it remembers is one row of numbers, zeros at an episode's start: the scaled observations of the last control
+    steps, newest first; the last action, limited to [-1, 1]; and the memory of its cell.
+    """
+
+    layers: tuple[Linear | Activation, ...]
+    mean: Array | None = None
+    """Taken off each observation, (n,)."""
+    scale: Array | None = None
+    """What it is multiplied with then, (n,)."""
+    history: int = 0
+    """Earlier observations that it sees."""
+    last_action: int = 0
+    """Numbers of the last action that it sees: all or none."""
+    observation_size: int = 0
+    """n; needed where there is a history."""
+    cell: Cell | None = None
+
+    @property
+    def window_size(self) -> int:
+        """Numbers of the history and the last action together."""
+        return self.history * self.observation_size + self.last_action
+
+    @property
+    def memory_size(self) -> int:
+        """Numbers that it hands on from a control step to the next."""
+        return self.window_size + (self.cell.memory_size if self.cell else 0)
+
+    def step(self, observation: Array, memory: Array | None) -> tuple[Array, Array | None]:
+        """Mean action (N, m), not limited, and the memory after.
+
+        Args:
+            observation: (N, n).
+            memory: (N, `memory_size`); None where it remembers nothing.
+        """
+        xp, k = _library(observation), self.window_size
+        x = observation if self.mean is None else (observation - self.mean) * self.scale
+        y = x if not k else xp.concatenate([x, memory[:, :k]], 1)
+        after = []
+        if self.cell is not None:
+            y, state = self.cell.step(y, memory[:, k:])
+            after = [state]
+        for layer in self.layers:
+            y = _linear(layer, y) if isinstance(layer, Linear) else _activate(xp, layer, y)
+        if k:
+            action = xp.clip(y, -1.0, 1.0) if self.last_action else None
+            after = [advance_history(xp, memory[:, :k], x, action, self.history), *after]
+        return y, (xp.concatenate(after, 1) if len(after) > 1 else after[0]) if after else None
+
+    def as_type(self, kind: Any) -> Network:
+        """With all numbers as NumPy's of that type."""
+
+        def cast(value: Any) -> Any:
+            if isinstance(value, tuple):
+                return tuple(cast(item) for item in value)
+            if isinstance(value, Linear | Cell):
+                return replace(value, **{f.name: cast(getattr(value, f.name)) for f in fields(value)})
+            if value is None or isinstance(value, int | float | str | Activation):
+                return value
+            return np.asarray(value if isinstance(value, np.ndarray) else value.detach().cpu().numpy(), kind)
+
+        return replace(self, **{f.name: cast(getattr(self, f.name)) for f in fields(self)})
+
+
+def advance_history(xp: Any, window: Array, x: Array, action: Array | None, history: int) -> Array:
+    """The window of history and last action after a control step.
+
+    Args:
+        xp: NumPy or torch.
+        window: Before it, (N, history * n + m).
+        x: The scaled observation of the step, (N, n).
+        action: What was done, in [-1, 1], (N, m); None where it is not remembered.
+        history: Observations that are remembered.
+    """
+    n = x.shape[1]
+    past = [x, window[:, : (history - 1) * n]] if history else []
+    return xp.concatenate([*past, *([] if action is None else [action])], 1)
+
+
+def first_memory(network: Any, rows: int, device: str | None = None) -> Array | None:
+    """What a network remembers at the start of so many episodes, (rows, k); None if it never does.
+
+    Args:
+        network: A `Network` or a torch module.
+        rows: How many.
+        device: Torch's, for a torch tensor; NumPy if None.
+    """
+    size = getattr(network, "memory_size", 0)
+    if not size:
+        return None
+    if device is None:
+        return np.zeros((rows, size), np.float32)
+    import torch
+
+    return torch.zeros(rows, size, device=device)
+
+
+def asked(network: Any, observation: Array, memory: Array | None) -> tuple[Array, Array | None]:
+    """Action (N, m) and the memory after, of a `Network` or a torch module."""
+    if isinstance(network, Network):
+        return network.step(observation, memory)
+    if memory is None:
+        return network(observation), None
+    action, memory = network(observation, memory)
+    return action, memory
+
+
+def _library(array: Array) -> Any:
+    return np if isinstance(array, np.ndarray) else sys.modules["torch"]
+
+
+def _linear(layer: Linear, x: Array) -> Array:
+    y = x @ layer.weight
+    return y if layer.bias is None else y + layer.bias
+
+
+def _sigmoid(xp: Any, x: Array) -> Array:
+    return 1.0 / (1.0 + xp.exp(-x))
+
+
+def _activate(xp: Any, layer: Activation, x: Array) -> Array:
+    if layer.kind == "Tanh":
+        return xp.tanh(x)
+    if layer.kind == "Identity":
+        return x
+    if layer.kind == "Relu":
+        return xp.where(x > 0.0, x, 0.0 * x)
+    return xp.where(x > 0.0, x, layer.alpha * xp.expm1(xp.where(x > 0.0, 0.0 * x, x)))

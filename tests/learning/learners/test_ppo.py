@@ -1,0 +1,262 @@
+"""PPO of our own: the same with NumPy and torch, without the host; it remembers, scales, and values what was drawn."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+import finssim
+from finssim.control.policy import Policy
+from finssim.engine.state import State
+from finssim.learning.held_evaluation import HeldEvaluation
+from finssim.learning.layers import Arrays
+from finssim.learning.learners import learner_named
+from finssim.learning.learners.ppo import Ppo
+from finssim.learning.network import Network
+from finssim.tasks import StationKeeping
+from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.episode import close_episode
+from reference.guess import BEST, Guess, Guessing, Steady, SteadyTogether
+from reference.policies import written
+
+KIND = learner_named("ppo")
+FEW = {"worlds": 8, "rollout": 8, "batch": 32, "epochs": 2, "hidden": (16, 16), "steps": 5000}
+
+
+class Torch(Arrays):
+    """Torch on the processor with NumPy's random numbers."""
+
+    def __init__(self, seed):
+        super().__init__(seed, "cpu")
+
+    def noise(self, out):
+        return out.copy_(torch.from_numpy(self._rng.standard_normal(out.shape, dtype=np.float32)))
+
+    def order(self, n):
+        return torch.from_numpy(self._rng.permutation(n))
+
+
+def made(task, arrays=None, seed=3, ranges="fossen_learn_to_swim", **changes):
+    settings = replace(KIND.settings(task), **{**FEW, **changes})
+    environment = finssim.make(
+        task,
+        worlds=settings.worlds,
+        seed=seed,
+        observe="training",
+        randomize=ranges,
+        privileged=ranges is not None,
+    )
+    return Ppo(environment, settings, seed=seed, arrays=arrays)
+
+
+VARIANTS = [
+    {},
+    {"normalize": True, "history": 2, "last_action": True},
+    {"memory": 8, "asymmetric": False},
+    {"memory": 8, "history": 1, "normalize": True},
+]
+
+
+@pytest.mark.parametrize("changes", VARIANTS)
+def test_torch_learns_what_numpy_learns(changes):
+    """Equal random numbers, three updates: parameters within what float32 rounds differently, and equal curves."""
+    numpy, torchs = made(StationKeeping(), **changes), made(StationKeeping(), Torch(3), **changes)
+    for _ in range(3):
+        rows = [learner.update() for learner in (numpy, torchs)]
+        for name, value in rows[0].items():
+            assert rows[1][name] == pytest.approx(value, rel=1e-3, abs=1e-4)
+    for ours, theirs in zip(numpy._numbers().values(), torchs._numbers().values(), strict=True):
+        np.testing.assert_allclose(theirs.numpy(), ours, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("changes", VARIANTS)
+def test_nothing_goes_through_the_host_between_two_rows(monkeypatch, changes):
+    """As on a GPU: torch, with the environment's own look at frozen worlds, which is rare there, left aside."""
+    learner = made(StationKeeping(), Torch(3), **changes)
+    held = HeldEvaluation(finssim.make(StationKeeping(time_limit=1.0), worlds=4, seed=1))
+    touched = []
+
+    def guard(owner, name):
+        original = getattr(owner, name)
+
+        def call(*arguments, **named):
+            touched.append(name)
+            return original(*arguments, **named)
+
+        monkeypatch.setattr(owner, name, call)
+
+    advance = learner.environment.advance
+
+    def quiet():
+        before = len(touched)
+        advance()
+        del touched[before:]
+
+    monkeypatch.setattr(learner.environment, "advance", quiet)
+    for name in ("numpy", "cpu", "item", "tolist", "__bool__", "__float__"):
+        guard(torch.Tensor, name)
+    guard(wp.array, "numpy")
+    with learner.arrays.plain():
+        learner._roll_out()
+        assert touched == []
+        learner._improve_value(learner._c[0], learner._r[0], 1e-3)
+        advantage, target = learner._advantages()
+        assert touched == []
+        before = learner.arrays.zeros(learner._rows, learner.settings.memory)
+        learner._learn(advantage, target, before, 1e-3)
+    assert len(touched) <= 6, "losses and noise, once for the row"
+    network = learner.network()
+    assert isinstance(network, Network)
+    del touched[:]
+    steps, own = 0, held.environment.advance
+
+    def counted():
+        nonlocal steps
+        steps, before = steps + 1, len(touched)
+        own()
+        del touched[before:]
+
+    monkeypatch.setattr(held.environment, "advance", counted)
+    held(torch_module(network))
+    looks = touched.count("__bool__")
+    assert steps == looks == 10, "on a processor alone: whether all episodes have ended"
+    assert len(touched) - looks <= 8, "the measures, once at the end"
+
+
+def torch_module(network):
+    """A held evaluation takes a network of arrays as it takes a module, where it runs with torch."""
+
+    class Module(torch.nn.Module):
+        memory_size = network.memory_size
+
+        def forward(self, observation, memory=None):
+            action, memory = network.step(observation, memory)
+            return action if memory is None else (action, memory)
+
+    return Module()
+
+
+@wp.kernel(enable_backward=False)
+def score_recall(state: State, arrays: TaskArrays, p: Guessing, world_offset: int):
+    """The sign is seen in the first of three steps, the third is paid."""
+    w = world_offset + wp.tid()
+    step = state.steps[w]
+    if step == 1:
+        arrays.totals[w, 0] = arrays.observation[w, 0]
+        arrays.observation[w, 0] = 0.0
+    off = float(0.0)
+    size = arrays.action.shape[1]
+    for i in range(size):
+        d = wp.clamp(arrays.action[w, i], -1.0, 1.0) - arrays.totals[w, 0] * p.best
+        off += d * d
+    last = step >= 3
+    arrays.reward[w] = wp.where(last, 1.0 - off / float(size), 0.0)
+    arrays.episode_return[w] = arrays.reward[w]
+    arrays.terminated[w] = wp.where(last, 1, 0)
+    arrays.truncated[w] = 0
+    arrays.done[w] = arrays.terminated[w]
+    if last:
+        close_episode(state, arrays, w)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recall(Guess):
+    """Guess whose sign must be remembered over two steps."""
+
+    name: str = "recall"
+    time_limit: float = 0.3
+    totals = ("sign",)
+    evaluate = staticmethod(score_recall)
+
+
+LEARN = {
+    "worlds": 64,
+    "rollout": 12,
+    "batch": 128,
+    "epochs": 4,
+    "learning_rate": 1e-2,
+    "steps": 50_000,
+    "discount": 0.9,
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "remembers"),
+    [({}, False), ({"history": 2}, True), ({"memory": 8}, True)],
+    ids=["blind", "history", "gru"],
+)
+def test_what_was_seen_two_steps_ago_is_remembered(tmp_path, changes, remembers):
+    """With a history or a GRU the held episodes pay 1, in onnxruntime too; without, no more than 1 - c² on average."""
+    learner = made(Recall(), ranges=None, **{**LEARN, **changes})
+    while learner.steps < learner.settings.steps:
+        learner.update()
+    network = learner.network()
+    held = HeldEvaluation(finssim.make(Recall(), worlds=32, seed=9))(network)
+    if not remembers:
+        assert held["evaluation_return"] < 1.0 - BEST**2 + 0.05 and network.memory_size == 0
+        return
+    assert held["evaluation_success"] == 1.0 and held["evaluation_return"] > 0.96
+    policy = Policy.load(written(network, tmp_path / "p", Recall(), learner.environment.action_size))
+    memory = policy.reset(2)
+    for sign in ([1.0, -1.0], [0.0, 0.0], [0.0, 0.0]):
+        action, memory = policy.step(memory, np.array(sign)[:, None])
+    np.testing.assert_allclose(
+        action, BEST * np.array([[1.0], [-1.0]]) * np.ones(action.shape), rtol=0, atol=0.15
+    )
+
+
+def test_observations_of_any_size_are_scaled():
+    """The running mean and deviation are those of all that was seen."""
+    learner = made(StationKeeping(), normalize=True)
+    seen = []
+    for _ in range(3):
+        mean, scale = learner._mean.copy(), learner._scale
+        learner.update()
+        seen.append(learner._x[:-1].reshape(-1, 16) / scale + mean)
+    seen = np.concatenate(seen)
+    np.testing.assert_allclose(learner._mean, seen.mean(0), rtol=0, atol=1e-4)
+    np.testing.assert_allclose(1.0 / learner._scale, np.sqrt(seen.var(0) + 1e-6), rtol=1e-3)
+
+
+@pytest.mark.parametrize("asymmetric", [True, False])
+def test_the_critic_sees_what_was_drawn_and_the_policy_does_not(asymmetric):
+    """Numbers that randomisation drew, in columns of their own, those of the episode that ended included."""
+    learner = made(StationKeeping(), asymmetric=asymmetric)
+    told = len(learner.environment.privileged_names)
+    assert told > 0 and learner.actor.sizes[0] == 16 and learner.critic.sizes[0] == 16 + told * asymmetric
+    learner.update()
+    if asymmetric:
+        np.testing.assert_array_equal(
+            learner._c[-1, :, 16:], learner.environment.arrays.privileged.numpy().reshape(8, -1)
+        )
+
+
+@pytest.mark.parametrize("task", [Steady, SteadyTogether])
+@pytest.mark.parametrize("changes", [{}, {"memory": 4}, {"history": 1, "normalize": True}])
+def test_time_ends_no_value(task, changes):
+    """With a critic that says 1 / (1 - γ), where every step pays 1, every return is that, across ends by time."""
+    learner = made(task(), ranges=None, rollout=12, discount=0.9, **changes)
+    learner.critic.weights[-2][:], learner.critic.weights[-1][:] = 0.0, 10.0
+    learner._roll_out()
+    np.testing.assert_allclose(learner._advantages()[1], 10.0, rtol=1e-5)
+    assert learner.environment.simulator.state.episode.numpy().min() >= 3
+
+
+def test_an_end_by_the_task_ends_the_value():
+    learner = made(Guess(), ranges=None)
+    learner.critic.weights[-2][:], learner.critic.weights[-1][:] = 0.0, 10.0
+    learner._roll_out()
+    assert learner._advantages()[1].max() <= 1.0 + 1e-5
+
+
+def test_the_noise_of_an_action_is_known_exactly():
+    """The ratio of the new density to the old one is 1 before the first gradient step."""
+    learner = made(StationKeeping(), memory=8)
+    before = learner._memory[:, learner._window :].copy()
+    learner._roll_out()
+    h = learner.gru(learner._x[:-1], before, learner._keep())
+    mean = learner.actor(h.reshape(-1, 8)).reshape(learner._u.shape)
+    z = (learner._u - mean) / np.exp(learner.noise.values)
+    np.testing.assert_allclose(-0.5 * (z * z).sum(2), learner._density, rtol=0, atol=1e-3)

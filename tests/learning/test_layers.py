@@ -1,0 +1,199 @@
+"""Gradients by hand are torch's own, with NumPy and with torch; a policy as plain arrays is what onnxruntime runs."""
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from finssim.learning.layers import Adam, Arrays, Gru, Parameters, Row, Stack
+from finssim.learning.network import Activation, Cell, Linear, Network, first_memory
+from finssim.learning.onnx_graph import write_graph
+from finssim.learning.recurrent import RecurrentNetwork, plain_network
+
+LIBRARIES = pytest.mark.parametrize("device", [None, "cpu"], ids=["numpy", "torch"])
+
+
+@LIBRARIES
+def test_a_stacks_gradient_is_torchs(device):
+    """Of weights, biases and inputs, in two calls of different size: what the first left behind has no part in it."""
+    arrays, rng = Arrays(1, device), np.random.default_rng(2)
+    stack = Stack(arrays, [5, 7, 6, 3])
+    Parameters(arrays, stack)
+    stack.initialize(1.0)
+    linear = [nn.Linear(a, b) for a, b in ((5, 7), (7, 6), (6, 3))]
+    with torch.no_grad():
+        for i, layer in enumerate(linear):
+            layer.weight.copy_(torch.from_numpy(arrays.numpy(stack.weights[2 * i]).T))
+            stack.weights[2 * i + 1][:] = arrays.array(rng.normal(size=layer.out_features))
+            layer.bias.copy_(torch.from_numpy(arrays.numpy(stack.weights[2 * i + 1])))
+    module = nn.Sequential(linear[0], nn.Tanh(), linear[1], nn.Tanh(), linear[2])
+    for rows in (11, 4, 11):
+        x, dy = (rng.normal(size=(rows, k)).astype(np.float32) for k in (5, 3))
+        inputs = torch.from_numpy(x).requires_grad_()
+        module.zero_grad()
+        expected = module(inputs)
+        expected.backward(torch.from_numpy(dy))
+        y = stack(arrays.array(x))
+        np.testing.assert_allclose(arrays.numpy(y), expected.detach().numpy(), rtol=0, atol=2e-6)
+        dx = stack.backward(arrays.array(dy), inputs=True)
+        np.testing.assert_allclose(arrays.numpy(dx), inputs.grad.numpy(), rtol=0, atol=5e-6)
+        for i, layer in enumerate(linear):
+            for found, parameter in zip(stack._gradients[2 * i : 2 * i + 2], layer.parameters(), strict=True):
+                np.testing.assert_allclose(
+                    arrays.numpy(found).T, parameter.grad.numpy(), rtol=1e-5, atol=1e-5
+                )
+
+
+@LIBRARIES
+def test_a_grus_gradient_is_torchs_through_time(device):
+    """With episodes that start within the piece of time, in some of its rows."""
+    arrays, rng = Arrays(1, device), np.random.default_rng(3)
+    n, k, T, rows = 4, 5, 6, 3
+    gru = Gru(arrays, n, k)
+    Parameters(arrays, gru)
+    gru.initialize()
+    for bias in (gru.weights[1], gru.weights[3]):
+        bias[:] = arrays.array(rng.normal(size=3 * k))
+    module = nn.GRU(n, k)
+    with torch.no_grad():
+        for name, ours in zip(("weight_ih", "bias_ih", "weight_hh", "bias_hh"), gru.weights, strict=True):
+            getattr(module, f"{name}_l0").copy_(torch.from_numpy(arrays.numpy(ours).T))
+    x, dy = rng.normal(size=(T, rows, n)).astype(np.float32), rng.normal(size=(T, rows, k)).astype(np.float32)
+    h0 = rng.normal(size=(rows, k)).astype(np.float32)
+    keep = np.ones((T, rows), np.float32)
+    keep[2, 0] = keep[4, 2] = keep[0, 1] = 0.0
+    h, outputs = torch.from_numpy(h0), []
+    for t in range(T):
+        h = module(torch.from_numpy(x[t : t + 1]), (h * torch.from_numpy(keep[t])[:, None])[None])[1][0]
+        outputs.append(h)
+    expected = torch.stack(outputs)
+    expected.backward(torch.from_numpy(dy))
+    y = gru(arrays.array(x), arrays.array(h0), arrays.array(keep))
+    np.testing.assert_allclose(arrays.numpy(y), expected.detach().numpy(), rtol=0, atol=2e-6)
+    gru.backward(arrays.array(dy))
+    for name, found in zip(("weight_ih", "bias_ih", "weight_hh", "bias_hh"), gru._gradients, strict=True):
+        wanted = getattr(module, f"{name}_l0").grad.numpy().T
+        np.testing.assert_allclose(arrays.numpy(found), wanted, rtol=1e-5, atol=1e-5)
+
+
+@LIBRARIES
+def test_adam_is_torchs(device):
+    """Over steps whose gradient is longer than the limit, and shorter."""
+    arrays, rng = Arrays(1, device), np.random.default_rng(4)
+    row = Row(9)
+    parameters = Parameters(arrays, row)
+    row.values[:] = arrays.array(rng.normal(size=9))
+    theirs = torch.from_numpy(arrays.numpy(row.values)).clone().requires_grad_()
+    ours, torchs = Adam(parameters, arrays, 0.5), torch.optim.Adam([theirs], lr=0.01, eps=1e-5)
+    for size in (0.01, 3.0, 0.1, 1.0, 0.02):
+        gradient = (size * rng.normal(size=9)).astype(np.float32)
+        row.gradient[:] = arrays.array(gradient)
+        ours.step(0.01)
+        theirs.grad = torch.from_numpy(gradient)
+        nn.utils.clip_grad_norm_([theirs], 0.5)
+        torchs.step()
+    np.testing.assert_allclose(arrays.numpy(row.values), theirs.detach().numpy(), rtol=0, atol=1e-6)
+
+
+def network(rng, history, last_action, cell, scaled):
+    """A network of 4 observations and 3 actions, with weights from a hat."""
+
+    def linear(inputs, outputs):
+        return Linear(*(rng.normal(size=s).astype(np.float32) for s in ((inputs, outputs), (outputs,))))
+
+    gates = {"lstm": 4, "gru": 3}
+    inputs = 4 + 4 * history + (3 if last_action else 0)
+    return Network(
+        (linear(5 if cell else inputs, 6), Activation("Tanh"), linear(6, 3)),
+        mean=rng.normal(size=4).astype(np.float32) if scaled else None,
+        scale=rng.uniform(0.5, 2.0, 4).astype(np.float32) if scaled else None,
+        history=history,
+        last_action=3 if last_action else 0,
+        observation_size=4,
+        cell=Cell(cell, linear(inputs, 5 * gates[cell]), linear(5, 5 * gates[cell])) if cell else None,
+    )
+
+
+@pytest.mark.parametrize("scaled", [False, True])
+@pytest.mark.parametrize("cell", [None, "gru", "lstm"])
+@pytest.mark.parametrize(
+    ("history", "last_action"), [(0, False), (1, False), (3, False), (0, True), (2, True)]
+)
+def test_onnxruntime_computes_what_the_arrays_do(history, last_action, cell, scaled):
+    """Step by step, each with the memory of its own step before; and so does torch on the same arrays."""
+    import onnxruntime
+
+    rng = np.random.default_rng(5)
+    ours = network(rng, history, last_action, cell, scaled)
+    session = onnxruntime.InferenceSession(write_graph(ours, 4, 3), providers=["CPUExecutionProvider"])
+    memories = [first_memory(ours, 2), first_memory(ours, 2)]
+    for _ in range(5):
+        x = rng.normal(size=(2, 4)).astype(np.float32)
+        given = {"observation": x} | ({} if memories[1] is None else {"memory": memories[1]})
+        action, memories[0] = ours.step(x, memories[0])
+        answer = session.run(None, given)
+        np.testing.assert_allclose(answer[0], np.clip(action, -1.0, 1.0), rtol=0, atol=5e-6)
+        memories[1] = answer[1] if len(answer) > 1 else None
+        if memories[0] is not None:
+            np.testing.assert_allclose(memories[1], memories[0], rtol=0, atol=5e-6)
+
+
+def test_a_history_is_of_the_last_observations_newest_first():
+    """Scaled, behind zeros at the start of an episode; the last action as it was limited."""
+    weight = np.zeros((4, 1), np.float32)
+    weight[0] = 10.0
+    ours = Network(
+        (Linear(weight, None),),
+        mean=np.ones(1, np.float32),
+        scale=np.full(1, 2.0, np.float32),
+        history=2,
+        last_action=1,
+        observation_size=1,
+    )
+    memory = first_memory(ours, 1)
+    seen = []
+    for x in (2.0, 0.9, 1.5):
+        _, memory = ours.step(np.array([[x]], np.float32), memory)
+        seen.append(memory[0].tolist())
+    np.testing.assert_allclose(
+        seen, [[2.0, 0.0, 1.0], [-0.2, 2.0, -1.0], [1.0, -0.2, 1.0]], rtol=0, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("bias", [True, False])
+def test_torchs_lstm_is_the_same_cell(bias):
+    """And the activations that torch has and ONNX too."""
+    torch.manual_seed(6)
+    layers = nn.Sequential(
+        nn.Linear(5, 6), nn.ELU(0.7), nn.Linear(6, 6), nn.ReLU(), nn.Linear(6, 2, bias=False)
+    )
+    module = RecurrentNetwork(nn.LSTM(3, 5, bias=bias), layers)
+    plain = plain_network(module).as_type(np.float32)
+    x, memory = torch.randn(4, 3), torch.randn(4, 10)
+    for ours, theirs in zip(plain.step(x.numpy(), memory.numpy()), module(x, memory), strict=True):
+        np.testing.assert_allclose(ours, theirs.detach().numpy(), rtol=0, atol=2e-6)
+
+
+def test_equal_seeds_are_equal_numbers():
+    """Noise, orders and first weights; a state goes on where it was taken."""
+    draws = []
+    for seed in (1, 1, 2):
+        arrays = Arrays(seed)
+        draws.append([arrays.noise(arrays.empty(3)).copy(), arrays.order(5), arrays.orthogonal(3, 2, 1.0)])
+    assert all(np.array_equal(a, b) for a, b in zip(draws[0], draws[1], strict=True))
+    assert not np.array_equal(draws[0][0], draws[2][0])
+    for device in (None, "cpu"):
+        arrays = Arrays(3, device)
+        state = arrays.state()
+        first = arrays.numpy(arrays.noise(arrays.empty(4))), arrays.numpy(arrays.order(9))
+        arrays.load(state)
+        again = arrays.numpy(arrays.noise(arrays.empty(4))), arrays.numpy(arrays.order(9))
+        assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+
+
+def test_first_weights_are_orthogonal():
+    """Whichever side is longer, scaled by the gain."""
+    for rows, columns in ((4, 7), (7, 4)):
+        w = Arrays(1).orthogonal(rows, columns, 2.0)
+        square = w @ w.T if rows < columns else w.T @ w
+        np.testing.assert_allclose(square, 4.0 * np.eye(4), rtol=0, atol=1e-5)

@@ -1,0 +1,24 @@
+"""Policy directories of networks that tests make."""
+
+from finssim.control.modes import action_mode
+from finssim.control.policy_description import PolicyDescription, VehicleIdentity
+from finssim.learning.description import observation_schema
+from finssim.learning.export import export_policy
+from finssim.vehicles import load_vehicle
+
+FINSROV = load_vehicle("finsrov")
+
+
+def written(network, folder, task, size):
+    """A policy directory of a network."""
+    description = PolicyDescription(
+        task=task.name,
+        observation=observation_schema(task),
+        action={**action_mode("wrench6", FINSROV).describe(), "size": size},
+        control_period=task.control_step,
+        vehicle=VehicleIdentity(name=FINSROV.name, sha256=FINSROV.sha256),
+        hydrodynamics="calibrated",
+        seed=0,
+        training={"randomization": None},
+    )
+    return export_policy(network, folder, description)
