@@ -28,8 +28,8 @@ def train(
     learner: Annotated[
         str,
         typer.Option(
-            help="Who learns: ppo (FinsSim's own), sb3-ppo, sb3-sac, sb3-recurrent-ppo or rsl-rl; one agent also torchrl-ppo, several "
-            "torchrl-ippo or torchrl-mappo; from demonstrations bc, dagger or gail.",
+            help="Who learns: ppo (FinsSim's own), sb3-ppo, sb3-sac, sb3-recurrent-ppo or rsl-rl; one agent also "
+            "torchrl-ppo, several torchrl-ippo or torchrl-mappo; from demonstrations bc, dagger or gail.",
             metavar="NAME",
         ),
     ] = "ppo",
