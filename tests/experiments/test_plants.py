@@ -5,7 +5,15 @@ import math
 import numpy as np
 import pytest
 
+from finssim.control.trajectories import load_trajectory
+from finssim.engine import read_run
+from finssim.experiments import trials as trials_module
+from finssim.experiments.episodes import run_episodes
 from finssim.experiments.plants import Plant, PlantError, available_plants, load_plant
+from finssim.experiments.players import make_player
+from finssim.experiments.t2_trials import run_tracking
+from finssim.experiments.trials import run_trials
+from finssim.tasks import Environment, EnvironmentSetupError, task_named
 from finssim.vehicles import VehicleError, load_vehicle
 
 FINSROV = load_vehicle("finsrov")
@@ -85,3 +93,139 @@ def test_a_wrong_plant_gets_its_sentence(tmp_path, text, sentence):
 def test_an_unknown_plant_is_told_the_nearest():
     with pytest.raises(PlantError, match="no plant 'nominel'.*did you mean 'nominal'"):
         load_plant("nominel")
+
+
+def thruster_limits(factor):
+    """A plant whose thrusters reach a multiple of what the vehicle file says."""
+    changes = {
+        f"thrusters.{name}.{key}": factor * getattr(t, key)
+        for name, t in FINSROV.thrusters.items()
+        for key in ("force_min", "force_max")
+    }
+    return Plant(name="limits", vehicle=changes)
+
+
+def commands_and_thrusts(run, plant, folder):
+    """What every thruster was commanded and delivered [N], (rows, thrusters), of a recorded evaluation."""
+    run(plant, folder)
+    table = read_run(folder)
+    return tuple(
+        table[[f"{what}_{name}" for name in FINSROV.thruster_names]].to_numpy()
+        for what in ("command", "thrust")
+    )
+
+
+def t1_trials(controller):
+    def run(plant, folder):
+        task = task_named("t1")
+        run_trials(make_player(controller, FINSROV, task), task, FINSROV, plant, trials=8, record=folder)
+
+    return run
+
+
+def t2_trials(plant, folder):
+    task = task_named("t2")
+    guides = [load_trajectory("lemniscate")]
+    run_tracking(
+        make_player("pid", FINSROV, task), task, FINSROV, plant, guides=guides, trials=1, record=folder
+    )
+
+
+def episodes(name, action=None):
+    def run(plant, folder):
+        task = task_named(name, time_limit=3.0)
+        run_episodes(Restless(task, action), task, FINSROV, plant, trials=4, record=folder)
+
+    return run
+
+
+class Restless:
+    """Asks for parts of every limit, another in every step, up to the whole."""
+
+    wrench_scale = 1.0
+
+    def __init__(self, task, action=None):
+        self.action, self.period = action or task.action, task.control_step
+
+    def reset(self, n):
+        return np.random.default_rng(3)
+
+    def act(self, rng, arrays, goal):
+        return rng.uniform(-1.0, 1.0, arrays.action.shape).astype(np.float32), rng
+
+
+EVERY_EVALUATION = {
+    "T1, PID": t1_trials("pid"),
+    "T1, published PID": t1_trials("pid-paper"),
+    "T2, PID": t2_trials,
+    "episodes by wrench": episodes("docking"),
+    "episodes by thruster": episodes("t3", "thruster8"),
+    "episodes of a scripted prey": episodes("pursuit"),
+}
+
+
+@pytest.mark.parametrize("name", EVERY_EVALUATION)
+def test_stronger_thrusters_deliver_what_is_asked_of_the_vehicle_that_the_controller_knows(
+    name, tmp_path, monkeypatch
+):
+    """Bit for bit: no command is beyond the limits of the file, so twice of them change nothing at all."""
+    monkeypatch.setattr(trials_module, "DURATION", 10.0)
+    run = EVERY_EVALUATION[name]
+    known = commands_and_thrusts(run, load_plant("nominal"), tmp_path / "nominal")
+    strong = commands_and_thrusts(run, thruster_limits(2.0), tmp_path / "strong")
+    assert np.abs(known[1]).max() > 0.5  # the thrusters work
+    for ours, theirs in zip(known, strong, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+MODES = ["thruster8", "wrench6", "wrench4"]
+
+
+def commanded_and_delivered(mode, plant):
+    """Thruster forces [N], (worlds, thrusters), 3 s after random actions that are equal for every plant, which is long
+    after every lag: what is commanded, and what is delivered."""
+    arguments = plant.environment_arguments()
+    environment = Environment(
+        task_named("t1"),
+        plant.changed(FINSROV),
+        nominal=FINSROV,
+        action=mode,
+        worlds=16,
+        auto_reset=False,
+        seed=2,
+        **arguments,
+    )
+    action = np.random.default_rng(5).uniform(-1.0, 1.0, (16, environment.action_size)).astype(np.float32)
+    for _ in range(30):
+        environment.step(action)
+    n, simulator = len(FINSROV.thrusters), environment.simulator
+    return simulator.command.thrust.numpy()[:, 0, :n], simulator.numpy("thrust")[:, 0, :n]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_weak_thrusters_deliver_what_is_asked_up_to_their_own_limits(mode):
+    """Half the limits: the commands are those of the nominal plant bit for bit, what is delivered is cut."""
+    plant = thruster_limits(0.5)
+    asked, _ = commanded_and_delivered(mode, load_plant("nominal"))
+    commanded, delivered = commanded_and_delivered(mode, plant)
+    np.testing.assert_array_equal(commanded, asked)
+    lower, upper = (np.asarray(limit, np.float32) for limit in plant.changed(FINSROV).force_limits)
+    expected = np.clip(asked, lower, upper)
+    assert 0.1 < (expected != asked).mean() < 0.9  # some saturate, and some do not
+    np.testing.assert_allclose(delivered, expected, rtol=1e-5, atol=1e-5 * upper.max())
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_what_is_drawn_of_thrusters_does_not_change_what_is_asked(mode):
+    """Ranges scale the thrust that comes of a command; nothing they draw is a limit by which actions are scaled."""
+    asked, nominal = commanded_and_delivered(mode, load_plant("nominal"))
+    commanded, delivered = commanded_and_delivered(mode, load_plant("randomised"))
+    np.testing.assert_array_equal(commanded, asked)
+    assert np.abs(delivered - nominal).max() > 0.1
+
+
+def test_a_controller_of_other_thrusters_is_refused():
+    with pytest.raises(
+        EnvironmentSetupError, match="bluerov2 has thrusters .*, expected those that its contr"
+    ):
+        Environment(task_named("t1"), "bluerov2", nominal=FINSROV)

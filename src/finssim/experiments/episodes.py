@@ -67,7 +67,7 @@ def run_episodes(
     Args:
         player: Who acts; several agents of a world share it.
         task: What is to be done.
-        vehicle: As its file has it; the plant changes it. Every vehicle of a world is one of these.
+        vehicle: As its file has it and the player knows it, every one of a world; the plant changes what they deliver.
         plant: What differs.
         trials: How many episodes.
         hydrodynamics: Model, unless the plant names one.
@@ -87,6 +87,7 @@ def run_episodes(
     environment = Environment(
         task,
         plant.changed(vehicle),
+        nominal=vehicle,
         worlds=trials,
         hydrodynamics=plant.hydrodynamics or hydrodynamics,
         action=player.action,

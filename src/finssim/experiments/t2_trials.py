@@ -87,7 +87,7 @@ def run_tracking(
     Args:
         player: Who acts.
         task: Its observation is what the player sees.
-        vehicle: As its file has it; the plant changes it.
+        vehicle: As its file has it and the player knows it; the plant changes what it delivers.
         plant: What differs.
         trials: How many, all at once.
         guides: What is followed, in turn; the four published trajectories if None.
@@ -109,6 +109,7 @@ def run_tracking(
             knot_spacing=0.1,
         ),
         plant.changed(vehicle),
+        nominal=vehicle,
         worlds=trials,
         hydrodynamics=plant.hydrodynamics or hydrodynamics,
         action=player.action,

@@ -83,7 +83,7 @@ def run_trials(
     Args:
         player: Who acts.
         task: Its observation is what the player sees.
-        vehicle: As its file has it; the plant changes it.
+        vehicle: As its file has it and the player knows it; the plant changes what it delivers.
         plant: What differs.
         trials: How many, all at once.
         hydrodynamics: Model, unless the plant names one.
@@ -97,6 +97,7 @@ def run_trials(
     environment = Environment(
         replace(task, control_step=player.period, substeps=math.ceil(player.period / PHYSICS_STEP - 1e-9)),
         plant.changed(vehicle),
+        nominal=vehicle,
         worlds=trials,
         hydrodynamics=plant.hydrodynamics or hydrodynamics,
         action=player.action,

@@ -1,16 +1,17 @@
 """From a policy's action in [-1, 1] to thruster force commands, inside the batch: Thruster8, Wrench6, Wrench4."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import warp as wp
 
 from finssim.control.allocation import AllocationData, allocate, allocation_data
 from finssim.control.allocator import axis_weights
-from finssim.engine.simulator import Simulator
+from finssim.engine.packed import Packed
 from finssim.physics.plant import VehicleCommand
 from finssim.physics.types import MAX_THRUSTERS, vec6, vec8
 from finssim.tasks.arrays import TaskArrays
+from finssim.vehicles import Vehicle
 
 WRENCH_AXES = {"wrench6": (0, 1, 2, 3, 4, 5), "wrench4": (0, 1, 2, 5)}
 """Axis of the wrench (surge sway heave roll pitch yaw) that each action component drives."""
@@ -80,13 +81,19 @@ def action_size(mode: str, thrusters: int) -> int:
 
 
 def add_action(
-    mode: str, simulator: Simulator, arrays: TaskArrays, agents: int, wrench_scale: np.ndarray
+    mode: str,
+    vehicles: Sequence[Vehicle],
+    command: Packed,
+    arrays: TaskArrays,
+    agents: int,
+    wrench_scale: np.ndarray,
 ) -> Callable[..., None]:
     """The stage that turns actions into thruster commands.
 
     Args:
         mode: thruster8, wrench6 or wrench4.
-        simulator: Whose vehicles are commanded.
+        vehicles: As their controllers know them, for limits and allocation; what the simulated ones deliver may differ.
+        command: Of the simulated ones.
         arrays: Holds the actions.
         agents: How many of the vehicles are agents: the first ones.
         wrench_scale: Part of each wrench limit that action 1 of an agent stands for, (6,).
@@ -94,12 +101,12 @@ def add_action(
     Returns:
         A function that appends the stage to a pipeline.
     """
-    vehicles, device = simulator.vehicles, simulator.device
+    device = command.array.device
     limits = [vehicle.force_limits for vehicle in vehicles]
     if mode == "thruster8":
         count = len(vehicles[0].thrusters)
         bounds = [_padded([ends[k] for ends in limits], device) for k in range(2)]
-        inputs = [arrays, simulator.command.array, *bounds, agents, count]
+        inputs = [arrays, command.array, *bounds, agents, count]
         return lambda pipeline: pipeline.add(thruster_action, inputs, vehicles=len(vehicles))
     reach = [vehicle.wrench_limits for vehicle in vehicles]
     data = allocation_data(
@@ -116,7 +123,7 @@ def add_action(
         whole = most * wrench_scale if v < agents else most
         rows[v, np.arange(len(axes)), axes] = whole[list(axes)]
     scale = wp.array(rows, dtype=vec6, device=device)
-    inputs = [arrays, simulator.command.array, scale, agents, len(axes), data]
+    inputs = [arrays, command.array, scale, agents, len(axes), data]
     return lambda pipeline: pipeline.add(wrench_action, inputs, vehicles=len(vehicles))
 
 

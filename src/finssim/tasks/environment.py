@@ -21,6 +21,7 @@ from finssim.tasks.given import (
     checked_action,
     checked_seed,
     crew,
+    refuse_other_thrusters,
 )
 from finssim.tasks.measurement import MeasurementNoise, connect_measured, measure, measurements
 from finssim.tasks.placing import place
@@ -54,6 +55,7 @@ class Environment:
         task: Task,
         vehicle: Vehicle | str | Sequence[Vehicle | str] = "finsrov",
         *,
+        nominal: Vehicle | str | Sequence[Vehicle | str] | None = None,
         worlds: int = 1,
         hydrodynamics: str = "calibrated",
         action: str | None = None,
@@ -76,6 +78,8 @@ class Environment:
         Args:
             task: What to do.
             vehicle: Who does it: a vehicle, a catalogue name or a file; or one for each of the task's vehicles.
+            nominal: The same as its controller knows it: its limits scale the actions, its allocation makes thruster
+                forces of wrenches, and the task is fitted to it; `vehicle` then only delivers. `vehicle` if None.
             worlds: How many at once.
             hydrodynamics: calibrated, mesh or simplified.
             action: thruster8, wrench6 or wrench4; the task's own if None.
@@ -103,7 +107,9 @@ class Environment:
                 f"unknown action mode '{self.action_mode}'; available: {', '.join(ACTION_MODES)}"
             )
         vehicles = crew(vehicle, task, self.action_mode)
-        self.task = task = task.fitted(vehicles)
+        self._nominal = vehicles if nominal is None else crew(nominal, task, self.action_mode)
+        refuse_other_thrusters(vehicles, self._nominal)
+        self.task = task = task.fitted(self._nominal)
         longest = max((t.delay for one in vehicles for t in one.thrusters.values()), default=0.0)
         extra = randomization.simulator_arguments(longest, tether) if randomization else {"tether": tether}
         self.simulator = Simulator(
@@ -153,7 +159,14 @@ class Environment:
         self._batch = batch = Batch(self.simulator.state, self.arrays, self.parameters, self.seed)
         if self.task.others:
             self.task.add_script(self._step, batch)
-        add_action(self.action_mode, self.simulator, self.arrays, self.agents, self.wrench_scale)(self._step)
+        add_action(
+            self.action_mode,
+            self._nominal,
+            self.simulator.command,
+            self.arrays,
+            self.agents,
+            self.wrench_scale,
+        )(self._step)
         self.drawing.add_step(self._step, self.seed)
         self.simulator.add_step(self._step)
         self._add_measure(self._step)
@@ -264,7 +277,7 @@ class Environment:
 
     def change(self, task: Task) -> None:
         """Go on with other settings of the same task: the episodes that run end by them."""
-        self.task = task.fitted(self.simulator.vehicles)
+        self.task = task.fitted(self._nominal)
         self._build()
 
     def _revive(self) -> None:

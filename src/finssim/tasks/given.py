@@ -60,6 +60,20 @@ def crew(vehicle: Vehicle | str | Sequence[Vehicle | str], task: Task, mode: str
     return vehicles
 
 
+def refuse_other_thrusters(vehicles: Sequence[Vehicle], nominal: Sequence[Vehicle]) -> None:
+    """Refuse vehicles whose thrusters are not those that their controllers command.
+
+    Raises:
+        EnvironmentSetupError: They differ in number, name or order.
+    """
+    for one, known in zip(vehicles, nominal, strict=True):
+        if one.thruster_names != known.thruster_names:
+            raise EnvironmentSetupError(
+                f"{one.name} has thrusters {', '.join(one.thruster_names)}, "
+                f"expected those that its controller commands: {', '.join(known.thruster_names)}"
+            )
+
+
 def checked_seed(seed: int) -> int:
     """The seed, if the kernels can take it.
 
