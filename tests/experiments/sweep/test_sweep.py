@@ -1,7 +1,10 @@
 """`finssim sweep`: results of every job, from one machine or from two of which one is lost."""
 
 import contextlib
+import ipaddress
 import json
+import os
+import sys
 import time
 from pathlib import Path
 
@@ -11,7 +14,7 @@ import yaml
 from finssim import boundary
 from finssim.cli import app
 from finssim.control.policy import Policy
-from finssim.experiments.sweep import command
+from finssim.experiments.sweep import cluster, command
 from finssim.experiments.sweep.plan import SweepError, load_sweep
 
 ray = pytest.importorskip("ray")
@@ -40,6 +43,44 @@ def ray_processes():
             if words.startswith(b"ray::") or b"/raylet\0" in words or b"/gcs_server\0" in words:
                 found.add(int(path.parent.name))
     return found
+
+
+def listening(processes):
+    """Address, port and command of every socket on which processes listen, from the kernel's tables."""
+    heard = {}
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            _, local, _, state, *others = line.split()
+            if state == "0A":  # LISTEN
+                address, port = local.split(":")
+                words = [
+                    int(address[i : i + 8], 16).to_bytes(4, sys.byteorder) for i in range(0, len(address), 8)
+                ]
+                heard[f"socket:[{others[5]}]"] = ipaddress.ip_address(b"".join(words)), int(port, 16)
+    found = set()
+    for process in processes:
+        with contextlib.suppress(OSError):  # it ended meanwhile
+            name = Path(f"/proc/{process}/cmdline").read_bytes().split(b"\0")[0].decode()
+            for file in Path(f"/proc/{process}/fd").iterdir():
+                with contextlib.suppress(OSError):
+                    if (socket := os.readlink(file)) in heard:
+                        found.add((*heard[socket], name))
+    return found
+
+
+def is_loopback(address):
+    return (getattr(address, "ipv4_mapped", None) or address).is_loopback
+
+
+def test_a_ray_of_its_own_listens_on_the_loopback_interface_alone():
+    """Every socket of this process and of every process that Ray starts: its servers, agents and workers."""
+    before = ray_processes()
+    with cluster.running(None, 1):
+        worker = ray.get(ray.remote(lambda: os.getpid()).remote())
+        sockets = listening({os.getpid(), *ray_processes() - before})
+        mine = listening({worker})
+    assert mine and len(sockets) >= 5  # driver, GCS server, raylet, agent of environments, worker
+    assert [socket for socket in sockets if not is_loopback(socket[0])] == []
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import logging
 import os
 import socket
@@ -16,6 +17,9 @@ __all__ = ["running", "spread"]
 
 PATIENCE = 10.0
 """For an answer to a first knock [s]."""
+SINGLE_MACHINE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+"""Variable that is 0 where Ray makes no clusters: only there it keeps 127.0.0.1 as a node's address and listens on it
+alone; elsewhere it takes the machine's address on the network in its place, whatever address it is given."""
 RETRIES = 3
 """How often a job is begun anew after its worker was lost."""
 
@@ -29,7 +33,7 @@ def running(address: str | None, processes: int | None) -> Iterator[int]:
         processes: Of a local one; as many as there are processors if None.
 
     Raises:
-        SweepError: Ray is not installed, or nothing answers at the address.
+        SweepError: Ray is not installed, nothing answers at the address, or a local one would listen on the network.
     """
     try:
         import ray
@@ -45,20 +49,46 @@ def running(address: str | None, processes: int | None) -> Iterator[int]:
         "include_dashboard": False,
         "_node_ip_address": "127.0.0.1",
     }
+    with contextlib.nullcontext() if address else _loopback_alone():
+        try:
+            ray.init(
+                **({"address": address} if address else local),
+                log_to_driver=False,
+                logging_level=logging.ERROR,
+                runtime_env={"env_vars": {"OMP_NUM_THREADS": "1"}},
+            )
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            what = (
+                f"no Ray cluster answers at {address}" if address else "a Ray of its own does not start here"
+            )
+            raise SweepError(f"{what}: {str(error).splitlines()[0]}") from error
+        try:
+            here = ray.util.get_node_ip_address()
+            if not address and not ipaddress.ip_address(here).is_loopback:
+                raise SweepError(
+                    f"Ray {ray.__version__} listens at {here} and not on the loopback interface alone: "
+                    "install the version of constraints.txt, or give --address of a cluster"
+                )
+            yield int(ray.cluster_resources().get("CPU", 1))
+        finally:
+            ray.shutdown()
+
+
+@contextlib.contextmanager
+def _loopback_alone() -> Iterator[None]:
+    """A Ray that begins in here, and its processes, listen on the loopback interface alone."""
+    from ray._private import ray_constants
+
+    before, enabled = os.environ.get(SINGLE_MACHINE), ray_constants.ENABLE_RAY_CLUSTER
+    os.environ[SINGLE_MACHINE] = "0"  # for the processes that Ray starts
+    ray_constants.ENABLE_RAY_CLUSTER = False  # for this one, in which the variable has been read already
     try:
-        ray.init(
-            **({"address": address} if address else local),
-            log_to_driver=False,
-            logging_level=logging.ERROR,
-            runtime_env={"env_vars": {"OMP_NUM_THREADS": "1"}},
-        )
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        what = f"no Ray cluster answers at {address}" if address else "a Ray of its own does not start here"
-        raise SweepError(f"{what}: {str(error).splitlines()[0]}") from error
-    try:
-        yield int(ray.cluster_resources().get("CPU", 1))
+        yield
     finally:
-        ray.shutdown()
+        ray_constants.ENABLE_RAY_CLUSTER = enabled
+        os.environ.pop(SINGLE_MACHINE)
+        if before is not None:
+            os.environ[SINGLE_MACHINE] = before
 
 
 def _knock(address: str) -> None:
