@@ -140,6 +140,21 @@ def test_the_mcap_library_finds_summary_metadata_and_vehicle_file(full):
     assert kept.data == VEHICLE.path.read_bytes()
 
 
+@pytest.mark.parametrize(
+    ("count", "kept"), [(7, 7), (2**32 - 1, 2**32 - 1), (2**32, 2**32 - 1), (10**30, 2**32 - 1)]
+)
+def test_counts_and_times_beyond_their_fields_are_the_last_that_fit(count, kept):
+    """A uint32 ends at 2³² - 1, the seconds of a time at ±2³¹: beyond them the serialiser would raise."""
+    messages = Messages(VEHICLE)
+    policy = messages.policy(10**9 * count, "pid", {"missed": count})
+    state = messages.estimator(0, reading(0.0), {"fixes_accepted": count, "fixes_rejected": count})
+    for message, kind in ((policy, "PolicyInfo"), (state, "EstimatorStatus")):
+        assert messages.cdr(message, f"finssim_msgs/msg/{kind}")
+    assert policy.missed == state.fixes_accepted == state.fixes_rejected == kept
+    assert policy.header.stamp.sec == min(count, 2**31 - 1)
+    assert messages.time(-(10**30)).sec == -(2**31)
+
+
 def test_pictures_are_left_out_on_request(tmp_path):
     """`pictures="none"` keeps tags and drops images."""
     with Recorder(tmp_path / "run.mcap", VEHICLE, pictures="none") as recorder:

@@ -294,6 +294,37 @@ def test_log_lines_look_like_those_of_ros(context, capfd):
     assert "seen" in capfd.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("calls", "sentence"),
+    [
+        ([{"severity": 20}, {"severity": 30}], "Logger severity cannot be changed between calls."),
+        (
+            [{"severity": 20}, {"severity": 20, "once": True}],
+            "Requested logging filters cannot be changed between calls.",
+        ),
+        (
+            [{"severity": 20, "throttle_duration_sec": x} for x in (1.0, 2.0)],
+            "Logging filter parameters cannot be changed between calls.",
+        ),
+    ],
+)
+def test_a_call_that_logs_keeps_its_severity_and_its_conditions(context, calls, sentence):
+    """As rclpy's rcutils_logger has it, word for word; a hidden line counts as well."""
+    logger = Node("hidden").get_logger()
+    logger.set_level(50)
+    with pytest.raises(ValueError) as refused:
+        for call in calls:
+            logger.log("text", **call)
+    assert str(refused.value) == sentence
+
+
+def test_two_calls_on_one_line_are_two(context, capfd):
+    logger = Node("a").get_logger()
+    for _ in range(2):
+        logger.info("left"), logger.warning("right", once=True)
+    assert capfd.readouterr().err.count("left") == 2
+
+
 def test_times_add_up():
     """Arithmetic, comparison and messages."""
     time_ = Time(seconds=1, nanoseconds=5) + Duration(seconds=0.5)

@@ -34,6 +34,12 @@ STATES = ("disarmed", "armed", "hold", "fault")
 
 THRUSTER_LISTS = ("requested", "force", "achieved", "normalised", "shaft_speed")
 
+MOST = 2**32 - 1
+"""Largest count of a uint32."""
+
+FIRST_TIME, LAST_TIME = -(2**31) * 10**9, 2**31 * 10**9 - 1
+"""Of builtin_interfaces/Time, whose seconds are an int32 [ns]."""
+
 LEVELS = ("ok", "warn", "error", "stale")
 """Words for the levels of a diagnostic, in their order."""
 
@@ -138,8 +144,8 @@ class Messages:
             vision_age=float(health.get("vision_age", math.nan)),
             imu_age=float(health.get("imu_age", math.nan)),
             depth_age=float(health.get("depth_age", math.nan)),
-            fixes_accepted=int(health.get("fixes_accepted", 0)),
-            fixes_rejected=int(health.get("fixes_rejected", 0)),
+            fixes_accepted=count(health.get("fixes_accepted", 0)),
+            fixes_rejected=count(health.get("fixes_rejected", 0)),
             reject_reason=str(health.get("reject_reason", "")),
             mahalanobis=float(health.get("mahalanobis", math.nan)),
             position_std=std[:3].copy(),
@@ -180,7 +186,7 @@ class Messages:
             pilot=pilot,
             period=float(values.get("period", math.nan)),
             compute_time=float(values.get("compute_time", math.nan)),
-            missed=int(values.get("missed", 0)),
+            missed=count(values.get("missed", 0)),
             wrench=floats(values.get("wrench", (math.nan,) * 6)),
             **words,
             **lists,
@@ -220,7 +226,8 @@ class Messages:
         return self._of["std_msgs/msg/Header"](self.time(stamp), frame)
 
     def time(self, stamp: int) -> Any:
-        """A time; those before 1970, and after 2038, wrap as the type does."""
+        """A time; one before or after those that the type has, 1901 to 2038, is the first or last of them."""
+        stamp = min(max(stamp, FIRST_TIME), LAST_TIME)
         return self._of["builtin_interfaces/msg/Time"](stamp // 1_000_000_000, stamp % 1_000_000_000)
 
     def vector(self, v: Any) -> Any:
@@ -237,6 +244,11 @@ class Messages:
             float(position[0]), float(position[1]), float(position[2])
         )
         return self._of["geometry_msgs/msg/Pose"](point, self.quaternion(q))
+
+
+def count(number: Any) -> int:
+    """A count as a uint32 holds it, at most `MOST`: a clock that leaps forward makes any number of turns be missed."""
+    return min(int(number), MOST)
 
 
 def floats(values: Any) -> npt.NDArray[np.float64]:

@@ -52,6 +52,9 @@ class Stage:
             PLACE,
             False,
         )
+        self.clock = None
+        """Simulated time that the peer publishes [ns]; the system's if None."""
+        self._clock = self.peer.create_publisher(ros_type("rosgraph_msgs/msg/Clock"), "/clock", 10)
         self._out = {
             key: self.peer.create_publisher(
                 ros_type(TOPICS[key].type), TOPICS[key].name, quality_profile(TOPICS[key].quality)
@@ -64,7 +67,10 @@ class Stage:
 
     def play(self):
         """One turn of everything around the node: a state, and what the bridge says."""
-        stamp = time.time_ns()
+        if self.clock is not None:
+            self.clock += 10_000_000
+            self._clock.publish(self.make.clock(self.clock))
+        stamp = time.time_ns() if self.clock is None else self.clock
         nothing = np.zeros(6), True, "fresh", "", np.full(7, 0.01)
         reading = Reading(0.0, self.place, np.array([0.0, 0.0, 0.0, 1.0]), *nothing)
         if not self.silent:
@@ -219,6 +225,31 @@ def joy(**held):
         kind, index = name[0], int(name[1:])
         (axes if kind == "a" else buttons)[index] = value
     return ros_type("sensor_msgs/msg/Joy")(axes=axes, buttons=buttons)
+
+
+@pytest.mark.parametrize("kind", ["fault", "refused", "error"])
+def test_a_grave_event_may_follow_an_ordinary_one(wire, kind, capfd):
+    """And the other way round, as after an emergency stop: each is told and logged with its severity."""
+    stage = wire(Controller)
+    for name in ("start", kind, "stop", kind):
+        stage.node.event(name, "of the test")
+    assert stage.until(lambda: len(stage.events(kind)) >= 2 and stage.events("stop"))
+    lines = [line for line in capfd.readouterr().err.splitlines() if "of the test" in line]
+    assert [line.split("]")[0] for line in lines] == ["[INFO", "[WARN", "[INFO", "[WARN"]
+
+
+def test_a_clock_of_somebody_else_does_not_end_an_armed_controller(wire):
+    """Simulated time that leaps from 10 s to the wall's is 1.7e10 missed decisions, more than the message's uint32."""
+    stage = wire(Controller, "-p", "use_sim_time:=true")
+    stage.clock, stage.state = 10 * 10**9, "armed"
+    assert stage.until(lambda: stage.heard["policy"])
+    assert stage.heard["policy"][-1].missed < 2**32 - 1
+    stage.clock = 1_760_000_000 * 10**9
+    stage.heard["policy"].clear()
+    assert stage.until(lambda: len(stage.heard["policy"]) > 2)
+    assert stage.heard["policy"][-1].missed == 2**32 - 1
+    stage.heard["command"].clear()
+    assert stage.until(lambda: stage.heard["command"])
 
 
 def test_hands_on_a_pad_become_wrench_arm_and_stop(wire):

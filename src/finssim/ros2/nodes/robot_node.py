@@ -115,8 +115,11 @@ class RobotNode(Node):
         now = self.now() if at is None else at
         values = {"stamp_ns": self.ns(now), "time": now, "kind": kind, "text": text, "node": self.get_name()}
         self.send("event", self.make.words(values))
-        log = self.get_logger()
-        (log.warning if kind in ("fault", "refused", "error") else log.info)(f"{kind}: {text}")
+        # Two lines: rclpy raises where one line of code logs now with this severity and now with that.
+        if kind in ("fault", "refused", "error"):
+            self.get_logger().warning(f"{kind}: {text}")
+        else:
+            self.get_logger().info(f"{kind}: {text}")
 
     def diagnose(self, level: str, text: str, values: dict[str, Any]) -> None:
         """Health, on the topic `diagnostics`; level is ok, warn, error or stale."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
@@ -21,6 +23,22 @@ class LoggingSeverity(IntEnum):
     FATAL = 50
 
 
+SUPPORTED = ("throttle_duration_sec", "throttle_time_source_type", "skip_first", "once")
+"""What a call may be conditioned by."""
+
+
+@dataclass
+class _Site:
+    """One call in the program: what it was called with first, which it has to keep, and what became of it."""
+
+    severity: LoggingSeverity
+    when: dict[str, Any]
+    skipped: bool = False
+    shown: bool = False
+    last: float = -math.inf
+    """When it was due last, by the conditions [s]."""
+
+
 _levels: dict[str, LoggingSeverity] = {"": LoggingSeverity.INFO}
 
 
@@ -29,7 +47,7 @@ class RcutilsLogger:
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self._seen: dict[tuple[str, int], float] = {}
+        self._sites: dict[tuple[str, str, int, int], _Site] = {}
 
     def get_child(self, name: str) -> RcutilsLogger:
         """The logger below this one."""
@@ -53,36 +71,41 @@ class RcutilsLogger:
         Args:
             message: What happened.
             severity: A `LoggingSeverity`.
-            **when: `once`, `skip_first` or `throttle_duration_sec`, each counted per line of code.
+            **when: `once`, `skip_first` or `throttle_duration_sec`, each counted by call in the program.
 
         Returns:
             Whether it was shown.
+
+        Raises:
+            ValueError: The same call in the program had another severity or other conditions before, as in rclpy.
+            TypeError: An unknown condition.
         """
-        if not self.is_enabled_for(severity) or (when and not self._wanted(when)):
+        severity = LoggingSeverity(severity)
+        site = self._site(severity, when)
+        if not self.is_enabled_for(severity) or not _due(site):
             return False
-        now, word = time.time(), LoggingSeverity(severity).name
-        print(f"[{word}] [{now:.9f}] [{self.name}]: {message}", file=sys.stderr, flush=True)
+        print(f"[{severity.name}] [{time.time():.9f}] [{self.name}]: {message}", file=sys.stderr, flush=True)
         return True
 
-    def _wanted(self, when: dict[str, Any]) -> bool:
-        """Whether a line with conditions is due; it is known by where the program calls from."""
+    def _site(self, severity: LoggingSeverity, when: dict[str, Any]) -> _Site:
+        """The call in the program that has led here; two on one line are two."""
+        unknown = set(when) - set(SUPPORTED)
+        if unknown:
+            raise TypeError(f"a log line takes {', '.join(SUPPORTED)}, found '{min(unknown)}'")
+        when = {name: value for name, value in when.items() if value}
         frame: Any = sys._getframe(2)
         while frame.f_code.co_filename == __file__:
             frame = frame.f_back
-        place, now = (frame.f_code.co_filename, frame.f_lineno), time.monotonic()
-        last = self._seen.get(place)
-        unknown = set(when) - {"once", "skip_first", "throttle_duration_sec", "throttle_time_source_type"}
-        if unknown:
-            raise TypeError(
-                f"a log line takes once, skip_first and throttle_duration_sec, found '{min(unknown)}'"
-            )
-        if last is None:
-            self._seen[place] = -1e18 if when.get("skip_first") else now
-            return not when.get("skip_first")
-        if when.get("once") and last > 0.0 or now - last < when.get("throttle_duration_sec", 0.0):
-            return False
-        self._seen[place] = now
-        return True
+        code = frame.f_code
+        here = code.co_filename, code.co_name, frame.f_lineno, frame.f_lasti
+        site = self._sites.setdefault(here, _Site(severity, when))
+        if site.severity != severity:
+            raise ValueError("Logger severity cannot be changed between calls.")
+        if site.when.keys() != when.keys():
+            raise ValueError("Requested logging filters cannot be changed between calls.")
+        if site.when != when:
+            raise ValueError("Logging filter parameters cannot be changed between calls.")
+        return site
 
     def debug(self, message: Any, **when: Any) -> bool:
         """For whoever looks for a fault."""
@@ -107,12 +130,24 @@ class RcutilsLogger:
         return self.log(message, LoggingSeverity.FATAL, **when)
 
 
-_loggers: dict[str, RcutilsLogger] = {}
+def _due(site: _Site) -> bool:
+    """Whether the conditions of a call let it through this time; in the order of rclpy."""
+    now = time.monotonic()
+    if now < site.last + site.when.get("throttle_duration_sec", 0.0):
+        return False
+    site.last = now
+    if "skip_first" in site.when and not site.skipped:
+        site.skipped = True
+        return False
+    if "once" in site.when and site.shown:
+        return False
+    site.shown = True
+    return True
 
 
 def get_logger(name: str) -> RcutilsLogger:
-    """The logger of a name."""
-    return _loggers.setdefault(name, RcutilsLogger(name))
+    """A logger of a name; what calls are bound to is counted by each logger anew, as in rclpy."""
+    return RcutilsLogger(name)
 
 
 def set_logger_level(name: str, level: int) -> None:

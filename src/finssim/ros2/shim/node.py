@@ -67,6 +67,7 @@ class Node(NodeParameters, NodeGraph):
         sources += [self.context.arguments] if use_global_arguments else []
         self._rules = [rule for source in sources for rule in source.remaps]
         self._name, self._namespace = self._named(node_name, namespace or "")
+        self._logger = get_logger(self.get_fully_qualified_name().strip("/").replace("/", "."))
         self.context.participant.codec  # noqa: B018 - refuses a context that is not initialized, before anything else
         self.timers: list[Timer] = []
         self._ends: list[Any] = []
@@ -96,7 +97,7 @@ class Node(NodeParameters, NodeGraph):
 
     def get_logger(self) -> RcutilsLogger:
         """Its logger, named by namespace and name with dots."""
-        return get_logger(self.get_fully_qualified_name().strip("/").replace("/", "."))
+        return self._logger
 
     def get_clock(self) -> ROSClock:
         """Its clock: system time, or that of /clock where the parameter `use_sim_time` is true."""
