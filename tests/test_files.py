@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from finssim.files import OutputError, atomic_directory, atomic_write, refuse_unwritable
+from finssim.files import OutputError, atomic_directory, atomic_write, plain_name, refuse_unwritable
 
 
 def entries(directory):
@@ -174,3 +174,60 @@ def test_a_place_is_tried_without_leaving_anything(tmp_path):
     assert entries(tmp_path) == ["old.yaml"] and (tmp_path / "old.yaml").read_text() == "old"
     with pytest.raises(OutputError, match="already holds files"):
         refuse_unwritable(atomic_directory(tmp_path))
+
+
+NO_NAMES = {
+    "": "is empty",
+    " ": "is empty",
+    ".": "is a folder's link",
+    "..": "is a folder's link",
+    "/etc/passwd": "has a separator",
+    "../x": "has a separator",
+    "a/b": "has a separator",
+    "a/": "has a separator",
+    "..\\x": "has a separator",
+    "\\\\server\\share": "has a separator",
+    "C:": "has the letter of a drive",
+    "c:x": "has the letter of a drive",
+    "a\0b": "has a control character",
+    "a\nb": "has a control character",
+    "a\x7f": "has a control character",
+    "a\u2028b": "has a control character",
+    "a" * 201: "is 201 bytes long, more than 200",
+    "\u00fc" * 101: "is 202 bytes long",
+    "\ud800": "no file's name can have",
+}
+
+
+@pytest.mark.parametrize(("name", "reason"), NO_NAMES.items(), ids=map(ascii, range(len(NO_NAMES))))
+def test_a_name_from_data_is_no_path(name, reason):
+    """On no system: separators and drives of others count too. One sentence says whose, what and what to do."""
+    with pytest.raises(KeyError, match=reason) as refused:
+        plain_name(name, "run.mcap: vehicle", KeyError)
+    sentence = refused.value.args[0]
+    assert sentence.startswith("run.mcap: vehicle '") and sentence.endswith("rename it")
+    assert sentence.isprintable() and len(sentence) < 200
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "finsrov",
+        "surge +3 N",
+        "2024-05-01T12:30:00",
+        "..a",
+        "a..",
+        "...",
+        ".x",
+        "\u6c34\u69fd",
+        "a" * 200,
+        "\udcff",
+        "~",
+        "$HOME",
+    ],
+)
+def test_a_plain_name_is_one_file_of_its_folder(tmp_path, name):
+    """It comes back as it is, and a file of that name lies where it was meant to lie, beside its temporary one."""
+    with atomic_write(tmp_path / f"{plain_name(name, 'trial', KeyError)}.yaml") as temporary:
+        assert temporary.parent == tmp_path
+    assert [file.name for file in tmp_path.iterdir()] == [f"{name}.yaml"]

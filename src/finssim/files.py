@@ -1,4 +1,7 @@
-"""Output that is either whole or absent: written beside its target under another name, then renamed into place."""
+"""Output that is either whole or absent: written beside its target under another name, then renamed into place.
+
+And names that may become part of a path: one that came from data is never a path itself.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,15 @@ import errno
 import os
 import secrets
 import shutil
+import unicodedata
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
-__all__ = ["OutputError", "atomic_directory", "atomic_write", "refuse_unwritable"]
+__all__ = ["OutputError", "atomic_directory", "atomic_write", "plain_name", "refuse_unwritable"]
+
+LONGEST_NAME = 200
+"""Of a file or folder that data names [bytes]: 255 are possible, and suffixes, seeds and digests are added."""
 
 _WHAT_TO_DO = {
     errno.ENOSPC: "the disk is full: free some space or write elsewhere",
@@ -101,6 +108,51 @@ def atomic_directory(path: str | os.PathLike[str], *, replaces: str | None = Non
             shutil.rmtree(temporary, ignore_errors=True)
             raise
         _flush(target.parent)
+
+
+def plain_name(name: str, where: str, error: type[Exception]) -> str:
+    """A name that came from data, where it becomes part of a path: it stands for one file or folder in one place.
+
+        file = folder / f"{plain_name(name, 'run.mcap: vehicle', ViewError)}.yaml"
+
+    Refused are names that any system reads as a path or not at all: empty, `.`, `..`, absolute, with a separator, a
+    drive letter or a control character, too long, or in no encoding of files.
+
+    Args:
+        name: From a file, a record, a message or another machine.
+        where: What is named and by whom; the message begins with it.
+        error: Class of the refusal.
+
+    Returns:
+        The name as it is.
+
+    Raises:
+        error: The name is refused, in one sentence.
+    """
+    reason = _no_plain_name(name)
+    if reason:
+        shown = repr(name if len(name) <= 60 else f"{name[:57]}...")
+        raise error(f"{where} {shown} {reason}, expected the plain name of a file or folder: rename it")
+    return name
+
+
+def _no_plain_name(name: str) -> str:
+    """Why a name is none; empty if it is."""
+    if not name.strip():
+        return "is empty"
+    if name in (".", ".."):
+        return "is a folder's link"
+    if any(c in "/\\" for c in name):
+        return "has a separator of folders"
+    if len(name) > 1 and name[1] == ":" and name[0].isascii() and name[0].isalpha():
+        return "has the letter of a drive"
+    if any(unicodedata.category(c) in ("Cc", "Zl", "Zp") for c in name):
+        return "has a control character"
+    try:
+        size = len(os.fsencode(name))
+    except UnicodeEncodeError:
+        return "has a character that no file's name can have"
+    return f"is {size} bytes long, more than {LONGEST_NAME}" if size > LONGEST_NAME else ""
 
 
 class _Probe(Exception):

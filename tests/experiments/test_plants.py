@@ -7,6 +7,7 @@ import pytest
 
 from finssim.control.trajectories import load_trajectory
 from finssim.engine import read_run
+from finssim.engine.ranges_file import load_ranges
 from finssim.experiments import trials as trials_module
 from finssim.experiments.episodes import run_episodes
 from finssim.experiments.plants import Plant, PlantError, available_plants, load_plant
@@ -88,6 +89,17 @@ def test_a_wrong_plant_gets_its_sentence(tmp_path, text, sentence):
     (tmp_path / "plant.yaml").write_text(text, encoding="utf-8")
     with pytest.raises(PlantError, match=sentence):
         load_plant(tmp_path / "plant.yaml")
+
+
+@pytest.mark.parametrize("load", [load_plant, load_ranges])
+def test_a_name_is_of_those_that_ship(load, tmp_path, monkeypatch):
+    """Plants and sweeps name ranges and plants: a name without a file is looked up, and never put into a path."""
+    (tmp_path / "mine.yaml").write_text("mass: [0.9, 1.1]\n", encoding="utf-8")
+    for module in ("finssim.experiments.plants", "finssim.engine.ranges_file"):
+        monkeypatch.setattr(f"{module}.SHIPPED", tmp_path / "shipped")
+    (tmp_path / "shipped").mkdir()
+    with pytest.raises(ValueError, match="no (plant|ranges) '../mine'"):
+        load("../mine")
 
 
 def test_an_unknown_plant_is_told_the_nearest():

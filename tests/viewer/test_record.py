@@ -5,6 +5,7 @@ import pytest
 
 from finssim.pool.truth import read_truth
 from finssim.robot.record_reader import open_record
+from finssim.vehicles import VehicleError
 from finssim.viewer.frame import ViewError
 from finssim.viewer.sources.alignment import offset_between
 from finssim.viewer.sources.record import RecordSource
@@ -96,3 +97,78 @@ def test_a_trail_ends_where_the_body_is():
     trail = poses.trail(60.0)
     assert 29.0 < trail[0, 0] < 31.0 and 59.0 < trail[-1, 0] < 60.0
     assert poses.at(-1.0) is None and len(poses.trail(-1.0)) == 0
+
+
+def rewritten(source, target, files=None, **metadata):
+    """A record as somebody else could have made it: with other metadata and other files."""
+    from mcap.reader import make_reader
+    from mcap.writer import Writer
+
+    with source.open("rb") as old, target.open("wb") as new:
+        reader, writer = make_reader(old), Writer(new)
+        writer.start()
+        (found,) = [m for m in reader.iter_metadata() if m.name == "finssim"]
+        writer.add_metadata("finssim", {**found.metadata, **metadata})
+        for name, text in (files or {}).items():
+            writer.add_attachment(0, 0, name, "text/plain", text.encode())
+        channels = {}
+        for schema, channel, message in reader.iter_messages(topics=["/finsrov/odom"]):
+            if channel.id not in channels:
+                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, kind)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    return target
+
+
+@pytest.mark.parametrize("place", ["{}/mine", "../{}/mine", "..\\mine", "", "..", "mine\0"])
+def test_the_name_of_a_vehicle_is_no_path(trial, tmp_path, monkeypatch, place):
+    """A record's own file would be written there: the user's stays as it was, and one sentence refuses the record."""
+    theirs = tmp_path / "home" / "mine.yaml"
+    theirs.parent.mkdir()
+    theirs.write_text("precious: 1\n", encoding="utf-8")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    name = place.format(theirs.parent if place.startswith("{") else "home")
+    bad = rewritten(trial.record, tmp_path / "bad.mcap", {f"{name}.yaml": "extends: finsrov\n"}, vehicle=name)
+    with pytest.raises(ViewError, match="bad.mcap: vehicle '.*expected the plain name"):
+        RecordSource(bad)
+    assert theirs.read_text(encoding="utf-8") == "precious: 1\n"
+    assert {path.name for path in tmp_path.rglob("*")} == {"home", "mine.yaml", "bad.mcap"}
+
+
+def test_a_record_names_vehicles_of_the_catalogue_or_keeps_their_file(trial, tmp_path, monkeypatch):
+    """A file of the user of that name is not looked at; the record's own is."""
+    (tmp_path / "other.yaml").write_text(
+        "extends: finsrov\norigin: measured\nsource: test\nbody: {mass: 99.0}\n", encoding="utf-8"
+    )
+    monkeypatch.chdir(tmp_path)
+    named = rewritten(trial.record, tmp_path / "a.mcap", vehicle="other.yaml")
+    with pytest.raises(VehicleError, match="unknown vehicle 'other.yaml'"):
+        RecordSource(named)
+    kept = rewritten(
+        trial.record,
+        tmp_path / "b.mcap",
+        {"other.yaml": "extends: finsrov\norigin: measured\nsource: test\nbody: {mass: 13.0}\n"},
+        vehicle="other",
+    )
+    assert RecordSource(kept).stage.vehicle.body.mass == 13.0
+
+
+@pytest.mark.parametrize(
+    ("files", "sentence"),
+    [
+        ({"mine.yaml": "extends: ../x.yaml\n"}, "mine.yaml: extends '../x.yaml' has a separator"),
+        (
+            {"mine.yaml": "extends: finsrov\nhull: {file: /theirs}\n"},
+            "mine.yaml: hull: file '/theirs' has",
+        ),
+        (
+            {"mine.yaml": "extends: finsrov\n", "pool.yaml": "camera: {lens: /theirs}\n"},
+            "pool.yaml: camera: lens '/theirs' has a separator",
+        ),
+    ],
+)
+def test_what_a_record_keeps_names_no_file_elsewhere(trial, tmp_path, files, sentence):
+    bad = rewritten(trial.record, tmp_path / "bad.mcap", files, vehicle="mine")
+    with pytest.raises(ViewError, match=sentence):
+        RecordSource(bad)

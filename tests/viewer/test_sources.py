@@ -1,5 +1,6 @@
 """Live sources go on, recorded ones can be read anywhere, and every option changes what is seen."""
 
+import json
 import math
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 from finssim.engine import Simulator
 from finssim.engine.recorder import Recorder
-from finssim.vehicles import load_vehicle
+from finssim.vehicles import VehicleError, load_vehicle
 from finssim.viewer.frame import ViewError
 from finssim.viewer.run import Choice, open_source
 from finssim.viewer.sources.pool import PoolSource
@@ -65,6 +66,22 @@ def test_a_run_of_the_engine_is_a_source(tmp_path):
     assert source.frame(2.9).force == pytest.approx(simulator.numpy("thrust")[1, 0], abs=1e-5)
     with pytest.raises(ViewError, match="world 7 was not recorded; it has 0, 1"):
         RunSource(tmp_path / "run", world=7)
+
+
+@pytest.mark.parametrize("name", ["{}/mine", "../mine", "mine.yaml", "mine"])
+def test_the_vehicle_that_a_run_names_is_of_the_catalogue(tmp_path, monkeypatch, name):
+    """A file of that name is not looked at."""
+    (tmp_path / "mine.yaml").write_text("extends: finsrov\n", encoding="utf-8")
+    simulator = Simulator("finsrov")
+    with Recorder(simulator, tmp_path / "run") as recorder:
+        recorder.record()
+    about = json.loads((tmp_path / "run" / "_run.json").read_text(encoding="utf-8"))
+    about["vehicles"][0]["name"] = name.format(tmp_path)
+    (tmp_path / "run" / "_run.json").write_text(json.dumps(about), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(VehicleError, match="_run.json: (vehicle '.*' has a separator|unknown vehicle 'mine)"):
+        RunSource(tmp_path / "run")
+    assert RunSource(tmp_path / "run", vehicle="finsrov").stage.vehicle.name == "finsrov"
 
 
 @pytest.mark.parametrize(

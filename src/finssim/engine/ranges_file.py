@@ -264,7 +264,7 @@ def load_ranges(name_or_path: str | Path) -> Ranges:
         RangesError: no such file, or a key or number in it is wrong; names file, key, value and expectation.
     """
     path = Path(name_or_path)
-    if not path.is_file():
+    if not path.is_file() and str(name_or_path) in available():
         path = SHIPPED / f"{name_or_path}.yaml"
     if not path.is_file():
         close = difflib.get_close_matches(str(name_or_path), available(), n=1)

@@ -24,7 +24,7 @@ from finssim.experiments.t2_metrics import summarize_tracking
 from finssim.experiments.t2_table import print_tracking, print_tracking_plants
 from finssim.experiments.t2_trials import T2_TRAJECTORIES, run_tracking
 from finssim.experiments.trials import run_trials
-from finssim.files import atomic_directory
+from finssim.files import atomic_directory, plain_name
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.tasks import task_named
@@ -138,8 +138,8 @@ def _plants(names: Sequence[str | Path]) -> list[Plant]:
     for i, plant in enumerate(plants):
         if plant.name in (earlier.name for earlier in plants[:i]):
             raise EvaluationError(f"two plants are named '{plant.name}': give each once, or rename one file")
-        if len(plants) > 1 and (plant.name in ("", "..") or Path(plant.name).name != plant.name):
-            raise EvaluationError(f"plant '{plant.name}' cannot name a folder: rename it")
+        if len(plants) > 1:
+            plain_name(plant.name, "plant", EvaluationError)
     return plants
 
 

@@ -104,7 +104,7 @@ def load_plant(name_or_path: str | Path) -> Plant:
         PlantError: No such plant, or its file is wrong; names file, key and expectation.
     """
     path = Path(name_or_path)
-    if not path.is_file():
+    if not path.is_file() and str(name_or_path) in available_plants():
         path = SHIPPED / f"{name_or_path}.yaml"
     if not path.is_file():
         close = difflib.get_close_matches(str(name_or_path), available_plants(), n=1)

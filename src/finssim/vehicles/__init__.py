@@ -7,7 +7,7 @@ from finssim.vehicles.equipment import DepthSensor, Dvl, Imu, Mcu, Mount, Safety
 from finssim.vehicles.errors import VehicleError
 from finssim.vehicles.esc import Esc
 from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
-from finssim.vehicles.loader import catalogue, load_vehicle
+from finssim.vehicles.loader import catalogue, catalogue_vehicle, load_vehicle
 from finssim.vehicles.thruster import Thruster
 from finssim.vehicles.vehicle import AXES, Provenance, Vehicle
 
@@ -34,6 +34,7 @@ __all__ = [
     "VehicleError",
     "Water",
     "catalogue",
+    "catalogue_vehicle",
     "check_vehicle",
     "load_vehicle",
 ]

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from finssim.files import plain_name
 from finssim.vehicles.errors import VehicleError
 from finssim.vehicles.part import did_you_mean
 from finssim.vehicles.reading import read_file
@@ -48,6 +49,21 @@ def load_vehicle(name_or_path: str | os.PathLike[str]) -> Vehicle:
     return vehicle
 
 
+def catalogue_vehicle(name: str, where: str) -> Vehicle:
+    """The vehicle of the catalogue that data names: such a name is never a path.
+
+    Args:
+        name: From a record or another file.
+        where: Who names it, for messages.
+
+    Raises:
+        VehicleError: No plain name, or none of the catalogue.
+    """
+    if plain_name(name, f"{where}: vehicle", VehicleError) not in catalogue():
+        raise VehicleError(f"{where}: {_unknown(name)}")
+    return load_vehicle(name)
+
+
 def with_changes(vehicle: Vehicle, changes: Mapping[str, Any], provenance: Provenance) -> Vehicle:
     """See `Vehicle.replace`."""
     values, origins = vehicle.values(), dict(vehicle.provenance)
@@ -72,12 +88,13 @@ def _locate(name_or_path: str | os.PathLike[str], beside: Path | None = None) ->
         return path, text
     if beside is not None and (beside / f"{text}.yaml").is_file():
         return beside / f"{text}.yaml", f"{text}.yaml"
-    path = CATALOGUE / f"{text}.yaml"
-    if not path.is_file():
-        raise VehicleError(
-            f"unknown vehicle '{text}'{did_you_mean(text, catalogue())} available: {_available()}"
-        )
-    return path, f"catalogue/{text}.yaml"
+    if text not in catalogue():
+        raise VehicleError(_unknown(text))
+    return CATALOGUE / f"{text}.yaml", f"catalogue/{text}.yaml"
+
+
+def _unknown(name: str) -> str:
+    return f"unknown vehicle '{name}'{did_you_mean(name, catalogue())} available: {_available()}"
 
 
 def _available() -> str:

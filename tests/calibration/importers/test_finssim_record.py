@@ -167,3 +167,23 @@ def test_broken_words_for_the_header_are_refused(tmp_path):
 def test_trial_folders_are_written(run, tmp_path):
     (folder,) = import_trials([run], out=tmp_path / "trials", split="arming")
     assert (folder / "trial.yaml").is_file()
+
+
+@pytest.mark.parametrize("meta", [{}, {"trial": {"vehicle": "../mine"}}], ids=["vehicle", "trial"])
+def test_a_vehicle_that_a_record_names_is_no_path(tmp_path, meta):
+    """Neither its own name nor the one for `trial.yaml`; nothing is written."""
+    vehicle = VEHICLE if meta else VEHICLE.model_copy(update={"name": "../mine"})
+    record(tmp_path / "run.mcap", meta=meta, vehicle=vehicle)
+    with pytest.raises(CalibrationError, match=r"run.mcap: vehicle '../mine' has a separator of folders"):
+        import_trials([tmp_path / "run.mcap"], out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_vehicle_that_a_record_names_is_of_the_catalogue(tmp_path, monkeypatch):
+    """A file of that name is not looked at: a note asks for --vehicle."""
+    (tmp_path / "mine.yaml").write_text("nothing: 1", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    record(tmp_path / "run.mcap", meta={"trial": {"vehicle": "mine.yaml"}})
+    (trial,) = read_trials([tmp_path / "run.mcap"])
+    assert trial.header.vehicle is None
+    assert any("vehicle mine.yaml, which is not in the catalogue" in note for note in trial.notes)

@@ -346,3 +346,22 @@ def test_the_maps_of_the_page_are_maps(tmp_path, name):
     """What the page prints can be read."""
     (tmp_path / name).write_text(shipped_map(name), encoding="utf-8")
     read_map(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["../mine", "..", "/tmp/mine", "a\\\\b", "C:x", ""])
+def test_a_window_of_a_map_names_a_folder_and_no_path(folder, tmp_path, name):
+    """The trial would be written there."""
+    map_file = tmp_path / "map.yaml"
+    map_file.write_text(f'time: t\ncolumns: {{u: u}}\nsplit: {{windows: {{"{name}": [0, 3]}}}}')
+    with pytest.raises(CalibrationError, match="^trial '.*expected the plain name of a file or folder"):
+        import_trials(folder(log__csv=table({"u": np.sin})), column_map=map_file, out=tmp_path / "in" / "out")
+    assert not (tmp_path / "in").exists() and not (tmp_path / "mine").exists()
+
+
+def test_a_file_name_makes_no_trial_that_is_a_path(tmp_path):
+    """`...csv` is `..` by the pattern {trial}.csv."""
+    (tmp_path / "...csv").write_text(table({"u": np.sin}))
+    (tmp_path / "map.yaml").write_text("files: {'{trial}.csv': {time: t, columns: {u: u}}}")
+    with pytest.raises(CalibrationError, match=r"^trial '\.\.' is a folder's link"):
+        import_trials([tmp_path / "...csv"], column_map=tmp_path / "map.yaml", out=tmp_path / "in" / "out")
+    assert not (tmp_path / "in").exists()

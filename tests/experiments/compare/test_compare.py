@@ -73,6 +73,19 @@ def test_what_cannot_be_compared_is_refused(tmp_path):
         groups_of([])
 
 
+def test_a_policy_names_no_code_to_run(tmp_path):
+    """FILE.py:CLASS in a policy.yaml is a path from data: the file is not run."""
+    (tmp_path / "evil.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n", encoding="utf-8")
+    one = policy(tmp_path / "a1", 1)
+    told = (one / "policy.yaml").read_text(encoding="utf-8")
+    evil = told.replace("task: t1", f"task: {tmp_path / 'evil.py'}:Task")
+    assert evil != told
+    (one / "policy.yaml").write_text(evil, encoding="utf-8")
+    with pytest.raises(CompareError, match="evil.py:Task', expected one of t1, t2"):
+        groups_of([str(one)])
+    assert not (tmp_path / "ran").exists()
+
+
 def test_scores_are_by_target_and_failures_infinitely_bad():
     """A mean over the trials of a setpoint; an error that was never reached is worse than any."""
     one = [

@@ -181,3 +181,17 @@ def test_the_command_takes_several_records(tmp_path, capsys):
     assert boundary.run(app, ["datasets", str(tmp_path)]) == 0
     assert boundary.run(app, [*words, "--episodes", "3"]) == 2
     assert boundary.run(app, ["collect", "pid", "--task", "t1", "--out", str(tmp_path / "x")]) == 2
+
+
+@pytest.mark.parametrize("name", ["{}/theirs.csv", "theirs.csv", "theirs", "/theirs"])
+def test_the_trajectory_that_a_record_names_is_no_file(tmp_path, monkeypatch, name):
+    """Only who collects names files, by --goal."""
+    (tmp_path / "theirs.csv").write_text("t,x,y,z\n0,0,0,-0.5\n9,1,0,-0.5\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    told = name.format(tmp_path)
+    path = written(
+        tmp_path / "run.mcap", meta={"command": "finssim run"}, events=[(0.0, "trial_start", told)]
+    )
+    with pytest.raises(DriveError, match=f"followed '{told}', which is none of .*: give --goal"):
+        collect_records([path], "t2", out=tmp_path / "set")
+    assert not (tmp_path / "set").exists()

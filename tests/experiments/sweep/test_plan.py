@@ -82,3 +82,21 @@ def test_what_cannot_be_is_refused(tmp_path, changes, sentence):
 def test_a_file_that_is_not_there(tmp_path):
     with pytest.raises(SweepError, match="cannot be read"):
         load_sweep(tmp_path / "nothing.yaml")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"settings": {"../../mine": {}}},
+        {"settings": {"/tmp/mine": {}}},
+        {"settings": {"a\\b": {}}},
+        {"settings": {"a" * 300: {}}},
+        {"grid": {"action": ["a\\b"]}},
+        {"settings": {"C:x": {}}, "grid": {"action": ["wrench6"]}},
+    ],
+    ids=range(6),
+)
+def test_a_setting_names_a_folder_of_the_sweep(tmp_path, changes):
+    """Each job has one, whose name begins with that of its setting and what the grid sets."""
+    with pytest.raises(SweepError, match="^setting '.*expected the plain name of a file or folder"):
+        load_sweep(written(tmp_path, **changes)).jobs()

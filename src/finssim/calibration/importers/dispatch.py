@@ -17,6 +17,7 @@ from finssim.calibration.importers.split import split_table
 from finssim.calibration.importers.streams import Stream, merge
 from finssim.calibration.importers.tables import TABLES, read_table
 from finssim.calibration.trials.trial import Trial
+from finssim.files import plain_name
 from finssim.vehicles import load_vehicle
 
 __all__ = ["FORMATS", "Format", "import_trials", "read_trials"]
@@ -101,7 +102,7 @@ def read_trials(
     if unknown and not any(trial.name.startswith(tuple(unknown)) for trial in trials):
         names = ", ".join(trial.name for trial in trials)
         raise CalibrationError(f"{column_map}: trials.{unknown[0]}: no such trial; the logs make {names}")
-    _refuse_equal_names(trials)
+    _check_names(trials)
     return trials
 
 
@@ -210,9 +211,11 @@ def _expression(pattern: str) -> str:
     return "".join(".*" if c == "*" else "." if c == "?" else re.escape(c) for c in pattern)
 
 
-def _refuse_equal_names(trials: list[Trial]) -> None:
+def _check_names(trials: list[Trial]) -> None:
+    """Each name is a folder's, and no other trial's: maps and patterns make them as well as names of logs."""
     seen = set()
     for trial in trials:
+        plain_name(trial.name, "trial", CalibrationError)
         if trial.name in seen:
             raise CalibrationError(
                 f"two logs make a trial '{trial.name}': import them one by one, or rename a file"

@@ -12,8 +12,9 @@ import numpy as np
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.importers.source_map import ColumnSource, SourceMap
 from finssim.calibration.importers.streams import Stream
+from finssim.files import plain_name
 from finssim.mcap_metadata import mcap_metadata
-from finssim.vehicles import VehicleError, load_vehicle
+from finssim.vehicles import VehicleError, catalogue_vehicle
 
 __all__ = ["THRUSTERS", "own_topics", "recorded_header", "spoken_events", "thruster_columns"]
 
@@ -98,14 +99,15 @@ def recorded_header(path: Path) -> tuple[dict[str, Any], list[str]]:
         raise CalibrationError(
             f"{path.name}: the record's 'trial' is {about['trial']!r}, expected a mapping"
         ) from None
-    name = about.get("vehicle")
-    if name is None or "vehicle" in told:
+    name = told.pop("vehicle", about.get("vehicle"))
+    if name is None:
         return told, []
+    plain_name(str(name), f"{path.name}: vehicle", CalibrationError)
     try:
-        vehicle = load_vehicle(name)
+        vehicle = catalogue_vehicle(str(name), path.name)
     except VehicleError:
         note = f"recorded with vehicle {name}, which is not in the catalogue: give --vehicle FILE"
         return told, [f"{path.name}: {note}"]
-    changed = vehicle.sha256 != about.get("vehicle_sha256")
+    changed = name == about.get("vehicle") and vehicle.sha256 != about.get("vehicle_sha256")
     note = f"{path.name}: recorded with another state of {name}'s file, which the record keeps"
     return {"vehicle": name, **told}, [note] if changed else []

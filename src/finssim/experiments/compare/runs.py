@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from finssim.control.policy import Policy
 from finssim.control.policy_description import PolicyDescription
+from finssim.tasks import TASKS
 
 __all__ = ["CompareError", "Group", "Run", "groups_of"]
 
@@ -80,6 +81,12 @@ def groups_of(words: Sequence[str]) -> list[Group]:
     tasks = {run.description.task for runs in named.values() for run in runs}
     if len(tasks) > 1:
         raise CompareError(f"runs were trained for {', '.join(sorted(tasks))}: compare those of one task")
+    if not tasks <= TASKS.keys():
+        # FILE.py:CLASS in somebody's policy.yaml would be code to run.
+        raise CompareError(
+            f"runs were trained for {tasks.pop()!r}, expected one of {', '.join(TASKS)}: policies of other tasks "
+            "are evaluated one by one, with finssim evaluate --task FILE.py:CLASS"
+        )
     for name, runs in named.items():
         _check(name, runs)
     return [Group(name, tuple(sorted(runs, key=lambda run: run.seed))) for name, runs in named.items()]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from finssim.control.guidance import Guide, Station
 from finssim.control.modes import Thruster8, Wrench6
 from finssim.control.observations import Observer
-from finssim.control.trajectories import load_trajectory
+from finssim.control.trajectories import PUBLISHED_NAMES, TRAJECTORIES, load_trajectory
 from finssim.experiments.driven.actions import actions_of
 from finssim.experiments.driven.drive import Drive, DriveError
 from finssim.geometry.rotations import quat_yaw
@@ -127,7 +127,7 @@ def _on_grid(run: Indices, time: Array, period: float) -> list[Indices]:
 def _guides(drive: Drive, task: str, goal: Station | str | None) -> Callable[[Indices], Guide]:
     """What tells a stretch's guide from the indices of its decisions."""
     if task != "t1":
-        trajectory = _trajectory(drive, str(goal or drive.guide))
+        trajectory = _trajectory(drive, str(goal or _recorded_name(drive)))
         return lambda rows: trajectory
     if isinstance(goal, Station):
         return lambda rows: goal
@@ -148,6 +148,16 @@ def _station(goal: Sequence[float] | Array) -> Station:
 
 def _ended(drive: Drive, rows: Indices) -> Station:
     return _station((*drive.position[rows[-1]], float(quat_yaw(drive.quaternion[rows[-1]]))))
+
+
+def _recorded_name(drive: Drive) -> str:
+    """Name of the trajectory that the record says was followed: one of ours, since what a record names is no path."""
+    if drive.guide not in (*TRAJECTORIES, *PUBLISHED_NAMES):
+        raise DriveError(
+            f"{drive.path}: followed '{drive.guide}', which is none of {', '.join(TRAJECTORIES)}: give --goal, the "
+            "name or the file of what was followed"
+        )
+    return drive.guide
 
 
 def _trajectory(drive: Drive, name: str) -> Guide:

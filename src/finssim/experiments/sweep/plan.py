@@ -15,6 +15,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from finssim.experiments.plants import load_plant
+from finssim.files import plain_name
 from finssim.learning.train import train
 from finssim.tasks import TASKS
 from finssim.yaml_file import read_mapping
@@ -119,10 +120,14 @@ class Sweep(BaseModel):
 
 
 def _named(name: str, combination: Mapping[str, Any]) -> str:
-    """Of a setting: its own name and what the grid sets, fit for a folder."""
+    """Of a setting: its own name and what the grid sets, as it names a folder.
+
+    Raises:
+        SweepError: It cannot.
+    """
     parts = [name] if name else []
     parts += [f"{option}-{Path(str(value)).stem}" for option, value in combination.items()]
-    return "_".join(parts) or "run"
+    return plain_name("_".join(parts) or "run", "setting", SweepError)
 
 
 def load_sweep(path: str | Path) -> Sweep:

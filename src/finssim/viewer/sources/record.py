@@ -6,25 +6,28 @@ import json
 import math
 import tempfile
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from finssim.files import plain_name
 from finssim.localization.pool import Pool, load_pool
 from finssim.pool.truth import Truth, read_truth
 from finssim.robot.messages import TagCorners
 from finssim.robot.record_messages import STATES
 from finssim.robot.record_pictures import picture_of
 from finssim.robot.record_reader import Record, open_record
-from finssim.vehicles import Vehicle, VehicleError, load_vehicle
+from finssim.vehicles import Vehicle, VehicleError, catalogue_vehicle, load_vehicle
 from finssim.viewer.frame import Curve, Frame, Picture, Stage, ViewError
 from finssim.viewer.sources.alignment import offset_between
 from finssim.viewer.sources.series import HEADING, POSITION, PoseSeries, Series, errors_between
 from finssim.viewer.stages import box_of
 from finssim.viewer.tags import TagLook
+from finssim.yaml_file import read_mapping
 
 __all__ = ["RecordSource"]
 
@@ -237,12 +240,9 @@ def _tags_in(text: str) -> tuple[TagCorners, ...]:
 
 
 def _pool_of(record: Record) -> Pool | None:
-    text = record.files.get("pool.yaml")
-    if text is None:
+    if "pool.yaml" not in record.files:
         return None
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "pool.yaml"
-        file.write_text(text, encoding="utf-8")
+    with _kept_file(record, "pool.yaml", ("camera", "lens")) as file:
         return load_pool(file)
 
 
@@ -251,16 +251,29 @@ def _vehicle_of(record: Record) -> Vehicle:
     name = record.metadata.get("vehicle")
     if name is None:
         raise ViewError(f"{record.path}: does not say whose it is: give --vehicle")
+    file_name = f"{plain_name(name, f'{record.path}: vehicle', ViewError)}.yaml"
     try:
-        vehicle = load_vehicle(name)
-        if vehicle.sha256 == record.metadata.get("vehicle_sha256"):
+        vehicle = catalogue_vehicle(name, str(record.path))
+        if vehicle.sha256 == record.metadata.get("vehicle_sha256") or file_name not in record.files:
             return vehicle
     except VehicleError:
-        if f"{name}.yaml" not in record.files:
+        if file_name not in record.files:
             raise
-    if f"{name}.yaml" not in record.files:
-        return vehicle
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / f"{name}.yaml"
-        file.write_text(record.files[file.name], encoding="utf-8")
+    with _kept_file(record, file_name, ("extends",), ("hull", "file")) as file:
         return load_vehicle(file)
+
+
+@contextmanager
+def _kept_file(record: Record, name: str, *references: tuple[str, ...]) -> Iterator[Path]:
+    """A file that the record keeps, in a folder of its own; `references` are its keys that may name other files."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / name
+        file.write_text(record.files[name], encoding="utf-8")
+        tree: Any = read_mapping(file, ViewError, such_as="name: value")
+        for keys in references:
+            value = tree
+            for key in keys:
+                value = value.get(key) if isinstance(value, dict) else None
+            if isinstance(value, str):
+                plain_name(value, f"{record.path}: {name}: {': '.join(keys)}", ViewError)
+        yield file

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from finssim.engine.recorder import read_run
-from finssim.vehicles import load_vehicle
+from finssim.engine.recorder import ABOUT, read_run
+from finssim.vehicles import catalogue_vehicle, load_vehicle
 from finssim.viewer.frame import Curve, Frame, Stage, ViewError
 from finssim.viewer.sources.series import PoseSeries, Series
 from finssim.viewer.stages import box_of
@@ -38,7 +38,8 @@ class RunSource:
             raise ViewError(
                 f"{folder}: world {chosen} was not recorded; it has {', '.join(map(str, worlds))}"
             )
-        ours = load_vehicle(vehicle or table.attrs["vehicles"][0]["name"])
+        named = table.attrs["vehicles"][0]["name"]
+        ours = load_vehicle(vehicle) if vehicle else catalogue_vehicle(named, f"{folder}: {ABOUT}")
         rows = table[(table["world"] == chosen) & (table["vehicle"] == 0)]
         time = rows["t"].to_numpy(float)
         self._poses = PoseSeries(
