@@ -242,6 +242,13 @@ def test_malformed_tags_are_none(told):
         assert found is None or isinstance(found[2], Picture)
 
 
+@pytest.mark.parametrize("stamp", ["1" + 400 * "0", "-1" + 400 * "0", str(2**31 * 10**9), "1e400", "NaN"])
+def test_tags_of_a_time_that_no_stamp_has_are_none(stamp):
+    """JSON has numbers of any size: one of 400 digits is no float, which would end the localizer."""
+    told = f'{{"stamp_ns": {stamp}, "sequence": 1, "finder": "camera", "tags": []}}'
+    assert tags_of(ros_type("std_msgs/msg/String")(data=told)) is None
+
+
 def test_every_topic_of_the_table_has_its_type():
     """Each can be imported as rclpy's classes are."""
     for topic in TOPICS.values():

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from finssim.control.guidance import Station
 from finssim.geometry.rotations import quat_yaw
 from finssim.robot.messages import Picture, TagCorners, Telemetry
+from finssim.robot.record_messages import FIRST_TIME, LAST_TIME
 from finssim.robot.record_pictures import picture_of
 from finssim.robot.robot import Reading
 
@@ -151,6 +152,8 @@ def tags_of(message: Any) -> tuple[int, str, Picture] | None:
         tags = tuple(_tag(tag) for tag in told["tags"][:MOST_TAGS])
         stamp, sequence, finder = int(told["stamp_ns"]), int(told["sequence"]), str(told["finder"])
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
+        return None
+    if not FIRST_TIME <= stamp <= LAST_TIME:  # a number of any size in JSON
         return None
     return stamp, finder, Picture(0.0, sequence, None, tags)
 
