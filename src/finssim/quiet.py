@@ -6,12 +6,14 @@ import ctypes.util
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 
 __all__ = ["start_warp"]
 
 
+@cache  # searching for the driver's library starts six processes
 def start_warp() -> None:
-    """Initialise Warp silently; afterwards it reports warnings and errors only.
+    """Initialise Warp silently, once a process; afterwards it reports warnings and errors only.
 
     Its banner goes to standard output, where it would spoil JSON. Its native library warns on standard error
     where there is no NVIDIA driver: on a laptop that is no news (`finssim doctor` says it), so it is kept back there.
