@@ -2,9 +2,10 @@
 
 import csv
 import hashlib
+import multiprocessing
+import os
 import shutil
-import subprocess
-import sys
+import signal
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -175,25 +176,21 @@ def test_checkpoints_of_an_earlier_and_longer_training_go(tmp_path):
     assert names == ["checkpoint-000001536", "checkpoint-000002048"]
 
 
-DYING = """
-import os, signal, sys
-from pathlib import Path
-from finssim.learning.train import train
-from finssim.learning.training_loop import Loop
+def die_in_the_sixth_update(out, learner, options):
+    """A training that kill -9 ends."""
+    update = Loop._update
 
-update = Loop._update
+    def dying(self, total):
+        if len(self.curves) == 5:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return update(self, total)
 
-def dying(self, total):
-    if len(self.curves) == 5:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return update(self, total)
-
-Loop._update = dying
-train("t1", out=Path(sys.argv[1]), learner=sys.argv[2], **eval(sys.argv[3]))
-"""
+    Loop._update = dying
+    train("t1", out=out, learner=learner, **options)
 
 
 @pytest.mark.long
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 @pytest.mark.parametrize("learner", ["ppo", "sb3-ppo", "sb3-sac", "rsl-rl", "torchrl-ppo"])
 def test_a_killed_training_goes_on_to_the_same_policy(tmp_path, learner):
     """kill -9 in the sixth of eight updates, then --resume: network and curves as if nothing had been."""
@@ -201,9 +198,13 @@ def test_a_killed_training_goes_on_to_the_same_policy(tmp_path, learner):
     if learner == "sb3-sac":
         options["settings"] = {"rollout": 32, "batch": 64, "warm_up": 600, "gradient_steps": 4}
     whole = train("t1", out=tmp_path / "whole", learner=learner, **options)
-    words = [sys.executable, "-c", DYING, str(tmp_path / "p"), learner, repr(options)]
-    run = subprocess.run(words, capture_output=True, text=True)
-    assert run.returncode == -9, run.stderr
+    # A forked child has everything imported.
+    run = multiprocessing.get_context("fork").Process(
+        target=die_in_the_sixth_update, args=(tmp_path / "p", learner, options)
+    )
+    run.start()
+    run.join()
+    assert run.exitcode == -signal.SIGKILL
     assert not (tmp_path / "p").exists() and (tmp_path / "p-training" / "checkpoint-000002048").is_dir()
     resumed = train("t1", out=tmp_path / "p", learner=learner, resume=True, **options)
     assert network(resumed) == network(whole)
