@@ -9,7 +9,7 @@ STRICT := $(wildcard $(addprefix src/finssim/,geometry physics control localizat
 STAMP := $(VENV)/.installed-$(shell cat pyproject.toml constraints.txt | cksum | cut -d ' ' -f 1)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check format bench docs clean
+.PHONY: help demo test quick check format bench docs clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z]*\):.*##/make \1\t/p' Makefile | expand -t 16
@@ -22,6 +22,9 @@ demo: $(STAMP)  ## identify, train, evaluate and report: the whole loop, result 
 test: check  ## check, then run every test
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --durations 25 || { [ $$? = 1 ] && \
 		OMP_NUM_THREADS=1 $(BIN)/python -m pytest --last-failed --last-failed-no-failures none; }
+
+quick: $(STAMP)  ## the tests that take about a second or less and start no process
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow" -q
 
 check: $(STAMP)  ## lint, format and types
 	$(BIN)/ruff check .

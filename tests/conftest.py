@@ -1,4 +1,4 @@
-"""What every test shares: one thread per process, reproducible examples, the errors of a whole run at a glance."""
+"""What every test shares: one thread per process, reproducible examples, processor time by test, the guard of `quick`."""
 
 import os
 import signal
@@ -6,6 +6,13 @@ import signal
 # Before any numeric library starts: OpenMP on busy cores slows torch tens of times.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import multiprocessing.process
+import sys
+import time
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
 from hypothesis import HealthCheck, settings
 
 settings.register_profile(
@@ -19,3 +26,84 @@ settings.load_profile("finssim")
 
 # A run in the background inherits an ignored Ctrl-C, and so would the processes that tests interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+# ---- processor time by test: `--durations N` shows wall-clock time, which neighbours on the machine change
+
+
+def processor_time() -> float:
+    """Processor time of this process and of its ended children so far [s]."""
+    children = os.times()
+    return time.process_time() + children.children_user + children.children_system
+
+
+_before = 0.0
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport():
+    """Each report, also from another worker, carries what was spent since the last one [s]."""
+    global _before
+    report = yield
+    now = processor_time()
+    report.processor_time, _before = now - _before, now
+    return report
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    """The N tests of `--durations N` that took the most processor time, and the sum of all."""
+    if not config.option.durations:
+        return
+    spent = defaultdict(float)
+    for reports in terminalreporter.stats.values():
+        for report in reports:
+            spent[getattr(report, "nodeid", "")] += getattr(report, "processor_time", 0.0)
+    terminalreporter.section(f"processor time, {sum(spent.values()) / 60.0:.1f} minutes in all")
+    for name, seconds in sorted(spent.items(), key=lambda item: -item[1])[: config.option.durations]:
+        terminalreporter.write_line(f"{seconds:7.2f}s {name}")
+
+
+# ---- `make quick`: no test starts a process
+
+LOOK_UPS = {"git", "gcc", "ld", "ldconfig", "uname"}
+"""What Python and FinsSim ask about this machine and this checkout, once a process."""
+
+_guarded = False
+
+
+def _refuse(program: str) -> None:
+    if _guarded and Path(program).name not in LOOK_UPS:
+        pytest.fail(f"this test starts a process ({program}): mark it with pytest.mark.slow")
+
+
+def _audit(event: str, arguments: tuple) -> None:
+    if event in ("subprocess.Popen", "os.posix_spawn"):
+        _refuse(os.fsdecode(arguments[0] or arguments[1][0]))
+    elif event in ("os.fork", "os.forkpty", "os.system"):
+        _refuse(event)
+
+
+def pytest_sessionstart(session):
+    """With -m "not slow" on, a process that a test starts fails the test."""
+    global _before
+    if session.config.option.markexpr == "not slow":
+        sys.addaudithook(_audit)
+        start = multiprocessing.process.BaseProcess.start
+
+        def guarded_start(process):
+            _refuse(f"multiprocessing, {process.name}")
+            start(process)
+
+        multiprocessing.process.BaseProcess.start = guarded_start
+    _before = processor_time()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol():
+    """The guard is for tests, not for what pytest and its plugins start around them."""
+    global _guarded
+    _guarded = True
+    try:
+        return (yield)
+    finally:
+        _guarded = False

@@ -162,7 +162,7 @@ def test_simulate_refuses_in_a_sentence(capsys, tmp_path):
     assert "write elsewhere" in refusal(capsys, *words, "/proc/x/run.csv", "--command", "surge=10")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_interrupted_training_leaves_a_policy(tmp_path):
     """Control-C ends with 130, one sentence and no traceback; the policy so far is whole, and says it is not done."""
     out = tmp_path / "hold"
@@ -220,7 +220,7 @@ def test_train_refuses_a_place_before_it_works(capsys, tmp_path):
     assert "write elsewhere" in refusal(capsys, "train", "t1", "--out", "/proc/x/policy")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_train_then_evaluate(capfd, tmp_path):
     """What `train` wrote is what `evaluate` reads; its result is a table, a JSON object and a directory."""
     policy = tmp_path / "policy"

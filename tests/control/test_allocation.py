@@ -97,7 +97,7 @@ def test_objective_equals_that_of_lsq_linear_for_any_regularisation(finsrov, reg
     assert_as_good_as_lsq_linear(finsrov, wrenches(finsrov, 500, seed=3), regularisation)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_objective_equals_that_of_lsq_linear_on_a_hundred_thousand_wrenches(layout):
     assert_as_good_as_lsq_linear(layout, wrenches(layout, 25_000, seed=2))
 

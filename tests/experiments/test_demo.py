@@ -19,7 +19,7 @@ from finssim.learning.training_loop import Loop
 from finssim.pool import load_plant_spec
 from finssim.vehicles import load_vehicle
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
 
 SMALL = Scope(
     levels={"surge": [18.0]},

@@ -100,7 +100,7 @@ def test_means_have_intervals_and_what_is_missing_is_counted():
     assert (row["trials"], row["valid"]) == (5, 4)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EPISODIC)
 def test_baselines_are_evaluated_by_name(name, tmp_path):
     """Table, JSON and figure; a row for each plant where there are two."""

@@ -88,7 +88,7 @@ def test_our_camera_shows_the_tag_where_it_is():
     assert np.sqrt(np.mean(moved**2)) > 3.0 * np.sqrt(np.mean(still**2))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_mitsuba_shows_the_tag_where_it_is():
     """Two crops by the renderer that shares no code with ours: the corners within half a pixel of the projection."""
     pytest.importorskip("mitsuba")

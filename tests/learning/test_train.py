@@ -189,7 +189,7 @@ def die_in_the_sixth_update(out, learner, options):
     train("t1", out=out, learner=learner, **options)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 @pytest.mark.parametrize("learner", ["ppo", "sb3-ppo", "sb3-sac", "rsl-rl", "torchrl-ppo"])
 def test_a_killed_training_goes_on_to_the_same_policy(tmp_path, learner):
@@ -287,7 +287,7 @@ def test_an_earlier_policy_is_replaced(trained, tmp_path):
     assert network(train("t1", out=tmp_path / "p", seed=5, **TINY)) == network(trained)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_policy_trained_from_nothing_holds_the_published_setpoints(tmp_path):
     """All eight in the nominal plant, within 2 cm and 1.5° once settled: seed 1, default settings."""
     result = evaluate_controller(train("t1", out=tmp_path / "p", seed=1), load_plant("nominal")).result
@@ -343,7 +343,7 @@ def test_trajectory_tracking_is_trained_too(tmp_path):
     assert kind.settings(task, randomized=True).steps > kind.settings(task).steps
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_short_training_follows_the_straight_line(tmp_path):
     """After half of the usual steps: within 3 cm, several times better than the paper's best on hardware."""
     folder = train("t2", out=tmp_path / "t2", seed=1, steps=300_000)

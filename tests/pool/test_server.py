@@ -270,7 +270,7 @@ def test_the_command_in_real_time(tmp_path, way):
     assert read_truth(truth).time[-1] > 1.5
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_command_draws_pictures():
     """A subprocess's drawn pictures arrive with tags that the detector finds, while telemetry goes on."""
     from finssim.localization.detection.detector import detector

@@ -42,7 +42,7 @@ def test_a_baseline_does_its_task(task, observe):
     assert measured["length"].min() > 100
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("vehicle", HOLONOMIC)
 @pytest.mark.parametrize("task", SINGLE)
 def test_a_baseline_does_its_task_with_every_vehicle_that_can(task, vehicle):

@@ -23,7 +23,7 @@ def start(*words):
     pytest.fail("no address was printed")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_page_is_served_until_control_c(trial):
     """The printed address answers; Ctrl-C ends with 0 and says nothing more."""
     run, url = start(trial.record, "--truth", trial.truth, "--port", "8240")
@@ -34,7 +34,7 @@ def test_the_page_is_served_until_control_c(trial):
     assert run.returncode == 0 and out == ""
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_live_pool_ends_by_itself():
     """--duration ends it, and --port and --speed are taken."""
     run, url = start("pool", "--goal", "0.2,0,-0.5,0", "--port", "8241", "--speed", "4", "--duration", "2")

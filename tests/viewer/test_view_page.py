@@ -85,7 +85,7 @@ def wait(holds):
         time.sleep(0.02)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
 def test_the_vehicle_is_drawn_where_it_is_and_moves_with_the_slider(view, page):
     """Hundreds of colours; truth-coloured pixels where the pose projects to; at the slider's end they are elsewhere."""

@@ -144,7 +144,7 @@ def test_a_row_of_a_curve_without_a_number_is_left_out(tmp_path):
     np.testing.assert_allclose(middle, np.maximum(steps, 100.0) / 100.0, rtol=1e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_command_evaluates_once_and_writes(tmp_path, capsys):
     """Table, JSON, Markdown and figure; a second call takes the trials that are there, and gives the same."""
     from finssim import boundary

@@ -109,7 +109,7 @@ def test_steps_on_rails_reach_the_closed_form():
     assert 27.14 / 39.07 < found.time_constant < 27.14 / 39.07 + 0.4  # motors and their delay come on top
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_excite_in_a_pool_by_command(tmp_path):
     """Trials, records and what they are; the pool, its vehicle and its severity are those of the options."""
     command = ["excite", "roll", "--vehicle", "finsrov", "--levels", "1.0", "--out", str(tmp_path / "t")]

@@ -49,7 +49,7 @@ def test_a_full_disk_ends_the_record_and_not_the_trip(tried, caplog):
     assert result["record_lost_s"] < 1.0 and "recording stopped: File too large" in caplog.text
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_vehicle_that_is_blind_for_a_while_waits_and_goes_on(tried):
     """3 s: no thrust until it sees again, then armed; 10 s: a fault that names the camera."""
     short, long = tried("blind-3", motion="station"), tried("blind-10", motion="station")

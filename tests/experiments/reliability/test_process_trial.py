@@ -6,7 +6,7 @@ from finssim.experiments.reliability.job import FaultJob
 from finssim.experiments.reliability.process_trial import play_kill
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_killed_robot_leaves_motors_that_stop_and_a_record_that_opens():
     """By the controller's own timeout of 0.5 s; no more than a second is missing."""
     result = play_kill(FaultJob(scenario="kill-robot", motion="station"))
@@ -14,7 +14,7 @@ def test_a_killed_robot_leaves_motors_that_stop_and_a_record_that_opens():
     assert 0.3 < result["thrust_gone_s"] < 1.5 and result["record_lost_s"] <= 1.0 and result["thrust_n"] > 0.5
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_robot_whose_pool_is_killed_stops_commanding_and_says_why():
     """Its process ends by itself, with a fault that names the silence."""
     result = play_kill(FaultJob(scenario="kill-pool", motion="station"))

@@ -21,7 +21,7 @@ def test_an_unknown_camera_is_refused_before_anything_starts(capsys, tmp_path):
     assert "unknown camera 'eyes'; available: pictures, corners" in capsys.readouterr().err
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_run_in_real_time_is_timed(capsys, tmp_path):
     """Both processes' own words, each figure against its limit."""
     words = [

@@ -110,7 +110,7 @@ def swept(capsys, *words):
     return status, json.loads(lines[-1]) if lines else None
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_sweep_is_done_once_and_goes_on_where_it_was(tmp_path, sweep_file, capsys):
     """A policy and a row for every job; only a run that is missing is made again; one that fails is told."""
     out = tmp_path / "out"
@@ -155,7 +155,7 @@ def two_machines(monkeypatch):
         cluster.shutdown()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_machine_that_is_lost_half_way_is_made_up_for(tmp_path, sweep_file, two_machines, monkeypatch):
     """One of two nodes is killed while both work. Every job still has its row and its policy."""
     changed(sweep_file, seeds=2)

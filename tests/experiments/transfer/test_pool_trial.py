@@ -70,7 +70,7 @@ def test_noise_on_the_input_does_not_reach_the_estimate(played):
     assert noisy < 2.0 * played()[0]["localization"]["horizontal_m"] + 0.005
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_pictures_and_corners_tell_nearly_the_same(played):
     """The quick camera stands for the slow one: the same plant, within a few centimetres of each other."""
     pictures = played(camera="pictures", duration=3.0)

@@ -123,7 +123,7 @@ def graph(tmp_path_factory):
         graph.end()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_station_is_held_through_topics_alone(graph):
     """Armed because it was asked for, by odometry near the goal; every node is on the graph and tells its health."""
     assert graph.until(lambda: graph.state() == ARMED), "".join(graph.said)
@@ -134,7 +134,7 @@ def test_a_station_is_held_through_topics_alone(graph):
     assert graph.until(lambda: {f"finsrov: {name}" for name in names} <= health())
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_killed_controller_leaves_no_thrust(graph):
     """kill -9: the bridge's states say zero from half a second after the last command, and the launcher tells of it."""
     assert graph.until(lambda: graph.state() == ARMED, each=graph.operate)
@@ -150,7 +150,7 @@ def test_a_killed_controller_leaves_no_thrust(graph):
     assert graph.until(lambda: any("controller has died" in line for line in graph.said))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_record_opens_and_no_process_is_left(graph):
     """rosbags reads every topic with its type; the launcher's status says that a node died."""
     pids = [graph.pid(name) for name in ("virtual_pool", "hardware_bridge", "recorder")]

@@ -188,7 +188,7 @@ def test_bad_messages_never_raise_and_never_get_through(room):
     assert room.until(lambda: words <= told(), room.tags)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["image", "jpeg"])
 def test_pictures_become_the_true_pose(room, form):
     """Raw and packed, drawn by the pool's camera; the tags that were found are told."""
