@@ -1,4 +1,4 @@
-"""What every test shares: one thread per process, reproducible examples, processor time by test, the guard of `quick`."""
+"""What every test shares: one thread per process, equal examples, processor time by test, the guard of `make quick`."""
 
 import os
 import signal

@@ -64,17 +64,16 @@ def pinhole_poses(seen: Observations, lens: Lens, seed: int = 0) -> list[Solutio
             + ": expected at least 4 that do not lie on one line; whether the camera file belongs to these "
             "pixels decides which are usable"
         )
-    found = [_refined(R, C, seen, lens) for R, C in _candidates(X, rays, values, seed)]
-    found = sorted((s for s in found if s is not None), key=lambda s: s.cost)
+    near = [_straight(R, C, seen, lens) for R, C in _candidates(X, rays, values, seed)]
+    # Most starts have met by now, and what has met ends at one pose.
+    near = _distinct([_refined(model, seen, 10) for model in near])
+    found = _distinct([_refined(s.model, seen, 30) for s in near])
+    found = [s for s in found if np.median(_sizes(s.model, seen)) <= 0.2 * lens.width]
     if not found:
         raise CalibrationError(
             "no pose of the camera explains the pixels: check ids, units and the camera file"
         )
-    kept: list[Solution] = []
-    for s in found:
-        if all(_apart(s.model, k.model) for k in kept):
-            kept.append(s)
-    return kept
+    return found
 
 
 def _candidates(X: Array, rays: Array, values: Array, seed: int) -> Iterator[tuple[Array, Array]]:
@@ -190,19 +189,34 @@ def _position(R_pc: Array, X: Array, rays: Array) -> Array | None:
     return np.asarray(C) if np.median(np.sum((X - C) * r, axis=1)) > 0.0 else None
 
 
-def _refined(R_pc: Array, C: Array, seen: Observations, lens: Lens) -> Solution | None:
-    """The straight-line pose nearby that suits the pixels best, judged by a scale common to all."""
+def _straight(R_pc: Array, C: Array, seen: Observations, lens: Lens) -> PoolModel:
+    """A camera without water before it."""
     camera = Camera(lens, C, matrix_to_quat(R_pc))
     plane = Interface(np.array([0.0, 0.0, 1.0]), 0.0)
-    model = PoolModel(camera, plane, seen.points[~seen.dry].mean(axis=0), refractive=False)
+    return PoolModel(camera, plane, seen.points[~seen.dry].mean(axis=0), refractive=False)
+
+
+def _refined(model: PoolModel, seen: Observations, iterations: int) -> Solution:
+    """The straight-line pose nearby that suits the pixels better, judged by a scale common to all."""
     active = np.array([name in NAMES[:6] for name in NAMES])
-    for count in (10, 30):
-        whiten = RobustPixels(model, seen)
-        model = solve(model, seen, whiten, active, Prior(start=model), iterations=count, tolerance=1e-6).model
-    size = np.linalg.norm(residuals(model, seen)[0], axis=1)
-    if np.median(size) > 0.2 * lens.width:
-        return None
+    whiten, prior = RobustPixels(model, seen), Prior(start=model)
+    model = solve(model, seen, whiten, active, prior, iterations=iterations, tolerance=1e-6).model
+    size = _sizes(model, seen)
     return Solution(model, float(np.minimum(size, 3.0 * np.median(size)).mean()), 0, True)
+
+
+def _sizes(model: PoolModel, seen: Observations) -> Array:
+    """Lengths of the residuals (N,) [px]."""
+    return np.asarray(np.linalg.norm(residuals(model, seen)[0], axis=1))
+
+
+def _distinct(solutions: list[Solution]) -> list[Solution]:
+    """The best first, without those that are another's pose."""
+    kept: list[Solution] = []
+    for s in sorted(solutions, key=lambda s: s.cost):
+        if all(_apart(s.model, k.model) for k in kept):
+            kept.append(s)
+    return kept
 
 
 def _apart(a: PoolModel, b: PoolModel) -> bool:
