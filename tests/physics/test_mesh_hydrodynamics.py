@@ -141,22 +141,22 @@ def wet_boolean(part, normal, height):
     ("hull", "reach"), [(lambda: FINSROV, 0.3), (rexrov, 1.5)], ids=["finsrov", "rexrov"]
 )
 def test_displacement_is_that_of_the_boolean(hull, reach):
-    """At 1000 random poses volume and first moment are those of the hull cut by an exact boolean.
+    """At 300 random poses volume and first moment are those of the hull cut by an exact boolean.
 
     Tolerance: float32 over about 300 pyramids, 3e-6 of the whole volume, and of that times the hull's half length.
     """
     vertices, faces = hull()
-    normal, height = random_surfaces(1000, reach, seed=1)
+    normal, height = random_surfaces(300, reach, seed=1)
     volume, centroid = displacement((vertices, faces), normal, height)
     parts = parts_of((vertices, faces))
     whole, length = mesh_volume(vertices, faces), np.ptp(vertices, axis=0).max() / 2
-    expected_volume, expected_moment = np.zeros(1000), np.zeros((1000, 3))
+    expected_volume, expected_moment = np.zeros(300), np.zeros((300, 3))
     for i, (n, h) in enumerate(zip(normal, height, strict=True)):
         for wet in (wet_boolean(part, n, h) for part in parts):
             if len(wet.faces):
                 expected_volume[i] += wet.volume
                 expected_moment[i] += wet.volume * wet.center_mass
-    assert ((expected_volume > 0.01 * whole) & (expected_volume < 0.99 * whole)).sum() > 400
+    assert ((expected_volume > 0.01 * whole) & (expected_volume < 0.99 * whole)).sum() > 120
     assert volume == pytest.approx(expected_volume, abs=3e-6 * whole)
     assert volume[:, None] * centroid == pytest.approx(expected_moment, abs=3e-6 * whole * length)
 
