@@ -88,18 +88,13 @@ def assert_as_good_as_lsq_linear(layout, tau, regularisation=1e-4):
 
 
 def test_objective_equals_that_of_lsq_linear(layout):
-    assert_as_good_as_lsq_linear(layout, wrenches(layout, 1250, seed=1))
+    assert_as_good_as_lsq_linear(layout, wrenches(layout, 2_500, seed=2))
 
 
 @pytest.mark.parametrize("regularisation", [1e-6, 1e-3, 1e-1])
 def test_objective_equals_that_of_lsq_linear_for_any_regularisation(finsrov, regularisation):
     """Small lambda makes the problem ill-conditioned (1e6 here), and float32 still solves it."""
     assert_as_good_as_lsq_linear(finsrov, wrenches(finsrov, 500, seed=3), regularisation)
-
-
-@pytest.mark.slow
-def test_objective_equals_that_of_lsq_linear_on_a_hundred_thousand_wrenches(layout):
-    assert_as_good_as_lsq_linear(layout, wrenches(layout, 25_000, seed=2))
 
 
 def test_full_surge_matches_the_published_thrusts(finsrov):

@@ -6,6 +6,7 @@ import pytest
 
 from finssim import boundary
 from finssim.cli import app
+from finssim.experiments.reliability import timing
 from finssim.experiments.reliability.timing import lockstep_speed
 
 
@@ -22,8 +23,10 @@ def test_an_unknown_camera_is_refused_before_anything_starts(capsys, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_run_in_real_time_is_timed(capsys, tmp_path):
+def test_a_run_in_real_time_is_timed(capsys, tmp_path, monkeypatch):
     """Both processes' own words, each figure against its limit."""
+    monkeypatch.setattr(timing, "TRIED", {"corners": 2.0, "pictures": 1.0})
+    monkeypatch.setattr(timing, "WARM_UP", 0.2)
     words = [
         "experiment",
         "timing",
