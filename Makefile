@@ -23,7 +23,7 @@ test: check  ## check, then run every test
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --durations 25 || { [ $$? = 1 ] && \
 		OMP_NUM_THREADS=1 $(BIN)/python -m pytest --last-failed --last-failed-no-failures none; }
 
-quick: $(STAMP)  ## the tests that take about a second or less and start no process
+quick: $(STAMP)  ## the tests that take little time and start no process
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow" -q
 
 check: $(STAMP)  ## lint, format and types

@@ -58,7 +58,9 @@ def pytest_terminal_summary(terminalreporter, config):
     for reports in terminalreporter.stats.values():
         for report in reports:
             spent[getattr(report, "nodeid", "")] += getattr(report, "processor_time", 0.0)
-    terminalreporter.section(f"processor time, {sum(spent.values()) / 60.0:.1f} minutes in all")
+    terminalreporter.section(
+        f"processor time, {sum(spent.values()) / 60.0:.1f} minutes beside importing the tests"
+    )
     for name, seconds in sorted(spent.items(), key=lambda item: -item[1])[: config.option.durations]:
         terminalreporter.write_line(f"{seconds:7.2f}s {name}")
 
@@ -83,9 +85,14 @@ def _audit(event: str, arguments: tuple) -> None:
         _refuse(event)
 
 
-def pytest_sessionstart(session):
-    """With -m "not slow" on, a process that a test starts fails the test."""
+def pytest_collection_finish():
+    """What importing the tests took is no test's."""
     global _before
+    _before = processor_time()
+
+
+def pytest_sessionstart(session):
+    """With -m "not slow", a process that a test starts fails the test."""
     if session.config.option.markexpr == "not slow":
         sys.addaudithook(_audit)
         start = multiprocessing.process.BaseProcess.start
@@ -95,7 +102,6 @@ def pytest_sessionstart(session):
             start(process)
 
         multiprocessing.process.BaseProcess.start = guarded_start
-    _before = processor_time()
 
 
 @pytest.hookimpl(wrapper=True)

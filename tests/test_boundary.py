@@ -91,6 +91,7 @@ def test_interruption_has_its_status(capsys):
     assert capsys.readouterr().err == "finssim: interrupted: nothing half-written is left\n"
 
 
+@pytest.mark.slow
 def test_a_reader_that_leaves_early_is_no_error():
     """`finssim --help | head -0` prints no traceback."""
     read, write = os.pipe()

@@ -87,6 +87,7 @@ def test_commands_are_those_of_the_contract():
     assert set(get_command(app).commands) == {name for name in COMMANDS if " " not in name}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_has_an_example_that_the_parser_takes(capsys, command):
     """Every command's help ends with an example of itself, whose options it has."""
@@ -183,6 +184,7 @@ def test_an_interrupted_training_leaves_a_policy(tmp_path):
     assert not [path for path in tmp_path.rglob("*") if ".partial" in path.name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
@@ -236,6 +238,7 @@ def test_train_then_evaluate(capfd, tmp_path):
     assert (tmp_path / "result" / "error_envelope.png").stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_evaluate_takes_several_plants(capfd):
     """One object with one for each plant; one plant gives its object alone."""
     words = ["evaluate", "pid", "--trials", "1", "--json", "--plant", "lag"]
@@ -246,6 +249,7 @@ def test_evaluate_takes_several_plants(capfd):
     assert plants[0] == alone and [one["plant"]["name"] for one in plants] == ["lag", "nominal"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("controller", ["pid", "pid-paper"])
 def test_pids_are_controllers_like_any(capfd, controller):
     """Both PIDs are evaluated by name."""
@@ -253,6 +257,7 @@ def test_pids_are_controllers_like_any(capfd, controller):
     assert json.loads(capfd.readouterr().out)["controller"]["name"] == controller
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [

@@ -51,6 +51,7 @@ def fitted(trials):
     return folder
 
 
+@pytest.mark.slow
 def test_hydrodynamics_writes_vehicle_report_and_ranges(fitted):
     """The damping of surge is measured now and near the truth; the file remembers its trials; the rest is as before."""
     truth, vehicle = load_vehicle("finsrov"), load_vehicle(fitted / "v.yaml")
@@ -65,6 +66,7 @@ def test_hydrodynamics_writes_vehicle_report_and_ranges(fitted):
     assert 0.8 < low < 1.0 < high < 1.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["regression", "simulation"])
 def test_hydrodynamics_as_json(capfd, tmp_path, trials, method):
     """One object with the keys of the contract, and nothing else on standard output."""
@@ -86,6 +88,7 @@ def test_hydrodynamics_as_json(capfd, tmp_path, trials, method):
     assert found["out"] == str(tmp_path / "v.yaml")
 
 
+@pytest.mark.slow
 def test_held_out_trials_are_left_out_and_it_is_said(capsys, tmp_path, trials):
     """A trial that its header keeps for replay is no part of the fit."""
     every = load_trials([trials / "fit"])
@@ -110,6 +113,7 @@ def vars_of(trial):
     return {name: getattr(trial, name) for name in trial.__dataclass_fields__}
 
 
+@pytest.mark.slow
 def test_replay_labels_what_the_vehicle_was_fitted_on(capfd, tmp_path, trials, fitted):
     """In-sample trials are named so; held-out ones are scored, as JSON and as a folder."""
     words = ["replay", trials / "held-out", "--vehicle", fitted / "v.yaml"]
@@ -139,6 +143,7 @@ def test_thruster_as_json_and_as_a_vehicle(capfd, tmp_path):
 HYDRODYNAMICS = ["calibrate", "hydrodynamics", "TRIALS", "--vehicle", "finsrov"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
@@ -175,6 +180,7 @@ def test_what_cannot_be_done_is_refused_in_a_sentence(capsys, tmp_path, monkeypa
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_an_interrupted_fit_leaves_the_best_so_far(capsys, tmp_path, monkeypatch, trials):
     """Ctrl-C while candidates are simulated: a whole vehicle that says so, and status 130."""
     from finssim.calibration.simulation import fit as simulation_fit
@@ -198,6 +204,7 @@ def test_an_interrupted_fit_leaves_the_best_so_far(capsys, tmp_path, monkeypatch
     assert "(interrupted)" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_motors_from_steps(capfd, tmp_path):
     """Simulated steps with logged commands and thrust: lag and delay of the vehicle file come back."""
     words = ["excite", "surge", "--vehicle", "finsrov", "--simulate", "--levels", "6,12"]

@@ -245,6 +245,7 @@ def test_localize_as_json(files, tmp_path, capsys):
     assert found["vehicle"]["sha256"] == FINSROV.sha256 and found["out"] == str(tmp_path / "out.csv")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "larger"),
     [
@@ -280,6 +281,7 @@ def test_localize_reads_the_tilt(files, tmp_path, capsys):
     assert (column(without, "std_x") > 1.2 * column(with_it, "std_x")).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_localize_takes_the_method(files, tmp_path, capsys, method):
     """Each of them answers by its name; those that need no depth do without."""
@@ -331,6 +333,7 @@ def test_localize_uses_pool_and_vehicle(files, tmp_path):
 SEEN = {"inputs": ("seen/pictures",), "known": ["--depth", str(DEPTH_SEEN)]}
 
 
+@pytest.mark.slow
 def test_localize_looks_at_pictures(files, seen, tmp_path, capsys):
     """A folder of pictures drawn through the water: 1 cm; times from the table, or none."""
     rows = localized(files, tmp_path, "--truth", "seen/truth.csv", "--json", **SEEN)
@@ -342,6 +345,7 @@ def test_localize_looks_at_pictures(files, seen, tmp_path, capsys):
     assert [float(row["time"]) for row in rows] == [4.5, 4.625]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words", [["--library", "opencv", "--refine", "subpix"], ["--refine", "edges"], ["--gamma", "2.2"]]
 )
@@ -365,6 +369,7 @@ NO_DEPTH = ["localize", "tags.csv", *LOCALIZE, "--out", "OUT"]
 PLAIN = [*NO_DEPTH, "--depth", "0.5"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
@@ -472,6 +477,7 @@ def test_fuse_writes_at_the_rate(files, tmp_path, rate):
     np.testing.assert_allclose(np.diff(column(rows, "t")), 1.0 / rate, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [
@@ -517,6 +523,7 @@ def test_fuse_turns_the_axes_of_the_imu(files, tmp_path, capsys):
     assert rms["sensor"] < 0.02 and rms["body"] > 1.2 * rms["sensor"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
@@ -644,6 +651,7 @@ def test_backproject_tells_the_error_of_points(points, capsys):
     assert "sigma_x" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [

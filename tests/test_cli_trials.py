@@ -66,6 +66,7 @@ def test_import_makes_a_trial_of_a_table(capsys, tmp_path):
     assert load_trials([folder])[0].has("tau_x", "u")
 
 
+@pytest.mark.slow
 def test_check_says_what_trials_can_tell(capsys, trials):
     """As text and as one JSON object, which names every trial."""
     assert finssim("trials", "check", trials, "--vehicle", "finsrov") == 0
@@ -75,6 +76,7 @@ def test_check_says_what_trials_can_tell(capsys, trials):
     assert {"surge_plus_9", "surge_minus_9"} == {trial["name"] for trial in found["trials"]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [

@@ -89,6 +89,7 @@ def charuco(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_camera_as_json_and_as_a_file(place, capsys):
     """One object with the keys of the contract; the file holds the same lens, and beside it stands nothing else."""
     found = found_by(capsys, *CAMERA, "--board", "9x6", "--report", "report")
@@ -105,6 +106,7 @@ def test_camera_as_json_and_as_a_file(place, capsys):
     assert "finssim calibrate camera" in (place / "report" / "report.html").read_text("utf-8")
 
 
+@pytest.mark.slow
 def test_camera_finds_the_board_by_itself_and_says_so(place, capsys):
     """Without --board; as a table. The pictures are small, for every common size is tried."""
     for path in SOME[:4]:
@@ -115,12 +117,14 @@ def test_camera_finds_the_board_by_itself_and_says_so(place, capsys):
     assert "fx" in out and "95 % interval" in out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["plumb_bob", "rational", "fisheye"])
 def test_camera_fits_the_lens_that_it_is_told(place, capsys, model):
     found = found_by(capsys, *CAMERA, "--board", "9x6", "--model", model)
     assert load_camera("camera.yaml").lens.model == found["settings"]["model"] == model
 
 
+@pytest.mark.slow
 def test_camera_takes_square_and_seed(place, capsys):
     """The square goes into the record; the seed decides which pictures are held out together, and no more. The report
     gives the command that does it again."""
@@ -138,6 +142,7 @@ def test_camera_takes_square_and_seed(place, capsys):
     assert "--square 0.05" in page and "--board 9x6" in page and "--seed 3" in page
 
 
+@pytest.mark.slow
 def test_camera_reads_a_charuco_board(place, charuco, capsys):
     """Its size, its squares, its markers and their dictionary are what the options say."""
     words = ["calibrate", "camera", charuco, "--out", "camera.yaml", "--charuco", "7x5", "--square", "0.03"]
@@ -151,6 +156,7 @@ def test_camera_reads_a_charuco_board(place, charuco, capsys):
     refused(capsys, place, words, "none of 6 pictures shows")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
@@ -272,6 +278,7 @@ def plain(pool_files):
     return json.loads(text.getvalue()), load_pool(pool_files / "plain.yaml")
 
 
+@pytest.mark.slow
 def test_pool_as_json_and_as_a_file(surveyed, plain):
     """The keys of the contract; near the truth; what was known beforehand is in the file's record."""
     found, pool = plain
@@ -286,6 +293,7 @@ def test_pool_as_json_and_as_a_file(surveyed, plain):
     assert pool.record["settings"]["water_height"] == 1.0 and pool.latency == 0.0
 
 
+@pytest.mark.slow
 def test_pool_as_a_table_with_a_report(surveyed, capsys):
     """Without any option but those that it needs: what was found, where it was written, and a command to do it again
     that does it again."""
@@ -304,12 +312,14 @@ def test_pool_as_a_table_with_a_report(surveyed, capsys):
     assert load_pool(surveyed / "p.yaml").sha256 == first.sha256 and first.latency == 0.05
 
 
+@pytest.mark.slow
 def test_pool_matches_a_survey_with_pixels(surveyed, plain, capsys):
     """Two tables with --surveyed give what one gives."""
     _, pool = pool_by(capsys, surveyed, *TAPE, "--surveyed", "survey.csv", inputs=("pixels.csv",))
     assert pool.sha256 == plain[1].sha256
 
 
+@pytest.mark.slow
 def test_pool_reads_lengths_in_the_unit(surveyed, plain, capsys):
     """Millimetres without a word of it spread over kilometres and are refused; with --unit they are the same survey."""
     words = ["calibrate", "pool", "millimetres.csv", *WITH, *SURFACE, *TAPE, "--out", surveyed / "p.yaml"]
@@ -374,6 +384,7 @@ OPTIONS = {
 """Option -> words, and what is then otherwise than without: JSON now, JSON without, pool now."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OPTIONS)
 def test_pool_does_what_each_option_says(surveyed, plain, capsys, name):
     """The result is otherwise in the way that the option names."""
@@ -383,6 +394,7 @@ def test_pool_does_what_each_option_says(surveyed, plain, capsys, name):
     assert not told(plain[0], plain[0], plain[1])
 
 
+@pytest.mark.slow
 def test_pool_finds_the_tags_of_a_picture(surveyed, tag_files, capsys):
     """Of the family that --family says, with the edge that --edge says: camera and water within 1.5 cm."""
     words = ["--surveyed", "tags.csv", *TAPE]
@@ -403,6 +415,7 @@ def test_pool_finds_the_tags_of_a_picture(surveyed, tag_files, capsys):
 POOL_WORDS = ["calibrate", "pool", "points.csv", *WITH, "--out", "OUT"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
@@ -489,6 +502,7 @@ MOUNT = ["calibrate", "mounts", "log", "--pool", "pool.yaml", "--vehicle", "vehi
 SPIN = [word if word != "log" else "spin" for word in MOUNT]
 
 
+@pytest.mark.slow
 def test_mounts_as_json_and_as_a_vehicle(mounting, capsys):
     """The keys of the contract; the tags' heights and distance as they are, in the vehicle file."""
     found = found_by(capsys, *MOUNT, mounting / "v.yaml", "--seed", "9", "--report", mounting / "report")
@@ -508,6 +522,7 @@ def test_mounts_as_json_and_as_a_vehicle(mounting, capsys):
     assert "finssim calibrate mounts log" in (mounting / "report" / "report.md").read_text("utf-8")
 
 
+@pytest.mark.slow
 def test_mounts_estimates_what_it_is_told(mounting, capsys):
     """`sensors` finds how the IMU sits and leaves the tag seen most where it is; the report's command says so."""
     words = ["--estimate", "sensors", "--report", mounting / "report"]
@@ -519,6 +534,7 @@ def test_mounts_estimates_what_it_is_told(mounting, capsys):
     np.testing.assert_allclose(after.tags.mounts[kept].position, before.tags.mounts[kept].position, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("centre", [(0.0, 0.0), (0.05, -0.02)])
 def test_mounts_takes_the_point_about_which_the_vehicle_turns(mounting, capsys, centre):
     """It is the body point beside which the tags are then found; as a table, with where it was written."""
@@ -531,6 +547,7 @@ def test_mounts_takes_the_point_about_which_the_vehicle_turns(mounting, capsys, 
         np.testing.assert_allclose(where[:2], truth.t[:2] + centre, atol=0.004)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [

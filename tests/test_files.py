@@ -78,6 +78,7 @@ def test_directories_and_devices_are_no_files(tmp_path):
         pass
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_nothing(tmp_path):
     """A write past the limit on file sizes fails as on a full disk: one sentence, no file."""
     target = tmp_path / "big.bin"
@@ -150,6 +151,7 @@ def test_only_an_earlier_output_is_replaced(tmp_path):
         pass
 
 
+@pytest.mark.slow
 def test_a_killed_run_leaves_no_target(tmp_path):
     """A process killed while it writes leaves the target's name free."""
     script = (

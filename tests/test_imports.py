@@ -242,6 +242,7 @@ def fresh(script: str) -> str:
     return run.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "absent"),
     [
@@ -261,6 +262,7 @@ def test_a_part_costs_only_what_it_needs(module, absent):
     assert not absent & set(loaded)
 
 
+@pytest.mark.slow
 def test_importing_finssim_costs_less_than_importing_numpy():
     """`import finssim` in a fresh Python takes less time than `import numpy`, the best of several of each."""
     script = "import time; t = time.perf_counter(); import {}; print(time.perf_counter() - t)"

@@ -24,6 +24,7 @@ def blocks(page: Path, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.stem
 )
@@ -65,6 +66,7 @@ def test_every_range_on_the_page_of_randomisation_loads(tmp_path):
         load_ranges(path)
 
 
+@pytest.mark.slow
 def test_pages_build_without_a_warning(tmp_path):
     """Every link between pages leads to a page and to a heading of it."""
     words = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", tmp_path / "site"]

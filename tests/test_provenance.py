@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import yaml
 
 import finssim
@@ -30,6 +31,7 @@ def test_the_revision_is_the_checkout_s_commit():
         assert revision.removesuffix("+modified") == head.stdout.strip()
 
 
+@pytest.mark.slow
 def test_an_installed_copy_does_not_claim_another_project_s_revision(tmp_path):
     """A package installed inside someone else's repository reports no revision."""
     package = tmp_path / "site-packages" / "finssim"

@@ -55,6 +55,7 @@ def test_every_command_is_of_a_known_kind():
     assert kinds <= {"make", "pip", ".venv/bin/finssim"}
 
 
+@pytest.mark.slow
 def test_make_targets_exist_and_run_what_the_tests_run():
     """Each `make` line names a target; the targets are this test run and the demo, tested on their own."""
     targets = {words[1] for words in commands() if words[0] == "make"}
@@ -73,6 +74,7 @@ def test_pip_line_names_what_is_declared():
         assert set(re.search(r"\[(.*?)\]", line)[1].split(",")) <= declared
 
 
+@pytest.mark.slow
 def test_finssim_lines_run_in_order(tmp_path, monkeypatch, capfd):
     """A newcomer's session, with trainings and evaluations cut short: each line succeeds and prints something."""
     monkeypatch.chdir(tmp_path)
@@ -85,6 +87,7 @@ def test_finssim_lines_run_in_order(tmp_path, monkeypatch, capfd):
     assert (tmp_path / "run.csv").stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_the_installed_command_starts(tmp_path):
     """What the README's lines begin with is there, and is this package."""
     assert run([str(BIN / "finssim"), "--version"], tmp_path) == f"finssim {__version__}\n"
@@ -99,6 +102,7 @@ def test_python_blocks_run(code, tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.py")), ids=lambda path: path.name)
 def test_examples_run(path, tmp_path, monkeypatch, capsys):
     """Every example runs from any folder and prints what it found; as it stands, but for trainings, which are short."""

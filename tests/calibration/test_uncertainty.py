@@ -34,6 +34,7 @@ def fitted(rng, trials, *, shared=0.0, unequal=False, samples=20):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trials", [3, 4, 6, 10, 30])
 @pytest.mark.parametrize("shared", [0.0, 0.5])
 @pytest.mark.parametrize("unequal", [False, True])

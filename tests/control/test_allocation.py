@@ -122,6 +122,7 @@ def test_attainable_wrenches_are_met_to_the_regularisation(finsrov):
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(tau=st.lists(st.floats(-1e6, 1e6), min_size=6, max_size=6))
 def test_never_outside_the_limits_by_one_ulp(measured_allocator, tau):

@@ -51,6 +51,7 @@ def pulse_impulse(motors):
     return np.array([[2.0 * side.half for side in (m.minus, m.plus)] for m in motors._motors]).T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VEHICLES)
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_mean_thrust_is_what_was_asked(name, sign):
@@ -124,6 +125,7 @@ def test_jitter_around_a_small_request_gives_its_mean():
     np.testing.assert_allclose(mean, 0.06, rtol=0.06)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VEHICLES)
 @given(share=st.floats(-3.0, 3.0, allow_subnormal=False), dt=st.floats(0.0, 1.0))
 def test_a_held_thrust_comes_out_as_its_speed(name, share, dt):

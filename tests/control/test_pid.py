@@ -119,6 +119,7 @@ def test_an_axis_that_water_holds_stiffly_is_left_to_it(vehicle):
 # -- the published task ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("period", "water"),
     [
@@ -138,6 +139,7 @@ def test_all_eight_setpoints_are_held(held, period, water):
     assert log[..., 4].max() < math.radians(3.0)
 
 
+@pytest.mark.slow
 def test_setpoints_are_reached_without_overshoot(held):
     """In the water it knows, no axis passes its goal by more than 5 cm."""
     log, _ = held(period=0.05)
@@ -146,6 +148,7 @@ def test_setpoints_are_reached_without_overshoot(held):
     assert passed.max(0)[far].max() < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [
@@ -161,6 +164,7 @@ def test_all_eight_setpoints_are_held_when_the_model_is_wrong(vehicle, pool, cha
     assert (settling_time(log, 0.05) < 20.0).all()
 
 
+@pytest.mark.slow
 def test_all_eight_setpoints_are_held_with_noisy_measurements(vehicle, pool):
     """2 cm, 2 degrees, 2 cm/s and 2 degrees/s of white noise on every sample."""
     rng = np.random.default_rng(0)
@@ -183,6 +187,7 @@ def holds_a_pose(name):
     ) and "calibrated" in craft.hydrodynamics
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in catalogue() if holds_a_pose(name)])
 def test_every_vehicle_that_can_hold_a_pose_holds_it(name, pool):
     """Two body lengths away and turned by a radian or two: in place within 30 s."""
@@ -197,12 +202,14 @@ def test_every_vehicle_that_can_hold_a_pose_holds_it(name, pool):
 # -- its parts ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_integral_becomes_the_load_it_carries(held):
     """With 2 N added to the weight, the upward integral ends at 2 N: nothing else is left in it."""
     _, memory = held(period=0.05, load=2.0)
     np.testing.assert_allclose(memory.force, np.tile([0.0, 0.0, 2.0], (8, 1)), atol=0.02)
 
 
+@pytest.mark.slow
 def test_a_long_way_at_full_thrust_does_not_wind_up(vehicle, pool):
     """Ten metres, 24 s of travel: the integral stays below a tenth of full thrust and the goal is not overrun."""
     pid = Pid.from_vehicle(vehicle)

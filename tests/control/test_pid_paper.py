@@ -74,6 +74,7 @@ def test_the_integral_decays_as_published(pid):
     assert memory.integral[1] == pytest.approx(0.4 / 60.0 / 0.05)
 
 
+@pytest.mark.slow
 def test_reaches_setpoints_in_still_water_but_needs_half_a_minute(pid, pool):
     """The published gains work in ideal water and are slow: this is the baseline that `pid` has to beat."""
     vehicle = load_vehicle("finsrov")

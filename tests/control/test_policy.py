@@ -208,6 +208,7 @@ def test_one_action_takes_microseconds(folder):
     assert np.median(durations) < 100e-6
 
 
+@pytest.mark.slow
 def test_running_a_policy_needs_no_torch(folder):
     code = (
         "import sys; from finssim.control.policy import Policy\n"

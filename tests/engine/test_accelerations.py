@@ -44,6 +44,7 @@ def accelerations(vehicle, model, states, tau, thrust, water):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moving", [False, True], ids=["still", "moving"])
 @EVERY_VEHICLE_AND_MODEL
 def test_accelerations_agree_with_the_reference(name, model, moving):

@@ -55,6 +55,7 @@ def same(a, b):
     return all(np.array_equal(a[name], b[name][: len(a[name])]) for name in FIELDS)
 
 
+@pytest.mark.slow
 @EVERY_CASE
 def test_equal_seeds_give_equal_bits_for_any_threads_and_worlds(model, integrator, surroundings):
     """Two runs, 1, 2 and 3 threads, and the first 64 of 64 or 1000 worlds: every number bitwise equal."""

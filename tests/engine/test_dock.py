@@ -68,6 +68,7 @@ def kinetic(worlds, vehicle):
     return 0.5 * np.einsum("ni,ij,nj->n", nu, vehicle.mass_matrix("calibrated"), nu)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
 def test_a_bounce_gives_back_the_energy_and_no_more(integrator):
     """Spring alone: what leaves has the energy that came, to the integrator's error. With a damper: less."""

@@ -88,6 +88,7 @@ VEHICLE_ENTRIES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VEHICLE_ENTRIES)
 def test_an_entry_does_to_the_plant_what_its_closed_form_says(name):
     """All fields, so that an entry does nothing else either."""

@@ -66,6 +66,7 @@ def error_after(vehicle, model, integrator, steps, duration, end):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["calibrated", "mesh", "simplified"])
 @pytest.mark.parametrize(
     ("integrator", "order", "steps"), [("euler", 1.0, (100, 200, 400)), ("rk4", 4.0, (28, 40, 56))]
@@ -84,6 +85,7 @@ def test_errors_fall_with_the_integrators_order(model, integrator, order, steps)
     assert 0.9 * order < measured < order + (1.0 if integrator == "rk4" else 0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("substeps", [1, 4])
 @for_each([x for x in PAIRS if x[1] == "calibrated"])
 def test_long_steps_are_stable_with_ten_times_the_mass_added(name, model, substeps):

@@ -39,6 +39,7 @@ def test_a_step_is_over_when_it_returns_even_after_an_interrupt() -> None:
     np.testing.assert_array_equal(threaded.numpy("velocity"), alone.numpy("velocity"))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 def test_a_forked_process_steps_on_threads_of_its_own() -> None:
     """Threads do not survive a fork: the child must not wait for the parent's."""

@@ -40,6 +40,7 @@ def period(vehicle):
     return 0.04 * float(np.sqrt(max(vehicle.body.size)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
 @EVERY_VEHICLE_AND_MODEL
 def test_energy_never_grows_without_thrust(name, model, integrator):
@@ -134,6 +135,7 @@ def with_and_without_current(name, model, carried):
     return runs, 30 * period(vehicle), max(vehicle.body.size)
 
 
+@pytest.mark.slow
 @for_each(RELATIVE)
 def test_a_steady_current_is_a_change_of_frame(name, model):
     """In water that moves with U, everything happens as in still water, U t further on (Galilean invariance)."""
@@ -246,6 +248,7 @@ def symmetric(name, model):
     return vehicle.replace(changes)
 
 
+@pytest.mark.slow
 @for_each([x for x in PAIRS if x != ("rexrov", "mesh")])
 def test_port_and_starboard_are_mirror_images(name, model):
     """Mirrored start, current and waves, mirrored motion: y, v, p, r change sign. RexROV's hull is not symmetric."""

@@ -25,6 +25,7 @@ def as_torch(view: wp.array) -> Any:
     return wp.to_torch(view, requires_grad=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("look", [as_numpy, as_torch, lambda view: view], ids=["numpy", "torch", "warp"])
 def test_a_view_keeps_the_memory_it_looks_at(look: Callable[[wp.array], Any]) -> None:
     """Whoever holds a field holds the structs; when nobody does any more, they are freed."""

@@ -82,6 +82,7 @@ def test_one_step_accelerates_as_the_simulator_does(name, model):
     np.testing.assert_array_equal(got[0][1], got[1][1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("names", "model", "water"),
     [
@@ -354,6 +355,7 @@ def test_every_camera_sees_something():
         scene.render(width=0, height=90)
 
 
+@pytest.mark.slow
 def test_pictures_of_two_scenes_do_not_disturb_each_other():
     """A scene that is thrown away takes nothing of another's pictures along."""
     kept = Scene("finsrov", pool=Pool())

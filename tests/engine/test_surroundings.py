@@ -23,6 +23,7 @@ def corners(vehicle, position, q):
     return position[..., None, :] + np.einsum("...ij,cj->...ci", rotation(q), signs * 0.5 * vehicle.body.size)
 
 
+@pytest.mark.slow
 @ONE_VEHICLE_PER_MODEL
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
 def test_a_sinking_vehicle_comes_to_rest_on_the_floor(model, integrator):

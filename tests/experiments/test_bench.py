@@ -11,6 +11,7 @@ from finssim.cli import app
 from finssim.experiments import bench
 
 
+@pytest.mark.slow
 def test_the_object_has_every_figure(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -87,6 +87,7 @@ def test_trials_are_those_of_the_protocol():
     np.testing.assert_array_equal(done.position[:, 0], done.position[:, 8])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", available_plants())
 @pytest.mark.parametrize("controller", ["pid", "pid-paper"])
 def test_every_plant_can_be_flown_in(name, controller, monkeypatch):
@@ -97,6 +98,7 @@ def test_every_plant_can_be_flown_in(name, controller, monkeypatch):
     assert all(trial["e_p_m"] is None for trial in result["per_trial"])  # the window was never reached
 
 
+@pytest.mark.slow
 def test_plants_make_a_difference(monkeypatch):
     """A current pushes, noise shakes, lag delays: each path differs from the nominal one."""
     monkeypatch.setattr(trials_module, "DURATION", 5.0)
@@ -138,6 +140,7 @@ def test_the_table_has_a_row_per_setpoint_all_and_the_papers(capsys):
     assert "8/8" in out and "44.08" in out and "its vehicle in its pool, PID, for orientation" in out
 
 
+@pytest.mark.slow
 def test_a_directory_holds_result_figure_and_trajectories(tmp_path, capsys):
     """All open, agree with each other, and may be replaced by the next evaluation."""
     for _ in range(2):
@@ -151,6 +154,7 @@ def test_a_directory_holds_result_figure_and_trajectories(tmp_path, capsys):
     np.testing.assert_allclose(path.t, evaluation.trials.t, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_several_plants_are_one_table_one_object_and_one_directory(tmp_path, capsys):
     """A row for each plant; under `plants` the object that each gives alone; trajectories in folders of their names."""
     plants = ["nominal", "simplified"]

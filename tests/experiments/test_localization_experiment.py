@@ -19,6 +19,8 @@ from finssim.localization.camera_file import load_camera
 from finssim.localization.detection.detections import read_detections
 from finssim.localization.pool import load_pool
 
+pytestmark = pytest.mark.slow
+
 TINY = {"locations": (4, 3), "images": 12}
 FILES = {
     *("localization.json", "localization.md", "error_map.png", "sensitivity.png", "camera.yaml", "pool.yaml"),

@@ -66,6 +66,7 @@ def test_what_lies_outside_the_picture_is_not_detected():
     assert any(inside) and not all(inside)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("renderer", ["own", "geometry"])
 def test_equal_seeds_give_equal_pictures(renderer):
     """Bit by bit, whatever came before; another campaign's noise is another."""
@@ -77,6 +78,7 @@ def test_equal_seeds_give_equal_pictures(renderer):
     assert (one != other).all()
 
 
+@pytest.mark.slow
 def test_our_camera_shows_the_tag_where_it_is():
     """In still water corners are detected within 0.3 px of their projection, 0.1 px rms; ripples move them further."""
     flat = draw_campaign(CONDITIONS["flat"], 1, **SMALL)

@@ -127,6 +127,7 @@ def test_figures_are_pooled_over_visits():
     assert figures["reasons"] == {"tag not detected": 3, "no": 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [1, 3, 10])
 def test_intervals_contain_the_estimate_and_are_repeatable(seeds):
     """And shrink with more visits of the same errors."""

@@ -48,6 +48,7 @@ def test_a_trial_that_ended_early_has_no_motion_afterwards(tmp_path, jobs):
     assert evaluation.result["valid"] == 1  # errors of the last twenty seconds
 
 
+@pytest.mark.slow
 def test_the_camera_view_shows_the_tags_of_the_vehicle(tmp_path, jobs, monkeypatch):
     """FinsROV's two tags are found where it is, and the answer is a PNG."""
     held(tmp_path, jobs[0])

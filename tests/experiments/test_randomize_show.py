@@ -109,6 +109,7 @@ def test_the_command_writes_table_picture_and_record(tmp_path, capsys):
     assert "linear_damping.surge" in printed and "heave, down" in printed
 
 
+@pytest.mark.slow
 def test_equal_seeds_print_equal_records(tmp_path, capsys):
     records = []
     for name in ("a", "b"):

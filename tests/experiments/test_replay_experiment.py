@@ -15,6 +15,8 @@ from finssim.experiments.replay_experiment import MODELS, PAPER_TABLE_3, pooled,
 from finssim.experiments.replay_table import markdown, print_table, tables_of
 from finssim.vehicles import load_vehicle
 
+pytestmark = pytest.mark.slow
+
 AXES = ("sway", "yaw")
 
 

@@ -55,6 +55,7 @@ def test_propellers_take_thrust_from_their_neighbours_and_from_their_own_motion(
     assert (ahead < still - 0.05).all() and (astern > still + 0.05).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("axis", "level"), [("surge", 12.0), ("sway", 9.0), ("heave", 9.0), ("yaw", 1.2)])
 def test_the_total_drag_is_within_a_quarter_of_the_published(axis, level):
     """Steady speed at the middle published level, against that of d1 v + d2 v² = level."""

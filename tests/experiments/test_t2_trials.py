@@ -27,6 +27,8 @@ from finssim.learning.export import export_policy
 from finssim.tasks import TrajectoryTracking
 from finssim.vehicles import load_vehicle
 
+pytestmark = pytest.mark.slow
+
 FINSROV = load_vehicle("finsrov")
 TASK = TrajectoryTracking()
 NOMINAL = load_plant("nominal")

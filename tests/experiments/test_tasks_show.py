@@ -27,6 +27,7 @@ def test_every_task_is_listed(capsys):
     assert all(words in out for words in ("align-insert", "formation", "pid", "[s]"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TASKS)
 def test_what_is_told_is_what_the_environment_has(name):
     """Sizes, agents, others, limits of the action, times; no part of the observation missing."""

@@ -45,6 +45,7 @@ def test_tetrahedron_volume_and_centroid_wherever_it_lies(offset):
     assert mesh_centroid(vertices, faces) == pytest.approx(vertices.mean(axis=0), rel=1e-12)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     size=st.tuples(*[st.floats(0.05, 5.0)] * 3),

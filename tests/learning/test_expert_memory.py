@@ -9,6 +9,7 @@ from finssim.tasks import TASKS, make
 from finssim.tasks.baselines import BASELINES, baseline
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", [task for task in TASKS if BASELINES.get(task)])
 def test_every_baselines_memory_survives(task, tmp_path):
     """After one action of three rows: from disk it gives the same second action."""

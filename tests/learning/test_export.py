@@ -63,6 +63,7 @@ NETWORKS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("network", NETWORKS.values(), ids=NETWORKS)
 def test_onnxruntime_computes_what_torch_does(tmp_path, network):
     """The two agree to 1e-6 over one observation and many, at the clipping limits too."""

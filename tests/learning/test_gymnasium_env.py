@@ -39,6 +39,7 @@ def test_every_task_of_one_agent_can_be_made_by_name(task):
     assert batch.reset(seed=1)[0].shape == (3, size)
 
 
+@pytest.mark.slow
 def test_nothing_needs_to_be_imported_where_the_name_says_from_where():
     script = """
 import gymnasium

@@ -11,12 +11,14 @@ from reference.pair import Pair
 EVERY = pytest.mark.parametrize("task", [*TASKS, Pair()], ids=[*TASKS, "pair"])
 
 
+@pytest.mark.slow
 @EVERY
 @pytest.mark.filterwarnings("error")
 def test_the_api_test_passes_for_every_task(task):
     parallel_api_test(PettingZooEnv(task))
 
 
+@pytest.mark.slow
 @EVERY
 def test_the_seed_test_passes_for_every_task(task):
     parallel_seed_test(lambda: PettingZooEnv(task), num_cycles=50)

@@ -13,6 +13,7 @@ from reference.pair import Pair
 SHORT = StationKeeping(time_limit=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", [*TASKS, Pair()], ids=[*TASKS, "pair"])
 def test_the_runner_trains_on_every_task(task, tmp_path, capsys):
     """RSL-RL's own runner, with its checks of every number, and its log of the task's metrics."""

@@ -15,6 +15,7 @@ SHORT = StationKeeping(time_limit=0.5)
 APART = {"port": ["right"], "starboard": ["left"]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", [*TASKS, Pair()], ids=[*TASKS, "pair"])
 def test_torchrls_checker_passes_for_every_task(task):
     check_env_specs(TorchRlEnv(task, worlds=3), seed=1)

@@ -89,6 +89,7 @@ def test_curves_and_log_are_written(trained):
     assert sorted(p.name for p in trained.iterdir()) == ["curves.csv", "policy.onnx", "policy.yaml"]
 
 
+@pytest.mark.slow
 def test_equal_seeds_are_equal_policies(trained, tmp_path):
     """Bit for bit; another seed is another policy."""
     assert network(train("t1", out=tmp_path / "again", seed=5, **TINY)) == network(trained)
@@ -122,6 +123,7 @@ def interrupt_after(updates, monkeypatch):
     monkeypatch.setattr(Loop, "_update", interrupt)
 
 
+@pytest.mark.slow
 def test_an_interrupted_training_writes_the_policy_so_far(tmp_path, monkeypatch):
     """Ctrl-C in the fourth update: a whole policy directory, that says so, then the interrupt goes on."""
     interrupt_after(3, monkeypatch)
@@ -131,6 +133,7 @@ def test_an_interrupted_training_writes_the_policy_so_far(tmp_path, monkeypatch)
     assert told["complete"] is False and told["steps_done"] == 3 * 4096
 
 
+@pytest.mark.slow
 def test_an_interrupted_training_leaves_an_earlier_policy_alone(trained, tmp_path, monkeypatch, capsys):
     """The policy so far goes beside it, which is said; a finished training replaces it as ever."""
     out = tmp_path / "p"
@@ -168,6 +171,7 @@ def test_the_last_two_checkpoints_are_kept_and_are_policies(tmp_path):
     assert Policy.load(folders[0]).description.training["steps_done"] == 3072
 
 
+@pytest.mark.slow
 def test_checkpoints_of_an_earlier_and_longer_training_go(tmp_path):
     """Else they would be taken for the newest, and those of the training that runs would go."""
     for steps in (4096, 2048):
@@ -219,6 +223,7 @@ def test_a_killed_training_goes_on_to_the_same_policy(tmp_path, learner):
     assert rows[0] == rows[1] and len(rows[0]) == 8
 
 
+@pytest.mark.slow
 def test_only_the_same_training_is_resumed(tmp_path, capsys):
     """Other arguments are named; where nothing was begun that is said; before the first checkpoint it begins anew."""
     with pytest.raises(ResumeError, match="nothing to resume: there is no folder .*leave out --resume"):
@@ -281,6 +286,7 @@ def test_somebodys_files_are_not_replaced(tmp_path):
         train("t1", out=tmp_path, **TINY)
 
 
+@pytest.mark.slow
 def test_an_earlier_policy_is_replaced(trained, tmp_path):
     """The same directory may be trained into again."""
     train("t1", out=tmp_path / "p", seed=6, **TINY)

@@ -29,6 +29,7 @@ def matrices(name, model):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "model"), COEFFICIENTS, ids=[f"{n}-{m}" for n, m in COEFFICIENTS])
 @settings(max_examples=50)
 @given(nu_r=vectors)

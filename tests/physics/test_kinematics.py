@@ -47,6 +47,7 @@ def test_quaternion_rate_is_the_derivative_of_the_turn(q, omega):
     )
 
 
+@pytest.mark.slow
 @given(q=quaternions, velocity=arrays(np.float32, 6, elements=numbers))
 def test_position_rate_is_the_velocity_in_the_world_frame(q, velocity):
     """x_dot = R(q) v."""

@@ -137,6 +137,7 @@ def wet_boolean(part, normal, height):
 # ---- displacement
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("hull", "reach"), [(lambda: FINSROV, 0.3), (rexrov, 1.5)], ids=["finsrov", "rexrov"]
 )
@@ -363,6 +364,7 @@ def test_drag_turns_with_the_body():
 # ---- drag: the surface
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("hull", "reach"), [(lambda: FINSROV, 0.3), (rexrov, 1.5)], ids=["finsrov", "rexrov"]
 )

@@ -38,6 +38,7 @@ def seen(eye, pose, duration=0.3):
     return [tuple(tag.tag_id for tag in p.tags) for p in eye.advance(0.0, duration, pose)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("severity", "most"), [("nominal", 0.05), ("realistic", 0.1), ("hard", 0.25)])
 def test_computed_corners_are_those_found_in_drawn_pictures(severity, most):
     """The same exposures, drawn and computed: rms difference per axis [px], without the computed ones' noise."""
@@ -100,6 +101,7 @@ def test_mounts_are_where_they_truly_are():
     assert np.array_equal(a.tags[1].corners, b.tags[1].corners)
 
 
+@pytest.mark.slow
 def test_exposure_blurs_drawn_pictures():
     """Of a vehicle that moves 1 m/s, 30 ms of exposure leave less contrast than 1 ms; of one that stands, as much."""
 
@@ -114,6 +116,7 @@ def test_exposure_blurs_drawn_pictures():
     assert contrast(0.030, 0.0) == pytest.approx(contrast(0.001, 0.0), rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["corners", "pictures"])
 def test_equal_seeds_give_equal_pictures_however_time_is_cut(mode):
     """Two cameras of one seed see the same in ticks of different length; one of another seed does not."""

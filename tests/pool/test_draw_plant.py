@@ -93,6 +93,7 @@ def file_speed(axis, wrench):
     return 2.0 * wrench / (d1 + np.sqrt(d1 * d1 + 4.0 * d2 * wrench))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", [0, 1, 2, 5])
 def test_a_realistic_plant_is_still_as_fast_as_the_vehicle(axis):
     """At 0.3 of full power each of 6 plants is within a quarter of the file's speed, and their mean within a tenth."""

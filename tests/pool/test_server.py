@@ -221,6 +221,7 @@ def test_a_plan_follows_its_file_and_its_options(tmp_path):
         make_plan("finsrov", "7", "hard", camera="film")
 
 
+@pytest.mark.slow
 def test_the_command_in_lockstep(tmp_path):
     """A subprocess is exchanged with, starts where it was told, and leaves pool file and truth."""
     pool_file, truth = tmp_path / "pool.yaml", tmp_path / "truth.fst"
@@ -243,6 +244,7 @@ def test_the_command_in_lockstep(tmp_path):
     assert load_pool(pool_file).camera.lens.width == 1280
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["udp", "shm"])
 def test_the_command_in_real_time(tmp_path, way):
     """Telemetry and tags of a subprocess arrive at the rates of their instruments; Ctrl-C closes its files."""
@@ -291,6 +293,7 @@ def test_the_command_draws_pictures():
     assert {d.tag for d in found} >= {15, 16}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [

@@ -42,6 +42,7 @@ def test_a_cut_file_opens_up_to_the_cut(tmp_path):
     assert len(read_truth(tmp_path / "cut.truth").time) == 4
 
 
+@pytest.mark.slow
 def test_a_killed_writer_leaves_all_but_the_last_records(tmp_path):
     """kill -9 loses at most what was not yet handed to the system."""
     script = (

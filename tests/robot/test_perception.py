@@ -47,6 +47,7 @@ def errors(world, readings):
     return np.sqrt(np.mean(np.square(found), axis=0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["constant-velocity", "error-state"])
 def test_the_state_is_the_vehicles(mode):
     """A moving, rocking vehicle seen 50 ms late is known to a centimetre and half a degree, and its speed to 3 cm/s."""
@@ -119,6 +120,7 @@ def test_a_clock_that_is_set_back_costs_a_moment():
 FIELDS = ["quaternion", "gyro", "accel", "depth", "pressure"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("bad", BAD)
 def test_a_bad_number_in_telemetry_never_raises_and_never_gets_through(field, bad):

@@ -191,6 +191,7 @@ def test_shared_memory_belongs_to_one_camera_at_a_time():
     assert not first.path.exists()
 
 
+@pytest.mark.slow
 def test_shared_memory_outlives_either_side():
     """A camera killed in the middle and started anew is found again; so is the picture after a reader's restart."""
     key = name()

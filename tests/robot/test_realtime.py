@@ -65,6 +65,7 @@ class Acted:
         return [command for data in self.theirs.receive() for command in decoder.feed(data)]
 
 
+@pytest.mark.slow
 def test_it_steps_at_its_rate_arms_and_ends_with_frames_without_thrust():
     """Two seconds at 60 Hz are 120 steps, none late; the last three frames are disabled."""
     world = Acted()
@@ -75,6 +76,7 @@ def test_it_steps_at_its_rate_arms_and_ends_with_frames_without_thrust():
     assert any(enabled) and enabled[-4:] == [True, False, False, False]
 
 
+@pytest.mark.slow
 def test_a_late_step_is_an_overrun_and_shifts_no_deadline():
     """One step of 55 ms loses two deadlines; the next is made at once, the others stay multiples of the period."""
     world, times = Acted(), []
@@ -94,6 +96,7 @@ def test_a_late_step_is_an_overrun_and_shifts_no_deadline():
     assert len(times) == 58
 
 
+@pytest.mark.slow
 def test_until_ends_the_run():
     """After the tenth step."""
     world = Acted()
@@ -102,6 +105,7 @@ def test_until_ends_the_run():
     assert runtime.counters.steps == 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_run_between_two_steps(number):
     """Disarmed, zero frames sent, and the handlers as before."""
@@ -118,6 +122,7 @@ def test_a_signal_ends_the_run_between_two_steps(number):
     assert signal.getsignal(number) is before and gc.isenabled()
 
 
+@pytest.mark.slow
 def test_thrusters_stop_even_where_the_loop_breaks():
     """An error of the program's own still sends frames without thrust."""
     world = Acted()

@@ -44,6 +44,7 @@ def recording(path, *, before=""):
     return subprocess.Popen([sys.executable, "-c", script, str(path)], stdout=subprocess.PIPE, text=True)
 
 
+@pytest.mark.slow
 def test_kill_9_loses_less_than_the_last_second(tmp_path):
     """The process is killed after two seconds of recording; all but the last second of it is read."""
     path = tmp_path / "run.mcap"
@@ -60,6 +61,7 @@ def test_kill_9_loses_less_than_the_last_second(tmp_path):
     assert times == pytest.approx(told[1 : len(times) + 1], abs=1e-6), "and nothing before is missing"
 
 
+@pytest.mark.slow
 def test_a_full_disk_stops_the_record_and_not_the_loop(tmp_path):
     """At a limit on the file's size recording stops with a sentence; the file is readable, the loop goes on."""
     path = tmp_path / "run.mcap"

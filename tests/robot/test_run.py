@@ -126,6 +126,7 @@ def test_a_trajectory_can_be_followed_in_place_of_a_goal(capsys, pool_file):
     assert status == 0 and summary["goal"] == "straight" and summary["decisions"] > 20
 
 
+@pytest.mark.slow
 def test_on_a_wire_with_nobody_at_its_end_nothing_is_armed(capsys, pool_file):
     """In real time, over UDP, without a camera: disarmed, and why."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
@@ -139,6 +140,7 @@ def test_on_a_wire_with_nobody_at_its_end_nothing_is_armed(capsys, pool_file):
     assert summary["reason"] == "no inertial data"
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_says_nothing_is_told_of(capsys, pool_file):
     """Once, after three seconds."""
     words = ("--policy", "pid", "--goal", "0.5,0.2,-0.5,30", "--pool-file", pool_file, "--pictures", "none")
@@ -146,6 +148,7 @@ def test_a_vehicle_that_says_nothing_is_told_of(capsys, pool_file):
     assert capsys.readouterr().err.count("no telemetry from udp://127.0.0.1:9") == 1
 
 
+@pytest.mark.slow
 def test_a_duration_of_zero_is_no_time_and_not_for_ever(capsys, pool_file):
     """Nothing but the frames of the end goes out."""
     words = ("--policy", "pid", "--goal", "0.5,0.2,-0.5,30", "--pool-file", pool_file, "--pictures", "none")
@@ -166,6 +169,7 @@ def test_no_record_is_left_of_a_run_that_could_not_be_connected(capsys, tmp_path
     assert record.read_text() == "mine" and "never replaced" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [

@@ -73,6 +73,7 @@ def world():
     return World()
 
 
+@pytest.mark.slow
 def test_a_drive_by_hand(world):
     """Thrust only while the hand is on; the last three frames are off."""
     runtime = drive(VEHICLE, Script(), world.ours, duration=3.0, clock=world.clock, wait=world.wait)
@@ -82,6 +83,7 @@ def test_a_drive_by_hand(world):
     assert runtime.bridge.state == "disarmed"
 
 
+@pytest.mark.slow
 def test_nobody_arms_nothing_moves(world):
     class Held(Script):
         def read(self, now):
@@ -91,6 +93,7 @@ def test_nobody_arms_nothing_moves(world):
     assert world.frames and not any(frame.enable for _, frame in world.frames)
 
 
+@pytest.mark.slow
 def test_a_device_that_vanishes_disarms(world):
     class Gone(Script):
         def read(self, now):
@@ -101,6 +104,7 @@ def test_a_device_that_vanishes_disarms(world):
     assert moving[-1] < 1.6 and runtime.bridge.state == "disarmed"
 
 
+@pytest.mark.slow
 def test_a_drive_is_recorded(world, tmp_path):
     """Telemetry, commands and events; it becomes a trial that its shaft speeds drive."""
     pytest.importorskip("mcap")
@@ -145,6 +149,7 @@ class Modes(Script):
         return replace(super().read(now), mode=1.0 <= now < 1.1 or 2.0 <= now < 2.1)
 
 
+@pytest.mark.slow
 def test_the_mode_button_hands_over_to_a_controller_and_back(world):
     """The controller's thrust comes from 1 s on, the person's zeros again from 2 s on."""
     drive(VEHICLE, Modes(), world.ours, other=Hold(), duration=3.0, clock=world.clock, wait=world.wait)
@@ -152,6 +157,7 @@ def test_the_mode_button_hands_over_to_a_controller_and_back(world):
     assert 1.0 <= moving[0] < 1.2 and 2.0 <= moving[-1] < 2.3
 
 
+@pytest.mark.slow
 def test_who_steers_is_on_record(world, tmp_path):
     """An event at every press of the mode button."""
     pytest.importorskip("mcap")

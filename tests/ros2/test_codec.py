@@ -62,6 +62,7 @@ def test_a_bool_and_an_octet_are_one_byte_each():
     assert CODEC.serialize(message("std_msgs/msg/Bool", data=True))[4] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distro", ["humble", "jazzy"])
 def test_every_known_type_survives_its_own_bytes(distro):
     """A message with all defaults, of every type of a release, reads back equal."""

@@ -156,6 +156,7 @@ def test_a_clock_on_the_wire_drives_timers(context):
     assert until(node, lambda: len(calls) == 3, each=at(1.25)), "the rhythm begins anew after time went back"
 
 
+@pytest.mark.slow
 def test_policies_that_do_not_fit_are_told(context, capfd):
     """A best-effort publisher gives a reliable subscription nothing, and both ends log it once."""
     node = Node("a")
@@ -390,30 +391,35 @@ def chosen(tmp_path, text, **environ):
     return subprocess.run([sys.executable, "-c", SCRIPT], env=variables, capture_output=True, text=True)
 
 
+@pytest.mark.slow
 def test_a_real_rclpy_is_never_shadowed(tmp_path):
     """If it can be imported it is used."""
     run = chosen(tmp_path, "")
     assert run.stdout.split() == ["native", "rclpy"] and "it can be imported" in run.stderr
 
 
+@pytest.mark.slow
 def test_a_half_sourced_ros_is_found_out_by_importing(tmp_path):
     """rclpy is there, what it needs is not: ours is used, and the reason told."""
     run = chosen(tmp_path, "import a_module_that_ros_needs\n")
     assert run.stdout.split() == ["dds", "finssim.ros2.shim"] and "a_module_that_ros_needs" in run.stderr
 
 
+@pytest.mark.slow
 def test_ours_can_be_asked_for(tmp_path):
     """PLATFORM_ROS=dds, even beside a real one."""
     run = chosen(tmp_path, "", PLATFORM_ROS="dds", ROS_DOMAIN_ID="7")
     assert run.stdout.split()[0] == "dds" and "domain 7, loopback only, as jazzy" in run.stderr
 
 
+@pytest.mark.slow
 def test_the_real_one_can_be_insisted_on(tmp_path):
     """PLATFORM_ROS=native without one is an error, not a surprise."""
     run = chosen(tmp_path, None, PLATFORM_ROS="native")
     assert run.returncode and "source a ROS 2 first" in run.stderr
 
 
+@pytest.mark.slow
 def test_without_cyclone_the_sentence_says_what_to_install():
     """A machine with neither ROS 2 nor Cyclone's wheel."""
     script = (

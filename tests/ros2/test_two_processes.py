@@ -23,6 +23,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool
 
+pytestmark = pytest.mark.slow
+
 PEER = Path(__file__).with_name("peer.py")
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PATIENCE = 10.0  # [s] on a busy machine; nothing here takes a tenth of it

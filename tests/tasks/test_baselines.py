@@ -33,6 +33,7 @@ def rollout(task, name, vehicle="finsrov", worlds=16, seed=3, **options):
     return env.task.metrics(env.arrays)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("observe", ["truth", "estimator"])
 @pytest.mark.parametrize("task", SINGLE)
 def test_a_baseline_does_its_task(task, observe):

@@ -133,6 +133,7 @@ class Misshapen(KeepDepth):
         return {**super().metrics(arrays), "success": np.zeros(3)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TASKS)
 def test_our_own_tasks_pass(name):
     check_task(TASKS[name]())
@@ -143,6 +144,7 @@ def test_the_example_passes_and_runs():
     check_task(KeepDepth(), "bluerov2", action="thruster8")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "sentence"),
     [

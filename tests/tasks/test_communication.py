@@ -55,6 +55,7 @@ def test_delay_is_the_way_over_the_speed_of_sound_and_processing():
     assert heard.max() > 70
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", [0.0, 0.3, 1.0])
 def test_as_many_are_lost_as_told(loss):
     """512 worlds, 6 pairs, 8 messages each: binomial, four standard deviations."""

@@ -103,6 +103,7 @@ def test_episodes_that_try_an_end_have_it():
     assert (inside > [ends[0], ends[2]]).all() and (inside < [ends[1], ends[3]]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("success", "part"), [(ALWAYS, 1.0), (NEVER, 0.0)])
 def test_automatic_widening_goes_to_the_end_that_success_decides(success, part):
     """Every end is tried often enough in 20 looks to reach the whole width, or none of it."""

@@ -43,6 +43,7 @@ def played(env, steps=25, given=None):
     return [np.array(column) for column in zip(*out, strict=True)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_equal_seeds_give_equal_runs(name):
     """Bit for bit, over several episodes; another seed gives another run."""
@@ -52,6 +53,7 @@ def test_equal_seeds_give_equal_runs(name):
     assert not np.array_equal(first[0], other[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_number_of_worlds_changes_nothing(name):
     """The first worlds of many, on two threads, are those of few, bit for bit."""
@@ -61,6 +63,7 @@ def test_the_number_of_worlds_changes_nothing(name):
         np.testing.assert_array_equal(a, b[:, :3])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vehicle", catalogue())
 @pytest.mark.parametrize("name", NAMES)
 def test_observations_stay_bounded_whatever_the_vehicle(name, vehicle):

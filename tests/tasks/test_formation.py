@@ -175,6 +175,7 @@ def rate(task, who, vehicle="finsrov", worlds=32):
     return success.mean(), torn.mean()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vehicle", ["finsrov", "bluerov2_heavy"])
 def test_the_consensus_delivers_and_a_still_team_does_not(vehicle):
     success, torn = rate(Formation(), "consensus", vehicle)

@@ -142,6 +142,7 @@ def test_what_cannot_be_is_refused(task, plan, sentence):
         climb(finssim.make(task), LevelPlan(**plan))
 
 
+@pytest.mark.slow
 def test_a_training_tells_the_level_and_goes_on_with_it(tmp_path, monkeypatch):
     """A column of the curve; the plan in policy.yaml; after a kill the same network."""
     import yaml

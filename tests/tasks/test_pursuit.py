@@ -106,6 +106,7 @@ def test_at_the_speed_it_can_hold_a_vehicle_stays_level():
     assert tilt[0] > 45.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", PREY_MODES)
 def test_every_prey_stays_in_its_range_and_below_its_speed(mode):
     """Chased by lead pursuit for two minutes: 20 % more while it turns, half a metre at the border."""

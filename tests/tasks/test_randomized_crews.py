@@ -8,6 +8,7 @@ import pytest
 from finssim.tasks import TASKS, make
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 def test_every_task_runs_with_drawn_vehicles_and_privileged_numbers(task):
     """Each agent's numbers are those of its own vehicle; runs of equal seeds are equal."""
@@ -39,6 +40,7 @@ def test_the_vehicles_of_a_world_share_its_water():
     assert (drawn[:, 0, 1] != drawn[:, 1, 1]).all()
 
 
+@pytest.mark.slow
 def test_no_vehicle_of_one_seed_is_another_of_the_next_seeds():
     """Trainings of seeds 1, 2, 3, ... share no vehicle, in whatever place."""
     first, *others = (

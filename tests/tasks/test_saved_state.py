@@ -41,6 +41,7 @@ def act(environment, steps, seed):
     return seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 def test_a_run_that_goes_on_is_the_run_that_was_not_interrupted(task):
     """Through ends of episodes, new draws and the delay lines: outputs and states afterwards."""

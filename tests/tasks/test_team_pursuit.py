@@ -53,6 +53,7 @@ NET = ((0.0, 0.0, -3.0), (3.0, 1.0, -3.0), (3.0, -1.0, -3.0))
 """A herder, and netters 2 m apart; the net's middle lies 3 m before the herder."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "x", "steps"),
     [
@@ -187,6 +188,7 @@ def rate(task, who, worlds=32, vehicle="finsrov"):
     return caught.mean()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", range(len(LEVELS)))
 def test_the_formation_captures_and_a_still_team_does_not(level):
     assert rate(TeamPursuit(level=level), "formation") > 0.4

@@ -123,6 +123,7 @@ def test_t1_in_torch_is_t1():
     assert all(np.allclose(wanted[name], found[name], atol=1e-3) for name in wanted)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", [KeepDepth(), TorchStationKeeping(), Herding()], ids=lambda task: task.name)
 def test_tasks_in_torch_pass_the_check(task):
     """Equal seeds, any number of worlds, no leak through a reset, bounds, ends, starts, measures."""
@@ -226,6 +227,7 @@ def test_adapters_take_it_and_their_checkers_pass(library):
         check(PettingZooEnv(replace(Herding(), time_limit=0.5)), num_cycles=20)
 
 
+@pytest.mark.slow
 def test_it_is_trained_like_any_task(tmp_path):
     """A policy directory with the task's name and observation; equal seeds, equal networks."""
     from finssim.control.policy import Policy

@@ -27,6 +27,7 @@ def test_the_catalogue_names_every_vehicle():
         assert name in printed(screen)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", catalogue())
 def test_a_vehicle_prints_its_thrusters_digest_and_sources(name):
     vehicle, screen = load_vehicle(name), console()
@@ -50,6 +51,7 @@ def test_guesses_are_marked_beside_the_number():
     assert row.split() == ["M_A", "15.0347", "28.5059", "23.3544", "0.1", "?", "0.1", "?", "0.590397"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["finsrov", "remus100", "rexrov"])
 def test_a_picture_of_the_layout_is_saved(name, tmp_path):
     print_vehicle(load_vehicle(name), console(), tmp_path / "layout.png")

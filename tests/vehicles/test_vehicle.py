@@ -177,6 +177,7 @@ def test_an_unknown_set_is_answered_with_the_known_ones():
         load_vehicle("warpauv").hydrodynamic_set("calibrated")
 
 
+@pytest.mark.slow
 def test_loading_a_vehicle_imports_nothing_heavy():
     code = (
         "import sys; from finssim.vehicles import load_vehicle; load_vehicle('finsrov');"

@@ -33,6 +33,7 @@ def test_the_pool_lives_and_the_robot_in_it_goes_to_the_goal():
     source.close()
 
 
+@pytest.mark.slow
 def test_the_pool_is_the_one_that_was_asked_for():
     """Plant, severity, policy, trajectory and vehicle are heeded."""
     plain = open_source(Choice(trajectory="ellipse", camera="pictures"))
@@ -100,6 +101,7 @@ def test_what_cannot_be_shown_is_refused_in_a_sentence(choice, sentence):
         open_source(choice)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("basin", ["4,2", "4,2,0", "a,b,c"])
 def test_a_pool_has_three_lengths(trial, basin):
     """Length, width and depth above zero."""

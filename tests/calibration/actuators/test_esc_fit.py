@@ -39,6 +39,7 @@ def test_an_exact_law_is_recovered(truth, volts):
         np.testing.assert_allclose(fit.esc.dead_band(voltage), truth.dead_band(voltage), atol=8.0)
 
 
+@pytest.mark.slow
 def test_intervals_cover_the_truth():
     """60 noisy tables: every number of the law lies in its 95 % interval in at least 85 % of them."""
     truth = TRUTHS["asymmetric"]

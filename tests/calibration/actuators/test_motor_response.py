@@ -57,6 +57,7 @@ def test_dead_time_and_lag_are_recovered(delay, tau, rate):
     assert len(found.used) == 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("delay", "tau", "rate"), [CASES[0], CASES[3]])
 def test_intervals_cover_the_truth(delay, tau, rate):
     """25 repetitions: the 95 % intervals hold the truth in at least 84 %, and are narrower than the numbers."""
@@ -191,6 +192,7 @@ def test_pulses_and_unsigned_speeds_with_lost_samples_and_spikes():
     assert any("stand alone far from their neighbours" in w for w in fit.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "asked"), [("finsrov", "command"), ("bluerov2", "pwm")])
 def test_the_simulators_motors_are_recovered_from_trials_of_the_whole_vehicle(name, asked):
     """The engine solves delay and lag by itself; its logs give back the vehicle file's numbers, here without noise."""

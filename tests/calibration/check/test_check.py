@@ -67,6 +67,7 @@ def negative(x):
     return -x
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["surge", "heave", "roll", "yaw"])
 def test_a_good_trial_is_usable_and_tells_its_axis(simulated, name):
     """Nothing to complain of; mass and both dampings of the driven axis; nothing of an axis that rests."""
@@ -106,6 +107,7 @@ WRONG = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", WRONG)
 def test_wrong_signs_and_units_are_refused(simulated, case):
     """One convention changed in a good trial is found, named, and nothing may rest on it."""
@@ -266,6 +268,7 @@ def test_an_axis_that_the_header_names_but_nothing_drives_is_told(simulated):
     )
 
 
+@pytest.mark.slow
 def test_between_trials(simulated):
     """Duplicates, roles, vehicles."""
     surge, yaw = simulated["surge"], simulated["yaw"]
@@ -282,6 +285,7 @@ def test_between_trials(simulated):
     assert any("no trial tells anything of sway" in f.text and "yaw" in f.text for f in good)
 
 
+@pytest.mark.slow
 def test_an_offset_that_several_trials_share_is_told_once(simulated):
     """The attitude of all trials is stamped 0.12 s late; one trial alone might be a coincidence."""
     late = []
@@ -296,6 +300,7 @@ def test_an_offset_that_several_trials_share_is_told_once(simulated):
     assert not any("late" in f.text for f in together(check_trials(list(simulated.values()), VEHICLE)))
 
 
+@pytest.mark.slow
 def test_the_report_is_json_and_fits_a_hundred_columns(simulated):
     """Programs get plain finite values; people lines that do not wrap."""
     reports = check_trials(list(simulated.values()), VEHICLE)

@@ -35,6 +35,7 @@ def test_a_written_programme_holds_the_thrusts_of_its_wrench(tmp_path):
         assert about["peak"] == {f"tau_{'y' if 'sway' in folder.name else 'n'}": 5.0}
 
 
+@pytest.mark.slow
 def test_simulated_trials_open_as_they_were_made(tmp_path):
     """A trial read back from its folder has the digest of the one in memory."""
     folders = excite("surge", vehicle=BLUEROV2, out=tmp_path / "trials", levels=[5.0], simulate=True, seed=3)

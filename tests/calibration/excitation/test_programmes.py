@@ -60,6 +60,7 @@ def test_a_pulse_rings_down_and_a_dive_coasts():
     assert all(p.ascent_speed == 0.01 for p in dives)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bluerov2", "bluerov2_heavy", "rexrov", "remus100", "lauv", "warpauv"])
 @pytest.mark.parametrize("kind", ["published", "validation", "multisine"])
 def test_every_vehicle_gets_levels_within_its_limits(name, kind):
@@ -96,6 +97,7 @@ def test_repeats_of_a_multisine_differ_and_seeds_repeat_them():
     assert (again[1].tau_desired == two.tau_desired).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["published", "multisine"])
 def test_room_bounds_the_way(kind):
     """A strong vehicle that would cross the pool is driven less, and then stays within it in the simulator too."""

@@ -53,6 +53,7 @@ def test_accelerometer_reads_the_acceleration_of_its_place_and_gravity():
     assert np.median(np.abs(felt - acceleration_w)) < 0.02 * moving
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_trials_and_worlds_do_not_matter():
     """A trial is the same bit for bit when run again; other seeds give other motion and noise."""
     digest = [t.sha256 for t in simulate_programme(SURGE, FINSROV, seed=4)]
@@ -137,6 +138,7 @@ def test_a_log_may_hold_few_columns_slowly():
         np.testing.assert_allclose(thrust, trial.channels[f"command_{name}"], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_dive_ends_when_the_ascent_is_steady():
     """A buoyant vehicle's coast stops 2 s after it rises faster than 1 cm/s; a trimmed one coasts for 30 s."""
     plan = [p for p in programmes("heave", FINSROV, levels=[9.0]) if "dive" in p.name]
@@ -147,6 +149,7 @@ def test_a_dive_ends_when_the_ascent_is_steady():
     assert buoyant.phase[-1] == "coast"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [

@@ -105,6 +105,7 @@ def test_arming_splits_the_log():
     assert trial.duration == pytest.approx(274.434 - 265.679, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "file, vehicle, part", [(BIN, "bluerov2", 0.95), (BIN, "bluerov2", 0.7), (TLOG, "bluerov2_heavy", 0.9)]
 )

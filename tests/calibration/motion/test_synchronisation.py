@@ -38,6 +38,7 @@ def log(late, noise=0.0, seed=0):
 LATE = {"attitude": 0.12, "position": 0.31, "depth": -0.08, "acceleration": 0.055}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_shifts_put_in_are_found(seed, noise):
@@ -51,6 +52,7 @@ def test_shifts_put_in_are_found(seed, noise):
     assert found["attitude"].reference == "rates" and found["depth"].reference == "position"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "late", [LATE, {"velocity": 0.15}, {"velocity": 0.1, "attitude": 0.03, "depth": 0.05}]
 )

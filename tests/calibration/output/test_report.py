@@ -83,6 +83,7 @@ def test_a_fit_of_almost_nothing_has_a_report(tmp_path):
     assert not list((tmp_path / "r").glob("*.png"))
 
 
+@pytest.mark.slow
 def test_many_curves_are_drawn_up_to_a_limit_that_is_said(tmp_path):
     """A hundred curves give eight figures and a sentence."""
     x = np.arange(3.0)

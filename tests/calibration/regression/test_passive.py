@@ -45,6 +45,7 @@ def decay(
     return Trial(name=f"decay{seed}", t=t, channels=channels, header=Header(passive=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", ["roll", "pitch"])
 @pytest.mark.parametrize(("w2", "c1", "c2"), [(4.0, 0.4, 0.0), (6.0, 0.0, 3.0)])
 def test_ring_down_gives_frequency_and_damping(axis, w2, c1, c2):
@@ -58,6 +59,7 @@ def test_ring_down_gives_frequency_and_damping(axis, w2, c1, c2):
     assert found.r2 > 0.95
 
 
+@pytest.mark.slow
 def test_intervals_of_a_ring_down_cover():
     """95 % intervals of ln w2 and c1 hold the truth in most of 20 noisy decays."""
     hits = np.zeros(2)
@@ -84,6 +86,7 @@ def test_a_trial_at_rest_is_refused_with_the_reason():
         free_decay(Trial(name="empty", t=np.arange(10.0), channels={}), "roll")
 
 
+@pytest.mark.slow
 def test_absolute_values_name_what_was_assumed():
     """With the stiffness or with the inertia of the file as known: which is said, and both agree in ratio."""
     w2, c1 = 4.0, 0.4
@@ -100,6 +103,7 @@ def test_absolute_values_name_what_was_assumed():
     assert heavy["roll.k"].estimate / heavy["roll.m_eff"].estimate == pytest.approx(w2, rel=0.03)
 
 
+@pytest.mark.slow
 def test_regression_takes_up_passive_trials():
     """Given only trials without thrust, the hydrodynamics command's regression reports the decay."""
     fit = regress([decay(4.0, 0.4, 0.0, seed=s) for s in range(2)], VEHICLE)
@@ -107,6 +111,7 @@ def test_regression_takes_up_passive_trials():
     assert set(fit.trials) == {"decay0", "decay1"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quadratic", [False, True])
 def test_rise_gives_terminal_speed_and_excess(quadratic):
     """From rest: the speed where drag equals the excess, and the excess over the mass from the acceleration."""
@@ -162,6 +167,7 @@ def hinsdale(name):
     return Trial(name=name, t=t, channels=channels, header=Header(passive=True))
 
 
+@pytest.mark.slow
 def test_real_release_is_found_and_fitted():
     """A BlueROV2 with an arm, let go by hand: roll and pitch ring with periods of about 3 s, lightly damped."""
     trial = hinsdale("traj005-1")

@@ -23,6 +23,7 @@ def without(some, *columns):
     return [replace(t, channels={n: c for n, c in t.channels.items() if n not in columns}) for t in some]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "axes"),
     [
@@ -52,6 +53,7 @@ def test_identifiable_parameters_come_back(name, axes):
     assert set(fit.trials) == {t.name for t in some}
 
 
+@pytest.mark.slow
 def test_intervals_cover_the_truth():
     """Over 24 noise draws of six trials, 95 % intervals of mass and damping hold the truth in at least 19."""
     names = ("surge.m_eff", "surge.d1", "surge.d2")
@@ -63,6 +65,7 @@ def test_intervals_cover_the_truth():
     assert (hits >= 19).all()  # 22.8 expected
 
 
+@pytest.mark.slow
 def test_instruments_remove_the_bias_of_noisy_velocities():
     """With 5 cm/s of noise least squares loses a tenth of the mass; with simulated velocities it comes back."""
     plain, instrumental = [], []
@@ -112,6 +115,7 @@ def test_late_motion_is_told_from_inertia():
     assert any("lags the recorded wrench by" in w for w in fit.warnings)
 
 
+@pytest.mark.slow
 def test_a_velocity_later_than_the_gyro_is_named():
     """u is logged 120 ms late, the gyro is not: mass within 5 %, its note tells of the lag, and the cause is named."""
     vehicle, some = trials("bluerov2_heavy", "surge", "sway", "heave", "yaw")
@@ -130,6 +134,7 @@ def test_a_velocity_later_than_the_gyro_is_named():
     assert not any("velocity seems" in w for w in regress(some, vehicle).warnings)
 
 
+@pytest.mark.slow
 def test_all_axes_moving_at_once():
     """A multi-sine on all axes: Coriolis terms and couplings of the file are taken off by the measured motion."""
     vehicle, some = trials("bluerov2_heavy", *AXES, kind="multisine")
@@ -181,6 +186,7 @@ def test_outliers_and_a_gap_do_little():
     assert fit.quality["surge"]["rejected"] >= 20
 
 
+@pytest.mark.slow
 def test_dive_and_coast_gives_the_buoyancy():
     """The coast after a dive shows the excess by itself; where it goes in the file reproduces it."""
     vehicle, some = trials("bluerov2", "heave")
@@ -206,6 +212,7 @@ def test_a_file_too_heavy_is_said():
     assert any("below the rigid 25 kg" in w for w in fit.warnings)
 
 
+@pytest.mark.slow
 def test_a_motion_that_the_wrench_does_not_explain_writes_nothing():
     """The velocity is another vehicle's: R² is low, and nothing of the axis is identifiable or written."""
     vehicle, some = trials("bluerov2_heavy", "heave", "yaw")
@@ -226,6 +233,7 @@ def test_a_motion_that_the_wrench_does_not_explain_writes_nothing():
     assert any(path.endswith("added_mass.5.5") for path in fit.changes)  # yaw is as good as ever
 
 
+@pytest.mark.slow
 def test_tilted_samples_are_left_out_unless_the_other_axes_are_fitted():
     """Surge steps pitch bluerov2 to 80°: with a wrong file, surge alone is not believed."""
     vehicle, some = trials("bluerov2", "surge", "sway", "heave", "yaw")
@@ -240,6 +248,7 @@ def test_tilted_samples_are_left_out_unless_the_other_axes_are_fitted():
     assert together.estimates["surge.m_eff"].estimate == pytest.approx(expected["surge.m_eff"], rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_turns_over_needs_trials_of_sway_too():
     """bluerov2 turned over by surge steps also sways: from surge and heave alone, nothing of surge is believed."""
     vehicle, some = trials("bluerov2", "surge", "heave")
@@ -256,6 +265,7 @@ def test_a_vehicle_that_turns_over_needs_trials_of_sway_too():
     assert fit.estimates["heave.m_eff"].estimate == pytest.approx(expected["heave.m_eff"], rel=0.03)
 
 
+@pytest.mark.slow
 def test_damping_is_written_as_a_pair_or_not_at_all():
     """A dropped term is written as zero beside the one that stays; an axis whose drag is unknown keeps both."""
     vehicle, some = trials("bluerov2_heavy", "sway", "roll")

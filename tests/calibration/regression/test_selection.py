@@ -9,6 +9,7 @@ from finssim.calibration.excitation.measurement import NoiseProfile
 from finssim.calibration.regression.regress import regress
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "axis", "dropped"),
     [("finsrov", "surge", "d2"), ("bluerov2_heavy", "sway", "d1"), ("bluerov2", "surge", None)],
@@ -29,6 +30,7 @@ def test_only_absent_damping_is_dropped(name, axis, dropped):
         assert count[term] > 2 if term == dropped else count[term] == 0
 
 
+@pytest.mark.slow
 def test_interval_of_the_kept_term_allows_for_the_dropped_one():
     """Nobody knows that the dropped term is zero: the kept one's interval is at least as wide as with both."""
     vehicle, some = trials("finsrov", "surge", noise=NoiseProfile(velocity_std=0.05))
@@ -37,6 +39,7 @@ def test_interval_of_the_kept_term_allows_for_the_dropped_one():
     assert auto[0] <= both[0] + 1e-9 and auto[1] >= both[1] - 1e-9
 
 
+@pytest.mark.slow
 def test_asking_for_one_kind_gives_it():
     """`linear` and `quadratic` fit that term alone; the other is not reported and is zero in the vehicle file."""
     vehicle, some = trials("finsrov", "surge")

@@ -44,6 +44,7 @@ def without(trial, *columns):
     return dataclasses.replace(trial, channels={k: v for k, v in trial.channels.items() if k not in columns})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS)
 def test_every_model_reproduces_trials_that_it_made(model):
     """Without noise the replay differs by the logging of the inputs at 50 Hz alone; every other model is worse."""
@@ -54,6 +55,7 @@ def test_every_model_reproduces_trials_that_it_made(model):
     assert all(other.value > 5.0 * own.value for other in others)
 
 
+@pytest.mark.slow
 def test_a_good_model_predicts_better_than_persistence_and_a_bad_one_is_told_by_its_skill(surge):
     result = replay(surge, FINSROV, hydrodynamics=("calibrated", "mesh"), horizon=3.0)
     good, bad = result.ahead["surge"]["calibrated"], result.ahead["surge"]["mesh"]
@@ -148,6 +150,7 @@ def test_a_slow_log_is_compared_at_its_own_rate(rate):
     assert result.aggregate("calibrated").value < 0.06
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inputs", ["rpm", "force", "wrench", "command"])
 def test_every_kind_of_input_drives_the_replay(inputs):
     result = replay(make("yaw", inputs=(inputs,)), FINSROV)
@@ -187,6 +190,7 @@ def test_a_diverging_model_has_no_aggregate_and_says_so(surge):
     assert all("does not stay finite" in s["surge"].why for s in found.scores["calibrated"])
 
 
+@pytest.mark.slow
 def test_the_command_reads_trials_and_writes_its_folder(surge, tmp_path, capsys):
     for trial in surge:
         write_trial(trial, tmp_path / "trials" / trial.name)

@@ -69,6 +69,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_numbers_come_back(name):
     """From coefficients off by factors of two, whatever drives and measures the vehicle."""
@@ -81,6 +82,7 @@ def test_numbers_come_back(name):
     assert len(identified) == len(axes)
 
 
+@pytest.mark.slow
 def test_a_calibrated_vehicle_holds_the_numbers():
     """The changes turn the wrong vehicle into one whose added mass and damping force are the true one's."""
     vehicle = load_vehicle("finsrov")
@@ -93,6 +95,7 @@ def test_a_calibrated_vehicle_holds_the_numbers():
     assert fit.quality["yaw"]["nrmse"] < 0.05 and len(fit.curves) == 1
 
 
+@pytest.mark.slow
 def test_thrust_against_mass_is_said_and_not_picked():
     """Motion gives only ratios: with a free thrust scale no mass is identifiable, and a sentence says why."""
     vehicle = load_vehicle("finsrov")
@@ -103,6 +106,7 @@ def test_thrust_against_mass_is_said_and_not_picked():
     assert not any(path.startswith(f"{SET}.added_mass") for path in fit.changes)
 
 
+@pytest.mark.slow
 def test_damping_at_zero_rests_on_its_bound():
     """FinsROV's surge has no quadratic drag: the estimate is compatible with zero and not called determined."""
     vehicle = load_vehicle("finsrov")
@@ -112,6 +116,7 @@ def test_damping_at_zero_rests_on_its_bound():
     assert d2.ci95[0] == 0.0 <= d2.estimate
 
 
+@pytest.mark.slow
 def test_a_late_stream_is_found_and_does_not_bias_the_mass():
     """Rates logged 80 ms late move the lag, not the inertia."""
     vehicle = load_vehicle("finsrov")
@@ -126,6 +131,7 @@ def test_a_late_stream_is_found_and_does_not_bias_the_mass():
     assert any("rates lags" in w for w in fit.warnings)
 
 
+@pytest.mark.slow
 def test_outliers_and_gaps_are_survived():
     """A second without measurements and a hundred wild samples leave the numbers where they were."""
     vehicle, rng = load_vehicle("finsrov"), np.random.default_rng(0)
@@ -138,6 +144,7 @@ def test_outliers_and_gaps_are_survived():
     check(fit_by_simulation(bad, wrong(vehicle)), vehicle, ("surge",), 0.05)
 
 
+@pytest.mark.slow
 def test_one_trial_says_what_its_intervals_rest_on():
     """With a single trial, blocks within it stand for trials, which is said."""
     vehicle = load_vehicle("finsrov")
@@ -146,6 +153,7 @@ def test_one_trial_says_what_its_intervals_rest_on():
     assert np.isfinite(fit.estimates["yaw.m_eff"].ci95).all()
 
 
+@pytest.mark.slow
 def test_an_interrupt_returns_the_best_until_then():
     """Ctrl-C while fitting ends with estimates and the mark of an interrupted fit."""
     vehicle = load_vehicle("finsrov")
@@ -159,6 +167,7 @@ def test_an_interrupt_returns_the_best_until_then():
     assert fit.estimates["yaw.m_eff"].estimate == pytest.approx(truth(vehicle, "yaw")["m_eff"], rel=0.3)
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_fits():
     """Nothing depends on threads, time or chance."""
     vehicle = load_vehicle("finsrov")

@@ -96,6 +96,7 @@ def test_an_earlier_trial_is_replaced_and_other_files_are_not(tmp_path):
     assert load_trial(tmp_path / "made").sha256 == a_trial(1).sha256
 
 
+@pytest.mark.slow
 def test_thirty_two_trials_load_in_less_than_a_second(tmp_path):
     """15 s at 50 Hz and 20 columns, 32 times, as the calibration of a vehicle reads them."""
     for seed in range(32):

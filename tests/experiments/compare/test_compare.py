@@ -104,6 +104,7 @@ def trials(error, success=True):
     return [{"setpoint": f"P{k}", "e_p_m": error * (1.0 + 0.1 * k), "success": success} for k in range(4)]
 
 
+@pytest.mark.slow
 def test_a_difference_in_every_seed_is_told_and_two_seeds_tell_nothing(tmp_path):
     """Errors of 1 cm against 2 cm over four seeds; the same over two stays open."""
     words = [

@@ -46,6 +46,7 @@ def test_probability_is_that_of_mann_and_whitney(less):
     assert probability_of_improvement(a, b, less) == pytest.approx(expected)
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth():
     """Of a symmetric distribution it is the middle: 12 runs, 200 draws; 95 % less what twelve cost."""
     rng = np.random.default_rng(3)

@@ -23,6 +23,8 @@ from finssim.robot.runtime import Runtime
 from finssim.tasks import make
 from finssim.vehicles import load_vehicle
 
+pytestmark = pytest.mark.slow
+
 FINSROV = load_vehicle("finsrov")
 LIMITS = np.asarray(FINSROV.wrench_limits)
 STATIONS = (Station((0.6, 0.25, -0.4), 0.5), Station((-0.6, -0.25, -0.6), -0.5))

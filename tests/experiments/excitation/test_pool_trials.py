@@ -18,6 +18,8 @@ from finssim.experiments.excitation.terminal import step_responses
 from finssim.pool import draw_plant
 from finssim.vehicles import load_vehicle
 
+pytestmark = pytest.mark.slow
+
 FINSROV = load_vehicle("finsrov")
 
 
@@ -109,7 +111,6 @@ def test_steps_on_rails_reach_the_closed_form():
     assert 27.14 / 39.07 < found.time_constant < 27.14 / 39.07 + 0.4  # motors and their delay come on top
 
 
-@pytest.mark.slow
 def test_excite_in_a_pool_by_command(tmp_path):
     """Trials, records and what they are; the pool, its vehicle and its severity are those of the options."""
     command = ["excite", "roll", "--vehicle", "finsrov", "--levels", "1.0", "--out", str(tmp_path / "t")]

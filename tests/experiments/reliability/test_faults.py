@@ -2,6 +2,8 @@
 
 import json
 
+import pytest
+
 from finssim import boundary
 from finssim.cli import app
 from finssim.experiments.reliability.faults import row_ok
@@ -23,6 +25,7 @@ def told(*trials):
     return [cells for cells, _ in shown.rows], shown
 
 
+@pytest.mark.slow
 def test_the_command_plays_a_scenario_and_goes_on_where_it_was(capsys, tmp_path):
     """The control, which fails as it must: status 0, a result and a table; again, without playing."""
     words = ["experiment", "faults", "--scenarios", "control", "--processes", "1", "--out", str(tmp_path)]

@@ -20,6 +20,7 @@ def tried(tmp_path):
     return trial
 
 
+@pytest.mark.slow
 def test_without_watchdogs_a_cut_link_drives_the_vehicle_out(tried):
     """The control: thrust never ends, the workspace is left, and the verdict says so; with watchdogs it passes."""
     control = tried("control")
@@ -30,18 +31,21 @@ def test_without_watchdogs_a_cut_link_drives_the_vehicle_out(tried):
     assert watched["state"] == "fault" and "telemetry" in watched["reason"]
 
 
+@pytest.mark.slow
 def test_a_clock_set_back_an_hour_stops_the_vehicle_and_not_the_record(tried):
     """Past zero, where a record has no time any more."""
     result = tried("robot-clock", "-3600 s")
     assert result["ok"] and "clock jumped" in result["reason"] and result["record_lost_s"] == 0.0
 
 
+@pytest.mark.slow
 def test_a_second_publisher_stops_the_vehicle(tried):
     """At the next step."""
     result = tried("second-publisher")
     assert result["ok"] and "two publishers" in result["reason"] and result["frames_off_s"] < 0.1
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_the_record_and_not_the_trip(tried, caplog):
     """The vehicle drives on; what was recorded until then can be read."""
     result = tried("full-disk")

@@ -6,6 +6,7 @@ import json
 import mmap
 
 import numpy as np
+import pytest
 
 from finssim import boundary
 from finssim.cli import app
@@ -25,6 +26,7 @@ def test_a_leak_is_told_from_a_cache_that_fills():
     assert verdict(t[:5], t[:5])["verdict"] == "too short to tell"
 
 
+@pytest.mark.slow
 def test_memory_is_that_of_this_process():
     """40 MiB that are touched are seen, nearly, however much memory the process had before and gave up."""
     gc.collect()
@@ -34,6 +36,7 @@ def test_memory_is_that_of_this_process():
         assert 39.0 < memory_mib() - before < 44.0
 
 
+@pytest.mark.slow
 def test_a_short_soak_keeps_its_station_and_its_samples(capsys, tmp_path):
     """14 s of vehicle time: near the station, a row every 10 s."""
     words = ["experiment", "soak", "--hours", "0.004", "--out", str(tmp_path), "--json"]

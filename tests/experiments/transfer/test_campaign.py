@@ -23,6 +23,7 @@ def marks(folder):
     return sorted((folder / "played.txt").read_text().split())
 
 
+@pytest.mark.slow
 def test_results_come_in_the_order_of_the_jobs(tmp_path):
     """Whatever process ended first."""
     results = run_jobs(JOBS, tmp_path, played.known, processes=2)
@@ -30,6 +31,7 @@ def test_results_come_in_the_order_of_the_jobs(tmp_path):
     assert [r["success"] for r in results] == [True, False, True]
 
 
+@pytest.mark.slow
 def test_what_is_finished_is_not_played_again(tmp_path):
     """A second call plays only what is new."""
     run_jobs(JOBS[:2], tmp_path, played.known, processes=1)
@@ -39,6 +41,7 @@ def test_what_is_finished_is_not_played_again(tmp_path):
     assert told[-1] == 1.0
 
 
+@pytest.mark.slow
 def test_a_trial_that_breaks_loses_no_other(tmp_path):
     """Its error is raised; the results so far stay, whole."""
     with pytest.raises(RuntimeError, match="P02 broke"):
@@ -56,6 +59,7 @@ def gone(pid):
     return Path(f"/proc/{pid}/stat").read_text().split()[2] == "Z"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signal", [SIGTERM, SIGKILL, SIGINT], ids=lambda signal: signal.name)
 def test_workers_do_not_outlive_a_campaign(tmp_path, signal):
     """However it ends: nobody is left playing trials that nobody waits for."""

@@ -15,6 +15,8 @@ from finssim.experiments.transfer.t2 import ROWS as T2_ROWS
 from finssim.experiments.transfer.t2 import T2
 from finssim.experiments.transfer.table import THEIRS, html_of, markdown_of
 
+pytestmark = pytest.mark.slow
+
 SMALL = {"plants": 1, "seeds": 1, "rows": ("pid",), "targets": ("P01",), "processes": 1}
 
 

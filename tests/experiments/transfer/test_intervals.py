@@ -24,6 +24,7 @@ def test_shared_errors_widen_the_interval():
     assert wide.high - wide.low > 1.8 * (narrow.high - narrow.low)
 
 
+@pytest.mark.slow
 def test_an_interval_holds_the_mean_about_as_often_as_it_says():
     """Nine clusters: a percentile bootstrap covers somewhat less than 95 %, never less than 80 %."""
     random = np.random.default_rng(2)

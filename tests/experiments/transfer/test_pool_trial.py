@@ -46,6 +46,7 @@ def test_equal_jobs_give_equal_results(played, tmp_path):
     assert np.array_equal(read_series(tmp_path / "again")["position"], played()[1]["position"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [
@@ -81,6 +82,7 @@ def test_pictures_and_corners_tell_nearly_the_same(played):
     assert pictures[0]["localization"]["horizontal_m"] < 0.03
 
 
+@pytest.mark.slow
 def test_a_trajectory_is_followed_from_its_own_start(played):
     """T2 begins where the way begins."""
     _, series = played(target="lemniscate", duration=60.0)

@@ -54,6 +54,7 @@ def linear(folder, rows=4000):
     return str(save(folder, [episode], about)), observation[:-1], action
 
 
+@pytest.mark.slow
 def test_cloning_finds_the_function_that_was_shown(tmp_path):
     """To a tenth of its spread after forty passes; more steps, less error."""
     place, observation, action = linear(tmp_path / "set")
@@ -127,6 +128,7 @@ def test_the_reward_of_gail_is_the_judges_and_not_the_tasks(shown):
     assert not np.allclose(learner.environment.arrays.reward.numpy(), expected.numpy()[:, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SMALL)
 def test_a_training_goes_on_bitwise(name, shown, tmp_path):
     """Two updates, a state on disk, two more in another learner: the same numbers."""

@@ -65,6 +65,7 @@ def same(first, second):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "task"), PAIRS)
 def test_it_finds_the_best_action(name, task):
     """Of a task of one step: c where +1 is seen and -c where -1, by every agent; the held evaluation says success."""
@@ -94,6 +95,7 @@ def test_it_finds_the_best_action(name, task):
     assert held["evaluation_success"] == 1.0 and held["evaluation_return"] > 0.96
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("name", REINFORCED)
 def test_it_learns_on_every_task_and_goes_on_bitwise(tmp_path, name, task):
@@ -117,6 +119,7 @@ def test_it_learns_on_every_task_and_goes_on_bitwise(tmp_path, name, task):
     assert same(whole.state(), other.state())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REINFORCED)
 def test_equal_seeds_are_equal_learners(name):
     """And another seed is another."""

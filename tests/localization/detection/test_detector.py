@@ -77,6 +77,7 @@ def outward(missed, drawn):
     return float(np.mean(np.sum(missed * unit, axis=-1)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("family", "library", "refine"), WAYS)
 def test_corners_lie_where_they_were_drawn(family, library, refine):
     """One order, integers at pixel centres, no bias, and the error that the way of refinement allows."""
@@ -91,6 +92,7 @@ def test_corners_lie_where_they_were_drawn(family, library, refine):
         assert abs(outward(missed, drawn)) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.parametrize("blur", [0.0, 0.5, 1.0])
 def test_the_fit_is_better_than_a_tenth_of_a_pixel_on_small_tags(family, blur):
@@ -102,6 +104,7 @@ def test_the_fit_is_better_than_a_tenth_of_a_pixel_on_small_tags(family, blur):
     assert abs(outward(missed, drawn)) < 0.04
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
 def test_linear_light_takes_the_bias_of_encoded_pictures_away(family):
     """Encoded with 2.2, dark borders shrink by tenths of a pixel; `gamma=2.2` puts corners where they were drawn."""
@@ -145,6 +148,7 @@ def shadow(light, u, v, at):
     return light * np.where(0.6 * (u - at[0]) + 0.8 * (v - at[1]) > 0.0, 0.7, 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("disturb", "rms"), [(glare, 0.25), (finger, 0.12), (caustic, 0.15), (shadow, 0.25)])
 def test_uneven_light_and_covered_cells_move_corners_little(disturb, rms):
     """Local contrast counts, not gray, and cells that do not fit lose their weight: a fraction of a pixel is left."""

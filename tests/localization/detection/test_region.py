@@ -24,6 +24,7 @@ def ring_at(u, v):
     return pose_corners(32.0, centre=(u, v), turn=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("library", LIBRARIES)
 def test_a_moving_tag_is_followed_in_regions_with_the_corners_of_a_whole_search(library):
     """After the first picture only regions are searched, a fraction of the pixels, at 9 px per picture."""
@@ -51,6 +52,7 @@ def test_a_tag_that_jumps_is_found_in_the_same_picture():
     assert tracker.counts.recovered == 2 and tracker.counts.whole == 2
 
 
+@pytest.mark.slow
 def test_a_missing_tag_is_searched_in_the_whole_picture_every_so_often():
     """One of two is seen; the other is looked for near its last place always, and everywhere every third picture."""
     tracker = RegionTracker(detector("tag25h9"), [15, 16], search_every=3)

@@ -47,6 +47,7 @@ def test_the_gyro_alone_follows_a_tilting_path():
     np.testing.assert_allclose(roll_pitch(tilt.up), quat_to_euler(attitude(10.0))[:2], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_wrong_start_and_a_bias_die_away():
     """From 0.3 rad wrong and with a gyro 0.01 rad/s off, the angles of a moving vehicle are found to 0.02 rad."""
     rng, dt = np.random.default_rng(0), 0.02

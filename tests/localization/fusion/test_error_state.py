@@ -124,6 +124,7 @@ def test_at_rest_with_the_right_biases_nothing_moves():
     np.testing.assert_allclose(after.p, state.p, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_errors_and_innovations_are_as_large_as_the_filter_says():
     """NEES (15) of 200 runs and NIS of fixes, yaws and depths lie in their 95 % bands about 95 % of the time."""
     rng, dt, variance = np.random.default_rng(7), 0.01, {"xy": 1e-4, "yaw": 4e-4, "depth": 2.5e-5}

@@ -48,6 +48,7 @@ def rms(e):
     return np.sqrt(np.mean(e**2, axis=0))
 
 
+@pytest.mark.slow
 @both
 def test_the_path_is_followed(mode):
     """With 1 cm and 1.1 degrees of noise and a biased IMU: 1 cm and half a degree, and speeds to 6 cm/s."""
@@ -57,6 +58,7 @@ def test_the_path_is_followed(mode):
     assert np.all(rms(np.array([x.x[3:] for x in found]) - slope(position, times)) < 0.06)
 
 
+@pytest.mark.slow
 @both
 def test_tilt_is_found_where_the_imu_does_not_tell_it(mode):
     """From gyro and accelerometer alone, roll and pitch are right to a degree and the depth's lever with them."""
@@ -116,6 +118,7 @@ def by_hand(state, sample, s, up):
     return position_filter.correct(state, position_filter.innovation(state, H, z, R), H, R)
 
 
+@pytest.mark.slow
 @both
 @pytest.mark.parametrize("seed", [0, 1])
 def test_shuffled_delivery_ends_in_the_same_state(mode, seed):
@@ -161,6 +164,7 @@ def test_what_is_later_than_the_horizon_is_refused_and_counted():
     assert e.counts["vision"]["too late"] == 1
 
 
+@pytest.mark.slow
 @both
 @pytest.mark.parametrize(
     ("age", "mode_then"),
@@ -201,6 +205,7 @@ def test_nothing_is_initialized_before_the_first_fix():
     assert found.x[2] == pytest.approx(position(2.0)[2], abs=0.02)
 
 
+@pytest.mark.slow
 @both
 @pytest.mark.parametrize("all_silent", [False, True], ids=["camera", "everything"])
 def test_the_state_never_runs_away(mode, all_silent):
@@ -227,6 +232,7 @@ def test_the_state_never_runs_away(mode, all_silent):
     assert doubt[1] > 0.1
 
 
+@pytest.mark.slow
 @both
 def test_dropouts_of_three_seconds_are_survived(mode):
     """Three silences of 3 s: errors stay within four of the stated deviations, and settle in half a second."""
@@ -244,6 +250,7 @@ def test_dropouts_of_three_seconds_are_survived(mode):
     assert np.abs(e[:, 3]).max() < math.radians(2.5)  # the gyro carries the heading through
 
 
+@pytest.mark.slow
 @both
 def test_outliers_and_flips_are_refused(mode):
     """5 % of fixes off by 0.5 to 1 m and 5 % of yaws off by 90 or 180 degrees: the path is followed as without.
@@ -308,6 +315,7 @@ def broken():
     ]
 
 
+@pytest.mark.slow
 @both
 def test_broken_samples_are_refused_counted_and_leave_no_trace(mode):
     """NaN, infinities, times long past and far ahead: every one is counted, and the state is the same bit by bit."""
@@ -420,6 +428,7 @@ def test_health_is_plain_json_with_the_published_keys():
     assert status["counts"]["imu"]["accepted"] == 200
 
 
+@pytest.mark.slow
 @both
 def test_innovations_are_as_large_as_expected(mode):
     """NIS per dimension of 20 s is about 1 for noises as set: below the 1.2 of a filter too sure of itself."""
@@ -432,6 +441,7 @@ def test_innovations_are_as_large_as_expected(mode):
         assert 0.6 < total / n < 1.2
 
 
+@pytest.mark.slow
 def test_acceleration_helps_where_the_camera_is_silent():
     """Over the same silences of 1.5 s, the error-state filter is off by less than half of what constant velocity is."""
     samples = streams(20.0, seed=9)

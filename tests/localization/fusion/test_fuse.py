@@ -241,6 +241,7 @@ def still_pool(pool):
     return replace(load_pool(pool), latency=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trial", ["traj005-1", "traj026-0", "traj_alt_009-0"])
 def test_a_real_gyro_carries_a_heading_seen_once_a_second(trial, tmp_path, pool):
     """BlueROV2, gyro at 20 Hz and mocap heading at 1 Hz against the full rate: at most 1.0 degree rms.
@@ -257,6 +258,7 @@ def test_a_real_gyro_carries_a_heading_seen_once_a_second(trial, tmp_path, pool)
     assert found.summary["nis_per_dimension"]["yaw"] < 1.5
 
 
+@pytest.mark.slow
 def test_a_real_flip_is_refused(tmp_path, pool):
     """`baseline2`: around 33.6 s the mocap is turned over for some frames, by 160 degrees. None of them is believed."""
     folder, t, heading = hinsdale(tmp_path / "b", "baseline2", every=None)

@@ -109,6 +109,7 @@ def test_reading_at_the_stamp_would_miss(files, capsys):
     assert json.loads(capsys.readouterr().out)["truth"]["rmse_m"] > 8e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_runs_from_files(files, method, capsys):
     """A file of detections gives a row per picture with every method; those without need of depth work without."""

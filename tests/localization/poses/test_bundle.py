@@ -19,6 +19,7 @@ def error(found, position, angles):
     return np.concatenate([found.position - position, turn])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", POOLS)
 def test_large_tilts_are_found_too(name):
     """A vehicle leaning by 20 degrees is found from exact corners, without depth or inertia."""
@@ -36,6 +37,7 @@ def test_large_tilts_are_found_too(name):
     assert looked_at
 
 
+@pytest.mark.slow
 def test_the_covariance_is_that_of_the_errors():
     """NEES over 60 noisy pictures of three tags averages 6 for the pose and 3 for x, y, yaw, within 99.9 % bands."""
     position, angles = np.array([0.5, -0.3, 0.3]), np.array([0.1, -0.1, 2.0])

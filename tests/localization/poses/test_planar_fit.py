@@ -51,6 +51,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_the_covariance_is_that_of_the_errors(case):
     """NEES over 400 noisy measurements averages 3, the number of unknowns, within its 99.9 % band."""
@@ -65,6 +66,7 @@ def test_the_covariance_is_that_of_the_errors(case):
     assert 3.0 - 0.42 < value < 3.0 + 0.55  # chi² of 1200 degrees of freedom over 400; Huber's rho adds 3 %
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", POOLS)
 def test_the_covariance_holds_everywhere(name):
     """Also at other places, behind windows and under other lenses."""

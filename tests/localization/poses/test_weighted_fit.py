@@ -37,6 +37,7 @@ def read(random, z_std, tilt_std, shared=0.0):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pixel", "z", "tilt", "shared"),
     [(0.1, 0.01, 0.01, 0.0), (0.5, 0.01, 0.01, 0.0), (0.5, 0.002, 0.02, 0.0), (0.2, 0.01, 0.01, 1.0)],

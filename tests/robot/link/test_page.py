@@ -52,6 +52,7 @@ def test_the_flags_on_the_page_are_those_of_the_code():
     assert f"`reject_flags`: {said}." in PAGE
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
 def test_the_firmware_on_the_page_reads_commands(tmp_path):
     """Compiled, it takes a command, and refuses a wrong CRC, a wrong tail and what is no share of full speed."""

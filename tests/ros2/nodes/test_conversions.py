@@ -233,6 +233,7 @@ JSON = st.recursive(
 )
 
 
+@pytest.mark.slow
 @given(told=JSON)
 def test_malformed_tags_are_none(told):
     """Any JSON, and what is none."""

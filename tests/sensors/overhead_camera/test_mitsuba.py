@@ -52,6 +52,7 @@ def detected(image, rectangle):
     return found.corners + np.array([r.left, r.top])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distortion", [(), PUBLISHED], ids=["pinhole", "distorted"])
 @pytest.mark.parametrize("water", WATER)
 def test_corners_agree_with_mitsuba(pool, water, distortion):
@@ -68,6 +69,7 @@ def test_corners_agree_with_mitsuba(pool, water, distortion):
     assert np.linalg.norm(referee.mean(axis=0) - middle) > 10.0
 
 
+@pytest.mark.slow
 def test_brightness_agrees_with_mitsuba(pool):
     """Paper, print, floor and a box have the same brightness in both pictures, Fresnel's losses included."""
     box = Body(size=(0.5, 0.4, 0.1), pose=Pose(position=(0.2, 0.1, 0.2)), colour=(0.3, 0.3, 0.3))

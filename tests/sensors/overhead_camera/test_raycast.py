@@ -35,6 +35,7 @@ def shown(scene, tag, edge_offsets):
     return edge_offsets(image, scene.camera, scene.interface, tag)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lens", LENSES)
 @pytest.mark.parametrize("interface", INTERFACES)
 def test_borders_lie_where_optics_puts_them(pool, square, edge_offsets, camera_at, lens, interface):

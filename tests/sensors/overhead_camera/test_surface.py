@@ -79,6 +79,7 @@ def test_rays_meet_the_surface_where_it_is():
     assert off.max() < 1e-4
 
 
+@pytest.mark.slow
 def test_ripples_leave_the_mean_picture_where_it_was(pool, square, edge_offsets):
     """Over many phases the mean of where a tag is seen tends to the flat geometry, and single pictures do not."""
     tag = square(0.2, 0.1, edge=0.25)

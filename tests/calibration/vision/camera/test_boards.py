@@ -91,6 +91,7 @@ def test_a_hidden_part_of_a_charuco_board_is_left_out():
     assert slope == pytest.approx(60 / 0.04, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_the_size_of_a_common_board_is_found():
     found = board_found([("a.png", drawn(H))], 0.025)
     assert (found.columns, found.rows) in ((9, 6), (6, 9))

@@ -13,6 +13,7 @@ from finssim.localization.camera_file import load_camera
 SOME = [PHOTOGRAPHS / f"left{i:02d}.jpg" for i in (1, 2, 3, 5, 6, 8)]
 
 
+@pytest.mark.slow
 def test_photographs_become_a_camera_file(tmp_path, capsys):
     """The file holds the lens with its intervals; the report its pictures."""
     fit = run(SOME, out=tmp_path / "camera.yaml", board="9x6", square=0.025, report=tmp_path / "report")
@@ -33,6 +34,7 @@ def test_json_is_one_object(tmp_path, capsys):
     assert {view["name"] for view in document["per_view"]} == {path.name for path in SOME}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -14,6 +14,7 @@ from finssim.calibration.vision.camera.lens_bundle import adjust, evidence, lens
 from finssim.localization.camera_file import load_camera
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS)
 def test_a_lens_comes_back_from_its_pictures(model):
     """Of every model: pixels over the whole picture to a fraction of the noise of a corner."""
@@ -30,6 +31,7 @@ def test_a_lens_comes_back_from_its_pictures(model):
         assert low - 1.0 < getattr(lens, name) < high + 1.0
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_nineteen_times_of_twenty():
     """Over many sets of ten pictures; 4 x 30 intervals, of which 84 % to all must hold."""
     lens, inside = LENSES["plumb_bob"], []
@@ -93,6 +95,7 @@ def test_published_distortion_bends_pixels_as_ours_where_corners_were_seen():
     assert np.linalg.norm(shift - A @ turn, axis=1).max() < 2.0
 
 
+@pytest.mark.slow
 def test_a_picture_that_disagrees_is_named_and_left_out():
     """And the lens is that of the others."""
     seen = list(views(LENSES["plumb_bob"], 14, np.random.default_rng(1)))

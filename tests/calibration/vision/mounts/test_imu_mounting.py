@@ -50,6 +50,7 @@ def degrees_between(a, b):
     return np.degrees(np.linalg.norm(quat_to_rotvec(quat_multiply(a, quat_conjugate(b)))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MOUNTS)
 def test_orientation_bias_and_clock_come_back(name):
     """From an attitude that is good to half a degree, whatever the mount, without a first guess."""
@@ -60,6 +61,7 @@ def test_orientation_bias_and_clock_come_back(name):
     assert fit.whole and not fit.advice
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth():
     """Three angles, over eight recordings; at least 80 % where 95 % are meant."""
     mount, inside = MOUNTS["published flip"], []
@@ -70,6 +72,7 @@ def test_intervals_hold_the_truth():
     assert np.mean(inside) >= 0.8
 
 
+@pytest.mark.slow
 def test_turning_about_one_axis_leaves_the_turn_about_it_to_the_file():
     """A vehicle that only yaws: how far the IMU is turned about z shows nowhere, its tilt does."""
     start = quat_from_rotvec(np.array([0.0, 0.0, 0.4]))
@@ -81,6 +84,7 @@ def test_turning_about_one_axis_leaves_the_turn_about_it_to_the_file():
     assert degrees_between(fit.orientation, true) < 1.0
 
 
+@pytest.mark.slow
 def test_jumps_of_the_attitude_have_no_weight():
     """A tracker that loses the body for moments, and finds it upside down, changes nothing."""
     attitude, gyro = measured(MOUNTS["published flip"], np.random.default_rng(1))
@@ -101,6 +105,7 @@ def test_a_gap_of_the_gyro_is_not_turned_across():
     assert np.isnan(turns[across]).all() and np.isfinite(turns[apart]).all()
 
 
+@pytest.mark.slow
 def test_streams_of_different_recordings_are_refused():
     attitude, _ = measured(MOUNTS["as the body"], np.random.default_rng(1))
     still = Gyro(

@@ -39,6 +39,7 @@ def place(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_tags_are_written_where_they_are(place, capsys):
     """The IMU and the port are right in the file; the tags move to where they are, with intervals as their notes."""
     write_log(place / "rocked", motion(), np.random.default_rng(1))
@@ -61,6 +62,7 @@ def test_tags_are_written_where_they_are(place, capsys):
     assert "tags.16.x" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_sensors_are_written_where_the_tag_is_right(place, capsys):
     """The published flip is not in the file and is found from the gyro; offset, scale and clock too."""
     right = {"position": MOUNTS[15].t.tolist(), "orientation": matrix_to_quat(MOUNTS[15].R).tolist()}
@@ -85,6 +87,7 @@ def test_sensors_are_written_where_the_tag_is_right(place, capsys):
     assert low < 0.05 < high
 
 
+@pytest.mark.slow
 def test_a_log_without_sensors_places_tags_to_one_another_alone(place, capsys):
     """Pictures alone: the reference tag keeps the file's mount, and it is said what is missing."""
     folder = write_log(place / "alone", motion(seconds=30.0), np.random.default_rng(3))

@@ -71,6 +71,7 @@ def test_derivatives_are_those_of_the_prediction(rocked):
         assert -blocks[0].b[k] == pytest.approx(numeric, rel=2e-4, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_a_rocking_vehicle_tells_its_tags_whole(fitted):
     """Relative to one another to tenths of a millimetre; in the body by the IMU's tilt and the depth."""
     assert not fitted.frozen
@@ -84,6 +85,7 @@ def test_a_rocking_vehicle_tells_its_tags_whole(fitted):
     assert fitted.rms == pytest.approx(0.15 * np.sqrt(2.0), rel=0.25)
 
 
+@pytest.mark.slow
 def test_a_level_vehicle_keeps_the_files_heading_and_place():
     """Without tilt nothing defines the body's axes and origin but the file; relative mounts are told all the same."""
     fit = fit_mounts(RIG, FILE, moments(motion(tilt=0.0), np.random.default_rng(1)))
@@ -95,6 +97,7 @@ def test_a_level_vehicle_keeps_the_files_heading_and_place():
     assert max(abs(off["16.x"]), abs(off["16.y"])) < 5e-4
 
 
+@pytest.mark.slow
 def test_a_known_centre_of_turning_gives_the_place():
     """A level vehicle that turns on the spot about a body point it knows."""
     spinning = motion(tilt=0.0, travel=0.0, heave=0.0)
@@ -106,6 +109,7 @@ def test_a_known_centre_of_turning_gives_the_place():
     assert "reference.x" in fit.free and "reference.turn_z" in fit.frozen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quarter", [1, 2])
 def test_a_tag_glued_on_turned_is_found(quarter):
     """The file's heading of the tag is wrong by quarter turns; the IMU's tilt tells the right one."""
@@ -117,6 +121,7 @@ def test_a_tag_glued_on_turned_is_found(quarter):
     assert max(abs(off["16.x"]), abs(off["16.y"])) < 1e-3  # placed though the file does not have it
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mount", [(0.0, 0.0, 1.0, 0.0), (0.02, 0.0, 0.0, 0.9998), (0.7071068, 0.0, 0.0, 0.7071068)]
 )
@@ -133,6 +138,7 @@ def test_a_turned_imu_is_found_where_the_tag_is_right(mount):
     np.testing.assert_array_equal(fit.state.reference.t, MOUNTS[15].t)
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth():
     """Six recordings, all that is told; at least 85 % where 95 % are meant."""
     inside = []
@@ -143,6 +149,7 @@ def test_intervals_hold_the_truth():
     assert np.mean(inside) > 0.85
 
 
+@pytest.mark.slow
 def test_wrongly_read_tags_do_not_pull(rocked):
     """Pictures in which another thing was read as a tag are left out."""
     rng = np.random.default_rng(0)

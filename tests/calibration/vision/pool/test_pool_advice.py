@@ -33,6 +33,7 @@ def tilt_error(fit, plane):
     return float(np.degrees(np.arccos(min(1.0, fit.model.interface.normal @ plane.normal))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("box", [FLOOR, SOLID], ids=["floor", "solid"])
 def test_wrong_rows_are_named_and_left_out(box):
     """Two pairs exchanged and one point 20 cm off: those five and no other."""
@@ -45,6 +46,7 @@ def test_wrong_rows_are_named_and_left_out(box):
     assert fit.model.camera.position[2] == pytest.approx(2.2, abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_rough_camera_file_is_found_out():
     """A focal length 3 % off and no distortion: the lens is fitted here, and said to be."""
     rough = Lens(1280, 720, 557.0, 557.0, 640.0, 360.0, "plumb_bob", ())
@@ -73,6 +75,7 @@ def test_points_near_the_axis_tell_no_height():
     assert low < 1.2 < high
 
 
+@pytest.mark.slow
 def test_a_sloping_floor_taken_for_level_is_noticed():
     """The water 1.2 degrees from the survey's level: the level is given up, and that is said."""
     water = Interface.water(1.0, tilt_x=0.02)
@@ -84,12 +87,14 @@ def test_a_sloping_floor_taken_for_level_is_noticed():
     assert tilt_error(fit, water) < 0.5
 
 
+@pytest.mark.slow
 def test_a_wrong_tape_is_contradicted():
     seen = survey(overhead(), WATER, SOLID, 80)
     fit = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, water_height=1.3, water_height_sigma=0.005))
     assert any("than it was measured" in sentence for sentence in fit.advice)
 
 
+@pytest.mark.slow
 def test_dry_points_help():
     """Markers above the water fix the camera: the water's height is told half as exactly again as without."""
     camera = overhead()
@@ -114,6 +119,7 @@ def test_dry_points_help():
     assert half[1] < half[0] / 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.7, 1.4])
 def test_a_guessed_focal_length_is_enough(factor):
     """Points at many depths give the focal length back within 2 % from a guess 30 or 40 % off."""
@@ -136,6 +142,7 @@ def rim(camera, count=8):
     return points, pixels + 0.25 * rng.standard_normal((count, 2))
 
 
+@pytest.mark.slow
 def test_marks_above_the_water_are_told_from_wrong_rows():
     """Eight marks on the rim whose flag was forgotten, and one mark under water that is 20 cm off."""
     wet = survey(overhead(), WATER, FLOOR, 40)
@@ -149,6 +156,7 @@ def test_marks_above_the_water_are_told_from_wrong_rows():
     assert any(sentence.startswith("1 more row was left out as wrong") for sentence in fit.advice)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("height", [1.05, 1.3])
 @pytest.mark.parametrize("asked", [FIT, None], ids=["lens held", "lens free"])
 def test_marks_over_which_the_water_was_put_are_noticed(height, asked):
@@ -179,12 +187,14 @@ def test_points_without_water_are_noticed():
     assert "straight lines meet held-out points better" in fit.advice[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("box", [FLOOR, SOLID], ids=["floor", "solid"])
 def test_points_in_water_raise_no_doubt(box):
     fit = calibrate_pool(survey(overhead(), WATER, box, 60), PLUMB_BOB, Settings(fit=FIT, water_height=1.0))
     assert doubted(fit, PLUMB_BOB).advice == fit.advice and doubted(fit, PLUMB_BOB).notes == fit.notes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("option", "value"), [("water_height", 100.0), ("water_depth", 100.0)])
 def test_centimetres_for_metres_are_refused(option, value):
     seen = survey(overhead(), WATER, FLOOR, 40)
@@ -213,6 +223,7 @@ def test_a_camera_on_the_plane_with_large_residuals_is_doubted(pixels, refused):
         assert "on the plane itself" in doubted(poor, PLUMB_BOB).advice[0]
 
 
+@pytest.mark.slow
 def test_a_flat_left_handed_survey_is_warned_of():
     """Its y negated, a floor could as well have z down; the water's height or a second depth tells the two apart."""
     turn = np.array([1.0, -1.0, 1.0])
@@ -229,6 +240,7 @@ def test_a_flat_left_handed_survey_is_warned_of():
     assert doubted(down, PLUMB_BOB).advice == down.advice
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.94, 0.96])
 def test_a_lens_that_misfits_before_a_known_wall_may_be_fitted(factor):
     """Wall and index known, the lens not: index or wall gives way, and the advice says how to free the lens."""
@@ -239,6 +251,7 @@ def test_a_lens_that_misfits_before_a_known_wall_may_be_fitted(factor):
     assert any("the pixels want" in sentence and "index,focal,center" in sentence for sentence in fit.advice)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plane", [None, (0.0, 1.0, 0.0, 0.0)], ids=["surface", "wall"])
 def test_correlations_bear_the_names_of_the_table(plane):
     if plane is None:

@@ -44,6 +44,7 @@ def test_a_pool_file_gives_held_out_points_back(pool):
     assert found.record["parameters"]["camera_height"]["ci95"][0] < 1.2
 
 
+@pytest.mark.slow
 def test_the_lens_is_as_sure_as_its_file_remembers(pool):
     """The intervals of `calibrate camera` become standard errors of focal length and centre; options go before them."""
     fx, cx = PLUMB_BOB.fx, PLUMB_BOB.cx
@@ -61,6 +62,7 @@ def test_the_lens_is_as_sure_as_its_file_remembers(pool):
     assert (said.focal_sigma, said.center_sigma) == (0.01, 5.0)
 
 
+@pytest.mark.slow
 def test_json_holds_what_was_promised(pool, capsys):
     run([pool / "points.csv"], camera=pool / "camera.yaml", out=pool / "pool.yaml", as_json=True)
     said = json.loads(capsys.readouterr().out)
@@ -78,6 +80,7 @@ def test_json_holds_what_was_promised(pool, capsys):
     assert said["held_out"]["rms_cm"] < said["pinhole"]["held_out"]["rms_cm"]
 
 
+@pytest.mark.slow
 def test_a_report_has_its_pictures(pool):
     run([pool / "points.csv"], camera=pool / "camera.yaml", out=pool / "pool.yaml", report=pool / "report")
     names = {path.name for path in (pool / "report").iterdir()}
@@ -94,6 +97,7 @@ def test_a_report_has_its_pictures(pool):
     assert "camera_height" in page and "finssim calibrate pool" in page and "http" not in page
 
 
+@pytest.mark.slow
 def test_a_tank_with_its_wall_surveyed(tmp_path, capsys):
     camera, plane = before_tank(30.0), wall(window=GLASS)
     write_camera(tmp_path / "camera.yaml", TANK_LENS, {})
@@ -109,6 +113,7 @@ def test_a_tank_with_its_wall_surveyed(tmp_path, capsys):
     assert "camera_distance" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_equal_inputs_write_equal_files(pool):
     for name in ("a.yaml", "b.yaml"):
         run([pool / "points.csv"], camera=pool / "camera.yaml", out=pool / name, water_height=1.0)
@@ -155,6 +160,7 @@ def test_parts_of_the_picture_are_no_pixels(pool):
     assert not (pool / "pool.yaml").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options", [{}, {"focal_sigma": 0.003}, {"focal_sigma": 0.0}, {"fit": "pose,height,focal"}]
 )

@@ -33,6 +33,7 @@ def tilt_error(fit, plane):
     return float(np.degrees(np.arccos(min(1.0, fit.model.interface.normal @ plane.normal))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lens", [PLUMB_BOB, FISHEYE, RATIONAL], ids=lambda lens: lens.model)
 @pytest.mark.parametrize("box", [FLOOR, SOLID], ids=["floor", "solid"])
 def test_noise_free_surveys_give_the_truth(lens, box):
@@ -45,6 +46,7 @@ def test_noise_free_surveys_give_the_truth(lens, box):
     assert np.linalg.norm(fit.residual, axis=1).max() < 1e-2
 
 
+@pytest.mark.slow
 def test_published_geometry_with_a_tape():
     """1.2 m above 1 m of water, 85 places, 2 mm of survey, 0.25 px, a tape of 2 mm (paper, table II)."""
     camera, errors = overhead(), []
@@ -62,6 +64,7 @@ def test_published_geometry_with_a_tape():
     assert max(tilts) < 0.12
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth():
     """19 of 20 intervals hold it: of 12 surveys x 4 numbers, 40 or more do (binomial, 1 in 200 has fewer than 41)."""
     inside = 0
@@ -86,6 +89,7 @@ def test_z_down_is_a_frame_like_any_other():
     np.testing.assert_allclose(fit.model.camera.position, camera.position * [1.0, -1.0, -1.0], atol=0.01)
 
 
+@pytest.mark.slow
 def test_a_left_handed_solid_is_refused():
     seen = survey(overhead(), WATER, SOLID, 40)
     mirrored = replace(seen, points=seen.points * np.array([1.0, -1.0, 1.0]))
@@ -117,6 +121,7 @@ def test_too_little_is_refused(points, words):
         calibrate_pool(observations(points, pixels), PLUMB_BOB)
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_fits():
     seen = survey(overhead(), WATER, FLOOR, 30)
     a, b = (calibrate_pool(seen, PLUMB_BOB, Settings(water_height=1.0, seed=4)) for _ in range(2))
@@ -140,6 +145,7 @@ def test_senseless_options_are_refused(options, words):
         Settings(**options)
 
 
+@pytest.mark.slow
 def test_intervals_allow_for_a_lens_that_is_not_sure():
     """Focal length off by 0.3 % and centre by 4 px: told so, the camera's place errs as its intervals say (95 % of the
     squares of normalised errors below 1.96²); taken for exact, far more."""
@@ -173,6 +179,7 @@ def test_intervals_allow_for_a_lens_that_is_not_sure():
     assert np.mean(squares["not told"]) > 3.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_a_flat_floor_with_two_dry_marks_is_not_taken_for_left_handed(seed):
     """Straight lines may fit the mirror image of such a survey better than the survey; bent ones fit the survey."""

@@ -40,6 +40,7 @@ def tilt_error(fit, plane):
     return float(np.degrees(np.arccos(min(1.0, fit.model.interface.normal @ plane.normal))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window", [(), GLASS], ids=["bare", "glass"])
 @pytest.mark.parametrize("degrees", [0.0, 20.0, 40.0])
 def test_points_behind_a_wall(degrees, window):
@@ -55,6 +56,7 @@ def test_points_behind_a_wall(degrees, window):
     assert fit.held_out.as_json()["rms_cm"] < 0.5 * fit.pinhole_held_out.as_json()["rms_cm"]
 
 
+@pytest.mark.slow
 def test_a_wall_in_the_frame_of_a_target():
     """Any frame will do: that of a target that lies askew in the water."""
     camera, plane = before_tank(30.0), wall(window=GLASS)
@@ -65,6 +67,7 @@ def test_a_wall_in_the_frame_of_a_target():
     assert np.linalg.norm(fit.model.camera.position - camera.position) < 0.03
 
 
+@pytest.mark.slow
 def test_a_surveyed_plane_makes_a_wall_exact():
     camera, plane = before_tank(20.0), wall(window=GLASS)
     seen = survey(camera, plane, TANK, 60, pixel=0.25, error=0.0005)
@@ -112,6 +115,7 @@ def noise():
     return np.sqrt(2.0) * np.hypot(PIXEL, SURVEY * TANK_LENS.fx / 0.7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("turn", "window"),
     [*((turn, GLASS) for turn in TURNS), *((turn, ()) for turn in TURNS[::5])],
@@ -131,6 +135,7 @@ def test_a_wall_turned_against_the_boards(turn, window):
     assert fit.touching == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [(12, -9), (-12, 9), (0, 20)], ids=str)
 def test_a_turned_wall_is_no_level_surface(turn):
     """The boards' z points into the tank, and a level plane does not explain the pixels."""
@@ -140,6 +145,7 @@ def test_a_turned_wall_is_no_level_surface(turn):
     assert fit.residual_json()["rms_px"] < 1.2 * noise()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [(8, -6), (-8, 6)], ids=str)
 def test_rows_before_the_wall_do_not_hold_it(turn):
     """Three points surveyed 15 cm before the wall are named, and the plane passes them."""
@@ -153,6 +159,7 @@ def test_rows_before_the_wall_do_not_hold_it(turn):
     assert fit.residual_json()["rms_px"] < 1.2 * noise()
 
 
+@pytest.mark.slow
 def test_a_plane_at_its_bound_is_told():
     """A window told far too thick leaves the plane no room before the nearest board."""
     camera, plane = before_tank(10.0), turned((12, -9), GLASS)
@@ -163,6 +170,7 @@ def test_a_plane_at_its_bound_is_told():
     assert any("ends against" in sentence and fit.touching[0] in sentence for sentence in fit.advice)
 
 
+@pytest.mark.slow
 def test_four_points_tell_a_surface_only():
     """Eight numbers cannot tell a wall's nine parameters from a surface's seven."""
     camera, plane = before_tank(10.0), turned((0, 0))
