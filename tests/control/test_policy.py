@@ -198,13 +198,13 @@ def test_a_bad_observation_is_refused_by_name(folder):
 
 
 def test_one_action_takes_microseconds(folder):
-    """A robot calls it with N = 1; the bound is loose, for loaded machines."""
+    """A robot calls it with N = 1; processor time, since others may work on the machine."""
     policy, observation = Policy.load(folder), np.zeros(3, dtype=np.float32)
     durations = []
     for _ in range(500):
-        start = time.perf_counter()
+        start = time.process_time()
         policy.act(observation)
-        durations.append(time.perf_counter() - start)
+        durations.append(time.process_time() - start)
     assert np.median(durations) < 100e-6
 
 
