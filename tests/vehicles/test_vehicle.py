@@ -185,3 +185,9 @@ def test_loading_a_vehicle_imports_nothing_heavy():
     )
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert printed.strip() == "[]"
+
+
+def test_a_zero_has_no_sign():
+    """-0.0 and 0.0 are equal numbers, so the vehicles that hold them have equal hashes."""
+    ways = [load_vehicle("finsrov").replace({"body.center_of_gravity": [0.0, y, 0.0]}) for y in (0.0, -0.0)]
+    assert ways[0].sha256 == ways[1].sha256
