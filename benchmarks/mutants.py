@@ -1,0 +1,224 @@
+"""Do the tests notice a wrong sign, bound or condition? Changes the source in 40 places, one at a time, and tests it.
+
+    python benchmarks/mutants.py [--count 40] [--seed 1] [--checkout FOLDER] [--list]
+
+A place is a sum, difference, product, comparison, boolean operator or number in a function of `src/finssim`, drawn in
+turn from the packages. It is changed in a copy of the package, on which the tests of the same name run and, where these
+pass, those of the same folder (`physics/damping.py`: `tests/physics/test_damping.py`, then `tests/physics`). A function
+that none of them calls is not counted: another place is drawn. `--checkout` takes the tests of another revision, to
+compare the two on the same changes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCE = ROOT / "src" / "finssim"
+PACKAGES = (
+    "geometry", "vehicles", "physics", "sensors", "engine", "control", "localization",
+    "tasks", "learning", "calibration", "robot", "ros2", "pool", "experiments",
+)  # fmt: skip
+SWAPS: dict[type[ast.AST], tuple[str, str]] = {
+    ast.Add: ("+", "-"),
+    ast.Sub: ("-", "+"),
+    ast.Mult: ("*", "/"),
+    ast.Lt: ("<", ">="),
+    ast.LtE: ("<=", ">"),
+    ast.Gt: (">", "<="),
+    ast.GtE: (">=", "<"),
+    ast.Eq: ("==", "!="),
+    ast.NotEq: ("!=", "=="),
+    ast.And: ("and", "or"),
+    ast.Or: ("or", "and"),
+}
+LONGEST = 900
+"""Of one run of tests, after which they count as failed [s]."""
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change: file below `src/finssim`, line and column of the text that is exchanged."""
+
+    path: str
+    line: int
+    column: int
+    before: str
+    after: str
+
+
+def mutants(path: Path) -> Iterator[Mutant]:
+    """Every change of a file's functions; docstrings, annotations and messages stay."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    name = path.relative_to(SOURCE).as_posix()
+    tree = ast.parse("\n".join(lines))
+    functions = [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef)]
+    seen: set[tuple[int, int]] = set()
+    for node in (n for f in functions for statement in f.body for n in ast.walk(statement)):
+        if isinstance(node, ast.BinOp):
+            pairs = [(node.left, node.op, node.right)]
+        elif isinstance(node, ast.Compare):
+            pairs = list(zip([node.left, *node.comparators], node.ops, node.comparators, strict=False))
+        elif isinstance(node, ast.BoolOp):
+            pairs = [(a, node.op, b) for a, b in zip(node.values, node.values[1:], strict=False)]
+        elif isinstance(node, ast.Constant) and type(node.value) in (int, float) and node.value not in (0, 1):
+            text = ast.get_source_segment("\n".join(lines), node) or ""
+            place = (node.lineno, len(lines[node.lineno - 1].encode()[: node.col_offset].decode()))
+            if place not in seen and lines[place[0] - 1][place[1] :].startswith(text):
+                seen.add(place)
+                yield Mutant(
+                    name,
+                    *place,
+                    text,
+                    f"(1.25 * {text})" if isinstance(node.value, float) else f"({text} + 1)",
+                )
+            continue
+        else:
+            continue
+        for left, op, right in pairs:
+            swap = SWAPS.get(type(op))
+            if swap is None or left.end_lineno != right.lineno or is_text(left) or is_text(right):
+                continue
+            line = lines[left.end_lineno - 1].encode()
+            between = line[left.end_col_offset : right.col_offset].decode()
+            if between.strip(" ()") != swap[0]:
+                continue
+            column = len(line[: left.end_col_offset].decode()) + between.index(swap[0])
+            if (left.end_lineno, column) not in seen:
+                seen.add((left.end_lineno, column))
+                yield Mutant(name, left.end_lineno, column, *swap)
+
+
+def is_text(node: ast.AST) -> bool:
+    """A string, of which neither sums nor products are arithmetic."""
+    return isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and isinstance(node.value, str))
+
+
+def drawn(seed: int) -> Iterator[Mutant]:
+    """Changes in turn from every package."""
+    rng = random.Random(seed)
+    pools = {}
+    for package in PACKAGES:
+        pools[package] = [m for path in sorted((SOURCE / package).rglob("*.py")) for m in mutants(path)]
+        rng.shuffle(pools[package])
+    while any(pools.values()):
+        for package in PACKAGES:
+            if pools[package]:
+                yield pools[package].pop()
+
+
+def tests_of(path: str, checkout: Path) -> list[Path]:
+    """The tests beside a module: of its name if there are any, then of its folder or the nearest above."""
+    folder = (checkout / "tests" / path).parent
+    while not folder.is_dir():
+        folder = folder.parent
+    named = sorted(folder.rglob(f"test_{Path(path).stem}.py"))
+    return [*named, folder]
+
+
+class Copy:
+    """A copy of the package that is changed, tested and put right again."""
+
+    def __init__(self, folder: Path, checkout: Path) -> None:
+        self.source, self.kernels, self.checkout = folder / "src", folder / "kernels", checkout
+        self.sound: dict[Path, bool] = {}
+        shutil.copytree(SOURCE, self.source / "finssim", ignore=shutil.ignore_patterns("__pycache__"))
+
+    def failing(self, mutant: Mutant, text: str) -> Path | None:
+        """The tests that fail where a file has another text, of those that pass on the original."""
+        file = self.source / "finssim" / mutant.path
+        original = file.read_text(encoding="utf-8")
+        for tests in tests_of(mutant.path, self.checkout):
+            if tests not in self.sound:
+                self.sound[tests] = self._passes(tests)
+            if not self.sound[tests]:
+                continue
+            file.write_text(text, encoding="utf-8")
+            passed = self._passes(tests)
+            file.write_text(original, encoding="utf-8")
+            if not passed:
+                return tests
+        return None
+
+    def _passes(self, tests: Path) -> bool:
+        environment = os.environ | {
+            "PYTHONPATH": str(self.source),
+            "PYTHONDONTWRITEBYTECODE": "1",  # a change within a second would be taken for the original
+            "WARP_CACHE_PATH": str(self.kernels),
+        }
+        words = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", str(tests)]
+        try:
+            done = subprocess.run(
+                words, cwd=self.checkout, env=environment, capture_output=True, timeout=LONGEST, check=False
+            )
+        except subprocess.TimeoutExpired:
+            return False
+        return done.returncode in (0, 5)  # 5: no tests
+
+
+def changed(mutant: Mutant) -> str:
+    """The file's text with the change."""
+    lines = (SOURCE / mutant.path).read_text(encoding="utf-8").splitlines(keepends=True)
+    line = lines[mutant.line - 1]
+    before, after = line[: mutant.column], line[mutant.column + len(mutant.before) :]
+    lines[mutant.line - 1] = before + mutant.after + after
+    return "".join(lines)
+
+
+def refusing(mutant: Mutant) -> str:
+    """The file's text with an error at the beginning of the function that holds the change."""
+    text = (SOURCE / mutant.path).read_text(encoding="utf-8")
+    holders = [
+        n
+        for n in ast.walk(ast.parse(text))
+        if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef)
+        and n.lineno <= mutant.line <= (n.end_lineno or 0)
+    ]
+    first = max(holders, key=lambda n: n.lineno).body[0]
+    lines = text.splitlines(keepends=True)
+    lines.insert(first.lineno - 1, " " * first.col_offset + 'raise RuntimeError("called")\n')
+    return "".join(lines)
+
+
+def main() -> None:
+    """Print each change with what became of it, and the sum."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--count", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--checkout", type=Path, default=ROOT, help="where the tests are")
+    parser.add_argument("--list", action="store_true", help="only print the places")
+    given = parser.parse_args()
+    caught = counted = 0
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Copy(Path(folder), given.checkout.resolve())
+        for mutant in drawn(given.seed):
+            if counted == given.count:
+                break
+            name = f"{mutant.path}:{mutant.line}: {mutant.before} -> {mutant.after}"
+            if given.list:
+                counted += 1
+                print(name)
+                continue
+            tests = copy.failing(mutant, changed(mutant))
+            if tests is None and copy.failing(mutant, refusing(mutant)) is None:
+                print(f"not called {name}", flush=True)
+                continue
+            counted, caught = counted + 1, caught + (tests is not None)
+            by = f" by {tests.relative_to(copy.checkout)}" if tests else ""
+            print(f"{'caught' if tests else 'SURVIVED':10} {name}{by}", flush=True)
+    if not given.list:
+        print(f"{caught} of {counted} caught")
+
+
+if __name__ == "__main__":
+    main()
