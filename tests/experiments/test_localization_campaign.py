@@ -53,6 +53,15 @@ def test_the_campaign_is_the_published_one():
     assert campaign.calibrates.sum() == 85
 
 
+def test_the_camera_is_the_published_one():
+    """Every digit of its lens, and its height above the water."""
+    camera = published_pool().camera
+    assert (camera.lens.fx, camera.lens.fy) == (540.9305, 540.9305)
+    assert (camera.lens.cx, camera.lens.cy) == (682.2341, 348.6136)
+    assert camera.lens.distortion == (0.02944176, -0.05975546, 0.00088098, 0.00179148, 0.01256862)
+    assert camera.position[2] == 2.171935
+
+
 def errors_of(campaign):
     """What went wrong at each visit: survey (3), heading, roll and pitch as it lies, depth, roll and pitch as read."""
     rows = []
