@@ -198,7 +198,7 @@ def test_an_interrupted_training_leaves_a_policy(tmp_path):
         (["train", "t1", "--learner", "sb4"], "unknown learner 'sb4'; available: ppo"),
         (["train", "t1", "--learner", "torchrl-mappo"], "task 't1' has one agent"),
         (["train", "t1", "--set", "gamma=0.9"], "unknown setting 'gamma'"),
-        (["train", "t1", "--set", "epochs=many"], "setting epochs is 'many', expected int such as 5"),
+        (["train", "t1", "--set", "epochs=many"], "setting epochs is 'many', expected int such as 3"),
         (["train", "t1", "--set", "epochs"], "setting 'epochs': expected NAME=VALUE"),
         (["train", "t1", "--resume"], "nothing to resume"),
         (["train", "t1", "--worlds", "0"], "Invalid value for '--worlds'"),
