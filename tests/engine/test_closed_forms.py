@@ -113,7 +113,7 @@ def test_a_light_or_heavy_vehicle_rises_or_sinks_at_its_terminal_speed(name, mod
 
 
 @for_each(FOSSEN)
-@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+@pytest.mark.parametrize("integrator", ["midpoint", "rk4"])
 def test_each_axis_coasts_down_as_the_closed_solution(name, model, integrator):
     """m dv/dt = -(d1 + d2 |v|) v from v0 gives v = d1 v0 E / (d1 + d2 |v0| (1 - E)) with E = exp(-d1 t/m).
 

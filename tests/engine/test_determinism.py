@@ -14,11 +14,11 @@ WATER = Water(
     waves=(Wave(amplitude=0.02, wavelength=3.0), Wave(amplitude=0.01, wavelength=1.0, heading=1.0)),
 )
 CASES = [
-    ("calibrated", "euler", {}),
+    ("calibrated", "midpoint", {}),
     ("calibrated", "rk4", {}),
-    ("mesh", "euler", {}),
-    ("simplified", "euler", {}),
-    ("calibrated", "euler", {"pool": Pool(), "tether": TetherLine(wet_weight=0.1)}),
+    ("mesh", "midpoint", {}),
+    ("simplified", "midpoint", {}),
+    ("calibrated", "midpoint", {"pool": Pool(), "tether": TetherLine(wet_weight=0.1)}),
 ]
 EVERY_CASE = pytest.mark.parametrize(
     ("model", "integrator", "surroundings"),

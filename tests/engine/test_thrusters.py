@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.engine import Simulator, SimulatorError
-from reference.cases import load
+from reference.cases import load, weightless
 
 STEP = 0.1
 
@@ -39,7 +39,7 @@ def exact_lag(commands, delay, tau):
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.05, 0.1, 0.23])
-@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+@pytest.mark.parametrize("integrator", ["midpoint", "rk4"])
 def test_a_delayed_lag_is_exact_when_the_delay_fits_the_substeps(delay, integrator):
     """Sums of F (1 - exp(-(t - delay)/T)) over 30 random commands, to float32; delays of 0 to 23 substeps."""
     vehicle = motors(time_constant=0.12, delay=delay)
@@ -125,13 +125,38 @@ def test_a_gain_scales_what_is_delivered_and_zero_is_a_dead_thruster():
     assert simulator.numpy("thrust")[:, 0] == pytest.approx(2.0 * gain[:, 0], abs=1e-5)
 
 
+@pytest.mark.parametrize("substeps", [1, 4])
+def test_the_mean_thrust_of_a_step_is_exact(substeps):
+    """From rest: M nu = B ∫ F (1 - exp(-t/T)) dt, whatever the step, for motors faster and slower than it.
+
+    And for one that only slews, at 0.1 N/s from 0: ∫ 0.1 t dt. What 0.02 N turns and damps in 0.1 s is 1e-4 of it.
+    """
+    vehicle = weightless(load("finsrov").replace({"water.gravity": 1e-6}), "simplified")
+    chosen = int(np.argmax(np.abs(vehicle.thruster_matrix()[0])))
+    for T, slew, delivered in (
+        (0.01, 1e6, lambda t: 0.02 * (t + 0.01 * np.expm1(-t / 0.01))),
+        (0.4, 1e6, lambda t: 0.02 * (t + 0.4 * np.expm1(-t / 0.4))),
+        (1e-6, 0.1, lambda t: 0.05 * np.minimum(t, 0.2) ** 2),
+    ):
+        plain = {"dead_rpm_minus": 0.0, "dead_rpm_plus": 0.0, "delay": 0.0, "time_constant": T, "slew": slew}
+        driven = vehicle.replace({f"thrusters.*.{key}": value for key, value in plain.items()})
+        simulator = Simulator(driven, hydrodynamics="simplified", control_step=0.1, substeps=substeps)
+        simulator.place(position=(0.0, 0.0, -10.0))
+        force = np.zeros(8)
+        force[chosen] = 0.02
+        simulator.set_thrust(force)
+        simulator.step()
+        impulse = simulator.numpy("velocity")[0, 0].astype(float) @ driven.rigid_body_mass_matrix()[0]
+        assert impulse == pytest.approx(vehicle.thruster_matrix()[0, chosen] * delivered(0.1), rel=1e-3)
+
+
 def test_thrust_reaches_the_body_through_the_thruster_matrix():
-    """From rest, one Euler substep: M nu_dot = B f with each thruster alone, its motor following at once."""
-    vehicle = motors(time_constant=1e-6, delay=0.0).replace(
+    """From rest, in a step of 0.1 µs: M nu_dot = B f with each thruster alone, its motor following at once."""
+    vehicle = motors(time_constant=1e-9, delay=0.0, slew=1e12).replace(
         {"water.gravity": 1e-6}  # no weight, no buoyancy: only thrust
     )
     force = 2.0 * np.eye(8)
-    simulator = Simulator(vehicle, worlds=8, control_step=0.01, substeps=1)
+    simulator = Simulator(vehicle, worlds=8, control_step=1e-7, substeps=1)
     simulator.place(position=(0.0, 0.0, -10.0))
     simulator.set_thrust(force[:, None])
     simulator.step()

@@ -72,7 +72,7 @@ def test_accelerating_water_carries_a_neutral_body_along(water):
     r = np.array([0.0, 0.02, -0.08])
     zero = wp.vec3(0.0, 0.0, 0.0)
     found = water_acceleration_wrench(
-        mat66(*M_A.ravel().tolist()), wp.vec3(*r), wp.vec3(*water), wp.vec3(*a_c), zero, 12.0
+        mat66(*M_A.ravel().tolist()), wp.vec3(*r), wp.vec3(*water), wp.vec3(*a_c), wp.vec3(*a_c), zero, 12.0
     )
     M = rigid_body_mass(12.0, r, np.eye(3)) + M_A
     assert wide(found) == pytest.approx(M @ np.r_[a_c, 0.0, 0.0, 0.0], abs=1e-5)

@@ -93,6 +93,36 @@ def submersion(n, height):
     return 3.0 * s**2 - 2.0 * s**3
 
 
+DEEP = np.array([[0.0, 0.0, 1.0]]), np.array([-1e3])
+"""Normal and height of a water surface far above the body."""
+
+
+def growth_under_water(n, model, up, surface, height, height_b, nu_r, dt=1e-6):
+    """Rate of the share of the volume under water, by a central difference along the motion through the water [1/s].
+
+    Args:
+        n: From `numbers`.
+        model: calibrated, mesh or simplified.
+        up: World z axis in the body frame (N, 3).
+        surface: Normal of the water surface in the body frame (N, 3).
+        height: Of the body origin above that plane (N,).
+        height_b: Of the centre of buoyancy above the surface, straight up (N,).
+        nu_r: Relative to the water (N, 6).
+        dt: [s].
+    """
+
+    def share(t):
+        if model == "mesh":
+            turned = surface - t * np.cross(nu_r[:, 3:], surface)
+            moved = height + t * (surface * nu_r[:, :3]).sum(-1)
+            return displacement(n.corners, turned, moved)[0]
+        speed = (up * (nu_r[:, :3] + np.cross(nu_r[:, 3:], n.r_b))).sum(-1)
+        return submersion(n, height_b + t * speed)
+
+    whole = displacement(n.corners, *DEEP)[0] if model == "mesh" else 1.0
+    return (share(dt) - share(-dt)) / (2.0 * dt * whole)
+
+
 def acceleration(n, model, position, q, nu, tau, water=None, t=0.0, thrust=None):
     """nu_dot, and a bound of what it is a sum of, for rounding.
 
@@ -115,19 +145,22 @@ def acceleration(n, model, position, q, nu, tau, water=None, t=0.0, thrust=None)
     up = R[..., 2, :]
     N = len(nu)
     elevation, surface, height = np.zeros(N), up, position[:, 2]
-    v_c, a_c, G_b = np.zeros((N, 3)), np.zeros((N, 3)), np.zeros((N, 3, 3))
+    v_c, a_x, a_c, G_b = np.zeros((N, 3)), np.zeros((N, 3)), np.zeros((N, 3)), np.zeros((N, 3, 3))
     if water is not None:
         around = flow(water, n.gravity, position, t)
         elevation, surface = around.elevation, times(Rt, around.normal)
         height = around.normal[:, 2] * (position[:, 2] - elevation)
-        v_c, a_c = times(Rt, around.velocity), times(Rt, around.acceleration)
+        v_c, local = times(Rt, around.velocity), around.acceleration
+        # Rate of the water's velocity as the body passes, and as the water itself goes.
+        a_x = times(Rt, local + times(around.gradient, times(R, nu[:, :3])))
+        a_c = times(Rt, local + times(around.gradient, around.velocity))
         G_b = Rt @ around.gradient @ R
     nu_r = nu - np.concatenate([v_c, np.zeros((N, 3))], -1)
     omega = nu[:, 3:]
 
     terms = [tau, wrench_of_force(n.r_g, -n.mass * n.gravity * up)]
     if model == "mesh":
-        whole = displacement(n.corners, np.array([[0.0, 0.0, 1.0]]), np.array([-1e3]))
+        whole = displacement(n.corners, *DEEP)
         volume, center = displacement(n.corners, surface, height)
         wet = volume / whole[0]
         displaced = n.density * n.volume * wet
@@ -143,34 +176,44 @@ def acceleration(n, model, position, q, nu, tau, water=None, t=0.0, thrust=None)
     terms.append(-times(rigid_body_coriolis(n.mass, n.r_g, n.inertia_g, nu), nu))
     sizes = [coriolis_size(n.M_RB, nu), size_D]
     if model != "simplified":
-        v_c_dot = a_c - times(skew(omega), v_c)  # in the turning body frame
+        v_c_dot = a_x - times(skew(omega), v_c)  # in the turning body frame
+        height_b = position[:, 2] + up @ n.r_b - elevation
+        growth = np.maximum(growth_under_water(n, model, up, surface, height, height_b, nu_r), 0.0)
         terms += [
-            -times(added_mass_coriolis(n.M_A, nu_r), nu_r),
-            times(n.M_A, np.concatenate([v_c_dot, np.zeros((N, 3))], -1)),
+            -wet[:, None] * times(added_mass_coriolis(n.M_A, nu_r), nu_r),
+            wet[:, None] * times(n.M_A, np.concatenate([v_c_dot, np.zeros((N, 3))], -1)),
             wrench_of_force(n.r_b, displaced[:, None] * a_c),
+            -growth[:, None] * times(n.M_A, nu_r),
         ]
         sizes.append(coriolis_size(n.M_A, np.abs(nu_r) + np.abs(nu)))
+    if thrust is not None:
+        sizes.append(np.abs(thrust))  # the engine adds and takes off what submerged thrusters would do
     total = sum(terms) + tau_D
     size = sum(np.abs(x) for x in terms) + sum(sizes)
-    M = n.M_RB + n.M_A
+    M = n.M_RB + wet[:, None, None] * n.M_A
     M_inv = np.linalg.inv(M)
     A = np.abs(M_inv)
-    return total @ M_inv.T, size @ (A @ np.abs(M) @ A).T
+    return times(M_inv, total), times(A @ np.abs(M) @ A, size)
 
 
 def energy(n, model, position, q, nu):
     """Kinetic energy of body and added mass, potential energy of weight and buoyancy, in still water (N,) [J].
 
-    T + m g z_g + U_b with U_b the work against buoyancy: -ρ g ∫ z dV over the wet hull, or of the faded volume
-    -ρ g V ∫ s dz; a hull whose centroid is not the centre of buoyancy is shifted by the difference, if it is submerged.
+    T + m g z_g + U_b, with T = ½ nuᵀ (M_RB + s M_A) nu of the wet share s, and U_b the work against buoyancy:
+    -ρ g ∫ z dV over the wet hull, or of the faded volume -ρ g V ∫ s dz; a hull whose centroid is not the centre of
+    buoyancy is shifted by the difference, if it is submerged.
     """
     R = rotation(q)
     up = R[..., 2, :]
-    kinetic = 0.5 * np.einsum("ni,ij,nj->n", nu, n.M_RB + n.M_A, nu)
+    if model == "mesh":
+        wet = displacement(n.corners, up, position[:, 2])[0] / displacement(n.corners, *DEEP)[0]
+    else:
+        wet = submersion(n, position[:, 2] + up @ n.r_b)
+    kinetic = 0.5 * np.einsum("ni,nij,nj->n", nu, n.M_RB + wet[:, None, None] * n.M_A, nu)
     weight = n.mass * n.gravity * (position[:, 2] + up @ n.r_g)
     full = n.density * n.gravity * n.volume
     if model == "mesh":
-        whole = displacement(n.corners, np.array([[0.0, 0.0, 1.0]]), np.array([-1e3]))
+        whole = displacement(n.corners, *DEEP)
         volume, center = displacement(n.corners, up, position[:, 2])
         height = position[:, 2] + np.einsum("ni,ni->n", up, center) + up @ (n.r_b - whole[1][0])
         return kinetic, weight, -full * volume / whole[0] * height

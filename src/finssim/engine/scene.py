@@ -120,7 +120,7 @@ class Scene:
         self.data = self._mujoco.MjData(self.model)
         self._find_vehicles()
         self._painter: Painter | None = None
-        names = ("position", "quaternion", "velocity", "acceleration")
+        names = ("position", "quaternion", "velocity", "acceleration", "pressed")
         self._views = {name: self._simulator.numpy(name)[0] for name in names}
         self.place(side_by_side(self.vehicles, depth=0.5 * pool.depth if pool else 1.0))
 
@@ -184,18 +184,22 @@ class Scene:
         if self._broken:
             self._refuse()
         mj.mj_step1(m, d)
-        self._simulator.step()
         q, nu = self._attitude_and_twist()
+        before = self._views["velocity"].astype(float)
+        self._simulator.step()
+        nu_dot = (self._views["velocity"] - before) / m.opt.timestep
         M = mujoco_inertia(self._inertia, q)
         d.M[self._M_index] = M[:, self._tril[0], self._tril[1]]
         mj.mj_factorM(m, d)
-        qacc = mujoco_acceleration(self._views["acceleration"], nu, q)
+        qacc = mujoco_acceleration(nu_dot, nu, q)
         # Bias and passive forces hold MuJoCo's own weight and Coriolis force of its stand-in body: ours are in nu_dot.
         own = d.qfrc_bias[dofs] - d.qfrc_passive[dofs]
         d.qfrc_applied[dofs] = (M @ qacc[..., None])[..., 0] + own
         mj.mj_step2(m, d)
         self._touch[0] += wrench_from_mujoco(d.qfrc_constraint[dofs], q) / self.substeps
-        self._views["acceleration"][:] = acceleration_from_mujoco(d.qacc[dofs], nu, q)
+        self._views["acceleration"][:] += acceleration_from_mujoco(d.qacc[dofs], nu, q) - nu_dot
+        # Contacts may stop what the simulator sees falling: its next forces are those at the twist that MuJoCo gives.
+        self._views["pressed"][:] = -nu_dot
         self._views["position"][:] = d.qpos[self._qpos[:, :3]]
         self._views["quaternion"][:], self._views["velocity"][:] = self._attitude_and_twist()
         whole = np.isfinite(d.qpos).all() and np.isfinite(d.qvel).all()
@@ -222,7 +226,7 @@ class Scene:
     def numpy(self, name: str) -> NDArray[Any]:
         """A field of `state` as NumPy, (1, vehicles, ...): a view; see `Simulator.numpy`.
 
-        `acceleration` is nu_dot of the last physics step, contacts included.
+        `acceleration` is nu_dot, with the mean of the last physics step where contacts act.
         """
         return self._simulator.numpy(name)
 

@@ -27,7 +27,7 @@ from finssim.physics.tether import Tether
 from finssim.physics.water import advance_drift
 from finssim.vehicles import Vehicle, load_vehicle
 
-INTEGRATORS = ("euler", "rk4")
+INTEGRATORS = ("midpoint", "rk4")
 
 
 class Simulator:
@@ -49,8 +49,8 @@ class Simulator:
         worlds: int = 1,
         hydrodynamics: str = "calibrated",
         control_step: float = 0.1,
-        substeps: int = 10,
-        integrator: str = "euler",
+        substeps: int = 4,
+        integrator: str = "midpoint",
         water: Water | None = None,
         pool: Pool | None = None,
         tether: TetherLine | None = None,
@@ -71,7 +71,7 @@ class Simulator:
             hydrodynamics: Key of `HYDRODYNAMICS`: calibrated, mesh or simplified.
             control_step: Time between commands [s].
             substeps: Physics steps in a control step.
-            integrator: `euler` (semi-implicit) or `rk4`.
+            integrator: `midpoint` or `rk4`; both are of order 2 for vehicles whose thrusters lag.
             water: Currents and waves; still water if None.
             pool: Walls and floor; open water if None.
             tether: On every vehicle; none if None.

@@ -18,7 +18,11 @@ class VehicleState:
     position: wp.vec3  # body origin, world frame [m]
     quaternion: wp.quat  # body to world, xyzw
     velocity: vec6  # nu, body frame [m/s, rad/s]
-    acceleration: vec6  # nu_dot of the last substep
+    acceleration: vec6  # nu_dot in this state, body frame [m/s², rad/s²]
+    coasting: (
+        vec6  # mean nu_dot of the last substep without thrust and contacts: what the next one extrapolates
+    )
+    pressed: vec6  # mean nu_dot of the last substep by contacts
     actuator: vec8  # lagged force [N] or propeller speed [rad/s]
     thrust: vec8  # delivered by each thruster [N]
 
@@ -27,11 +31,13 @@ class VehicleState:
 class State:
     """Views of the vehicles' states by (world, vehicle); clocks and status by world; delay line and history."""
 
-    vehicle: wp.array2d(dtype=VehicleState)  # the memory behind the six views that follow
+    vehicle: wp.array2d(dtype=VehicleState)  # the memory behind the eight views that follow
     position: wp.array2d(dtype=wp.vec3)  # body origin, world frame [m]
     quaternion: wp.array2d(dtype=wp.quat)  # body to world, xyzw
     velocity: wp.array2d(dtype=vec6)  # nu, body frame [m/s, rad/s]
-    acceleration: wp.array2d(dtype=vec6)  # nu_dot of the last substep
+    acceleration: wp.array2d(dtype=vec6)  # nu_dot in this state, body frame [m/s², rad/s²]
+    coasting: wp.array2d(dtype=vec6)  # mean nu_dot of the last substep without thrust and contacts
+    pressed: wp.array2d(dtype=vec6)  # mean nu_dot of the last substep by contacts
     actuator: wp.array2d(dtype=vec8)  # lagged force [N] or propeller speed [rad/s]
     thrust: wp.array2d(dtype=vec8)  # delivered by each thruster [N]
     commands: wp.array3d(dtype=vec8)  # delay line: past commands, a ring over control steps
@@ -71,6 +77,8 @@ def clear_actuators(state: State, mask: wp.array(dtype=int), world_offset: int):
         return
     for v in range(state.position.shape[1]):
         state.acceleration[w, v] = vec6()
+        state.coasting[w, v] = vec6()
+        state.pressed[w, v] = vec6()
         state.actuator[w, v] = vec8()
         state.thrust[w, v] = vec8()
         for k in range(state.commands.shape[2]):

@@ -5,16 +5,31 @@ from functools import cache
 import warp as wp
 
 from finssim.engine.actuation import delayed_command, delivered_thrust, lag_target
+from finssim.engine.midpoint import (
+    DOCK_STEP,
+    WALL_STEP,
+    Motion,
+    Touch,
+    lead_of,
+    relaxation_of,
+    relaxed,
+    yielding,
+)
 from finssim.engine.state import HISTORY, State, VehicleState, is_finite, snapshot, vec13
-from finssim.physics.contact import PoolWalls, contact_wrench
+from finssim.physics.contact import PoolWalls, contact_wrench, walls_within
 from finssim.physics.damping import surge_coupled_wrench, twist_at, wrench_from
-from finssim.physics.funnel import Funnel, funnel_wrench
+from finssim.physics.funnel import Funnel, funnel_within, funnel_wrench
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
-from finssim.physics.hydrodynamics.mesh import HullMesh
-from finssim.physics.inertia import coriolis_wrench, rigid_body_momentum, water_acceleration_wrench
+from finssim.physics.hydrodynamics.mesh import HullMesh, drag_slope
+from finssim.physics.inertia import (
+    coriolis_wrench,
+    rigid_body_momentum,
+    solve_spd,
+    water_acceleration_wrench,
+)
 from finssim.physics.kinematics import position_rate, quaternion_rate, rotate_by, up_in_body
 from finssim.physics.motors import admissible, first_order
-from finssim.physics.plant import VehicleCommand, VehicleParameters
+from finssim.physics.plant import VehicleCommand, VehicleParameters, mass_matrix
 from finssim.physics.tether import Tether, tether_wrench
 from finssim.physics.types import angular, join, linear, symmetric_times, vec6, vec8
 from finssim.physics.water import Flow, WaterArrays, flow_at
@@ -41,7 +56,7 @@ def physics_kernel(
 
     Args:
         model: A key of `HYDRODYNAMICS`.
-        integrator: `euler` (semi-implicit: velocity first, then pose with the new velocity) or `rk4`.
+        integrator: `midpoint` (see `finssim.engine.midpoint`) or `rk4`.
         water_moving: Whether there are currents or waves.
         walls_present: Whether there is a pool to bump into.
         tether_present: Whether there is a tether.
@@ -55,6 +70,8 @@ def physics_kernel(
     hydrodynamic_wrench = HYDRODYNAMICS[model]
     runge_kutta = integrator == "rk4"
     added_mass = model != "simplified"
+    contacts = walls_present or funnel_present
+    contact_step = DOCK_STEP if funnel_present else WALL_STEP
 
     @wp.func
     def thrust_of(plant: wp.array2d(dtype=VehicleParameters), w: int, v: int, actuator: vec8) -> vec8:
@@ -63,67 +80,119 @@ def physics_kernel(
         return wp.cw_mul(plant[w, v].gain, actuator)
 
     @wp.func
-    def nu_dot_of(
+    def motion_at(
         plant: wp.array2d(dtype=VehicleParameters),
         hull: HullMesh,
         water: WaterArrays,
-        walls: PoolWalls,
         tether: wp.array2d(dtype=Tether),
+        w: int,
+        v: int,
+        position: wp.vec3,
+        q: wp.quat,
+        nu: vec6,
+        nu_start: vec6,
+        thrust: vec8,
+        pushed: vec6,
+        tau_other: vec6,
+        t: float,
+        t_step: float,
+        h: float,
+    ) -> Motion:
+        """Acceleration from the equation of motion, with nu_r = nu - [v_c; 0] and the water's v_c in the body frame.
+
+        (M_RB + s M_A) nu_dot = tau_model + s tau_thrust + tau_other - C_RB(nu) nu - s C_A(nu_r) nu_r
+                                + s M_A d(nu_c)/dt + tau_FK - [s_dot]_+ M_A nu_r
+
+        Solved with M_RB + s M_A together: as an applied force, added mass diverges once M_A exceeds M_RB. Both Coriolis
+        terms share ω, so C_RB(nu) nu + s C_A(nu_r) nu_r is that of the summed momentum less [0; v_c × p_A].
+
+        Propellers push, and water moves along, in proportion to the wet part s of the vehicle. Where s grows, momentum
+        is shared with more water (von Kármán 1929); where it falls, the water keeps what it has: neither adds energy.
+        That term is taken at the middle of a substep h that starts with nu_start, implicitly: M_A sets no limit to h.
+        """
+        out = Motion()
+        up = up_in_body(q)
+        momentum = rigid_body_momentum(plant[w, v].mass, plant[w, v].r_g, plant[w, v].inertia, nu)
+        flow = Flow()
+        nu_r = nu
+        water_b = wp.vec3(0.0)
+        if wp.static(water_moving):
+            flow = flow_at(water, w, position, t, t_step)
+            water_b = wp.quat_rotate_inv(q, flow.velocity)
+            if wp.static(added_mass):
+                nu_r = nu - join(water_b, wp.vec3(0.0))
+        else:
+            flow.normal = wp.vec3(0.0, 0.0, 1.0)
+        wet = hydrodynamic_wrench(plant, hull, water, w, v, position, q, up, nu, nu_r, flow)
+        tau = tau_other + wet.tau
+        if wp.static(added_mass):
+            momentum_A = wet.wet * symmetric_times(plant[w, v].M_A, nu_r)
+            momentum += momentum_A
+            if wp.static(water_moving):
+                tau += join(wp.vec3(0.0), wp.cross(water_b, linear(momentum_A)))
+                passing = flow.acceleration + flow.gradient * position_rate(q, nu)
+                flowing = flow.acceleration + flow.gradient * flow.velocity
+                tau += water_acceleration_wrench(
+                    wet.wet * plant[w, v].M_A, plant[w, v].r_b, water_b, wp.quat_rotate_inv(q, passing),
+                    wp.quat_rotate_inv(q, flowing), angular(nu), wet.displaced,
+                )  # fmt: skip
+        if wp.static(surge_coupled):
+            r_h = plant[w, v].r_h
+            nu_h = twist_at(nu_r, r_h)
+            tau += wet.wet * wrench_from(surge_coupled_wrench(nu_h, plant[w, v].Du), r_h)
+        if wp.static(tether_present):
+            tau += tether_wrench(tether[w, v], water.density, position, q, nu, flow.velocity)
+        tau -= coriolis_wrench(momentum, nu)
+        # The drag of the wet faces of a mesh is all there before much of its volume is wet.
+        damped = wet.wet
+        if wp.static(model == "mesh"):
+            damped = wp.where(wet.wet > 0.0, 1.0, 0.0)
+        share = vec6(damped, damped, damped, damped, damped, damped)
+        if wp.static(added_mass):
+            if wet.wet == 1.0 and wet.wet_rate <= 0.0:
+                out.nu_dot = symmetric_times(plant[w, v].M_inv, tau) + pushed
+            else:
+                s_dot = wp.max(wet.wet_rate, 0.0)
+                tau += wet.wet * (plant[w, v].B * thrust)
+                tau -= s_dot * symmetric_times(plant[w, v].M_A, nu_start - join(water_b, wp.vec3(0.0)))
+                s = wet.wet + 0.5 * h * s_dot
+                M = mass_matrix(plant[w, v].mass, plant[w, v].r_g, plant[w, v].inertia, s * plant[w, v].M_A)
+                out.nu_dot = solve_spd(M, tau)
+                dry = wp.cw_div(wp.get_diag(plant[w, v].M_A), wp.get_diag(M))
+                share = damped * (vec6(1.0, 1.0, 1.0, 1.0, 1.0, 1.0) + (1.0 - s) * dry)
+        else:
+            out.nu_dot = symmetric_times(plant[w, v].M_inv, tau) + wet.wet * pushed
+        out.wet = wet.wet
+        if wp.static(not runge_kutta):
+            if wp.static(model == "mesh"):
+                slope = drag_slope(
+                    hull, plant[w, v].hull, nu_r, water.density, plant[w, v].form_drag, plant[w, v].skin_drag
+                )
+                out.relaxation = wp.cw_mul(share, wp.cw_mul(plant[w, v].relax, slope))
+            else:
+                out.relaxation = wp.cw_mul(share, relaxation_of(plant, w, v, nu_r))
+        return out
+
+    @wp.func
+    def contact_at(
+        plant: wp.array2d(dtype=VehicleParameters),
+        walls: PoolWalls,
         funnel: Funnel,
         w: int,
         v: int,
         position: wp.vec3,
         q: wp.quat,
         nu: vec6,
-        tau_thrust: vec6,
-        tau_other: vec6,
-        t: float,
-        t_step: float,
-    ) -> vec6:
-        """Acceleration from the equation of motion, with nu_r = nu - [v_c; 0] and the water's v_c in the body frame.
-
-        (M_RB + M_A) nu_dot = tau_model + wet tau_thrust + tau_other - C_RB(nu) nu - C_A(nu_r) nu_r
-                              + M_A d(nu_c)/dt + tau_FK
-
-        Solved with M_RB + M_A together: as an applied force, added mass diverges once M_A exceeds M_RB. Both Coriolis
-        terms share ω, so C_RB(nu) nu + C_A(nu_r) nu_r is that of the summed momentum less [0; v_c × p_A]. Propellers
-        push in proportion to the part of the vehicle that is wet: in the air they have nothing to push against.
-        """
-        up = up_in_body(q)
-        momentum = rigid_body_momentum(plant[w, v].mass, plant[w, v].r_g, plant[w, v].inertia, nu)
-        tau = tau_other
-        flow = Flow()
-        nu_r = nu
-        if wp.static(water_moving):
-            flow = flow_at(water, w, position, t, t_step)
-            water_b = wp.quat_rotate_inv(q, flow.velocity)
-            if wp.static(added_mass):
-                nu_r = nu - join(water_b, wp.vec3(0.0))
-            momentum_A = symmetric_times(plant[w, v].M_A, nu_r)
-            wet = hydrodynamic_wrench(plant, hull, water, w, v, position, q, up, nu, nu_r, flow)
-            a_b = wp.quat_rotate_inv(q, flow.acceleration)
-            tau += wet.tau + wet.wet * tau_thrust + join(wp.vec3(0.0), wp.cross(water_b, linear(momentum_A)))
-            tau += water_acceleration_wrench(
-                plant[w, v].M_A, plant[w, v].r_b, water_b, a_b, angular(nu), wet.displaced
-            )
-            momentum += momentum_A
-        else:
-            flow.normal = wp.vec3(0.0, 0.0, 1.0)
-            wet = hydrodynamic_wrench(plant, hull, water, w, v, position, q, up, nu, nu, flow)
-            tau += wet.tau + wet.wet * tau_thrust
-            if wp.static(added_mass):
-                momentum += symmetric_times(plant[w, v].M_A, nu)
-        if wp.static(surge_coupled):
-            r_h = plant[w, v].r_h
-            nu_h = twist_at(nu_r, r_h)
-            tau += wet.wet * wrench_from(surge_coupled_wrench(nu_h, plant[w, v].Du), r_h)
+    ) -> Touch:
+        """Wrench of walls and dock, and the size of the dock's force."""
+        out = Touch()
         if wp.static(walls_present):
-            tau += contact_wrench(walls, position, q, nu, plant[w, v].half_size)
-        if wp.static(funnel_present and runge_kutta):
-            tau += funnel_wrench(funnel, w, position, q, nu, plant[w, v].half_size)
-        if wp.static(tether_present):
-            tau += tether_wrench(tether[w, v], water.density, position, q, nu, flow.velocity)
-        return symmetric_times(plant[w, v].M_inv, tau - coriolis_wrench(momentum, nu))
+            out.tau = contact_wrench(walls, position, q, nu, plant[w, v].half_size)
+        if wp.static(funnel_present):
+            tau = funnel_wrench(funnel, w, position, q, nu, plant[w, v].half_size)
+            out.push = wp.length(linear(tau))
+            out.tau += tau
+        return out
 
     @wp.kernel(enable_backward=False, module="unique", module_options=MODULE_OPTIONS)
     def physics_step(
@@ -156,8 +225,6 @@ def physics_kernel(
         nu = state[w, v].velocity
         actuator = state[w, v].actuator
         other = command[w, v].disturbance
-        nu_dot = vec6()
-        thrust = vec8()
         if not is_finite(wp.vec3(0.0), wp.quat_identity(), command[w, v].disturbance) or not wp.isfinite(
             wp.dot(command[w, v].thrust, command[w, v].thrust)
         ):
@@ -178,64 +245,151 @@ def physics_kernel(
         max_change = h * plant[w, v].slew
         greatest = float(0.0)
         impulse = float(0.0)
-        for k in range(substeps):
-            elapsed = float(k) * h
+        coasting = state[w, v].coasting
+        jerk = vec6()
+        pressed = state[w, v].pressed
+        x_dot = position_rate(q, nu)
+        first = int(0)
+        if wp.static(not runge_kutta):
+            # The first substep of an episode has nothing to extrapolate: it is taken twice, and -1 only looks ahead.
+            first = wp.where(step == 0, -1, 0)
+        for k in range(first, substeps):
+            committed = wp.where(k < 0, 0.0, 1.0)
+            step_h = committed * h
+            elapsed = float(wp.max(k, 0)) * h
             t = float(step) * control_step + elapsed
             target = delayed_command(commands, w, v, head, elapsed, plant[w, v].delay, h, rate)
-            before = thrust_of(plant, w, v, actuator)
-            actuator = first_order(actuator, target, plant[w, v].alpha, max_change)
-            thrust = thrust_of(plant, w, v, actuator)
-            outer = other
-            if wp.static(funnel_present):
-                contact = funnel_wrench(funnel, w, position, q, nu, plant[w, v].half_size)
-                push = wp.length(linear(contact))
-                greatest = wp.max(greatest, push)
-                impulse += h * push
-                if wp.static(not runge_kutta):
-                    outer = other + contact
+            mean = first_order(actuator, target, plant[w, v].beta, 0.5 * max_change)
+            after = first_order(actuator, target, plant[w, v].alpha, max_change)
+            thrust = thrust_of(plant, w, v, mean)
+            pushed = plant[w, v].G * thrust
             if wp.static(runge_kutta):
-                tau = plant[w, v].B * (0.5 * (before + thrust))
-                x1 = position_rate(q, nu)
-                q1 = quaternion_rate(q, wp.vec3(nu[3], nu[4], nu[5]))
-                n1 = nu_dot_of(
-                    plant, hull, water, walls, tether, funnel, w, v, position, q, nu, tau, other, t, elapsed
-                )
+                outer = other
+                actuator = after
+                if wp.static(contacts):
+                    touch = contact_at(plant, walls, funnel, w, v, position, q, nu)
+                    greatest = wp.max(greatest, touch.push)
+                    impulse += h * touch.push
+                    outer = other + touch.tau
+                q1 = quaternion_rate(q, angular(nu))
+                n1 = motion_at(
+                    plant,
+                    hull,
+                    water,
+                    tether,
+                    w,
+                    v,
+                    position,
+                    q,
+                    nu,
+                    nu,
+                    thrust,
+                    pushed,
+                    outer,
+                    t,
+                    elapsed,
+                    0.0,
+                ).nu_dot
                 nu2 = nu + 0.5 * h * n1
                 qm = wp.normalize(q + 0.5 * h * q1)
+                xm = position + 0.5 * h * x_dot
                 x2 = position_rate(qm, nu2)
-                q2 = quaternion_rate(qm, wp.vec3(nu2[3], nu2[4], nu2[5]))
-                n2 = nu_dot_of(
-                    plant, hull, water, walls, tether, funnel, w, v, position + 0.5 * h * x1, qm, nu2, tau, other,
-                    t + 0.5 * h, elapsed + 0.5 * h,
-                )  # fmt: skip
+                q2 = quaternion_rate(qm, angular(nu2))
+                if wp.static(contacts):
+                    outer = other + contact_at(plant, walls, funnel, w, v, xm, qm, nu2).tau
+                n2 = motion_at(
+                    plant, hull, water, tether, w, v, xm, qm, nu2, nu2, thrust, pushed, outer, t + 0.5 * h,
+                    elapsed + 0.5 * h, 0.0,
+                ).nu_dot  # fmt: skip
                 nu3 = nu + 0.5 * h * n2
                 qn = wp.normalize(q + 0.5 * h * q2)
+                xn = position + 0.5 * h * x2
                 x3 = position_rate(qn, nu3)
-                q3 = quaternion_rate(qn, wp.vec3(nu3[3], nu3[4], nu3[5]))
-                n3 = nu_dot_of(
-                    plant, hull, water, walls, tether, funnel, w, v, position + 0.5 * h * x2, qn, nu3, tau, other,
-                    t + 0.5 * h, elapsed + 0.5 * h,
-                )  # fmt: skip
+                q3 = quaternion_rate(qn, angular(nu3))
+                if wp.static(contacts):
+                    outer = other + contact_at(plant, walls, funnel, w, v, xn, qn, nu3).tau
+                n3 = motion_at(
+                    plant, hull, water, tether, w, v, xn, qn, nu3, nu3, thrust, pushed, outer, t + 0.5 * h,
+                    elapsed + 0.5 * h, 0.0,
+                ).nu_dot  # fmt: skip
                 nu4 = nu + h * n3
                 qe = wp.normalize(q + h * q3)
+                xe = position + h * x3
                 x4 = position_rate(qe, nu4)
-                q4 = quaternion_rate(qe, wp.vec3(nu4[3], nu4[4], nu4[5]))
-                n4 = nu_dot_of(
-                    plant, hull, water, walls, tether, funnel, w, v, position + h * x3, qe, nu4, tau, other, t + h,
+                q4 = quaternion_rate(qe, angular(nu4))
+                if wp.static(contacts):
+                    outer = other + contact_at(plant, walls, funnel, w, v, xe, qe, nu4).tau
+                n4 = motion_at(
+                    plant,
+                    hull,
+                    water,
+                    tether,
+                    w,
+                    v,
+                    xe,
+                    qe,
+                    nu4,
+                    nu4,
+                    thrust,
+                    pushed,
+                    outer,
+                    t + h,
                     elapsed + h,
-                )  # fmt: skip
-                nu_dot = (n1 + 2.0 * n2 + 2.0 * n3 + n4) / 6.0
-                position = position + (h / 6.0) * (x1 + 2.0 * x2 + 2.0 * x3 + x4)
+                    0.0,
+                ).nu_dot
+                position = position + (h / 6.0) * (x_dot + 2.0 * x2 + 2.0 * x3 + x4)
                 q = wp.normalize(q + (h / 6.0) * (q1 + 2.0 * q2 + 2.0 * q3 + q4))
-                nu = nu + h * nu_dot
+                nu = nu + (h / 6.0) * (n1 + 2.0 * n2 + 2.0 * n3 + n4)
+                x_dot = position_rate(q, nu)
+                coasting = n4 - pushed
             else:
-                tau = plant[w, v].B * thrust
-                nu_dot = nu_dot_of(
-                    plant, hull, water, walls, tether, funnel, w, v, position, q, nu, tau, outer, t, elapsed
-                )
-                nu = nu + h * nu_dot
-                position = position + h * position_rate(q, nu)
-                q = rotate_by(q, wp.vec3(nu[3], nu[4], nu[5]), h)
+                guess = coasting + pushed
+                near = bool(False)
+                if wp.static(contacts):
+                    half_size = plant[w, v].half_size
+                    turn = wp.length(angular(nu)) + h * wp.length(angular(guess))
+                    slack = wp.length(linear(nu)) + h * wp.length(linear(guess)) + turn * wp.length(half_size)
+                    if wp.static(walls_present):
+                        near = walls_within(walls, position, q, half_size, h * slack)
+                    if wp.static(funnel_present):
+                        near = near or funnel_within(funnel, w, position, half_size, h * slack)
+                # What leans on a wall does not fall through it, and the water must not feel that it did.
+                nu_middle = nu + h * lead_of(nu, h) * (guess + pressed)
+                x_middle = position + 0.5 * h * x_dot
+                q_middle = q + 0.5 * h * quaternion_rate(q, angular(nu))
+                motion = motion_at(
+                    plant, hull, water, tether, w, v, x_middle, q_middle, nu_middle, nu, thrust, pushed, other,
+                    t + 0.5 * h, elapsed + 0.5 * h, h,
+                )  # fmt: skip
+                nu_dot = relaxed(motion.nu_dot, guess, motion.relaxation, plant[w, v].r_m)
+                jerk = nu_dot - guess
+                coasting = nu_dot - pushed
+                if k >= 0:
+                    actuator = after
+                    pressed = vec6()
+                if k < 0 or not near:
+                    nu_new = nu + step_h * nu_dot
+                    q = rotate_by(q, 0.5 * (angular(nu) + angular(nu_new)), step_h)
+                    nu = nu_new
+                    position = position + 0.5 * step_h * x_dot
+                    x_dot = position_rate(q, nu)
+                    position = position + 0.5 * step_h * x_dot
+                else:
+                    if wp.static(contacts):
+                        parts = int(wp.ceil(h / wp.static(contact_step) - 1.0e-4))
+                        d = h / float(parts)
+                        for _ in range(parts):
+                            position = position + 0.5 * d * x_dot
+                            q = rotate_by(q, angular(nu), 0.5 * d)
+                            touch = contact_at(plant, walls, funnel, w, v, position, q, nu)
+                            greatest = wp.max(greatest, touch.push)
+                            impulse += d * touch.push
+                            push = yielding(plant, w, v, motion.wet, touch.tau)
+                            pressed += push / float(parts)
+                            nu = nu + d * (nu_dot + push)
+                            q = rotate_by(q, angular(nu), 0.5 * d)
+                            x_dot = position_rate(q, nu)
+                            position = position + 0.5 * d * x_dot
         q = wp.normalize(q)
         history[step % wp.static(HISTORY), w, v] = snapshot(position, q, nu)
         if not is_finite(position, q, nu):
@@ -244,9 +398,12 @@ def physics_kernel(
         state[w, v].position = position
         state[w, v].quaternion = q
         state[w, v].velocity = nu
-        state[w, v].acceleration = nu_dot
+        delivered = thrust_of(plant, w, v, actuator)
+        state[w, v].acceleration = coasting + 0.5 * jerk + pressed + plant[w, v].G * delivered
+        state[w, v].coasting = coasting
+        state[w, v].pressed = pressed
         state[w, v].actuator = actuator
-        state[w, v].thrust = thrust
+        state[w, v].thrust = delivered
         if wp.static(funnel_present):
             funnel.force[w, v] = greatest
             funnel.impulse[w, v] = impulse

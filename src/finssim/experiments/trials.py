@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 DURATION = 60.0
 """Length of a trial [s]."""
 
-PHYSICS_STEP = 0.01
+PHYSICS_STEP = 0.025
 """Longest physics step [s]."""
 
 

@@ -63,6 +63,35 @@ def wall_force(penetration: float, v: wp.vec3, n: wp.vec3, walls: PoolWalls) -> 
 
 
 @wp.func
+def walls_within(walls: PoolWalls, position: wp.vec3, q: wp.quat, half_size: wp.vec3, reach: float) -> bool:
+    """Whether a wall or the floor is nearer to the vehicle's envelope box than `reach`.
+
+    Args:
+        walls: The pool.
+        position: Body origin, world frame [m].
+        q: Attitude, body to world.
+        half_size: Half extents of the envelope about the body origin, body axes [m].
+        reach: [m]; 0 asks whether it touches.
+    """
+    if walls.present == 0:
+        return False
+    gap = wp.min(walls.half_length - wp.abs(position[0]), walls.half_width - wp.abs(position[1]))
+    gap = wp.min(gap, position[2] + walls.depth) - reach
+    if gap > 0.0 and gap * gap > wp.dot(half_size, half_size):
+        return False
+    # Half extents of the turned box along the world's axes: most vehicles near a wall still do not touch it.
+    R = wp.quat_to_matrix(q)
+    extent = wp.vec3(
+        wp.dot(wp.abs(R[0]), half_size), wp.dot(wp.abs(R[1]), half_size), wp.dot(wp.abs(R[2]), half_size)
+    )
+    return (
+        wp.abs(position[0]) + extent[0] + reach > walls.half_length
+        or wp.abs(position[1]) + extent[1] + reach > walls.half_width
+        or position[2] - extent[2] - reach < -walls.depth
+    )
+
+
+@wp.func
 def contact_wrench(walls: PoolWalls, position: wp.vec3, q: wp.quat, nu: vec6, half_size: wp.vec3) -> vec6:
     """Wrench of walls and floor on the eight corners of the vehicle's envelope box.
 
@@ -77,23 +106,9 @@ def contact_wrench(walls: PoolWalls, position: wp.vec3, q: wp.quat, nu: vec6, ha
         Wrench about the body origin, body frame [N, N m].
     """
     tau = vec6()
-    if walls.present == 0:
+    if not walls_within(walls, position, q, half_size, 0.0):
         return tau
-    gap = wp.min(walls.half_length - wp.abs(position[0]), walls.half_width - wp.abs(position[1]))
-    gap = wp.min(gap, position[2] + walls.depth)
-    if gap > 0.0 and gap * gap > wp.dot(half_size, half_size):
-        return tau
-    # Half extents of the turned box along the world's axes: most vehicles near a wall still do not touch it.
     R = wp.quat_to_matrix(q)
-    extent = wp.vec3(
-        wp.dot(wp.abs(R[0]), half_size), wp.dot(wp.abs(R[1]), half_size), wp.dot(wp.abs(R[2]), half_size)
-    )
-    if (
-        wp.abs(position[0]) + extent[0] <= walls.half_length
-        and wp.abs(position[1]) + extent[1] <= walls.half_width
-        and position[2] - extent[2] >= -walls.depth
-    ):
-        return tau
     v = linear(nu)
     omega = angular(nu)
     corners = int(

@@ -92,6 +92,23 @@ def hull_point(i: int, half_size: wp.vec3) -> wp.vec3:
 
 
 @wp.func
+def funnel_within(funnel: Funnel, w: int, position: wp.vec3, half_size: wp.vec3, reach: float) -> bool:
+    """Whether the ball around the funnel of a world and the one around the vehicle are nearer than `reach` [m].
+
+    Args:
+        funnel: Shapes, and poses by world.
+        w: Which world.
+        position: Body origin, world frame [m].
+        half_size: Half extents of the envelope about the body origin, body axes [m].
+        reach: [m].
+    """
+    long = 0.5 * (funnel.cone_length + funnel.tube_length + funnel.back)
+    middle = wp.quat_rotate(funnel.quaternion[w], wp.vec3(long - funnel.cone_length, 0.0, 0.0))
+    most = wp.sqrt(long * long + funnel.outer_radius * funnel.outer_radius) + wp.length(half_size) + reach
+    return wp.length_sq(position - funnel.position[w] - middle) <= most * most
+
+
+@wp.func
 def funnel_wrench(
     funnel: Funnel, w: int, position: wp.vec3, q: wp.quat, nu: vec6, half_size: wp.vec3
 ) -> vec6:
@@ -108,13 +125,10 @@ def funnel_wrench(
     Returns:
         Wrench about the body origin, body frame [N, N m]; its force is what the block gives altogether.
     """
+    if not funnel_within(funnel, w, position, half_size, 0.0):
+        return vec6()
     q_d = funnel.quaternion[w]
     origin = wp.quat_rotate_inv(q_d, position - funnel.position[w])
-    long = 0.5 * (funnel.cone_length + funnel.tube_length + funnel.back)
-    middle = wp.vec3(long - funnel.cone_length, 0.0, 0.0)
-    reach = wp.sqrt(long * long + funnel.outer_radius * funnel.outer_radius) + wp.length(half_size)
-    if wp.length_sq(origin - middle) > reach * reach:
-        return vec6()
     R = wp.quat_to_matrix(wp.quat_inverse(q_d) * q)
     v = linear(nu)
     omega = angular(nu)

@@ -14,6 +14,7 @@ class WaterWrench:
     tau: vec6  # about the body origin, body frame [N, N m]
     displaced: float  # mass of water [kg]
     wet: float  # part of the displaced volume that is under water
+    wet_rate: float  # its rate [1/s]
 
 
 @wp.func
@@ -32,6 +33,13 @@ def submerged_fraction(height: float, half_height: float) -> float:
     """
     s = wp.clamp(0.5 - 0.5 * height / half_height, 0.0, 1.0)
     return s * s * (3.0 - 2.0 * s)
+
+
+@wp.func
+def submersion_rate(height: float, half_height: float, climb: float) -> float:
+    """Rate of `submerged_fraction` [1/s] while the height grows at `climb` [m/s]."""
+    s = wp.clamp(0.5 - 0.5 * height / half_height, 0.0, 1.0)
+    return -3.0 * s * (1.0 - s) * climb / half_height
 
 
 @wp.func

@@ -4,7 +4,7 @@
 
 import warp as wp
 
-from finssim.physics.types import angular, join, linear, mat66, mat66d, vec6
+from finssim.physics.types import angular, join, linear, mat66, mat66d, vec6, vec6d
 
 
 @wp.func
@@ -45,11 +45,17 @@ def rigid_body_momentum(mass: float, r_g: wp.vec3, inertia: wp.mat33, nu: vec6) 
 
 @wp.func
 def water_acceleration_wrench(
-    M_A: mat66, r_b: wp.vec3, water_b: wp.vec3, a_b: wp.vec3, omega: wp.vec3, displaced: float
+    M_A: mat66,
+    r_b: wp.vec3,
+    water_b: wp.vec3,
+    passing: wp.vec3,
+    flowing: wp.vec3,
+    omega: wp.vec3,
+    displaced: float,
 ) -> vec6:
     """Wrench of accelerating water on a body: M_A d(nu_c)/dt and the Froude-Krylov force.
 
-    M_A [a_c - ω × v_c; 0] + [m_w a_c; r_b × m_w a_c]
+    M_A [a_x - ω × v_c; 0] + [m_w a_c; r_b × m_w a_c],  a_x = (∂/∂t + x_dot·∇) v_c,  a_c = (∂/∂t + v_c·∇) v_c
 
     The second part is the pressure gradient that accelerates the water itself: with it a neutral body at rest in the
     water keeps moving with it, whatever its added mass.
@@ -58,15 +64,16 @@ def water_acceleration_wrench(
         M_A: Added mass about the body origin.
         r_b: Centre of buoyancy, body frame [m].
         water_b: Velocity of the water v_c, body frame [m/s].
-        a_b: Acceleration of the water a_c, body frame [m/s²].
+        passing: Rate of the water's velocity where the body is, as it moves: a_x, body frame [m/s²].
+        flowing: Acceleration of the water a_c, body frame [m/s²].
         omega: Angular velocity of the body, body frame [rad/s].
         displaced: Mass of the water displaced, m_w [kg].
 
     Returns:
         Wrench about the body origin, body frame [N, N m].
     """
-    f = displaced * a_b
-    return M_A * join(a_b - wp.cross(omega, water_b), wp.vec3(0.0)) + join(f, wp.cross(r_b, f))
+    f = displaced * flowing
+    return M_A * join(passing - wp.cross(omega, water_b), wp.vec3(0.0)) + join(f, wp.cross(r_b, f))
 
 
 @wp.func
@@ -98,4 +105,35 @@ def invert_spd(M: mat66) -> mat66:
     for i in range(6):
         for j in range(6):
             out[i, j] = wp.float32(wp.float64(0.5) * (X[i, j] + X[j, i]))
+    return out
+
+
+@wp.func
+def solve_spd(M: mat66, b: vec6) -> vec6:
+    """x with M x = b for a symmetric positive definite M, by elimination in float64; see `invert_spd`."""
+    A = mat66d()
+    x = vec6d()
+    for i in range(6):
+        x[i] = wp.float64(b[i])
+        for j in range(6):
+            A[i, j] = wp.float64(M[i, j])
+    # Loops of constant length, which Warp unrolls: conditions on their counters cost nothing.
+    for k in range(6):
+        pivot = wp.float64(1.0) / A[k, k]
+        for i in range(6):
+            if i > k:
+                factor = pivot * A[k, i]
+                x[i] = x[i] - factor * x[k]
+                for j in range(6):
+                    if j >= i:
+                        A[i, j] = A[i, j] - factor * A[k, j]
+    out = vec6()
+    for n in range(6):
+        i = 5 - n
+        total = x[i]
+        for j in range(6):
+            if j > i:
+                total = total - A[i, j] * x[j]
+        x[i] = total / A[i, i]
+        out[i] = wp.float32(x[i])
     return out

@@ -37,10 +37,13 @@ def rotate_by(q: wp.quat, omega: wp.vec3, h: float) -> wp.quat:
     """
     half = 0.5 * h * omega
     s2 = wp.dot(half, half)
-    # sin(a)/a and cos(a): two terms are exact to float32 rounding below a = 0.03 (3.6° a step).
-    sinc = 1.0 - s2 * (1.0 / 6.0)
-    cosine = 1.0 - 0.5 * s2
-    if s2 > 1.0e-3:
+    # sin(a)/a and cos(a) by series: exact to float32 rounding up to a = 1 (115° a step).
+    s4 = s2 * s2
+    sinc = (1.0 - s2 * (1.0 / 6.0)) + s4 * ((1.0 / 120.0) - s2 * (1.0 / 5040.0) + s4 * (1.0 / 362880.0))
+    cosine = (1.0 - s2 * 0.5) + s4 * (
+        (1.0 / 24.0) - s2 * (1.0 / 720.0) + s4 * ((1.0 / 40320.0) - s2 * (1.0 / 3628800.0))
+    )
+    if s2 > 1.0:
         a = wp.sqrt(s2)
         sinc = wp.sin(a) / a
         cosine = wp.cos(a)

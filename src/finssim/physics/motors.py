@@ -49,6 +49,7 @@ def first_order(x: vec8, target: vec8, alpha: vec8, max_change: vec8) -> vec8:
         max_change: Slew limit times the step, same unit as x.
 
     Returns:
-        Thrusts or speeds after the step.
+        Thrusts or speeds after the step. With the part of the way that the mean over the step has made for alpha, and
+        half of max_change, it is that mean: exact for the lag alone and for the slew limit alone.
     """
     return x + wp.max(wp.min(wp.cw_mul(alpha, target - x), max_change), -max_change)

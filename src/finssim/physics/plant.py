@@ -1,6 +1,7 @@
 """The physical parameters of a simulated vehicle, as one Warp struct; kernels take them by (world, vehicle)."""
 
-# mypy: disable-error-code="index,misc,no-untyped-def,operator,untyped-decorator,valid-type"
+# mypy: disable-error-code="no-untyped-call,return-value,index,misc,no-untyped-def,operator"
+# mypy: disable-error-code="untyped-decorator,valid-type"
 
 import warp as wp
 
@@ -21,6 +22,12 @@ class VehicleParameters:
     half_size: wp.vec3  # half extents of the envelope [m]
     M_A: mat66  # added mass about the body origin
     M_inv: mat66  # inverse of M_RB + M_A
+    G: mat68  # M_inv B: thruster forces to acceleration, submerged
+    r_m: wp.vec3  # point about which inertia is nearly diagonal, body frame [m], kept by `refresh_plant`
+    relax: vec6  # relaxation of a substep per slope of the damping, kept by `refresh_plant`
+    relax_1: vec6  # what linear damping adds to the relaxation of a substep, kept by `refresh_plant`
+    relax_2: vec6  # what quadratic damping adds to it, per speed on the same axis [s/m, s/rad]
+    relax_v: vec6  # what damping away from the origin and coupled to surge adds, per linear speed [s/m]
     r_h: wp.vec3  # point where the damping coefficients hold, body frame [m]
     D1: mat66
     D2: mat66
@@ -37,6 +44,7 @@ class VehicleParameters:
     time_constant: vec8  # [s]
     slew: vec8  # [N/s] or, for a speed lag, [rad/s²]
     alpha: vec8  # 1 - exp(-substep / time_constant), kept by `refresh_plant`
+    beta: vec8  # the same for the mean over a substep, kept by `refresh_plant`
     delay: float  # command delay [s]
     speed_lag: int  # 1: lag and slew act on propeller speed, 0: on force
     c_plus: vec8  # [N s²/rad²]
@@ -66,15 +74,24 @@ def mass_matrix(mass: float, r_g: wp.vec3, inertia: wp.mat33, M_A: mat66) -> mat
     return M
 
 
+RELAXATION = 0.6
+"""Weight c of the damping that a substep of the midpoint rule takes implicitly (see `finssim.engine.midpoint`)."""
+
+DERIVED = ("M_inv", "G", "r_m", "relax", "relax_1", "relax_2", "relax_v", "alpha", "beta")
+"""Fields of `VehicleParameters` that `refresh_plant` writes."""
+
+
 @wp.kernel(enable_backward=False)
 def refresh_plant(
     plant: wp.array2d(dtype=VehicleParameters), substep: float, mask: wp.array(dtype=int), world_offset: int
 ):
-    """Bring the derived parameters up to date in the worlds where mask is not 0: M_inv and the lag's alpha.
+    """Bring the derived parameters up to date in the worlds where mask is not 0.
+
+    The lag makes alpha = 1 - exp(-h/T) of its way in a substep; its mean has made beta = 1 - alpha T/h of it.
 
     Args:
         plant: Parameters.
-        substep: Physics step [s].
+        substep: Physics step h [s].
         mask: Which worlds, by world.
         world_offset: First world of this launch.
     """
@@ -83,9 +100,63 @@ def refresh_plant(
     if mask[w] == 0:
         return
     M = mass_matrix(plant[w, v].mass, plant[w, v].r_g, plant[w, v].inertia, plant[w, v].M_A)
-    plant[w, v].M_inv = invert_spd(M)
+    M_inv = invert_spd(M)
+    plant[w, v].M_inv = M_inv
+    plant[w, v].G = M_inv * plant[w, v].B
     alpha = vec8()
+    beta = vec8()
     tau = plant[w, v].time_constant
     for k in range(MAX_THRUSTERS):
-        alpha[k] = wp.where(tau[k] > 0.0, 1.0 - wp.exp(-substep / wp.max(tau[k], 1.0e-9)), 1.0)
+        alpha[k] = 1.0
+        beta[k] = 1.0
+        if tau[k] > 0.0:
+            x = substep / tau[k]
+            alpha[k] = 1.0 - wp.exp(-x)
+            # Below x = 0.05 the difference loses digits to its series x/2 - x²/6 + x³/24.
+            beta[k] = wp.where(x > 0.05, 1.0 - alpha[k] / x, x * (0.5 - x * (1.0 / 6.0 - x / 24.0)))
     plant[w, v].alpha = alpha
+    plant[w, v].beta = beta
+    p = inertia_center(M)
+    plant[w, v].r_m = p
+    r = plant[w, v].r_h - p
+    d1 = diagonal_at_origin(wp.get_diag(plant[w, v].D1), r)
+    d2 = 2.0 * wp.get_diag(plant[w, v].D2)
+    dv = diagonal_at_origin(d2, r) - d2 + wp.get_diag(plant[w, v].Du)
+    dv[0] = dv[0] + plant[w, v].Du[0, 0]
+    H = twist_shift(p)
+    weight = substep * wp.static(RELAXATION) * wp.get_diag(H * M_inv * wp.transpose(H))
+    none = vec6()
+    plant[w, v].relax = weight
+    plant[w, v].relax_1 = wp.cw_mul(weight, wp.max(d1, none))
+    plant[w, v].relax_2 = wp.cw_mul(weight, wp.max(d2, none))
+    plant[w, v].relax_v = wp.cw_mul(weight, wp.max(dv, none))
+
+
+@wp.func
+def inertia_center(M: mat66) -> wp.vec3:
+    """Point about which a 6x6 inertia hardly couples translation with turning: the mean of the two axes' points."""
+    return 0.5 * wp.vec3(
+        M[1, 5] / M[1, 1] - M[2, 4] / M[2, 2],
+        M[2, 3] / M[2, 2] - M[0, 5] / M[0, 0],
+        M[0, 4] / M[0, 0] - M[1, 3] / M[1, 1],
+    )
+
+
+@wp.func
+def diagonal_at_origin(d: vec6, r: wp.vec3) -> vec6:
+    """Diagonal of Hᵀ diag(d) H: of a matrix that holds at the point r, about the origin."""
+    x = r[0] * r[0]
+    y = r[1] * r[1]
+    z = r[2] * r[2]
+    return d + vec6(0.0, 0.0, 0.0, d[1] * z + d[2] * y, d[0] * z + d[2] * x, d[0] * y + d[1] * x)
+
+
+@wp.func
+def twist_shift(r: wp.vec3) -> mat66:
+    """H with nu(at r) = H nu(at the origin): [[1, -S(r)], [0, 1]]."""
+    H = wp.identity(n=6, dtype=float)
+    S = wp.skew(r)
+    for i in range(3):
+        for j in range(3):
+            H[i, j + 3] = -S[i, j]
+    return H

@@ -8,6 +8,7 @@ MAX_THRUSTERS = 8
 """Thrusters a vehicle may have; a vehicle with fewer leaves the last columns zero."""
 
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
+vec6d = wp.types.vector(length=6, dtype=wp.float64)
 vec8 = wp.types.vector(length=MAX_THRUSTERS, dtype=wp.float32)
 mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float32)
 mat66d = wp.types.matrix(shape=(6, 6), dtype=wp.float64)

@@ -111,8 +111,6 @@ class Docking(Task):
     name: str = "docking"
     totals: ClassVar[tuple[str, ...]] = ("success", "success_time", "contact_impulse", "peak_force", "crash")
     observation: tuple[ObservationPart, ...] = OBSERVATION
-    substeps: int = 20
-    """5 ms: a contact is stiff."""
     time_limit: float = 40.0
     hull: Hull = Hull()
     """Of the vehicle; the environment sets it."""

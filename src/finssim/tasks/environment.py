@@ -65,7 +65,7 @@ class Environment:
         water: Water | None = None,
         pool: Pool | None = None,
         tether: TetherLine | None = None,
-        integrator: str = "euler",
+        integrator: str = "midpoint",
         device: str = "cpu",
         threads: int | None = None,
         seed: int = 0,
@@ -89,7 +89,7 @@ class Environment:
             water: Currents and waves.
             pool: Walls and floor; the task's own if None.
             tether: On the vehicle.
-            integrator: euler or rk4.
+            integrator: midpoint or rk4.
             device: cpu or cuda.
             threads: Threads on a CPU.
             seed: Of goals, starts, randomisation and noise; 0 to 2³¹ - 1.

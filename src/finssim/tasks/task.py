@@ -66,7 +66,7 @@ class Task:
     observation: tuple[ObservationPart, ...] = field(repr=False)
     control_step: float = 0.1
     """Time between actions [s]."""
-    substeps: int = 10
+    substeps: int = 4
     """Physics steps between actions."""
     time_limit: float = 20.0
     """Length of an episode in training [s]."""

@@ -13,6 +13,7 @@ from finssim.calibration.excitation.programmes import Programme
 from finssim.control.allocator import Allocator
 from finssim.engine import Pool, Simulator, TetherLine, Water
 from finssim.geometry.rotations import quat_from_euler
+from finssim.physics.plant import DERIVED
 from finssim.vehicles import Vehicle
 
 __all__ = ["Recording", "record"]
@@ -132,8 +133,8 @@ def _longest_delay(vehicle: Vehicle, plant: Mapping[str, ArrayLike] | None) -> f
 def _override(simulator: Simulator, plant: Mapping[str, ArrayLike]) -> None:
     """Write fields of the plant and refresh what follows from them."""
     for name, value in plant.items():
-        if name not in simulator.plant.fields or name in ("M_inv", "alpha"):
-            known = ", ".join(f for f in simulator.plant.fields if f not in ("M_inv", "alpha"))
+        if name not in simulator.plant.fields or name in DERIVED:
+            known = ", ".join(f for f in simulator.plant.fields if f not in DERIVED)
             raise CalibrationError(f"plant has no field '{name}'; available: {known}")
         view = simulator.plant.fields[name].numpy()[:, 0]
         try:

@@ -6,7 +6,8 @@ import warp as wp
 
 from finssim.physics.damping import twist_at, uncoupled_damping_wrench, wrench_from
 from finssim.physics.hydrodynamics.mesh import HullMesh
-from finssim.physics.hydrostatics import WaterWrench, hydrostatic_wrench, submerged_fraction
+from finssim.physics.hydrostatics import WaterWrench, hydrostatic_wrench, submerged_fraction, submersion_rate
+from finssim.physics.kinematics import point_velocity
 from finssim.physics.plant import VehicleParameters
 from finssim.physics.types import vec6
 from finssim.physics.water import Flow, WaterArrays
@@ -54,6 +55,9 @@ def fossen_wrench(
     wet = submerged_fraction(height, plant[w, v].surface_half_height)
     out = WaterWrench()
     out.wet = wet
+    if wp.abs(height) < plant[w, v].surface_half_height:
+        climb = wp.dot(up, point_velocity(nu, r_b)) - flow.velocity[2]
+        out.wet_rate = submersion_rate(height, plant[w, v].surface_half_height, climb)
     out.displaced = water.density * plant[w, v].volume * wet
     r_h = plant[w, v].r_h
     tau_D = uncoupled_damping_wrench(twist_at(nu_r, r_h), plant[w, v].D1, plant[w, v].D2)

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from finssim.geometry.mesh import check_closed, face_geometry, mesh_centroid, mesh_volume
-from finssim.physics.types import angular, join, linear, vec6, vec8
+from finssim.physics.types import angular, join, linear, mat66, vec6, vec8
 
-__all__ = ["HullMesh", "hull_mesh", "mesh_displacement", "mesh_drag"]
+__all__ = ["HullMesh", "drag_slope", "hull_mesh", "mesh_displacement", "mesh_drag", "mesh_inflow"]
 
 
 @wp.struct
@@ -32,6 +32,10 @@ class HullMesh:
     """Half lengths of that box (kinds,) [m]."""
     face: wp.array(dtype=vec8)
     """Centroid [m], outward unit normal and area [m²] of each face (faces,), side by side for one read; then 0."""
+    slope_form: wp.array(dtype=mat66)
+    """How fast form drag grows on each axis, by the columns of `drag_slope` (kinds,)."""
+    slope_skin: wp.array(dtype=mat66)
+    """The same for skin drag."""
     corners: wp.array(dtype=wp.mat33)
     """Corners of each face, a row each (faces,) [m]; only read near the surface."""
 
@@ -50,6 +54,7 @@ def hull_mesh(hulls: Sequence[tuple[ArrayLike, ArrayLike]], device: str | None =
         MeshError: A hull is not closed and outward.
     """
     start, volume, centroid, box_center, box_half, face, corners = [0], [], [], [], [], [], []
+    form, skin = [], []
     for vertices, faces in hulls:
         points, triangles = np.asarray(vertices, np.float64), np.asarray(faces)
         check_closed(points, triangles)
@@ -62,6 +67,9 @@ def hull_mesh(hulls: Sequence[tuple[ArrayLike, ArrayLike]], device: str | None =
         box_half.append((high - low) / 2.0)
         face.append(np.column_stack([middle, normal, area, np.zeros(len(area))]))
         corners.append(points[triangles])
+        slopes = _slopes(middle, normal, area)
+        form.append(slopes[0])
+        skin.append(slopes[1])
 
     result = HullMesh()
     result.start = wp.array(start, dtype=wp.int32, device=device)
@@ -70,8 +78,48 @@ def hull_mesh(hulls: Sequence[tuple[ArrayLike, ArrayLike]], device: str | None =
     result.box_center = wp.array(np.array(box_center), dtype=wp.vec3, device=device)
     result.box_half = wp.array(np.array(box_half), dtype=wp.vec3, device=device)
     result.face = wp.array(np.concatenate(face), dtype=vec8, device=device)
+    result.slope_form = wp.array(np.array(form), dtype=mat66, device=device)
+    result.slope_skin = wp.array(np.array(skin), dtype=mat66, device=device)
     result.corners = wp.array(np.concatenate(corners), dtype=wp.mat33, device=device)
     return result
+
+
+def _slopes(
+    middle: NDArray[np.float64], normal: NDArray[np.float64], area: NDArray[np.float64]
+) -> list[NDArray[np.float64]]:
+    """Form and skin drag's growth with speed on each axis, (6, 6) each: column 0 per |v|, column 1 per |ω|.
+
+    A face at c moves along s = e_i or e_i × c with axis i, and its drag grows with its speed |v| + |c| |ω|: the form's
+    by at most |n·s| |s| + |s|² [n·v]_+/|v|, half and a quarter of which is the mean over all directions of the flow;
+    the skin's by 2 |s|².
+    """
+    turning = np.stack([np.cross(e, middle) for e in np.eye(3)], axis=1)
+    s = np.concatenate([np.broadcast_to(np.eye(3), turning.shape), turning], axis=1)  # (faces, 6, 3)
+    size = np.linalg.norm(s, axis=-1)
+    across = np.abs((s @ normal[..., None])[..., 0])
+    out = []
+    for growth in (0.5 * across * size + 0.25 * size**2, 2.0 * size**2):
+        table = np.zeros((6, 6))
+        table[:, 0] = area @ growth
+        table[:, 1] = (area * np.linalg.norm(middle, axis=1)) @ growth
+        out.append(table)
+    return out
+
+
+@wp.func
+def drag_slope(hull: HullMesh, kind: int, nu_r: vec6, density: float, form: float, skin: float) -> vec6:
+    """About how fast the drag of a submerged hull grows with the speed on each axis [N s/m, N m s/rad].
+
+    Args:
+        hull: The hulls.
+        kind: Which of them.
+        nu_r: Twist relative to the water, body frame [m/s, rad/s].
+        density: Of the water [kg/m³].
+        form: Form drag coefficient.
+        skin: Skin drag coefficient.
+    """
+    x = vec6(wp.length(linear(nu_r)), wp.length(angular(nu_r)), 0.0, 0.0, 0.0, 0.0)
+    return 0.5 * density * (form * (hull.slope_form[kind] * x) + skin * (hull.slope_skin[kind] * x))
 
 
 @wp.func
@@ -257,3 +305,31 @@ def mesh_displacement(hull: HullMesh, kind: int, surface_normal: wp.vec3, surfac
         return wp.vec4(0.0)
     c = apex + 0.75 * moment / volume
     return wp.vec4(volume, c[0], c[1], c[2])
+
+
+@wp.func
+def mesh_inflow(
+    hull: HullMesh, kind: int, nu_r: vec6, surface_normal: wp.vec3, surface_height: float
+) -> float:
+    """Rate at which the volume below the surface grows: what the wet faces sweep, ∫ n·(v + ω × c) dA.
+
+    Args:
+        hull: The hulls.
+        kind: Which of them.
+        nu_r: Twist of the body at its origin relative to the water, body frame [m/s, rad/s].
+        surface_normal: Upward unit normal of the water surface, body frame.
+        surface_height: Height of the body origin above the surface along that normal, negative below [m].
+
+    Returns:
+        [m³/s]; 0 for a hull that is wholly wet or dry, up to rounding.
+    """
+    v = linear(nu_r)
+    omega = angular(nu_r)
+    inflow = float(0.0)
+    for i in range(hull.start[kind], hull.start[kind + 1]):
+        wet = wet_part(hull.corners[i], surface_normal, surface_height)
+        if wet[3] > 0.0:
+            f = hull.face[i]
+            c = wp.vec3(wet[0], wet[1], wet[2])
+            inflow += wet[3] * f[6] * wp.dot(wp.vec3(f[3], f[4], f[5]), v + wp.cross(omega, c))
+    return inflow

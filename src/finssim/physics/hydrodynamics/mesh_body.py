@@ -4,7 +4,7 @@
 
 import warp as wp
 
-from finssim.physics.hydrodynamics.mesh import HullMesh, mesh_displacement, mesh_drag
+from finssim.physics.hydrodynamics.mesh import HullMesh, mesh_displacement, mesh_drag, mesh_inflow
 from finssim.physics.hydrostatics import WaterWrench, hydrostatic_wrench
 from finssim.physics.plant import VehicleParameters
 from finssim.physics.types import linear, vec6
@@ -58,11 +58,13 @@ def mesh_wrench(
     wet = mesh_displacement(hull, kind, normal, height)
     out = WaterWrench()
     out.wet = wet[0] / hull.volume[kind]
+    water_b = linear(nu) - linear(nu_r)
+    if out.wet > 0.0 and out.wet < 1.0:
+        out.wet_rate = mesh_inflow(hull, kind, nu_r, normal, height) / hull.volume[kind]
     out.displaced = water.density * plant[w, v].volume * out.wet
     center = wp.vec3(wet[1], wet[2], wet[3]) + plant[w, v].r_b - hull.centroid[kind]
     weight = plant[w, v].mass * water.gravity
     tau = hydrostatic_wrench(weight, out.displaced * water.gravity, plant[w, v].r_g, center, up)
-    water_b = linear(nu) - linear(nu_r)
     form = plant[w, v].form_drag
     tau += mesh_drag(hull, kind, nu, water_b, G, water.density, form, plant[w, v].skin_drag, normal, height)
     out.tau = tau
