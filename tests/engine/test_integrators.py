@@ -145,7 +145,7 @@ def test_the_acceleration_is_that_of_its_state():
 def test_four_steps_of_the_midpoint_rule_do_better_than_ten_of_eulers(name):
     """After 2 s of random commands the default is less than half as far off as semi-implicit Euler's ten steps were.
 
-    Those were, with this file's commands and starts, 3.3, 10.7 and 6.8 mm off (RMS), the last time that they were there.
+    Those were, with this file's commands and starts, 3.3, 10.7 and 6.8 mm off (RMS), when last measured.
     """
     euler = {"finsrov": 3.3e-3, "bluerov2": 10.7e-3, "bluerov2_heavy": 6.8e-3}[name]
     away = driven(name, "midpoint", 4)[0] - driven(name, "rk4", 80)[0]
