@@ -41,7 +41,7 @@ def accelerations(vehicle, model, states, tau, thrust, water):
         substeps=1,
         water=water,
     )
-    simulator.plant.time_constant.zero_()  # motors that follow at once
+    simulator.plant.time_constant.fill_(vec8(*[1e-20] * 8))  # motors that follow at once
     simulator.plant.slew.fill_(vec8(*[np.inf] * 8))
     simulator.refresh()
     simulator.place(position, q, nu)

@@ -1,6 +1,7 @@
 """No catalogue vehicle runs away at steps of 25 ms, turning fast under water, through the surface or in the air."""
 
 import numpy as np
+import pytest
 
 from finssim.engine import Simulator
 from reference.body import rotation
@@ -20,6 +21,7 @@ def fast_starts(vehicle, rng):
     return position, random_attitudes(rng, WORLDS), nu.reshape(WORLDS, 6).astype(np.float32)
 
 
+@pytest.mark.slow
 @EVERY_VEHICLE_AND_MODEL
 def test_nothing_runs_away_from_a_fast_turn(name, model):
     """From 3 m/s and 10 rad/s, 5 s in steps of 25 ms: all worlds go on, and energy is what weight and thrust can give.

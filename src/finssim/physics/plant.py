@@ -88,6 +88,7 @@ def refresh_plant(
     """Bring the derived parameters up to date in the worlds where mask is not 0.
 
     The lag makes alpha = 1 - exp(-h/T) of its way in a substep; its mean has made beta = 1 - alpha T/h of it.
+    Without a lag, T = 0, forces are samples of what is linear between them: alpha = 1, beta = 1/2.
 
     Args:
         plant: Parameters.
@@ -108,7 +109,7 @@ def refresh_plant(
     tau = plant[w, v].time_constant
     for k in range(MAX_THRUSTERS):
         alpha[k] = 1.0
-        beta[k] = 1.0
+        beta[k] = 0.5
         if tau[k] > 0.0:
             x = substep / tau[k]
             alpha[k] = 1.0 - wp.exp(-x)
