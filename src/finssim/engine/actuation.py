@@ -61,11 +61,9 @@ def delayed_command(
     old = steps_ago(age, rate)
     new = steps_ago(age - h, rate)
     command = commands[w, v, slot_before(head, old, commands.shape[2])]
-    if new != old:
-        part = wp.clamp((age * rate - float(new)) / (h * rate), 0.0, 1.0)
-        newer = commands[w, v, slot_before(head, new, commands.shape[2])]
-        command = part * command + (1.0 - part) * newer
-    return command
+    newer = commands[w, v, slot_before(head, new, commands.shape[2])]
+    part = wp.clamp((age * rate - float(new)) / (h * rate), 0.0, 1.0)
+    return newer + wp.where(new == old, 1.0, part) * (command - newer)
 
 
 @wp.func

@@ -136,13 +136,16 @@ class Pipeline:
         self.slices = [(a, b - a) for a, b in zip(edges, edges[1:], strict=False)]
         self._parts: list[_Kernels | Callable[[], None]] = []
 
-    def add(self, kernel: wp.Kernel, inputs: Sequence[Any], vehicles: int | None = None) -> None:
+    def add(
+        self, kernel: wp.Kernel, inputs: Sequence[Any], vehicles: int | None = None, block: int | None = None
+    ) -> None:
         """Append a kernel.
 
         Args:
             kernel: Its last parameter is `world_offset`.
             inputs: All arguments but `world_offset`.
             vehicles: Launch over (worlds, vehicles) if given, else over worlds.
+            block: Launch over blocks of so many worlds; the kernel takes the number of worlds before `world_offset`.
         """
         last = self._parts[-1] if self._parts else None
         if not isinstance(last, _Kernels):
@@ -150,10 +153,10 @@ class Pipeline:
             self._parts.append(last)
         last.graph = None
         for (offset, count), commands in zip(self.slices, last.recorded, strict=True):
-            dim = count if vehicles is None else (count, vehicles)
-            command = wp.launch(
-                kernel, dim=dim, inputs=[*inputs, offset], device=self.device, record_cmd=True
-            )
+            rows = count if block is None else -(-count // block)
+            dim = rows if vehicles is None else (rows, vehicles)
+            given = [*inputs, offset] if block is None else [*inputs, count, offset]
+            command = wp.launch(kernel, dim=dim, inputs=given, device=self.device, record_cmd=True)
             commands.append(command)
 
     def call(self, function: Callable[[], None]) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from finssim.engine.arguments import find_device, one_of, placed_at, shared_water, thrust_table
 from finssim.engine.dock import Dock
+from finssim.engine.lanes import LANES
 from finssim.engine.launch import Pipeline
 from finssim.engine.packed import Packed
 from finssim.engine.plant_arrays import SimulatorError, build_plant
@@ -112,6 +113,8 @@ class Simulator:
         longest = 2.0 * float(self.plant.delay.numpy().max()) if max_delay is None else max_delay
         slots = math.ceil(longest / control_step) + 2
         self.state = new_state(Packed(VehicleState, (worlds, n), self.device), slots)
+        self._shared = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self._drawn = False
         self._all = wp.ones(worlds, dtype=wp.int32, device=self.device)
         self._mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
         self._threads = threads
@@ -163,6 +166,7 @@ class Simulator:
             speed_lag=bool(self.plant.speed_lag.numpy().any()),
             surge_coupled=bool(self.plant.Du.numpy().any()),
             funnel_present=self.dock is not None,
+            lanes=self.in_lanes,
         )
         around = [self.hull, self.water, self.walls, self.tether.array, self.funnel]
         s = self.state
@@ -176,15 +180,28 @@ class Simulator:
             self.control_step,
             self.substeps,
         ]
-        pipeline.add(kernel, inputs, vehicles=len(self.vehicles))
+        if self.in_lanes:
+            inputs.append(self._shared)
+        pipeline.add(kernel, inputs, len(self.vehicles), LANES if self.in_lanes else None)
         pipeline.add(tick, [self.state])
+
+    @property
+    def in_lanes(self) -> bool:
+        """Whether blocks of worlds go together: on a processor, where a trace can follow what they do."""
+        traceable = self.integrator == "midpoint" and self.hydrodynamics != "mesh"
+        return self.device.is_cpu and traceable and not self.water.moving and self.dock is None
 
     def add_reset(self, pipeline: Pipeline, mask: wp.array) -> None:
         """Append the kernels that reset motors and clocks, where mask (by world, int32) is not 0."""
         pipeline.add(clear_actuators, [self.state, mask])
 
     def add_refresh(self, pipeline: Pipeline, mask: wp.array) -> None:
-        """Append the kernel that recomputes derived parameters, where mask (by world, int32) is not 0."""
+        """Append the kernel that recomputes derived parameters of worlds that draw their own, where mask is not 0."""
+        self._drawn = True
+        self._shared.zero_()
+        self._add_refresh(pipeline, mask)
+
+    def _add_refresh(self, pipeline: Pipeline, mask: wp.array) -> None:
         h = self.control_step / self.substeps
         pipeline.add(refresh_plant, [self.plant.array, h, mask], vehicles=len(self.vehicles))
 
@@ -204,8 +221,15 @@ class Simulator:
                 f"thruster delay {longest:.6g} s exceeds the delay line; give max_delay={longest:.6g}"
             )
         pipeline = self.pipeline()
-        self.add_refresh(pipeline, self._all)
+        self._add_refresh(pipeline, self._all)
         pipeline.run()
+        self.compare_worlds()
+
+    def compare_worlds(self) -> None:
+        """Note whether all worlds have equal parameters, which are then read once; never if some are drawn."""
+        if self.in_lanes:
+            rows = self.plant.array.numpy().view(np.uint8).reshape(self.worlds, -1)
+            self._shared.fill_(int(not self._drawn and bool((rows == rows[0]).all())))
 
     def reset(self, mask: ArrayLike | None = None) -> None:
         """Stop the motors, empty the delay lines and set the clocks to zero; pose and velocity stay.

@@ -1,10 +1,22 @@
 """The physics kernel: one thread takes one vehicle through all substeps of a control step."""
 
+import math
 from functools import cache
+from typing import Any
 
 import warp as wp
 
 from finssim.engine.actuation import delayed_command, delivered_thrust, lag_target
+from finssim.engine.lanes import (
+    LANES,
+    Loop,
+    StructArray,
+    Trace,
+    UniformStruct,
+    VectorArray,
+    block_source,
+    lane_function,
+)
 from finssim.engine.midpoint import (
     DOCK_STEP,
     WALL_STEP,
@@ -41,6 +53,22 @@ MODULE_OPTIONS = {
 """Warp's defaults, but with fused multiply-adds and no limit on the depth of SLP vectorisation: a quarter faster."""
 
 
+@wp.struct
+class Course:
+    """A vehicle on its way through the substeps of a control step."""
+
+    position: wp.vec3
+    quaternion: wp.quat
+    velocity: vec6
+    actuator: vec8
+    coasting: vec6  # mean acceleration of the last substep without thrust and contacts
+    x_dot: wp.vec3  # rate of the position, world frame [m/s]
+    jerk: vec6  # by how much the last acceleration was another than expected
+    pressed: vec6  # mean acceleration by contacts in the last substep
+    greatest: float  # force of the dock so far [N]
+    impulse: float  # of the dock so far [N s]
+
+
 @cache
 def physics_kernel(
     model: str,
@@ -51,6 +79,7 @@ def physics_kernel(
     speed_lag: bool = True,
     surge_coupled: bool = True,
     funnel_present: bool = False,
+    lanes: bool = False,
 ) -> wp.Kernel:
     """The kernel for one hydrodynamic model and one integrator, without the code that a simulation does not need.
 
@@ -63,9 +92,11 @@ def physics_kernel(
         speed_lag: Whether some vehicle's motors lag in speed rather than in force.
         surge_coupled: Whether some vehicle's damping is coupled to surge (Du is not zero).
         funnel_present: Whether there is a dock to enter.
+        lanes: Whether worlds go in blocks of `LANES`, on a processor; see `finssim.engine.lanes`.
 
     Returns:
-        A kernel over (worlds of the slice, vehicles).
+        A kernel over (worlds of the slice, vehicles); with lanes over (blocks of the slice, vehicles), which takes the
+        number of the slice's worlds before its offset.
     """
     hydrodynamic_wrench = HYDRODYNAMICS[model]
     runge_kutta = integrator == "rk4"
@@ -194,6 +225,309 @@ def physics_kernel(
             out.tau += tau
         return out
 
+    @wp.func
+    def set_out(
+        state: wp.array2d(dtype=VehicleState),
+        command: wp.array2d(dtype=VehicleCommand),
+        commands: wp.array3d(dtype=vec8),
+        plant: wp.array2d(dtype=VehicleParameters),
+        w: int,
+        v: int,
+        head: int,
+    ) -> Course:
+        """Where the vehicle is, with its newest command in the delay line."""
+        out = Course()
+        newest = admissible(
+            command[w, v].thrust,
+            plant[w, v].force_min,
+            plant[w, v].force_max,
+            plant[w, v].dead_minus,
+            plant[w, v].dead_plus,
+        )
+        if wp.static(speed_lag):
+            newest = lag_target(plant, w, v, newest)
+        commands[w, v, head] = newest
+        out.position = state[w, v].position
+        out.quaternion = state[w, v].quaternion
+        out.velocity = state[w, v].velocity
+        out.actuator = state[w, v].actuator
+        out.coasting = state[w, v].coasting
+        out.pressed = state[w, v].pressed
+        out.x_dot = position_rate(out.quaternion, out.velocity)
+        return out
+
+    @wp.func
+    def substep(
+        command: wp.array2d(dtype=VehicleCommand),
+        commands: wp.array3d(dtype=vec8),
+        plant: wp.array2d(dtype=VehicleParameters),
+        hull: HullMesh,
+        water: WaterArrays,
+        walls: PoolWalls,
+        tether: wp.array2d(dtype=Tether),
+        funnel: Funnel,
+        w: int,
+        v: int,
+        head: int,
+        step: int,
+        k: int,
+        h: float,
+        control_step: float,
+        course: Course,
+    ) -> Course:
+        """The course after substep k; -1 only looks ahead."""
+        out = Course()
+        position = course.position
+        q = course.quaternion
+        nu = course.velocity
+        actuator = course.actuator
+        coasting = course.coasting
+        x_dot = course.x_dot
+        jerk = course.jerk
+        pressed = course.pressed
+        greatest = course.greatest
+        impulse = course.impulse
+        other = command[w, v].disturbance
+        max_change = h * plant[w, v].slew
+        rate = 1.0 / control_step
+        committed = wp.where(k < 0, 0.0, 1.0)
+        step_h = committed * h
+        elapsed = float(wp.max(k, 0)) * h
+        t = float(step) * control_step + elapsed
+        target = delayed_command(commands, w, v, head, elapsed, plant[w, v].delay, h, rate)
+        mean = first_order(actuator, target, plant[w, v].beta, 0.5 * max_change)
+        after = first_order(actuator, target, plant[w, v].alpha, max_change)
+        thrust = thrust_of(plant, w, v, mean)
+        pushed = plant[w, v].G * thrust
+        if wp.static(runge_kutta):
+            outer = other
+            actuator = after
+            if wp.static(contacts):
+                touch = contact_at(plant, walls, funnel, w, v, position, q, nu)
+                greatest = wp.max(greatest, touch.push)
+                impulse += h * touch.push
+                outer = other + touch.tau
+            q1 = quaternion_rate(q, angular(nu))
+            n1 = motion_at(
+                plant,
+                hull,
+                water,
+                tether,
+                w,
+                v,
+                position,
+                q,
+                nu,
+                nu,
+                thrust,
+                pushed,
+                outer,
+                t,
+                elapsed,
+                0.0,
+            ).nu_dot
+            nu2 = nu + 0.5 * h * n1
+            qm = wp.normalize(q + 0.5 * h * q1)
+            xm = position + 0.5 * h * x_dot
+            x2 = position_rate(qm, nu2)
+            q2 = quaternion_rate(qm, angular(nu2))
+            if wp.static(contacts):
+                outer = other + contact_at(plant, walls, funnel, w, v, xm, qm, nu2).tau
+            n2 = motion_at(
+                plant, hull, water, tether, w, v, xm, qm, nu2, nu2, thrust, pushed, outer, t + 0.5 * h,
+                elapsed + 0.5 * h, 0.0,
+            ).nu_dot  # fmt: skip
+            nu3 = nu + 0.5 * h * n2
+            qn = wp.normalize(q + 0.5 * h * q2)
+            xn = position + 0.5 * h * x2
+            x3 = position_rate(qn, nu3)
+            q3 = quaternion_rate(qn, angular(nu3))
+            if wp.static(contacts):
+                outer = other + contact_at(plant, walls, funnel, w, v, xn, qn, nu3).tau
+            n3 = motion_at(
+                plant, hull, water, tether, w, v, xn, qn, nu3, nu3, thrust, pushed, outer, t + 0.5 * h,
+                elapsed + 0.5 * h, 0.0,
+            ).nu_dot  # fmt: skip
+            nu4 = nu + h * n3
+            qe = wp.normalize(q + h * q3)
+            xe = position + h * x3
+            x4 = position_rate(qe, nu4)
+            q4 = quaternion_rate(qe, angular(nu4))
+            if wp.static(contacts):
+                outer = other + contact_at(plant, walls, funnel, w, v, xe, qe, nu4).tau
+            n4 = motion_at(
+                plant,
+                hull,
+                water,
+                tether,
+                w,
+                v,
+                xe,
+                qe,
+                nu4,
+                nu4,
+                thrust,
+                pushed,
+                outer,
+                t + h,
+                elapsed + h,
+                0.0,
+            ).nu_dot
+            position = position + (h / 6.0) * (x_dot + 2.0 * x2 + 2.0 * x3 + x4)
+            q = wp.normalize(q + (h / 6.0) * (q1 + 2.0 * q2 + 2.0 * q3 + q4))
+            nu = nu + (h / 6.0) * (n1 + 2.0 * n2 + 2.0 * n3 + n4)
+            x_dot = position_rate(q, nu)
+            coasting = n4 - pushed
+        else:
+            guess = coasting + pushed
+            near = bool(False)
+            if wp.static(contacts):
+                half_size = plant[w, v].half_size
+                turn = wp.length(angular(nu)) + h * wp.length(angular(guess))
+                slack = wp.length(linear(nu)) + h * wp.length(linear(guess)) + turn * wp.length(half_size)
+                if wp.static(walls_present):
+                    near = walls_within(walls, position, q, half_size, h * slack)
+                if wp.static(funnel_present):
+                    near = near or funnel_within(funnel, w, position, half_size, h * slack)
+            # What leans on a wall does not fall through it, and the water must not feel that it did.
+            nu_middle = nu + h * lead_of(nu, h) * (guess + pressed)
+            x_middle = position + 0.5 * h * x_dot
+            q_middle = q + 0.5 * h * quaternion_rate(q, angular(nu))
+            motion = motion_at(
+                plant, hull, water, tether, w, v, x_middle, q_middle, nu_middle, nu, thrust, pushed, other,
+                t + 0.5 * h, elapsed + 0.5 * h, h,
+            )  # fmt: skip
+            nu_dot = relaxed(motion.nu_dot, guess, motion.relaxation, plant[w, v].r_m)
+            jerk = nu_dot - guess
+            coasting = nu_dot - pushed
+            if k >= 0:
+                actuator = after
+                pressed = vec6()
+            if k < 0 or not near:
+                nu_new = nu + step_h * nu_dot
+                q = rotate_by(q, 0.5 * (angular(nu) + angular(nu_new)), step_h)
+                nu = nu_new
+                position = position + 0.5 * step_h * x_dot
+                x_dot = position_rate(q, nu)
+                position = position + 0.5 * step_h * x_dot
+            else:
+                if wp.static(contacts):
+                    parts = int(wp.ceil(h / wp.static(contact_step) - 1.0e-4))
+                    d = h / float(parts)
+                    for _ in range(parts):
+                        position = position + 0.5 * d * x_dot
+                        q = rotate_by(q, angular(nu), 0.5 * d)
+                        touch = contact_at(plant, walls, funnel, w, v, position, q, nu)
+                        greatest = wp.max(greatest, touch.push)
+                        impulse += d * touch.push
+                        push = yielding(plant, w, v, motion.wet, touch.tau)
+                        pressed += push / float(parts)
+                        nu = nu + d * (nu_dot + push)
+                        q = rotate_by(q, angular(nu), 0.5 * d)
+                        x_dot = position_rate(q, nu)
+                        position = position + 0.5 * d * x_dot
+        out.position = position
+        out.quaternion = q
+        out.velocity = nu
+        out.actuator = actuator
+        out.coasting = coasting
+        out.x_dot = x_dot
+        out.jerk = jerk
+        out.pressed = pressed
+        out.greatest = greatest
+        out.impulse = impulse
+        return out
+
+    @wp.func
+    def arrive(
+        state: wp.array2d(dtype=VehicleState),
+        history: wp.array3d(dtype=vec13),
+        broken: wp.array(dtype=int),
+        plant: wp.array2d(dtype=VehicleParameters),
+        funnel: Funnel,
+        w: int,
+        v: int,
+        slot: int,
+        course: Course,
+    ):
+        """Write down where the vehicle has come to, unless a number stopped being finite."""
+        q = wp.normalize(course.quaternion)
+        history[slot, w, v] = snapshot(course.position, q, course.velocity)
+        if not is_finite(course.position, q, course.velocity):
+            broken[w] = 1
+            return
+        state[w, v].position = course.position
+        state[w, v].quaternion = q
+        state[w, v].velocity = course.velocity
+        delivered = thrust_of(plant, w, v, course.actuator)
+        state[w, v].acceleration = (
+            course.coasting + 0.5 * course.jerk + course.pressed + plant[w, v].G * delivered
+        )
+        state[w, v].coasting = course.coasting
+        state[w, v].pressed = course.pressed
+        state[w, v].actuator = course.actuator
+        state[w, v].thrust = delivered
+        if wp.static(funnel_present):
+            funnel.force[w, v] = course.greatest
+            funnel.impulse[w, v] = course.impulse
+
+    @wp.func
+    def step_vehicle(
+        state: wp.array2d(dtype=VehicleState),
+        command: wp.array2d(dtype=VehicleCommand),
+        commands: wp.array3d(dtype=vec8),
+        history: wp.array3d(dtype=vec13),
+        steps: wp.array(dtype=int),
+        broken: wp.array(dtype=int),
+        plant: wp.array2d(dtype=VehicleParameters),
+        hull: HullMesh,
+        water: WaterArrays,
+        walls: PoolWalls,
+        tether: wp.array2d(dtype=Tether),
+        funnel: Funnel,
+        control_step: float,
+        substeps: int,
+        w: int,
+        v: int,
+    ):
+        """One control step of one vehicle."""
+        step = steps[w]
+        h = control_step / float(substeps)
+        if not is_finite(wp.vec3(0.0), wp.quat_identity(), command[w, v].disturbance) or not wp.isfinite(
+            wp.dot(command[w, v].thrust, command[w, v].thrust)
+        ):
+            history[step % wp.static(HISTORY), w, v] = snapshot(
+                state[w, v].position, state[w, v].quaternion, state[w, v].velocity
+            )
+            broken[w] = 1
+            return
+        head = step % commands.shape[2]
+        course = set_out(state, command, commands, plant, w, v, head)
+        first = int(0)
+        if wp.static(not runge_kutta):
+            # The first substep of an episode has nothing to extrapolate: it is taken twice, and -1 only looks ahead.
+            first = wp.where(step == 0, -1, 0)
+        for k in range(first, substeps):
+            course = substep(
+                command,
+                commands,
+                plant,
+                hull,
+                water,
+                walls,
+                tether,
+                funnel,
+                w,
+                v,
+                head,
+                step,
+                k,
+                h,
+                control_step,
+                course,
+            )
+        arrive(state, history, broken, plant, funnel, w, v, step % wp.static(HISTORY), course)
+
     @wp.kernel(enable_backward=False, module="unique", module_options=MODULE_OPTIONS)
     def physics_step(
         state: wp.array2d(dtype=VehicleState),
@@ -217,198 +551,152 @@ def physics_kernel(
         w = world_offset + i
         if frozen[w] != 0:
             return
-        step = steps[w]
-        h = control_step / float(substeps)
-        rate = 1.0 / control_step
-        position = state[w, v].position
-        q = state[w, v].quaternion
-        nu = state[w, v].velocity
-        actuator = state[w, v].actuator
-        other = command[w, v].disturbance
-        if not is_finite(wp.vec3(0.0), wp.quat_identity(), command[w, v].disturbance) or not wp.isfinite(
-            wp.dot(command[w, v].thrust, command[w, v].thrust)
-        ):
-            history[step % wp.static(HISTORY), w, v] = snapshot(position, q, nu)
-            broken[w] = 1
-            return
-        newest = admissible(
-            command[w, v].thrust,
-            plant[w, v].force_min,
-            plant[w, v].force_max,
-            plant[w, v].dead_minus,
-            plant[w, v].dead_plus,
-        )
-        if wp.static(speed_lag):
-            newest = lag_target(plant, w, v, newest)
-        head = step % commands.shape[2]
-        commands[w, v, head] = newest
-        max_change = h * plant[w, v].slew
-        greatest = float(0.0)
-        impulse = float(0.0)
-        coasting = state[w, v].coasting
-        jerk = vec6()
-        pressed = state[w, v].pressed
-        x_dot = position_rate(q, nu)
-        first = int(0)
-        if wp.static(not runge_kutta):
-            # The first substep of an episode has nothing to extrapolate: it is taken twice, and -1 only looks ahead.
-            first = wp.where(step == 0, -1, 0)
-        for k in range(first, substeps):
-            committed = wp.where(k < 0, 0.0, 1.0)
-            step_h = committed * h
-            elapsed = float(wp.max(k, 0)) * h
-            t = float(step) * control_step + elapsed
-            target = delayed_command(commands, w, v, head, elapsed, plant[w, v].delay, h, rate)
-            mean = first_order(actuator, target, plant[w, v].beta, 0.5 * max_change)
-            after = first_order(actuator, target, plant[w, v].alpha, max_change)
-            thrust = thrust_of(plant, w, v, mean)
-            pushed = plant[w, v].G * thrust
-            if wp.static(runge_kutta):
-                outer = other
-                actuator = after
-                if wp.static(contacts):
-                    touch = contact_at(plant, walls, funnel, w, v, position, q, nu)
-                    greatest = wp.max(greatest, touch.push)
-                    impulse += h * touch.push
-                    outer = other + touch.tau
-                q1 = quaternion_rate(q, angular(nu))
-                n1 = motion_at(
-                    plant,
-                    hull,
-                    water,
-                    tether,
-                    w,
-                    v,
-                    position,
-                    q,
-                    nu,
-                    nu,
-                    thrust,
-                    pushed,
-                    outer,
-                    t,
-                    elapsed,
-                    0.0,
-                ).nu_dot
-                nu2 = nu + 0.5 * h * n1
-                qm = wp.normalize(q + 0.5 * h * q1)
-                xm = position + 0.5 * h * x_dot
-                x2 = position_rate(qm, nu2)
-                q2 = quaternion_rate(qm, angular(nu2))
-                if wp.static(contacts):
-                    outer = other + contact_at(plant, walls, funnel, w, v, xm, qm, nu2).tau
-                n2 = motion_at(
-                    plant, hull, water, tether, w, v, xm, qm, nu2, nu2, thrust, pushed, outer, t + 0.5 * h,
-                    elapsed + 0.5 * h, 0.0,
-                ).nu_dot  # fmt: skip
-                nu3 = nu + 0.5 * h * n2
-                qn = wp.normalize(q + 0.5 * h * q2)
-                xn = position + 0.5 * h * x2
-                x3 = position_rate(qn, nu3)
-                q3 = quaternion_rate(qn, angular(nu3))
-                if wp.static(contacts):
-                    outer = other + contact_at(plant, walls, funnel, w, v, xn, qn, nu3).tau
-                n3 = motion_at(
-                    plant, hull, water, tether, w, v, xn, qn, nu3, nu3, thrust, pushed, outer, t + 0.5 * h,
-                    elapsed + 0.5 * h, 0.0,
-                ).nu_dot  # fmt: skip
-                nu4 = nu + h * n3
-                qe = wp.normalize(q + h * q3)
-                xe = position + h * x3
-                x4 = position_rate(qe, nu4)
-                q4 = quaternion_rate(qe, angular(nu4))
-                if wp.static(contacts):
-                    outer = other + contact_at(plant, walls, funnel, w, v, xe, qe, nu4).tau
-                n4 = motion_at(
-                    plant,
-                    hull,
-                    water,
-                    tether,
-                    w,
-                    v,
-                    xe,
-                    qe,
-                    nu4,
-                    nu4,
-                    thrust,
-                    pushed,
-                    outer,
-                    t + h,
-                    elapsed + h,
-                    0.0,
-                ).nu_dot
-                position = position + (h / 6.0) * (x_dot + 2.0 * x2 + 2.0 * x3 + x4)
-                q = wp.normalize(q + (h / 6.0) * (q1 + 2.0 * q2 + 2.0 * q3 + q4))
-                nu = nu + (h / 6.0) * (n1 + 2.0 * n2 + 2.0 * n3 + n4)
-                x_dot = position_rate(q, nu)
-                coasting = n4 - pushed
-            else:
-                guess = coasting + pushed
-                near = bool(False)
-                if wp.static(contacts):
-                    half_size = plant[w, v].half_size
-                    turn = wp.length(angular(nu)) + h * wp.length(angular(guess))
-                    slack = wp.length(linear(nu)) + h * wp.length(linear(guess)) + turn * wp.length(half_size)
-                    if wp.static(walls_present):
-                        near = walls_within(walls, position, q, half_size, h * slack)
-                    if wp.static(funnel_present):
-                        near = near or funnel_within(funnel, w, position, half_size, h * slack)
-                # What leans on a wall does not fall through it, and the water must not feel that it did.
-                nu_middle = nu + h * lead_of(nu, h) * (guess + pressed)
-                x_middle = position + 0.5 * h * x_dot
-                q_middle = q + 0.5 * h * quaternion_rate(q, angular(nu))
-                motion = motion_at(
-                    plant, hull, water, tether, w, v, x_middle, q_middle, nu_middle, nu, thrust, pushed, other,
-                    t + 0.5 * h, elapsed + 0.5 * h, h,
-                )  # fmt: skip
-                nu_dot = relaxed(motion.nu_dot, guess, motion.relaxation, plant[w, v].r_m)
-                jerk = nu_dot - guess
-                coasting = nu_dot - pushed
-                if k >= 0:
-                    actuator = after
-                    pressed = vec6()
-                if k < 0 or not near:
-                    nu_new = nu + step_h * nu_dot
-                    q = rotate_by(q, 0.5 * (angular(nu) + angular(nu_new)), step_h)
-                    nu = nu_new
-                    position = position + 0.5 * step_h * x_dot
-                    x_dot = position_rate(q, nu)
-                    position = position + 0.5 * step_h * x_dot
-                else:
-                    if wp.static(contacts):
-                        parts = int(wp.ceil(h / wp.static(contact_step) - 1.0e-4))
-                        d = h / float(parts)
-                        for _ in range(parts):
-                            position = position + 0.5 * d * x_dot
-                            q = rotate_by(q, angular(nu), 0.5 * d)
-                            touch = contact_at(plant, walls, funnel, w, v, position, q, nu)
-                            greatest = wp.max(greatest, touch.push)
-                            impulse += d * touch.push
-                            push = yielding(plant, w, v, motion.wet, touch.tau)
-                            pressed += push / float(parts)
-                            nu = nu + d * (nu_dot + push)
-                            q = rotate_by(q, angular(nu), 0.5 * d)
-                            x_dot = position_rate(q, nu)
-                            position = position + 0.5 * d * x_dot
-        q = wp.normalize(q)
-        history[step % wp.static(HISTORY), w, v] = snapshot(position, q, nu)
-        if not is_finite(position, q, nu):
-            broken[w] = 1
-            return
-        state[w, v].position = position
-        state[w, v].quaternion = q
-        state[w, v].velocity = nu
-        delivered = thrust_of(plant, w, v, actuator)
-        state[w, v].acceleration = coasting + 0.5 * jerk + pressed + plant[w, v].G * delivered
-        state[w, v].coasting = coasting
-        state[w, v].pressed = pressed
-        state[w, v].actuator = actuator
-        state[w, v].thrust = delivered
-        if wp.static(funnel_present):
-            funnel.force[w, v] = greatest
-            funnel.impulse[w, v] = impulse
+        step_vehicle(
+            state, command, commands, history, steps, broken, plant, hull, water, walls, tether, funnel,
+            control_step, substeps, w, v,
+        )  # fmt: skip
 
-    return physics_step
+    if not lanes:
+        return physics_step
+
+    block = lane_block(set_out, substep, arrive)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=MODULE_OPTIONS)
+    def physics_blocks(
+        state: wp.array2d(dtype=VehicleState),
+        command: wp.array2d(dtype=VehicleCommand),
+        commands: wp.array3d(dtype=vec8),
+        history: wp.array3d(dtype=vec13),
+        steps: wp.array(dtype=int),
+        broken: wp.array(dtype=int),
+        frozen: wp.array(dtype=int),
+        plant: wp.array2d(dtype=VehicleParameters),
+        hull: HullMesh,
+        water: WaterArrays,
+        walls: PoolWalls,
+        tether: wp.array2d(dtype=Tether),
+        funnel: Funnel,
+        control_step: float,
+        substeps: int,
+        shared: wp.array(dtype=int),
+        worlds: int,
+        world_offset: int,
+    ):
+        i, v = wp.tid()
+        w = world_offset + wp.static(LANES) * i
+        count = wp.min(wp.static(LANES), worlds - wp.static(LANES) * i)
+        done = block(
+            state, command, commands, history, steps, frozen, plant, shared, water, walls, tether, control_step,
+            substeps, w, v, count,
+        )  # fmt: skip
+        for k in range(count):
+            if ((done >> k) & 1) == 0 and frozen[w + k] == 0:
+                step_vehicle(
+                    state, command, commands, history, steps, broken, plant, hull, water, walls, tether, funnel,
+                    control_step, substeps, w + k, v,
+                )  # fmt: skip
+
+    return physics_blocks
+
+
+SUBMERGED = {"position": (0.0, 0.0, -5.0), "quaternion": (0.0, 0.0, 0.0, 1.0)}
+"""Example of a state, in which the vehicle is under water."""
+WIDE = {"half_length": 1e3, "half_width": 1e3, "depth": 1e3}
+"""Example of a pool, whose walls are far away."""
+
+
+def lane_block(set_out: Any, substep: Any, arrive: Any) -> Any:
+    """A native function that takes a block of worlds through a control step, traced from the functions for one.
+
+    Worlds are left out whose episode has just begun, that are frozen, whose command is not finite, that are not wholly
+    under water in still water, or that are near a wall.
+    """
+    trace = Trace()
+    state = StructArray(trace, "state", VehicleState, SUBMERGED)
+    command = StructArray(trace, "command", VehicleCommand, {})
+    plant = StructArray(trace, "plant", VehicleParameters, {})
+    tether = StructArray(trace, "tether", Tether, {})
+    commands, history = VectorArray(trace, "commands", vec8, 2), VectorArray(trace, "history", vec13, 0)
+    commands.shape = (0, 0, trace.symbol("I", "slots", 4))
+    water, walls = (
+        UniformStruct(trace, "water", WaterArrays, {}),
+        UniformStruct(trace, "walls", PoolWalls, WIDE),
+    )
+    step, head, slot = (trace.symbol("I", name, 2) for name in ("step", "head", "place"))
+    h, control_step = (trace.symbol("F", name, 0.1) for name in ("h", "control"))
+    given = command[0, 0].thrust.numbers + command[0, 0].disturbance.numbers
+    for number in given:
+        trace.require(trace.apply("M", "finite({})", math.isfinite, number))
+    loop = Loop(trace, "course", lane_function(set_out)(state, command, commands, plant, 0, 0, head))
+    trace.level = 1
+    trace.sections[1].append("const I k = all_i(pass);")
+    k = trace.symbol("I", "k", 1)
+    loop.carry(
+        lane_function(substep)(
+            command,
+            commands,
+            plant,
+            None,
+            water,
+            walls,
+            tether,
+            None,
+            0,
+            0,
+            head,
+            step,
+            k,
+            h,
+            control_step,
+            loop.value(),
+        )
+    )
+    trace.level = 2
+    lane_function(arrive)(state, history, None, plant, None, 0, 0, slot, loop.value())
+    source = block_source(
+        trace,
+        [state, commands, history],
+        f"""
+const long row = shared.data[0] ? 0 : plant.strides[0];
+const At state_at = {{(char*)state.data + w * state.strides[0] + v * state.strides[1], state.strides[0], 0}};
+const At command_at = {{(char*)command.data + w * command.strides[0] + v * command.strides[1], command.strides[0], 0}};
+const At plant_at = {{(char*)plant.data + w * row + v * plant.strides[1], row, 0}};
+const At tether_at = {{(char*)tether.data + w * tether.strides[0] + v * tether.strides[1], tether.strides[0], 0}};
+const At commands_at = {{
+    (char*)commands.data + w * commands.strides[0] + v * commands.strides[1], commands.strides[0], commands.strides[2]
+}};
+const At history_at = {{
+    (char*)history.data + w * history.strides[1] + v * history.strides[2], history.strides[1], history.strides[0]
+}};
+I step; for (int l = 0; l < {LANES}; ++l) step[l] = l < count && frozen.data[w + l] == 0 ? steps.data[w + l] : 0;
+ok &= step != 0;
+const I slots = all_i(commands.shape[2]), head = step % slots, place = step % all_i({HISTORY});
+const F control = all(control_step), h = all(control_step / (float)substeps);
+""",
+        "for (int pass = 0; pass < substeps; ++pass)",
+    )
+
+    @wp.func_native(source)
+    def block(
+        state: wp.array2d(dtype=VehicleState),
+        command: wp.array2d(dtype=VehicleCommand),
+        commands: wp.array3d(dtype=vec8),
+        history: wp.array3d(dtype=vec13),
+        steps: wp.array(dtype=int),
+        frozen: wp.array(dtype=int),
+        plant: wp.array2d(dtype=VehicleParameters),
+        shared: wp.array(dtype=int),
+        water: WaterArrays,
+        walls: PoolWalls,
+        tether: wp.array2d(dtype=Tether),
+        control_step: float,
+        substeps: int,
+        w: int,
+        v: int,
+        count: int,
+    ) -> int: ...
+
+    return block
 
 
 @wp.kernel(enable_backward=False)

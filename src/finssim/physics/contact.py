@@ -75,10 +75,6 @@ def walls_within(walls: PoolWalls, position: wp.vec3, q: wp.quat, half_size: wp.
     """
     if walls.present == 0:
         return False
-    gap = wp.min(walls.half_length - wp.abs(position[0]), walls.half_width - wp.abs(position[1]))
-    gap = wp.min(gap, position[2] + walls.depth) - reach
-    if gap > 0.0 and gap * gap > wp.dot(half_size, half_size):
-        return False
     # Half extents of the turned box along the world's axes: most vehicles near a wall still do not touch it.
     R = wp.quat_to_matrix(q)
     extent = wp.vec3(

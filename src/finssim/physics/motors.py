@@ -26,7 +26,7 @@ def admissible(command: vec8, lower: vec8, upper: vec8, dead_minus: vec8, dead_p
     """A force command as the motors take it: inside [lower, upper], and zero inside (dead_minus, dead_plus) [N]."""
     f = wp.min(wp.max(command, lower), upper)
     for i in range(MAX_THRUSTERS):
-        f[i] = wp.where(f[i] > dead_minus[i] and f[i] < dead_plus[i], 0.0, f[i])
+        f[i] = wp.where(f[i] > dead_minus[i], wp.where(f[i] < dead_plus[i], 0.0, f[i]), f[i])
     return f
 
 

@@ -63,6 +63,7 @@ def load_state(environment: "Environment", saved: Mapping[str, NDArray[Any]]) ->
             )
     for name, array in arrays.items():
         array.assign(np.ascontiguousarray(saved[name]))
+    environment.simulator.compare_worlds()
     environment._steps = int(saved["counters.steps"])
     if environment.drawing.schedule is not None:
         environment.drawing.schedule._steps = int(saved["counters.schedule"])
