@@ -122,12 +122,19 @@ def measure(
     bias = wp.rand_init(wp.randi(own), -1)
     rng = wp.rand_init(wp.randi(own), step)
     n = wp.vec3(wp.randn(rng), wp.randn(rng), wp.randn(rng))
-    lasting = wp.vec3(wp.randn(bias), wp.randn(bias), wp.randn(bias))
-    angle = m.yaw_std * wp.randn(rng) + m.yaw_bias * wp.randn(bias)
+    angle = m.yaw_std * wp.randn(rng)
     for k in range(3):
-        nu[k] = nu[k] + m.velocity_std * wp.randn(rng) + m.velocity_bias * wp.randn(bias)
+        nu[k] = nu[k] + m.velocity_std * wp.randn(rng)
     for k in range(3):
-        nu[k + 3] = nu[k + 3] + m.rate_std * wp.randn(rng) + m.rate_bias * wp.randn(bias)
+        nu[k + 3] = nu[k + 3] + m.rate_std * wp.randn(rng)
+    lasting = wp.vec3(0.0)
+    if m.position_bias + m.yaw_bias + m.velocity_bias + m.rate_bias > 0.0:
+        lasting = wp.vec3(wp.randn(bias), wp.randn(bias), wp.randn(bias))
+        angle += m.yaw_bias * wp.randn(bias)
+        for k in range(3):
+            nu[k] = nu[k] + m.velocity_bias * wp.randn(bias)
+        for k in range(3):
+            nu[k + 3] = nu[k + 3] + m.rate_bias * wp.randn(bias)
     if step > 0 and wp.randf(rng) < m.dropout:
         return  # what was seen last is seen again
     arrays.position[w, v] = x + m.position_std * n + m.position_bias * lasting
