@@ -72,6 +72,7 @@ def is_loopback(address):
     return (getattr(address, "ipv4_mapped", None) or address).is_loopback
 
 
+@pytest.mark.slow
 def test_a_ray_of_its_own_listens_on_the_loopback_interface_alone():
     """Every socket of this process and of every process that Ray starts: its servers, agents and workers."""
     before = ray_processes()
