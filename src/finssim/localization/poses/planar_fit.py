@@ -186,17 +186,22 @@ def _covariance(
     With the miss e_i = Q_i - P_i, an error δ that all share moves the solution by -H^-1 sum_i J_i' w_i A_i de_i/dδ.
     """
     slope, level = seen.per_height[used], level[used]
-    about_x = np.array([math.cos(constraints.pitch), 0.0, -math.sin(constraints.pitch)])  # R_y e1
-    about_y = np.array([0.0, 1.0, 0.0])
-    port = tilt_matrix(constraints.roll, constraints.pitch) @ np.asarray(constraints.port, float)
+    cp, sp = math.cos(constraints.pitch), math.sin(constraints.pitch)
+    # Crossed with the axes of roll, R_y e1 = (cp, 0, -sp), and of pitch, e2: R_g p -> axis x R_g p, side by side.
+    turned = (
+        level
+        @ np.array(
+            [[0.0, -sp, 0.0, 0.0, 0.0, -1.0], [sp, 0.0, cp, 0.0, 0.0, 0.0], [0.0, -cp, 0.0, 1.0, 0.0, 0.0]]
+        )
+    ).reshape(-1, 2, 3)
+    x, y, _ = (tilt_matrix(constraints.roll, constraints.pitch) @ constraints.port).tolist()
+    raised = np.array([1.0, -cp * y, x, 0.0, 0.0])  # dz_b
     turn = _about_up(fit.xi[2])[:2, :2]
-    shared = np.zeros((5, len(slope), 2))
-    raised = np.array([1.0, 0.0, 0.0, 0.0, 0.0])  # dz_b
+    shared = np.empty((5, len(slope), 2))
     shared[0] = slope
-    for i, axis in enumerate((about_x, about_y), start=1):
-        turned = _cross(axis, level)
-        raised[i] = -_cross(axis, port[None])[0, 2]
-        shared[i] = slope * (turned[:, 2] + raised[i])[:, None] - turned[:, :2] @ turn.T
+    shared[1:3] = (
+        slope[:, None] * (turned[:, :, 2] + raised[1:3])[:, :, None] - turned[:, :, :2] @ turn.T
+    ).transpose(1, 0, 2)
     shared[3:] = seen.per_pixel[used].transpose(2, 0, 1)
     moved = np.empty((4, 5))  # x, y, psi, z_b by height, roll, pitch, u, v
     moved[:3] = fit.response(shared)
@@ -210,13 +215,6 @@ def _covariance(
     to_pool = np.zeros((3, 4))
     to_pool[:2, :2], to_pool[:2, 3], to_pool[2, 2] = R_pg[:2, :2], R_pg[:2, 2], R_pg[2, 2]
     return np.asarray(to_pool @ P @ to_pool.T)
-
-
-def _cross(axis: Array, vectors: Array) -> Array:
-    """axis x vector for each row: np.cross takes longer than all the rest."""
-    x, y, z = axis
-    S = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(vectors @ S.T)
 
 
 def _about_up(angle: float) -> Array:

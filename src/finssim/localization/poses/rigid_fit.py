@@ -13,6 +13,7 @@ __all__ = ["RigidFit", "rigid_fit"]
 Array = npt.NDArray[np.float64]
 
 _MOST_STEPS = 30
+_MOST_TURNS = 8
 _STILL = 1e-13
 """A step that changes the misses by less than the root of this [px²] is the last."""
 
@@ -65,8 +66,8 @@ class RigidFit:
 def rigid_fit(Q: Array, points: Array, A: Array, huber: float) -> RigidFit | None:
     """Find xi = (x, y, psi) that minimises sum_i rho(|A_i (Q_i - R(psi) points_i - [x, y])|).
 
-    Levenberg and Marquardt's method with the analytic Jacobian -A [I, R'(psi) points], from the closed-form solution
-    with equal weights.
+    Levenberg and Marquardt's method with the analytic Jacobian -A [I, R'(psi) points], from the minimum of the plain
+    sum of squares: where no point misses by `huber` or more, its first step is its last.
 
     Args:
         Q: Where the points are seen [m], (n, 2).
@@ -77,7 +78,7 @@ def rigid_fit(Q: Array, points: Array, A: Array, huber: float) -> RigidFit | Non
     Returns:
         The fit, or None where the points are too close together to tell the angle.
     """
-    xi = _procrustes(Q, points)
+    xi = _least_squares(Q, points, A)
     now = _evaluate(xi, Q, points, A, huber)
     damping, converged = 1e-6, False
     step_number = 0
@@ -123,10 +124,8 @@ def _inverse(H: Array, damping: float) -> Array | None:
     return np.asarray(np.array([[A, D, E], [D, B, F], [E, F, C]]) / determinant)
 
 
-def _procrustes(Q: Array, points: Array) -> tuple[float, float, float]:
-    """The closed form for equal weights."""
-    centre, middle = Q.sum(axis=0) / len(Q), points.sum(axis=0) / len(Q)
-    q, p = Q - centre, points - middle
+def _procrustes(centre: Array, middle: Array, q: Array, p: Array) -> tuple[float, float, float]:
+    """The closed form for equal weights, of the middles of both sets of points and where they are from them."""
     along = float(np.vdot(p, q))
     across = float(p[:, 0] @ q[:, 1] - p[:, 1] @ q[:, 0])
     psi = math.atan2(across, along)
@@ -138,16 +137,62 @@ def _procrustes(Q: Array, points: Array) -> tuple[float, float, float]:
     )
 
 
+def _least_squares(Q: Array, points: Array, A: Array) -> tuple[float, float, float]:
+    """The minimum of sum_i |A_i (Q_i - R(psi) points_i - [x, y])|², beside the closed form for equal weights.
+
+    The misses are linear in (x, y, cos psi, sin psi), so the sum is a quadratic form. Without x and y, which it decides
+    for each psi, it is K over (cos psi, sin psi, 1): Newton's method finds its minimum in plain numbers.
+    """
+    n = len(Q)
+    centre, middle = Q.sum(axis=0) / n, points.sum(axis=0) / n
+    q, p = Q - centre, points - middle
+    columns = np.zeros((n, 2, 5))  # of x, y, cos psi and sin psi in R points + [x, y], and -Q
+    columns[:, 0, 0] = columns[:, 1, 1] = 1.0
+    columns[:, :, 2] = p
+    columns[:, 0, 3], columns[:, 1, 3] = -p[:, 1], p[:, 0]
+    columns[:, :, 4] = -q
+    in_pixels = (A @ columns).reshape(-1, 5)
+    G = (in_pixels.T @ in_pixels).tolist()
+    (a, b), d = G[0][:2], G[1][1]
+    determinant = a * d - b * b
+    if not determinant > 0.0:
+        return _procrustes(centre, middle, q, p)
+    # Where x and y are for each of cos psi, sin psi, 1; and what is left of the form.
+    x = [-(d * G[0][k] - b * G[1][k]) / determinant for k in (2, 3, 4)]
+    y = [-(a * G[1][k] - b * G[0][k]) / determinant for k in (2, 3, 4)]
+    cc, ss, cs, c1, s1 = (
+        G[i + 2][j + 2] + G[i + 2][0] * x[j] + G[i + 2][1] * y[j]
+        for i, j in ((0, 0), (1, 1), (0, 1), (0, 2), (1, 2))
+    )
+    _, _, psi = begin = _procrustes(centre, middle, q, p)
+    for _ in range(_MOST_TURNS):
+        c, s = math.cos(psi), math.sin(psi)
+        slope = (ss - cc) * c * s + cs * (c * c - s * s) - c1 * s + s1 * c
+        curvature = (ss - cc) * (c * c - s * s) - 4.0 * cs * c * s - c1 * c - s1 * s
+        if not curvature > 0.0:
+            return begin
+        psi -= slope / curvature
+        if abs(slope) < 1e-8 * curvature:  # the error is the square of this, once the step is taken
+            break
+    c, s = math.cos(psi), math.sin(psi)
+    (qx, qy), (px, py) = centre.tolist(), middle.tolist()
+    return (
+        x[0] * c + x[1] * s + x[2] + qx - (c * px - s * py),
+        y[0] * c + y[1] * s + y[2] + qy - (s * px + c * py),
+        psi,
+    )
+
+
 def _evaluate(xi: tuple[float, float, float], Q: Array, points: Array, A: Array, huber: float) -> _State:
     c, s = math.cos(xi[2]), math.sin(xi[2])
     turned = points @ np.array([[c, s], [-s, c]])
     change = np.empty((len(Q), 2, 4))  # columns: Q - P, and P's derivatives by x, y, psi
-    change[:, :, 0] = Q - turned - np.array(xi[:2])
+    change[:, :, 0] = Q - turned - xi[:2]
     change[:, :, 1:3] = -_UNIT
     change[:, 0, 3], change[:, 1, 3] = turned[:, 1], -turned[:, 0]
     in_pixels = A @ change
     miss, J = in_pixels[:, :, 0], in_pixels[:, :, 1:]
-    squares = np.einsum("ij,ij->i", miss, miss)
+    squares = (miss * miss) @ _ONES
     missed = np.sqrt(squares)
     flat = J.reshape(-1, 3)
     if missed.max() <= huber:
@@ -163,4 +208,4 @@ def _evaluate(xi: tuple[float, float, float], Q: Array, points: Array, A: Array,
     return _State(cost, weighted.reshape(-1, 3).T @ flat, g, weighted, missed)
 
 
-_UNIT = np.eye(2)
+_UNIT, _ONES = np.eye(2), np.ones(2)
