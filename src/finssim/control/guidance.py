@@ -69,15 +69,20 @@ class Station:
 
 def goal_at(guide: Guide, t: float) -> Goal:
     """The level pose, velocity and acceleration that a pose controller is given at a time since the start [s]."""
-    reference = guide.at(t)
-    acceleration = acceleration_at(guide, t)
-    return Goal(reference.position, quat_from_yaw(reference.yaw), reference.velocity, acceleration)
+    before, after = _around(guide, t)
+    reference = guide.at(np.array([t, before, after]))
+    velocity = reference.velocity
+    acceleration = (velocity[2] - velocity[1]) / (after - before) if after > before else np.zeros(3)
+    return Goal(reference.position[0], quat_from_yaw(reference.yaw[0]), velocity[0], acceleration)
 
 
 def acceleration_at(guide: Guide, t: float) -> Array:
     """Acceleration of a guide, world frame [m/s²], (3,): the change of its velocity over 0.1 s; zero past its ends."""
+    return np.asarray(goal_at(guide, t).acceleration)
+
+
+def _around(guide: Guide, t: float) -> tuple[float, float]:
+    """Times between which the acceleration is taken [s]; equal past the guide's ends."""
     if not 0.0 <= t <= guide.duration:
-        return np.zeros(3)
-    before, after = max(t - DIFFERENCE, 0.0), min(t + DIFFERENCE, guide.duration)
-    change = guide.at(np.array([before, after])).velocity
-    return np.asarray((change[1] - change[0]) / (after - before))
+        return t, t
+    return max(t - DIFFERENCE, 0.0), min(t + DIFFERENCE, guide.duration)

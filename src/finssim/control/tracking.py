@@ -11,6 +11,7 @@ import numpy.typing as npt
 from finssim.geometry.rotations import (
     cross,
     quat_conjugate,
+    quat_from_yaw,
     quat_inverse_rotate,
     quat_multiply,
     quat_rotate,
@@ -94,9 +95,7 @@ def tracking_error(measured: Measured, goal: Goal, point: npt.ArrayLike) -> Trac
 
     relative = quat_multiply(quat_conjugate(q), q_goal)
     heading = wrap_angle(2.0 * np.arctan2(relative[..., 2], relative[..., 3]))
-    half, zero = 0.5 * heading, np.zeros_like(heading)
-    turn = np.stack([zero, zero, np.sin(half), np.cos(half)], axis=-1)
-    tilt = quat_to_rotvec(quat_multiply(relative, quat_conjugate(turn)))[..., :2]
+    tilt = quat_to_rotvec(quat_multiply(relative, quat_from_yaw(-heading)))[..., :2]
     drift = quat_inverse_rotate(q, np.asarray(goal.velocity, float))
     return TrackingError(
         np.concatenate([distance, tilt, heading[..., None]], axis=-1),

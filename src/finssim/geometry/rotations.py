@@ -108,9 +108,14 @@ def quat_inverse_rotate(q_ab: npt.ArrayLike, vector_a: npt.ArrayLike) -> Array:
 
 def quat_to_matrix(q_ab: npt.ArrayLike) -> Array:
     """Rotation matrix R_ab of a unit quaternion, (..., 4) -> (..., 3, 3)."""
-    q = np.asarray(q_ab, float)
-    S = skew(q[..., :3])
-    return np.asarray(np.eye(3) + 2.0 * q[..., 3, None, None] * S + 2.0 * S @ S)
+    x, y, z, w = _components(q_ab)
+    # 1 + 2 w S + 2 S S with S = S(x, y, z).
+    R = _vector(
+        *(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        *(2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        *(2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+    return R.reshape(*R.shape[:-1], 3, 3)
 
 
 def matrix_to_quat(R_ab: npt.ArrayLike) -> Array:
@@ -133,16 +138,13 @@ def matrix_to_quat(R_ab: npt.ArrayLike) -> Array:
 
 def quat_from_euler(roll: npt.ArrayLike, pitch: npt.ArrayLike, yaw: npt.ArrayLike) -> Array:
     """Quaternion of R_z(yaw) R_y(pitch) R_x(roll) [rad], (...) each -> (..., 4)."""
-    r, p, y = np.broadcast_arrays(*(0.5 * np.asarray(angle, float) for angle in (roll, pitch, yaw)))
+    r, p, y = (0.5 * np.asarray(angle, float) for angle in (roll, pitch, yaw))
     cr, cp, cy, sr, sp, sy = np.cos(r), np.cos(p), np.cos(y), np.sin(r), np.sin(p), np.sin(y)
-    return np.stack(
-        [
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-            cr * cp * cy + sr * sp * sy,
-        ],
-        axis=-1,
+    return _vector(
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
     )
 
 
@@ -160,7 +162,8 @@ def quat_to_euler(q: npt.ArrayLike) -> tuple[Array, Array, Array]:
 
 def quat_from_yaw(yaw: npt.ArrayLike) -> Array:
     """Quaternion of a turn about the vertical, left positive [rad], (...) -> (..., 4)."""
-    return quat_from_euler(0.0, 0.0, yaw)
+    half = 0.5 * np.asarray(yaw, float)
+    return _vector(0.0, 0.0, np.sin(half), np.cos(half))
 
 
 def quat_yaw(q: npt.ArrayLike) -> Array:

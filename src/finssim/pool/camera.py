@@ -75,7 +75,7 @@ class PoolCamera:
             rate=s.rate, exposure=s.exposure, latency=s.latency, jitter=s.jitter, dropout=s.dropout, seed=seed
         )
         self._mail = Mail()
-        self._T_pw = site.T_pw
+        self._R_pw, self._t_pw = site.T_pw[:3, :3], site.T_pw[:3, 3]
         self._q_pw = np.asarray(site.world_orientation)
 
     def advance(self, t0: float, t1: float, pose_at: PoseAt) -> list[Picture]:
@@ -95,9 +95,9 @@ class PoolCamera:
 
     def develop(self, exposure: Exposure) -> Picture:
         """What the robot gets of an exposure."""
-        T = self._T_pw
-        places = np.stack([exposure.start[0], exposure.end[0]]) @ T[:3, :3].T + T[:3, 3]
-        turns = np.asarray(quat_multiply(self._q_pw, np.stack([exposure.start[1], exposure.end[1]])))
-        start, end = zip(places, turns, strict=True)
+        start, end = (
+            (self._R_pw @ position + self._t_pw, quat_multiply(self._q_pw, quaternion))
+            for position, quaternion in (exposure.start, exposure.end)
+        )
         picture = self._view.picture(start, end, exposure.middle, exposure.sequence)
         return replace(picture, time=exposure.arrival)

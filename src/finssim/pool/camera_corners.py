@@ -77,22 +77,22 @@ class CornerCamera:
         shape = len(self._ids), -1
         seen = seen.reshape(shape).all(axis=1)
         corners, bend = self._fit.corners(pixels.reshape(*shape, 2))
+        rim = self._inside(corners + RIM * (corners - corners[:, OPPOSITE])).all(axis=1)
         noise = np.random.default_rng([self._seed, sequence]).standard_normal(corners.shape)
         found = [
             TagCorners(tag, reported)
-            for tag, there, c, b, e in zip(self._ids, seen, corners, bend.tolist(), noise, strict=True)
-            if there and (reported := self._reported(c, b, e)) is not None
+            for tag, there, c, b, e in zip(self._ids, seen & rim, corners, bend.tolist(), noise, strict=True)
+            if there and (reported := _reported(c, b, self._noise, e)) is not None
         ]
         return Picture(middle, sequence, tags=tuple(found))
 
-    def _reported(self, corners: Array, bend: float, noise: Array) -> Array | None:
-        """Corners of one tag, None where a detector would not find it."""
-        (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners.tolist()
-        sides = math.hypot(bx - ax, by - ay), math.hypot(cx - bx, cy - by), math.hypot(dx - cx, dy - cy)
-        area = 0.5 * ((cx - ax) * (dy - by) - (cy - ay) * (dx - bx))
-        if bend > MOST_BENT or min(sides) < LEAST_EDGE or area < NARROWEST * max(sides) ** 2:
-            return None
-        if not self._inside(corners + RIM * (corners - corners[OPPOSITE])).all():
-            return None
-        error = math.hypot(self._noise, UNEXPLAINED * bend * math.sqrt(area))
-        return np.asarray(corners + error * noise)
+
+def _reported(corners: Array, bend: float, pixel_noise: float, noise: Array) -> Array | None:
+    """Corners of one tag in the picture, None where a detector would not find it."""
+    (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners.tolist()
+    sides = math.hypot(bx - ax, by - ay), math.hypot(cx - bx, cy - by), math.hypot(dx - cx, dy - cy)
+    area = 0.5 * ((cx - ax) * (dy - by) - (cy - ay) * (dx - bx))
+    if bend > MOST_BENT or min(sides) < LEAST_EDGE or area < NARROWEST * max(sides) ** 2:
+        return None
+    error = math.hypot(pixel_noise, UNEXPLAINED * bend * math.sqrt(area))
+    return np.asarray(corners + error * noise)

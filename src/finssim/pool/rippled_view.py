@@ -136,13 +136,13 @@ class _Surface:
         self._phase = waves.phase + offset @ self._k
         kx, ky = self._k
         a = waves.amplitude
-        self._of_sine = np.stack([a, -a * kx * kx, -a * kx * ky, -a * ky * ky], axis=1)
-        self._of_cosine = np.stack([a * kx, a * ky], axis=1)
+        self._of_sine = np.stack([a, -a * kx * kx, -a * kx * ky, -a * ky * ky])
+        self._of_cosine = np.stack([a * kx, a * ky])
 
     def at(self, x: Array, y: Array, time: float) -> tuple[Array, Array, Array, Array, Array, Array]:
         """h [m], h_x, h_y, h_xx, h_xy, h_yy [1/m] at places, (N,) each."""
-        angle = np.stack([x, y], axis=1) @ self._k
+        angle = np.array((x, y)).T @ self._k
         angle += self._phase - self._omega * time
-        even = np.sin(angle) @ self._of_sine
-        odd = np.cos(angle) @ self._of_cosine
-        return even[:, 0], odd[:, 0], odd[:, 1], even[:, 1], even[:, 2], even[:, 3]
+        h, h_xx, h_xy, h_yy = self._of_sine @ np.sin(angle).T
+        h_x, h_y = self._of_cosine @ np.cos(angle).T
+        return h, h_x, h_y, h_xx, h_xy, h_yy

@@ -171,8 +171,8 @@ class RadialTangential:
     def _radial(self, s: Array) -> tuple[Array, Array, Array | float]:
         """R(s), dR/ds and the denominator of R."""
         k1, k2, k3 = self._numerator
-        R = 1.0 + s * (k1 + s * (k2 + s * k3))
-        slope = k1 + s * (2.0 * k2 + (3.0 * k3) * s)
+        R = 1.0 + s * (k1 + s * (k2 + s * k3 if k3 else k2))
+        slope = k1 + s * (2.0 * k2 + (3.0 * k3) * s if k3 else 2.0 * k2)
         if not any(self._denominator):
             return R, slope, 1.0
         k4, k5, k6 = self._denominator
