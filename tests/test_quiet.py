@@ -1,0 +1,44 @@
+"""What Warp prints, and what a user is told instead."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+SCRIPT = """
+import json
+from finssim.quiet import start_warp
+start_warp()
+import numpy as np
+from finssim.control.allocator import Allocator
+from finssim.vehicles import load_vehicle
+thrusts, _ = Allocator.from_vehicle(load_vehicle("finsrov")).allocate(np.ones(6))
+print(json.dumps(thrusts.tolist()))
+"""
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """The same script twice, with a kernel cache that is empty at first."""
+    cache = tmp_path_factory.mktemp("kernels")
+    environment = {**os.environ, "WARP_CACHE_PATH": str(cache)}
+    command = [sys.executable, "-c", SCRIPT]
+    return [
+        subprocess.run(command, env=environment, capture_output=True, text=True, check=True) for _ in range(2)
+    ]
+
+
+def test_what_is_compiled_is_told_once_and_on_standard_error(runs):
+    """By the name of the module that holds the kernels; with compiled kernels nothing is said."""
+    announced, *compiled = runs[0].stderr.splitlines()
+    assert "once on this machine" in announced
+    assert [line.split(" in ")[0] for line in compiled] == ["compiled the kernels of control.allocation"]
+    assert runs[1].stderr == ""
+
+
+def test_standard_output_holds_what_the_program_prints_alone(runs):
+    """JSON can be read from it, whether kernels were compiled or not, and is the same."""
+    first, second = (json.loads(run.stdout) for run in runs)
+    assert len(first) == 8 and first == second
