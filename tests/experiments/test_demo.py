@@ -1,5 +1,7 @@
 """`finssim demo`: the whole loop at a small size, and a report that stands alone."""
 
+import contextlib
+import io
 import json
 import re
 
@@ -33,14 +35,14 @@ SMALL = Scope(
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """The command, with a policy that had no time to learn: its folder, and what was identified."""
-    out, found = tmp_path_factory.mktemp("demo") / "demo", []
-    with pytest.MonkeyPatch.context() as patch:
+    """The command, with a policy that had no time to learn: its folder, what was identified, and what it told."""
+    out, found, told = tmp_path_factory.mktemp("demo") / "demo", [], io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(told):
         patch.setattr(demo_module, "VIEW_AT", 1.0)
         patch.setattr(demo_module, "identify", lambda *a, **k: found.append(identify(*a, **k)) or found[0])
         patch.setattr(demo_module, "FULL", SMALL)
         assert boundary.run(app, ["demo", "--steps", "8192", "--seed", "1", "--out", str(out)]) == 0
-    return out, found[0]
+    return out, found[0], told.getvalue()
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +77,7 @@ def test_policy_results_and_report_are_there(folder):
 
 def test_the_identified_vehicle_is_as_fast_as_the_plant_and_the_policy_is_for_it(made):
     """Terminal speed of surge within 10 % of the plant's, from a step in each direction; trials by role."""
-    folder, _ = made
+    folder, _, _ = made
     vehicle = load_vehicle(folder / "finsrov_identified.yaml")
     assert Policy.load(folder / "policy", vehicle=vehicle).description.vehicle.sha256 == vehicle.sha256
     steps = json.loads((folder / "steps.json").read_text(encoding="utf-8"))
@@ -86,6 +88,19 @@ def test_the_identified_vehicle_is_as_fast_as_the_plant_and_the_policy_is_for_it
         for trial in load_trials([folder / "trials" / role]):
             assert trial.header.role == role and vehicle.fitted_on(trial.sha256) is (role == "fit")
             assert (folder / "trials" / role / "records" / f"{trial.name}.mcap").is_file()
+
+
+def test_each_trial_is_told_as_soon_as_it_is_over(made):
+    """First the speeds that trials reached, near those of the plant, then what was identified, then who held what."""
+    lines = made[2].splitlines()
+    at = [next(i for i, line in enumerate(lines) if line.startswith(s)) for s in ("identified", "holding")]
+    reached = dict(re.findall(r"  (\w+): up to ([\d.]+)", "\n".join(lines[: at[0]])))
+    assert len(reached) == 4 and at[0] < at[1]
+    for step in json.loads((made[0] / "steps.json").read_text(encoding="utf-8")):
+        name = f"{step['axis']}_plus_{step['level']:g}"
+        assert float(reached[name]) == pytest.approx(step["plant_speed"], rel=0.2)
+    assert sum(" at P01: " in line for line in lines[at[1] :]) == 3
+    assert "  policy-with-pictures at P02: not held" in lines
 
 
 def test_controllers_met_the_plant_that_the_trials_came_from_through_the_whole_stack(folder):

@@ -113,3 +113,22 @@ def test_batches_of_any_shape_equal_single_calls():
     for function in (quat_to_matrix, quat_to_rotvec, quat_yaw, quat_conjugate):
         np.testing.assert_array_equal(function(grid)[3, 7], function(grid[3, 7]))
     assert quat_from_euler(np.zeros((4, 1)), 0.1, np.zeros(5)).shape == (4, 5, 4)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-9, 1e-3, 1.0, 6.0])
+def test_one_is_as_one_of_many(scale):
+    """Plain numbers of a single rotation and columns of a batch: the same formulas, so the same to rounding."""
+    v, w = scale * np.random.default_rng(11).standard_normal((2, 7, 3))
+    q, r = quat_from_rotvec(v), quat_from_rotvec(w)
+    for function, arguments in (
+        (quat_from_rotvec, (v,)),
+        (skew, (v,)),
+        (cross, (v, w)),
+        (quat_multiply, (q, r)),
+        (quat_rotate, (q, v)),
+        (quat_to_matrix, (q,)),
+        (quat_from_yaw, (v[:, 0],)),
+    ):
+        many = function(*arguments)
+        for i in range(7):
+            np.testing.assert_allclose(function(*(a[i] for a in arguments)), many[i], rtol=1e-14, atol=1e-15)

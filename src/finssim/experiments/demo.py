@@ -6,7 +6,7 @@ import shutil
 import sys
 import time
 import webbrowser
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from os import environ
@@ -30,14 +30,14 @@ from finssim.experiments.pool_evaluation import pool_evaluation, pool_jobs
 from finssim.experiments.results_table import print_comparison
 from finssim.experiments.running import Say
 from finssim.experiments.setpoints import T1_SETPOINTS
-from finssim.experiments.transfer.campaign import run_jobs
+from finssim.experiments.transfer.campaign import Show, run_jobs
 from finssim.experiments.transfer.job import Job
 from finssim.experiments.transfer.pool_trial import play
 from finssim.files import atomic_directory
 from finssim.learning.train import train
 from finssim.pool import draw_plant
 from finssim.quiet import start_warp
-from finssim.vehicles import Vehicle, load_vehicle
+from finssim.vehicles import AXES, Vehicle, load_vehicle
 
 __all__ = ["FULL", "Scope", "demo"]
 
@@ -156,12 +156,19 @@ def _identified(
     standing = load_vehicle(VEHICLE)
     spec = draw_plant(standing, PLANT, SEVERITY)
     spec.write(folder / PLANT_FILE)
+    console.print("recording trials in the virtual pool", highlight=False)
     with console.status("recording trials in the virtual pool") as status:
 
         def say(part: float, what: str) -> None:
-            status.update(f"recording trials in the virtual pool: {what}")
+            fitting = f"fitting {VEHICLE} to the trials, replaying others"
+            status.update(f"recording trials in the virtual pool: {what}" if part < 1.0 else fitting)
 
-        record = _recorder(standing, scope, processes, say)
+        def show(run: Any, result: Mapping[str, Any]) -> None:
+            unit = "m/s" if run.programme.axes[0] in AXES[:3] else "rad/s"
+            told = f"  {run.target}: up to {result['fastest']:.2f} {unit} in {result['duration']:.0f} s"
+            console.print(told, highlight=False)
+
+        record = _recorder(standing, scope, processes, say, show)
         found = identify(folder, VEHICLE, seed=seed, shown=out, record=record)
         linear = {axis: levels for axis, levels in scope.levels.items() if axis not in ("roll", "pitch")}
         found = found.with_steps(compare_steps(found.vehicle, standing, spec, linear))
@@ -169,13 +176,19 @@ def _identified(
     console.print(
         f"identified from {len(found.fit.trials)} trials in {found.seconds:.0f} s: {told} of "
         f"{len(found.fit.estimates)} parameters told, NRMSE on {len(found.replay.pairs)} other trials "
-        f"{found.replay.aggregate('calibrated').value:.3f}",
+        f"{found.replay.aggregate('calibrated').value:.3f}, terminal speeds within {100.0 * _farthest(found):.0f} % of "
+        "the pool's own vehicle",
         highlight=False,
     )
     return found
 
 
-def _recorder(standing: Vehicle, scope: Scope, processes: int | None, say: Say) -> Record:
+def _farthest(found: Identification) -> float:
+    """Largest error of an identified terminal speed, part of the plant's."""
+    return max(abs(float(s["model_speed"]) / float(s["plant_speed"]) - 1.0) for s in found.steps)
+
+
+def _recorder(standing: Vehicle, scope: Scope, processes: int | None, say: Say, show: Show) -> Record:
     """Trials of the virtual pool."""
 
     def record(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
@@ -194,6 +207,7 @@ def _recorder(standing: Vehicle, scope: Scope, processes: int | None, say: Say) 
             seed=seed,
             processes=processes,
             say=say,
+            show=show,
         )
 
     return record
@@ -217,9 +231,17 @@ def _deployed(
     seen = jobs[:1]
     jobs += pool_jobs(names, scope.setpoints, camera="corners", **common)
     place = folder / TRIALS_FOLDER
+    console.print("holding setpoints in the virtual pool", highlight=False)
     with console.status("holding setpoints in the virtual pool") as status:
         say: Say = lambda part, what: status.update(f"holding setpoints in the virtual pool: {what}")  # noqa: E731
-        results = run_jobs(jobs, place, play, processes=processes, say=say)
+
+        def show(job: Job, result: Mapping[str, Any]) -> None:
+            held = "held" if result["success"] else result["fault"] or "not held"
+            if result["e_p_m"] is not None:
+                held += f", {result['e_p_m']:.3f} m and {result['e_psi_deg']:.1f}° off"
+            console.print(f"  {job.row} at {job.target}: {held}", highlight=False)
+
+        results = run_jobs(jobs, place, play, processes=processes, say=say, show=show)
         evaluations = _by_row(jobs, results, place)
         picture = camera_view(seen[0], place / seen[0].key(), VIEW_AT, seed) if seen else None
     return evaluations, picture

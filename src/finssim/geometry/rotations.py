@@ -6,6 +6,7 @@ yaw is a LEFT turn.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,6 @@ __all__ = [
 Array = npt.NDArray[np.float64]
 
 _CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
-_YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 def _components(a: npt.ArrayLike) -> tuple[Any, ...]:
@@ -68,11 +68,9 @@ def _cross(a: tuple[Any, ...], b: tuple[Any, ...]) -> tuple[Any, Any, Any]:
 
 def skew(a: npt.ArrayLike) -> Array:
     """Matrix S(a) with S(a) b = a x b, (..., 3) -> (..., 3, 3)."""
-    a = np.asarray(a, float)
-    S = np.zeros((*a.shape, 3))
-    S[..., _ZXY, _YZX] = a
-    S[..., _YZX, _ZXY] = -a
-    return S
+    x, y, z = _components(a)
+    S = _vector(0.0, -z, y, z, 0.0, -x, -y, x, 0.0)
+    return S.reshape(*S.shape[:-1], 3, 3)
 
 
 def quat_multiply(q_ab: npt.ArrayLike, q_bc: npt.ArrayLike) -> Array:
@@ -173,10 +171,11 @@ def quat_yaw(q: npt.ArrayLike) -> Array:
 
 def quat_from_rotvec(rotvec: npt.ArrayLike) -> Array:
     """Quaternion of a rotation vector (axis times angle) [rad], (..., 3) -> (..., 4)."""
-    v = np.asarray(rotvec, float)
-    angle = np.linalg.norm(v, axis=-1, keepdims=True)
+    x, y, z = _components(rotvec)
+    half = 0.5 * np.sqrt(x * x + y * y + z * z)
     # sinc(x) = sin(pi x)/(pi x) stays exact through zero.
-    return np.concatenate([0.5 * np.sinc(angle / (2.0 * np.pi)) * v, np.cos(0.5 * angle)], axis=-1)
+    ratio = 0.5 * (np.sinc(half / np.pi) if np.ndim(half) else math.sin(half) / half if half else 1.0)
+    return _vector(ratio * x, ratio * y, ratio * z, np.cos(half))
 
 
 def quat_to_rotvec(q: npt.ArrayLike) -> Array:

@@ -35,10 +35,17 @@ def test_results_come_in_the_order_of_the_jobs(tmp_path):
 def test_what_is_finished_is_not_played_again(tmp_path):
     """A second call plays only what is new."""
     run_jobs(JOBS[:2], tmp_path, played.known, processes=1)
-    told = []
-    run_jobs(JOBS, tmp_path, played.known, processes=1, say=lambda part, what: told.append(part))
+    told, shown = [], []
+    run_jobs(
+        JOBS,
+        tmp_path,
+        played.known,
+        processes=1,
+        say=lambda part, what: told.append(part),
+        show=lambda job, result: shown.append((job.target, result["success"])),
+    )
     assert marks(tmp_path) == ["P01", "P02", "P03"]
-    assert told[-1] == 1.0
+    assert told[-1] == 1.0 and shown == [("P03", True)]
 
 
 @pytest.mark.slow

@@ -12,12 +12,9 @@ from finssim.geometry.rotations import (
     quat_from_rotvec,
     quat_multiply,
     quat_rotate,
-    quat_to_matrix,
     quat_to_rotvec,
-    skew,
     wrap_angle,
 )
-from finssim.localization.fusion import fuse_turns
 from finssim.localization.fusion.error_state import (
     ErrorStateNoise,
     InertialState,
@@ -180,19 +177,6 @@ def measured(found, true, name, variance, rng, nis):
     distance, gain = error_innovation(found, residual, H, R)
     nis[name].append(distance)
     return correct(found, residual, H, R, gain)
-
-
-def test_quick_rotations_are_those_of_the_geometry():
-    """Constant matrices give what `finssim.geometry.rotations` gives, one or many, small or large."""
-    rng = np.random.default_rng(11)
-    for scale in (1e-9, 1e-3, 2e-3, 1.0, 6.0):
-        v, w = scale * rng.standard_normal((2, 7, 3))
-        q, r = quat_from_rotvec(v), quat_from_rotvec(w)
-        np.testing.assert_allclose(fuse_turns.turn_of(v), q, rtol=1e-13, atol=1e-16)
-        np.testing.assert_allclose(fuse_turns.product(q, r), quat_multiply(q, r), atol=1e-15)
-        np.testing.assert_allclose(fuse_turns.matrix_of(q), quat_to_matrix(q), atol=1e-15)
-        np.testing.assert_array_equal(fuse_turns.skew(v), skew(v))
-        np.testing.assert_allclose(fuse_turns.product(q[0], r[0]), quat_multiply(q[0], r[0]), atol=1e-15)
 
 
 def test_restarts_and_caps_keep_the_covariance_positive():

@@ -27,7 +27,7 @@ from finssim.robot.perception import Perception
 from finssim.robot.programme_pilot import ProgrammePilot
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
-from finssim.vehicles import Vehicle, load_vehicle
+from finssim.vehicles import AXES, Vehicle, load_vehicle
 
 __all__ = ["PoolRun", "play_programme", "trial_of_record"]
 
@@ -81,12 +81,15 @@ class PoolRun:
 
 
 class _Phases:
-    """Tells the record when the programme's phase changes."""
+    """Tells the record when the programme's phase changes, and remembers how fast the vehicle was."""
 
-    def __init__(self, pilot: ProgrammePilot, recorder: Recorder) -> None:
+    def __init__(self, pilot: ProgrammePilot, recorder: Recorder, axis: int) -> None:
         self._pilot, self._recorder, self._said = pilot, recorder, ""
+        self._axis, self.fastest = axis, 0.0
 
     def __call__(self, runtime: Runtime) -> None:
+        if self._said and runtime.reading is not None:
+            self.fastest = max(self.fastest, abs(float(runtime.reading.nu[self._axis])))
         if self._pilot.phase != self._said and runtime.reading is not None:
             self._said = self._pilot.phase
             self._recorder.event(runtime.reading.time, "phase", self._said)
@@ -100,16 +103,17 @@ def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
         path: PATH.mcap takes the record, PATH (a folder) the trial.
 
     Returns:
-        `fault` (why the bridge ended it early, or empty), `duration` [s] and the `notes` of the import.
+        `fault` (why the bridge ended it early, or empty), `duration` [s], `fastest` (the highest speed along the
+        programme's first axis, as the robot estimates it [m/s, rad/s]) and the `notes` of the import.
     """
     start_warp()
     path.mkdir(parents=True, exist_ok=True)
     record = path.with_name(f"{path.name}.mcap")
     record.unlink(missing_ok=True)
-    fault, duration = _record(run, record)
+    fault, duration, fastest = _record(run, record)
     trial = trial_of_record(record, run.programme.name, run.row)
     write_trial(trial, path, format="parquet")
-    return {"fault": fault, "duration": duration, "notes": list(trial.notes)}
+    return {"fault": fault, "duration": duration, "fastest": fastest, "notes": list(trial.notes)}
 
 
 def trial_of_record(record: Path, name: str, role: str) -> Trial:
@@ -124,8 +128,8 @@ def trial_of_record(record: Path, name: str, role: str) -> Trial:
     return replace(trial, name=name, header=trial.header.model_copy(update={"role": role}))
 
 
-def _record(run: PoolRun, record: Path) -> tuple[str, float]:
-    """Run robot and pool against each other; returns why it ended early, and how long it took [s]."""
+def _record(run: PoolRun, record: Path) -> tuple[str, float, float]:
+    """Run robot and pool against each other; returns why it ended early, how long it took [s], and how fast it was."""
     vehicle, standing = load_vehicle(run.vehicle), load_vehicle(run.pool_vehicle)
     spec = draw_plant(standing, run.plant, run.severity)  # type: ignore[arg-type]
     true_site, known_site, settings = camera_of(standing, run.plant, run.severity)  # type: ignore[arg-type]
@@ -150,15 +154,16 @@ def _record(run: PoolRun, record: Path) -> tuple[str, float]:
             start=(place.position, quat_from_yaw(place.yaw)),
             seed=seed,
         )
+        phases = _Phases(pilot, recorder, AXES.index(run.programme.axes[0]))
         run_lockstep(
             runtime,
             world,
             GETTING_READY + run.programme.duration,
-            show=_Phases(pilot, recorder),
+            show=phases,
             until=lambda r: pilot.finished or r.bridge.state == "fault",
         )
         world.close()
-    return _fault(runtime, pilot), 0.0 if math.isnan(runtime.t) else runtime.t
+    return _fault(runtime, pilot), 0.0 if math.isnan(runtime.t) else runtime.t, phases.fastest
 
 
 def _pilot(programme: Programme, vehicle: Vehicle, room: float | None, hold: str | None) -> ProgrammePilot:

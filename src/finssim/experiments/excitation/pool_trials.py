@@ -14,7 +14,7 @@ from finssim.calibration.trials.trial_files import load_trial
 from finssim.experiments.excitation.places import place_of
 from finssim.experiments.excitation.pool_run import PoolRun, play_programme
 from finssim.experiments.running import Say
-from finssim.experiments.transfer.campaign import run_jobs
+from finssim.experiments.transfer.campaign import Show, run_jobs
 from finssim.pool.draw_plant import draw_plant
 from finssim.vehicles import load_vehicle
 
@@ -36,6 +36,7 @@ def pool_trials(
     hold: str | None = "pid",
     processes: int | None = None,
     say: Say = lambda part, what: None,
+    show: Show = lambda job, result: None,
 ) -> dict[str, list[Trial]]:
     """Play programmes in a pool; the robot's whole software does, at the start that `places` gives each.
 
@@ -50,6 +51,7 @@ def pool_trials(
         hold: PID that keeps the axes that a programme does not excite; None leaves them alone.
         processes: As many as there are processors if None.
         say: Told the share that is done and what is left.
+        show: Given each run and its result, of `play_programme`, as soon as there is one.
 
     Returns:
         The trials by role, in the order of the programmes; a trial is complete.
@@ -77,7 +79,14 @@ def pool_trials(
     for run in runs:  # what cannot be is refused before anything is played
         place_of(run.programme, body, basin)
     with tempfile.TemporaryDirectory() as scratch:
-        results = run_jobs(runs, Path(scratch), play_programme, processes=processes, say=say)  # type: ignore[arg-type]
+        results = run_jobs(
+            runs,  # type: ignore[arg-type]
+            Path(scratch),
+            play_programme,  # type: ignore[arg-type]
+            processes=processes,
+            say=say,
+            show=show,
+        )
         for run, result in zip(runs, results, strict=True):
             if result["fault"]:
                 raise CalibrationError(

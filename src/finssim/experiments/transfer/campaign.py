@@ -8,7 +8,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,15 @@ from finssim.experiments.running import Say
 from finssim.experiments.transfer.job import Job
 from finssim.files import atomic_write
 
-__all__ = ["Play", "run_jobs"]
+__all__ = ["Play", "Show", "run_jobs"]
 
 WATCH = 1.0
 """Time between two looks of a worker at its parent [s]."""
 
 Play = Callable[[Job, Path], dict[str, Any]]
 """Plays a job, leaves its series in files that begin with the given path, and returns its result as plain data."""
+Show = Callable[[Job, Mapping[str, Any]], None]
+"""Given a job that has been played, and its result."""
 
 
 def run_jobs(
@@ -33,6 +35,7 @@ def run_jobs(
     *,
     processes: int | None = None,
     say: Say = lambda part, what: None,
+    show: Show = lambda job, result: None,
 ) -> list[dict[str, Any]]:
     """Play what has no result yet; after Ctrl-C or a kill the next call goes on where this one was.
 
@@ -42,6 +45,7 @@ def run_jobs(
         play: A function of a module, as it is called in other processes.
         processes: As many as there are processors if None.
         say: Told the share that is done and what is left.
+        show: Given each trial that is played now and its result, as soon as there is one.
 
     Returns:
         The results in the order of the jobs, each with its `job` and `key`.
@@ -52,12 +56,12 @@ def run_jobs(
         key: job for key, job in zip(keys, jobs, strict=True) if not (folder / f"{key}.json").is_file()
     }
     if missing:
-        _play_all(missing, folder, play, processes or os.cpu_count() or 1, len(set(keys)), say)
+        _play_all(missing, folder, play, processes or os.cpu_count() or 1, len(set(keys)), say, show)
     return [json.loads((folder / f"{key}.json").read_text(encoding="utf-8")) for key in keys]
 
 
 def _play_all(
-    missing: dict[str, Job], folder: Path, play: Play, processes: int, total: int, say: Say
+    missing: dict[str, Job], folder: Path, play: Play, processes: int, total: int, say: Say, show: Show
 ) -> None:
     # A fork would copy the threads of Warp and torch half-alive.
     context = multiprocessing.get_context("spawn")
@@ -65,13 +69,12 @@ def _play_all(
         min(processes, len(missing)), mp_context=context, initializer=_prepare, initargs=(os.getpid(),)
     )
     try:
-        running: set[Future[None]] = {
-            executor.submit(_play_one, key, job, folder, play) for key, job in missing.items()
-        }
+        jobs = {executor.submit(_play_one, key, job, folder, play): job for key, job in missing.items()}
+        running: set[Future[dict[str, Any]]] = set(jobs)
         while running:
             done, running = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
-                future.result()
+                show(jobs[future], future.result())
             say(1.0 - len(running) / total, f"{len(running)} trials left")
     except BaseException:
         _stop(executor)
@@ -101,7 +104,7 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-def _play_one(key: str, job: Job, folder: Path, play: Play) -> None:
+def _play_one(key: str, job: Job, folder: Path, play: Play) -> dict[str, Any]:
     result = {
         "key": key,
         "job": {**job.described(), "row": job.row, "target": job.target},
@@ -109,3 +112,4 @@ def _play_one(key: str, job: Job, folder: Path, play: Play) -> None:
     }
     with atomic_write(folder / f"{key}.json") as temporary:
         temporary.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return result

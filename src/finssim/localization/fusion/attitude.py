@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.rotations import quat_rotate
-from finssim.localization.fusion.fuse_turns import matrix_of, skew, turn_of
+from finssim.geometry.rotations import quat_from_rotvec, quat_rotate, quat_to_matrix, skew
 
 __all__ = [
     "Tilt",
@@ -114,6 +113,6 @@ def follow(tilt: Tilt, omega: npt.ArrayLike, accel: npt.ArrayLike, dt: float, ga
     up_measured = np.where(known, accel / np.where(known, force, 1.0), tilt.up)
     error = weight * (skew(up_measured) @ tilt.up[..., None])[..., 0]
     turn = np.asarray(omega, float) - tilt.bias + gains.proportional * error
-    up = (matrix_of(turn_of(-dt * turn)) @ tilt.up[..., None])[..., 0]
+    up = (quat_to_matrix(quat_from_rotvec(-dt * turn)) @ tilt.up[..., None])[..., 0]
     length = np.sqrt(np.sum(up * up, axis=-1, keepdims=True))
     return Tilt(up / length, np.asarray(tilt.bias - gains.integral * error * dt))

@@ -15,8 +15,8 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from finssim.geometry.rotations import quat_from_rotvec, quat_multiply, quat_to_matrix, skew
 from finssim.localization.fusion.changed import changed
-from finssim.localization.fusion.fuse_turns import matrix_of, product, skew, turn_of
 from finssim.localization.fusion.position_filter import Motion, process_noise, transition
 
 __all__ = [
@@ -84,11 +84,11 @@ def predict(
         gravity: Pool frame [m/s²], (3,): downwards.
     """
     turn = (omega - state.gyro_bias) * dt
-    R = matrix_of(product(state.q, turn_of(0.5 * turn)))
+    R = quat_to_matrix(quat_multiply(state.q, quat_from_rotvec(0.5 * turn)))
     pushed = (R @ (force - state.accel_bias)[..., None])[..., 0]
     a = pushed + gravity
-    q = product(state.q, turn_of(turn))
-    F = np.tile(_I15, (*turn.shape[:-1], 1, 1))
+    q = quat_multiply(state.q, quat_from_rotvec(turn))
+    F = np.broadcast_to(_I15, (*turn.shape[:-1], 15, 15)).copy()
     F[..., P, V] = dt * _I15[:3, :3]
     S, turned = dt * skew(pushed), dt * R
     F[..., V, A], F[..., P, A] = -S, (-0.5 * dt) * S
@@ -151,7 +151,7 @@ def position_model(state: InertialState, lever: Array) -> tuple[Array, Array]:
     Returns:
         Position, pool frame [m], (..., 3), and its Jacobian, (..., 3, 15).
     """
-    arm = (matrix_of(state.q) @ lever[:, None])[..., 0]
+    arm = (quat_to_matrix(state.q) @ lever[:, None])[..., 0]
     H = np.zeros((*arm.shape[:-1], 3, 15))
     H[..., range(3), range(3)] = 1.0
     H[..., A] = -skew(arm)
@@ -182,7 +182,7 @@ def yaw_model(state: InertialState) -> tuple[Array, Array]:
     Returns:
         Yaw [rad], (..., 1), and its Jacobian, (..., 1, 15).
     """
-    c = matrix_of(state.q)[..., :, 0]
+    c = quat_to_matrix(state.q)[..., :, 0]
     level = c[..., 0] ** 2 + c[..., 1] ** 2
     H = np.zeros((*c.shape[:-1], 1, 15))
     H[..., 0, 6] = -c[..., 2] * c[..., 0] / level
@@ -224,7 +224,7 @@ def correct(state: InertialState, residual: Array, H: Array, R: Array, gain: Arr
     kept = _I15 - gain @ H
     covariance = kept @ state.covariance @ np.swapaxes(kept, -1, -2)
     covariance = covariance + gain @ R @ np.swapaxes(gain, -1, -2)
-    q = product(turn_of(d[..., A]), state.q)
+    q = quat_multiply(quat_from_rotvec(d[..., A]), state.q)
     return InertialState(
         state.p + d[..., P],
         state.v + d[..., V],

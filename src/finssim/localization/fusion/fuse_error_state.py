@@ -13,6 +13,7 @@ from finssim.geometry.rotations import (
     matrix_to_quat,
     quat_from_euler,
     quat_multiply,
+    quat_to_matrix,
     wrap_angle,
 )
 from finssim.localization.fusion import error_state, fuse_restart
@@ -27,7 +28,6 @@ from finssim.localization.fusion.fuse_constant_velocity import (
     vision_covariance,
 )
 from finssim.localization.fusion.fuse_settings import Settings, Site
-from finssim.localization.fusion.fuse_turns import matrix_of
 from finssim.localization.fusion.gate import GateMemory, judge
 from finssim.localization.fusion.health import Estimate, Outcome
 from finssim.localization.fusion.streams import DepthSample, ImuSample, VisionSample
@@ -156,7 +156,7 @@ class ErrorState:
         if old:
             x[3:5] = 0.0
         yaw, H = error_state.yaw_model(state)
-        rates = matrix_of(state.q) @ (np.array(track.omega) - state.gyro_bias)
+        rates = quat_to_matrix(state.q) @ (np.array(track.omega) - state.gyro_bias)
         return Estimate(
             time=time,
             x=x,
@@ -174,7 +174,7 @@ class ErrorState:
     def _to_body(self, state: InertialState, omega: Array) -> tuple[Array, Array]:
         """Jacobian (6, 15) of the body origin's position and velocity, and their values (6,)."""
         position, H = error_state.position_model(state, self._body)
-        R = matrix_of(state.q)
+        R = quat_to_matrix(state.q)
         swing = R @ cross(omega - state.gyro_bias, self._body)
         T = np.zeros((6, 15))
         T[:3] = H
@@ -189,7 +189,7 @@ class ErrorState:
         known = self._before.estimate(before, time)
         level = quat_from_euler(known.roll, known.pitch, known.yaw)
         from_level = axes_of_up(self.site.up)
-        R = from_level @ matrix_of(level)
+        R = from_level @ quat_to_matrix(level)
         q = quat_multiply(matrix_to_quat(from_level), level)
         covariance = np.zeros((15, 15))
         covariance[:6, :6] = known.P
@@ -276,7 +276,7 @@ class ErrorState:
     def _kept(self, track: InertialTrack) -> InertialTrack:
         """The track with roll and pitch read from its attitude."""
         assert track.inertial is not None
-        roll, pitch = roll_pitch(self._up @ matrix_of(track.inertial.q))
+        roll, pitch = roll_pitch(self._up @ quat_to_matrix(track.inertial.q))
         return changed(track, roll=float(roll), pitch=float(pitch))
 
 
