@@ -120,14 +120,13 @@ class Firmware:
         self._bad_frames = bad
         if self._timed_out:
             refused |= RejectFlag.TIMEOUT
-        received = np.array(command.normalised)
-        in_range = bool(np.all(np.abs(received) <= 1.0))
+        in_range = _within(command)
         self.commands += 1
         if not in_range:
             refused |= RejectFlag.BAD_FRAME
         else:
             self._last_command, self._timed_out, self._enabled = now, False, command.enable
-            self._aim(received if command.enable else np.zeros(self._outputs))
+            self._aim(np.array(command.normalised) if command.enable else np.zeros(self._outputs))
         if not command.enable:
             refused |= RejectFlag.DISABLED
         self._unechoed += 1

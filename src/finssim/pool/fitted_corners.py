@@ -22,6 +22,7 @@ NODES = 6
 """Along each side of the tag: a polynomial of degree 5 follows ripples as long as the tag's edge."""
 HOMOGENEOUS = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 1.0], [0.0, 1.0, 1.0]])
 """Corners of the unit square."""
+_UNITY = np.eye(3)
 
 
 class CornerFit:
@@ -54,17 +55,17 @@ class CornerFit:
             (T,). Those of a tag of which not all nodes have pixels mean nothing.
         """
         with np.errstate(all="ignore"):
-            H = np.array([_from_square(tag) for tag in pixels[:, self._at_corner].tolist()])
-            back = np.linalg.inv(H)
+            square = [_from_square(tag) for tag in pixels[:, self._at_corner].tolist()]
+            H, back = np.array(square), np.array([_adjugate(tag) for tag in square])
             seen = pixels @ back[:, :, :2].transpose(0, 2, 1) + back[:, None, :, 2]
             moved = (seen[..., :2] / seen[..., 2:] - self._square).transpose(0, 2, 1).reshape(len(H), -1)
             change = (self._matrix @ moved[..., None])[..., 0]
-            warp = np.concatenate([change[:, :8], np.zeros((len(H), 1))], axis=1).reshape(-1, 3, 3) + np.eye(
-                3
-            )
-            image = HOMOGENEOUS @ (H @ warp).transpose(0, 2, 1)
+            warp = np.zeros((len(H), 9))
+            warp[:, :8] = change[:, :8]
+            image = HOMOGENEOUS @ (H @ (warp.reshape(-1, 3, 3) + _UNITY)).transpose(0, 2, 1)
             left = change[:, 8:]
-            return image[..., :2] / image[..., 2:], np.sqrt(2.0 * np.mean(left * left, axis=1))
+            bend = np.sqrt(2.0 * (left * left).sum(axis=1) / left.shape[1])
+            return image[..., :2] / image[..., 2:], bend
 
 
 def _fit_matrix(family: str, tag: int, along: Array, square: Array) -> Array:
@@ -117,6 +118,16 @@ def _from_square(corners: list[list[float]]) -> list[list[float]]:
     wx, wy = ax - bx + cx - dx, ay - by + cy - dy
     area = ux * vy - uy * vx
     if not abs(area) > 1e-9:
-        return np.eye(3).tolist()
+        return [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     p, q = (wx * vy - wy * vx) / area, (ux * wy - uy * wx) / area
     return [[bx - ax + p * bx, dx - ax + q * dx, ax], [by - ay + p * by, dy - ay + q * dy, ay], [p, q, 1.0]]
+
+
+def _adjugate(H: list[list[float]]) -> list[list[float]]:
+    """The homography back, (3, 3): the inverse but for a factor, which a homography does not feel."""
+    (a, b, c), (d, e, f), (g, h, i) = H
+    return [
+        [e * i - f * h, c * h - b * i, b * f - c * e],
+        [f * g - d * i, a * i - c * g, c * d - a * f],
+        [d * h - e * g, b * g - a * h, a * e - b * d],
+    ]

@@ -103,7 +103,7 @@ def back_project(camera: Camera, interface: Interface, pixels: npt.ArrayLike) ->
         sine2 = 1.0 - cosine * cosine
         along = ray + cosine[..., None] * n
         reach = height / cosine  # eq. 8: s; its part along the plane is s times `along`
-        worst = np.full(cosine.shape, np.inf)
+        worst: Array | float = np.inf
         depth = height
         for layer in interface.window:
             eta = interface.index_near / layer.index

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +29,6 @@ WORST = 4.0
 """A corner that misses its place by more than this [px], and by more than 8 standard deviations, is an outlier."""
 WORST_WITHOUT_WATER = 40.0
 """The same where the water is left out, which alone may cost many pixels."""
-_LEVEL = np.eye(3)
 _SUSPECTS = (
     "look at the tag's id, edge and mount, the depth, the tilt and the pool file",
     "the tags contradict each other: look at their ids and mounts, the depth, the tilt and the pool file",
@@ -70,8 +70,7 @@ def planar_fit(
         return refused(method, pairs.why_too_few, pairs.rejected)
     if constraints is None:
         return refused(method, "height and tilt are not known: give a depth", pairs.rejected, tags=pairs.tags)
-    up = np.asarray(constraints.up, float)
-    R_pg = _LEVEL if constraints.up == (0.0, 0.0, 1.0) else axes_of_up(up / np.linalg.norm(up))
+    R_pg = _frame_of(constraints.up)
     level = pairs.points_b @ tilt_matrix(constraints.roll, constraints.pitch).T
     seen = corner_points(pool, R_pg, pairs.pixels, constraints.z_b + level[:, 2], straight=straight)
     limit = max(WORST_WITHOUT_WATER if straight else WORST, 8.0 * pixel_std)
@@ -94,6 +93,12 @@ def planar_fit(
         fit.iterations,
         _medium(seen.in_air[solved.used]) if not straight else "",
     )
+
+
+@lru_cache(maxsize=16)
+def _frame_of(up: tuple[float, float, float]) -> Array:
+    """R_pg of `axes_of_up` for a direction of any length, (3, 3)."""
+    return axes_of_up(np.asarray(up) / np.linalg.norm(up))
 
 
 @dataclass(frozen=True, eq=False)
