@@ -35,7 +35,7 @@ from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import load_vehicle
 
-GOALS = {"corners": 20.0, "pictures": 2.0}
+GOALS = {"corners": 20.0, "pictures": 4.0}
 """Vehicle seconds in a second of one core, at least."""
 RATE = 60
 
