@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.engine import Simulator
+from finssim.engine import Pool, Simulator
 from reference.body import rotation
 from reference.cases import EVERY_VEHICLE_AND_MODEL, load, random_attitudes
 from reference.motion import energy, numbers
@@ -84,3 +84,23 @@ def test_a_body_in_the_air_keeps_its_momentum():
     angle = 5.0 / 12.0 * (0.025 * rate) ** 2 * rate
     assert np.abs(v_1 - v_0 - [0.0, 0.0, -9.81]).max() < angle * (9.81 + np.abs(v_0).max())
     assert np.abs(h_1 - h_0).max() < angle * np.linalg.norm(h_0, axis=1).max()
+
+
+def test_a_vehicle_put_half_into_a_wall_comes_out():
+    """With at most the energy of the springs that it lay in, four corners of 4000 N/m half a length deep, and no more.
+
+    In the air it would leave with sqrt(2 E / m); the water takes from that.
+    """
+    vehicle = load("finsrov")
+    pool, rng = Pool(), np.random.default_rng(2)
+    simulator = Simulator(vehicle, worlds=64, pool=pool)
+    side = rng.choice([-1.0, 1.0], 64)
+    position = np.stack([side * pool.length / 2, rng.uniform(-0.5, 0.5, 64), np.full(64, -0.5)], axis=1)
+    simulator.place(position[:, None], random_attitudes(rng, 64)[:, None])
+    reach = np.linalg.norm(vehicle.body.size) / 2.0
+    fastest = np.sqrt(8 * pool.stiffness * reach**2 / vehicle.body.mass)
+    for _ in range(30):
+        simulator.step()
+        assert np.linalg.norm(simulator.numpy("velocity")[:, 0, :3], axis=1).max() < fastest
+    assert simulator.frozen_worlds().tolist() == []
+    assert np.abs(simulator.numpy("position")[:, 0, 0]).max() < pool.length / 2

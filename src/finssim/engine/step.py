@@ -389,8 +389,16 @@ def physics_kernel(
                     near = walls_within(walls, position, q, half_size, h * slack)
                 if wp.static(funnel_present):
                     near = near or funnel_within(funnel, w, position, half_size, h * slack)
-            # What leans on a wall does not fall through it, and the water must not feel that it did.
-            nu_middle = nu + h * lead_of(nu, h) * (guess + pressed)
+            # What leans on a wall does not fall through it, and the water must not feel that it did. A wall's push is
+            # expected to stop a vehicle at most: expected to throw it back, it would feed on itself. A dock's is short.
+            lead = h * lead_of(nu, h)
+            nu_middle = nu + lead * guess
+            push_ahead = lead * pressed
+            if wp.static(not funnel_present):
+                push_ahead = wp.min(
+                    wp.max(push_ahead, wp.min(-nu_middle, vec6())), wp.max(-nu_middle, vec6())
+                )
+            nu_middle = nu_middle + push_ahead
             x_middle = position + 0.5 * h * x_dot
             q_middle = q + 0.5 * h * quaternion_rate(q, angular(nu))
             motion = motion_at(
