@@ -7,9 +7,10 @@ A substep h from (x, q, nu) takes the pose half a step on, the twist by extrapol
     nu'  = nu + h a',   a' = g + (1 + θ)⁻¹ (a - g),   θ_i = c h (M⁻¹)_ii d_i
     x'   = x + h/2 (x_dot + x_dot'),   q' = q ⊗ exp(h (ω + ω')/4),   r' = a' - G T
 
-r is the mean acceleration of the last substep without thrust and contacts, r_c that by contacts (of
-walls as far as it brings nu_m to 0), G = M⁻¹ B, and d_i the slope of the damping on axis i, d1 + 2 d2 |nu_r|, at the point r_m where inertia is
-nearly diagonal. For forces that are linear in nu and θ = 0 this is the two-step method of Adams and Bashforth.
+r is the mean acceleration of the last substep without thrust and contacts, r_c that by contacts (of walls as far as it
+brings nu_m to 0), G = M⁻¹ B, and d_i the slope of the damping on axis i, d1 + 2 d2 |nu_r|, at the point r_m where
+inertia is nearly diagonal. For forces that are linear in nu and θ = 0 this is the two-step method of Adams and
+Bashforth.
 
 Order: r is O(h) off its value a step later, so nu_m is O(h²) off the middle, and a' is θ (a - g) = O(h) O(h) off a: the
 error of a substep is O(h³). An episode's first substep is taken twice, the first time for r alone. What e has above 1/2
