@@ -87,6 +87,7 @@ def run(row: Row, seed: int, folder: Path, plant: Path, environment: dict[str, s
     )  # fmt: skip
     told = json.loads(done.stdout)
     result = told[0] if isinstance(told, list) else told
+    result |= {name: measure["value"] for name, measure in result.get("metrics", {}).items()}
     names = (
         "success",
         "trials",
