@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from finssim.engine import Pool, Simulator, TetherLine
-from finssim.engine.lanes import LANES, LaneError, Trace, UniformStruct, lane_function
+from finssim.engine.lanes import LANES, LaneError, StructArray, Trace, UniformStruct, lane_function
 from finssim.physics.contact import PoolWalls
 from reference.cases import PAIRS, random_states
 
@@ -134,6 +134,8 @@ def test_what_cannot_be_followed_is_said():
 
         _ = UniformStruct(Trace(), "shape", Shape, {}).offset
     assert UniformStruct(Trace(), "walls", PoolWalls, {}).depth.example == 1
+    with pytest.raises(LaneError, match="shape has 3 numbers, expected at least 8"):
+        StructArray(Trace(), "shape", Shape, {})
 
 
 @wp.func

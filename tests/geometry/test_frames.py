@@ -129,6 +129,7 @@ def test_mujoco_puts_w_first():
     np.testing.assert_array_equal(xyzw_from_wxyz(wxyz_from_xyzw(Q)), Q)
 
 
+@pytest.mark.slow  # importing MuJoCo's viewer starts a process
 def test_mujoco_free_joint_moves_as_the_body_does():
     """A free joint with our velocity advances its position along our body's motion, and turns about its axes."""
     mujoco = pytest.importorskip("mujoco")
@@ -144,6 +145,7 @@ def test_mujoco_free_joint_moves_as_the_body_does():
     np.testing.assert_allclose(velocity_from_mujoco(mujoco_velocity(TWIST, Q), Q), TWIST, atol=1e-14)
 
 
+@pytest.mark.slow  # importing MuJoCo's viewer starts a process
 def test_mujoco_free_joint_accelerates_as_the_body_does():
     """A lopsided rigid body under a wrench: Kirchhoff's equations in our coordinates give MuJoCo's qacc and inertia."""
     mujoco = pytest.importorskip("mujoco")

@@ -436,6 +436,8 @@ class StructArray:
     def __init__(self, trace: Trace, name: str, struct: Any, examples: Mapping[str, Any]) -> None:
         """Take its name in C++, its type, and examples of fields, which are 1 otherwise."""
         layout = np.dtype(struct.numpy_dtype())
+        if layout.itemsize < 4 * LANES:
+            raise LaneError(f"{name} has {layout.itemsize // 4} numbers, expected at least {LANES}")
         fields = {f: (kind, (layout.fields or {})[f][1]) for f, kind in struct.cls.__annotations__.items()}
         self.__dict__.update(
             _trace=trace,
