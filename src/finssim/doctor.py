@@ -32,6 +32,7 @@ EXTRAS = {
             "stable-baselines3": "stable_baselines3",
             "gymnasium": "gymnasium",
             "tensorboard": "tensorboard",
+            "threadpoolctl": "threadpoolctl",
             "onnx": "onnx",
             "onnxscript": "onnxscript",
             "matplotlib": "matplotlib",
