@@ -51,6 +51,7 @@ def has_rosidl():
     return probe.returncode == 0
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not has_rosidl(), reason="needs apt-get install python3-rosidl python3-lark python3-empy")
 def test_the_official_parser_takes_every_message(tmp_path):
     """rosidl_adapter turns each into IDL."""
