@@ -24,7 +24,7 @@ CHASE: dict[str, dict[str, Any]] = {
 }
 
 SETTINGS: Table = {
-    # Smaller networks than the default are as good here, and are learnt in two thirds of the time.
+    # Smaller networks than the default are as good here, and are learnt in three quarters of the time.
     "t1": {"ppo": {"hidden": (48, 48)}},
     "t2": {
         # A reference is close all the time: one second of foresight is enough, and learns faster than five.
