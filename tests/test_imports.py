@@ -23,7 +23,7 @@ ARROWS = {
     "tasks": {"engine", "control", "localization"},
     "learning": {"tasks"},
     "calibration": {"engine", "control", "localization"},
-    "robot": {"control", "localization"},
+    "robot": {"tasks"},
     "ros2": {"robot"},
     "pool": {"engine", "sensors", "robot"},
     "ros2_worlds": {"ros2", "pool"},

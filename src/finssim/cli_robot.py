@@ -14,14 +14,24 @@ __all__ = ["run"]
 
 def run(
     policy: Annotated[
-        str, typer.Option(help="A policy's directory, or pid, or pid-paper.", metavar="DIR|pid|pid-paper")
+        str,
+        typer.Option(
+            help="A policy's directory, or pid, or pid-paper, or with --task one of the task's baselines.",
+            metavar="DIR|NAME",
+        ),
     ],
     task: Annotated[
         str | None,
         typer.Option(
-            help="Task that the policy must have been trained for: t1 (station keeping) or t2 (trajectories); "
-            "its own if not given.",
+            help="Task that the policy must have been trained for, by name (see finssim tasks) or as FILE.py:CLASS of "
+            "one's own; the policy's if not given.",
             metavar="TASK",
+        ),
+    ] = None,
+    agent: Annotated[
+        str | None,
+        typer.Option(
+            help="This vehicle's place in a task of several; its first if not given.", metavar="NAME"
         ),
     ] = None,
     goal: Annotated[
@@ -113,6 +123,7 @@ def run(
     status = drive(
         policy,
         task=task,
+        agent=agent,
         goal=goal,
         trajectory=trajectory,
         pool_file=pool_file,

@@ -4,13 +4,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.reference.observed import published_t2
 
 from finssim.control.errors import ControlError
-from finssim.control.observe_t2 import SCHEMA, observe_t2
 from finssim.control.policy_description import ObservationEntry, ObservationSchema
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.control.trim import Trim
 from finssim.geometry.rotations import quat_from_euler
+from finssim.tasks import TrajectoryTracking
 
 TRIM = Trim(rate=0.5, limit=0.1, reach=0.2)
 PLACE = np.array([0.1, -0.2, -0.5])
@@ -20,9 +21,9 @@ MEASURED = SimpleNamespace(position=PLACE, quaternion=quat_from_euler(0.1, -0.2,
 def test_the_shown_observation_is_that_of_a_vehicle_shifted_the_other_way():
     """Only the offsets change: those to a reference moved by the shift."""
     shift, circle = np.array([0.02, -0.03, 0.01]), TRAJECTORIES["circle"]
-    shown = TRIM.shown(observe_t2(MEASURED, circle, 3.0), MEASURED, shift, SCHEMA)
+    shown = TRIM.shown(published_t2(MEASURED, circle, 3.0), MEASURED, shift, TrajectoryTracking().schema)
     moved = SimpleNamespace(**{**vars(MEASURED), "position": PLACE - shift})
-    np.testing.assert_allclose(shown, observe_t2(moved, circle, 3.0), atol=1e-12)
+    np.testing.assert_allclose(shown, published_t2(moved, circle, 3.0), atol=1e-12)
 
 
 def test_the_shift_is_the_integral_of_the_error():

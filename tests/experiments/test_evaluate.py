@@ -21,7 +21,6 @@ from finssim.experiments.players import PidPlayer
 from finssim.experiments.setpoints import T1_SETPOINTS, T1_START
 from finssim.experiments.trials import run_trials
 from finssim.files import OutputError
-from finssim.learning.description import observation_schema
 from finssim.learning.export import export_policy
 from finssim.tasks import EnvironmentSetupError, StationKeeping
 from finssim.vehicles import load_vehicle
@@ -44,7 +43,7 @@ def proportional(folder, vehicle=FINSROV, action="wrench6"):
     task = StationKeeping()
     description = PolicyDescription(
         task="t1",
-        observation=observation_schema(task),
+        observation=task.schema,
         action=action_mode(action, vehicle).describe(),
         control_period=task.control_step,
         vehicle=VehicleIdentity(name=vehicle.name, sha256=vehicle.sha256),

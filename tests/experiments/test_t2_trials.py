@@ -22,7 +22,6 @@ from finssim.experiments.t2_figure import draw_tracking
 from finssim.experiments.t2_metrics import MEASURES
 from finssim.experiments.t2_table import by_trajectory
 from finssim.experiments.t2_trials import T2_TRAJECTORIES, run_tracking
-from finssim.learning.description import observation_schema
 from finssim.learning.export import export_policy
 from finssim.tasks import TrajectoryTracking
 from finssim.vehicles import load_vehicle
@@ -166,7 +165,7 @@ def stiff_policy(folder):
         layer.weight[5, 20] = -0.3
     description = PolicyDescription(
         task="t2",
-        observation=observation_schema(TASK),
+        observation=TASK.schema,
         action=action_mode("wrench6", FINSROV).describe(),
         control_period=TASK.control_step,
         vehicle=VehicleIdentity(name=FINSROV.name, sha256=FINSROV.sha256),

@@ -12,7 +12,6 @@ from torch import nn
 import finssim
 from finssim.control.guidance import Station
 from finssim.control.modes import action_mode
-from finssim.control.observations import OBSERVERS
 from finssim.control.policy import Policy
 from finssim.control.policy_description import PolicyError
 from finssim.experiments.episodes import NOWHERE
@@ -22,10 +21,11 @@ from finssim.learning.export import ExportError
 from finssim.learning.held_evaluation import HeldEvaluation
 from finssim.learning.learners import learner_named
 from finssim.learning.recurrent import RecurrentNetwork
-from finssim.robot.pilots import PolicyPilot
+from finssim.robot.pilots import ObservingPilot
 from finssim.robot.robot import Reading
 from finssim.tasks import StationKeeping
 from finssim.tasks.baselines import restarted
+from finssim.tasks.observer import Observer
 from reference.guess import Guess
 from reference.policies import FINSROV, written
 
@@ -106,8 +106,8 @@ def test_a_network_that_remembers_otherwise_is_not_exported(tmp_path):
 
 def test_a_pilot_remembers_until_it_is_reset(policy):
     """The thrusts of the policy's own steps; after `reset` the first ones again."""
-    pilot, run = PolicyPilot(policy, FINSROV), Policy.load(policy)
-    mode, seen = action_mode("wrench6", FINSROV), OBSERVERS["t1"].observe(READING, STATION, 0.0)
+    pilot, run = ObservingPilot(policy, FINSROV), Policy.load(policy)
+    mode, seen = action_mode("wrench6", FINSROV), Observer("t1", FINSROV).observe(READING, STATION, 0.0)
     memory, given = run.reset(1), []
     for _ in range(3):
         action, memory = run.step(memory, seen)

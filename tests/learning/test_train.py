@@ -14,18 +14,16 @@ import pytest
 import yaml
 
 from finssim.control.modes import action_mode
-from finssim.control.observe_t2 import SCHEMA as SCHEMA_T2
 from finssim.control.policy import Policy
 from finssim.engine.ranges_file import RangesError
 from finssim.experiments.evaluate import evaluate_controller
 from finssim.experiments.plants import load_plant
 from finssim.files import OutputError
-from finssim.learning.description import observation_schema
 from finssim.learning.learners import LEARNERS, LearningError
 from finssim.learning.resume import ResumeError
 from finssim.learning.train import TrainingError, train
 from finssim.learning.training_loop import Loop
-from finssim.tasks import EnvironmentSetupError, StationKeeping, Task
+from finssim.tasks import EnvironmentSetupError, StationKeeping, Task, TrajectoryTracking
 from finssim.vehicles import VehicleError, load_vehicle
 from reference.guess import Guess
 
@@ -55,7 +53,7 @@ def trained(tmp_path_factory):
 def test_the_policy_loads_for_what_it_was_trained_with(trained):
     """Vehicle, task, action mode and rate are those of the training, and actions come out."""
     vehicle, task = load_vehicle("finsrov"), StationKeeping()
-    schema = observation_schema(task).model_dump(mode="json")
+    schema = task.schema.model_dump(mode="json")
     policy = Policy.load(
         trained,
         vehicle=vehicle,
@@ -340,7 +338,9 @@ def test_an_end_that_cannot_come_is_refused(tmp_path, task, until, sentence):
 def test_trajectory_tracking_is_trained_too(tmp_path):
     """T2's own settings and noise, in a policy that the robot's observation fits."""
     folder = train("t2", out=tmp_path / "t2", seed=1, randomize="hold_for_position", **TINY)
-    policy = Policy.load(folder, task={"name": "t2", "observation": SCHEMA_T2.model_dump(mode="json")})
+    policy = Policy.load(
+        folder, task={"name": "t2", "observation": TrajectoryTracking().schema.model_dump(mode="json")}
+    )
     assert policy.act(np.zeros((2, 30))).shape == (2, 6)
     training = yaml.safe_load((folder / "policy.yaml").read_text(encoding="utf-8"))["training"]
     assert training["discount"] == 0.9 and training["learner"] == "ppo"

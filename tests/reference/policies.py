@@ -2,7 +2,6 @@
 
 from finssim.control.modes import action_mode
 from finssim.control.policy_description import PolicyDescription, VehicleIdentity
-from finssim.learning.description import observation_schema
 from finssim.learning.export import export_policy
 from finssim.vehicles import load_vehicle
 
@@ -13,7 +12,7 @@ def written(network, folder, task, size):
     """A policy directory of a network."""
     description = PolicyDescription(
         task=task.name,
-        observation=observation_schema(task),
+        observation=task.schema,
         action={**action_mode("wrench6", FINSROV).describe(), "size": size},
         control_period=task.control_step,
         vehicle=VehicleIdentity(name=FINSROV.name, sha256=FINSROV.sha256),

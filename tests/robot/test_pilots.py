@@ -12,15 +12,16 @@ from finssim.control.controllers import controller
 from finssim.control.errors import ControlError
 from finssim.control.guidance import Station, goal_at
 from finssim.control.modes import Wrench4, Wrench6
-from finssim.control.observations import OBSERVERS
 from finssim.control.policy_description import PolicyError
 from finssim.control.trim import Trim
 from finssim.geometry.rotations import quat_from_euler
 from finssim.robot.ablation import NoisyInput
 from finssim.robot.counters import Ticks
 from finssim.robot.goals import GoalError, check_reachable, guide_of, station_of
-from finssim.robot.pilots import ModeSwitch, PidPilot, PolicyPilot, WrenchPilot, make_pilot
+from finssim.robot.pilots import ModeSwitch, ObservingPilot, PidPilot, WrenchPilot, make_pilot
 from finssim.robot.robot import Reading
+from finssim.tasks import StationKeeping
+from finssim.tasks.observer import Observer
 from finssim.vehicles import load_vehicle
 
 VEHICLE = load_vehicle("finsrov")
@@ -57,7 +58,7 @@ def policy(tmp_path):
         description = {
             "format": 1,
             "task": "t1",
-            "observation": OBSERVERS["t1"].schema.model_dump(mode="json"),
+            "observation": StationKeeping().schema.model_dump(mode="json"),
             "action": Wrench4.from_vehicle(VEHICLE, 0.5).describe(),
             "control_period": 0.1,
             "vehicle": {"name": VEHICLE.name, "sha256": VEHICLE.sha256},
@@ -77,8 +78,8 @@ def policy(tmp_path):
 
 def test_a_policy_pilot_gives_the_thrusts_of_its_network(policy):
     """Observation, network, action mode and allocation in a row."""
-    pilot = PolicyPilot(policy(), VEHICLE)
-    action = np.clip(GAIN @ OBSERVERS["t1"].observe(READING, STATION, 0.0), -1.0, 1.0)
+    pilot = ObservingPilot(policy(), VEHICLE)
+    action = np.clip(GAIN @ Observer("t1", VEHICLE).observe(READING, STATION, 0.0), -1.0, 1.0)
     expected = Wrench4.from_vehicle(VEHICLE, 0.5).to_thrusters(action)
     np.testing.assert_allclose(pilot.act(READING, STATION, 0.0), expected, atol=1e-4)
     assert pilot.period == 0.1 and pilot.describe()["task"] == "t1"
@@ -103,7 +104,7 @@ def test_a_policy_pilot_gives_the_thrusts_of_its_network(policy):
 def test_a_policy_that_does_not_fit_is_refused(policy, changes, sentence):
     """Vehicle, task, observation or limits: one sentence that names it."""
     with pytest.raises((PolicyError, ControlError), match=sentence):
-        PolicyPilot(policy(**changes), VEHICLE)
+        ObservingPilot(policy(**changes), VEHICLE)
 
 
 def test_a_policy_of_another_task_or_rate_than_asked_is_refused(policy):
@@ -111,7 +112,7 @@ def test_a_policy_of_another_task_or_rate_than_asked_is_refused(policy):
     with pytest.raises(PolicyError, match="trained for task 't1', but this is 't2'"):
         make_pilot(policy(), VEHICLE, task="t2")
     with pytest.raises(PolicyError, match=r"control period of 0.1 s, but it would be called every 0.05 s"):
-        PolicyPilot(policy(), VEHICLE, period=0.05)
+        ObservingPilot(policy(), VEHICLE, period=0.05)
 
 
 def test_a_network_that_was_changed_is_refused(policy):
@@ -119,7 +120,7 @@ def test_a_network_that_was_changed_is_refused(policy):
     folder = policy()
     (folder / "policy.onnx").write_bytes(b"x")
     with pytest.raises(PolicyError, match="corrupt"):
-        PolicyPilot(folder, VEHICLE)
+        ObservingPilot(folder, VEHICLE)
 
 
 @pytest.mark.parametrize("name", ["pid", "pid-paper"])
@@ -269,7 +270,7 @@ def test_a_goal_outside_the_workspace_is_refused():
 def test_a_trim_moves_what_a_policy_sees_until_it_is_reset(policy):
     """The first decision sees one period of it, later ones more; a policy without one decides the same again."""
     near = Station((0.25, 0.05, -0.38), 0.2)
-    plain, trimmed = PolicyPilot(policy(), VEHICLE), PolicyPilot(policy(), VEHICLE, trim=Trim(rate=1.0))
+    plain, trimmed = ObservingPilot(policy(), VEHICLE), ObservingPilot(policy(), VEHICLE, trim=Trim(rate=1.0))
     alone = plain.act(READING, near, 0.0)
     first, second = (trimmed.act(READING, near, 0.1 * k) for k in range(2))
     assert np.abs(first - alone).max() > 1e-4

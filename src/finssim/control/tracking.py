@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -19,7 +20,7 @@ from finssim.geometry.rotations import (
     wrap_angle,
 )
 
-__all__ = ["Controller", "Goal", "Measured", "TrackingError", "tracking_error", "velocity_at"]
+__all__ = ["Controller", "Goal", "Measured", "Track", "TrackingError", "tracking_error", "velocity_at"]
 
 Array = npt.NDArray[np.float64]
 
@@ -38,6 +39,20 @@ class Measured(Protocol):
     @property
     def nu(self) -> Any:
         """Velocity of the body origin and angular velocity, body frame [m/s, rad/s], (..., 6)."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """What is known of another vehicle, or of anything else that moves; it is a `Measured`."""
+
+    position: Array
+    """Its origin, world frame [m], (3,)."""
+    quaternion: Array
+    """Body to world, xyzw, (4,)."""
+    nu: Array
+    """Body frame [m/s, rad/s], (6,)."""
+    time: float = math.nan
+    """When that was measured [s]; NaN where it is not told."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from finssim.control.modes import mode_from_dict
 from finssim.control.policy import Policy
 from finssim.control.tracking import Controller, Goal
 from finssim.control.trim import Trim
-from finssim.learning.description import observation_schema
 from finssim.tasks import Task
 from finssim.tasks.baselines import BASELINES, baseline
 from finssim.vehicles import Vehicle
@@ -54,7 +53,7 @@ class PolicyPlayer:
         Raises:
             PolicyError, ControlError: It was trained for another vehicle, task, observation or other limits.
         """
-        schema = observation_schema(task).model_dump(mode="json")
+        schema = task.schema.model_dump(mode="json")
         policy = Policy.load(directory, vehicle=vehicle, task={"name": task.name, "observation": schema})
         mode = mode_from_dict(policy.description.action, vehicle)
         self.period = policy.description.control_period

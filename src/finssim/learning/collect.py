@@ -13,7 +13,6 @@ from finssim.control.modes import action_mode
 from finssim.control.policy_description import plain_data
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.learning.demonstrations import DATASET_FILE, DatasetError, Episode, save
-from finssim.learning.description import observation_schema
 from finssim.learning.experts import Expert, expert_for
 from finssim.provenance import provenance
 from finssim.tasks import Environment, make
@@ -76,7 +75,7 @@ def collect(
     described = {
         "task": environment.task.name,
         "expert": who.name,
-        "observation": observation_schema(environment.task).model_dump(mode="json"),
+        "observation": environment.task.schema.model_dump(mode="json"),
         "action": action_mode(environment.action_mode, body).describe(),
         "vehicle": {"name": body.name, "sha256": body.sha256},
         "hydrodynamics": hydrodynamics,

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from finssim.control.policy import Policy
 from finssim.control.policy_description import DESCRIPTION_FILE
-from finssim.learning.description import observation_schema
 from finssim.tasks import Environment
 from finssim.tasks.baselines import BASELINES, baseline, restarted
 
@@ -54,7 +53,7 @@ class _BaselineExpert:
 class _PolicyExpert:
     def __init__(self, directory: Path, environment: Environment) -> None:
         task = environment.task
-        schema = observation_schema(task).model_dump(mode="json")
+        schema = task.schema.model_dump(mode="json")
         self._policy = Policy.load(
             directory,
             vehicle=environment.simulator.vehicles[0],

@@ -20,7 +20,6 @@ from finssim.control.policy_description import (
 )
 from finssim.engine.randomize import Randomization
 from finssim.files import atomic_directory, refuse_unwritable
-from finssim.learning.description import observation_schema, task_record
 from finssim.learning.learners import learner_named
 from finssim.quiet import start_warp
 from finssim.tasks import Environment, Task, make, task_named
@@ -132,7 +131,7 @@ def train(
         climb(environment, plan)
     description = PolicyDescription(
         task=the_task.name,
-        observation=observation_schema(the_task),
+        observation=the_task.schema,
         action=mode.describe(),
         control_period=the_task.control_step,
         vehicle=VehicleIdentity(name=chosen.name, sha256=chosen.sha256),
@@ -144,7 +143,7 @@ def train(
             **asdict(values),
             "device": device,
             "randomization": randomization.ranges.model_dump(mode="json") if randomization else None,
-            "task": task_record(the_task),
+            "task": the_task.record(),
             "agents": list(the_task.agents),
             "levels": asdict(plan) if plan else None,
             "until": until,

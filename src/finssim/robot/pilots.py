@@ -13,15 +13,14 @@ import numpy.typing as npt
 from finssim.control.controllers import CONTROLLERS, controller_for
 from finssim.control.errors import ControlError
 from finssim.control.guidance import Guide, goal_at
-from finssim.control.modes import Wrench6, mode_from_dict
-from finssim.control.observations import observer
+from finssim.control.modes import Wrench6, action_mode, mode_from_dict
 from finssim.control.policy import Policy
 from finssim.control.policy_description import PolicyError, read_description
 from finssim.control.tracking import Measured
 from finssim.control.trim import Trim
 from finssim.vehicles import Vehicle
 
-__all__ = ["ModeSwitch", "PidPilot", "Pilot", "PolicyPilot", "WrenchPilot", "make_pilot"]
+__all__ = ["ModeSwitch", "ObservingPilot", "PidPilot", "Pilot", "WrenchPilot", "make_pilot"]
 
 Array = npt.NDArray[np.float64]
 
@@ -97,79 +96,94 @@ class PidPilot:
         return self._mode.allocator.allocate(np.clip(tau, -self._limits, self._limits))[0]
 
 
-class PolicyPilot:
-    """A policy directory, run with onnxruntime, on the observation of the task that it was trained for."""
+class ObservingPilot:
+    """Who acts on a task's observation: a policy directory, run with onnxruntime, or one of the task's baselines."""
 
     needs_state = True
 
     def __init__(
         self,
-        directory: str | Path,
+        who: str | Path,
         vehicle: Vehicle,
         *,
         task: str | None = None,
+        agent: str | None = None,
         period: float | None = None,
         trim: Trim | None = None,
     ) -> None:
-        """Load a policy and check that it fits.
+        """Load a policy and check that it fits, or make a baseline.
 
         Args:
-            directory: Of the policy.
-            vehicle: It must be the very one that the policy was trained for.
-            task: It must have been trained for; None: whatever it was trained for.
+            who: A policy's directory, or the name of a baseline of the task.
+            vehicle: It must be the very one that a policy was trained for.
+            task: Its name, or FILE.py:CLASS of one's own; a policy must have been trained for it; None: whatever a
+                policy was trained for.
+            agent: Its place in a task of several; the first if None.
             period: Time between two decisions at which it would be asked [s]; None: its own.
             trim: An integral in front of it, for a steady current or weight; none if None.
 
         Raises:
-            PolicyError, ControlError: Another vehicle, task, observation, rate or other limits, in one sentence.
+            PolicyError, ControlError, BaselineError: Another vehicle, task, observation, rate or other limits, in one
+                sentence.
         """
-        trained_for = read_description(Path(directory)).task
-        self._observer = observer(task or trained_for)
-        self.policy = Policy.load(
-            directory,
-            vehicle=vehicle,
-            task=self._observer.describe(task or trained_for),
-            control_period=period,
-        )
-        self._mode = mode_from_dict(self.policy.description.action, vehicle)
-        self.name = Path(directory).resolve().name
-        self._trim = trim
-        self.reset()
+        from finssim.tasks.baselines import BASELINES, baseline
+        from finssim.tasks.observer import Observer
 
-    @property
-    def period(self) -> float:
-        """Time between two decisions [s]: that of training."""
-        return self.policy.description.control_period
+        self.name = Path(who).resolve().name
+        self._trim = trim
+        if task is not None and str(who) in BASELINES.get(task, {}):
+            self._observer = Observer(task, vehicle, agent=agent)
+            self._mode = action_mode(self._observer.task.action, vehicle)
+            self._who: Any = baseline(task, str(who), vehicle)
+            self.period, self._act = self._who.period, self._who.act
+            self._about: dict[str, Any] = {"kind": "baseline", "task": task, "trim": None}
+            self.reset()
+            return
+        trained = read_description(Path(who))
+        self._mode = mode_from_dict(trained.action, vehicle)
+        self._observer = Observer(
+            task or trained.task, vehicle, agent=agent, action=str(trained.action["mode"])
+        )
+        self._who = policy = Policy.load(
+            who, vehicle=vehicle, task=self._observer.describe(), control_period=period
+        )
+        self._act = policy.step
+        self.period = trained.control_period
+        self._about = {
+            "kind": "policy",
+            "task": trained.task,
+            "trim": asdict(trim) if trim else None,
+            "hydrodynamics": trained.hydrodynamics,
+            "seed": trained.seed,
+            "files": dict(trained.files),
+        }
+        self.reset()
 
     def describe(self) -> dict[str, Any]:
         """Name, network, and what it was trained in."""
-        d = self.policy.description
-        return {
-            "name": self.name,
-            "kind": "policy",
-            "task": d.task,
-            "action": self._mode.name,
-            "period_s": self.period,
-            "trim": asdict(self._trim) if self._trim else None,
-            "hydrodynamics": d.hydrodynamics,
-            "seed": d.seed,
-            "files": dict(d.files),
-        }
+        about = {"name": self.name, **self._about, "action": self._mode.name, "period_s": self.period}
+        several = len(self._observer.task.agents) > 1
+        return {**about, "agent": self._observer.agent} if several else about
 
     def reset(self) -> None:
-        """Forget what a policy with memory has seen, and the trim's shift."""
-        self._memory = self.policy.reset(1)
+        """Forget what was seen, and the trim's shift."""
+        self._memory = self._who.reset(1)
         self._shift = np.zeros(3)
+        self.observation, self.action = np.zeros(0, np.float32), np.zeros(0, np.float32)
+        """What was seen, and done in [-1, 1], at the last decision; empty before the first."""
+        self._observer.restart()
 
     def act(self, reading: Measured, guide: Guide, t: float) -> Array:
         """Wanted thrusts in canonical order [N], (n,)."""
-        observation = self._observer.observe(reading, guide, t)
+        observation: Any = self._observer.observe(
+            reading, guide, t, self.action if self.action.size else None
+        )
         if self._trim is not None:
             self._shift = self._trim.update(self._shift, reading, guide.at(t).position, self.period)
-            schema = self.policy.description.observation
-            observation = self._trim.shown(observation, reading, self._shift, schema)
-        action, self._memory = self.policy.step(self._memory, observation)
-        return self._mode.to_thrusters(action)
+            observation = self._trim.shown(observation, reading, self._shift, self._observer.schema)
+        action, self._memory = self._act(self._memory, observation[None])
+        self.observation, self.action = np.asarray(observation), np.clip(action[0], -1.0, 1.0)
+        return self._mode.to_thrusters(action[0])
 
 
 class WrenchPilot:
@@ -270,17 +284,28 @@ class ModeSwitch:
 
 
 def make_pilot(
-    name_or_directory: str | Path, vehicle: Vehicle, *, task: str | None = None, trim: Trim | None = None
-) -> PidPilot | PolicyPilot:
-    """A PID by its name, or the policy of a directory; a PID has an integral of its own and takes no trim.
+    name_or_directory: str | Path,
+    vehicle: Vehicle,
+    *,
+    task: str | None = None,
+    agent: str | None = None,
+    trim: Trim | None = None,
+) -> PidPilot | ObservingPilot:
+    """A PID by its name, the policy of a directory, or a baseline of the task; only a policy takes a trim.
 
     Raises:
         PolicyError, ControlError: It does not fit the vehicle or the task.
     """
-    if str(name_or_directory) in CONTROLLERS:
+    if str(name_or_directory) in CONTROLLERS and task in (None, "t1", "t2"):
         return PidPilot(str(name_or_directory), vehicle, task or "t1")
-    if not Path(name_or_directory).exists():
+    if Path(name_or_directory).exists():
+        return ObservingPilot(name_or_directory, vehicle, task=task, agent=agent, trim=trim)
+    from finssim.tasks.baselines import BASELINES
+
+    known = BASELINES.get(task or "", {})
+    if str(name_or_directory) not in known:
+        names = dict.fromkeys([*(CONTROLLERS if task in (None, "t1", "t2") else ()), *known])
         raise PolicyError(
-            f"{name_or_directory}: neither {' nor '.join(CONTROLLERS)} nor a policy directory: give one of these"
+            f"{name_or_directory}: neither {' nor '.join(names)} nor a policy directory: give one of these"
         )
-    return PolicyPilot(name_or_directory, vehicle, task=task, trim=trim)
+    return ObservingPilot(name_or_directory, vehicle, task=task, agent=agent)

@@ -14,7 +14,6 @@ from rich.console import Console
 
 from finssim.control.controllers import CONTROLLERS
 from finssim.control.errors import ControlError
-from finssim.control.observations import observer
 from finssim.control.trim import Trim
 from finssim.localization.pool import load_pool
 from finssim.robot.goals import check_reachable, guide_of
@@ -46,6 +45,7 @@ def run(
     pool_file: Path,
     vehicle: str = "finsrov",
     task: str | None = None,
+    agent: str | None = None,
     wiring: Wiring | None = None,
     record: Path | None = None,
     duration: float | None = None,
@@ -62,7 +62,8 @@ def run(
         trajectory: Name or file, in place of a goal.
         pool_file: Camera, water and frames.
         vehicle: Name or file.
-        task: That the policy must have been trained for.
+        task: That the policy must have been trained for, or whose baseline acts.
+        agent: Place of this vehicle in a task of several.
         wiring: How the robot is connected; to the virtual pool of this machine if None.
         record: File that takes down everything.
         duration: When to end [s]; at the end of a trajectory, or when interrupted, if None.
@@ -77,7 +78,7 @@ def run(
     wiring, console = wiring or Wiring(), Console(stderr=True)
     ours, guide = load_vehicle(vehicle), guide_of(goal, trajectory)
     check_reachable(guide, ours)
-    pilot = _pilot(policy, ours, task, trim, follows=trajectory is not None)
+    pilot = _pilot(policy, ours, task, trim, agent=agent, follows=trajectory is not None)
     pool = load_pool(pool_file)
     perception = Perception(ours, pool, mode=mode)
     meta = {"command": "finssim run", "pilot": pilot.describe(), "guide": guide.name, "armed": arm}
@@ -106,15 +107,19 @@ def run(
     return UNHEARD if runtime.counters.steps and not runtime.counters.telemetry else 0
 
 
-def _pilot(policy: str, vehicle: Vehicle, task: str | None, trim: bool, *, follows: bool) -> Pilot:
+def _pilot(
+    policy: str, vehicle: Vehicle, task: str | None, trim: bool, *, agent: str | None, follows: bool
+) -> Pilot:
     """Who steers; a PID that follows a trajectory is that of T2."""
     if task is not None:
-        observer(task)  # refuses what is no task
+        from finssim.tasks.observer import fitted_task
+
+        fitted_task(task, vehicle)  # refuses what is no task, or none for this vehicle
     if policy in CONTROLLERS:
         if trim:
             raise ControlError(f"{policy} has an integral of its own: leave --trim out")
         task = task or ("t2" if follows else None)
-    return make_pilot(policy, vehicle, task=task, trim=Trim() if trim else None)
+    return make_pilot(policy, vehicle, task=task, agent=agent, trim=Trim() if trim else None)
 
 
 @contextmanager

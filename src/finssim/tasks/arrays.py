@@ -96,6 +96,7 @@ class TaskArrays:
 
     action: wp.array2d(dtype=float)  # (worlds, agents * size), each in [-1, 1]
     previous_action: wp.array2d(dtype=float)
+    time: wp.array(dtype=float)  # in the episode [s]
     scripted: wp.array2d(dtype=float)  # (worlds, others * size): actions of the vehicles that do not learn
     observation: wp.array2d(dtype=float)  # (worlds, agents * size)
     final_observation: wp.array2d(dtype=float)  # last observation of the episode that ended in this step
@@ -153,7 +154,7 @@ def task_arrays(
         "final_totals": totals,
     }.items():
         setattr(out, name, wp.zeros((worlds, columns), dtype=wp.float32, device=device))
-    for name in ("reward", "episode_return", "final_return", "held", "final_held"):
+    for name in ("time", "reward", "episode_return", "final_return", "held", "final_held"):
         setattr(out, name, wp.zeros(worlds, dtype=wp.float32, device=device))
     if agents == 1:
         out.reward = out.agent_reward.reshape(worlds)

@@ -18,6 +18,7 @@ def uniform3(rng: wp.uint32, low: wp.vec3, high: wp.vec3) -> wp.vec3:
 @wp.func
 def open_episode(arrays: TaskArrays, w: int):
     """Start the totals of an episode over."""
+    arrays.time[w] = 0.0
     arrays.held[w] = 0.0
     arrays.episode_return[w] = 0.0
     for i in range(arrays.totals.shape[1]):

@@ -68,6 +68,7 @@ class MovingTarget(Task):
     and tolerances are the published ones; across the pool its box is what the walls leave (published: 2.5 m).
     """
 
+    moving: ClassVar[bool] = True
     title: ClassVar[str] = "stay with a target that changes its course"
     name: str = "t3"
     totals: ClassVar[tuple[str, ...]] = ("success", "success_time", "squared_error")

@@ -91,6 +91,7 @@ class Pursuit(OpenWater):
     others: ClassVar[tuple[str, ...]] = ("prey",)
     totals: ClassVar[tuple[str, ...]] = ("captured", "left", "closest")
 
+    moving: ClassVar[bool] = True
     title: ClassVar[str] = "catch a prey, one against one"
     name: str = "pursuit"
     observation: tuple[ObservationPart, ...] = field(default=CHASE, repr=False)

@@ -5,10 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from finssim.control.guidance import Guide
+from finssim.control.guidance import Guide, Reference
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.tasks.arrays import ReferenceTable
 from finssim.tasks.environment import Environment, EnvironmentSetupError
+
+ENDLESS = 1.0e9
+"""A guide that takes longer takes this long [s]."""
 
 
 def reference_table(worlds: int, knots: int, spacing: float, device: wp.Device) -> ReferenceTable:
@@ -92,6 +95,18 @@ def follow(environment: Environment, guides: Sequence[Guide]) -> np.ndarray:
             f"a guide takes {longest:g} s, longer than the task's time_limit of {environment.task.time_limit:g} s: "
             "make the task with a longer one"
         )
+    places = fill_table(table, guides)
+    position, yaw = (np.stack([getattr(place, name)[0] for place in places]) for name in ("position", "yaw"))
+    q = quat_from_yaw(yaw)
+    return environment.start(position, q, position, q)
+
+
+def fill_table(table: ReferenceTable, guides: Sequence[Guide]) -> list[Reference]:
+    """Give world i the motion of guides[i]; a station has no end, and no progress.
+
+    Returns:
+        Each guide at the times of the knots, held at its end.
+    """
     t = table.spacing * np.arange(table.position.shape[1])
     ends = [np.minimum(t, guide.duration) for guide in guides]
     places = [guide.at(time) for guide, time in zip(guides, ends, strict=True)]
@@ -100,9 +115,7 @@ def follow(environment: Environment, guides: Sequence[Guide]) -> np.ndarray:
     beyond = (t - np.stack(ends))[..., None] * velocity
     table.position.assign((np.stack([place.position for place in places]) + beyond).astype(np.float32))
     table.velocity.assign(velocity.astype(np.float32))
-    table.duration.assign(np.array([guide.duration for guide in guides], np.float32))
+    table.duration.assign(np.array([min(guide.duration, ENDLESS) for guide in guides], np.float32))
     table.offset.zero_()
     table.given.fill_(1)
-    position, yaw = (np.stack([getattr(place, name)[0] for place in places]) for name in ("position", "yaw"))
-    q = quat_from_yaw(yaw)
-    return environment.start(position, q, position, q)
+    return places

@@ -1,13 +1,14 @@
 """What a task is: an observation schema, times, and the kernels that score, start and observe an episode."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from finssim.control.policy_description import ObservationEntry, ObservationSchema
 from finssim.engine import Dock, Pool
 from finssim.engine.launch import Pipeline
 from finssim.engine.state import State
@@ -59,6 +60,8 @@ class Task:
     """Walls and floor, unless others are asked for; None is open water."""
     levels: ClassVar[int] = 0
     """How many there are, of a task whose setting `level` says how hard it is; 0: it has none."""
+    moving: ClassVar[bool] = False
+    """Whether what it goes to moves: a robot is then given a trajectory, otherwise a pose."""
     totals: ClassVar[tuple[str, ...]] = ()
     """Names of what the kernels count in `arrays.totals`; zero at the start of an episode, and a part of `metrics`."""
 
@@ -81,6 +84,25 @@ class Task:
     def observation_size(self) -> int:
         """Numbers in the observation of an agent."""
         return sum(part.size for part in self.observation)
+
+    @property
+    def schema(self) -> ObservationSchema:
+        """The observation of an agent as a policy directory tells it, part by part."""
+        entries, first = [], 0
+        for part in self.observation:
+            clip = None if part.clip is None else (-part.clip, part.clip)
+            indices = tuple(range(first, first + part.size))
+            entries.append(
+                ObservationEntry(name=part.name, indices=indices, unit=part.unit, scale=part.scale, clip=clip)
+            )
+            first += part.size
+        return ObservationSchema(size=first, entries=tuple(entries))
+
+    def record(self) -> dict[str, Any]:
+        """The settings as plain data: ranges, limits, reward weights."""
+        settings = asdict(self)
+        del settings["observation"]
+        return settings
 
     @property
     def vehicles(self) -> tuple[str, ...]:

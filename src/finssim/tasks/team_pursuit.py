@@ -123,6 +123,7 @@ class TeamPursuit(OpenWater):
     )
 
     levels: ClassVar[int] = len(LEVELS)
+    moving: ClassVar[bool] = True
     title: ClassVar[str] = "drive a prey into a net, three against one"
     name: str = "team-pursuit"
     observation: tuple[ObservationPart, ...] = field(default=(*CHASE, *MATE, *MATE), repr=False)

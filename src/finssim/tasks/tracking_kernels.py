@@ -53,8 +53,9 @@ class TrackingParameters:
 
 
 @wp.func
-def write_tracking(arrays: TaskArrays, w: int, t: float):
-    """The 30 numbers of `OBSERVATION` from the measured state of vehicle 0, at a time since the start [s]."""
+def write_tracking(arrays: TaskArrays, w: int):
+    """The 30 numbers of `OBSERVATION` from the measured state of vehicle 0, at the time in the episode."""
+    t = arrays.time[w]
     q = arrays.quaternion[w, 0]
     x = arrays.position[w, 0]
     for i in range(4):
@@ -104,6 +105,7 @@ def evaluate_tracking(state: State, arrays: TaskArrays, p: TrackingParameters, w
         report_frozen(state, arrays, w)
         return
     t = float(state.steps[w]) * p.control_step
+    arrays.time[w] = t
     x = state.position[w, 0]
     goal = reference_position(arrays.reference, w, t)
     arrays.goal_position[w] = goal
@@ -122,7 +124,7 @@ def evaluate_tracking(state: State, arrays: TaskArrays, p: TrackingParameters, w
     arrays.truncated[w] = wp.where(late and not lost, 1, 0)
     arrays.done[w] = wp.where(done, 1, 0)
     arrays.episode_return[w] = arrays.episode_return[w] + reward
-    write_tracking(arrays, w, t)
+    write_tracking(arrays, w)
     if done:
         close_episode(state, arrays, w)
 
@@ -184,4 +186,4 @@ def observe_tracking(arrays: TaskArrays, mask: wp.array(dtype=int), world_offset
     """First observation of the episodes that start, where mask is not 0."""
     w = world_offset + wp.tid()
     if mask[w] != 0:
-        write_tracking(arrays, w, 0.0)
+        write_tracking(arrays, w)

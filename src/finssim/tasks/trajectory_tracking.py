@@ -87,6 +87,7 @@ class TrajectoryTracking(Task):
     """
 
     levels: ClassVar[int] = len(LEVELS)
+    moving: ClassVar[bool] = True
     title: ClassVar[str] = "follow a moving reference, whatever the heading"
     name: str = "t2"
     observation: tuple[ObservationPart, ...] = OBSERVATION

@@ -15,7 +15,6 @@ from finssim.experiments.compare.figure import curve_of
 from finssim.experiments.compare.runs import CompareError, groups_of
 from finssim.experiments.compare.scores import measures_of, scores_of
 from finssim.experiments.compare.table import markdown, sentences_of
-from finssim.learning.description import observation_schema
 from finssim.learning.export import export_policy
 from finssim.tasks import task_named
 from finssim.vehicles import load_vehicle
@@ -36,7 +35,7 @@ def policy(folder, seed, gain=6.0, task="t1", **training):
             layer.weight[5, 4], layer.weight[5, 14] = 0.3, -0.3
     description = PolicyDescription(
         task=task,
-        observation=observation_schema(the_task),
+        observation=the_task.schema,
         action=action_mode("wrench6", FINSROV).describe(),
         control_period=the_task.control_step,
         vehicle=VehicleIdentity(name=FINSROV.name, sha256=FINSROV.sha256),

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tests.reference.observed import published_t1
 
 from finssim.control.guidance import Station
-from finssim.control.observe_t1 import observe_t1
 from finssim.experiments.driven.command import collect_records
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.learning.demonstrations import load
@@ -50,7 +50,7 @@ class Watched(PidPilot):
         self._controller = Heard()
 
     def act(self, reading, guide, t):
-        self.seen.append(observe_t1(reading, guide, t))
+        self.seen.append(published_t1(reading, guide, t))
         return super().act(reading, guide, t)
 
 

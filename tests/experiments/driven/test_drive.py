@@ -8,12 +8,12 @@ import pytest
 from finssim import boundary
 from finssim.cli import app
 from finssim.control.modes import action_mode
-from finssim.control.observations import observer
 from finssim.experiments.driven.actions import actions_of
 from finssim.experiments.driven.command import collect_records
 from finssim.experiments.driven.drive import DriveError, read_drive
 from finssim.experiments.driven.episodes import episodes_of, indices_of
 from finssim.learning.demonstrations import about, load
+from finssim.tasks.observer import Observer
 from finssim.vehicles import load_vehicle
 
 pytest.importorskip("mcap")
@@ -69,7 +69,7 @@ def test_a_drive_is_sampled_at_the_tasks_period(tmp_path):
     """Sixty decisions a second become ten, the first among them; observation and action by hand."""
     path = written(tmp_path / "a.mcap", force=lambda t: surge(5.0 + t))
     assert spans(path) == [(0.0, 1.9, 20)]
-    (episode,) = episodes_of(read_drive(path, FINSROV), "t1", observer("t1"), WRENCH6, FINSROV, period=0.1)
+    (episode,) = episodes_of(read_drive(path, FINSROV), Observer("t1", FINSROV), WRENCH6, FINSROV)
     t = 0.1 * np.arange(20)
     assert episode.observation.shape == (20, 16) and episode.action.shape == (19, 6)
     np.testing.assert_allclose(episode.observation[:, 0], (1.0 - 0.1 * t) / 3.0, atol=1e-6)
@@ -101,7 +101,7 @@ def test_another_goal_begins_another_episode_of_a_station_task(tmp_path):
     path = written(tmp_path / "a.mcap", goal=lambda t: ((0.5 if t < 0.99 else -0.5, 0.0, -0.5), 0.0))
     assert spans(path) == [(0.0, 0.9, 10), (1.0, 1.9, 10)]
     assert spans(path, split_goals=False) == [(0.0, 1.9, 20)]
-    episodes = episodes_of(read_drive(path, FINSROV), "t1", observer("t1"), WRENCH6, FINSROV, period=0.1)
+    episodes = episodes_of(read_drive(path, FINSROV), Observer("t1", FINSROV), WRENCH6, FINSROV)
     assert [e.observation[0, 0] > 0.0 for e in episodes] == [True, False]
 
 
@@ -143,7 +143,7 @@ def test_records_that_do_not_fit_are_refused(tmp_path):
         (slow, "t1", "decided every 0.2 s, expected at most 0.1 s, the period of t1"),
         (never, "t1", "nowhere was the robot armed"),
         (tmp_path / "blind.mcap", "t1", "holds no estimate of where it was"),
-        (slow, "pursuit", "unknown task 'pursuit'; a robot can do: t1, t2"),
+        (slow, "t9", "unknown task 't9'; available: t1, t2"),
     ):
         with pytest.raises(ValueError, match=sentence):
             collect_records([path], task, out=tmp_path / "set")

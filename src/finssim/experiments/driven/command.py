@@ -8,14 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from finssim.control.modes import action_mode
-from finssim.control.observations import observer
 from finssim.experiments.driven.drive import DriveError, read_drive
 from finssim.experiments.driven.episodes import END, episodes_of
 from finssim.learning.demonstrations import save
-from finssim.learning.description import observation_schema
 from finssim.provenance import provenance
 from finssim.robot.goals import station_of
-from finssim.tasks import task_named
+from finssim.tasks.observer import Observer
 from finssim.vehicles import load_vehicle
 
 __all__ = ["collect_records"]
@@ -34,7 +32,7 @@ def collect_records(
 
     Args:
         records: MCAP files of `finssim teleop` or `finssim run`.
-        task: t1 or t2, which a robot knows how to observe.
+        task: Its name, or FILE.py:CLASS of one's own.
         out: Folder of the data set; an earlier one there is replaced.
         vehicle: Name or file; the very one that was driven.
         action: Mode; the task's own if None.
@@ -48,13 +46,15 @@ def collect_records(
         DriveError: A record does not fit, or nothing in it can be learnt from.
         RecordError, ControlError, GoalError, VehicleError, OutputError: As they say.
     """
-    watch, the_task, body = observer(task), task_named(task), load_vehicle(vehicle)
+    body = load_vehicle(vehicle)
+    watch = Observer(task, body)
+    the_task = watch.task
     mode = action_mode(action or the_task.action, body)
-    to = station_of(goal) if goal is not None and task == "t1" and goal != END else goal
+    to = station_of(goal) if goal is not None and not the_task.moving and goal != END else goal
     found, sources = [], []
     for path in records:
         drive = read_drive(path, body)
-        episodes = episodes_of(drive, task, watch, mode, body, period=the_task.control_step, goal=to)
+        episodes = episodes_of(drive, watch, mode, body, goal=to)
         found += episodes
         steps = sum(len(e.action) for e in episodes)
         sources.append(
@@ -73,9 +73,9 @@ def collect_records(
             f"{the_task.control_step:g} s apart towards one goal: nothing to learn from"
         )
     described = {
-        "task": task,
+        "task": the_task.name,
         "expert": " and ".join(dict.fromkeys(str(source["driver"]) for source in sources)),
-        "observation": observation_schema(the_task).model_dump(mode="json"),
+        "observation": the_task.schema.model_dump(mode="json"),
         "action": mode.describe(),
         "vehicle": {"name": body.name, "sha256": body.sha256},
         "observe": "record",

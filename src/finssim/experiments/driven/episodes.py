@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from finssim.control.guidance import Guide, Station
 from finssim.control.modes import Thruster8, Wrench6
-from finssim.control.observations import Observer
 from finssim.control.trajectories import PUBLISHED_NAMES, TRAJECTORIES, load_trajectory
 from finssim.experiments.driven.actions import actions_of
 from finssim.experiments.driven.drive import Drive, DriveError
 from finssim.geometry.rotations import quat_yaw
 from finssim.learning.demonstrations import Episode
+from finssim.tasks.observer import Observer
 from finssim.vehicles import Vehicle
 
 __all__ = ["END", "episodes_of", "indices_of"]
@@ -40,8 +40,8 @@ class _Seen(NamedTuple):
 
 
 def episodes_of(
-    drive: Drive, task: str, observer: Observer, mode: Thruster8 | Wrench6, vehicle: Vehicle,
-    *, period: float, goal: Station | str | None = None,
+    drive: Drive, observer: Observer, mode: Thruster8 | Wrench6, vehicle: Vehicle, *,
+    goal: Station | str | None = None,
 ) -> list[Episode]:  # fmt: skip
     """Demonstrations of a drive; none where it has no stretch of two decisions.
 
@@ -50,23 +50,22 @@ def episodes_of(
 
     Args:
         drive: What was done.
-        task: Its name.
-        observer: How it is observed.
+        observer: How the task is observed.
         mode: In which it is acted.
         vehicle: Which was driven.
-        period: Between two actions of the task [s].
         goal: In place of the recorded one: a station, or `END`; of a task that follows a trajectory its name or file.
 
     Raises:
         DriveError: Decisions further apart than the task's, no goal, or commands that the mode cannot ask for.
     """
+    task, period = observer.task, observer.task.control_step
     if drive.period > period * (1.0 + 1e-6):
         raise DriveError(
             f"{drive.path}: {drive.driver} decided every {drive.period:g} s, expected at most {period:g} s, the period "
-            f"of {task}: it cannot be taken for a controller of that task"
+            f"of {task.name}: it cannot be taken for a controller of that task"
         )
-    guide_of = _guides(drive, task, goal)
-    stretches = indices_of(drive, period, split_goals=task == "t1" and goal is None)
+    guide_of = _guides(drive, task.moving, goal)
+    stretches = indices_of(drive, period, split_goals=not task.moving and goal is None)
     if not stretches:
         return []
     try:
@@ -76,6 +75,7 @@ def episodes_of(
     found, first = [], 0
     for rows in stretches:
         guide = guide_of(rows)
+        observer.restart()
         seen = [_Seen(drive.position[i], drive.quaternion[i], drive.nu[i]) for i in rows]
         times = np.nan_to_num(drive.since[rows])
         observation = [observer.observe(s, guide, float(t)) for s, t in zip(seen, times, strict=True)]
@@ -124,9 +124,9 @@ def _on_grid(run: Indices, time: Array, period: float) -> list[Indices]:
     return [run[p] for p in (*pieces, piece)]
 
 
-def _guides(drive: Drive, task: str, goal: Station | str | None) -> Callable[[Indices], Guide]:
+def _guides(drive: Drive, moving: bool, goal: Station | str | None) -> Callable[[Indices], Guide]:
     """What tells a stretch's guide from the indices of its decisions."""
-    if task != "t1":
+    if moving:
         trajectory = _trajectory(drive, str(goal or _recorded_name(drive)))
         return lambda rows: trajectory
     if isinstance(goal, Station):

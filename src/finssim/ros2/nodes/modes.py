@@ -15,7 +15,7 @@ from finssim.control.guidance import Guide
 from finssim.control.policy_description import NETWORK_FILE
 from finssim.control.tracking import Measured
 from finssim.control.trim import Trim
-from finssim.robot.pilots import ModeSwitch, PidPilot, PolicyPilot, WrenchPilot
+from finssim.robot.pilots import ModeSwitch, ObservingPilot, PidPilot, WrenchPilot
 from finssim.robot.runtime import Runtime
 from finssim.ros2.nodes.conversions import wrench_of
 from finssim.ros2.nodes.robot_node import RobotNode
@@ -45,14 +45,11 @@ class Modes:
         self._node = node
         self._wrench, self._wrench_at = np.zeros(6), -math.inf
         pilots: dict[str, Any] = {name: PidPilot(name, node.vehicle) for name in CONTROLLERS}
-        self._observed: _Observed | None = None
-        self._hash = ""
+        self._policy: ObservingPilot | None = None
         if policy not in pilots:
-            pilots["policy"] = pilot = PolicyPilot(
+            pilots["policy"] = self._policy = ObservingPilot(
                 policy, node.vehicle, task=task or None, trim=Trim() if trim else None
             )
-            pilot.policy = self._observed = _Observed(pilot.policy)
-            self._hash = self._observed.description.files.get(NETWORK_FILE, "")
         pilots["teleop"] = WrenchPilot(self._newest, node.vehicle)
         self._pilots = {name: _Timed(pilot) for name, pilot in pilots.items()}
         self.switch = ModeSwitch(self._pilots, policy if policy in pilots else "policy")
@@ -81,12 +78,11 @@ class Modes:
             "vehicle_sha256": self._node.vehicle.sha256,
             "task": pilot.describe().get("task", ""),
         }
-        if self.switch.mode == "policy" and self._observed is not None:
-            seen = self._observed
+        if self.switch.mode == "policy" and self._policy is not None:
             values |= {
-                "policy_sha256": self._hash,
-                "observation": seen.observation,
-                "action": seen.action,
+                "policy_sha256": self._policy.describe().get("files", {}).get(NETWORK_FILE, ""),
+                "observation": self._policy.observation,
+                "action": self._policy.action,
             }
         return self._node.make.policy(stamp, self.switch.mode, values)
 
@@ -117,20 +113,3 @@ class _Timed:
         force: Array = self._pilot.act(reading, guide, t)
         self.took = time.perf_counter() - start
         return force
-
-
-class _Observed:
-    """A policy, with what it saw last and what it answered."""
-
-    def __init__(self, policy: Any) -> None:
-        self._policy = policy
-        self.observation = self.action = np.zeros(0)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._policy, name)
-
-    def step(self, memory: Any, observation: Any) -> Any:
-        """The policy's action, and its memory after."""
-        action, memory = self._policy.step(memory, observation)
-        self.observation, self.action = np.asarray(observation, float), np.asarray(action, float)
-        return action, memory

@@ -1,0 +1,208 @@
+"""What a policy sees on a robot: the observation of its task, by the kernels of training, of one world on the CPU."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from finssim.control.errors import ControlError
+from finssim.control.guidance import Guide, Reference
+from finssim.control.policy_description import ObservationSchema
+from finssim.control.tracking import Measured, Track
+from finssim.engine.launch import Pipeline
+from finssim.engine.state import State
+from finssim.geometry.rotations import quat_from_yaw, quat_inverse_rotate, quat_rotate
+from finssim.physics.types import vec6
+from finssim.tasks.actions import action_size
+from finssim.tasks.arrays import task_arrays
+from finssim.tasks.given import EnvironmentSetupError, crew
+from finssim.tasks.make import task_named
+from finssim.tasks.reference import fill_table
+from finssim.tasks.task import Batch, Task
+from finssim.vehicles import Vehicle
+
+__all__ = ["Observer", "fitted_task"]
+
+Array = NDArray[np.float64]
+
+
+def fitted_task(
+    task: str | Task, vehicle: Vehicle | Sequence[Vehicle | str], action: str | None = None
+) -> Task:
+    """A task as these vehicles do it.
+
+    Args:
+        task: A task, its name, or FILE.py:CLASS of one's own.
+        vehicle: One for all of its places, or one for each.
+        action: Mode; the task's own if None.
+
+    Raises:
+        ControlError: There is no such task, or the vehicle cannot do it.
+    """
+    try:
+        made = task_named(task)
+        return made.fitted(crew(vehicle, made, action or made.action))
+    except EnvironmentSetupError as error:
+        raise ControlError(str(error)) from None
+
+
+class Observer:
+    """The task's own `observe`, fed with a reading in place of a simulator's state.
+
+    What the vehicle senses of itself is the reading. Where the task has it go is the guide: the pose to hold, the
+    reference to follow, the target, the dock. Vehicles that are not this one are the reading's `tracks`, by the name of
+    their place in the task; the one that a task commands itself, such as a prey, is where the guide is if it has no
+    track.
+
+    Attributes:
+        task: Fitted to the vehicle.
+        agent: Place of this vehicle in the task.
+        schema: Which quantity stands where, in which unit and scale.
+    """
+
+    def __init__(
+        self,
+        task: str | Task,
+        vehicle: Vehicle | Sequence[Vehicle | str],
+        *,
+        agent: str | None = None,
+        action: str | None = None,
+    ) -> None:
+        """
+        Args:
+            task: A task, its name, or FILE.py:CLASS of one's own.
+            vehicle: This one, or one for each of the task's places.
+            agent: Its place in the task, of several; the first if None.
+            action: Mode of its actions; the task's own if None.
+
+        Raises:
+            ControlError: There is no such task or place, the vehicle cannot do it, or what it sees cannot be told on a
+                robot.
+        """
+        self.task = task = fitted_task(task, vehicle, action)
+        self.agent = agent or task.agents[0]
+        if self.agent not in task.agents:
+            raise ControlError(f"task '{task.name}' has no '{agent}'; its agents: {', '.join(task.agents)}")
+        self.schema: ObservationSchema = task.schema
+        self._place = task.vehicles.index(self.agent)
+        thrusters = len(crew(vehicle, task, action or task.action)[0].thrusters)
+        self._action_size = action_size(action or task.action, thrusters)
+        self._guide: Guide | None = None
+        self._build(task)
+
+    def describe(self) -> dict[str, Any]:
+        """The task as `Policy.load` compares it."""
+        return {"name": self.task.name, "observation": self.schema.model_dump(mode="json")}
+
+    def restart(self) -> None:
+        """Forget the guide: the next observation is the first of an episode."""
+        self._guide = None
+
+    def observe(
+        self, reading: Measured, guide: Guide, t: float, previous: ArrayLike | None = None
+    ) -> NDArray[np.float32]:
+        """The observation, (schema.size,).
+
+        Args:
+            reading: The vehicle's state, and others' as its `tracks`, where it has some.
+            guide: Where to go.
+            t: Time since the guide's start [s].
+            previous: The action before, in [-1, 1], (size,), for tasks that look at it; zeros if None.
+
+        Raises:
+            ControlError: The place of a vehicle that the task needs is not known.
+        """
+        if guide is not self._guide:
+            self._guide = guide
+            self._aim(guide)
+        a, now = self._arrays, guide.at(t)
+        a.time.numpy()[0] = t
+        self._steps[0] = max(round(t / self.task.control_step), 0)
+        if previous is not None:
+            first = self._place * self._action_size
+            a.previous_action.numpy()[0, first : first + self._action_size] = previous
+        a.goal_position.numpy()[0] = now.position
+        a.goal_quaternion.numpy()[0] = quat_from_yaw(now.yaw)
+        if a.target.velocity is not None:
+            a.target.velocity.numpy()[0] = now.velocity
+        self._put(self._place, reading.position, reading.quaternion, reading.nu)
+        self._put_others(getattr(reading, "tracks", {}), now)
+        self._pipeline.run()
+        rows: NDArray[np.float32] = a.observation.numpy()[0].reshape(len(self.task.agents), -1)
+        return rows[self._place].copy()
+
+    def _build(self, task: Task) -> None:
+        """Arrays of one world, and what observes it."""
+        device, vehicles = wp.get_device("cpu"), len(task.vehicles)
+        self._arrays = arrays = task_arrays(
+            1, len(task.agents), len(task.others), task.observation_size, self._action_size, device, len(task.totals)
+        )  # fmt: skip
+        task.allocate(arrays, 1, device)
+        for name, dtype in (("position", wp.vec3), ("quaternion", wp.quat), ("velocity", vec6)):
+            setattr(arrays, name, wp.zeros((1, vehicles), dtype=dtype, device=device))
+        arrays.quaternion.fill_(wp.quat(0.0, 0.0, 0.0, 1.0))
+        state = State()
+        for name in ("position", "quaternion", "velocity"):
+            setattr(state, name, getattr(arrays, name))
+        for name in ("steps", "episode", "frozen"):
+            setattr(state, name, wp.zeros(1, dtype=wp.int32, device=device))
+        self._steps = state.steps.numpy()
+        everywhere = wp.ones(1, dtype=wp.int32, device=device)
+        self._pipeline = Pipeline(1, device)
+        task.add_observe(self._pipeline, Batch(state, arrays, task.parameters(), 0), everywhere)
+
+    def _aim(self, guide: Guide) -> None:
+        """What of a guide is looked at ahead of time."""
+        if self._arrays.reference.position is None:
+            return
+        if math.isfinite(guide.duration) and guide.duration > self.task.time_limit:
+            self.task = replace(self.task, time_limit=guide.duration)
+            self._build(self.task)
+        fill_table(self._arrays.reference, [guide])
+
+    def _put(self, v: int, position: ArrayLike, quaternion: ArrayLike, nu: ArrayLike) -> None:
+        """What is measured of a vehicle."""
+        a = self._arrays
+        a.position.numpy()[0, v] = position
+        a.quaternion.numpy()[0, v] = quaternion
+        a.velocity.numpy()[0, v] = nu
+
+    def _put_others(self, tracks: Mapping[str, Measured], now: Reference) -> None:
+        """What is known of everything that is not this vehicle."""
+        a, agents = self._arrays, len(self.task.agents)
+        for v, name in enumerate(self.task.vehicles):
+            if v == self._place:
+                continue
+            track = self._track(name, tracks, now if name in self.task.others else None)
+            self._put(v, track.position, track.quaternion, track.nu)
+            if a.messages.on and v < agents:
+                a.messages.position.numpy()[0, self._place * agents + v] = track.position
+                a.messages.velocity.numpy()[0, self._place * agents + v] = _velocity(track)
+        if a.net.target is not None:
+            target = self._track("target", tracks, None)
+            a.net.target.numpy()[0] = target.position
+            a.net.motion.numpy()[0] = _velocity(target)
+
+    def _track(self, name: str, tracks: Mapping[str, Measured], otherwise: Reference | None) -> Measured:
+        """The track of that name; the guide's motion where there is none and that will do."""
+        if name in tracks:
+            return tracks[name]
+        if otherwise is None:
+            raise ControlError(
+                f"task '{self.task.name}' looks at '{name}', and nobody tells where it is; known: "
+                f"{', '.join(tracks) or 'none'}"
+            )
+        q = quat_from_yaw(otherwise.yaw)
+        nu = np.array([*quat_inverse_rotate(q, otherwise.velocity), 0.0, 0.0, 0.0])
+        return Track(np.asarray(otherwise.position), q, nu)
+
+
+def _velocity(track: Measured) -> Array:
+    """World frame [m/s], (3,)."""
+    return quat_rotate(np.asarray(track.quaternion), np.asarray(track.nu)[:3])

@@ -1,0 +1,134 @@
+"""A policy on the robot sees what it saw in training, bit for bit, whatever the task."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from finssim.control.errors import ControlError
+from finssim.control.guidance import Reference, Station
+from finssim.control.tracking import Track
+from finssim.control.trajectories import TRAJECTORIES
+from finssim.geometry.rotations import quat_from_yaw, quat_rotate, quat_yaw
+from finssim.tasks import TASKS, Environment, follow, task_named
+from finssim.tasks.observer import Observer
+from finssim.tasks.task import Batch
+from finssim.vehicles import load_vehicle
+
+FINSROV = load_vehicle("finsrov")
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+OWN = [f"{EXAMPLES / 'own_task.py'}:KeepDepth", f"{EXAMPLES / 'own_task_torch.py'}:KeepDepth"]
+
+
+class Moment:
+    """A guide that is somewhere at one time."""
+
+    name, duration = "moment", np.inf
+
+    def __init__(self, position, velocity, yaw):
+        self.now = Reference(position, velocity, yaw, np.zeros(()))
+
+    def at(self, t):
+        return self.now
+
+
+def track(env, w, v):
+    rows = (env.arrays.position, env.arrays.quaternion, env.arrays.velocity)
+    return Track(*(row.numpy()[w, v].astype(float) for row in rows))
+
+
+def world(env, w, yaw):
+    """What a robot would be given in place of a world of the batch: its guide, and tracks of the others by name."""
+    a = env.arrays
+    velocity = np.zeros(3) if a.target.velocity is None else a.target.velocity.numpy()[w]
+    guide = Moment(a.goal_position.numpy()[w].astype(float), velocity.astype(float), yaw[w])
+    tracks = {name: track(env, w, v) for v, name in enumerate(env.task.vehicles)}
+    if a.net.target is not None:
+        level = np.array([0.0, 0.0, 0.0, 1.0])
+        nu = np.array([*a.net.motion.numpy()[w].astype(float), 0.0, 0.0, 0.0])
+        tracks["target"] = Track(a.net.target.numpy()[w].astype(float), level, nu)
+    return guide, tracks
+
+
+def with_tracks(reading, tracks):
+    class Known(Track):
+        pass
+
+    known = Known(reading.position, reading.quaternion, reading.nu)
+    object.__setattr__(known, "tracks", tracks)
+    return known
+
+
+@pytest.mark.parametrize("name", [*TASKS, *OWN])
+def test_the_robot_sees_what_the_batch_sees_bit_for_bit(name):
+    """Random actions, measurement noise, every agent; goals are exact poses on both sides."""
+    task = task_named(name, time_limit=200.0) if name == "t2" else task_named(name)
+    env = Environment(task, worlds=4, seed=3, noise=task.training_noise)
+    if name == "t2":
+        follow(env, [TRAJECTORIES["circle"], TRAJECTORIES["helix"], *[TRAJECTORIES["lemniscate"]] * 2])
+    rng = np.random.default_rng(0)
+    observers = [Observer(name, FINSROV, agent=agent) for agent in env.task.agents]
+    for _ in range(3):
+        for _ in range(4):
+            env.step(
+                rng.uniform(-1.0, 1.0, (env.worlds, env.agents, env.action_size)).squeeze(
+                    1 if env.agents == 1 else ()
+                )
+            )
+        yaw = quat_yaw(env.arrays.goal_quaternion.numpy().astype(float))
+        env.arrays.goal_quaternion.assign(quat_from_yaw(yaw).astype(np.float32))
+        again = env.simulator.pipeline()
+        env._mask.fill_(1)
+        env.task.add_observe(
+            again, Batch(env.simulator.state, env.arrays, env.parameters, env.seed), env._mask
+        )
+        again.run()
+        seen = env.arrays.observation.numpy().reshape(env.worlds, env.agents, -1)
+        steps = env.simulator.state.steps.numpy()
+        for w in range(env.worlds):
+            guide, tracks = world(env, w, yaw)
+            if name == "t2":
+                guide = TRAJECTORIES[("circle", "helix", "lemniscate", "lemniscate")[w]]
+            for a, observer in enumerate(observers):
+                reading = with_tracks(track(env, w, a), tracks)
+                given = observer.observe(reading, guide, float(np.float32(steps[w]) * np.float32(0.1)))
+                np.testing.assert_array_equal(given, seen[w, a])
+
+
+def test_the_prey_of_a_pursuit_without_a_track_is_where_the_guide_is():
+    observer = Observer("pursuit", FINSROV)
+    circle = TRAJECTORIES["circle"]
+    me = Track(np.array([0.1, 0.2, -0.5]), quat_from_yaw(0.4), np.zeros(6))
+    now = circle.at(3.0)
+    seen = observer.observe(me, circle, 3.0)
+    np.testing.assert_allclose(
+        quat_rotate(me.quaternion, seen[6:9].astype(float)) * 6.0, now.position - me.position, atol=1e-6
+    )
+    np.testing.assert_allclose(quat_rotate(me.quaternion, seen[9:12].astype(float)), now.velocity, atol=1e-6)
+
+
+def test_a_team_mate_that_nobody_tells_of_is_named():
+    me = Track(np.zeros(3), quat_from_yaw(0.0), np.zeros(6))
+    with pytest.raises(
+        ControlError, match="'team-pursuit' looks at 'left_netter', and nobody tells where it is"
+    ):
+        Observer("team-pursuit", FINSROV).observe(me, Station((1.0, 0.0, -1.0), 0.0), 0.0)
+
+
+def test_what_is_no_task_or_no_place_in_it_is_refused():
+    with pytest.raises(ControlError, match="unknown task 't9'; available: t1"):
+        Observer("t9", FINSROV)
+    with pytest.raises(ControlError, match="task 't1' has no 'herder'; its agents: vehicle"):
+        Observer("t1", FINSROV, agent="herder")
+
+
+def test_a_trajectory_longer_than_an_episode_is_seen_to_its_end():
+    """The table of knots grows with the guide."""
+    circle = TRAJECTORIES["circle"]
+    assert circle.duration > task_named("t2").time_limit
+    observer = Observer("t2", FINSROV)
+    t = circle.duration - 1.0
+    me = Track(circle.at(t).position, quat_from_yaw(0.0), np.zeros(6))
+    seen = observer.observe(me, circle, t)
+    np.testing.assert_allclose(seen[:3], 0.0, atol=1e-4)
+    np.testing.assert_allclose(seen[12:15], circle.at(t).velocity, atol=1e-3)
