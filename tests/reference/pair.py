@@ -1,6 +1,6 @@
 """A task of two agents and one vehicle of the task's own, for tests: an agent's place is 0.3 m beside a goal.
 
-Reward of agent a: (a + 1) `bonus` - `slope` · distance to its place. No kernel looks at any other task.
+Reward of agent a: (a + 1) `bonus` - `slope` · distance to its place. No term is any other task's.
 """
 
 from dataclasses import dataclass
@@ -10,19 +10,8 @@ import warp as wp
 
 from finssim.engine.state import State
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.episode import close_episode, open_episode, report_frozen, uniform3
 from finssim.tasks.task import ObservationPart, Task
-
-SIZE = 7
-
-
-@wp.struct
-class PairParameters:
-    time_limit: float
-    control_step: float
-    bonus: float
-    slope: float
-    bound: float
+from finssim.tasks.terms import End, RewardTerm, Terms, uniform3
 
 
 @wp.func
@@ -31,74 +20,48 @@ def place(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
 
 
 @wp.func
-def write(arrays: TaskArrays, w: int):
-    for a in range(2):
-        q = arrays.quaternion[w, a]
-        offset = wp.quat_rotate_inv(q, place(arrays, w, a) - arrays.position[w, a])
-        for k in range(3):
-            arrays.observation[w, 7 * a + k] = offset[k]
-            arrays.observation[w, 7 * a + 3 + k] = wp.clamp(arrays.velocity[w, a][k], -2.0, 2.0)
-        arrays.observation[w, 7 * a + 6] = float(a)
+def offset(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], place(arrays, w, a) - arrays.position[w, a])
 
 
-@wp.kernel(enable_backward=False)
-def evaluate_pair(state: State, arrays: TaskArrays, p: PairParameters, world_offset: int):
-    w = world_offset + wp.tid()
-    if state.frozen[w] != 0:
-        report_frozen(state, arrays, w)
-        return
-    total = float(0.0)
-    out = bool(False)
-    for a in range(2):
-        x = state.position[w, a]
-        reward = float(a + 1) * p.bonus - p.slope * wp.length(place(arrays, w, a) - x)
-        arrays.agent_reward[w, a] = reward
-        total += 0.5 * reward
-        if wp.abs(x[0]) > p.bound:
-            out = True
-    late = float(state.steps[w]) * p.control_step >= p.time_limit - 0.5 * p.control_step
-    arrays.reward[w] = total
-    arrays.terminated[w] = wp.where(out, 1, 0)
-    arrays.truncated[w] = wp.where(late and not out, 1, 0)
-    arrays.done[w] = wp.where(out or late, 1, 0)
-    arrays.episode_return[w] = arrays.episode_return[w] + total
-    write(arrays, w)
-    if out or late:
-        close_episode(state, arrays, w)
+@wp.func
+def velocity(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    nu = arrays.velocity[w, a]
+    return wp.vec3(nu[0], nu[1], nu[2])
 
 
-@wp.kernel(enable_backward=False)
-def spawn_pair(
-    state: State,
-    arrays: TaskArrays,
-    p: PairParameters,
-    seed: int,
-    mask: wp.array(dtype=int),
-    world_offset: int,
-):
-    w = world_offset + wp.tid()
-    if mask[w] == 0:
-        return
-    key = seed + 15485863 * state.episode[w]
+@wp.func
+def number(a: int) -> float:
+    return float(a)
+
+
+@wp.func
+def bonus(a: int) -> float:
+    return float(a + 1)
+
+
+@wp.func
+def away(state: State, arrays: TaskArrays, w: int, a: int) -> float:
+    return wp.length(place(arrays, w, a) - state.position[w, a])
+
+
+@wp.func
+def out(state: State, p: Any, w: int) -> bool:
+    return wp.abs(state.position[w, 0][0]) > p.bound or wp.abs(state.position[w, 1][0]) > p.bound
+
+
+@wp.func
+def begin_pair(state: State, arrays: TaskArrays, key: int, w: int):
     low, high = wp.vec3(-0.5, -0.2, -0.6), wp.vec3(0.5, 0.2, -0.4)
     arrays.goal_position[w] = uniform3(wp.rand_init(key, 4 * w), low, high)
     for a in range(2):
-        away = wp.vec3(0.0, 0.5 - 1.0 * float(a), 0.0)
-        state.position[w, a] = away + uniform3(wp.rand_init(key, 4 * w + 1 + a), low, high)
+        beside = wp.vec3(0.0, 0.5 - 1.0 * float(a), 0.0)
+        state.position[w, a] = beside + uniform3(wp.rand_init(key, 4 * w + 1 + a), low, high)
     state.position[w, 2] = wp.vec3(2.0, 0.0, -0.5)
-    open_episode(arrays, w)
 
 
-@wp.kernel(enable_backward=False)
-def observe_pair(arrays: TaskArrays, mask: wp.array(dtype=int), world_offset: int):
-    w = world_offset + wp.tid()
-    if mask[w] != 0:
-        write(arrays, w)
-
-
-@wp.kernel(enable_backward=False)
-def script_pair(state: State, arrays: TaskArrays, p: PairParameters, seed: int, world_offset: int):
-    w = world_offset + wp.tid()
+@wp.func
+def stand(arrays: TaskArrays, w: int):
     for i in range(arrays.scripted.shape[1]):
         arrays.scripted[w, i] = 0.0
 
@@ -112,25 +75,22 @@ class Pair(Task):
 
     name: str = "pair"
     observation: tuple[ObservationPart, ...] = (
-        ObservationPart("offset, body frame", 3, "m"),
-        ObservationPart("linear velocity, body frame", 3, "m/s", clip=2.0),
-        ObservationPart("number of the agent", 1, "1", clip=1.0),
+        ObservationPart("offset, body frame", 3, "m", term=offset),
+        ObservationPart("linear velocity, body frame", 3, "m/s", clip=2.0, term=velocity),
+        ObservationPart("number of the agent", 1, "1", clip=1.0, term=number),
     )
     time_limit: float = 2.0
     bonus: float = 0.0
     slope: float = 1.0
     bound: float = 3.0
 
-    evaluate = staticmethod(evaluate_pair)
-    spawn = staticmethod(spawn_pair)
-    observe = staticmethod(observe_pair)
-    script = staticmethod(script_pair)
-
-    def parameters(self) -> Any:
-        p = PairParameters()
-        for name in ("time_limit", "control_step", "bonus", "slope", "bound"):
-            setattr(p, name, getattr(self, name))
-        return p
+    def terms(self) -> Terms:
+        return Terms(
+            start=begin_pair,
+            command=stand,
+            rewards=(RewardTerm("bonus", bonus, self.bonus), RewardTerm("away", away, -self.slope)),
+            ends=(End("out", out),),
+        )
 
 
 def constant(**settings: Any) -> Pair:

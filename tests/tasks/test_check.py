@@ -2,122 +2,108 @@
 
 import importlib.util
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import warp as wp
 
 from finssim.engine.state import State
-from finssim.tasks import TASKS
+from finssim.tasks import TASKS, Environment, EnvironmentSetupError, ObservationPart
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.check import TaskError, check_task
-from finssim.tasks.episode import action_effort, close_episode, open_episode
+from finssim.tasks.terms import RewardTerm
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own_task.py"
 spec = importlib.util.spec_from_file_location("own_task", EXAMPLE)
 own = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(own)
-DepthParameters, KeepDepth = own.DepthParameters, own.KeepDepth
+KeepDepth = own.KeepDepth
 
 
-@wp.kernel(enable_backward=False)
-def spawn_without_opening(
-    state: State,
-    arrays: TaskArrays,
-    p: DepthParameters,
-    seed: int,
-    mask: wp.array(dtype=int),
-    world_offset: int,
-):
-    """The last action of the episode before stays, and with it the first change of actions."""
-    w = world_offset + wp.tid()
-    if mask[w] == 0:
-        return
-    rng = wp.rand_init(seed + 15485863 * state.episode[w], w)
-    arrays.goal_position[w] = wp.vec3(0.0, 0.0, -wp.randf(rng, 0.3, p.deepest))
+@wp.func
+def start_moving(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
+    """The velocity of the episode before stays."""
+    arrays.goal_position[w] = wp.vec3(0.0, 0.0, -wp.randf(wp.rand_init(key, w), 0.3, p.deepest))
     state.position[w, 0] = wp.vec3(0.0, 0.0, -0.5)
     state.quaternion[w, 0] = wp.quat_identity()
-    nu = state.velocity[w, 0]
-    for i in range(6):
-        nu[i] = 0.0
-    state.velocity[w, 0] = nu
-    arrays.episode_return[w] = 0.0
 
 
-@wp.kernel(enable_backward=False)
-def spawn_moving(
-    state: State,
-    arrays: TaskArrays,
-    p: DepthParameters,
-    seed: int,
-    mask: wp.array(dtype=int),
-    world_offset: int,
-):
-    """The velocity of the episode before stays."""
-    w = world_offset + wp.tid()
-    if mask[w] != 0:
-        state.position[w, 0] = wp.vec3(0.0, 0.0, -0.5)
-        state.quaternion[w, 0] = wp.quat_identity()
-        open_episode(arrays, w)
+@wp.func
+def remember(arrays: TaskArrays, w: int):
+    """What no start sets back."""
+    q = arrays.goal_quaternion[w]
+    q[0] = q[0] + arrays.action[w, 0]
+    arrays.goal_quaternion[w] = q
 
 
-@wp.kernel(enable_backward=False)
-def evaluate_scaled(state: State, arrays: TaskArrays, p: DepthParameters, world_offset: int):
-    """`deepest` scales reward and observation; the change of actions counts; the time limit is p.time_limit."""
-    w = world_offset + wp.tid()
-    effort = action_effort(arrays, w)
-    reward = p.deepest - effort[1]
-    late = float(state.steps[w]) * p.control_step >= p.time_limit - 0.5 * p.control_step
-    arrays.reward[w] = reward
-    arrays.terminated[w] = 0
-    arrays.truncated[w] = wp.where(late, 1, 0)
-    arrays.done[w] = wp.where(late, 1, 0)
-    arrays.episode_return[w] = arrays.episode_return[w] + reward
-    arrays.observation[w, 0] = p.deepest * arrays.goal_position[w][2]
-    arrays.observation[w, 1] = 3.0 * arrays.velocity[w, 0][2]
-    if late:
-        close_episode(state, arrays, w)
+@wp.func
+def remembered(arrays: TaskArrays, w: int) -> float:
+    return arrays.goal_quaternion[w][0]
+
+
+@wp.func
+def scaled(arrays: TaskArrays, p: Any, w: int) -> float:
+    return p.factor * arrays.goal_position[w][2]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Leaking(KeepDepth):
-    evaluate = staticmethod(evaluate_scaled)
-    spawn = staticmethod(spawn_without_opening)
+    def terms(self):
+        rewards = (RewardTerm("remembered", remembered, 1.0),)
+        return replace(super().terms(), advance=remember, rewards=rewards)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Moving(KeepDepth):
-    spawn = staticmethod(spawn_moving)
+    def terms(self):
+        return replace(super().terms(), start=start_moving)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Unbounded(KeepDepth):
-    evaluate = staticmethod(evaluate_scaled)
+    observation: tuple[ObservationPart, ...] = (
+        ObservationPart("way to the depth, upwards", 1, "m", term=scaled),
+    )
 
-    def parameters(self):
-        p = super().parameters()
-        p.deepest = 1000.0
-        return p
+    @property
+    def factor(self) -> float:
+        return 1000.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dicing(KeepDepth):
-    evaluate = staticmethod(evaluate_scaled)
-
-    def parameters(self):
-        p = super().parameters()
-        p.deepest = int.from_bytes(os.urandom(2), "big") / 2**17
-        return p
+class Dicing(Unbounded):
+    @property
+    def factor(self) -> float:
+        return int.from_bytes(os.urandom(2), "big") / 2**17
 
 
 @dataclass(frozen=True, kw_only=True)
 class Endless(KeepDepth):
-    def parameters(self):
-        p = super().parameters()
-        p.time_limit = 1e9
-        return p
+    def add_evaluate(self, pipeline, batch):
+        pass
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wrong(KeepDepth):
+    """A term that takes what there is not."""
+
+    def terms(self):
+        return replace(super().terms(), inside=look_up)
+
+
+@wp.func
+def look_up(state: State, sky: int) -> bool:
+    return True
+
+
+def test_a_term_that_takes_what_there_is_not_is_named():
+    with pytest.raises(
+        EnvironmentSetupError, match=r"inside \(.*look_up\) takes 'sky', expected of: arrays, p"
+    ):
+        Environment(Wrong())
 
 
 @dataclass(frozen=True, kw_only=True)

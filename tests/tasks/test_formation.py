@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from finssim.tasks import Environment, EnvironmentSetupError
 from finssim.tasks.baselines import baseline
 from finssim.tasks.communication import Communication
-from finssim.tasks.formation import Formation
-from finssim.tasks.formation_net import sorted_edges, triangle_distance
+from finssim.tasks.formation import Formation, sorted_edges, triangle_distance
 from finssim.tasks.pursuit_drive import DriveNumbers
 from finssim.vehicles import load_vehicle
 
@@ -34,6 +33,11 @@ def triangle(side, height=-3.0):
     angles = 2.0 * math.pi / 3.0 * np.arange(3)
     level = side / math.sqrt(3.0)
     return np.column_stack([level * np.cos(angles), level * np.sin(angles), np.full(3, height)])
+
+
+def total(env, name):
+    """What is counted under that name in the episodes that run."""
+    return env.arrays.totals.numpy()[:, env.task.totals.index(name)].copy()
 
 
 def place(env, corners, target, goal):
@@ -104,7 +108,7 @@ def test_the_net_holds_what_is_near_while_it_is_neither_torn_nor_slack(side, hei
     env = environment(replace(QUIET, collision=0.0))
     place(env, triangle(side), (0.0, 0.0, -3.0 + height), (3.0, 0.0, -3.0))
     still(env)
-    assert (env.arrays.totals.numpy()[:, 3] > 0.0).all() == held
+    assert (total(env, "held_time") > 0.0).all() == held
 
 
 def test_what_is_held_goes_along_and_what_is_not_drifts():
@@ -150,12 +154,12 @@ def test_progress_adds_up_to_the_way():
     """Of the net to the target and of the target to the goal, each with its weight."""
     weights = dict.fromkeys(("shape", "step", "bump", "action", "change"), 0.0)
     env = environment(Formation(reward=replace(QUIET.reward, net=2.0, goal=3.0, **weights)), worlds=8)
-    before, total = env.arrays.totals.numpy()[:, 5:7].copy(), np.zeros(8)
+    before, paid = (total(env, "to_net"), total(env, "to_goal")), np.zeros(8)
     rng = np.random.default_rng(0)
     for _ in range(8):
-        total += env.step(rng.uniform(-1.0, 1.0, (8, 3, 4))).reward.mean(axis=1)
-    way = before - env.arrays.totals.numpy()[:, 5:7]
-    np.testing.assert_allclose(total, 2.0 * way[:, 0] + 3.0 * way[:, 1], atol=1e-4)
+        paid += env.step(rng.uniform(-1.0, 1.0, (8, 3, 4))).reward.mean(axis=1)
+    way = before[0] - total(env, "to_net"), before[1] - total(env, "to_goal")
+    np.testing.assert_allclose(paid, 2.0 * way[0] + 3.0 * way[1], atol=1e-4)
 
 
 def rate(task, who, vehicle="finsrov", worlds=32):

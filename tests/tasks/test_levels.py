@@ -7,6 +7,7 @@ import pytest
 
 import finssim
 from finssim.tasks import EnvironmentSetupError, TrajectoryTracking
+from finssim.tasks.kernels import settings_of
 from finssim.tasks.levels import LevelPlan, climb
 from finssim.tasks.team_pursuit import TeamPursuit
 
@@ -78,9 +79,11 @@ def test_worlds_that_end_early_do_not_speak_for_the_others():
 def test_what_the_level_says_is_what_the_worlds_do():
     """The prey's speed and the rules of the capture are those of the level; shapes of references too."""
     env = finssim.make(TeamPursuit(level=3), worlds=2)
-    fast, touch = env.parameters.prey.speed, env.parameters.mode
+    settings = settings_of(env.task)
+    fast, touch = settings.speed, settings.rules.mode
     climb(env)
-    assert env.parameters.prey.speed == pytest.approx(fast * 0.5 / 0.8) and env.parameters.mode != touch
+    settings = settings_of(env.task)
+    assert settings.speed == pytest.approx(fast * 0.5 / 0.8) and settings.rules.mode != touch
     env.reset(seed=3)
     assert env.task.level == 0 and env.step(np.zeros((2, 3, 4))).observation.shape == (2, 3, 30)
 

@@ -153,4 +153,3 @@ def test_a_longer_vehicle_has_a_larger_pool_and_a_faster_target():
     assert large.simulator.surroundings[1].length == pytest.approx(4.0 * size)
     _, path, velocity = played(large, 50)
     assert 0.5 * pace * TASK.fastest < np.linalg.norm(velocity, axis=2).max() * 5.0
-    assert large.parameters.tolerance == pytest.approx(TASK.tolerance * size)

@@ -79,9 +79,7 @@ def test_the_robot_sees_what_the_batch_sees_bit_for_bit(name):
         env.arrays.goal_quaternion.assign(quat_from_yaw(yaw).astype(np.float32))
         again = env.simulator.pipeline()
         env._mask.fill_(1)
-        env.task.add_observe(
-            again, Batch(env.simulator.state, env.arrays, env.parameters, env.seed), env._mask
-        )
+        env.task.add_observe(again, Batch(env.simulator.state, env.arrays, env.seed), env._mask)
         again.run()
         seen = env.arrays.observation.numpy().reshape(env.worlds, env.agents, -1)
         steps = env.simulator.state.steps.numpy()

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from finssim.engine import Pool
 from finssim.tasks import Environment, StationKeeping
+from finssim.tasks.kernels import kernels_of, settings_of
 from finssim.tasks.station_keeping import Reward
 
 TASK = StationKeeping()
@@ -69,7 +70,7 @@ def test_fast_and_far_is_limited_in_the_observation():
     )
     env.simulator.state.velocity.assign(np.full((2, 1, 6), -5.0, np.float32))
     mask = wp.ones(2, dtype=wp.int32, device="cpu")
-    wp.launch(TASK.observe, 2, [env.arrays, mask, 0], device="cpu")
+    wp.launch(kernels_of(TASK).observe, 2, [env.arrays, settings_of(TASK), mask, 0], device="cpu")
     far = env.arrays.observation.numpy()[0]
     np.testing.assert_allclose(far, observed(env)[0], atol=SINGLE * 10.0)
     assert far[0] == pytest.approx(10.0) and far[15] == 1.0 and np.all(far[9:15] == -2.0)

@@ -13,8 +13,7 @@ from finssim.tasks.baselines import baseline
 from finssim.tasks.communication import Communication
 from finssim.tasks.pursuit_drive import DriveNumbers
 from finssim.tasks.pursuit_prey import Prey
-from finssim.tasks.team_pursuit import LEVELS, TeamPursuit
-from finssim.tasks.team_pursuit_net import net_distance
+from finssim.tasks.team_pursuit import LEVELS, TeamPursuit, net_distance
 from finssim.vehicles import load_vehicle
 
 
@@ -142,10 +141,11 @@ def test_progress_adds_up_to_the_way():
     weights = dict.fromkeys(("distance", "step", "drive", "stray", "spread", "bump", "action", "change"), 0.0)
     task = TeamPursuit()
     env = environment(TeamPursuit(reward=type(task.reward)(progress=1.0, **weights)), worlds=8)
-    before, total = env.arrays.totals.numpy()[:, 4].copy(), 0.0
+    gap = env.task.totals.index("gap")
+    before, total = env.arrays.totals.numpy()[:, gap].copy(), 0.0
     for _ in range(30):
         total = total + env.step(np.full((8, 3, 4), 0.5)).reward[:, 0]
-    np.testing.assert_allclose(total, before - env.arrays.totals.numpy()[:, 4], atol=1e-4)
+    np.testing.assert_allclose(total, before - env.arrays.totals.numpy()[:, gap], atol=1e-4)
 
 
 def test_a_level_that_rises_is_no_way_lost():

@@ -119,8 +119,8 @@ def test_t1_in_torch_is_t1():
     np.testing.assert_allclose(first[0], second[0], atol=5e-6)
     np.testing.assert_allclose(first[1], second[1], atol=5e-5)
     wanted, found = one.task.metrics(one.arrays), other.task.metrics(other.arrays)
-    assert 0.0 < wanted["success"].mean() < 1.0 and wanted.keys() == found.keys()
-    assert all(np.allclose(wanted[name], found[name], atol=1e-3) for name in wanted)
+    assert 0.0 < wanted["success"].mean() < 1.0 and wanted.keys() - found.keys() == {"left"}
+    assert all(np.allclose(wanted[name], found[name], atol=1e-3) for name in found)
 
 
 @pytest.mark.slow

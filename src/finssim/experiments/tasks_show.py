@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich import box
@@ -63,13 +63,15 @@ def tasks_show(
     for title, table in (
         ("Observation, of one agent", _observation(told)),
         ("Action, from -1 to 1", _action(told)),
-        ("Reward", _weights(told)),
+        ("Reward, in every step", _terms(told["reward"]["terms"], "weight")),
+        ("Ends", _terms(told["ends"], "reward")),
+        ("Counted", _terms(told["totals"])),
         ("Settings", _settings(told)),
     ):
         if table.row_count:
             console.print(Text(f"\n{title}", style="bold"))
             console.print(table)
-        if title == "Reward" and told["reward"]["told"]:
+        if title.startswith("Reward") and told["reward"]["told"]:
             console.print(Text(told["reward"]["told"]))
 
 
@@ -113,10 +115,10 @@ def _action(told: Mapping[str, Any]) -> Table:
     return table
 
 
-def _weights(told: Mapping[str, Any]) -> Table:
-    table = _table("weight", "value")
-    for name, value in told["reward"]["weights"].items():
-        table.add_row(name, f"{value:g}" if isinstance(value, float) else str(value))
+def _terms(terms: Sequence[Mapping[str, Any]], number: str | None = None) -> Table:
+    table = _table("name", *([number] if number else []), "term")
+    for one in terms:
+        table.add_row(Text(one["name"]), *([f"{one[number]:g}"] if number else []), Text(one["told"]))
     return table
 
 
@@ -143,7 +145,19 @@ def _words(values: Mapping[str, Any]) -> str:
 
 def _table(*heads: str) -> Table:
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    numbers = ("agents", "sees", "does", "every [s]", "for [s]", "divided by", "limited to", "at -1", "at 1")
+    numbers = (
+        "agents",
+        "sees",
+        "does",
+        "every [s]",
+        "for [s]",
+        "divided by",
+        "limited to",
+        "at -1",
+        "at 1",
+        "weight",
+        "reward",
+    )
     for head in heads:
         table.add_column(
             Text(head),

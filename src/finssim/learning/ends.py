@@ -14,7 +14,7 @@ from finssim.tasks.arrays import TaskArrays
 
 __all__ = ["EpisodeEnds"]
 
-TOTALS = ("final_return", "final_length", "final_held", "final_totals")
+TOTALS = ("final_return", "final_length", "final_held", "final_totals", "final_earned")
 """What tasks measure an episode by, of the one that ended last in each world."""
 
 
@@ -56,6 +56,10 @@ class EpisodeEnds:
     def clear(self) -> None:
         """Forget them."""
         self.ended[...] = False
+
+    def earned(self) -> dict[str, NDArray[np.float64]]:
+        """What each reward and each end added to the return, by world; see `Task.earned`."""
+        return self._environment.task.earned(self._copy)
 
     def metrics(self) -> tuple[NDArray[np.bool_], dict[str, NDArray[np.float64]]]:
         """Where there was an end, and the task's measures by world, as NumPy: the one copy through the host."""

@@ -38,9 +38,7 @@ class EpisodeTally:
         self._arrays, self._ends = arrays, EpisodeEnds(environment, arrays)
         self._rewards = arrays.view(environment.arrays.reward)
         self._shortened = self._ends.done() | True if shortened else self._ends.done() & False
-        self._episodes: deque[tuple[float, float, float]] = deque(
-            maxlen=max(SHORTEST_WINDOW, environment.worlds)
-        )
+        self._episodes: deque[tuple[float, ...]] = deque(maxlen=max(SHORTEST_WINDOW, environment.worlds))
         self._reward, self._looks = arrays.zeros(1), 0
 
     def look(self) -> None:
@@ -52,16 +50,23 @@ class EpisodeTally:
         self._shortened &= ~done
 
     def row(self) -> dict[str, float]:
-        """Means over the last episodes, and of the reward since the row before."""
+        """Means over the last episodes, also of what each reward gave, and of the reward since the row before."""
         ended, measured = self._ends.metrics()
         if ended.any():
             success = measured.get("success", np.zeros(self.environment.worlds))
-            columns = [measured["return"][ended], measured["length"][ended], success[ended]]
+            earned = self._ends.earned()
+            parts = [measured["return"], measured["length"], success, *earned.values()]
+            columns = [part[ended] for part in parts]
             self._episodes.extend(zip(*(column.tolist() for column in columns), strict=True))
-        means = np.mean(self._episodes, axis=0) if self._episodes else np.zeros(3)
+        names = (
+            "mean_return",
+            "mean_length",
+            "held",
+            *(f"earned_{n}" for n in self.environment.task.earnings),
+        )
+        means = np.mean(self._episodes, axis=0) if self._episodes else np.zeros(len(names))
         reward = float(self._arrays.numpy(self._reward)[0]) / max(self._looks, 1)
         self._start_row()
-        names = ("mean_return", "mean_length", "held")
         return {**dict(zip(names, means.tolist(), strict=True)), "mean_reward": reward}
 
     def _start_row(self) -> None:
@@ -73,7 +78,7 @@ class EpisodeTally:
         """What `load` takes."""
         return {
             "shortened": self._arrays.numpy(self._shortened),
-            "episodes": np.array(self._episodes).reshape(-1, 3),
+            "episodes": np.array(self._episodes),
         }
 
     def load(self, state: dict[str, Any]) -> None:

@@ -228,4 +228,7 @@ def _tag(name: str) -> str:
     }.items():
         if name in names:
             return f"{group}/{name}"
-    return name.replace("evaluation_", "evaluation/") if name.startswith("evaluation_") else f"learner/{name}"
+    for group in ("evaluation", "earned"):
+        if name.startswith(f"{group}_"):
+            return name.replace("_", "/", 1)
+    return f"learner/{name}"

@@ -53,19 +53,9 @@ class MessageTable:
 class NetTable:
     """A net that agents hold, and what drifts in the water to be caught with it."""
 
-    side: float  # of the triangle at rest [m]
-    stretch: float  # longest edge that does not tear it, in sides
     target: wp.array(dtype=wp.vec3)  # world frame [m]
     drift: wp.array(dtype=wp.vec3)  # its velocity while nothing holds it [m/s]
     motion: wp.array(dtype=wp.vec3)  # its velocity now [m/s]
-
-
-@wp.struct
-class Berth:
-    """Where a vehicle comes to rest in a dock."""
-
-    nose: float  # of the vehicle, from its origin along body x [m]
-    depth: float  # where the nose rests, from the throat along the dock's x [m]
 
 
 @wp.struct
@@ -76,7 +66,6 @@ class Answers:
     terminated: wp.array(dtype=int)
     inside: wp.array(dtype=int)  # 1: within the tolerance of success
     counted: wp.array2d(dtype=float)  # (worlds, task.totals): what this step adds to them
-    observation: wp.array2d(dtype=float)  # (worlds, agents * size)
     position: wp.array2d(dtype=wp.vec3)  # (worlds, vehicles), where an episode would start; world frame [m]
     quaternion: wp.array2d(dtype=wp.quat)
     velocity: wp.array2d(dtype=vec6)
@@ -95,6 +84,7 @@ class TaskArrays:
     """
 
     action: wp.array2d(dtype=float)  # (worlds, agents * size), each in [-1, 1]
+    action_size: int  # of one vehicle
     previous_action: wp.array2d(dtype=float)
     time: wp.array(dtype=float)  # in the episode [s]
     scripted: wp.array2d(dtype=float)  # (worlds, others * size): actions of the vehicles that do not learn
@@ -112,11 +102,14 @@ class TaskArrays:
     final_held: wp.array(dtype=float)  # the same when the last episode ended [s]
     totals: wp.array2d(dtype=float)  # (worlds, task.totals): what the task counts in the episode, from 0
     final_totals: wp.array2d(dtype=float)  # the same when the last episode ended
+    earned: wp.array2d(
+        dtype=float
+    )  # (worlds, rewards and ends): what each added to the return, mean over agents
+    final_earned: wp.array2d(dtype=float)  # the same when the last episode ended
     goal_position: wp.array(dtype=wp.vec3)  # world frame [m]
     goal_quaternion: wp.array(dtype=wp.quat)  # body to world
     reference: ReferenceTable  # of tasks that follow one
     target: TargetMotion  # of tasks whose goal moves
-    berth: Berth  # of tasks with a dock
     funnel: Funnel  # of tasks with a dock: the simulator's; its pose is the goal's
     messages: MessageTable  # of tasks whose agents talk to each other
     net: NetTable  # of tasks whose agents hold a net
@@ -129,7 +122,14 @@ class TaskArrays:
 
 
 def task_arrays(
-    worlds: int, agents: int, others: int, observation: int, action: int, device: wp.Device, totals: int = 0
+    worlds: int,
+    agents: int,
+    others: int,
+    observation: int,
+    action: int,
+    device: wp.Device,
+    totals: int = 0,
+    earned: int = 0,
 ) -> TaskArrays:
     """Zero arrays of the right size; the measured ones are left for the environment to fill or alias.
 
@@ -141,8 +141,10 @@ def task_arrays(
         action: Numbers in the action of a vehicle.
         device: Where.
         totals: Numbers that the task counts in an episode.
+        earned: Rewards and ends of the task.
     """
     out = TaskArrays()
+    out.action_size = action
     for name, columns in {
         "action": agents * action,
         "previous_action": agents * action,
@@ -152,6 +154,8 @@ def task_arrays(
         "agent_reward": agents,
         "totals": totals,
         "final_totals": totals,
+        "earned": earned,
+        "final_earned": earned,
     }.items():
         setattr(out, name, wp.zeros((worlds, columns), dtype=wp.float32, device=device))
     for name in ("time", "reward", "episode_return", "final_return", "held", "final_held"):

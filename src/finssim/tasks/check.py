@@ -145,7 +145,7 @@ def _repeats(first: Played, again: Played, many: Played) -> Iterator[str]:
     """Equal seeds, equal numbers, for any number of worlds."""
     pairs = [(a, b) for a, b in zip(first[:4], again[:4], strict=True)]
     if not all(np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in pairs):
-        yield "equal seeds give other numbers: draw from wp.rand_init(seed and episode, world) or w.uniform alone"
+        yield "equal seeds give other numbers: draw from wp.rand_init(key, world) or w.uniform alone"
         return
     if not all(
         np.array_equal(a, b[:, :WORLDS], equal_nan=a.dtype.kind == "f")
@@ -164,16 +164,16 @@ def _leaks(first: Played, past: Played) -> Iterator[str]:
     second = slice(EPISODE, 2 * EPISODE)
     start = slice(EPISODE - 1, 2 * EPISODE - 1)
     if not np.array_equal(first.observation[start][:, worlds], past.observation[start][:, worlds]):
-        yield "an observation depends on the episode before: set everything in spawn"
+        yield "an observation depends on the episode before: set everything at the start"
     elif not np.array_equal(first.reward[second][:, worlds], past.reward[second][:, worlds]):
-        yield "a reward depends on the episode before: start totals and the last action over with open_episode in spawn"
+        yield "a reward depends on the episode before: start over at the start whatever it is made of"
 
 
 def _starts(played: Played) -> Iterator[str]:
     """What is seen after a reset differs between worlds and episodes."""
     starts = played.observation[played.ended]
     if len(starts) > 1 and len({row.tobytes() for row in starts}) == 1:
-        yield "every episode starts alike: draw something in spawn or reset, from the seed, the episode and the world"
+        yield "every episode starts alike: draw something at the start or in reset, from the key or with w.uniform"
 
 
 def _metrics(played: Played) -> Iterator[str]:
@@ -193,7 +193,6 @@ def _metrics(played: Played) -> Iterator[str]:
             total, played.metrics["return"][world], rtol=1e-3, atol=1e-3
         ):
             yield (
-                "return and length are not those of the last episode: add each reward to episode_return once, and call "
-                "close_episode at the end"
+                "return and length are not those of the last episode: leave those that Task.metrics gives as they are"
             )
             return

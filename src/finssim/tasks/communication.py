@@ -8,6 +8,7 @@ import warp as wp
 from finssim.engine.state import State
 from finssim.tasks.arrays import MessageTable, TaskArrays
 from finssim.tasks.given import EnvironmentSetupError
+from finssim.tasks.terms import measured_velocity
 
 MOST_UNDER_WAY = 32
 """Messages of one agent that can be under way at once."""
@@ -97,13 +98,6 @@ def message_table(
 
 
 @wp.func
-def measured_velocity(arrays: TaskArrays, w: int, v: int) -> wp.vec3:
-    """Measured velocity of a vehicle, world frame [m/s]."""
-    nu = arrays.velocity[w, v]
-    return wp.quat_rotate(arrays.quaternion[w, v], wp.vec3(nu[0], nu[1], nu[2]))
-
-
-@wp.func
 def mate_position(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
     """Where agent a takes agent b to be, world frame [m]: where it was when it sent the newest message heard."""
     x = arrays.position[w, b]
@@ -122,10 +116,10 @@ def mate_velocity(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
 
 
 @wp.func
-def key_messages(state: State, arrays: TaskArrays, seed: int, w: int):
+def key_messages(arrays: TaskArrays, key: int, w: int):
     """Give the episode's losses a random stream of their own; a part of spawning."""
     if arrays.messages.on != 0:
-        arrays.messages.key[w] = seed + 15485863 * state.episode[w] + 11
+        arrays.messages.key[w] = key + 11
 
 
 @wp.func

@@ -61,6 +61,9 @@ def describe_task(
         "time_limit_s": the_task.time_limit,
         "levels": the_task.levels,
         "reward": _reward(the_task),
+        "ends": _ends(the_task),
+        "totals": _totals(the_task),
+        "inside": _told(the_task, the_task.terms().inside),
         "success": the_task.success_rule(),
         "settings": _settings(the_task),
         "training_noise": {name: value for name, value in noise.items() if value},
@@ -76,9 +79,27 @@ def title_of(task: Task) -> str:
 def _observation(task: Task) -> list[dict[str, Any]]:
     parts, first = [], 0
     for part in task.observation:
-        parts.append({"first": first, **asdict(part)})
+        parts.append(
+            {
+                "first": first,
+                "name": part.name,
+                "size": part.size,
+                "unit": part.unit,
+                "scale": part.scale,
+                "clip": part.clip,
+                "told": _told(task, part.term),
+            }
+        )
         first += part.size
     return parts
+
+
+def _told(task: Task, term: Any) -> str:
+    """What is written of a term, or of what is shared under its name."""
+    if isinstance(term, str):
+        terms = task.terms()
+        term = {**terms.shared, **terms.seen}[term]
+    return " ".join((inspect.getdoc(term.func) or "").split()) if term is not None else ""
 
 
 def _action(mode: str, vehicle: Vehicle) -> dict[str, Any]:
@@ -101,11 +122,25 @@ def _action(mode: str, vehicle: Vehicle) -> dict[str, Any]:
 
 
 def _reward(task: Task) -> dict[str, Any]:
-    """Weights by name and what is written of them; or what is written of the function of a task in torch."""
+    """Terms with their weights, and what is written of them all; of a task in torch, of its function."""
     own: Any = getattr(task, "reward", None)
-    if is_dataclass(own) and not isinstance(own, type):
-        return {"weights": asdict(own), "told": inspect.getdoc(type(own)) or ""}
-    return {"weights": {}, "told": (inspect.getdoc(own) or "") if callable(own) else ""}
+    weights = asdict(own) if is_dataclass(own) and not isinstance(own, type) else {}
+    told = inspect.getdoc(type(own) if weights else own) if weights or callable(own) else ""
+    terms = [
+        {"name": one.name, "weight": one.weight, "told": _told(task, one.term)}
+        for one in task.terms().rewards
+    ]
+    return {"terms": terms, "weights": weights, "told": told or ""}
+
+
+def _ends(task: Task) -> list[dict[str, Any]]:
+    return [
+        {"name": one.name, "reward": one.reward, "told": _told(task, one.term)} for one in task.terms().ends
+    ]
+
+
+def _totals(task: Task) -> list[dict[str, Any]]:
+    return [{"name": one.name, "told": _told(task, one.term)} for one in task.terms().totals]
 
 
 def _settings(task: Task) -> list[dict[str, Any]]:

@@ -11,28 +11,65 @@ from numpy.typing import NDArray
 
 from finssim.control.pole_placement import axis_model
 from finssim.engine import Dock, Pool
-from finssim.tasks.arrays import Berth, TaskArrays
-from finssim.tasks.docking_kernels import (
-    DISTANCE_SCALE,
-    VELOCITY_CLIP,
-    DockingParameters,
-    evaluate_docking,
-    observe_docking,
-    spawn_docking,
-)
+from finssim.engine.state import State
+from finssim.physics.types import vec6
+from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.fitting import coefficients_of
 from finssim.tasks.measurement import MeasurementNoise
 from finssim.tasks.task import ObservationPart, Task
+from finssim.tasks.terms import (
+    End,
+    RewardTerm,
+    Terms,
+    Total,
+    action_change,
+    action_effort,
+    attitude_error,
+    goal_columns,
+    length,
+    linear_velocity,
+    straight,
+    tilted,
+    turn_rates,
+    turning,
+    uniform3,
+)
 from finssim.vehicles import Vehicle
 from finssim.vehicles.capability import terminal_speeds
 
+DISTANCE_SCALE = 3.0
+"""Distances are divided by this in the observation [m]."""
+VELOCITY_CLIP = 2.0
+"""Velocities are clipped here in the observation [m/s, rad/s]."""
+
+
+@wp.func
+def in_dock(arrays: TaskArrays, p: Any, w: int, x: wp.vec3, q: wp.quat) -> wp.vec3:
+    """The nose of a vehicle with its origin at x and attitude q, in the axes of the world's dock [m]."""
+    nose = x + wp.quat_rotate(q, wp.vec3(0.5 * p.hull.length, 0.0, 0.0))
+    return wp.quat_rotate_inv(arrays.goal_quaternion[w], nose - arrays.goal_position[w])
+
+
+@wp.func
+def seen_nose(arrays: TaskArrays, p: Any, w: int) -> wp.vec3:
+    """The nose as measured, in dock axes, from the throat [m]."""
+    return in_dock(arrays, p, w, arrays.position[w, 0], arrays.quaternion[w, 0])
+
+
+@wp.func
+def berth_offset(arrays: TaskArrays, p: Any, w: int, nose: wp.vec3) -> wp.vec3:
+    """From the nose to its berth, body frame [m]."""
+    R = wp.quat_to_matrix(wp.quat_inverse(arrays.quaternion[w, 0]) * arrays.goal_quaternion[w])
+    return R * (wp.vec3(p.berth * p.funnel.tube_length, 0.0, 0.0) - nose)
+
+
 OBSERVATION = (
-    ObservationPart("nose to its berth, body frame", 3, "m", scale=DISTANCE_SCALE),
-    ObservationPart("dock rotation relative to the body, first two columns", 6, "1"),
-    ObservationPart("linear velocity, body frame", 3, "m/s", clip=VELOCITY_CLIP),
-    ObservationPart("angular velocity, body frame", 3, "rad/s", clip=VELOCITY_CLIP),
-    ObservationPart("nose from the throat, dock axes", 3, "m", scale=DISTANCE_SCALE),
-    ObservationPart("distance of the nose to its berth", 1, "m", scale=DISTANCE_SCALE, clip=1.0),
+    ObservationPart("nose to its berth, body frame", 3, "m", scale=DISTANCE_SCALE, term="offset"),
+    ObservationPart("dock rotation relative to the body, first two columns", 6, "1", term=goal_columns),
+    ObservationPart("linear velocity, body frame", 3, "m/s", clip=VELOCITY_CLIP, term=linear_velocity),
+    ObservationPart("angular velocity, body frame", 3, "rad/s", clip=VELOCITY_CLIP, term=turn_rates),
+    ObservationPart("nose from the throat, dock axes", 3, "m", scale=DISTANCE_SCALE, term="nose"),
+    ObservationPart("distance of the nose to its berth", 1, "m", scale=DISTANCE_SCALE, clip=1.0, term=length),
 )
 
 BRISK = 0.9
@@ -100,6 +137,100 @@ class DockingReward:
     loss: float = 20.0
 
 
+@wp.func
+def nose(state: State, arrays: TaskArrays, p: Any, w: int) -> wp.vec3:
+    """The nose in dock axes [m]."""
+    return in_dock(arrays, p, w, state.position[w, 0], state.quaternion[w, 0])
+
+
+@wp.func
+def berth_error(p: Any, x: wp.vec3) -> float:
+    """e: from the nose to its berth, in vehicle lengths."""
+    return wp.length(wp.vec3(p.berth * p.funnel.tube_length - x[0], x[1], x[2])) / p.hull.length
+
+
+@wp.func
+def berthed(p: Any, e: float) -> float:
+    """exp(-e / position_scale)."""
+    return wp.exp(-e / p.reward.position_scale)
+
+
+@wp.func
+def off_corridor(p: Any, x: wp.vec3) -> float:
+    """off: how far the nose is outside the cone that leads to the berth, in vehicle lengths."""
+    room = p.gap + wp.tan(p.cone) * wp.max(-x[0], 0.0)
+    return wp.max(wp.length(wp.vec2(x[1], x[2])) - room, 0.0) / p.hull.length
+
+
+@wp.func
+def push(arrays: TaskArrays, p: Any, w: int) -> float:
+    """min(contact force / limit, 1)."""
+    return wp.min(arrays.funnel.force[w, 0] / p.force_limit, 1.0)
+
+
+@wp.func
+def is_crashed(arrays: TaskArrays, p: Any, w: int) -> bool:
+    """A contact force above `force_limit`."""
+    return arrays.funnel.force[w, 0] > p.force_limit
+
+
+@wp.func
+def is_lost(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
+    """Half a length out of the water, or farther from the dock than the tank is wide."""
+    x = state.position[w, 0]
+    away = wp.length(x - arrays.goal_position[w])
+    return x[2] > 0.5 * p.hull.length or away > p.tank[0] * p.hull.length
+
+
+@wp.func
+def is_docked(state: State, arrays: TaskArrays, p: Any, w: int, x: wp.vec3) -> bool:
+    """The nose far enough in the tube, slow and not crashed."""
+    nu = state.velocity[w, 0]
+    still = wp.length(wp.vec3(nu[0], nu[1], nu[2])) <= p.slow * p.hull.speed
+    aside = wp.length(wp.vec2(x[1], x[2]))
+    deep = x[0] >= p.inside * p.funnel.tube_length
+    return deep and aside <= 2.0 * p.gap and still and not is_crashed(arrays, p, w)
+
+
+@wp.func
+def contact_impulse(arrays: TaskArrays, w: int, was: float) -> float:
+    """Of all contacts so far [N s]."""
+    return was + arrays.funnel.impulse[w, 0]
+
+
+@wp.func
+def peak_force(arrays: TaskArrays, w: int, was: float) -> float:
+    """Greatest contact force so far [N]."""
+    return wp.max(was, arrays.funnel.force[w, 0])
+
+
+@wp.func
+def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
+    """A dock somewhere, and a vehicle at rest before its mouth."""
+    length = p.hull.length
+    rng = wp.rand_init(key, 4 * w + 3)
+    q_d = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), wp.randf(rng, -3.14159265, 3.14159265))
+    middle = wp.vec3(0.0, 0.0, -0.5 * p.tank[1])
+    low, high = length * (middle - p.dock_spread), length * (middle + p.dock_spread)
+    arrays.goal_position[w] = uniform3(wp.rand_init(key, 4 * w), low, high)
+    arrays.goal_quaternion[w] = q_d
+    arrays.funnel.force[w, 0] = 0.0
+    arrays.funnel.impulse[w, 0] = 0.0
+    roll = wp.randf(rng, -p.tilt, p.tilt)
+    pitch = wp.randf(rng, -p.tilt, p.tilt)
+    q = q_d * tilted(roll, pitch, wp.randf(rng, -p.turn, p.turn))
+    near = p.funnel.cone_length + length * p.start[0]
+    far = p.funnel.cone_length + length * p.start[1]
+    across = length * p.start_aside[0]
+    up = length * p.start_aside[1]
+    x = uniform3(wp.rand_init(key, 4 * w + 1), wp.vec3(-far, -across, -up), wp.vec3(-near, across, up))
+    state.position[w, 0] = (
+        arrays.goal_position[w] + wp.quat_rotate(q_d, x) - wp.quat_rotate(q, wp.vec3(0.5 * length, 0.0, 0.0))
+    )
+    state.quaternion[w, 0] = q
+    state.velocity[w, 0] = vec6()
+
+
 @dataclass(frozen=True, kw_only=True)
 class Docking(Task):
     """Lengths in vehicle lengths, unless said otherwise; the dock's section in parts of the vehicle's girth.
@@ -107,9 +238,9 @@ class Docking(Task):
     An episode goes on when it has succeeded: staying in is what pays. Sizes are ours: nothing is published.
     """
 
+    succeeds: ClassVar[str] = "once"
     title: ClassVar[str] = "enter a funnel nose first, gently"
     name: str = "docking"
-    totals: ClassVar[tuple[str, ...]] = ("success", "success_time", "contact_impulse", "peak_force", "crash")
     observation: tuple[ObservationPart, ...] = OBSERVATION
     time_limit: float = 40.0
     hull: Hull = Hull()
@@ -156,10 +287,6 @@ class Docking(Task):
         position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02
     )
 
-    evaluate = staticmethod(evaluate_docking)
-    spawn = staticmethod(spawn_docking)
-    observe = staticmethod(observe_docking)
-
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Docking":
         """With a dock that fits the vehicle."""
         return replace(self, hull=Hull.of(vehicles[0]))
@@ -194,11 +321,15 @@ class Docking(Task):
             stiffness=dock.stiffness, damping=dock.damping,
         )  # fmt: skip
 
-    def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
-        """Where the vehicle's nose comes to rest."""
-        place = Berth()
-        place.nose, place.depth = 0.5 * self.hull.length, self.berth * self.dock().tube_length
-        arrays.berth = place
+    @property
+    def funnel(self) -> Dock:
+        """The dock, for the terms."""
+        return self.dock()
+
+    @property
+    def gap(self) -> float:
+        """Between the envelope's corners and the tube [m]."""
+        return self.dock().throat_radius - self.hull.girth
 
     def success_rule(self) -> str:
         """See `Task`."""
@@ -214,36 +345,25 @@ class Docking(Task):
         measured["success_time"][measured["success"] == 0.0] = np.nan
         return measured
 
-    def parameters(self) -> Any:
-        """The struct that the kernels take."""
-        p, r, dock, length = DockingParameters(), self.reward, self.dock(), self.hull.length
-        p.inside, p.gap, p.length = (
-            self.inside * dock.tube_length,
-            dock.throat_radius - self.hull.girth,
-            length,
+    def terms(self) -> Terms:
+        """See `DockingReward`."""
+        r = self.reward
+        return Terms(
+            start=start,
+            shared={"x": nose, "e": berth_error, "theta": attitude_error},
+            seen={"nose": seen_nose, "offset": berth_offset},
+            rewards=(
+                RewardTerm("position", berthed, r.position),
+                RewardTerm("distance", "e", -r.distance),
+                RewardTerm("corridor", off_corridor, -r.corridor),
+                RewardTerm("heading", straight, r.heading),
+                RewardTerm("turn", "theta", -r.turn),
+                RewardTerm("contact", push, -r.contact),
+                RewardTerm("action", action_effort, -r.action),
+                RewardTerm("change", action_change, -r.change),
+                RewardTerm("rate", turning, -r.rate),
+            ),
+            ends=(End("crash", is_crashed, -r.loss), End("lost", is_lost, -r.loss)),
+            inside=is_docked,
+            totals=(Total("contact_impulse", contact_impulse), Total("peak_force", peak_force)),
         )
-        p.slope = math.tan(self.cone)
-        middle = wp.vec3(0.0, 0.0, -0.5 * self.tank[1])
-        spread = wp.vec3(*self.dock_spread)
-        p.dock_low, p.dock_high = length * (middle - spread), length * (middle + spread)
-        across, up = (length * s for s in self.start_aside)
-        near, far = (dock.cone_length + length * s for s in self.start)
-        p.start_low, p.start_high = wp.vec3(-far, -across, -up), wp.vec3(-near, across, up)
-        p.ceiling, p.range = 0.5 * length, self.tank[0] * length
-        p.slow, p.force_limit = self.slow * self.hull.speed, self.force_limit
-        for name in ("turn", "tilt", "hold", "time_limit", "control_step"):
-            setattr(p, name, getattr(self, name))
-        for name in (
-            "position",
-            "distance",
-            "corridor",
-            "heading",
-            "turn",
-            "contact",
-            "action",
-            "change",
-            "rate",
-        ):
-            setattr(p, f"{name}_weight", getattr(r, name))
-        p.position_scale, p.heading_scale, p.loss = r.position_scale, r.heading_scale, r.loss
-        return p

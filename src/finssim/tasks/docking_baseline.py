@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from finssim.control.pid import PidMemory
 from finssim.control.tracking import Goal
 from finssim.geometry.rotations import cross, matrix_to_quat, quat_conjugate, quat_rotate
-from finssim.tasks.docking import Docking
-from finssim.tasks.docking_kernels import DISTANCE_SCALE
+from finssim.tasks.docking import DISTANCE_SCALE, Docking
 from finssim.tasks.pid_baselines import PERIOD, Seen, WrenchPid
 from finssim.vehicles import Vehicle
 

@@ -46,7 +46,6 @@ class Environment:
         agents: How many agents a world has.
         simulator: The worlds.
         arrays: Actions, observations, rewards and goals, as Warp arrays by world.
-        parameters: The struct of the task's settings that its kernels take.
         drawing: What randomisation draws, how its ranges grow, and a log of it.
     """
 
@@ -122,7 +121,7 @@ class Environment:
         """Numbers in the action of an agent."""
         self.arrays = task_arrays(
             worlds, self.agents, len(task.others), task.observation_size, self.action_size, self.device,
-            len(task.totals),
+            len(task.totals), len(task.earnings),
         )  # fmt: skip
         if self.simulator.dock is not None:
             # The dock is the goal: the same memory.
@@ -155,10 +154,9 @@ class Environment:
 
     def _build(self) -> None:
         self._step = self.simulator.pipeline()
-        self.parameters = self.task.parameters()
-        self._batch = batch = Batch(self.simulator.state, self.arrays, self.parameters, self.seed)
+        self._batch = batch = Batch(self.simulator.state, self.arrays, self.seed)
         if self.task.others:
-            self.task.add_script(self._step, batch)
+            self.task.add_command(self._step, batch)
         add_action(
             self.action_mode,
             self._nominal,

@@ -1,50 +1,216 @@
 """Formation keeping: three vehicles hold a triangular net between them, catch something that drifts, and carry it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
-import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
+from finssim.engine.state import State
 from finssim.tasks.arrays import NetTable, TaskArrays
-from finssim.tasks.communication import Communication, message_table
-from finssim.tasks.formation_kernels import (
-    DEPTH_SCALE,
-    NEAR,
-    REACH,
-    FormationParameters,
-    evaluate_formation,
-    observe_formation,
-    spawn_formation,
+from finssim.tasks.communication import (
+    Communication,
+    exchange_messages,
+    key_messages,
+    mate_position,
+    message_table,
+    open_messages,
 )
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.pursuit import OpenWater
 from finssim.tasks.pursuit_drive import slowest
-from finssim.tasks.pursuit_observation import MATE, PI, VELOCITY_CLIP
+from finssim.tasks.pursuit_observation import OWN, PI, gap_to, mate, motion_of
 from finssim.tasks.task import ObservationPart
+from finssim.tasks.team_pursuit import any_outside, bumps
+from finssim.tasks.terms import (
+    End,
+    RewardTerm,
+    Terms,
+    Total,
+    action_change,
+    action_effort,
+    level_direction,
+    measured_velocity,
+    one,
+    place_at_rest,
+    uniform3,
+    world_velocity,
+)
 from finssim.vehicles import Vehicle
 
-OBSERVATION = (
-    ObservationPart("linear velocity, body frame", 3, "m/s", clip=VELOCITY_CLIP),
-    ObservationPart("angular velocity, body frame", 3, "rad/s", clip=VELOCITY_CLIP),
-    ObservationPart("target from here, body frame", 3, "m", scale=NEAR, clip=REACH),
-    ObservationPart("target's velocity less one's own, body frame", 3, "m/s", clip=REACH),
-    ObservationPart("depth", 1, "m", scale=DEPTH_SCALE, clip=REACH),
-    ObservationPart("bearing of the way out from the net's middle", 1, "rad", scale=PI, clip=1.0),
-    *MATE[1:],
-    *MATE[1:],
-    ObservationPart("goal from here, body frame", 3, "m", scale=NEAR, clip=REACH),
-    ObservationPart("lengths of the edges less the side, in sides, the shortest first", 3, "1", clip=REACH),
-    ObservationPart("distance from the target to the net", 1, "m", scale=NEAR, clip=REACH),
-    ObservationPart("what the longest edge may still stretch, in sides", 1, "1", clip=REACH),
-)
-"""34 numbers of each agent. Team-mates follow in the order of the triangle: each sees its next one first."""
-
+AGENTS = 3
+NEAR = 3.0
+"""Distances to target, goal and net are divided by this in the observation [m]."""
+REACH = 4.0
+"""Scaled distances are clipped here."""
+SETTLE = 0.5
+"""How fast what is held slides to the middle of the net [1/s]."""
+DEPTH_SCALE = 5.0
+"""The depth is divided by this [m]."""
 
 ROOM = 2.1
 """The net's side is at least this many lengths of a vehicle: with that of FinsROV, 1.2 m."""
+
+
+@wp.func
+def triangle_distance(x: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> float:
+    """Distance from a point to a triangle [m].
+
+    The nearest point by the region of the triangle that the point lies before: a corner, an edge or the inside
+    (Ericson, Real-Time Collision Detection, section 5.1.5).
+    """
+    ab = b - a
+    ac = c - a
+    d1 = wp.dot(ab, x - a)
+    d2 = wp.dot(ac, x - a)
+    d3 = wp.dot(ab, x - b)
+    d4 = wp.dot(ac, x - b)
+    d5 = wp.dot(ab, x - c)
+    d6 = wp.dot(ac, x - c)
+    va = d3 * d6 - d5 * d4
+    vb = d5 * d2 - d1 * d6
+    vc = d1 * d4 - d3 * d2
+    if d1 <= 0.0 and d2 <= 0.0:
+        return wp.length(x - a)
+    if d3 >= 0.0 and d4 <= d3:
+        return wp.length(x - b)
+    if d6 >= 0.0 and d5 <= d6:
+        return wp.length(x - c)
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        return wp.length(x - a - (d1 / (d1 - d3)) * ab)
+    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        return wp.length(x - a - (d2 / (d2 - d6)) * ac)
+    if va <= 0.0 and d4 >= d3 and d5 >= d6:
+        return wp.length(x - b - ((d4 - d3) / ((d4 - d3) + (d5 - d6))) * (c - b))
+    whole = va + vb + vc
+    return wp.length(x - a - (vb / whole) * ab - (vc / whole) * ac)
+
+
+@wp.func
+def sorted_edges(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
+    """Lengths of a triangle's edges, the shortest first [m]."""
+    ab = wp.length(b - a)
+    bc = wp.length(c - b)
+    ca = wp.length(a - c)
+    least = wp.min(ab, wp.min(bc, ca))
+    most = wp.max(ab, wp.max(bc, ca))
+    return wp.vec3(least, ab + bc + ca - least - most, most)
+
+
+@wp.func
+def next_corner(a: int, k: int) -> int:
+    """Number of the k-th corner after agent a, around the triangle."""
+    return (a + k) % AGENTS
+
+
+@wp.func
+def corner_gap(arrays: TaskArrays, w: int, a: int, k: int) -> wp.vec3:
+    """From the agent to its k-th next corner, body frame [m]."""
+    return gap_to(arrays, w, a, next_corner(a, k))
+
+
+@wp.func
+def corner_motion(arrays: TaskArrays, w: int, a: int, k: int) -> wp.vec3:
+    """Velocity of the k-th next corner less one's own, body frame [m/s]."""
+    return motion_of(arrays, w, a, next_corner(a, k))
+
+
+@wp.func
+def in_body(arrays: TaskArrays, w: int, a: int, x: wp.vec3) -> wp.vec3:
+    """A way in the world as one in the measured body frame of agent a."""
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], x)
+
+
+@wp.func
+def target_gap(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """From the agent to the target, body frame [m]."""
+    return in_body(arrays, w, a, arrays.net.target[w] - arrays.position[w, a])
+
+
+@wp.func
+def target_slip(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """The target's velocity less the agent's own, body frame [m/s]."""
+    return in_body(arrays, w, a, arrays.net.motion[w] - measured_velocity(arrays, w, a))
+
+
+@wp.func
+def goal_gap(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """From the agent to the goal, body frame [m]."""
+    return in_body(arrays, w, a, arrays.goal_position[w] - arrays.position[w, a])
+
+
+@wp.func
+def seen_depth(arrays: TaskArrays, w: int, a: int) -> float:
+    """Depth of the agent [m]."""
+    return -arrays.position[w, a][2]
+
+
+@wp.func
+def next_place(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """Where the agent takes the next corner to be, world frame [m]."""
+    return mate_position(arrays, w, a, next_corner(a, 1))
+
+
+@wp.func
+def last_place(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """Where the agent takes the corner after that to be, world frame [m]."""
+    return mate_position(arrays, w, a, next_corner(a, 2))
+
+
+@wp.func
+def outward(arrays: TaskArrays, w: int, a: int, left: wp.vec3, right: wp.vec3) -> float:
+    """Bearing of the way out from the net's middle, seen from the agent [rad]."""
+    away = in_body(arrays, w, a, 2.0 * arrays.position[w, a] - left - right)
+    return wp.atan2(away[1], away[0])
+
+
+@wp.func
+def seen_edges(arrays: TaskArrays, w: int, a: int, left: wp.vec3, right: wp.vec3) -> wp.vec3:
+    """Lengths of the net's edges as far as the agent has heard, the shortest first [m]."""
+    return sorted_edges(arrays.position[w, a], left, right)
+
+
+@wp.func
+def edge_errors(p: Any, edges: wp.vec3) -> wp.vec3:
+    """Lengths of the edges less the side, in sides, the shortest first."""
+    side = wp.vec3(p.side, p.side, p.side)
+    return (edges - side) / p.side
+
+
+@wp.func
+def seen_surface(arrays: TaskArrays, w: int, a: int, left: wp.vec3, right: wp.vec3) -> float:
+    """From the target to the net's surface, as far as the agent has heard [m]."""
+    return triangle_distance(arrays.net.target[w], arrays.position[w, a], left, right)
+
+
+@wp.func
+def left_to_stretch(p: Any, edges: wp.vec3) -> float:
+    """What the longest edge may still stretch, in sides."""
+    return p.stretch - edges[2] / p.side
+
+
+OBSERVATION = (
+    *OWN,
+    ObservationPart("target from here, body frame", 3, "m", NEAR, REACH, target_gap),
+    ObservationPart("target's velocity less one's own, body frame", 3, "m/s", clip=REACH, term=target_slip),
+    ObservationPart("depth", 1, "m", DEPTH_SCALE, REACH, seen_depth),
+    ObservationPart("bearing of the way out from the net's middle", 1, "rad", PI, 1.0, outward),
+    *mate(1, corner_gap, corner_motion),
+    *mate(2, corner_gap, corner_motion),
+    ObservationPart("goal from here, body frame", 3, "m", NEAR, REACH, goal_gap),
+    ObservationPart(
+        "lengths of the edges less the side, in sides, the shortest first",
+        3,
+        "1",
+        clip=REACH,
+        term=edge_errors,
+    ),
+    ObservationPart("distance from the target to the net", 1, "m", NEAR, REACH, seen_surface),
+    ObservationPart(
+        "what the longest edge may still stretch, in sides", 1, "1", clip=REACH, term=left_to_stretch
+    ),
+)
+"""34 numbers of each agent. Team-mates follow in the order of the triangle: each sees its next one first."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +239,139 @@ class FormationReward:
     loss: float = 20.0
 
 
+@wp.func
+def carried_net(state: State, w: int, x: wp.vec3) -> wp.vec4:
+    """The net's distance from a point [m], and the lengths of its edges, the shortest first [m]."""
+    a = state.position[w, 0]
+    b = state.position[w, 1]
+    c = state.position[w, 2]
+    edges = sorted_edges(a, b, c)
+    return wp.vec4(triangle_distance(x, a, b, c), edges[0], edges[1], edges[2])
+
+
+@wp.func
+def holds(p: Any, net: wp.vec4) -> bool:
+    """Whether the net holds the target: near enough, and neither stretched too far nor slack."""
+    return net[0] <= p.reach and net[1] >= p.slack * p.side and net[3] <= p.stretch * p.side
+
+
+@wp.func
+def move_target(state: State, arrays: TaskArrays, p: Any, w: int):
+    """Messages; then the target goes along with the net and into its middle while it is held, else it drifts."""
+    exchange_messages(state, arrays, w)
+    v = arrays.net.drift[w]
+    if holds(p, carried_net(state, w, arrays.net.target[w])):
+        middle = (state.position[w, 0] + state.position[w, 1] + state.position[w, 2]) / 3.0
+        v = (world_velocity(state, w, 0) + world_velocity(state, w, 1) + world_velocity(state, w, 2)) / 3.0
+        v += SETTLE * (middle - arrays.net.target[w])
+    arrays.net.motion[w] = v
+    arrays.net.target[w] = arrays.net.target[w] + p.control_step * v
+
+
+@wp.func
+def net_now(state: State, arrays: TaskArrays, w: int) -> wp.vec4:
+    """`carried_net` of the target."""
+    return carried_net(state, w, arrays.net.target[w])
+
+
+@wp.func
+def net_gap(net: wp.vec4) -> float:
+    """From the target to the net's surface [m]."""
+    return net[0]
+
+
+@wp.func
+def goal_distance(arrays: TaskArrays, w: int) -> float:
+    """From the target to the goal [m]."""
+    return wp.length(arrays.goal_position[w] - arrays.net.target[w])
+
+
+@wp.func
+def net_gained(net: wp.vec4, to_net: float) -> float:
+    """Way of the net to the target in this step [m]."""
+    return to_net - net[0]
+
+
+@wp.func
+def goal_gained(arrays: TaskArrays, w: int, to_goal: float) -> float:
+    """Way of the target to the goal in this step [m]."""
+    return to_goal - goal_distance(arrays, w)
+
+
+@wp.func
+def misshape(p: Any, net: wp.vec4) -> float:
+    """Mean error of an edge, in sides."""
+    error = float(0.0)
+    for i in range(3):
+        error += wp.abs(net[i + 1] - p.side) / (3.0 * p.side)
+    return error
+
+
+@wp.func
+def held_time(p: Any, net: wp.vec4, was: float) -> float:
+    """Time that the target was held [s]."""
+    return was + wp.where(holds(p, net), p.control_step, 0.0)
+
+
+@wp.func
+def shape_error(state: State, p: Any, w: int, net: wp.vec4, was: float) -> float:
+    """Mean of the error of an edge, in sides."""
+    return was + (misshape(p, net) - was) / float(state.steps[w])
+
+
+@wp.func
+def stretched_time(p: Any, net: wp.vec4, stretched: float) -> float:
+    """Time that the net has been too long [s]."""
+    far = net[3] > p.stretch * p.side
+    return wp.where(far, stretched + p.control_step, 0.0)
+
+
+@wp.func
+def is_there(arrays: TaskArrays, p: Any, w: int, net: wp.vec4) -> bool:
+    """The target held, near the goal."""
+    return holds(p, net) and goal_distance(arrays, w) <= p.goal_radius
+
+
+@wp.func
+def is_delivered(p: Any, held: float) -> bool:
+    """Held near the goal for `hold` seconds."""
+    return held > 0.0 and held >= p.hold - 0.1 * p.control_step
+
+
+@wp.func
+def is_torn(p: Any, net: wp.vec4, stretched: float) -> bool:
+    """Stretched for more than `grace` seconds."""
+    return stretched_time(p, net, stretched) > p.grace + 0.1 * p.control_step
+
+
+@wp.func
+def away_from(p: Any, rng: wp.uint32, x: wp.vec3) -> wp.vec3:
+    """A place at a level distance from x that is drawn, up to 0.5 m higher or lower."""
+    level = x + wp.randf(rng, p.nearest, p.farthest) * level_direction(wp.randf(rng, -PI, PI))
+    return wp.vec3(level[0], level[1], wp.clamp(x[2] + wp.randf(rng, -0.5, 0.5), p.low, p.high))
+
+
+@wp.func
+def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
+    """The team in its triangle, the target some way off, the goal beyond."""
+    rng = wp.rand_init(key, 4 * w)
+    turn = wp.randf(rng, -PI, PI)
+    away = p.spawn_radius * wp.sqrt(wp.randf(rng)) * level_direction(wp.randf(rng, -PI, PI))
+    middle = wp.vec3(away[0], away[1], wp.randf(rng, p.low, p.high))
+    most = wp.vec3(p.jitter, p.jitter, p.jitter)
+    for a in range(AGENTS):
+        angle = turn + float(a) * 2.0 * PI / 3.0
+        shift = uniform3(wp.rand_init(wp.randi(rng)), -most, most)
+        x = middle + p.side / wp.sqrt(3.0) * level_direction(angle) + shift
+        place_at_rest(state, w, a, x, angle + wp.randf(rng, -0.5, 0.5))
+    target = away_from(p, wp.rand_init(wp.randi(rng)), middle)
+    arrays.goal_position[w] = away_from(p, wp.rand_init(wp.randi(rng)), target)
+    arrays.net.target[w] = target
+    arrays.net.drift[w] = p.speed * level_direction(wp.randf(rng, -PI, PI))
+    arrays.net.motion[w] = arrays.net.drift[w]
+    key_messages(arrays, key, w)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Formation(OpenWater):
     """Carry a virtual net. It is a triangle between the three vehicles, without weight or drag, and it can tear.
@@ -83,10 +382,7 @@ class Formation(OpenWater):
     """
 
     agents: ClassVar[tuple[str, ...]] = ("corner_1", "corner_2", "corner_3")
-    totals: ClassVar[tuple[str, ...]] = (
-        *("success", "torn", "left", "held_time", "shape_error", "to_net", "to_goal", "stretched"),
-    )
-
+    succeeds: ClassVar[str] = "delivered"
     title: ClassVar[str] = "catch what drifts in a net and carry it, three together"
     name: str = "formation"
     observation: tuple[ObservationPart, ...] = field(default=OBSERVATION, repr=False)
@@ -123,10 +419,6 @@ class Formation(OpenWater):
     speed: float = 0.0
     """Of the drift [m/s]: follows from the vehicles."""
 
-    evaluate = staticmethod(evaluate_formation)
-    spawn = staticmethod(spawn_formation)
-    observe = staticmethod(observe_formation)
-
     def __post_init__(self) -> None:
         if not 0.0 < self.slack < 1.0 < self.stretch or self.side <= 0.0:
             raise EnvironmentSetupError(
@@ -142,7 +434,6 @@ class Formation(OpenWater):
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """Room for the target and for messages, if there are any."""
         net = NetTable()
-        net.side, net.stretch = self.side, self.stretch
         for name in ("target", "drift", "motion"):
             setattr(net, name, wp.zeros(worlds, dtype=wp.vec3, device=device))
         arrays.net = net
@@ -154,28 +445,35 @@ class Formation(OpenWater):
         """See `Task`."""
         return f"the target held within {self.goal_radius:g} m of the goal for {self.hold:g} s"
 
-    def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """As every task's, and the time until it was delivered [s], nan where it was not."""
-        measured = super().metrics(arrays)
-        took = np.where(measured["success"] > 0.0, self.control_step * measured["length"], np.nan)
-        return {**measured, "success_time": took}
-
-    def parameters(self) -> Any:
-        """The struct that the kernels take."""
-        p = FormationParameters()
-        p.arena, p.drift = self.arena_struct(self.nearest, self.farthest), self.speed
-        for name in (
-            "side",
-            "stretch",
-            "slack",
-            "reach",
-            "goal_radius",
-            "hold",
-            "grace",
-            "collision",
-            "jitter",
-        ):
-            setattr(p, name, getattr(self, name))
-        for one in fields(self.reward):
-            setattr(p, one.name, getattr(self.reward, one.name))
-        return p
+    def terms(self) -> Terms:
+        """See `FormationReward`."""
+        r = self.reward
+        return Terms(
+            start=start,
+            begin=open_messages,
+            advance=move_target,
+            shared={"net": net_now},
+            seen={"left": next_place, "right": last_place, "edges": seen_edges},
+            rewards=(
+                RewardTerm("net", net_gained, r.net),
+                RewardTerm("goal", goal_gained, r.goal),
+                RewardTerm("shape", misshape, -r.shape),
+                RewardTerm("step", one, -r.step),
+                RewardTerm("bump", bumps, -r.bump),
+                RewardTerm("action", action_effort, -r.action),
+                RewardTerm("change", action_change, -r.change),
+            ),
+            ends=(
+                End("delivered", is_delivered, r.success),
+                End("torn", is_torn, -r.loss),
+                End("left", any_outside, -r.loss),
+            ),
+            inside=is_there,
+            totals=(
+                Total("held_time", held_time),
+                Total("shape_error", shape_error),
+                Total("to_net", net_gap, first=net_gap),
+                Total("to_goal", goal_distance, first=goal_distance),
+                Total("stretched", stretched_time),
+            ),
+        )

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.tasks.formation import Formation
-from finssim.tasks.formation_kernels import NEAR
+from finssim.tasks.formation import NEAR, Formation
 from finssim.tasks.pursuit_baselines import PERIOD
 from finssim.tasks.pursuit_drive import DriveNumbers
 from finssim.tasks.pursuit_observation import DISTANCE_SCALE, PI

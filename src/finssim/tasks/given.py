@@ -2,12 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle, load_vehicle
+
+if TYPE_CHECKING:
+    from finssim.tasks.task import Task
 
 GREATEST_SEED = 2**31 - 1
 """Kernels take seeds as 32-bit integers."""
@@ -33,7 +36,7 @@ class Step:
     """Last observation of the episodes that ended in this step; older rows elsewhere."""
 
 
-def crew(vehicle: Vehicle | str | Sequence[Vehicle | str], task: Task, mode: str) -> list[Vehicle]:
+def crew(vehicle: Vehicle | str | Sequence[Vehicle | str], task: "Task", mode: str) -> list[Vehicle]:
     """The vehicles of a world: those that are given, or one of a kind for every place.
 
     Raises:

@@ -10,27 +10,48 @@ import warp as wp
 from numpy.typing import NDArray
 
 from finssim.engine import Pool
+from finssim.engine.state import State
 from finssim.tasks.arrays import TargetMotion, TaskArrays
 from finssim.tasks.fitting import Fit, fit
 from finssim.tasks.measurement import MeasurementNoise
-from finssim.tasks.moving_target_kernels import (
-    DISTANCE_SCALE,
-    TARGET_SCALE,
-    VELOCITY_CLIP,
-    TargetParameters,
-    evaluate_target,
-    observe_target,
-    spawn_target,
-)
 from finssim.tasks.task import ObservationPart, Task
+from finssim.tasks.terms import (
+    End,
+    RewardTerm,
+    Terms,
+    Total,
+    action_change,
+    action_effort,
+    angular_velocity,
+    goal_offset,
+    length,
+    linear_velocity,
+    tilted,
+    turn_rates,
+    uniform3,
+)
 from finssim.vehicles import Vehicle
 
+DISTANCE_SCALE = 3.0
+"""Distances are divided by this in the observation [m]."""
+TARGET_SCALE = 0.2
+"""The target's velocity is divided by this in the observation [m/s]."""
+VELOCITY_CLIP = 2.0
+"""Velocities of the vehicle are clipped here in the observation [m/s, rad/s]."""
+
+
+@wp.func
+def target_drift(arrays: TaskArrays, w: int) -> wp.vec3:
+    """Velocity of the target, in the measured body frame [m/s]."""
+    return wp.quat_rotate_inv(arrays.quaternion[w, 0], arrays.target.velocity[w])
+
+
 OBSERVATION = (
-    ObservationPart("target offset, body frame", 3, "m", scale=DISTANCE_SCALE),
-    ObservationPart("target velocity, body frame", 3, "m/s", scale=TARGET_SCALE),
-    ObservationPart("linear velocity, body frame", 3, "m/s", clip=VELOCITY_CLIP),
-    ObservationPart("angular velocity, body frame", 3, "rad/s", clip=VELOCITY_CLIP),
-    ObservationPart("distance to the target", 1, "m", scale=DISTANCE_SCALE, clip=1.0),
+    ObservationPart("target offset, body frame", 3, "m", scale=DISTANCE_SCALE, term="offset"),
+    ObservationPart("target velocity, body frame", 3, "m/s", scale=TARGET_SCALE, term=target_drift),
+    ObservationPart("linear velocity, body frame", 3, "m/s", clip=VELOCITY_CLIP, term=linear_velocity),
+    ObservationPart("angular velocity, body frame", 3, "rad/s", clip=VELOCITY_CLIP, term=turn_rates),
+    ObservationPart("distance to the target", 1, "m", scale=DISTANCE_SCALE, clip=1.0, term=length),
 )
 
 
@@ -60,6 +81,117 @@ class TargetReward:
     loss: float = 10.0
 
 
+@wp.func
+def new_course(arrays: TaskArrays, p: Any, w: int, t: float):
+    """Draw a velocity that the target is to have, and until when; from the world's own stream."""
+    rng = arrays.target.rng[w]
+    z = wp.randf(rng, -1.0, 1.0)
+    angle = wp.randf(rng, -3.14159265, 3.14159265)
+    pace = wp.randf(rng, 0.0, p.fit.pace * p.fastest)
+    level = wp.sqrt(1.0 - z * z)
+    arrays.target.wanted[w] = pace * wp.vec3(level * wp.cos(angle), level * wp.sin(angle), p.vertical * z)
+    arrays.target.until[w] = t + wp.randf(rng, p.retarget[0], p.retarget[1])
+    arrays.target.rng[w] = rng
+
+
+@wp.func
+def move_target(arrays: TaskArrays, p: Any, w: int):
+    """Take the target through the control step that ends now; outside its box it is on its way back."""
+    t = arrays.time[w]
+    if t >= arrays.target.until[w]:
+        new_course(arrays, p, w, t)
+    x = arrays.goal_position[w]
+    wanted = arrays.target.wanted[w]
+    for k in range(3):
+        if x[k] > p.fit.size * p.high[k]:
+            wanted[k] = -wp.abs(wanted[k])
+        if x[k] < p.fit.size * p.low[k]:
+            wanted[k] = wp.abs(wanted[k])
+    arrays.target.wanted[w] = wanted
+    v = arrays.target.velocity[w]
+    change = wanted - v
+    most = p.fit.pace * p.acceleration * p.control_step
+    v += change * wp.min(1.0, most / wp.max(wp.length(change), 1.0e-9))
+    arrays.target.velocity[w] = v
+    arrays.goal_position[w] = x + p.control_step * v
+
+
+@wp.func
+def target_error(state: State, arrays: TaskArrays, w: int) -> float:
+    """e: from the vehicle to the target [m]."""
+    return wp.length(arrays.goal_position[w] - state.position[w, 0])
+
+
+@wp.func
+def slip(state: State, arrays: TaskArrays, w: int) -> float:
+    """u: speed relative to the target [m/s]."""
+    nu = state.velocity[w, 0]
+    drift = wp.quat_rotate_inv(state.quaternion[w, 0], arrays.target.velocity[w])
+    return wp.length(wp.vec3(nu[0], nu[1], nu[2]) - drift)
+
+
+@wp.func
+def near(p: Any, e: float) -> float:
+    """near = exp(-e / near_scale)."""
+    return wp.exp(-e / (p.fit.size * p.reward.near_scale))
+
+
+@wp.func
+def match(p: Any, close: float, u: float) -> float:
+    """near · exp(-u / match_scale)."""
+    return close * wp.exp(-u / (p.fit.pace * p.reward.match_scale))
+
+
+@wp.func
+def spin(state: State, w: int) -> float:
+    """min(|ω|, 2) [rad/s]."""
+    return wp.min(wp.length(angular_velocity(state, w)), 2.0)
+
+
+@wp.func
+def out_of_pool(state: State, p: Any, w: int) -> bool:
+    """Beyond `bounds`, above `ceiling` or below `depth`, in proportion to the vehicle."""
+    x = state.position[w, 0] / p.fit.size
+    return wp.abs(x[0]) > p.bounds[0] or wp.abs(x[1]) > p.bounds[1] or x[2] > p.ceiling or x[2] < -p.depth
+
+
+@wp.func
+def with_target(state: State, p: Any, w: int, e: float, u: float) -> bool:
+    """Near enough, as fast as the target, and not turning."""
+    close = e <= p.fit.size * p.tolerance
+    matched = u <= p.fit.pace * p.slip_tolerance
+    return close and matched and wp.length(angular_velocity(state, w)) <= p.rate_tolerance
+
+
+@wp.func
+def squared_error(arrays: TaskArrays, p: Any, w: int, e: float, was: float) -> float:
+    """Mean of e² after `settle` [m²]."""
+    k = wp.floor((arrays.time[w] - p.settle) / p.control_step + 0.5)
+    return wp.where(k >= 1.0, was + (e * e - was) / wp.max(k, 1.0), was)
+
+
+@wp.func
+def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
+    """A target that stands still, and a vehicle somewhere else in the pool."""
+    size = p.fit.size
+    arrays.goal_position[w] = uniform3(wp.rand_init(key, 4 * w), size * p.low, size * p.high)
+    arrays.goal_quaternion[w] = wp.quat_identity()
+    arrays.target.velocity[w] = wp.vec3(0.0)
+    arrays.target.rng[w] = wp.rand_init(key, 4 * w + 1)
+    new_course(arrays, p, w, 0.0)
+    state.position[w, 0] = uniform3(wp.rand_init(key, 4 * w + 2), size * p.spawn_low, size * p.spawn_high)
+    rng = wp.rand_init(key, 4 * w + 3)
+    roll = wp.randf(rng, -p.tilt, p.tilt)
+    pitch = wp.randf(rng, -p.tilt, p.tilt)
+    state.quaternion[w, 0] = tilted(roll, pitch, wp.randf(rng, -3.14159265, 3.14159265))
+    most = p.fit.pace * p.speed
+    nu = state.velocity[w, 0]
+    for k in range(3):
+        nu[k] = wp.randf(rng, -most, most)
+        nu[k + 3] = 0.0
+    state.velocity[w, 0] = nu
+
+
 @dataclass(frozen=True, kw_only=True)
 class MovingTarget(Task):
     """T3. Lengths in metres, world frame with z up and 0 on the water, as for FinsROV.
@@ -68,10 +200,10 @@ class MovingTarget(Task):
     and tolerances are the published ones; across the pool its box is what the walls leave (published: 2.5 m).
     """
 
+    succeeds: ClassVar[str] = "once"
     moving: ClassVar[bool] = True
     title: ClassVar[str] = "stay with a target that changes its course"
     name: str = "t3"
-    totals: ClassVar[tuple[str, ...]] = ("success", "success_time", "squared_error")
     observation: tuple[ObservationPart, ...] = OBSERVATION
     time_limit: float = 30.0
     fit: Fit = Fit()
@@ -115,10 +247,6 @@ class MovingTarget(Task):
         position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02
     )
 
-    evaluate = staticmethod(evaluate_target)
-    spawn = staticmethod(spawn_target)
-    observe = staticmethod(observe_target)
-
     def fitted(self, vehicles: Sequence[Vehicle]) -> "MovingTarget":
         """As large and fast as suits the vehicle."""
         return replace(self, fit=fit(vehicles[0]))
@@ -154,24 +282,25 @@ class MovingTarget(Task):
         measured = super().metrics(arrays)
         squared = measured.pop("squared_error")
         long = measured["length"] * self.control_step > self.settle + 0.5 * self.control_step
-        measured["success_time"][measured["success"] == 0.0] = np.nan
         return {**measured, "error": np.where(long, np.sqrt(squared), np.nan)}
 
-    def parameters(self) -> Any:
-        """The struct that the kernels take."""
-        p, r = TargetParameters(), self.reward
-        size, pace = self.fit.size, self.fit.pace
-        for name in ("low", "high", "spawn_low", "spawn_high"):
-            setattr(p, name, size * wp.vec3(*getattr(self, name)))
-        p.bounds = size * wp.vec3(*self.bounds, 0.0)
-        for name in ("ceiling", "depth", "tolerance"):
-            setattr(p, name, size * getattr(self, name))
-        for name in ("fastest", "acceleration", "speed", "slip_tolerance"):
-            setattr(p, name, pace * getattr(self, name))
-        for name in ("vertical", "tilt", "rate_tolerance", "hold", "settle", "time_limit", "control_step"):
-            setattr(p, name, getattr(self, name))
-        p.soonest, p.latest = self.retarget
-        p.near_weight, p.near_scale, p.distance_weight = r.near, size * r.near_scale, r.distance / size
-        p.match_weight, p.match_scale = r.match, pace * r.match_scale
-        p.spin_weight, p.action_weight, p.change_weight, p.loss = r.spin, r.action, r.change, r.loss
-        return p
+    def terms(self) -> Terms:
+        """See `TargetReward`."""
+        r = self.reward
+        return Terms(
+            start=start,
+            advance=move_target,
+            shared={"e": target_error, "u": slip, "close": near},
+            seen={"offset": goal_offset},
+            rewards=(
+                RewardTerm("near", "close", r.near),
+                RewardTerm("match", match, r.match),
+                RewardTerm("distance", "e", -r.distance / self.fit.size),
+                RewardTerm("spin", spin, -r.spin),
+                RewardTerm("action", action_effort, -r.action),
+                RewardTerm("change", action_change, -r.change),
+            ),
+            ends=(End("left", out_of_pool, -r.loss),),
+            inside=with_target,
+            totals=(Total("squared_error", squared_error),),
+        )

@@ -141,7 +141,8 @@ class Observer:
         """Arrays of one world, and what observes it."""
         device, vehicles = wp.get_device("cpu"), len(task.vehicles)
         self._arrays = arrays = task_arrays(
-            1, len(task.agents), len(task.others), task.observation_size, self._action_size, device, len(task.totals)
+            1, len(task.agents), len(task.others), task.observation_size, self._action_size, device, len(task.totals),
+            len(task.earnings),
         )  # fmt: skip
         task.allocate(arrays, 1, device)
         for name, dtype in (("position", wp.vec3), ("quaternion", wp.quat), ("velocity", vec6)):
@@ -155,7 +156,7 @@ class Observer:
         self._steps = state.steps.numpy()
         everywhere = wp.ones(1, dtype=wp.int32, device=device)
         self._pipeline = Pipeline(1, device)
-        task.add_observe(self._pipeline, Batch(state, arrays, task.parameters(), 0), everywhere)
+        task.add_observe(self._pipeline, Batch(state, arrays, 0), everywhere)
 
     def _aim(self, guide: Guide) -> None:
         """What of a guide is looked at ahead of time."""

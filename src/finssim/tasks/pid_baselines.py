@@ -19,11 +19,11 @@ from finssim.geometry.rotations import (
     quat_rotate,
 )
 from finssim.tasks.fitting import coefficients_of
-from finssim.tasks.moving_target_kernels import DISTANCE_SCALE as TARGET_DISTANCE_SCALE
-from finssim.tasks.moving_target_kernels import TARGET_SCALE
+from finssim.tasks.moving_target import DISTANCE_SCALE as TARGET_DISTANCE_SCALE
+from finssim.tasks.moving_target import TARGET_SCALE
 from finssim.tasks.station_keeping import DISTANCE_SCALE
-from finssim.tasks.tracking_kernels import DISTANCE_SCALE as TRACKING_SCALE
-from finssim.tasks.tracking_kernels import LOOK_AHEAD
+from finssim.tasks.trajectory_tracking import DISTANCE_SCALE as TRACKING_SCALE
+from finssim.tasks.trajectory_tracking import LOOK_AHEAD
 from finssim.vehicles import Vehicle
 
 __all__ = ["Seen", "StationPid", "TargetPid", "TrackingPid", "WrenchPid"]

@@ -1,27 +1,32 @@
 """1-v-1 pursuit: come up to a prey that flees with a vehicle like one's own, and stay with it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
+import warp as wp
 
-from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.given import EnvironmentSetupError
+from finssim.engine.state import State
 from finssim.tasks.pursuit_drive import DriveNumbers
-from finssim.tasks.pursuit_kernels import (
-    Arena,
-    PursuitParameters,
-    evaluate_pursuit,
-    observe_pursuit,
-    script_pursuit,
-    spawn_pursuit,
-)
-from finssim.tasks.pursuit_observation import CHASE
-from finssim.tasks.pursuit_prey import Prey, prey_speed
+from finssim.tasks.pursuit_observation import CHASE, prey_gap
+from finssim.tasks.pursuit_prey import Prey, command_prey, prey_speed
 from finssim.tasks.task import ObservationPart, Task
+from finssim.tasks.terms import (
+    End,
+    RewardTerm,
+    Terms,
+    Total,
+    action_change,
+    action_effort,
+    level_direction,
+    one,
+    place_at_rest,
+    world_velocity,
+)
 from finssim.vehicles import Vehicle
+
+DISTANCE_SLOPE = 8.0
+"""The distance costs its full weight here and beyond [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,13 +79,108 @@ class OpenWater(Task):
     depth: float = 8.0
     """And sinking below this depth."""
 
-    def arena_struct(self, nearest: float = 0.0, farthest: float = 0.0) -> Arena:
-        """The struct that kernels take, for a prey that starts `nearest` to `farthest` metres from the agents."""
-        a = Arena()
-        a.spawn, a.nearest, a.farthest = self.spawn_radius, nearest, farthest
-        for name in ("low", "high", "bounds", "ceiling", "depth", "time_limit", "control_step"):
-            setattr(a, name, getattr(self, name))
-        return a
+
+@wp.func
+def outside(state: State, p: Any, w: int, v: int) -> bool:
+    """Whether a vehicle is out of bounds."""
+    x = state.position[w, v]
+    return x[0] * x[0] + x[1] * x[1] > p.bounds * p.bounds or x[2] > p.ceiling or x[2] < -p.depth
+
+
+@wp.func
+def prey_start(p: Any, rng: wp.uint32, x: wp.vec3) -> wp.vec3:
+    """A place for the prey: at a distance from x that is drawn, in any direction, at about the same height."""
+    angle = wp.randf(rng, -3.14159265, 3.14159265)
+    away = wp.randf(rng, p.nearest, p.farthest)
+    height = wp.clamp(x[2] + wp.randf(rng, -0.5, 0.5), p.low, p.high)
+    level = x + away * level_direction(angle)
+    return wp.vec3(level[0], level[1], height)
+
+
+@wp.func
+def gap(state: State, w: int) -> wp.vec3:
+    """From the pursuer to the prey, world frame [m]."""
+    return state.position[w, 1] - state.position[w, 0]
+
+
+@wp.func
+def distance(way: wp.vec3) -> float:
+    """d, from the pursuer to the prey [m]."""
+    return wp.max(wp.length(way), 1.0e-6)
+
+
+@wp.func
+def relative_motion(state: State, w: int) -> wp.vec3:
+    """The prey's velocity less the pursuer's, world frame [m/s]."""
+    return world_velocity(state, w, 1) - world_velocity(state, w, 0)
+
+
+@wp.func
+def gained(p: Any, way: wp.vec3, d: float, motion: wp.vec3) -> float:
+    """Closing speed times the control step [m]."""
+    return -wp.dot(way, motion) / d * p.control_step
+
+
+@wp.func
+def far(d: float) -> float:
+    """min(d / 8 m, 1)."""
+    return wp.min(d / DISTANCE_SLOPE, 1.0)
+
+
+@wp.func
+def facing(state: State, w: int, way: wp.vec3, d: float) -> float:
+    """Cosine of the angle from the bow to the prey."""
+    ahead = wp.quat_rotate(state.quaternion[w, 0], wp.vec3(1.0, 0.0, 0.0))
+    return wp.dot(ahead, way) / d
+
+
+@wp.func
+def close_by(p: Any, d: float) -> float:
+    """1 within `near_radius`."""
+    return wp.where(d < p.reward.near_radius, 1.0, 0.0)
+
+
+@wp.func
+def yawing(state: State, w: int) -> float:
+    """r², the yaw rate squared [rad²/s²]."""
+    r = state.velocity[w, 0][5]
+    return r * r
+
+
+@wp.func
+def with_prey(p: Any, d: float, motion: wp.vec3) -> bool:
+    """Within `radius`, at no more than `relative_speed`."""
+    return d <= p.radius and wp.length(motion) <= p.relative_speed
+
+
+@wp.func
+def is_captured(p: Any, held: float) -> bool:
+    """With the prey for `hold` seconds."""
+    return held > 0.0 and held >= p.hold - 0.1 * p.control_step
+
+
+@wp.func
+def is_outside(state: State, p: Any, w: int) -> bool:
+    """The pursuer is out of bounds."""
+    return outside(state, p, w, 0)
+
+
+@wp.func
+def closest(d: float, was: float) -> float:
+    """Smallest distance so far [m]."""
+    return wp.min(was, d)
+
+
+@wp.func
+def start(state: State, p: Any, key: int, w: int):
+    """Pursuer near the origin, prey some way off, both at rest."""
+    pi = 3.14159265
+    rng = wp.rand_init(key, 4 * w)
+    away = p.spawn_radius * wp.sqrt(wp.randf(rng)) * level_direction(wp.randf(rng, -pi, pi))
+    x = wp.vec3(away[0], away[1], wp.randf(rng, p.low, p.high))
+    place_at_rest(state, w, 0, x, wp.randf(rng, -pi, pi))
+    heading = wp.randf(rng, -pi, pi)
+    place_at_rest(state, w, 1, prey_start(p, wp.rand_init(wp.randi(rng)), x), heading)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,8 +189,7 @@ class Pursuit(OpenWater):
 
     agents: ClassVar[tuple[str, ...]] = ("pursuer",)
     others: ClassVar[tuple[str, ...]] = ("prey",)
-    totals: ClassVar[tuple[str, ...]] = ("captured", "left", "closest")
-
+    succeeds: ClassVar[str] = "captured"
     moving: ClassVar[bool] = True
     title: ClassVar[str] = "catch a prey, one against one"
     name: str = "pursuit"
@@ -115,11 +214,6 @@ class Pursuit(OpenWater):
     prey_drive: DriveNumbers | None = field(default=None, repr=False)
     """What the prey's thrusters do: follows from its vehicle."""
 
-    evaluate = staticmethod(evaluate_pursuit)
-    spawn = staticmethod(spawn_pursuit)
-    observe = staticmethod(observe_pursuit)
-    script = staticmethod(script_pursuit)
-
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Pursuit":
         """The prey's speed and thrust from the vehicles: pursuer, prey."""
         speed = prey_speed(self.prey_speed, vehicles[:1], vehicles[1])
@@ -129,34 +223,25 @@ class Pursuit(OpenWater):
         """See `Task`."""
         return f"within {self.radius:g} m at no more than {self.relative_speed:g} m/s for {self.hold:g} s"
 
-    def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """As every task's; success: captured; capture_time [s], nan where it was not."""
-        measured = super().metrics(arrays)
-        return {**measured, **capture_metrics(measured, self.control_step)}
-
-    def parameters(self) -> Any:
-        """The struct that the kernels take."""
-        if self.prey_drive is None:
-            raise EnvironmentSetupError(
-                f"task '{self.name}' is not fitted to vehicles: call fitted([...]) first"
-            )
-        p, r = PursuitParameters(), self.reward
-        p.prey = self.prey.struct(self.prey_drive, self.speed, self.control_step)
-        p.arena = self.arena_struct(self.nearest, self.farthest)
-        p.radius, p.relative_speed, p.hold = self.radius, self.relative_speed, self.hold
-        p.near, p.close = r.near_radius, r.near
-        for one in fields(r):
-            if one.name not in ("near", "near_radius"):
-                setattr(p, one.name, getattr(r, one.name))
-        return p
-
-
-def capture_metrics(
-    measured: dict[str, NDArray[np.float64]], control_step: float
-) -> dict[str, NDArray[np.float64]]:
-    """Success and capture time [s] from what was counted; the time is nan where nothing was captured."""
-    captured = measured["captured"] > 0.0
-    return {
-        "success": np.where(captured, 1.0, 0.0),
-        "capture_time": np.where(captured, control_step * measured["length"], np.nan),
-    }
+    def terms(self) -> Terms:
+        """See `PursuitReward`."""
+        r = self.reward
+        return Terms(
+            start=start,
+            command=command_prey,
+            shared={"way": gap, "d": distance, "motion": relative_motion},
+            seen={"gap": prey_gap},
+            rewards=(
+                RewardTerm("progress", gained, r.progress),
+                RewardTerm("distance", far, -r.distance),
+                RewardTerm("heading", facing, r.heading),
+                RewardTerm("near", close_by, r.near),
+                RewardTerm("spin", yawing, -r.spin),
+                RewardTerm("action", action_effort, -r.action),
+                RewardTerm("change", action_change, -r.change),
+                RewardTerm("step", one, -r.step),
+            ),
+            ends=(End("captured", is_captured, r.capture), End("left", is_outside, -r.loss)),
+            inside=with_prey,
+            totals=(Total("closest", closest, first="d"),),
+        )

@@ -31,26 +31,14 @@ ROWS = [0, 1, 2, 5]
 """... and their places in a wrench."""
 
 
-@wp.struct
-class Drive:
-    """What following a velocity takes: on surge, sway, heave and yaw."""
-
-    d1: wp.vec4  # linear damping [N s/m, N m s]
-    d2: wp.vec4  # quadratic damping
-    mass: wp.vec4  # with added mass [kg, kg m²]
-    limit: wp.vec4  # wrench of an action of 1 [N, N m]
-    terminal: wp.vec4  # steady speed at the limit [m/s, rad/s]
-    sink: float  # weight less buoyancy [N]
-
-
 @wp.func
-def drive(d: Drive, q: wp.quat, nu: vec6, wanted: wp.vec4) -> wp.vec4:
+def drive(d: Any, q: wp.quat, nu: vec6, wanted: wp.vec4) -> wp.vec4:
     """Action that brings the velocity to a wanted one.
 
     tau = d1 v* + d2 |v*| v* + RATE m (v* - v) + (weight - buoyancy) up,  action = shared(tau / limit)
 
     Args:
-        d: The vehicle's numbers.
+        d: The vehicle's `DriveNumbers`.
         q: Body to world.
         nu: Velocity, body frame [m/s, rad/s].
         wanted: v*: surge, sway, heave and yaw rate, body frame [m/s, rad/s].
@@ -104,17 +92,17 @@ def write_scripted(arrays: TaskArrays, w: int, action: wp.vec4):
 
 @dataclass(frozen=True)
 class DriveNumbers:
-    """`Drive` of a vehicle as plain numbers; rows are surge, sway, heave, yaw."""
+    """What following a velocity takes; rows are surge, sway, heave, yaw."""
 
-    d1: tuple[float, ...]
+    d1: tuple[float, float, float, float]
     """Linear damping [N s/m, N m s]."""
-    d2: tuple[float, ...]
+    d2: tuple[float, float, float, float]
     """Quadratic damping."""
-    mass: tuple[float, ...]
+    mass: tuple[float, float, float, float]
     """With added mass [kg, kg m²]."""
-    limit: tuple[float, ...]
+    limit: tuple[float, float, float, float]
     """Wrench of an action of 1 [N, N m]."""
-    terminal: tuple[float, ...]
+    terminal: tuple[float, float, float, float]
     """Steady speed at the limit [m/s, rad/s]."""
     sink: float
     """Weight less buoyancy [N]."""
@@ -174,14 +162,6 @@ class DriveNumbers:
     def turned(self, error: Array) -> Array:
         """Yaw rate that takes a heading error away [rad/s], from the error [rad]."""
         return np.clip(TURN * error, -MOST_TURN, MOST_TURN)
-
-    def struct(self) -> Drive:
-        """The struct that kernels take."""
-        out = Drive()
-        for name in ("d1", "d2", "mass", "limit", "terminal"):
-            setattr(out, name, wp.vec4(*getattr(self, name)))
-        out.sink = self.sink
-        return out
 
 
 def level_speed(vehicle: Vehicle, name: str) -> float:

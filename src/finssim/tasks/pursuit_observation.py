@@ -1,10 +1,13 @@
-"""What a pursuer sees of itself and of its prey: 14 numbers, all in its body frame."""
+"""What a pursuer sees of itself, of its prey and of its team-mates, all in its body frame."""
+
+from typing import Any
 
 import warp as wp
 
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.communication import mate_position, mate_velocity, measured_velocity
+from finssim.tasks.communication import mate_position, mate_velocity
 from finssim.tasks.task import ObservationPart
+from finssim.tasks.terms import linear_velocity, measured_velocity, turn_rates
 
 DISTANCE_SCALE = 6.0
 """Distances are divided by this [m]."""
@@ -14,57 +17,68 @@ VELOCITY_CLIP = 4.0
 """Velocities are clipped here [m/s, rad/s]."""
 PI = 3.14159265
 
+
+@wp.func
+def prey_gap(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """From agent a to the vehicle after the agents, body frame [m]."""
+    prey = arrays.agent_reward.shape[1]
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], arrays.position[w, prey] - arrays.position[w, a])
+
+
+@wp.func
+def prey_motion(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """Its velocity less the agent's own, body frame [m/s]."""
+    relative = measured_velocity(arrays, w, arrays.agent_reward.shape[1]) - measured_velocity(arrays, w, a)
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], relative)
+
+
+@wp.func
+def prey_distance(gap: wp.vec3) -> float:
+    """From the agent to the vehicle after the agents [m]."""
+    return wp.length(gap)
+
+
+@wp.func
+def prey_bearing(gap: wp.vec3) -> float:
+    """Positive to the left [rad]."""
+    return wp.atan2(gap[1], gap[0])
+
+
+@wp.func
+def gap_to(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
+    """From agent a to agent b, as far as a has heard, body frame of a [m]."""
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], mate_position(arrays, w, a, b) - arrays.position[w, a])
+
+
+@wp.func
+def motion_of(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
+    """Velocity of agent b less that of agent a, as far as a has heard, body frame of a [m/s]."""
+    relative = mate_velocity(arrays, w, a, b) - measured_velocity(arrays, w, a)
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], relative)
+
+
+OWN = (
+    ObservationPart("linear velocity, body frame", 3, "m/s", clip=VELOCITY_CLIP, term=linear_velocity),
+    ObservationPart("angular velocity, body frame", 3, "rad/s", clip=VELOCITY_CLIP, term=turn_rates),
+)
+"""6 numbers of oneself."""
+
 CHASE = (
-    ObservationPart("linear velocity, body frame", 3, "m/s", clip=VELOCITY_CLIP),
-    ObservationPart("angular velocity, body frame", 3, "rad/s", clip=VELOCITY_CLIP),
-    ObservationPart("prey from here, body frame", 3, "m", scale=DISTANCE_SCALE, clip=REACH),
-    ObservationPart("prey's velocity less one's own, body frame", 3, "m/s", clip=VELOCITY_CLIP),
-    ObservationPart("distance to the prey", 1, "m", scale=DISTANCE_SCALE, clip=REACH),
-    ObservationPart("bearing of the prey, positive to the left", 1, "rad", scale=PI, clip=1.0),
+    *OWN,
+    ObservationPart("prey from here, body frame", 3, "m", DISTANCE_SCALE, REACH, term="gap"),
+    ObservationPart(
+        "prey's velocity less one's own, body frame", 3, "m/s", clip=VELOCITY_CLIP, term=prey_motion
+    ),
+    ObservationPart("distance to the prey", 1, "m", DISTANCE_SCALE, REACH, term=prey_distance),
+    ObservationPart("bearing of the prey, positive to the left", 1, "rad", PI, 1.0, term=prey_bearing),
 )
-"""14 numbers of one pursuer."""
-
-MATE = (
-    ObservationPart("team-mate's role: herder, netter", 2, "1"),
-    ObservationPart("team-mate from here, body frame", 3, "m", scale=DISTANCE_SCALE, clip=REACH),
-    ObservationPart("team-mate's velocity less one's own, body frame", 3, "m/s", clip=VELOCITY_CLIP),
-)
-"""8 numbers of each team-mate."""
+"""14 numbers of one pursuer, for a task that shares `prey_gap` as `gap`."""
 
 
-@wp.func
-def write_scaled(arrays: TaskArrays, w: int, at: int, x: wp.vec3, scale: float, clip: float):
-    """Three numbers of the observation from number `at` on."""
-    for i in range(3):
-        arrays.observation[w, at + i] = wp.clamp(x[i] / scale, -clip, clip)
-
-
-@wp.func
-def write_own_velocity(arrays: TaskArrays, w: int, a: int, at: int):
-    """Six numbers: the measured velocity of agent a, body frame."""
-    nu = arrays.velocity[w, a]
-    for i in range(6):
-        arrays.observation[w, at + i] = wp.clamp(nu[i], -VELOCITY_CLIP, VELOCITY_CLIP)
-
-
-@wp.func
-def write_chase(arrays: TaskArrays, w: int, a: int, prey: int, at: int):
-    """The 14 numbers of `CHASE` for agent a, from number `at` of the row on."""
-    q = arrays.quaternion[w, a]
-    gap = wp.quat_rotate_inv(q, arrays.position[w, prey] - arrays.position[w, a])
-    relative = wp.quat_rotate_inv(q, measured_velocity(arrays, w, prey) - measured_velocity(arrays, w, a))
-    write_own_velocity(arrays, w, a, at)
-    write_scaled(arrays, w, at + 6, gap, DISTANCE_SCALE, REACH)
-    write_scaled(arrays, w, at + 9, relative, 1.0, VELOCITY_CLIP)
-    arrays.observation[w, at + 12] = wp.min(wp.length(gap) / DISTANCE_SCALE, REACH)
-    arrays.observation[w, at + 13] = wp.atan2(gap[1], gap[0]) / PI
-
-
-@wp.func
-def write_mate(arrays: TaskArrays, w: int, a: int, b: int, at: int):
-    """Six numbers: where agent b is from agent a, and how it moves, as far as agent a has heard; body frame of a."""
-    q = arrays.quaternion[w, a]
-    gap = wp.quat_rotate_inv(q, mate_position(arrays, w, a, b) - arrays.position[w, a])
-    relative = wp.quat_rotate_inv(q, mate_velocity(arrays, w, a, b) - measured_velocity(arrays, w, a))
-    write_scaled(arrays, w, at, gap, DISTANCE_SCALE, REACH)
-    write_scaled(arrays, w, at + 3, relative, 1.0, VELOCITY_CLIP)
+def mate(k: int, gap: Any, motion: Any) -> tuple[ObservationPart, ...]:
+    """6 numbers of the k-th team-mate, by the terms that tell where it is and how it moves."""
+    moves = "team-mate's velocity less one's own, body frame"
+    return (
+        ObservationPart("team-mate from here, body frame", 3, "m", DISTANCE_SCALE, REACH, gap, k),
+        ObservationPart(moves, 3, "m/s", clip=VELOCITY_CLIP, term=motion, index=k),
+    )

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def save_state(environment: "Environment") -> dict[str, NDArray[Any]]:
-    """Copies of the vehicles' states, delay lines, parameters, water, the task's arrays and all counters.
+    """Copies of the vehicles' states, delay lines, water, the task's arrays and all counters.
 
     Returns:
         Arrays by name, such as `state.position` or `plant.mass`; the counters under `counters.`.
@@ -85,7 +85,6 @@ def _arrays(environment: "Environment") -> Iterator[tuple[str, wp.array]]:
         ("state", simulator.state),
         ("water", simulator.water),
         ("task", environment.arrays),
-        ("parameters", environment.parameters),
     ):
         yield from _members(name, struct)
 

@@ -1,7 +1,7 @@
-"""What a task is: an observation schema, times, and the kernels that score, start and observe an episode."""
+"""What a task is: what is seen, done and paid for, as terms, and how long an episode takes."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -13,7 +13,9 @@ from finssim.engine import Dock, Pool
 from finssim.engine.launch import Pipeline
 from finssim.engine.state import State
 from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.kernels import kernels_of, settings_of
 from finssim.tasks.measurement import MeasurementNoise
+from finssim.tasks.terms import Terms
 from finssim.vehicles import Vehicle
 
 
@@ -26,6 +28,10 @@ class ObservationPart:
     unit: str
     scale: float = 1.0
     clip: float | None = None
+    term: Any = field(default=None, repr=False)
+    """What gives the value, from what is measured: a float, or a vector of `size`. None in a task in plain torch."""
+    index: int = 0
+    """The term's argument `k`: of which team-mate, how far ahead, ..."""
 
 
 class Batch(NamedTuple):
@@ -33,20 +39,12 @@ class Batch(NamedTuple):
 
     state: State
     arrays: TaskArrays
-    parameters: Any
-    """What `Task.parameters` gave."""
     seed: int
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """Base of every task: plain data; its kernels are class attributes.
-
-    `evaluate(state, arrays, parameters, world_offset)` after each step, `spawn(state, arrays, parameters, seed, mask,
-    world_offset)` where an episode starts, `observe(arrays, mask, world_offset)` for its first observation. A task with
-    `others` has `script(state, arrays, parameters, seed, world_offset)` too: it runs before each step and writes
-    `arrays.scripted`. The `add_` methods put them where they belong; a task that is not of kernels has its own.
-    """
+    """Base of every task: plain data, and the terms that make kernels of it; see `finssim.tasks.terms`."""
 
     agents: ClassVar[tuple[str, ...]] = ("vehicle",)
     """Names of the vehicles that learn, in the order of the world's vehicles."""
@@ -62,8 +60,9 @@ class Task:
     """How many there are, of a task whose setting `level` says how hard it is; 0: it has none."""
     moving: ClassVar[bool] = False
     """Whether what it goes to moves: a robot is then given a trajectory, otherwise a pose."""
-    totals: ClassVar[tuple[str, ...]] = ()
-    """Names of what the kernels count in `arrays.totals`; zero at the start of an episode, and a part of `metrics`."""
+    succeeds: ClassVar[str] = ""
+    """When an episode is a success: `held`, for `hold` seconds at its end; `once`, for `hold` seconds at any time; or
+    the name of an end. Empty: nothing is."""
 
     name: str
     observation: tuple[ObservationPart, ...] = field(repr=False)
@@ -75,10 +74,23 @@ class Task:
     """Length of an episode in training [s]."""
     training_noise: MeasurementNoise = field(default_factory=MeasurementNoise)
     """On what the controller sees in training."""
-    evaluate: ClassVar[Any]
-    spawn: ClassVar[Any]
-    observe: ClassVar[Any]
-    script: ClassVar[Any] = None
+
+    def terms(self) -> Terms:
+        """Of what the task is made."""
+        raise TypeError(f"task '{self.name}' does not say of what it is made: define terms()")
+
+    @property
+    def totals(self) -> tuple[str, ...]:
+        """Names of what is counted in an episode, a part of `metrics`: success, the terms' totals, the ends."""
+        terms = self.terms()
+        first = ("success", "success_time") if self.succeeds == "once" else ()
+        return (*first, *(total.name for total in terms.totals), *(end.name for end in terms.ends))
+
+    @property
+    def earnings(self) -> tuple[str, ...]:
+        """Names of what adds to the return: the rewards, then the ends."""
+        terms = self.terms()
+        return (*(reward.name for reward in terms.rewards), *(end.name for end in terms.ends))
 
     @property
     def observation_size(self) -> int:
@@ -100,9 +112,10 @@ class Task:
 
     def record(self) -> dict[str, Any]:
         """The settings as plain data: ranges, limits, reward weights."""
-        settings = asdict(self)
-        del settings["observation"]
-        return settings
+        kept = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "observation"}
+        return {
+            name: asdict(v) if is_dataclass(v) and not isinstance(v, type) else v for name, v in kept.items()
+        }
 
     @property
     def vehicles(self) -> tuple[str, ...]:
@@ -129,32 +142,32 @@ class Task:
         hold = getattr(self, "hold", None)
         return "as metrics tells" if hold is None else f"within its tolerance for {hold:g} s, at the end"
 
-    def parameters(self) -> Any:
-        """The struct that the kernels take."""
-        raise TypeError(f"task '{self.name}' does not say what its kernels take: define parameters()")
-
-    def add_script(self, pipeline: Pipeline, batch: Batch) -> None:
+    def add_command(self, pipeline: Pipeline, batch: Batch) -> None:
         """Append what commands the `others`, before each step."""
-        pipeline.add(self.script, [batch.state, batch.arrays, batch.parameters, batch.seed])
+        pipeline.add(kernels_of(self).command, [batch.state, batch.arrays, settings_of(self), batch.seed])
 
     def add_evaluate(self, pipeline: Pipeline, batch: Batch) -> None:
         """Append what comes after each step: reward, ends, observation."""
-        pipeline.add(self.evaluate, [batch.state, batch.arrays, batch.parameters])
+        made, terms = kernels_of(self), self.terms()
+        weights = [reward.weight for reward in terms.rewards] + [end.reward for end in terms.ends]
+        inputs = [batch.state, batch.arrays, settings_of(self), made.weights(*(weights or [0.0]))]
+        pipeline.add(made.evaluate, inputs)
 
     def add_spawn(self, pipeline: Pipeline, batch: Batch, mask: wp.array) -> None:
         """Append the start of an episode where mask (by world, int32) is not 0."""
-        pipeline.add(self.spawn, [batch.state, batch.arrays, batch.parameters, batch.seed, mask])
+        pipeline.add(kernels_of(self).spawn, [batch.state, batch.arrays, settings_of(self), batch.seed, mask])
 
     def add_observe(self, pipeline: Pipeline, batch: Batch, mask: wp.array) -> None:
         """Append the first observation of the episodes that start where mask is not 0."""
-        pipeline.add(self.observe, [batch.arrays, mask])
+        pipeline.add(kernels_of(self).observe, [batch.arrays, settings_of(self), mask])
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
         """How the episode that ended last went, by world.
 
         Returns:
             Name to numbers (worlds,): return, length in control steps, time held inside the tolerance at the end [s],
-            the task's `totals`, and what the task makes of them, such as success (0 or 1).
+            the task's `totals`, and, of a task with success, success (0 or 1) and, unless it is to hold to the end,
+            success_time [s], nan where there was none.
         """
         totals = arrays.final_totals.numpy()
         columns = {
@@ -163,4 +176,20 @@ class Task:
             "held": arrays.final_held.numpy(),
             **{name: totals[:, i] for i, name in enumerate(self.totals)},
         }
-        return {name: np.array(values, dtype=np.float64) for name, values in columns.items()}
+        out = {name: np.array(values, dtype=np.float64) for name, values in columns.items()}
+        if self.succeeds == "held":
+            hold: float = getattr(self, "hold", 0.0)
+            out["success"] = np.where(
+                out["held"] >= max(hold, self.control_step) - 0.5 * self.control_step, 1.0, 0.0
+            )
+        elif self.succeeds and self.succeeds != "once":
+            out["success"] = np.where(out[self.succeeds] > 0.0, 1.0, 0.0)
+            out["success_time"] = self.control_step * out["length"]
+        if "success_time" in out:
+            out["success_time"][out["success"] == 0.0] = np.nan
+        return out
+
+    def earned(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
+        """What each reward and each end added to the return of the episode that ended last, (worlds,) by name."""
+        columns = arrays.final_earned.numpy()
+        return {name: np.array(columns[:, i], dtype=np.float64) for i, name in enumerate(self.earnings)}

@@ -4,26 +4,38 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
-import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
+from finssim.engine.state import State
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.communication import Communication, message_table
+from finssim.tasks.communication import (
+    Communication,
+    exchange_messages,
+    key_messages,
+    message_table,
+    open_messages,
+)
 from finssim.tasks.given import EnvironmentSetupError
-from finssim.tasks.pursuit import OpenWater, capture_metrics
+from finssim.tasks.pursuit import OpenWater, outside, prey_start
 from finssim.tasks.pursuit_drive import DriveNumbers
-from finssim.tasks.pursuit_observation import CHASE, MATE
-from finssim.tasks.pursuit_prey import Prey, prey_speed
+from finssim.tasks.pursuit_observation import CHASE, gap_to, mate, motion_of, prey_gap
+from finssim.tasks.pursuit_prey import Prey, command_prey, nearest_pursuer, prey_speed
 from finssim.tasks.task import ObservationPart
-from finssim.tasks.team_pursuit_kernels import (
-    TeamParameters,
-    evaluate_team,
-    observe_team,
-    script_team,
-    spawn_team,
+from finssim.tasks.terms import (
+    End,
+    RewardTerm,
+    Terms,
+    Total,
+    action_change,
+    action_effort,
+    level_direction,
+    one,
+    place_at_rest,
 )
 from finssim.vehicles import Vehicle
+
+AGENTS = 3
+PREY = 3
 
 CAPTURE_MODES = ("net", "touch", "proximity", "either")
 """Published modes 0 to 3.
@@ -51,6 +63,11 @@ class Level:
     """Reward for a capture, and what an agent out of bounds costs everybody."""
     from_step: int
     """Agent-steps of training after which it was taken up."""
+
+    @property
+    def mode(self) -> int:
+        """Number of the capture mode."""
+        return CAPTURE_MODES.index(self.capture)
 
 
 LEVELS = (
@@ -88,6 +105,45 @@ LEVELS = (
 """The published curriculum in three levels, all of which the formation baseline masters, and the task: one more."""
 
 
+@wp.func
+def other(a: int, k: int) -> int:
+    """Number of the k-th team-mate of agent a, the lowest number first."""
+    return wp.where(k == 1, wp.where(a == 0, 1, 0), wp.where(a == 2, 1, 2))
+
+
+@wp.func
+def mate_role(a: int, k: int) -> wp.vec2:
+    """(1, 0): the k-th team-mate is the herder; (0, 1): it is a netter."""
+    herds = other(a, k) == 0
+    return wp.vec2(wp.where(herds, 1.0, 0.0), wp.where(herds, 0.0, 1.0))
+
+
+@wp.func
+def mate_gap(arrays: TaskArrays, w: int, a: int, k: int) -> wp.vec3:
+    """From the agent to its k-th team-mate, body frame [m]."""
+    return gap_to(arrays, w, a, other(a, k))
+
+
+@wp.func
+def mate_motion(arrays: TaskArrays, w: int, a: int, k: int) -> wp.vec3:
+    """Velocity of the k-th team-mate less one's own, body frame [m/s]."""
+    return motion_of(arrays, w, a, other(a, k))
+
+
+OBSERVATION = (
+    *CHASE,
+    *(
+        part
+        for k in (1, 2)
+        for part in (
+            ObservationPart("team-mate's role: herder, netter", 2, "1", term=mate_role, index=k),
+            *mate(k, mate_gap, mate_motion),
+        )
+    ),
+)
+"""30 numbers of each agent."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class TeamReward:
     """Weights of the reward besides the level's stake; each term has one reason.
@@ -112,21 +168,185 @@ class TeamReward:
     change: float = 0.0015
 
 
+@wp.func
+def net_distance(x: wp.vec3, left: wp.vec3, right: wp.vec3, height: float) -> float:
+    """Distance from a point to the net's surface [m].
+
+    The net reaches from one netter to the other; half its height lies above that line and half below, along the
+    direction across the line that is nearest to upright; with the netters one above the other it shrinks to the line.
+
+    Args:
+        x: The point, world frame [m].
+        left: One netter.
+        right: The other.
+        height: Of the net [m].
+    """
+    span = right - left
+    length = wp.max(wp.length(span), 1.0e-6)
+    along = span / length
+    up = wp.vec3(0.0, 0.0, 1.0) - along[2] * along
+    rise = wp.length(up)
+    up = up / wp.max(rise, 1.0e-3)
+    gap = x - left
+    s = wp.clamp(wp.dot(gap, along), 0.0, length)
+    t = wp.clamp(wp.dot(gap, up), -0.5 * height, 0.5 * height)
+    return wp.length(gap - s * along - t * up)
+
+
+@wp.func
+def net_gap(state: State, p: Any, w: int) -> float:
+    """Distance from the prey to the net [m]; a net stretched beyond its length does not catch: the excess is added."""
+    left = state.position[w, 1]
+    right = state.position[w, 2]
+    excess = wp.max(wp.length(right - left) - p.net_length, 0.0)
+    return net_distance(state.position[w, PREY], left, right, p.net_height) + 2.0 * excess
+
+
+@wp.func
+def agent_gap(state: State, w: int) -> float:
+    """Distance from the prey to the nearest agent [m]."""
+    return nearest_pursuer(state, AGENTS, w)
+
+
+@wp.func
+def missing(p: Any, net: float, near: float) -> float:
+    """How much nearer the prey must come to be captured, by the mode's rule [m]; 0: it is near enough."""
+    by_net = net - p.rules.net_reach
+    by_vehicle = near - p.rules.proximity
+    gap = by_net
+    if p.rules.mode == 1:
+        gap = net - p.prey_radius - p.touch
+    if p.rules.mode == 2:
+        gap = by_vehicle
+    if p.rules.mode == 3:
+        gap = wp.min(by_net, by_vehicle)
+    return wp.max(gap, 0.0)
+
+
+@wp.func
+def capture_gap(p: Any, net: float, near: float) -> float:
+    """What is missing for a capture now [m]."""
+    return missing(p, net, near)
+
+
+@wp.func
+def gained(p: Any, gap_now: float, to_net: float, to_agent: float) -> float:
+    """Way gained towards a capture in this step [m].
+
+    What was missing by the rules of now: a level that rises under a running episode is no way gained or lost.
+    """
+    return missing(p, to_net, to_agent) - gap_now
+
+
+@wp.func
+def far(gap_now: float) -> float:
+    """min(what is missing / 8 m, 1)."""
+    return wp.min(gap_now / 8.0, 1.0)
+
+
+@wp.func
+def driving(state: State, w: int, a: int) -> float:
+    """Herder: cosine of the angle between the way to the prey and the way on to the net's middle."""
+    prey = state.position[w, PREY]
+    middle = 0.5 * (state.position[w, 1] + state.position[w, 2])
+    ahead = wp.normalize(prey - state.position[w, a])
+    return wp.where(a == 0, wp.dot(ahead, wp.normalize(middle - prey)), 0.0)
+
+
+@wp.func
+def straying(state: State, w: int, a: int) -> float:
+    """Herder: min(d / 8 m, 1), d its distance to the prey."""
+    away = wp.length(state.position[w, PREY] - state.position[w, a])
+    return wp.where(a == 0, wp.min(away / 8.0, 1.0), 0.0)
+
+
+@wp.func
+def misfit(state: State, p: Any, w: int, a: int) -> float:
+    """Netters: |span - 0.7 net_length|, up to the net's length [m]."""
+    span = wp.length(state.position[w, 2] - state.position[w, 1])
+    return wp.where(a == 0, 0.0, wp.min(wp.abs(span - 0.7 * p.net_length), p.net_length))
+
+
+@wp.func
+def bumps(state: State, arrays: TaskArrays, p: Any, w: int, a: int) -> float:
+    """Agents nearer than `collision`."""
+    count = float(0.0)
+    for b in range(arrays.agent_reward.shape[1]):
+        if b != a and wp.length(state.position[w, b] - state.position[w, a]) < p.collision:
+            count += 1.0
+    return count
+
+
+@wp.func
+def in_net(p: Any, net: float) -> bool:
+    """The prey within the net's reach."""
+    return net <= p.rules.net_reach
+
+
+@wp.func
+def is_captured(p: Any, net: float, near: float, held: float) -> bool:
+    """By the mode's rule; the net of modes net and either must have it for `hold`, without a break."""
+    netted = held > 0.0 and held >= p.rules.hold - 0.1 * p.control_step
+    caught = netted and (p.rules.mode == 0 or p.rules.mode == 3)
+    if p.rules.mode == 1:
+        caught = net - p.prey_radius <= p.touch
+    if p.rules.mode >= 2 and near <= p.rules.proximity:
+        caught = True
+    return caught
+
+
+@wp.func
+def any_outside(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
+    """An agent is out of bounds."""
+    out = bool(False)
+    for a in range(arrays.agent_reward.shape[1]):
+        if outside(state, p, w, a):
+            out = True
+    return out
+
+
+@wp.func
+def closest(near: float, was: float) -> float:
+    """Smallest distance from the prey to an agent so far [m]."""
+    return wp.min(was, near)
+
+
+@wp.func
+def closest_to_net(net: float, was: float) -> float:
+    """Smallest distance from the prey to the net so far [m]."""
+    return wp.min(was, net)
+
+
+@wp.func
+def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
+    """The team around the origin, the prey some way off."""
+    pi = 3.14159265
+    rng = wp.rand_init(key, 4 * w)
+    turn = wp.randf(rng, -pi, pi)
+    height = wp.randf(rng, p.low, p.high)
+    for a in range(AGENTS):
+        angle = turn + (float(a) + wp.randf(rng, -0.2, 0.2)) * 2.0 * pi / 3.0
+        away = wp.randf(rng, 0.5, 1.0) * p.spawn_radius
+        x = away * level_direction(angle) + wp.vec3(0.0, 0.0, height + wp.randf(rng, -0.3, 0.3))
+        place_at_rest(state, w, a, x, wp.randf(rng, -pi, pi))
+    heading = wp.randf(rng, -pi, pi)
+    prey = prey_start(p, wp.rand_init(wp.randi(rng)), wp.vec3(0.0, 0.0, height))
+    place_at_rest(state, w, PREY, prey, heading)
+    key_messages(arrays, key, w)
+
+
 @dataclass(frozen=True, kw_only=True)
 class TeamPursuit(OpenWater):
     """3-v-1 pursuit. What counts as a capture, the prey's speed and the stake are the level's, unless given here."""
 
     agents: ClassVar[tuple[str, ...]] = ("herder", "left_netter", "right_netter")
     others: ClassVar[tuple[str, ...]] = ("prey",)
-    totals: ClassVar[tuple[str, ...]] = (
-        *("captured", "left", "closest", "closest_to_net", "gap", "to_net", "to_agent"),
-    )
-
+    succeeds: ClassVar[str] = "captured"
     levels: ClassVar[int] = len(LEVELS)
     moving: ClassVar[bool] = True
     title: ClassVar[str] = "drive a prey into a net, three against one"
     name: str = "team-pursuit"
-    observation: tuple[ObservationPart, ...] = field(default=(*CHASE, *MATE, *MATE), repr=False)
+    observation: tuple[ObservationPart, ...] = field(default=OBSERVATION, repr=False)
     spawn_radius: float = 1.5
     time_limit: float = 60.0
     level: int = 3
@@ -161,11 +381,6 @@ class TeamPursuit(OpenWater):
     """Of its hull, level [m]: follows from its vehicle."""
     prey_drive: DriveNumbers | None = field(default=None, repr=False)
     """What its thrusters do: follows from its vehicle."""
-
-    evaluate = staticmethod(evaluate_team)
-    spawn = staticmethod(spawn_team)
-    observe = staticmethod(observe_team)
-    script = staticmethod(script_team)
 
     def __post_init__(self) -> None:
         if not 0 <= self.level < len(LEVELS):
@@ -208,24 +423,34 @@ class TeamPursuit(OpenWater):
             "either": f"{net}, or {near}",
         }[rules.capture]
 
-    def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """As every task's; success: captured; capture_time [s], nan where it was not."""
-        measured = super().metrics(arrays)
-        return {**measured, **capture_metrics(measured, self.control_step)}
-
-    def parameters(self) -> Any:
-        """The struct that the kernels take."""
-        if self.prey_drive is None:
-            raise EnvironmentSetupError(
-                f"task '{self.name}' is not fitted to vehicles: call fitted([...]) first"
-            )
-        p, rules = TeamParameters(), self.rules
-        p.prey = self.prey.struct(self.prey_drive, self.speed, self.control_step)
-        p.arena = self.arena_struct(self.nearest, self.farthest)
-        p.mode = CAPTURE_MODES.index(rules.capture)
-        p.proximity, p.reach, p.hold, p.stake = rules.proximity, rules.net_reach, rules.hold, rules.stake
-        for name in ("touch", "net_length", "net_height", "collision", "prey_radius"):
-            setattr(p, name, getattr(self, name))
-        for one in fields(self.reward):
-            setattr(p, one.name, getattr(self.reward, one.name))
-        return p
+    def terms(self) -> Terms:
+        """See `TeamReward`."""
+        r, stake = self.reward, self.rules.stake
+        return Terms(
+            start=start,
+            begin=open_messages,
+            advance=exchange_messages,
+            command=command_prey,
+            seen={"gap": prey_gap},
+            shared={"net": net_gap, "near": agent_gap, "gap_now": capture_gap},
+            rewards=(
+                RewardTerm("progress", gained, r.progress),
+                RewardTerm("distance", far, -r.distance),
+                RewardTerm("step", one, -r.step),
+                RewardTerm("drive", driving, r.drive),
+                RewardTerm("stray", straying, -r.stray),
+                RewardTerm("spread", misfit, -r.spread),
+                RewardTerm("bump", bumps, -r.bump),
+                RewardTerm("action", action_effort, -r.action),
+                RewardTerm("change", action_change, -r.change),
+            ),
+            ends=(End("captured", is_captured, stake), End("left", any_outside, -stake)),
+            inside=in_net,
+            totals=(
+                Total("closest", closest, first="near"),
+                Total("closest_to_net", closest_to_net, first="net"),
+                Total("gap", "gap_now", first="gap_now"),
+                Total("to_net", "net", first="net"),
+                Total("to_agent", "near", first="near"),
+            ),
+        )

@@ -8,17 +8,23 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 import warp as wp
-from numpy.typing import NDArray
 from torch import Tensor
 
 from finssim.engine.launch import Pipeline
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.task import Batch, Task
-from finssim.tasks.torch_kernels import Times, answers, begin_episode, finish_step, first_observation
+from finssim.tasks.terms import End, RewardTerm, Terms, Total
+from finssim.tasks.torch_kernels import (
+    answered_failure,
+    answered_inside,
+    answered_reward,
+    answered_start,
+    answered_total,
+    answers,
+)
 from finssim.tasks.torch_worlds import Worlds
 
 __all__ = ["Start", "TorchTask", "Worlds"]
@@ -56,6 +62,9 @@ class TorchTask(Task):
     what is measured; where episodes begin `reset`, and `observe` again. Gradients are off.
     """
 
+    succeeds: ClassVar[str] = "held"
+    totals: ClassVar[tuple[str, ...]] = ()  # type: ignore[misc]
+    """Names of what `counted` counts."""
     memory: ClassVar[Mapping[str, int]] = {}
     """Numbers that the task keeps within an episode: name and size. `reward` may write `w.memory[name][:] = ...`."""
 
@@ -90,30 +99,28 @@ class TorchTask(Task):
         """What this step adds to the `totals` of the episode, (worlds,) by name."""
         return {}
 
-    def script(self, w: Worlds) -> Tensor:  # type: ignore[override]
+    def script(self, w: Worlds) -> Tensor:
         """Actions of the `others` in the step to come, (worlds, others, size), each in [-1, 1]."""
         raise NotImplementedError(f"task '{self.name}' has others: define script(self, w) -> tensor")
 
-    def parameters(self) -> Times:
-        """The times that the kernels take."""
-        times = Times()
-        times.time_limit, times.control_step = self.time_limit, self.control_step
-        return times
+    def terms(self) -> Terms:
+        """What every task of this kind goes on with, once its functions have answered."""
+        return Terms(
+            start=answered_start,
+            shown=False,
+            rewards=(RewardTerm("reward", answered_reward, 1.0),),
+            ends=(End("terminated", answered_failure),),
+            inside=answered_inside,
+            totals=tuple(Total(name, answered_total, index=i) for i, name in enumerate(self.totals)),
+        )
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """Room for what the functions answer."""
         arrays.answers = answers(
-            worlds, len(self.vehicles), len(self.agents), self.observation_size, len(self.totals),
-            sum(self.memory.values()), device,
+            worlds, len(self.vehicles), len(self.agents), len(self.totals), sum(self.memory.values()), device
         )  # fmt: skip
 
-    def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """As every task's, and success."""
-        measured = super().metrics(arrays)
-        enough = max(self.hold, self.control_step) - 0.5 * self.control_step
-        return {**measured, "success": np.where(measured["held"] >= enough, 1.0, 0.0)}
-
-    def add_script(self, pipeline: Pipeline, batch: Batch) -> None:
+    def add_command(self, pipeline: Pipeline, batch: Batch) -> None:
         """Append what commands the `others`."""
         w, out = self._worlds(batch, SCRIPT), batch.arrays.scripted
         pipeline.call(
@@ -124,24 +131,26 @@ class TorchTask(Task):
         """Append reward, ends and observation."""
         true, seen = self._worlds(batch, SCORE), self._worlds(batch, OBSERVE, measured=True)
 
+        frozen = wp.to_torch(batch.state.frozen, requires_grad=False)[:, None, None]
+
         def score() -> None:
             self._score(true.begin(), batch.arrays)
-            self._look(seen.begin(), batch.arrays)
+            self._look(seen.begin(), batch.arrays, frozen == 0)
 
         pipeline.call(partial(_run, batch, score))
-        pipeline.add(finish_step, [batch.state, batch.arrays, batch.parameters])
+        super().add_evaluate(pipeline, batch)
 
     def add_spawn(self, pipeline: Pipeline, batch: Batch, mask: wp.array) -> None:
         """Append the start of an episode where mask is not 0."""
         w = self._worlds(batch, RESET)
         pipeline.call(partial(_run, batch, lambda: self._begin(w.begin(), batch.arrays), mask))
-        pipeline.add(begin_episode, [batch.state, batch.arrays, mask])
+        super().add_spawn(pipeline, batch, mask)
 
     def add_observe(self, pipeline: Pipeline, batch: Batch, mask: wp.array) -> None:
         """Append the first observation where mask is not 0."""
         seen = self._worlds(batch, OBSERVE, measured=True)
-        pipeline.call(partial(_run, batch, lambda: self._look(seen.begin(), batch.arrays), mask))
-        pipeline.add(first_observation, [batch.arrays, mask])
+        starts = wp.to_torch(mask, requires_grad=False)[:, None, None]
+        pipeline.call(partial(_run, batch, lambda: self._look(seen.begin(), batch.arrays, starts != 0), mask))
 
     def _worlds(self, batch: Batch, stage: int, measured: bool = False) -> Worlds:
         return Worlds(batch, self.memory, self.control_step, stage=stage, measured=measured)
@@ -161,14 +170,15 @@ class TorchTask(Task):
             rows = [counted[name].reshape(w.count, 1) for name in self.totals]
             self._answer("counted", torch.cat(rows, dim=1), given.counted)
 
-    def _look(self, w: Worlds, arrays: TaskArrays) -> None:
+    def _look(self, w: Worlds, arrays: TaskArrays, where: Tensor) -> None:
+        """Write the observation of the worlds `where`, bool, (worlds, 1, 1)."""
         parts, agents = self.observe(w), len(self.agents)
         if len(parts) != len(self.observation):
             raise EnvironmentSetupError(
                 f"task '{self.name}': observe gives {len(parts)} tensors, expected {len(self.observation)}: one for "
                 "each part of the observation"
             )
-        rows = wp.to_torch(arrays.answers.observation, requires_grad=False).view(w.count, agents, -1)
+        rows = wp.to_torch(arrays.observation, requires_grad=False).view(w.count, agents, -1)
         first = 0
         for part, given in zip(self.observation, parts, strict=True):
             if given.numel() != w.count * agents * part.size or given.shape[0] != w.count:
@@ -178,9 +188,9 @@ class TorchTask(Task):
                 )
             values = given.reshape(w.count, agents, part.size)
             values = values if part.scale == 1.0 else values / part.scale
-            rows[..., first : first + part.size] = (
-                values if part.clip is None else values.clamp(-part.clip, part.clip)
-            )
+            values = values if part.clip is None else values.clamp(-part.clip, part.clip)
+            old = rows[..., first : first + part.size]
+            old[:] = torch.where(where, values, old)
             first += part.size
 
     def _begin(self, w: Worlds, arrays: TaskArrays) -> None:

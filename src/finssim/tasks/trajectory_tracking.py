@@ -4,23 +4,29 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
+from finssim.engine.state import State
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.measurement import MeasurementNoise
-from finssim.tasks.reference import reference_table
-from finssim.tasks.reference_shapes import SHAPE_NAMES
+from finssim.tasks.reference import (
+    reference_position,
+    reference_progress,
+    reference_table,
+    reference_velocity,
+)
+from finssim.tasks.reference_shapes import SHAPE_NAMES, fill_reference, greatest_rate
 from finssim.tasks.task import ObservationPart, Task
-from finssim.tasks.tracking_kernels import (
-    DISTANCE_SCALE,
-    LOOK_AHEAD,
-    VELOCITY_CLIP,
-    TrackingParameters,
-    evaluate_tracking,
-    observe_tracking,
-    spawn_tracking,
+from finssim.tasks.terms import (
+    End,
+    RewardTerm,
+    Terms,
+    action_change,
+    action_effort,
+    linear_velocity,
+    tilted,
+    turn_rates,
+    uniform3,
 )
 
 LEVELS = (
@@ -31,19 +37,71 @@ LEVELS = (
 )
 """Shapes of the three published levels of difficulty, and of ours, which has them all at once."""
 
+DISTANCE_SCALE = 3.0
+"""Distances are divided by this in the observation [m]."""
+VELOCITY_CLIP = 2.0
+"""Velocities are clipped here in the observation [m/s, rad/s]."""
+LOOK_AHEAD = 0.1
+"""The reference is seen now and one, two and three times this later [s]."""
+
+REST = 1.0e-6
+"""A reference slower than this has no tangent: it is taken to lie ahead [m/s]."""
+
+
+@wp.func
+def reference_offset(arrays: TaskArrays, w: int, k: int) -> wp.vec3:
+    """From the vehicle to where the reference is k `LOOK_AHEAD` from now, body frame [m]."""
+    place = reference_position(arrays.reference, w, arrays.time[w] + LOOK_AHEAD * float(k))
+    return wp.quat_rotate_inv(arrays.quaternion[w, 0], place - arrays.position[w, 0])
+
+
+@wp.func
+def reference_drift(arrays: TaskArrays, w: int) -> wp.vec3:
+    """Velocity of the reference, body frame [m/s]."""
+    return wp.quat_rotate_inv(
+        arrays.quaternion[w, 0], reference_velocity(arrays.reference, w, arrays.time[w])
+    )
+
+
+@wp.func
+def world_up(arrays: TaskArrays, w: int) -> wp.vec3:
+    """The world's z axis, body frame."""
+    return wp.quat_rotate_inv(arrays.quaternion[w, 0], wp.vec3(0.0, 0.0, 1.0))
+
+
+@wp.func
+def tangent(drift: wp.vec3) -> wp.vec2:
+    """Sine and cosine of the heading of the reference's velocity, seen from the body."""
+    pace = wp.sqrt(drift[0] * drift[0] + drift[1] * drift[1])
+    return wp.vec2(wp.where(pace > REST, drift[1] / pace, 0.0), wp.where(pace > REST, drift[0] / pace, 1.0))
+
+
+@wp.func
+def progress(arrays: TaskArrays, w: int) -> wp.vec4:
+    """Sine and cosine of the progress, once and twice."""
+    turn = 6.2831853 * reference_progress(arrays.reference, w, arrays.time[w])
+    return wp.vec4(wp.sin(turn), wp.cos(turn), wp.sin(2.0 * turn), wp.cos(2.0 * turn))
+
+
 OBSERVATION = (
     *(
         ObservationPart(
-            f"reference offset in {LOOK_AHEAD * i:.1f} s, body frame", 3, "m", scale=DISTANCE_SCALE
+            f"reference offset in {LOOK_AHEAD * i:.1f} s, body frame",
+            3,
+            "m",
+            DISTANCE_SCALE,
+            None,
+            reference_offset,
+            i,
         )
         for i in range(4)
     ),
-    ObservationPart("reference velocity, body frame", 3, "m/s"),
-    ObservationPart("linear velocity, body frame", 3, "m/s", clip=VELOCITY_CLIP),
-    ObservationPart("angular velocity, body frame", 3, "rad/s", clip=VELOCITY_CLIP),
-    ObservationPart("world up, body frame", 3, "1"),
-    ObservationPart("tangent heading in the body, sine and cosine", 2, "1"),
-    ObservationPart("progress, sine and cosine of one and two turns", 4, "1"),
+    ObservationPart("reference velocity, body frame", 3, "m/s", term="drift"),
+    ObservationPart("linear velocity, body frame", 3, "m/s", clip=VELOCITY_CLIP, term=linear_velocity),
+    ObservationPart("angular velocity, body frame", 3, "rad/s", clip=VELOCITY_CLIP, term=turn_rates),
+    ObservationPart("world up, body frame", 3, "1", term=world_up),
+    ObservationPart("tangent heading in the body, sine and cosine", 2, "1", term=tangent),
+    ObservationPart("progress, sine and cosine of one and two turns", 4, "1", term=progress),
 )
 
 
@@ -78,6 +136,92 @@ class TrackingReward:
     loss: float = 10.0
 
 
+@wp.func
+def lead_reference(arrays: TaskArrays, w: int):
+    """Take the goal to where the reference is now."""
+    arrays.goal_position[w] = reference_position(arrays.reference, w, arrays.time[w])
+
+
+@wp.func
+def tracking_error(state: State, arrays: TaskArrays, w: int) -> float:
+    """e: from the vehicle to the reference [m]."""
+    return wp.length(arrays.goal_position[w] - state.position[w, 0])
+
+
+@wp.func
+def track(p: Any, e: float) -> float:
+    """pose = exp(-e / track_scale)."""
+    return wp.exp(-e / p.reward.track_scale)
+
+
+@wp.func
+def posture(state: State, p: Any, w: int, pose: float) -> float:
+    """pose · (0.5 / (1 + (tilt / tilt_scale)²) + 0.5 / (1 + (r / spin_scale)⁴))."""
+    tilt = wp.acos(wp.clamp(wp.quat_rotate(state.quaternion[w, 0], wp.vec3(0.0, 0.0, 1.0))[2], -1.0, 1.0))
+    rate = state.velocity[w, 0][5]
+    lean = tilt / p.reward.tilt_scale
+    spun = rate * rate / (p.reward.spin_scale * p.reward.spin_scale)
+    return pose * (0.5 / (1.0 + lean * lean) + 0.5 / (1.0 + spun * spun))
+
+
+@wp.func
+def spin(state: State, w: int) -> float:
+    """|r|, the yaw rate [rad/s]."""
+    return wp.abs(state.velocity[w, 0][5])
+
+
+@wp.func
+def is_lost(state: State, p: Any, w: int, e: float) -> bool:
+    """Farther than `lost` from the reference, above `ceiling`, or beyond `range`."""
+    x = state.position[w, 0]
+    return e > p.lost or x[2] > p.ceiling or wp.length(x) > p.range
+
+
+@wp.func
+def within_tolerance(p: Any, e: float) -> bool:
+    """Within `tolerance` of the reference."""
+    return e <= p.tolerance
+
+
+@wp.func
+def draw_reference(arrays: TaskArrays, p: Any, key: int, w: int):
+    """A shape, its size, height, phase, direction and speed, drawn for this episode alone."""
+    pi = 3.14159265
+    rng = wp.rand_init(key, 4 * w)
+    kind = p.shape_of[wp.randi(rng, 0, p.shapes)]
+    lift = wp.randf(rng, -p.lift, p.lift)
+    phase = wp.randf(rng, -pi, pi)
+    direction = wp.where(wp.randf(rng) < 0.5, -1.0, 1.0)
+    pace = wp.randf(rng, p.slowest, 1.0)
+    scale = uniform3(wp.rand_init(key, 4 * w + 1), p.scale_low, p.scale_high)
+    origin = wp.vec3(0.0, 0.0, p.depth) + uniform3(wp.rand_init(key, 4 * w + 2), -p.jitter, p.jitter)
+    # As published, no more than one turn in an episode and no axis beyond its speed limit.
+    fastest = wp.min(2.0 * pi / p.time_limit, greatest_rate(kind, lift, scale, p.speed_limit))
+    fill_reference(arrays.reference, w, kind, lift, scale, origin, phase, direction * pace * fastest)
+
+
+@wp.func
+def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
+    """A reference, unless one is given, and a start beside its first point."""
+    if arrays.reference.given[w] == 0:
+        draw_reference(arrays, p, key, w)
+    rng = wp.rand_init(key, 4 * w + 3)
+    start = reference_position(arrays.reference, w, 0.0)
+    away = wp.vec3(wp.randf(rng, -1.0, 1.0), wp.randf(rng, -1.0, 1.0), wp.randf(rng, -1.0, 1.0))
+    state.position[w, 0] = start + wp.cw_mul(away, p.jitter)
+    roll = wp.randf(rng, -p.tilt, p.tilt)
+    pitch = wp.randf(rng, -p.tilt, p.tilt)
+    state.quaternion[w, 0] = tilted(roll, pitch, wp.randf(rng, -3.14159265, 3.14159265))
+    nu = state.velocity[w, 0]
+    for i in range(3):
+        nu[i] = wp.randf(rng, -p.speed, p.speed)
+    for i in range(3):
+        nu[i + 3] = 0.0
+    state.velocity[w, 0] = nu
+    arrays.goal_position[w] = start
+    arrays.goal_quaternion[w] = wp.quat_identity()
+
+
 @dataclass(frozen=True, kw_only=True)
 class TrajectoryTracking(Task):
     """T2. Lengths in metres, angles in radians, world frame with z up and 0 on the water.
@@ -87,6 +231,7 @@ class TrajectoryTracking(Task):
     """
 
     levels: ClassVar[int] = len(LEVELS)
+    succeeds: ClassVar[str] = "held"
     moving: ClassVar[bool] = True
     title: ClassVar[str] = "follow a moving reference, whatever the heading"
     name: str = "t2"
@@ -130,10 +275,6 @@ class TrajectoryTracking(Task):
     )
     """About what an estimate is off by: with exact states, gains are learnt that chatter on measured ones."""
 
-    evaluate = staticmethod(evaluate_tracking)
-    spawn = staticmethod(spawn_tracking)
-    observe = staticmethod(observe_tracking)
-
     def __post_init__(self) -> None:
         if not 0 <= self.level < len(LEVELS):
             raise ValueError(f"level is {self.level}, expected 0 to {len(LEVELS) - 1}")
@@ -147,26 +288,33 @@ class TrajectoryTracking(Task):
         """See `Task`."""
         return f"{self.tolerance:g} m from the reference for {self.hold:g} s, at the end"
 
-    def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """As every task's, and success: held for `hold` seconds when the episode ended."""
-        measured = super().metrics(arrays)
-        enough = measured["held"] >= self.hold - 0.5 * self.control_step
-        return {**measured, "success": np.where(enough, 1.0, 0.0)}
-
-    def parameters(self) -> Any:
-        """The struct that the kernels take."""
-        p, r = TrackingParameters(), self.reward
+    @property
+    def shape_of(self) -> tuple[int, int, int, int]:
+        """Numbers of the shapes to draw from, the first `shapes` of them."""
         kinds = [SHAPE_NAMES.index(name) for name in LEVELS[self.level]]
-        p.shape_of, p.shapes = wp.vec4i(*kinds, *[0] * (4 - len(kinds))), len(kinds)
-        for name in ("scale_low", "scale_high", "speed_limit", "jitter"):
-            setattr(p, name, wp.vec3(*getattr(self, name)))
-        for name in (
-            *("slowest", "lift", "depth", "tilt", "speed", "lost", "ceiling", "range", "tolerance"),
-            *("time_limit", "control_step"),
-        ):
-            setattr(p, name, getattr(self, name))
-        p.track_weight, p.track_scale, p.distance_weight = r.track, r.track_scale, r.distance
-        p.posture_weight, p.tilt_scale, p.spin_scale = r.posture, r.tilt_scale, r.spin_scale
-        p.spin_weight = r.spin
-        p.action_weight, p.change_weight, p.loss = r.action, r.change, r.loss
-        return p
+        return (*kinds, *[0] * (4 - len(kinds)))  # type: ignore[return-value]
+
+    @property
+    def shapes(self) -> int:
+        """How many shapes there are to draw from."""
+        return len(LEVELS[self.level])
+
+    def terms(self) -> Terms:
+        """See `TrackingReward`."""
+        r = self.reward
+        return Terms(
+            start=start,
+            advance=lead_reference,
+            shared={"e": tracking_error, "pose": track},
+            seen={"drift": reference_drift},
+            rewards=(
+                RewardTerm("track", "pose", r.track),
+                RewardTerm("posture", posture, r.posture),
+                RewardTerm("distance", "e", -r.distance),
+                RewardTerm("spin", spin, -r.spin),
+                RewardTerm("action", action_effort, -r.action),
+                RewardTerm("change", action_change, -r.change),
+            ),
+            ends=(End("lost", is_lost, -r.loss),),
+            inside=within_tolerance,
+        )

@@ -1,6 +1,7 @@
 """PPO of our own: the same with NumPy and torch, without the host; it remembers, scales, and values what was drawn."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,10 +16,10 @@ from finssim.learning.layers import Arrays
 from finssim.learning.learners import learner_named
 from finssim.learning.learners.ppo import Ppo
 from finssim.learning.network import Network
-from finssim.tasks import StationKeeping
+from finssim.tasks import ObservationPart, StationKeeping
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.episode import close_episode
-from reference.guess import BEST, Guess, Guessing, Steady, SteadyTogether
+from finssim.tasks.terms import End, RewardTerm, Terms
+from reference.guess import BEST, Guess, Steady, SteadyTogether, draw, guessed
 from reference.policies import written
 
 KIND = learner_named("ppo")
@@ -138,27 +139,21 @@ def torch_module(network):
     return Module()
 
 
-@wp.kernel(enable_backward=False)
-def score_recall(state: State, arrays: TaskArrays, p: Guessing, world_offset: int):
-    """The sign is seen in the first of three steps, the third is paid."""
-    w = world_offset + wp.tid()
-    step = state.steps[w]
-    if step == 1:
-        arrays.totals[w, 0] = arrays.observation[w, 0]
-        arrays.observation[w, 0] = 0.0
-    off = float(0.0)
-    size = arrays.action.shape[1]
-    for i in range(size):
-        d = wp.clamp(arrays.action[w, i], -1.0, 1.0) - arrays.totals[w, 0] * p.best
-        off += d * d
-    last = step >= 3
-    arrays.reward[w] = wp.where(last, 1.0 - off / float(size), 0.0)
-    arrays.episode_return[w] = arrays.reward[w]
-    arrays.terminated[w] = wp.where(last, 1, 0)
-    arrays.truncated[w] = 0
-    arrays.done[w] = arrays.terminated[w]
-    if last:
-        close_episode(state, arrays, w)
+@wp.func
+def shown_once(arrays: TaskArrays, w: int) -> float:
+    """The sign, in the first of three steps."""
+    return wp.where(arrays.time[w] < 0.05, arrays.goal_position[w][0], 0.0)
+
+
+@wp.func
+def recalled(state: State, arrays: TaskArrays, p: Any, w: int) -> float:
+    """The third step is paid."""
+    return wp.where(state.steps[w] >= 3, guessed(arrays, p, w, 0), 0.0)
+
+
+@wp.func
+def third(state: State, w: int) -> bool:
+    return state.steps[w] >= 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,8 +162,10 @@ class Recall(Guess):
 
     name: str = "recall"
     time_limit: float = 0.3
-    totals = ("sign",)
-    evaluate = staticmethod(score_recall)
+    observation: tuple[ObservationPart, ...] = (ObservationPart("sign", 1, "1", clip=1.0, term=shown_once),)
+
+    def terms(self) -> Terms:
+        return Terms(start=draw, rewards=(RewardTerm("guess", recalled, 1.0),), ends=(End("over", third),))
 
 
 LEARN = {

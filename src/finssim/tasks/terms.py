@@ -1,0 +1,260 @@
+"""Terms: small functions of which a task is made, each with a name; and those that tasks share.
+
+A term is a `wp.func` whose arguments are told by their names; see `finssim.tasks.kernels`. What a policy sees comes
+from `arrays`, which holds what is measured; what it is paid for and how an episode ends comes from `state`, the truth.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import warp as wp
+
+from finssim.engine.state import State
+from finssim.physics.types import vec6
+from finssim.tasks.arrays import TaskArrays
+
+
+@dataclass(frozen=True)
+class RewardTerm:
+    """A part of the reward of every step: weight times what the term gives."""
+
+    name: str
+    term: Any
+    """-> float; with an argument `a`, of that agent, otherwise of all together. Or the name of what is shared."""
+    weight: float
+
+
+@dataclass(frozen=True)
+class End:
+    """What ends an episode before its time; of several that are true the first is the one. It is counted by name."""
+
+    name: str
+    term: Any
+    """-> bool"""
+    reward: float = 0.0
+    """Of every agent, once."""
+
+
+@dataclass(frozen=True)
+class Total:
+    """What is counted in an episode: a part of the task's metrics, by its name."""
+
+    name: str
+    term: Any
+    """-> float: the total after a step; its argument `was` is the total before. Or the name of what is shared."""
+    first: Any = 0.0
+    """Where an episode starts: a number, a function of the start, or the name of what is shared."""
+    index: int = 0
+    """The term's argument `k`."""
+
+
+@dataclass(frozen=True)
+class Terms:
+    """All of a task but what is observed, which stands in its `observation`."""
+
+    start: Any
+    """Puts vehicles and goal where an episode starts, drawn from `key` and the world alone."""
+    rewards: Sequence[RewardTerm] = ()
+    ends: Sequence[End] = ()
+    inside: Any = None
+    """-> bool: within the tolerance of success; the time of that without a break is `arrays.held`."""
+    totals: Sequence[Total] = ()
+    advance: Any = None
+    """What goes on in the world besides the vehicles, after each step and before it is scored."""
+    begin: Any = None
+    """What is done before the first observation, when the start has been measured."""
+    shared: Mapping[str, Any] = field(default_factory=dict)
+    """Of which several terms are made: name -> function of the truth, once a step; terms take it by an argument."""
+    seen: Mapping[str, Any] = field(default_factory=dict)
+    """The same for observation terms: name -> function of what is measured, once for each agent."""
+    shown: bool = True
+    """Whether the observation is written by the terms of its parts; False: the task writes it by itself."""
+    command: Any = None
+    """Writes `arrays.scripted`, the actions of the vehicles that the task commands, before each step."""
+
+
+@wp.func
+def open_episode(arrays: TaskArrays, w: int):
+    """Start everything over that is kept in an episode."""
+    arrays.time[w] = 0.0
+    arrays.held[w] = 0.0
+    arrays.episode_return[w] = 0.0
+    for i in range(arrays.totals.shape[1]):
+        arrays.totals[w, i] = 0.0
+    for i in range(arrays.earned.shape[1]):
+        arrays.earned[w, i] = 0.0
+    for i in range(arrays.action.shape[1]):
+        arrays.previous_action[w, i] = 0.0
+
+
+@wp.func
+def close_episode(state: State, arrays: TaskArrays, w: int):
+    """Keep the last observation and the totals of an episode that ends."""
+    for i in range(arrays.observation.shape[1]):
+        arrays.final_observation[w, i] = arrays.observation[w, i]
+    arrays.final_return[w] = arrays.episode_return[w]
+    arrays.final_length[w] = state.steps[w]
+    arrays.final_held[w] = arrays.held[w]
+    for i in range(arrays.totals.shape[1]):
+        arrays.final_totals[w, i] = arrays.totals[w, i]
+    for i in range(arrays.earned.shape[1]):
+        arrays.final_earned[w, i] = arrays.earned[w, i]
+
+
+@wp.func
+def report_frozen(state: State, arrays: TaskArrays, w: int):
+    """A frozen world ends and waits for its report, and nobody in it is rewarded."""
+    for a in range(arrays.agent_reward.shape[1]):
+        arrays.agent_reward[w, a] = 0.0
+    arrays.reward[w] = 0.0
+    arrays.terminated[w] = 1
+    arrays.truncated[w] = 0
+    arrays.done[w] = 0
+    close_episode(state, arrays, w)
+
+
+@wp.func
+def remember_actions(arrays: TaskArrays, w: int):
+    """Keep the actions for the next step's change."""
+    for i in range(arrays.action.shape[1]):
+        arrays.previous_action[w, i] = wp.clamp(arrays.action[w, i], -1.0, 1.0)
+
+
+@wp.func
+def uniform3(rng: wp.uint32, low: wp.vec3, high: wp.vec3) -> wp.vec3:
+    """A point drawn uniformly from a box; the caller passes a stream of its own."""
+    a = wp.randf(rng)
+    b = wp.randf(rng)
+    c = wp.randf(rng)
+    return low + wp.cw_mul(wp.vec3(a, b, c), high - low)
+
+
+@wp.func
+def tilted(roll: float, pitch: float, yaw: float) -> wp.quat:
+    """Attitude: yaw about world z, then pitch, then roll [rad]."""
+    about_x = wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), roll)
+    about_y = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), pitch)
+    return wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw) * about_y * about_x
+
+
+@wp.func
+def level_direction(angle: float) -> wp.vec3:
+    """Unit vector at an angle from the world's x axis."""
+    return wp.vec3(wp.cos(angle), wp.sin(angle), 0.0)
+
+
+@wp.func
+def place_at_rest(state: State, w: int, v: int, x: wp.vec3, yaw: float):
+    """Put a vehicle somewhere, level and at rest."""
+    state.position[w, v] = x
+    state.quaternion[w, v] = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw)
+    state.velocity[w, v] = vec6()
+
+
+@wp.func
+def world_velocity(state: State, w: int, v: int) -> wp.vec3:
+    """Velocity of a vehicle, world frame [m/s]."""
+    nu = state.velocity[w, v]
+    return wp.quat_rotate(state.quaternion[w, v], wp.vec3(nu[0], nu[1], nu[2]))
+
+
+@wp.func
+def angular_velocity(state: State, w: int) -> wp.vec3:
+    """Of vehicle 0, body frame [rad/s]."""
+    nu = state.velocity[w, 0]
+    return wp.vec3(nu[3], nu[4], nu[5])
+
+
+@wp.func
+def attitude_error(state: State, arrays: TaskArrays, w: int) -> float:
+    """Angle of the rotation from vehicle 0's attitude to its goal's, in [0, π] [rad]."""
+    d = wp.quat_inverse(state.quaternion[w, 0]) * arrays.goal_quaternion[w]
+    return 2.0 * wp.atan2(wp.length(wp.vec3(d[0], d[1], d[2])), wp.abs(d[3]))
+
+
+@wp.func
+def straight(p: Any, theta: float) -> float:
+    """exp(-θ / heading_scale), θ the attitude error."""
+    return wp.exp(-theta / p.reward.heading_scale)
+
+
+@wp.func
+def action_effort(arrays: TaskArrays, w: int, a: int) -> float:
+    """Mean square of the action: the cheapest thrusts that do it."""
+    effort = float(0.0)
+    for i in range(arrays.action_size):
+        u = wp.clamp(arrays.action[w, a * arrays.action_size + i], -1.0, 1.0)
+        effort += u * u
+    return effort / float(arrays.action_size)
+
+
+@wp.func
+def action_change(arrays: TaskArrays, w: int, a: int) -> float:
+    """Mean square of the action's change since the last step: commands that a motor can follow."""
+    change = float(0.0)
+    for i in range(arrays.action_size):
+        k = a * arrays.action_size + i
+        d = wp.clamp(arrays.action[w, k], -1.0, 1.0) - arrays.previous_action[w, k]
+        change += d * d
+    return change / float(arrays.action_size)
+
+
+@wp.func
+def turning(state: State, w: int) -> float:
+    """min(|ω|², 4): no spinning on the way [rad²/s²]."""
+    omega = angular_velocity(state, w)
+    return wp.min(wp.dot(omega, omega), 4.0)
+
+
+@wp.func
+def one(w: int) -> float:
+    """1, in every step."""
+    return 1.0
+
+
+@wp.func
+def out_of_box(state: State, p: Any, w: int) -> bool:
+    """Beyond `bounds`, above `ceiling` or below `depth`."""
+    x = state.position[w, 0]
+    return wp.abs(x[0]) > p.bounds[0] or wp.abs(x[1]) > p.bounds[1] or x[2] > p.ceiling or x[2] < -p.depth
+
+
+@wp.func
+def linear_velocity(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """Measured velocity of an agent, body frame [m/s]."""
+    nu = arrays.velocity[w, a]
+    return wp.vec3(nu[0], nu[1], nu[2])
+
+
+@wp.func
+def turn_rates(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """Measured angular velocity of an agent, body frame [rad/s]."""
+    nu = arrays.velocity[w, a]
+    return wp.vec3(nu[3], nu[4], nu[5])
+
+
+@wp.func
+def measured_velocity(arrays: TaskArrays, w: int, v: int) -> wp.vec3:
+    """Measured velocity of a vehicle, world frame [m/s]."""
+    nu = arrays.velocity[w, v]
+    return wp.quat_rotate(arrays.quaternion[w, v], wp.vec3(nu[0], nu[1], nu[2]))
+
+
+@wp.func
+def goal_offset(arrays: TaskArrays, w: int) -> wp.vec3:
+    """From vehicle 0 to the goal, body frame [m]."""
+    return wp.quat_rotate_inv(arrays.quaternion[w, 0], arrays.goal_position[w] - arrays.position[w, 0])
+
+
+@wp.func
+def length(offset: wp.vec3) -> float:
+    """Of the offset that is shared under this name [m]."""
+    return wp.length(offset)
+
+
+@wp.func
+def goal_columns(arrays: TaskArrays, w: int) -> vec6:
+    """First two columns of the goal's rotation relative to vehicle 0's body."""
+    R = wp.quat_to_matrix(wp.quat_inverse(arrays.quaternion[w, 0]) * arrays.goal_quaternion[w])
+    return vec6(R[0, 0], R[1, 0], R[2, 0], R[0, 1], R[1, 1], R[2, 1])
