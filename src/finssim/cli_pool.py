@@ -70,11 +70,12 @@ def pool(
         Path | None, typer.Option(help="File to write what truly happened into, for scoring.", metavar="FILE")
     ] = None,
     start: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="Where the vehicle starts, world frame: x,y,z [m], yaw [deg].", metavar="X,Y,Z,YAW"
+            help="Where the vehicle starts, world frame: x,y,z [m], yaw [deg]; in the middle if not given.",
+            metavar="X,Y,Z,YAW",
         ),
-    ] = "0,0,-0.5,0",
+    ] = None,
     duration: Annotated[
         float | None, typer.Option(help="When to end, pool's clock [s]; never if not given.", min=0.0)
     ] = None,

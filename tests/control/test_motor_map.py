@@ -163,6 +163,9 @@ def test_outputs_that_cannot_be_are_refused():
         MotorMap.from_vehicle(FINSROV.replace({"thrusters.H_LF.motor_index": 3}))
     with pytest.raises(ControlError, match="lie in 0 to 7"):
         MotorMap.from_vehicle(FINSROV.replace({"thrusters.H_LF.motor_index": 8}))
-    bare = {"left": SimpleNamespace(motor_index=None, motor_sign=1)}
+    bare = {
+        "left": SimpleNamespace(motor_index=None, motor_sign=1),
+        "right": SimpleNamespace(motor_index=0, motor_sign=1),
+    }
     with pytest.raises(ControlError, match="'left' has no motor_index"):
         MotorMap.from_vehicle(SimpleNamespace(name="minnow", mcu=FINSROV.mcu, thrusters=bare))

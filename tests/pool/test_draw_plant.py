@@ -108,8 +108,9 @@ def test_a_realistic_plant_is_still_as_fast_as_the_vehicle(axis):
 
 def test_a_vehicle_without_what_the_pool_needs_is_refused():
     """The message says what is missing; so it does for an unknown severity."""
-    with pytest.raises(PlantSpecError, match="mcu"):
-        draw_plant(load_vehicle("bluerov2"), 0, "nominal")
+    blind = FINSROV.model_copy(update={"sensors": FINSROV.sensors.model_copy(update={"imu": None})})
+    with pytest.raises(PlantSpecError, match="has no sensors.imu"):
+        draw_plant(blind, 0, "nominal")
     with pytest.raises(PlantSpecError, match="available: nominal, realistic, hard"):
         draw_plant(FINSROV, 0, "cruel")
     other = FINSROV.model_copy(update={"thrusters": dict(list(FINSROV.thrusters.items())[:6])})

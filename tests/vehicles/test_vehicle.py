@@ -172,9 +172,9 @@ def test_the_hull_encloses_the_displaced_volume_about_the_centre_of_buoyancy(nam
 
 def test_an_unknown_set_is_answered_with_the_known_ones():
     with pytest.raises(
-        VehicleError, match="warpauv has no hydrodynamic set 'calibrated'; available: simplified"
+        VehicleError, match="lauv has no hydrodynamic set 'simplified'; available: calibrated"
     ):
-        load_vehicle("warpauv").hydrodynamic_set("calibrated")
+        load_vehicle("lauv").hydrodynamic_set("simplified")
 
 
 @pytest.mark.slow

@@ -78,20 +78,20 @@ class MotorMap:
 
     @classmethod
     def from_vehicle(cls, vehicle: Any) -> MotorMap:
-        """Map of a vehicle; without an `mcu` section canonical order, sign +1, and its fastest shaft as full scale.
+        """Map of a vehicle; canonical order where no thruster names a motor, sign +1 where it names none.
 
         Raises:
-            ControlError: There is an `mcu` section, but a thruster without `motor_index` or `motor_sign`.
+            ControlError: Only some thrusters have `motor_index` and `motor_sign`.
         """
         thrusters = list(vehicle.thrusters.values())
-        if vehicle.mcu is None:
-            fastest = max(max(t.rpm_max, -t.rpm_min) for t in thrusters)
-            n = len(thrusters)
-            return cls(thrusters, range(n), [1] * n, fastest, n)
+        if all(t.motor_index is None for t in thrusters):
+            signs = [t.motor_sign or 1 for t in thrusters]
+            mcu = vehicle.mcu
+            return cls(thrusters, range(len(thrusters)), signs, mcu.rpm_full_scale, mcu.outputs)
         for name, t in vehicle.thrusters.items():
             if t.motor_index is None or t.motor_sign is None:
                 raise ControlError(
-                    f"{vehicle.name}: thruster '{name}' has no motor_index or motor_sign, which an mcu needs: give both"
+                    f"{vehicle.name}: thruster '{name}' has no motor_index or motor_sign, others do: give both to each"
                 )
         index, sign = [t.motor_index for t in thrusters], [t.motor_sign for t in thrusters]
         return cls(thrusters, index, sign, vehicle.mcu.rpm_full_scale, vehicle.mcu.outputs)

@@ -199,11 +199,9 @@ def check_vehicle(trajectory: Trajectory, vehicle: Vehicle) -> None:
     """
     from finssim.vehicles.capability import terminal_speeds
 
-    if vehicle.safety is not None:
-        lower, upper = (
-            tuple(map(float, x)) for x in (vehicle.safety.workspace_lower, vehicle.safety.workspace_upper)
-        )
-        check_limits(trajectory, Limits(lower=lower, upper=upper))  # type: ignore[arg-type]
+    safety = vehicle.safety
+    lower, upper = (tuple(map(float, x)) for x in (safety.workspace_lower, safety.workspace_upper))
+    check_limits(trajectory, Limits(lower=lower, upper=upper))  # type: ignore[arg-type]
     t, reference = _samples(trajectory)
     speed = np.abs(quat_inverse_rotate(quat_from_yaw(reference.yaw), reference.velocity))
     able = terminal_speeds(vehicle)[:3]

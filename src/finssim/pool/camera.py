@@ -13,7 +13,7 @@ from finssim.localization.pool import Pool
 from finssim.pool.camera_corners import CornerCamera
 from finssim.pool.camera_pictures import PictureCamera
 from finssim.pool.exposures import Exposure, Mail, PoseAt, Shutter
-from finssim.pool.plant_spec import Basin, PlantSpecError
+from finssim.pool.plant_spec import Basin, PlantSpecError, basin_of
 from finssim.pool.site import CameraSettings
 from finssim.robot.messages import Picture
 from finssim.sensors.overhead_camera import Ripples
@@ -44,7 +44,7 @@ class PoolCamera:
             mode: pictures are rendered; corners are computed by the same optics without a picture, with what the
                 detector would make of ripples, pixel noise and tags that it would not find.
             settings: How it takes pictures, from `camera_of`.
-            basin: What the pictures show around the vehicle.
+            basin: What the pictures show around the vehicle; that of plants drawn around it if None.
             seed: Of ripples, noise, jitter and losses.
 
         Raises:
@@ -67,7 +67,7 @@ class PoolCamera:
                 tags,
                 site,
                 ripples,
-                basin=basin or Basin(),
+                basin=basin or basin_of(vehicle),
                 exposure=s.exposure,
                 seed=seed,
             )

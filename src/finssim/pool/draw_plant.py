@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.pool.plant_spec import PlantSpec, PlantSpecError, Severity
+from finssim.pool.plant_spec import PlantSpec, PlantSpecError, Severity, basin_of
 from finssim.pool.share import hull_share, less_share, panel_drag, steady_share
 from finssim.pool.spread import SPREADS, Spread
 from finssim.vehicles import Vehicle
+from finssim.vehicles.defaults import room
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 
 __all__ = ["draw_plant"]
@@ -27,7 +28,7 @@ def draw_plant(vehicle: Vehicle, seed: int, severity: Severity = "realistic") ->
     """A plant around the vehicle that stands in the pool; equal seeds give equal plants.
 
     Args:
-        vehicle: Its file, with a `calibrated` set, an `mcu` section, an IMU and a depth sensor.
+        vehicle: Its file, with a `calibrated` set, an IMU and a depth sensor.
         seed: 0 or more. A seed keeps its character over severities: what is strong in `realistic` is so in `hard`.
         severity: nominal, realistic or hard.
 
@@ -38,7 +39,6 @@ def draw_plant(vehicle: Vehicle, seed: int, severity: Severity = "realistic") ->
         raise PlantSpecError(f"unknown severity '{severity}'; available: {', '.join(SPREADS)}")
     hydro = vehicle.hydrodynamics.get("calibrated")
     needed = {
-        "mcu": vehicle.mcu,
         "sensors.imu": vehicle.sensors.imu,
         "sensors.depth": vehicle.sensors.depth,
         "hydrodynamics.calibrated": hydro,
@@ -56,6 +56,7 @@ def draw_plant(vehicle: Vehicle, seed: int, severity: Severity = "realistic") ->
         "severity": severity,
         "seed": seed,
         "vehicle": vehicle.name,
+        "basin": basin_of(vehicle),
         "body": _body(vehicle, spread, draw),
         "thrusters": _thrusters(vehicle, spread, draw),
         "propellers": {"own_share": spread.own_share, "induced_share": spread.induced_share},
@@ -185,8 +186,10 @@ def _circulation(spread: Spread, draw: _Draw) -> dict[str, Any]:
 
 
 def _tether(vehicle: Vehicle, spread: Spread, draw: _Draw) -> dict[str, Any] | None:
-    anchor = (draw.sign() * 2.0, draw.sign() * draw.within(0.6, 1.0), 0.3)
-    length, size = draw.within(*spread.tether), vehicle.body.size
+    size = vehicle.body.size
+    scale = room(size)
+    anchor = (scale * draw.sign() * 2.0, scale * draw.sign() * draw.within(0.6, 1.0), 0.3)
+    length = scale * draw.within(*spread.tether)
     weight = draw.around(spread.tether_weight)
     if not length:
         return None

@@ -55,7 +55,6 @@ class Firmware:
             now: Time of power-on [s].
         """
         mcu = vehicle.mcu
-        assert mcu is not None  # draw_plant refuses a vehicle without one
         self._timeout, self._outputs = mcu.command_timeout, mcu.outputs
         self._full = mcu.rpm_full_scale * RPM
         thrusters = list(vehicle.thrusters.values())

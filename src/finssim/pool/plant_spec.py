@@ -11,9 +11,11 @@ from pydantic import Field, ValidationError, field_validator
 from finssim.files import atomic_write
 from finssim.pool.coupled import Section, Three
 from finssim.pool.water_spec import AddedMass, BuoyancyDrift, Circulation, Damping, HullDrag, SlackTether
+from finssim.vehicles import Vehicle
+from finssim.vehicles.defaults import POOL, room
 from finssim.yaml_file import read_mapping
 
-__all__ = ["PlantSpec", "PlantSpecError", "Severity", "load_plant_spec"]
+__all__ = ["Basin", "PlantSpec", "PlantSpecError", "Severity", "basin_of", "load_plant_spec"]
 
 Severity = Literal["nominal", "realistic", "hard"]
 
@@ -31,6 +33,12 @@ class Basin(Section):
     """Along world y [m]."""
     depth: float = Field(default=1.0, gt=0.0)
     """[m]"""
+
+
+def basin_of(vehicle: Vehicle) -> Basin:
+    """The published pool; a larger one, of the same shape, for a vehicle that it has no room for."""
+    length, width, depth = (room(vehicle.body.size) * side for side in POOL)
+    return Basin(length=length, width=width, depth=depth)
 
 
 class TrueBody(Section):

@@ -107,14 +107,15 @@ def run(
     robot: str,
     pool_file: Path | None,
     truth: Path | None,
-    start: str,
+    start: str | None,
     duration: float | None,
     seed: int,
 ) -> None:
     """Run a virtual pool; arguments as of the command."""
     logging.basicConfig(level=logging.WARNING, format="finssim: %(message)s", stream=sys.stderr)
-    begin = station_of(start)
     plan = make_plan(vehicle, plant, severity, camera=camera, seed=seed)
+    start = start or f"0,0,{-0.5 * plan.spec.basin.depth:g},0"
+    begin = station_of(start)
     _check_start(begin, plan.spec.basin, start)
     if not 0 < port <= 65533:
         raise LinkError(f"port {port}: expected 1 to 65533, as the two after it are taken too")

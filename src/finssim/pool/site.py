@@ -12,7 +12,7 @@ import numpy.typing as npt
 from finssim.geometry.optics import Camera, Interface, Lens
 from finssim.geometry.rotations import quat_from_rotvec, quat_multiply
 from finssim.localization.pool import Pool
-from finssim.pool.plant_spec import Basin, PlantSpecError, Severity
+from finssim.pool.plant_spec import Basin, PlantSpecError, Severity, basin_of
 from finssim.vehicles import Vehicle
 from finssim.vehicles.equipment import Mount
 
@@ -135,7 +135,7 @@ def camera_of(
         vehicle: Has tags.
         seed: Of all errors; equal seeds give equal cameras.
         severity: How large they are: nominal has none.
-        basin: Of the plant.
+        basin: Of the plant; that of plants drawn around the vehicle if None.
 
     Returns:
         The pool as it is, the pool as its calibration has it, and the settings for `PoolCamera`.
@@ -148,7 +148,7 @@ def camera_of(
     if vehicle.tags is None:
         raise PlantSpecError(f"vehicle {vehicle.name} has no tags: a camera cannot find it, run without one")
     errors, random = ERRORS[severity], np.random.default_rng([seed, 0x517E])
-    true = true_site(basin)
+    true = true_site(basin or basin_of(vehicle))
     late = float(random.normal(0.0, errors.latency))
     settings = CameraSettings(
         latency=max(LATENCY + late, 0.01),

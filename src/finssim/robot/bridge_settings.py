@@ -73,7 +73,7 @@ class BridgeSettings:
 
     @classmethod
     def of(cls, vehicle: Vehicle, **changes: Any) -> BridgeSettings:
-        """Limits of a vehicle file; what it does not give keeps the default, without tilt limit and workspace.
+        """Limits of a vehicle's `safety` section.
 
         Args:
             vehicle: Its `safety` section and the slew limits of its thrusters are read.
@@ -88,13 +88,8 @@ class BridgeSettings:
             raise BridgeError(
                 f"no bridge setting {', '.join(unknown)}; available: {', '.join(sorted(known))}"
             )
-        own: dict[str, Any] = {
-            "slew": _slew(vehicle),
-            "workspace_lower": np.full(3, -math.inf),
-            "workspace_upper": np.full(3, math.inf),
-        }
-        if vehicle.safety is not None:
-            own.update({name: getattr(vehicle.safety, name) for name in FROM_FILE})
+        own: dict[str, Any] = {"slew": _slew(vehicle)}
+        own.update({name: getattr(vehicle.safety, name) for name in FROM_FILE})
         return replace(cls(**own), **changes) if changes else cls(**own)
 
 

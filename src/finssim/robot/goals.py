@@ -48,13 +48,11 @@ def guide_of(goal: str | None, trajectory: str | None) -> Guide:
 
 
 def check_reachable(guide: Guide, vehicle: Vehicle) -> None:
-    """Refuse a motion that leaves the box in which the vehicle file lets the vehicle move, if it gives one.
+    """Refuse a motion that leaves the box in which the vehicle may move.
 
     Raises:
         GoalError: It does; says where.
     """
-    if vehicle.safety is None:
-        return
     end = guide.duration if math.isfinite(guide.duration) else 0.0
     places = guide.at(np.linspace(0.0, end, 401)).position
     lower, upper = vehicle.safety.workspace_lower, vehicle.safety.workspace_upper

@@ -78,6 +78,12 @@ def run(
     wiring, console = wiring or Wiring(), Console(stderr=True)
     ours, guide = load_vehicle(vehicle), guide_of(goal, trajectory)
     check_reachable(guide, ours)
+    if ours.defaults:
+        console.print(
+            f"{ours.name}: {', '.join(ours.defaults)} are defaults, fit for the virtual world; give a real vehicle "
+            "its own in the file",
+            highlight=False,
+        )
     pilot = _pilot(policy, ours, task, trim, agent=agent, follows=trajectory is not None)
     pool = load_pool(pool_file)
     perception = Perception(ours, pool, mode=mode)

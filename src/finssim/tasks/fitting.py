@@ -6,11 +6,9 @@ from dataclasses import dataclass
 
 from finssim.vehicles import HydrodynamicSet, Vehicle
 from finssim.vehicles.capability import terminal_speeds
+from finssim.vehicles.defaults import room
 
 __all__ = ["Fit", "coefficients_of", "driven_axes", "fit"]
-
-LENGTH = 0.6
-"""Vehicles up to this long have the published pool, which FinsROV (0.56 m) fits [m]; for others everything grows."""
 
 SLOWEST_SPEED = 0.22
 """Terminal speed of FinsROV's slowest direction, heave [m/s]: the published speeds are a part of it."""
@@ -46,7 +44,7 @@ def coefficients_of(vehicle: Vehicle) -> str:
 
 def fit(vehicle: Vehicle) -> Fit:
     """Room in proportion to the vehicle's length, speeds in proportion to the room or to what it can do, the lesser."""
-    size = max(1.0, float(max(vehicle.body.size)) / LENGTH)
+    size = room(vehicle.body.size)
     speeds = terminal_speeds(vehicle, coefficients_of(vehicle))[list(driven_axes(vehicle))]
     slowest = float(speeds.min()) if len(speeds) else 0.0
     return Fit(size, min(size, slowest / SLOWEST_SPEED), max(1.0, float(vehicle.body.mass) / MASS))

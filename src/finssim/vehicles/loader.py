@@ -68,6 +68,9 @@ def with_changes(vehicle: Vehicle, changes: Mapping[str, Any], provenance: Prove
     """See `Vehicle.replace`."""
     values, origins = vehicle.values(), dict(vehicle.provenance)
     for path, value in changes.items():
+        section, inner, _ = path.partition(".")
+        if inner and section in vehicle.defaults:  # what is changed in a part is kept as a whole
+            values.setdefault(section, getattr(vehicle, section).values())
         for full in _set(values, path.split("."), value, vehicle.name):
             for key in [key for key in origins if key == full or key.startswith(full + ".")]:
                 del origins[key]
@@ -132,6 +135,10 @@ def _merged(base: Any, change: Any, path: tuple[str, ...], origins: Origins) -> 
             if value is None:
                 result.pop(key, None)
                 _forget(inner, origins)
+                if inner == (
+                    "tags",
+                ):  # a vehicle may have none; every other section left out has its default
+                    result[key] = None
             else:
                 result[key] = _merged(base.get(key), value, inner, origins)
         return result

@@ -14,6 +14,7 @@ from rich.text import Text
 
 from finssim.vehicles.capability import restoring, terminal_speeds, time_constants, wrench_capability
 from finssim.vehicles.check import check_vehicle
+from finssim.vehicles.defaults import DEFAULTS
 from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
 from finssim.vehicles.loader import catalogue, load_vehicle
 from finssim.vehicles.vehicle import AXES, ORIGINS, Vehicle
@@ -76,6 +77,8 @@ def print_vehicle(vehicle: Vehicle, console: Console, picture: Path | None = Non
     console.print(_thrusters(vehicle))
     console.print(_performance(vehicle))
     console.print(_sources(vehicle))
+    if vehicle.defaults:
+        console.print(_defaults(vehicle))
     console.print(_findings(vehicle))
     if picture is not None:
         from finssim.vehicles.picture import draw_vehicle  # Matplotlib is slow to import
@@ -221,6 +224,14 @@ def _sources(vehicle: Vehicle) -> Table:
     for (origin, source, note), paths in entries.items():
         shown = paths[0] if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
         table.add_row(escape(shown), origin, escape("; ".join(filter(None, [source, note]))))
+    return table
+
+
+def _defaults(vehicle: Vehicle) -> Table:
+    table = _table("Defaults (the file does not give these: for the virtual world; measure your own)")
+    table.add_column("what stands for it", overflow="fold")
+    for name in vehicle.defaults:
+        table.add_row(name, escape(DEFAULTS[name]))
     return table
 
 

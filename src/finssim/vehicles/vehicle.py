@@ -15,6 +15,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from finssim.vehicles.body import Body, Hull, Water, moved_to_origin, skew
 from finssim.vehicles.calibration_record import CalibrationRecord
+from finssim.vehicles.defaults import DEFAULTS, default_mcu, default_safety, default_sensors, default_tags
 from finssim.vehicles.equipment import Mcu, Safety, Sensors, Tags
 from finssim.vehicles.errors import VehicleError
 from finssim.vehicles.hydrodynamics import AnyHydrodynamicSet, HydrodynamicSet, MeshSet
@@ -56,10 +57,11 @@ class Vehicle(Part):
     """Axes the thrusters are there to control; the others are left to the water (an underactuated vehicle)."""
     wrench_reference: Vector3 = Field(default_factory=lambda given: given["body"].center_of_gravity)
     """Body point about which wrenches are commanded [m], (3,); the centre of gravity where the file gives none."""
-    sensors: Sensors = Field(default_factory=Sensors)
-    tags: Tags | None = None
-    mcu: Mcu | None = None
-    safety: Safety | None = None
+    sensors: Sensors = Field(default_factory=default_sensors)
+    tags: Tags | None = Field(default_factory=default_tags)
+    """None only where a file takes them off: `tags: null`."""
+    mcu: Mcu = Field(default_factory=default_mcu)
+    safety: Safety = Field(default_factory=default_safety)
     calibrations: tuple[CalibrationRecord, ...] = ()
     """How its numbers were fitted to trials, oldest first; not part of `sha256`."""
     name: str = Field(exclude=True)
@@ -97,6 +99,16 @@ class Vehicle(Part):
                     f"hydrodynamics.{name}: needs a hull: give 'hull: {{parametric: true}}' or a mesh file"
                 )
         return self
+
+    @property
+    def defaults(self) -> tuple[str, ...]:
+        """Sections that the file leaves out and that `finssim.vehicles.defaults` gives; not part of `sha256`."""
+        return tuple(name for name in DEFAULTS if name not in self.model_fields_set)
+
+    @property
+    def file_tags(self) -> Tags | None:
+        """The tags that the file gives: what a real camera may look for; None where they are none or defaults."""
+        return None if "tags" in self.defaults else self.tags
 
     # -- numbers that follow directly -------------------------------------------------------------------------
 

@@ -28,7 +28,7 @@ def box_of(
     if basin is not None:
         half = np.array([0.5 * basin[0], 0.5 * basin[1]])
         return np.array([*-half, -basin[2]]), np.array([*half, 0.0])
-    if vehicle.safety is not None:
+    if "safety" not in vehicle.defaults:
         lower = np.array(vehicle.safety.workspace_lower, float)
         upper = np.array(vehicle.safety.workspace_upper, float)
         if np.isfinite([lower, upper]).all():

@@ -75,7 +75,6 @@ def _play(job: FaultJob, record: Path) -> dict[str, Any]:
     scenario = SCENARIOS[job.scenario]
     fault, (start, goal, when) = scenario.faults[job.variant], MOTIONS[job.motion]
     vehicle = load_vehicle(job.vehicle)
-    assert vehicle.safety is not None  # FaultJob.key was asked before
     box = inset(vehicle.safety.workspace_lower, vehicle.safety.workspace_upper)
     settings = BridgeSettings.of(
         vehicle, **{"workspace_lower": box[0], "workspace_upper": box[1], **scenario.settings}

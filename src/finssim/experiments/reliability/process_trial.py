@@ -125,7 +125,6 @@ def _kill_robot(job: FaultJob, pair: _Pair) -> dict[str, Any]:
     time.sleep(WATCHED)
     pair.pool.end()
     truth, safety = read_truth(pair.truth), load_vehicle(job.vehicle).safety
-    assert safety is not None
     course = Course(truth.time, truth.position, truth.thrust, np.full(len(truth.time), math.nan))
     box = inset(safety.workspace_lower, safety.workspace_upper)
     return {

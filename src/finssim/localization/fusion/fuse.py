@@ -15,7 +15,7 @@ from finssim.files import atomic_write, refuse_unwritable
 from finssim.localization.detection.detections import Frame
 from finssim.localization.errors import LocalizationError
 from finssim.localization.fusion.estimator import Estimator
-from finssim.localization.fusion.fuse_detections import Fixes, check_method
+from finssim.localization.fusion.fuse_detections import NO_TAGS, Fixes, check_method
 from finssim.localization.fusion.fuse_log import Log, NoFix, load_log
 from finssim.localization.fusion.fuse_output import row_of, summary_lines, summary_of, write_rows
 from finssim.localization.fusion.fuse_settings import settings_of, site_of
@@ -121,6 +121,8 @@ def fuse(
         raise LocalizationError(
             "mode error-state needs accelerations with gravity (ax, ay, az beside p, q, r): use constant-velocity"
         )
+    if log.frames and vehicle.file_tags is None:  # defaults are for the virtual world
+        raise LocalizationError(NO_TAGS)
     fixes = Fixes(pool, vehicle, method=method, pixel_std=pixel_std) if log.frames else None
     deliveries = _deliveries(log)
     found = Run()

@@ -18,7 +18,9 @@ from finssim.localization.poses.measurement import Constraints
 from finssim.localization.poses.methods import METHODS, NEEDS_DEPTH
 from finssim.vehicles import Vehicle
 
-__all__ = ["Fixes", "check_method"]
+__all__ = ["NO_TAGS", "Fixes", "check_method"]
+
+NO_TAGS = "the vehicle file has no tags: add a section tags: with family, edge and mounts"
 
 
 def check_method(method: str) -> None:
@@ -49,9 +51,7 @@ class Fixes:
         """
         check_method(method)
         if vehicle.tags is None:
-            raise LocalizationError(
-                "the vehicle file has no tags: add a section tags: with family, edge and mounts"
-            )
+            raise LocalizationError(NO_TAGS)
         if not (math.isfinite(pixel_std) and pixel_std > 0.0):
             raise LocalizationError(
                 f"pixel_std is {pixel_std}, expected the error of a corner in pixels, such as 0.3"

@@ -50,7 +50,8 @@ class Locator:
                 f"method {method} needs --depth FILE (columns t, depth) or --depth METRES, the depth of the pressure "
                 "port; --method refractive-6dof does without"
             )
-        if vehicle.tags is None:
+        tags = vehicle.file_tags
+        if tags is None:
             raise LocalizationError(
                 f"{vehicle.name}: the vehicle file has no tags: add a section tags: with family, edge and mounts"
             )
@@ -58,9 +59,9 @@ class Locator:
             raise LocalizationError(
                 f"pixel_std is {pixel_std}, expected the error of a corner in pixels, such as 0.3"
             )
-        self.known, self.family = known, family_named(family or vehicle.tags.family).name
+        self.known, self.family = known, family_named(family or tags.family).name
         self._pool, self._method, self._pixel_std = pool, method, pixel_std
-        self._tags_b = tag_corners_b(vehicle.tags)
+        self._tags_b = tag_corners_b(tags)
 
     @property
     def tags(self) -> tuple[int, ...]:

@@ -69,7 +69,8 @@ def calibrate_mounts(
     """
     if estimate not in ESTIMATES:
         raise CalibrationError(f"unknown estimate '{estimate}'; available: {', '.join(ESTIMATES)}")
-    if vehicle.tags is None:
+    tags = vehicle.file_tags
+    if tags is None:
         raise CalibrationError(
             f"{vehicle.name} has no tags: give its file a section tags with edge and one mount"
         )
@@ -79,13 +80,13 @@ def calibrate_mounts(
         )
     mounts = {
         tag: Pose(quat_to_matrix(mount.orientation), np.asarray(mount.position, float))
-        for tag, mount in vehicle.tags.mounts.items()
+        for tag, mount in tags.mounts.items()
     }
     depth = vehicle.sensors.depth
     blind = log.moments()
     rig = Rig(
         pool=pool,
-        corners_t=corners(vehicle.tags.edge),
+        corners_t=corners(tags.edge),
         port=np.zeros(3) if depth is None else np.asarray(depth.position, float),
         reference=reference_tag(blind, mounts),
         centre=None if centre is None else np.asarray(centre, float),

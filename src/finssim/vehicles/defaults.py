@@ -1,0 +1,95 @@
+"""What stands for the sections `sensors`, `tags`, `mcu` and `safety` where a vehicle file leaves them out.
+
+They make every vehicle fit for the virtual world. None of them is known of the real one: `finssim vehicles show` lists
+them as defaults, and what reads records of real water refuses tags that the file does not give.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from finssim.vehicles.equipment import DepthSensor, Imu, Mcu, Mount, Safety, Sensors, Tags
+
+__all__ = ["DEFAULTS", "default_mcu", "default_safety", "default_sensors", "default_tags", "room"]
+
+LENGTH = 0.6
+"""Vehicles up to this long have the published pool, which FinsROV (0.56 m) fits [m]; for others everything grows."""
+POOL = (4.0, 2.0, 1.0)
+"""The published pool: length, width and depth [m]."""
+EDGE = (0.2, 0.4)
+"""Largest edge of a tag, part of the vehicle's length and of its width: two with their margins fit on the top."""
+APART = 0.15
+"""Of a tag from the middle of the top, part of the vehicle's length."""
+QUARTER_TURN = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
+
+DEFAULTS: Mapping[str, str] = {
+    "sensors": "IMU and pressure gauge of a small MEMS unit, at the body origin",
+    "tags": "two tag25h9 (15 ahead, 16 astern) on the middle of the top, as large as it takes, as on FinsROV",
+    "mcu": "an output for each thruster in the order of the file, positive forward; full scale is the fastest shaft",
+    "safety": "silences of 0.5 s; 45 degrees of tilt, 60 for a vehicle that does not control its heave; the published "
+    "pool, scaled to the vehicle's length",
+}
+"""Section -> what stands for it where a file leaves it out."""
+
+
+def room(size: Any) -> float:
+    """Factor on the published pool, goals and trajectories for a vehicle of this envelope [m], (3,)."""
+    return max(1.0, float(max(size)) / LENGTH)
+
+
+def default_sensors() -> Sensors:
+    """The catalogue's guess of a MEMS unit, as in `finsrov.yaml`."""
+    origin = np.zeros(3)
+    return Sensors(
+        imu=Imu(
+            rate=100.0,
+            position=origin,
+            gyro_noise_density=2.5e-4,
+            gyro_bias_walk=2.0e-5,
+            gyro_bias_initial=5.0e-3,
+            accel_noise_density=1.7e-3,
+            accel_bias_walk=1.0e-4,
+            accel_bias_initial=0.05,
+        ),
+        depth=DepthSensor(rate=20.0, position=origin, noise_std=0.005, bias_initial=0.01, quantisation=0.002),
+    )
+
+
+def default_tags(given: Mapping[str, Any]) -> Tags:
+    """Two tags on top of the envelope, about the centre of buoyancy, which is the middle of the hull."""
+    length, width, height = given["body"].size
+    x, y, z = given["body"].center_of_buoyancy
+    top = float(z + 0.5 * height)
+    mounts = {
+        tag: Mount(position=np.array([x + side * APART * length, y, top]), orientation=np.array(QUARTER_TURN))
+        for tag, side in ((15, 1.0), (16, -1.0))
+    }
+    return Tags(family="tag25h9", edge=float(min(EDGE[0] * length, EDGE[1] * width)), mounts=mounts)
+
+
+def default_mcu(given: Mapping[str, Any]) -> Mcu:
+    """Outputs enough for the motors that the thrusters name, or for one each."""
+    thrusters = given["thrusters"].values()
+    named = [t.motor_index + 1 for t in thrusters if t.motor_index is not None]
+    fastest = max(max(t.rpm_max, -t.rpm_min) for t in thrusters)
+    return Mcu(rpm_full_scale=fastest, command_timeout=0.5, outputs=max(len(thrusters), *named, 1))
+
+
+def default_safety(given: Mapping[str, Any]) -> Safety:
+    """Limits by class: a vehicle that hovers, or one that needs way on to dive and may pitch further for it."""
+    hovers = "heave" in given["controlled_axes"]
+    length, width, depth = (room(given["body"].size) * side for side in POOL)
+    return Safety(
+        command_timeout=0.5,
+        telemetry_timeout=0.5,
+        state_timeout=0.5,
+        command_rate=20.0,
+        max_tilt=math.radians(45.0 if hovers else 60.0),
+        max_tilt_duration=1.0,
+        workspace_lower=np.array([-0.5 * length, -0.5 * width, -depth]),
+        workspace_upper=np.array([0.5 * length, 0.5 * width, 0.0]),
+    )

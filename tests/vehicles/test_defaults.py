@@ -1,0 +1,90 @@
+"""What stands for the sections that a vehicle file leaves out."""
+
+from __future__ import annotations
+
+import io
+import math
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from finssim.calibration.output.vehicle_file import write_vehicle
+from finssim.geometry.rotations import quat_to_matrix
+from finssim.pool.draw_plant import draw_plant
+from finssim.pool.plant_spec import Basin, basin_of
+from finssim.pool.site import camera_of
+from finssim.vehicles import catalogue, load_vehicle
+from finssim.vehicles.defaults import DEFAULTS
+from finssim.vehicles.show import print_vehicle
+
+
+@pytest.mark.parametrize("name", catalogue())
+def test_tags_lie_on_the_top_and_face_up(name):
+    """Two tags whose margins do not meet, on the envelope, printed side up."""
+    vehicle = load_vehicle(name)
+    tags, half = vehicle.tags, 0.5 * vehicle.body.size
+    first, second = (np.asarray(mount.position) for mount in tags.mounts.values())
+    assert np.linalg.norm(first - second) > 9.0 / 7.0 * tags.edge
+    for mount in tags.mounts.values():
+        np.testing.assert_allclose(quat_to_matrix(mount.orientation)[:, 2], [0.0, 0.0, 1.0], atol=1e-7)
+        if "tags" in vehicle.defaults:
+            place = np.asarray(mount.position) - vehicle.body.center_of_buoyancy
+            assert place[2] == pytest.approx(half[2])
+            assert np.all(np.abs(place[:2]) + 0.5 * tags.edge <= half[:2])
+
+
+@pytest.mark.parametrize("name", [name for name in catalogue() if name not in ("lauv", "remus100")])
+def test_every_vehicle_that_hovers_has_a_pool(name):
+    """A plant and a camera, a basin that the hull fits in, and a workspace as large as the basin."""
+    vehicle = load_vehicle(name)
+    spec = draw_plant(vehicle, 1, "realistic")
+    camera_of(vehicle, 1, "realistic")
+    assert min(spec.basin.width, spec.basin.length) > 2.0 * math.hypot(*vehicle.body.size[:2])
+    assert spec.basin == basin_of(vehicle)
+    if "safety" in vehicle.defaults:
+        np.testing.assert_allclose(
+            vehicle.safety.workspace_upper[:2], [spec.basin.length / 2, spec.basin.width / 2]
+        )
+        assert vehicle.safety.workspace_lower[2] == -spec.basin.depth
+
+
+def test_the_published_vehicle_has_the_published_pool():
+    """FinsROV gives everything itself and keeps its pool of 4 m x 2 m x 1 m."""
+    vehicle = load_vehicle("finsrov")
+    assert vehicle.defaults == () and basin_of(vehicle) == Basin()
+
+
+def test_defaults_are_no_part_of_the_digest_or_the_file(tmp_path):
+    """A vehicle written to a file and read again has the same defaults and the same digest, and no section of them."""
+    vehicle = load_vehicle("rexrov")
+    assert vehicle.defaults == tuple(DEFAULTS)
+    write_vehicle(vehicle, tmp_path / "copy.yaml")
+    again = load_vehicle(tmp_path / "copy.yaml")
+    assert again.sha256 == vehicle.sha256 and again.defaults == vehicle.defaults
+    assert again.tags == vehicle.tags and again.mcu == vehicle.mcu
+
+
+def test_one_number_of_a_default_can_be_changed():
+    """The rest of its section then stays what it was and belongs to the vehicle."""
+    vehicle = load_vehicle("bluerov2_heavy")
+    changed = vehicle.replace({"safety.max_tilt": 0.5, "tags.edge": 0.05})
+    assert changed.safety.max_tilt == 0.5 and changed.safety.command_rate == vehicle.safety.command_rate
+    assert changed.tags.mounts.keys() == vehicle.tags.mounts.keys() and changed.tags.edge == 0.05
+    assert changed.defaults == ("mcu",) and changed.file_tags is changed.tags
+
+
+def test_tags_can_be_taken_off(tmp_path):
+    """`tags: null` is a vehicle without, and a default is none that a real camera may look for."""
+    (tmp_path / "bare.yaml").write_text("extends: bluerov2\ntags: null\n", encoding="utf-8")
+    assert load_vehicle(tmp_path / "bare.yaml").tags is None
+    assert load_vehicle("bluerov2").file_tags is None
+
+
+def test_show_says_which_sections_are_defaults():
+    """Each with what stands for it; of a vehicle that gives all of them, nothing."""
+    for name, said in (("bluerov2_heavy", True), ("finsrov", False)):
+        console = Console(record=True, width=200, file=io.StringIO())
+        print_vehicle(load_vehicle(name), console)
+        text = console.export_text()
+        assert ("Defaults" in text) is said and ("15 ahead" in text) is said
