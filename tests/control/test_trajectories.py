@@ -146,3 +146,13 @@ def test_what_is_no_trajectory_is_refused():
         load_trajectory("circle", heading="north")
     with pytest.raises(ControlError, match="duration is"):
         replace(TRAJECTORIES["circle"], duration=0.0)
+
+
+@EVERY
+def test_a_published_trajectory_grows_with_the_vehicle(name):
+    """Its way and its speed, not its time; FinsROV's is the published one."""
+    published, own = TRAJECTORIES[name], load_trajectory(name, vehicle=load_vehicle("rexrov"))
+    t = np.linspace(0.0, published.duration, 50)
+    for part in ("position", "velocity"):
+        np.testing.assert_allclose(getattr(own.at(t), part), 2.6 / 0.6 * getattr(published.at(t), part))
+    assert load_trajectory(name, vehicle=FINSROV) is published

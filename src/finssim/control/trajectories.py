@@ -16,6 +16,7 @@ from finssim.control.guidance import Reference
 from finssim.control.trajectory_shapes import DEPTH, Motion, circle, ellipse, gerono, helix, polyline
 from finssim.geometry.rotations import quat_from_yaw, quat_inverse_rotate, wrap_angle
 from finssim.vehicles import Vehicle
+from finssim.vehicles.defaults import room
 
 __all__ = [
     "PUBLISHED_LIMITS",
@@ -74,6 +75,15 @@ class Trajectory:
         velocity = np.where(moving[..., None], velocity, 0.0)
         return Reference(position, velocity, self._yaw(inside), inside / self.duration)
 
+    def scaled(self, factor: float) -> Trajectory:
+        """The same way in the same time, with lengths, depth and speeds times a factor."""
+
+        def motion(t: Array) -> tuple[Array, Array]:
+            position, velocity = self.motion(t)
+            return factor * position, factor * velocity
+
+        return self if factor == 1.0 else replace(self, motion=motion)
+
     def _yaw(self, t: Array) -> Array:
         if self.heading == "fixed":
             turned = 0.0 if self.turning is None else self.turning(t)
@@ -122,14 +132,15 @@ def load_trajectory(
         name_or_file: Key of `TRAJECTORIES`, or a file as `control.trajectory_file` reads it.
         heading: Keep one heading, or look along the way; as the trajectory has it if None.
         yaw: That heading, or the angle to the way [rad]; as the trajectory has it if None.
-        vehicle: Refuse a trajectory that this vehicle cannot follow or that leaves its workspace.
+        vehicle: Scales a published trajectory by the room that the vehicle needs (1 for FinsROV); one that it cannot
+            follow or that leaves its workspace is refused.
 
     Raises:
         ControlError: No such trajectory, a file that is wrong, or a vehicle that cannot.
     """
     name = PUBLISHED_NAMES.get(str(name_or_file), str(name_or_file))
     if name in TRAJECTORIES:
-        trajectory = TRAJECTORIES[name]
+        trajectory = TRAJECTORIES[name].scaled(1.0 if vehicle is None else room(vehicle.body.size))
     elif Path(name_or_file).is_file():
         from finssim.control.trajectory_file import read_trajectory
 

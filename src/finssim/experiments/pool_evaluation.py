@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from finssim.control.controllers import CONTROLLERS
 from finssim.control.policy import Policy
 from finssim.experiments.evaluate import Evaluation
 from finssim.experiments.metrics import summarize
-from finssim.experiments.setpoints import T1_SETPOINTS
+from finssim.experiments.setpoints import T1_SETPOINTS, in_room
 from finssim.experiments.transfer.job import Job
 from finssim.experiments.transfer.series import read_series
 from finssim.experiments.trials import DURATION, Trials
@@ -53,12 +52,10 @@ def pool_evaluation(jobs: Sequence[Job], results: Sequence[Mapping[str, Any]], f
     """
     first = jobs[0]
     vehicle = load_vehicle(first.vehicle)
-    goals = {job.target: T1_SETPOINTS[job.target] for job in jobs}
     measures = [
         {
             "trial": i,
             "setpoint": job.target,
-            "goal": [*goals[job.target][:3].tolist(), math.degrees(goals[job.target][3])],
             **{key: value for key, value in result.items() if key not in ("job", "key", "provenance")},
         }
         for i, (job, result) in enumerate(zip(jobs, results, strict=True))
@@ -109,5 +106,6 @@ def _trials(jobs: Sequence[Job], paths: Sequence[Path]) -> Trials:
         for axis in range(3):
             position[inside, i, axis] = np.interp(t[inside], series["t"], series["position"][:, axis])
         yaw[inside, i] = np.interp(t[inside], series["t"], np.unwrap(series["yaw"]))
-    goals = np.array([T1_SETPOINTS[job.target] for job in jobs])
+    standing = load_vehicle(jobs[0].pool_vehicle)
+    goals = np.array([in_room(T1_SETPOINTS[job.target], standing) for job in jobs])
     return Trials(tuple(job.target for job in jobs), goals, t, position, yaw)

@@ -8,7 +8,10 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["T1_PUBLISHED", "T1_SETPOINTS", "T1_START", "from_published"]
+from finssim.vehicles import Vehicle
+from finssim.vehicles.defaults import room
+
+__all__ = ["T1_PUBLISHED", "T1_SETPOINTS", "T1_START", "from_published", "in_room"]
 
 T1_PUBLISHED = MappingProxyType(
     {
@@ -53,3 +56,9 @@ T1_SETPOINTS = MappingProxyType({name: from_published(setpoint) for name, setpoi
 
 T1_START = from_published((0.0, -0.5, 0.0, 0.0))
 """Pose at the start of every trial [x, y, z [m], yaw [rad]], world frame, at rest and level."""
+
+
+def in_room(pose: NDArray[np.float64], vehicle: Vehicle) -> NDArray[np.float64]:
+    """A published pose [x, y, z [m], yaw [rad]] in the pool that this vehicle needs: places grow with it, yaw stays."""
+    size = room(vehicle.body.size)
+    return pose * np.array([size, size, size, 1.0])

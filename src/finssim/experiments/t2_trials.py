@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from finssim.control.guidance import Guide, acceleration_at
 from finssim.control.tracking import Goal
-from finssim.control.trajectories import TRAJECTORIES
+from finssim.control.trajectories import load_trajectory
 from finssim.engine import Recorder
 from finssim.experiments.plants import Plant
 from finssim.experiments.players import Player
@@ -97,7 +97,7 @@ def run_tracking(
         crash_directory: Where the last states of a world that broke are written.
         show: Called with the part done.
     """
-    ways = guides or [TRAJECTORIES[name] for name in T2_TRAJECTORIES]
+    ways = guides or [load_trajectory(name, vehicle=vehicle) for name in T2_TRAJECTORIES]
     chosen = tuple(ways[i % len(ways)] for i in range(trials))
     longest = max(guide.duration for guide in chosen)
     environment = Environment(

@@ -17,7 +17,7 @@ from finssim.engine import Recorder
 from finssim.experiments.metrics import measure_trial
 from finssim.experiments.plants import Plant
 from finssim.experiments.players import Player
-from finssim.experiments.setpoints import T1_SETPOINTS, T1_START
+from finssim.experiments.setpoints import T1_SETPOINTS, T1_START, in_room
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.tasks import Environment, Task
 from finssim.vehicles import Vehicle
@@ -93,7 +93,8 @@ def run_trials(
         show: Called with the part done.
     """
     names = tuple(list(T1_SETPOINTS)[i % len(T1_SETPOINTS)] for i in range(trials))
-    goals = np.array([T1_SETPOINTS[name] for name in names])
+    goals = np.array([in_room(T1_SETPOINTS[name], vehicle) for name in names])
+    start = in_room(T1_START, vehicle)
     environment = Environment(
         replace(task, control_step=player.period, substeps=math.ceil(player.period / PHYSICS_STEP - 1e-9)),
         plant.changed(vehicle),
@@ -107,7 +108,7 @@ def run_trials(
         crash_directory=crash_directory,
         **plant.environment_arguments(),
     )
-    environment.start(T1_START[:3], quat_from_yaw(T1_START[3]), goals[:, :3], quat_from_yaw(goals[:, 3]))
+    environment.start(start[:3], quat_from_yaw(start[3]), goals[:, :3], quat_from_yaw(goals[:, 3]))
     with nullcontext() if record is None else Recorder(environment.simulator, record) as recorder:
         t, position, yaw = _play(player, environment, goals, recorder, show)
     return Trials(names, goals, t, position, yaw)

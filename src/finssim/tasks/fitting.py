@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from finssim.engine import Pool
 from finssim.vehicles import HydrodynamicSet, Vehicle
 from finssim.vehicles.capability import terminal_speeds
-from finssim.vehicles.defaults import room
+from finssim.vehicles.defaults import POOL, room
 
 __all__ = ["Fit", "coefficients_of", "driven_axes", "fit"]
 
@@ -27,6 +28,17 @@ class Fit:
     """On speeds and accelerations."""
     weight: float = 1.0
     """On masses and stiffnesses."""
+
+    def pool(self) -> Pool:
+        """The paper's pool, in proportion, with walls as stiff for the vehicle as they are for FinsROV."""
+        length, width, depth = (self.size * side for side in POOL)
+        return Pool(
+            length=length,
+            width=width,
+            depth=depth,
+            stiffness=4000.0 * self.weight,
+            damping=100.0 * self.weight,
+        )
 
 
 def driven_axes(vehicle: Vehicle) -> tuple[int, ...]:

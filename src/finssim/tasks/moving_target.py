@@ -26,6 +26,7 @@ from finssim.tasks.terms import (
     goal_offset,
     length,
     linear_velocity,
+    out_of_pool,
     tilted,
     turn_rates,
     uniform3,
@@ -149,13 +150,6 @@ def spin(state: State, w: int) -> float:
 
 
 @wp.func
-def out_of_pool(state: State, p: Any, w: int) -> bool:
-    """Beyond `bounds`, above `ceiling` or below `depth`, in proportion to the vehicle."""
-    x = state.position[w, 0] / p.fit.size
-    return wp.abs(x[0]) > p.bounds[0] or wp.abs(x[1]) > p.bounds[1] or x[2] > p.ceiling or x[2] < -p.depth
-
-
-@wp.func
 def with_target(state: State, p: Any, w: int, e: float, u: float) -> bool:
     """Near enough, as fast as the target, and not turning."""
     close = e <= p.fit.size * p.tolerance
@@ -252,11 +246,8 @@ class MovingTarget(Task):
         return replace(self, fit=fit(vehicles[0]))
 
     def arena(self) -> Pool:
-        """The paper's pool, in proportion, with walls as stiff for the vehicle as they are for FinsROV."""
-        size, weight = self.fit.size, self.fit.weight
-        return Pool(
-            length=4.0 * size, width=2.0 * size, depth=size, stiffness=4000.0 * weight, damping=100.0 * weight
-        )
+        """See `Fit.pool`."""
+        return self.fit.pool()
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """Room for every target's motion."""

@@ -1,13 +1,16 @@
 """T1, station keeping: reach a pose in the pool and hold it within 0.10 m per axis and 10° (paper, section IV)."""
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import warp as wp
 
+from finssim.engine import Pool
 from finssim.engine.state import State
 from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.fitting import Fit, fit
 from finssim.tasks.measurement import MeasurementNoise
 from finssim.tasks.task import ObservationPart, Task
 from finssim.tasks.terms import (
@@ -21,13 +24,14 @@ from finssim.tasks.terms import (
     goal_offset,
     length,
     linear_velocity,
-    out_of_box,
+    out_of_pool,
     straight,
     tilted,
     turn_rates,
     turning,
     uniform3,
 )
+from finssim.vehicles import Vehicle
 
 DISTANCE_SCALE = 3.0
 """Distances are divided by this in the observation [m]."""
@@ -78,7 +82,7 @@ def position_error(state: State, arrays: TaskArrays, w: int) -> float:
 @wp.func
 def near(p: Any, e: float) -> float:
     """exp(-e / position_scale)."""
-    return wp.exp(-e / p.reward.position_scale)
+    return wp.exp(-e / (p.fit.size * p.reward.position_scale))
 
 
 @wp.func
@@ -107,8 +111,9 @@ def within_tolerance(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
     """A goal pose, a start pose and velocity."""
     pi = 3.14159265
-    arrays.goal_position[w] = uniform3(wp.rand_init(key, 4 * w), p.goal_low, p.goal_high)
-    state.position[w, 0] = uniform3(wp.rand_init(key, 4 * w + 1), p.spawn_low, p.spawn_high)
+    size = p.fit.size
+    arrays.goal_position[w] = uniform3(wp.rand_init(key, 4 * w), size * p.goal_low, size * p.goal_high)
+    state.position[w, 0] = uniform3(wp.rand_init(key, 4 * w + 1), size * p.spawn_low, size * p.spawn_high)
     most = wp.vec3(p.tilt, p.tilt, pi)
     angles = uniform3(wp.rand_init(key, 4 * w + 2), -most, most)
     rng = wp.rand_init(key, 4 * w + 3)
@@ -124,12 +129,17 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 
 @dataclass(frozen=True, kw_only=True)
 class StationKeeping(Task):
-    """T1. Lengths in metres, angles in radians, world frame with z up and 0 on the water."""
+    """T1. Lengths in metres, angles in radians, world frame with z up and 0 on the water.
+
+    A longer vehicle has goals, starts and pool `fit.size` times as large; the tolerance stays.
+    """
 
     succeeds: ClassVar[str] = "held"
     title: ClassVar[str] = "reach a pose in the pool and hold it"
     name: str = "t1"
     observation: tuple[ObservationPart, ...] = OBSERVATION
+    fit: Fit = Fit()
+    """Of lengths to the vehicle; the environment sets it."""
     goal_low: tuple[float, float, float] = (-1.2, -0.5, -0.82)
     """Goals are uniform in this box; yaw is uniform over the circle, roll and pitch are level."""
     goal_high: tuple[float, float, float] = (1.2, 0.5, -0.28)
@@ -159,6 +169,14 @@ class StationKeeping(Task):
     )
     """About what an estimate is off by, and how late it comes: with exact states, gains are learnt that chatter."""
 
+    def fitted(self, vehicles: Sequence[Vehicle]) -> "StationKeeping":
+        """As large as suits the vehicle."""
+        return replace(self, fit=fit(vehicles[0]))
+
+    def arena(self) -> Pool:
+        """See `Fit.pool`."""
+        return self.fit.pool()
+
     def success_rule(self) -> str:
         """See `Task`."""
         turn = math.degrees(self.yaw_tolerance)
@@ -173,13 +191,13 @@ class StationKeeping(Task):
             seen={"offset": goal_offset},
             rewards=(
                 RewardTerm("position", near, r.position),
-                RewardTerm("distance", "e", -r.distance),
+                RewardTerm("distance", "e", -r.distance / self.fit.size),
                 RewardTerm("heading", straight, r.heading),
                 RewardTerm("turn", "theta", -r.turn),
                 RewardTerm("action", action_effort, -r.action),
                 RewardTerm("change", action_change, -r.change),
                 RewardTerm("rate", turning, -r.rate),
             ),
-            ends=(End("left", out_of_box, -r.loss),),
+            ends=(End("left", out_of_pool, -r.loss),),
             inside=within_tolerance,
         )

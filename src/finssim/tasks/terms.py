@@ -214,9 +214,9 @@ def one(w: int) -> float:
 
 
 @wp.func
-def out_of_box(state: State, p: Any, w: int) -> bool:
-    """Beyond `bounds`, above `ceiling` or below `depth`."""
-    x = state.position[w, 0]
+def out_of_pool(state: State, p: Any, w: int) -> bool:
+    """Beyond `bounds`, above `ceiling` or below `depth`, in proportion to the vehicle."""
+    x = state.position[w, 0] / p.fit.size
     return wp.abs(x[0]) > p.bounds[0] or wp.abs(x[1]) > p.bounds[1] or x[2] > p.ceiling or x[2] < -p.depth
 
 

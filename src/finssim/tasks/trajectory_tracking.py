@@ -1,13 +1,16 @@
 """T2, trajectory tracking: follow a moving reference, whatever the heading (paper, section IV)."""
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import warp as wp
 
+from finssim.engine import Pool
 from finssim.engine.state import State
 from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.fitting import Fit, fit
 from finssim.tasks.measurement import MeasurementNoise
 from finssim.tasks.reference import (
     reference_position,
@@ -28,6 +31,7 @@ from finssim.tasks.terms import (
     turn_rates,
     uniform3,
 )
+from finssim.vehicles import Vehicle
 
 LEVELS = (
     ("line", "circle"),
@@ -151,7 +155,7 @@ def tracking_error(state: State, arrays: TaskArrays, w: int) -> float:
 @wp.func
 def track(p: Any, e: float) -> float:
     """pose = exp(-e / track_scale)."""
-    return wp.exp(-e / p.reward.track_scale)
+    return wp.exp(-e / (p.fit.size * p.reward.track_scale))
 
 
 @wp.func
@@ -174,7 +178,8 @@ def spin(state: State, w: int) -> float:
 def is_lost(state: State, p: Any, w: int, e: float) -> bool:
     """Farther than `lost` from the reference, above `ceiling`, or beyond `range`."""
     x = state.position[w, 0]
-    return e > p.lost or x[2] > p.ceiling or wp.length(x) > p.range
+    size = p.fit.size
+    return e > size * p.lost or x[2] > size * p.ceiling or wp.length(x) > size * p.range
 
 
 @wp.func
@@ -187,16 +192,18 @@ def within_tolerance(p: Any, e: float) -> bool:
 def draw_reference(arrays: TaskArrays, p: Any, key: int, w: int):
     """A shape, its size, height, phase, direction and speed, drawn for this episode alone."""
     pi = 3.14159265
+    size = p.fit.size
+    jitter = size * p.jitter
     rng = wp.rand_init(key, 4 * w)
     kind = p.shape_of[wp.randi(rng, 0, p.shapes)]
     lift = wp.randf(rng, -p.lift, p.lift)
     phase = wp.randf(rng, -pi, pi)
     direction = wp.where(wp.randf(rng) < 0.5, -1.0, 1.0)
     pace = wp.randf(rng, p.slowest, 1.0)
-    scale = uniform3(wp.rand_init(key, 4 * w + 1), p.scale_low, p.scale_high)
-    origin = wp.vec3(0.0, 0.0, p.depth) + uniform3(wp.rand_init(key, 4 * w + 2), -p.jitter, p.jitter)
+    scale = uniform3(wp.rand_init(key, 4 * w + 1), size * p.scale_low, size * p.scale_high)
+    origin = wp.vec3(0.0, 0.0, size * p.depth) + uniform3(wp.rand_init(key, 4 * w + 2), -jitter, jitter)
     # As published, no more than one turn in an episode and no axis beyond its speed limit.
-    fastest = wp.min(2.0 * pi / p.time_limit, greatest_rate(kind, lift, scale, p.speed_limit))
+    fastest = wp.min(2.0 * pi / p.time_limit, greatest_rate(kind, lift, scale, size * p.speed_limit))
     fill_reference(arrays.reference, w, kind, lift, scale, origin, phase, direction * pace * fastest)
 
 
@@ -208,7 +215,7 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
     rng = wp.rand_init(key, 4 * w + 3)
     start = reference_position(arrays.reference, w, 0.0)
     away = wp.vec3(wp.randf(rng, -1.0, 1.0), wp.randf(rng, -1.0, 1.0), wp.randf(rng, -1.0, 1.0))
-    state.position[w, 0] = start + wp.cw_mul(away, p.jitter)
+    state.position[w, 0] = start + wp.cw_mul(away, p.fit.size * p.jitter)
     roll = wp.randf(rng, -p.tilt, p.tilt)
     pitch = wp.randf(rng, -p.tilt, p.tilt)
     state.quaternion[w, 0] = tilted(roll, pitch, wp.randf(rng, -3.14159265, 3.14159265))
@@ -227,7 +234,8 @@ class TrajectoryTracking(Task):
     """T2. Lengths in metres, angles in radians, world frame with z up and 0 on the water.
 
     The published generator, except that shapes are as large as the pool (published: half axes up to 2.5 and 1.25 m,
-    beyond its walls) and that their speed is drawn, since what is to be followed is slow.
+    beyond its walls) and that their speed is drawn, since what is to be followed is slow. A longer vehicle has shapes,
+    their speeds and the pool `fit.size` times as large; the tolerance stays.
     """
 
     levels: ClassVar[int] = len(LEVELS)
@@ -237,6 +245,8 @@ class TrajectoryTracking(Task):
     name: str = "t2"
     observation: tuple[ObservationPart, ...] = OBSERVATION
     time_limit: float = 30.0
+    fit: Fit = Fit()
+    """Of lengths to the vehicle; the environment sets it."""
     level: int = 3
     """Which of `LEVELS` the shapes are drawn from: 0 to 2 as published, 3 all of them."""
     scale_low: tuple[float, float, float] = (0.3, 0.2, 0.04)
@@ -279,6 +289,14 @@ class TrajectoryTracking(Task):
         if not 0 <= self.level < len(LEVELS):
             raise ValueError(f"level is {self.level}, expected 0 to {len(LEVELS) - 1}")
 
+    def fitted(self, vehicles: Sequence[Vehicle]) -> "TrajectoryTracking":
+        """As large as suits the vehicle."""
+        return replace(self, fit=fit(vehicles[0]))
+
+    def arena(self) -> Pool:
+        """See `Fit.pool`."""
+        return self.fit.pool()
+
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """Room for every world's reference, from the start to what is seen at the end."""
         knots = math.ceil((self.time_limit + 3.0 * LOOK_AHEAD) / self.knot_spacing) + 2
@@ -310,7 +328,7 @@ class TrajectoryTracking(Task):
             rewards=(
                 RewardTerm("track", "pose", r.track),
                 RewardTerm("posture", posture, r.posture),
-                RewardTerm("distance", "e", -r.distance),
+                RewardTerm("distance", "e", -r.distance / self.fit.size),
                 RewardTerm("spin", spin, -r.spin),
                 RewardTerm("action", action_effort, -r.action),
                 RewardTerm("change", action_change, -r.change),

@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from finssim.experiments.setpoints import T1_SETPOINTS, T1_START
+from finssim.experiments.setpoints import T1_SETPOINTS, T1_START, in_room
 from finssim.experiments.transfer.job import Job
 from finssim.experiments.transfer.pool_trial import play
 from finssim.experiments.transfer.series import read_series
+from finssim.vehicles import load_vehicle
 
 SHORT = Job(row="pid", controller="pid", target="P03", camera="corners", duration=6.0)
 
@@ -88,3 +89,15 @@ def test_a_trajectory_is_followed_from_its_own_start(played):
     _, series = played(target="lemniscate", duration=60.0)
     assert np.linalg.norm(series["position"][0][:2] - [0.0, 0.0]) < 0.06
     assert series["t"][-1] == pytest.approx(30.0, abs=0.11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bluerov2", "bluerov2_heavy", "rexrov", "warpauv"])
+def test_other_vehicles_hold_a_setpoint_of_their_own_pool(played, name):
+    """Defaults of tags, mcu and safety, a pool and a place as large as the vehicle, and a PID made for it: 5 cm."""
+    vehicle = load_vehicle(name)
+    result, series = played(vehicle=name, pool_vehicle=name, target="P01", duration=20.0)
+    goal = in_room(T1_SETPOINTS["P01"], vehicle)[:3]
+    assert result["fault"] == "" and result["localization"]["position_m"] < 0.05
+    assert np.linalg.norm(series["position"][-1] - goal) < 0.05
+    np.testing.assert_allclose(result["goal"][:3], goal)

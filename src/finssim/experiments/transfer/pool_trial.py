@@ -17,7 +17,7 @@ from finssim.control.guidance import Guide, Station
 from finssim.control.trajectories import load_trajectory
 from finssim.control.trim import Trim
 from finssim.experiments.metrics import measure_trial
-from finssim.experiments.setpoints import T1_SETPOINTS, T1_START
+from finssim.experiments.setpoints import T1_SETPOINTS, T1_START, in_room
 from finssim.experiments.t2_metrics import ERRORS, measure_tracking
 from finssim.experiments.transfer.job import Job
 from finssim.experiments.transfer.series import write_series
@@ -34,7 +34,8 @@ from finssim.robot.lockstep import run_lockstep
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import Pilot, make_pilot
 from finssim.robot.runtime import Runtime
-from finssim.vehicles import load_vehicle
+from finssim.vehicles import Vehicle, load_vehicle
+from finssim.vehicles.defaults import room
 
 __all__ = ["play"]
 
@@ -73,8 +74,8 @@ def play(job: Job, path: Path) -> dict[str, Any]:
     """
     start_warp()
     began = time.perf_counter()
-    guide, start = _guide(job)
     vehicle, standing = load_vehicle(job.vehicle), load_vehicle(job.pool_vehicle)
+    guide, start = _guide(job, standing)
     true_site, known_site, settings = camera_of(standing, job.plant, job.severity)
     seed = zlib.crc32(f"{job.seed} {job.target}".encode()) & 0x7FFFFFFF
     runtime = Runtime(
@@ -103,6 +104,7 @@ def play(job: Job, path: Path) -> dict[str, Any]:
     return {
         **_measures(job, guide, series, vehicle.force_limits, bool(fault)),
         "fault": fault,
+        "room": room(standing.body.size),
         "localization": _localization(series),
         "missed_decisions": runtime.counters.missed,
         "seconds": time.perf_counter() - began,
@@ -136,12 +138,12 @@ def _fault(runtime: Runtime) -> str:
     return runtime.bridge.reason if runtime.bridge.state == "fault" else ""
 
 
-def _guide(job: Job) -> tuple[Guide, Array]:
+def _guide(job: Job, standing: Vehicle) -> tuple[Guide, Array]:
     """The wanted motion, and the pose at which the vehicle is put into the pool: [x, y, z, yaw]."""
     if job.task == "t1":
-        x, y, z, yaw = T1_SETPOINTS[job.target]
-        return Station((x, y, z), yaw, name=job.target), np.asarray(T1_START)
-    trajectory = load_trajectory(job.target)
+        x, y, z, yaw = in_room(T1_SETPOINTS[job.target], standing).tolist()
+        return Station((x, y, z), yaw, name=job.target), in_room(T1_START, standing)
+    trajectory = load_trajectory(job.target, vehicle=standing)
     first = trajectory.at(0.0)
     return trajectory, np.array([*first.position, float(first.yaw)])
 
@@ -175,7 +177,11 @@ def _series(truth: Truth, started: float, duration: float, estimates: Array) -> 
 
 def _measures(job: Job, guide: Guide, series: dict[str, Array], limits: Any, stopped: bool) -> dict[str, Any]:
     if job.task == "t1":
-        return measure_trial(series["t"], series["position"], series["yaw"], T1_SETPOINTS[job.target])
+        goal = np.array([*guide.position, guide.yaw])  # type: ignore[attr-defined]
+        return {
+            "goal": [*guide.position, math.degrees(goal[3])],  # type: ignore[attr-defined]
+            **measure_trial(series["t"], series["position"], series["yaw"], goal),
+        }
     measures = measure_tracking(
         series["t"],
         series["position"],

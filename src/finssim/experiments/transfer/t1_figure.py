@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from finssim.experiments.envelope import error_envelope, save_envelopes
 from finssim.experiments.setpoints import T1_SETPOINTS
 from finssim.experiments.transfer.series import read_series
@@ -27,9 +29,8 @@ def draw_t1(
         trials = []
         for result in by_row.get(name, []):
             series = read_series(folder / "trials" / result["key"])
-            trials.append(
-                (series["t"], series["position"], series["yaw"], T1_SETPOINTS[result["job"]["target"]])
-            )
+            goal = T1_SETPOINTS[result["job"]["target"]] * np.array([*[result.get("room", 1.0)] * 3, 1.0])
+            trials.append((series["t"], series["position"], series["yaw"], goal))
         if trials:
             envelopes[titles[name]] = error_envelope(trials)
     if not envelopes:

@@ -50,7 +50,8 @@ def _draw_target(
     titles: Mapping[str, str],
     folder: Path,
 ) -> None:
-    trajectory = load_trajectory(target)
+    played = next(r for results in flown.values() for r in results if r["job"]["target"] == target)
+    trajectory = load_trajectory(target).scaled(played.get("room", 1.0))
     way = trajectory.at(np.linspace(0.0, trajectory.duration, 1000)).position
     axes.plot(way[:, 0], way[:, 1], "k--", linewidth=1.2, label="reference")
     for name, results in flown.items():
