@@ -106,17 +106,18 @@ def demo(
     out: Annotated[
         Path, typer.Option(help="Directory of trials, vehicle, policy, results and report.")
     ] = Path("demo"),
+    vehicle: Vehicle = "finsrov",
     seed: Seed = 1,
     steps: Steps = None,
 ) -> None:
     """Identify a vehicle in the virtual pool, train in it, deploy there beside two PIDs, write a report.
 
-    Example: finssim demo --out demo
+    Example: finssim demo --vehicle bluerov2_heavy --out demo
     """
     start_warp()
     from finssim.experiments.demo import demo as run
 
-    run(out, seed=seed, steps=steps)
+    run(out, vehicle=vehicle, seed=seed, steps=steps)
 
 
 @app.command()

@@ -1,12 +1,26 @@
 """What a task is for a vehicle that is longer than the paper's."""
 
+import io
+
 import numpy as np
 import pytest
+from rich.console import Console
 
 from finssim import make
+from finssim.control.modes import mode_from_dict
+from finssim.control.pole_placement import axis_model
+from finssim.control.policy import Policy
 from finssim.engine import Pool
 from finssim.experiments.setpoints import T1_SETPOINTS, in_room
-from finssim.vehicles import load_vehicle
+from finssim.learning.train import train
+from finssim.tasks import EnvironmentSetupError
+from finssim.tasks.catalogue import TASKS
+from finssim.tasks.fitting import authority
+from finssim.tasks.given import crew
+from finssim.vehicles import catalogue, load_vehicle
+from finssim.vehicles.defaults import room
+
+QUIET = Console(file=io.StringIO())
 
 SIZE = 2.6 / 0.6
 """RexROV's length over that of the published pool's vehicles."""
@@ -31,3 +45,46 @@ def test_setpoints_grow_with_the_pool():
     np.testing.assert_allclose(goal[:3], SIZE * T1_SETPOINTS["P02"][:3])
     assert goal[3] == T1_SETPOINTS["P02"][3]
     assert np.array_equal(in_room(T1_SETPOINTS["P02"], load_vehicle("finsrov")), T1_SETPOINTS["P02"])
+
+
+@pytest.mark.parametrize("task", sorted(TASKS))
+@pytest.mark.parametrize("name", catalogue())
+def test_a_vehicle_has_the_axes_of_its_task_or_is_refused_by_name(task, name):
+    """Whoever lacks an axis is told which before a world is made; whoever has all may go on."""
+    vehicle, needs = load_vehicle(name), TASKS[task].needs
+    missing = [axis for axis in needs if axis not in vehicle.controlled_axes]
+    assert set(needs) >= {"surge", "sway", "heave"}
+    if missing:
+        said = f"vehicle '{name}' does not control {', '.join(missing)}, which task '{task}' needs"
+        with pytest.raises(EnvironmentSetupError, match=said):
+            crew(name, TASKS[task](), TASKS[task].action)
+    else:
+        assert crew(name, TASKS[task](), TASKS[task].action)[0].name == name
+    assert bool(missing) == (name in ("lauv", "remus100"))
+
+
+def test_an_agent_may_use_all_of_finsrov_and_a_part_of_a_stronger_vehicle():
+    """Wrench over inertia, added mass included, is then at most 1 m/s² and 20 rad/s², times RexROV's size."""
+    assert np.array_equal(authority(load_vehicle("finsrov")), np.ones(6))
+    for name in ("bluerov2_heavy", "rexrov"):
+        vehicle = load_vehicle(name)
+        scale, size = authority(vehicle), room(vehicle.body.size)
+        pull = scale * vehicle.wrench_limits / axis_model(vehicle).inertia
+        assert np.all(pull <= np.array([size] * 3 + [20.0] * 3) * (1.0 + 1e-12))
+        assert np.all((scale == 1.0) | (pull >= 0.999 * np.array([size] * 3 + [20.0] * 3)))
+
+
+def test_a_policy_says_what_its_actions_stand_for(tmp_path):
+    """The share of the limits is in its description, and so is what a robot makes of its actions."""
+    path = train("t1", out=tmp_path / "p", vehicle="bluerov2_heavy", worlds=16, steps=512, console=QUIET)
+    vehicle = load_vehicle("bluerov2_heavy")
+    mode = mode_from_dict(Policy.load(path, vehicle=vehicle).description.action, vehicle)
+    np.testing.assert_allclose(mode.scale, authority(vehicle))
+    np.testing.assert_allclose(mode.to_wrench(np.ones(6)), authority(vehicle) * vehicle.wrench_limits)
+
+
+def test_an_underactuated_vehicle_trains_nothing(tmp_path):
+    """No policy, no folder."""
+    with pytest.raises(EnvironmentSetupError, match="does not control sway, heave, yaw"):
+        train("t1", out=tmp_path / "p", vehicle="remus100", steps=512, console=QUIET)
+    assert not any(tmp_path.iterdir())

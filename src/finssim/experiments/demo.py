@@ -8,7 +8,7 @@ import time
 import webbrowser
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import environ
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from finssim.control.policy_description import DESCRIPTION_FILE
 from finssim.experiments.camera_view import camera_view
 from finssim.experiments.demo_files import PLANT_FILE, TRIALS_FOLDER, command_lines, write_demo
 from finssim.experiments.evaluate import Evaluation
+from finssim.experiments.excitation.levels import matched
 from finssim.experiments.excitation.pool_trials import pool_trials
 from finssim.experiments.excitation.shuttle import shuttles
 from finssim.experiments.excitation.terminal import compare_steps
@@ -43,7 +44,7 @@ __all__ = ["FULL", "Scope", "demo"]
 
 REPORT_FILE = "report.html"
 SEED = 1
-VEHICLE, PLANT, SEVERITY, RANGES = "finsrov", 1, "realistic", "pool"
+PLANT, SEVERITY, RANGES = 1, "realistic", "pool"
 CONTROLLERS = ("policy", "pid", "pid-paper")
 VIEW_AT = 12.0
 """Time of a trial from which the report shows a picture [s]."""
@@ -56,7 +57,7 @@ class Scope:
     """How much of everything a demonstration does."""
 
     levels: dict[str, list[float]]
-    """Axis -> levels of the steps and pulses that the fit is made from [N, N m]."""
+    """Axis -> levels of the steps and pulses that the fit is made from, for FinsROV [N, N m]."""
     shuttles: dict[str, list[float]]
     """The same of the square waves."""
     held_out: dict[str, list[float]]
@@ -67,6 +68,16 @@ class Scope:
     """Tried by the policy with pictures drawn and searched."""
     duration: float = 60.0
     """Of a trial [s]."""
+
+    def of(self, vehicle: Vehicle) -> Scope:
+        """The same for a vehicle: levels that move it as FinsROV's move FinsROV, on the axes that it controls.
+
+        See `excitation.levels.matched`.
+        """
+        return replace(
+            self,
+            **{name: matched(getattr(self, name), vehicle) for name in ("levels", "shuttles", "held_out")},
+        )
 
 
 FULL = Scope(
@@ -89,13 +100,14 @@ FULL = Scope(
 def demo(
     out: Path,
     *,
+    vehicle: str = "finsrov",
     steps: int | None = None,
     seed: int = SEED,
     console: Console | None = None,
     scope: Scope | None = None,
     processes: int | None = None,
 ) -> Path:
-    """Identify FinsROV in the virtual pool, train T1 in what was identified, and let the policy hold setpoints there.
+    """Identify a vehicle in the virtual pool, train T1 in what was identified, and let the policy hold setpoints there.
 
     Trials are recorded and controllers deployed through the robot's whole software: camera, localization, fusion,
     controller, allocation, bridge and the motor controller's protocol. Beside the policy, `pid` and `pid-paper` try
@@ -103,6 +115,7 @@ def demo(
 
     Args:
         out: Directory for trials, vehicle, policy, results and `report.html`; an earlier one there is replaced.
+        vehicle: Name or file.
         steps: Control steps to train; as `finssim train --randomize pool` if None.
         seed: Of the noise and of the training.
         console: Where progress is shown; standard error if None.
@@ -115,11 +128,12 @@ def demo(
     Raises:
         KeyboardInterrupt: After Ctrl-C. A policy so far is then in `OUT-training/interrupted`, and `out` as it was.
     """
-    console, scope = console or Console(stderr=True), scope or FULL
+    console, standing = console or Console(stderr=True), load_vehicle(vehicle)
+    scope = (scope or FULL).of(standing)
     start_warp()
     rescue = out.with_name(f"{out.name}-training") / "interrupted"
     with atomic_directory(out, replaces=REPORT_FILE) as folder:
-        found = _identified(folder, out, seed, scope, processes, console)
+        found = _identified(vehicle, folder, out, seed, scope, processes, console)
         began = time.perf_counter()
         policy = train(
             "t1",
@@ -138,8 +152,8 @@ def demo(
             "steps": Policy.load(policy).description.training["steps"],
         }
         with _rescued(policy, rescue, console):
-            evaluations, picture = _deployed(folder, policy, seed, scope, processes, console)
-            commands = command_lines(out, VEHICLE, PLANT, SEVERITY, RANGES, training)
+            evaluations, picture = _deployed(vehicle, folder, policy, seed, scope, processes, console)
+            commands = command_lines(out, vehicle, PLANT, SEVERITY, RANGES, training)
             write_demo(folder, found, evaluations, policy, training, commands, picture)
     print_comparison([e.result for e in evaluations if e.result["camera"] == "corners"], Console())
     report = Path(out) / REPORT_FILE
@@ -150,17 +164,17 @@ def demo(
 
 
 def _identified(
-    folder: Path, out: Path, seed: int, scope: Scope, processes: int | None, console: Console
+    name: str, folder: Path, out: Path, seed: int, scope: Scope, processes: int | None, console: Console
 ) -> Identification:
     """Trials in the pool, the vehicle they tell of, and how its speeds compare with the plant's."""
-    standing = load_vehicle(VEHICLE)
+    standing = load_vehicle(name)
     spec = draw_plant(standing, PLANT, SEVERITY)
     spec.write(folder / PLANT_FILE)
     console.print("recording trials in the virtual pool", highlight=False)
     with console.status("recording trials in the virtual pool") as status:
 
         def say(part: float, what: str) -> None:
-            fitting = f"fitting {VEHICLE} to the trials, replaying others"
+            fitting = f"fitting {standing.name} to the trials, replaying others"
             status.update(f"recording trials in the virtual pool: {what}" if part < 1.0 else fitting)
 
         def show(run: Any, result: Mapping[str, Any]) -> None:
@@ -168,8 +182,8 @@ def _identified(
             told = f"  {run.target}: up to {result['fastest']:.2f} {unit} in {result['duration']:.0f} s"
             console.print(told, highlight=False)
 
-        record = _recorder(standing, scope, processes, say, show)
-        found = identify(folder, VEHICLE, seed=seed, shown=out, record=record)
+        record = _recorder(name, standing, scope, processes, say, show)
+        found = identify(folder, name, seed=seed, shown=out, record=record)
         linear = {axis: levels for axis, levels in scope.levels.items() if axis not in ("roll", "pitch")}
         found = found.with_steps(compare_steps(found.vehicle, standing, spec, linear))
     told = sum(e.identifiable for e in found.fit.estimates.values())
@@ -188,7 +202,9 @@ def _farthest(found: Identification) -> float:
     return max(abs(float(s["model_speed"]) / float(s["plant_speed"]) - 1.0) for s in found.steps)
 
 
-def _recorder(standing: Vehicle, scope: Scope, processes: int | None, say: Say, show: Show) -> Record:
+def _recorder(
+    name: str, standing: Vehicle, scope: Scope, processes: int | None, say: Say, show: Show
+) -> Record:
     """Trials of the virtual pool."""
 
     def record(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
@@ -201,7 +217,7 @@ def _recorder(standing: Vehicle, scope: Scope, processes: int | None, say: Say, 
             plans,
             folder,
             vehicle=str(rough),
-            pool_vehicle=VEHICLE,
+            pool_vehicle=name,
             plant=PLANT,
             severity=SEVERITY,
             seed=seed,
@@ -214,18 +230,18 @@ def _recorder(standing: Vehicle, scope: Scope, processes: int | None, say: Say, 
 
 
 def _deployed(
-    folder: Path, policy: Path, seed: int, scope: Scope, processes: int | None, console: Console
+    name: str, folder: Path, policy: Path, seed: int, scope: Scope, processes: int | None, console: Console
 ) -> tuple[list[Evaluation], bytes | None]:
     """All controllers in the pool, the policy with pictures too, and one of those pictures."""
     common: dict[str, Any] = {
-        "vehicle": str(folder / vehicle_files(VEHICLE)[1]),
-        "pool_vehicle": VEHICLE,
+        "vehicle": str(folder / vehicle_files(load_vehicle(name).name)[1]),
+        "pool_vehicle": name,
         "plant": PLANT,
         "severity": SEVERITY,
         "seed": seed,
         "duration": scope.duration,
     }
-    names = {name: str(policy) if name == "policy" else name for name in CONTROLLERS}
+    names = {who: str(policy) if who == "policy" else who for who in CONTROLLERS}
     # Pictures first: they take longest, and the other processor has time for the rest.
     jobs = pool_jobs({"policy-with-pictures": str(policy)}, scope.pictures, camera="pictures", **common)
     seen = jobs[:1]

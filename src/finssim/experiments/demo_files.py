@@ -10,6 +10,7 @@ from typing import Any
 
 from finssim.experiments.evaluate import Evaluation
 from finssim.experiments.identify import TRIALS, Identification, commands, vehicle_files
+from finssim.vehicles import load_vehicle
 
 __all__ = ["PLANT_FILE", "TRIALS_FOLDER", "command_lines", "write_demo"]
 
@@ -26,19 +27,19 @@ def command_lines(
 
     Args:
         out: Its folder.
-        vehicle: Name in the catalogue.
+        vehicle: Name or file.
         plant: Seed of the pool.
         severity: Of the pool.
         ranges: That the policy was trained in.
         training: `seed` and `steps`.
     """
-    rough, identified = (out / file for file in vehicle_files(vehicle))
+    rough, identified = (out / file for file in vehicle_files(load_vehicle(vehicle).name))
     seed, steps = training["seed"], training["steps"]
     return [
         f"finssim trials import {out / TRIALS / 'fit' / 'records'}/*.mcap --split phase --out trials",
         f"finssim excite all --vehicle {rough} --pool {plant} --severity {severity} --pool-vehicle {vehicle} --coast 4 "
         "--out more-trials",
-        *commands(out, vehicle, seed),
+        *commands(out, load_vehicle(vehicle).name, seed),
         f"finssim train t1 --vehicle {identified} --randomize {ranges} --seed {seed} --steps {steps} --out policy",
         f"finssim pool --vehicle {vehicle} --plant {out / PLANT_FILE} --pool-file site.yaml --truth truth.fst",
         f"finssim run --policy policy --vehicle {identified} --goal 1,0.3,-0.5,90 --robot pool --pool-file site.yaml "

@@ -22,6 +22,7 @@ from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import write_trial
 from finssim.quiet import start_warp
 from finssim.vehicles import Provenance, Vehicle, load_vehicle
+from finssim.vehicles.defaults import room
 
 __all__ = [
     "HELD_OUT",
@@ -74,13 +75,16 @@ def rough_vehicle(truth: Vehicle) -> Vehicle:
     """What one knows of a vehicle before any trial: weighed, measured out, thrusters from a bench.
 
     Its hydrodynamics are guesses: added mass of half the displaced water on every linear axis, damping of the order of
-    other small vehicles.
+    other small vehicles, forces growing with the square of the length, moments with its fourth power and moments of
+    inertia with its fifth. Moments are guessed low: a controller that counts on damping which is not there rings.
     """
     half = 0.5 * truth.water.density * truth.body.displaced_volume
+    size = room(truth.body.size)
+    force, moment, inertia = size**2, size**4, 0.1 * size**5
     guess = {
-        f"{SET}.added_mass": [half, half, half, 0.1, 0.1, 0.1],
-        f"{SET}.linear_damping": [20.0, 20.0, 20.0, 1.0, 1.0, 1.0],
-        f"{SET}.quadratic_damping": [50.0, 50.0, 50.0, 1.0, 1.0, 1.0],
+        f"{SET}.added_mass": [half, half, half, inertia, inertia, inertia],
+        f"{SET}.linear_damping": [20.0 * force] * 3 + [0.1 * moment] * 3,
+        f"{SET}.quadratic_damping": [50.0 * force] * 3 + [moment] * 3,
     }
     origin = Provenance("guessed", "", "the order of other small vehicles, before any trial")
     words = "Hydrodynamics are guesses; the rest is the catalogue's."
@@ -102,7 +106,7 @@ def identify(
 
     Args:
         folder: Existing directory.
-        name: Vehicle of the catalogue.
+        name: Name or file of a vehicle.
         seed: Of initial conditions and noise of the trials.
         shown: Name of the folder in the report, where `folder` is a temporary one.
         record: Makes the trials; in the simulator if None.
@@ -113,6 +117,7 @@ def identify(
     began = time.perf_counter()
     start_warp()
     truth = load_vehicle(name)
+    name = truth.name
     start_file, vehicle_file = vehicle_files(name)
     write_vehicle(rough_vehicle(truth), folder / start_file)
     recorded = (record or simulated_trials(truth))(folder / TRIALS, folder / start_file, seed)

@@ -23,6 +23,7 @@ from finssim.files import atomic_directory, refuse_unwritable
 from finssim.learning.learners import learner_named
 from finssim.quiet import start_warp
 from finssim.tasks import Environment, Task, make, task_named
+from finssim.tasks.fitting import authority
 from finssim.tasks.levels import LevelPlan, climb
 from finssim.vehicles import Vehicle, load_vehicle
 
@@ -101,7 +102,9 @@ def train(
     randomization = Randomization(randomize) if randomize is not None else None
     refuse_unwritable(atomic_directory(out, replaces=DESCRIPTION_FILE))
     start_warp()
-    mode = action_mode(action or the_task.action, chosen)
+    mode_name = action or the_task.action
+    scale = authority(chosen) if mode_name.startswith("wrench") else 1.0
+    mode = action_mode(mode_name, chosen, scale)
     side = Path(out).with_name(f"{Path(out).name}-training")
 
     from finssim.learning.held_evaluation import HELD_WORLDS, HeldEvaluation, held_seed
@@ -117,7 +120,7 @@ def train(
     def worlds_of(count: int, ranges: Randomization | None, its_seed: int, **more: Any) -> Environment:
         return make(
             the_task, worlds=count, vehicle=chosen, hydrodynamics=hydrodynamics, action=action,
-            randomize=ranges, observe="training", device=device, seed=its_seed, **more,
+            randomize=ranges, observe="training", device=device, seed=its_seed, wrench_scale=scale, **more,
         )  # fmt: skip
 
     asymmetric = randomized and getattr(values, "asymmetric", False)

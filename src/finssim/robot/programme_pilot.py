@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,8 @@ from finssim.control.controllers import controller
 from finssim.control.errors import ControlError
 from finssim.control.guidance import Guide, goal_at
 from finssim.control.modes import Wrench6
-from finssim.control.tracking import Measured
-from finssim.geometry.rotations import quat_rotate
+from finssim.control.tracking import Goal, Measured
+from finssim.geometry.rotations import quat_inverse_rotate, quat_rotate
 from finssim.vehicles import AXES, Vehicle
 
 __all__ = ["ProgrammePilot"]
@@ -78,6 +79,7 @@ class ProgrammePilot:
         self._mode = Wrench6.from_vehicle(vehicle)
         self._limits = np.asarray(vehicle.wrench_limits, float)
         kept = HELD_IN_TURNS if "yaw" in axes else HELD
+        self._driven = [AXES.index(axis) for axis in axes]  # type: ignore[arg-type]
         self._held = [AXES.index(a) for a in kept if hold is not None and a not in axes]
         self._hold = controller(hold, vehicle, period=period) if hold is not None else None
         self.reset()
@@ -108,9 +110,21 @@ class ProgrammePilot:
         self.phase = str(self._phase[row])
         tau = self._tau[row].copy()
         if self._hold is not None:
-            wanted, self._memory = self._hold.command(self._memory, reading, goal_at(guide, t))
+            goal = self._beside(goal_at(guide, t), reading)
+            wanted, self._memory = self._hold.command(self._memory, reading, goal)
             tau[self._held] = wanted[self._held]
         return self._mode.allocator.allocate(np.clip(tau, -self._limits, self._limits))[0]
+
+    def _beside(self, goal: Goal, reading: Measured) -> Goal:
+        """The goal moved along the excited axes to where the vehicle is.
+
+        Left behind, a way of s metres and a heading error ψ would look like s sin ψ on an axis that is held, and
+        correcting that turns the vehicle further.
+        """
+        q = np.asarray(goal.quaternion, float)
+        away = quat_inverse_rotate(q, np.asarray(reading.position, float) - np.asarray(goal.position, float))
+        along = np.where([axis in self._driven for axis in range(3)], away, 0.0)
+        return replace(goal, position=np.asarray(goal.position, float) + quat_rotate(q, along))
 
     def _row(self, reading: Measured, t: float) -> int:
         """Which row it is the turn of; excitations and coasts that have done their work are left early."""

@@ -240,6 +240,7 @@ class Docking(Task):
 
     succeeds: ClassVar[str] = "once"
     title: ClassVar[str] = "enter a funnel nose first, gently"
+    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
     name: str = "docking"
     observation: tuple[ObservationPart, ...] = OBSERVATION
     time_limit: float = 40.0

@@ -4,15 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.control.pole_placement import axis_model
 from finssim.engine import Pool
 from finssim.vehicles import HydrodynamicSet, Vehicle
 from finssim.vehicles.capability import terminal_speeds
 from finssim.vehicles.defaults import POOL, room
 
-__all__ = ["Fit", "coefficients_of", "driven_axes", "fit"]
+__all__ = ["Fit", "authority", "coefficients_of", "driven_axes", "fit"]
+
+Array = NDArray[np.float64]
 
 SLOWEST_SPEED = 0.22
 """Terminal speed of FinsROV's slowest direction, heave [m/s]: the published speeds are a part of it."""
+
+ACCELERATION, TURNING = 1.0, 20.0
+"""Largest acceleration that an agent may ask for [m/s², rad/s²]: somewhat more than FinsROV's limits give it, 0.45 to
+0.72 m/s² and 8 to 17 rad/s²."""
 
 MASS = 12.11
 """FinsROV's [kg]."""
@@ -39,6 +49,19 @@ class Fit:
             stiffness=4000.0 * self.weight,
             damping=100.0 * self.weight,
         )
+
+
+def authority(vehicle: Vehicle) -> Array:
+    """Part of each wrench limit that an agent's action of 1 stands for, (6,), up to 1.
+
+    What accelerates the vehicle, added mass included, by `ACCELERATION` times its `room`, or turns it by `TURNING`: all
+    of FinsROV's limits, and a fifth of those of a vehicle that is five times as strong for its mass. With all of them
+    gains are learnt that ring on estimates, which lag.
+    """
+    limits = np.asarray(vehicle.wrench_limits)
+    most = np.array([ACCELERATION * room(vehicle.body.size)] * 3 + [TURNING] * 3)
+    inertia = axis_model(vehicle, coefficients_of(vehicle)).inertia
+    return np.asarray(np.minimum(1.0, np.divide(most * inertia, limits, out=np.ones(6), where=limits > 0.0)))
 
 
 def driven_axes(vehicle: Vehicle) -> tuple[int, ...]:

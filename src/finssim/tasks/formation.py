@@ -384,6 +384,7 @@ class Formation(OpenWater):
     agents: ClassVar[tuple[str, ...]] = ("corner_1", "corner_2", "corner_3")
     succeeds: ClassVar[str] = "delivered"
     title: ClassVar[str] = "catch what drifts in a net and carry it, three together"
+    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
     name: str = "formation"
     observation: tuple[ObservationPart, ...] = field(default=OBSERVATION, repr=False)
     time_limit: float = 60.0

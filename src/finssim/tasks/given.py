@@ -40,7 +40,8 @@ def crew(vehicle: Vehicle | str | Sequence[Vehicle | str], task: "Task", mode: s
     """The vehicles of a world: those that are given, or one of a kind for every place.
 
     Raises:
-        EnvironmentSetupError: Another number than the task has places, or thrusters that do not fit the action mode.
+        EnvironmentSetupError: Another number than the task has places, a vehicle with too few controlled axes, or
+            thrusters that do not fit the action mode.
     """
     given = [vehicle] * len(task.vehicles) if isinstance(vehicle, Vehicle | str) else list(vehicle)
     if len(given) != len(task.vehicles):
@@ -49,6 +50,13 @@ def crew(vehicle: Vehicle | str | Sequence[Vehicle | str], task: "Task", mode: s
             f"{len(given)} vehicles are given, expected {len(task.vehicles)} for task '{task.name}': {names}"
         )
     vehicles = [one if isinstance(one, Vehicle) else load_vehicle(one) for one in given]
+    for one in vehicles:
+        missing = [axis for axis in task.needs if axis not in one.controlled_axes]
+        if missing:
+            raise EnvironmentSetupError(
+                f"vehicle '{one.name}' does not control {', '.join(missing)}, which task '{task.name}' needs: its "
+                f"thrusters control {', '.join(one.controlled_axes)}; take another vehicle"
+            )
     if mode == "thruster8" and task.others:
         raise EnvironmentSetupError(
             f"actions of task '{task.name}' are by thruster, expected wrench4 or wrench6: {', '.join(task.others)} is "

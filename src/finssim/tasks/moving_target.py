@@ -197,6 +197,7 @@ class MovingTarget(Task):
     succeeds: ClassVar[str] = "once"
     moving: ClassVar[bool] = True
     title: ClassVar[str] = "stay with a target that changes its course"
+    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave")
     name: str = "t3"
     observation: tuple[ObservationPart, ...] = OBSERVATION
     time_limit: float = 30.0

@@ -192,6 +192,7 @@ class Pursuit(OpenWater):
     succeeds: ClassVar[str] = "captured"
     moving: ClassVar[bool] = True
     title: ClassVar[str] = "catch a prey, one against one"
+    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
     name: str = "pursuit"
     observation: tuple[ObservationPart, ...] = field(default=CHASE, repr=False)
     time_limit: float = 60.0

@@ -1,6 +1,5 @@
 """Following a wanted velocity with a vehicle's own thrust: for vehicles that a script commands, and for baselines."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +12,7 @@ from finssim.physics.types import vec6
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.vehicles import HydrodynamicSet, Vehicle
-from finssim.vehicles.capability import restoring, terminal_speeds
+from finssim.vehicles.capability import level_speed, terminal_speeds
 
 Array = NDArray[Any]
 
@@ -25,10 +24,8 @@ TURN = 1.0
 """Yaw rate asked for at a heading error of 1 rad [1/s]."""
 MOST_TURN = 0.8
 """Largest yaw rate asked for [rad/s]."""
-NEEDED = ("surge", "sway", "heave", "yaw")
-"""Axes that a vehicle of these tasks must control ..."""
 ROWS = [0, 1, 2, 5]
-"""... and their places in a wrench."""
+"""Places in a wrench of the axes that these tasks need: surge, sway, heave, yaw."""
 
 
 @wp.func
@@ -119,15 +116,13 @@ class DriveNumbers:
         """The numbers of a vehicle, from its first hydrodynamic set with coefficients.
 
         Raises:
-            EnvironmentSetupError: It does not control one of the axes, or has no coefficients.
+            EnvironmentSetupError: It has no coefficients.
         """
-        missing = [axis for axis in NEEDED if axis not in vehicle.controlled_axes]
         sets = [name for name, one in vehicle.hydrodynamics.items() if isinstance(one, HydrodynamicSet)]
-        if missing or not sets:
-            lacks = f"does not control {', '.join(missing)}" if missing else "has no damping coefficients"
+        if not sets:
             raise EnvironmentSetupError(
-                f"vehicle '{vehicle.name}' {lacks}: pursuit and formation need {', '.join(NEEDED)} and known damping; "
-                "take another vehicle"
+                f"vehicle '{vehicle.name}' has no damping coefficients, which pursuit and formation need: take another "
+                "vehicle"
             )
         hydro: Any = vehicle.hydrodynamics[sets[0]]
         quadratic = np.diag(hydro.quadratic_damping).copy()
@@ -162,21 +157,6 @@ class DriveNumbers:
     def turned(self, error: Array) -> Array:
         """Yaw rate that takes a heading error away [rad/s], from the error [rad]."""
         return np.clip(TURN * error, -MOST_TURN, MOST_TURN)
-
-
-def level_speed(vehicle: Vehicle, name: str) -> float:
-    """Speed ahead at which a small pitch angle θ begins to grow by itself [m/s]; inf where it never does.
-
-    Stiffness k θ against the Munk moment (m_z - m_x) u² θ, masses with added mass: u² = k / (m_z - m_x). Damping in
-    heave and pitch lets a vehicle go somewhat faster; it is left out.
-
-    Args:
-        vehicle: The vehicle.
-        name: Of its hydrodynamic set.
-    """
-    mass = np.diag(vehicle.mass_matrix(name))
-    excess, stiffness = float(mass[2] - mass[0]), float(restoring(vehicle, name).stiffness[1])
-    return math.sqrt(stiffness / excess) if excess > 0.0 and stiffness > 0.0 else math.inf
 
 
 def slowest(vehicles: Sequence[Vehicle]) -> float:

@@ -136,6 +136,7 @@ class StationKeeping(Task):
 
     succeeds: ClassVar[str] = "held"
     title: ClassVar[str] = "reach a pose in the pool and hold it"
+    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
     name: str = "t1"
     observation: tuple[ObservationPart, ...] = OBSERVATION
     fit: Fit = Fit()

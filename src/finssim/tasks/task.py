@@ -52,6 +52,8 @@ class Task:
     """Names of the vehicles after them, which the task commands."""
     title: ClassVar[str] = ""
     """What is to be done, in a few words."""
+    needs: ClassVar[tuple[str, ...]] = ()
+    """Axes that every vehicle of the task must control; another is refused before anything is trained."""
     action: ClassVar[str] = "wrench6"
     """Action mode, unless another is asked for."""
     pool: ClassVar[Pool | None] = Pool()

@@ -345,6 +345,7 @@ class TeamPursuit(OpenWater):
     levels: ClassVar[int] = len(LEVELS)
     moving: ClassVar[bool] = True
     title: ClassVar[str] = "drive a prey into a net, three against one"
+    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
     name: str = "team-pursuit"
     observation: tuple[ObservationPart, ...] = field(default=OBSERVATION, repr=False)
     spawn_radius: float = 1.5

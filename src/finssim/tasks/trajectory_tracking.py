@@ -242,6 +242,7 @@ class TrajectoryTracking(Task):
     succeeds: ClassVar[str] = "held"
     moving: ClassVar[bool] = True
     title: ClassVar[str] = "follow a moving reference, whatever the heading"
+    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave")
     name: str = "t2"
     observation: tuple[ObservationPart, ...] = OBSERVATION
     time_limit: float = 30.0

@@ -17,6 +17,7 @@ __all__ = [
     "Restoring",
     "Trim",
     "WrenchCapability",
+    "level_speed",
     "restoring",
     "terminal_speed",
     "terminal_speeds",
@@ -122,6 +123,23 @@ def time_constants(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> Array
         _at_center_of_gravity(vehicle, moved_to_origin(chosen.linear_damping, chosen.reference_point))
     )
     return np.asarray(np.divide(mass, d1, out=np.full(6, math.inf), where=d1 > 0.0))
+
+
+def level_speed(vehicle: Vehicle, hydrodynamics: str = "calibrated", axis: int = 0) -> float:
+    """Speed along surge (or sway) at which a small pitch (or roll) angle θ begins to grow by itself [m/s]; inf if none.
+
+    Stiffness k θ against the Munk moment (m_z - m_x) u² θ, masses with added mass: u² = k / (m_z - m_x). Damping in
+    heave and pitch lets a vehicle go somewhat faster; it is left out.
+
+    Args:
+        vehicle: The vehicle.
+        hydrodynamics: Its set.
+        axis: 0 surge, 1 sway.
+    """
+    mass = np.diag(vehicle.mass_matrix(hydrodynamics))
+    excess = float(mass[2] - mass[axis])
+    stiffness = float(restoring(vehicle, hydrodynamics).stiffness[1 - axis])
+    return math.sqrt(stiffness / excess) if excess > 0.0 and stiffness > 0.0 else math.inf
 
 
 @dataclass(frozen=True)

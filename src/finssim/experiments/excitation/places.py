@@ -12,13 +12,14 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation.programmes import Programme
 from finssim.pool.plant_spec import Basin
 from finssim.vehicles import AXES, Vehicle
+from finssim.vehicles.defaults import room
 
 __all__ = ["Place", "place_of"]
 
 Array = NDArray[np.float64]
 
 WALL, SURFACE, FLOOR = 0.35, 0.15, 0.12
-"""Water kept between the vehicle's envelope and these at the ends of a run [m]."""
+"""Water kept between the vehicle's envelope and these at the ends of a run [m]; these three grow with `room`."""
 STOPPING = {"surge": 0.35, "sway": 0.3, "heave": 0.06}
 """Of the way, kept for the coast after an excitation [m]."""
 LEAST_ROOM = 0.15
@@ -51,7 +52,8 @@ def place_of(programme: Programme, vehicle: Vehicle, basin: Basin) -> Place:
         CalibrationError: The pool has no room for it.
     """
     length, width, height = vehicle.body.size
-    top, bottom = -(0.5 * height + SURFACE), -basin.depth + 0.5 * height + FLOOR
+    scale = room(vehicle.body.size)
+    top, bottom = -(0.5 * height + scale * SURFACE), -basin.depth + 0.5 * height + scale * FLOOR
     middle = (0.0, 0.0, 0.5 * (top + bottom))
     if len(programme.axes) != 1 or programme.axes[0] in ("roll", "pitch", "yaw"):
         return Place(middle, 0.0, 0.5 * basin.width - 0.5 * math.hypot(length, width))
@@ -60,14 +62,16 @@ def place_of(programme: Programme, vehicle: Vehicle, basin: Basin) -> Place:
     if axis == "heave":
         way = top - bottom
         z = middle[2] - 0.5 * sign * way
-        start = Place((0.0, 0.0, z), 0.0, way * (1.0 if sign else 0.5) - STOPPING[axis])
+        start = Place((0.0, 0.0, z), 0.0, way * (1.0 if sign else 0.5) - scale * STOPPING[axis])
     else:
-        half = 0.5 * basin.length - 0.5 * (length if axis == "surge" else width) - WALL
+        half = 0.5 * basin.length - 0.5 * (length if axis == "surge" else width) - scale * WALL
         # Heading along the pool for surge; across it for sway, so that its left is where x falls.
         ahead = 1.0 if axis == "surge" else -1.0
         yaw = 0.0 if axis == "surge" else 0.5 * math.pi
         start = Place(
-            (-sign * ahead * half, 0.0, middle[2]), yaw, half * (2.0 if sign else 1.0) - STOPPING[axis]
+            (-sign * ahead * half, 0.0, middle[2]),
+            yaw,
+            half * (2.0 if sign else 1.0) - scale * STOPPING[axis],
         )
     if start.room is None or not start.room >= LEAST_ROOM:
         raise CalibrationError(
