@@ -1,12 +1,14 @@
 """Command lines, parameter files and names are read as ROS 2 reads them."""
 
+import math
+import re
+
 import pytest
 
-from finssim.ros2.errors import Ros2Error
-from finssim.ros2.shim.arguments import parse_arguments, parsed_value
-from finssim.ros2.shim.exceptions import InvalidTopicNameException
+from finssim.ros2.shim.arguments import parse_arguments
+from finssim.ros2.shim.exceptions import InvalidTopicNameException, RosArgumentsError
 from finssim.ros2.shim.names import Remap, expanded, remapped
-from finssim.ros2.shim.parameter_files import overrides_for, read_parameters
+from finssim.ros2.shim.parameter_files import overrides_for, parsed_value, read_parameters
 
 FILE = """
 /**:
@@ -24,9 +26,16 @@ rov:
 @pytest.fixture
 def parameters(tmp_path):
     """Assignments of the file above."""
-    path = tmp_path / "p.yaml"
-    path.write_text(FILE)
-    return read_parameters(path)
+    return read(tmp_path, FILE)
+
+
+def read(tmp_path, *texts):
+    """Parameters of files with these texts, one after the other."""
+    overrides = {}
+    for i, text in enumerate(texts):
+        (tmp_path / f"{i}.yaml").write_text(text)
+        read_parameters(tmp_path / f"{i}.yaml", overrides)
+    return overrides
 
 
 @pytest.mark.parametrize(
@@ -44,12 +53,49 @@ def test_files_reach_the_nodes_they_name(parameters, node, values):
     assert overrides_for(node, parameters) == values
 
 
-def test_a_file_without_values_says_where(tmp_path):
-    """Not laid out as a parameter file."""
-    path = tmp_path / "p.yaml"
-    path.write_text("gain: 1.0\n")
-    with pytest.raises(Ros2Error, match="ros__parameters"):
-        read_parameters(path)
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("gain: 1.0", "gain: expected 'ros__parameters:'"),
+        ("ros__parameters: {gain: 1.0}", "stands below '', expected the name of a node"),
+        ("/a b: {ros__parameters: {gain: 1.0}}", "stands below '/a b'"),
+        ("/**: {ros__parameters: {gain: }}", "gain: has no value"),
+        ("/**: {ros__parameters: {gains: [1, 2.0]}}", "all of one type"),
+        ("/**: {ros__parameters: {gains: [[1], [2]]}}", "plain values only"),
+        ("/**: {ros__parameters: [1]}", "expected parameters and values"),
+        ("/a: &x {ros__parameters: {gain: 1.0}}\n/b: *x", "no aliases"),
+        ("/**: {ros__parameters: {", "while parsing"),
+    ],
+)
+def test_files_that_rcl_refuses_are_refused(tmp_path, text, words):
+    """With the file's name, in one sentence, and as a RuntimeError like rclpy's."""
+    with pytest.raises(RosArgumentsError, match=re.escape(words)) as refused:
+        read(tmp_path, text)
+    assert "0.yaml" in str(refused.value) and isinstance(refused.value, RuntimeError)
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(RosArgumentsError, match="No such file"):
+        read_parameters(tmp_path / "none.yaml", {})
+
+
+WILD, NAMED = "/**: {ros__parameters: {policy: a}}\n", "/**/controller: {ros__parameters: {policy: b}}\n"
+
+
+@pytest.mark.parametrize(
+    ("texts", "value"),
+    [
+        ((WILD + NAMED,), "b"),
+        ((NAMED + WILD,), "a"),
+        ((NAMED, WILD), "a"),
+        ((WILD + NAMED, WILD.replace("policy: a", "policy: c")), "b"),
+        ((WILD + NAMED, "/x/controller: {ros__parameters: {policy: d}}\n"), "d"),
+        (("/x/controller: {ros__parameters: {policy: d}}\n", WILD), "a"),
+    ],
+)
+def test_a_pattern_keeps_the_rank_of_its_first_mention(tmp_path, texts, value):
+    """As rcl merges files: it is why a launch argument below /** lost against the package's own file."""
+    assert overrides_for("/x/controller", read(tmp_path, *texts)) == {"policy": value}
 
 
 def test_a_command_line_is_split_into_ros_and_the_rest():
@@ -58,34 +104,63 @@ def test_a_command_line_is_split_into_ros_and_the_rest():
     found = parse_arguments(line)
     assert found.rest == ["prog", "--mine", "--more"]
     assert found.remaps == [Remap("", "a", "b")]
-    assert overrides_for("/x/n", found.parameters) == {"gain": 2} and not overrides_for(
-        "/x/m", found.parameters
-    )
+    assert overrides_for("/n", found.parameters) == {"gain": 2}
+    assert not overrides_for("/x/n", found.parameters), "a node without namespace, as in rcl"
 
 
 @pytest.mark.parametrize(
-    "line", ["--ros-args -p gain", "--ros-args --nonsense 1", "--ros-args -r", "--ros-args --log-level x"]
+    "line",
+    [
+        "-p gain",
+        "-p gain:=",
+        "-p gain:={a: 1}",
+        "--nonsense 1",
+        "-r",
+        "-r __ns:=rov",
+        "-r __node:=/rov",
+        "--log-level x",
+        "--log-level :=debug",
+        "--params-file /nowhere.yaml",
+    ],
 )
 def test_malformed_arguments_are_refused(line):
     """Instead of being left out."""
-    with pytest.raises(Ros2Error):
-        parse_arguments(line.split())
+    with pytest.raises(RosArgumentsError):
+        parse_arguments(["--ros-args", *line.split(maxsplit=1)])
 
 
 @pytest.mark.parametrize(
     ("text", "value"),
     [
         ("1", 1),
+        ("+7", 7),
+        ("0x1F", 31),
+        ("010", 8),
+        ("08", 8.0),
+        ("1_000", "1_000"),
+        ("12:30", "12:30"),
+        ("2026-11-23", "2026-11-23"),
+        ("9223372036854775808", 9223372036854775808.0),
         ("1.0", 1.0),
-        ("1e-3", 1e-3),
+        ("1e3", 1000.0),
+        ("-.5", -0.5),
+        ("inf", math.inf),
+        ("-.inf", -math.inf),
         ("true", True),
+        ("y", True),
+        ("off", False),
         ("abc", "abc"),
+        ("null", "null"),
+        ("~", "~"),
         ("'1'", "1"),
+        ("!!str 1", "1"),
         ("[1.0, 2.0]", [1.0, 2.0]),
+        ("[a, b]", ["a", "b"]),
+        ("[]", None),
     ],
 )
 def test_values_have_the_type_they_look_like(text, value):
-    """As rcl reads them."""
+    """As rcl's get_value reads them, which is neither YAML 1.1 nor 1.2."""
     assert parsed_value(text) == value and type(parsed_value(text)) is type(value)
 
 

@@ -1,7 +1,11 @@
 """Our message files are legal ROS 2, and the workspace builds from the very same ones."""
 
 import ast
+import re
+import runpy
 import subprocess
+import sys
+import types
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -9,6 +13,10 @@ import pytest
 import yaml
 
 from finssim.ros2.definitions import INTERFACES
+from finssim.ros2.graphs import NODES as GRAPH_NODES
+from finssim.ros2.shim.arguments import parse_arguments
+from finssim.ros2.shim.parameter_files import overrides_for
+from finssim.vehicles.loader import catalogue
 
 MESSAGES = sorted(INTERFACES.glob("*/msg/*.msg"))
 WORKSPACE = Path(__file__).resolve().parents[2] / "ros2_ws" / "src"
@@ -91,37 +99,119 @@ def test_python_of_the_workspace_compiles_on_humble(path):
     ast.parse(path.read_text(), feature_version=(3, 10))
 
 
-def started_by(launch):
-    """Executables that a launch file names."""
-    tree = ast.parse(launch.read_text())
-    words = {k.value.value for k in ast.walk(tree) if isinstance(k, ast.keyword) and k.arg == "executable"
-             and isinstance(k.value, ast.Constant)}  # fmt: skip
-    calls = [c for c in ast.walk(tree) if isinstance(c, ast.Call) and getattr(c.func, "id", "") == "node"]
-    return words | {c.args[0].value for c in calls}
-
-
 def entry_points():
-    """Names that setup.py installs and functions that they call."""
+    """Names that setup.py installs."""
     tree = ast.parse((NODES / "setup.py").read_text())
     nodes = next(n for n in tree.body if isinstance(n, ast.Assign) and n.targets[0].id == "NODES")
     return {element.value for element in nodes.value.elts}
 
 
-def test_launch_files_start_what_is_installed():
-    """Every executable of every launch file has an entry point and a function."""
-    launches = sorted(NODES.glob("launch/*.launch.py"))
-    assert [p.name for p in launches] == ["pool.launch.py", "robot.launch.py", "sim.launch.py"]
-    functions = {f.name for f in ast.parse((NODES / "finssim_ros/run.py").read_text()).body
-                 if isinstance(f, ast.FunctionDef)}  # fmt: skip
-    assert set().union(*(started_by(p) for p in launches)) | functions - {"_run"} == entry_points()
+@pytest.fixture
+def launched(monkeypatch, tmp_path):
+    """Runs a launch file with arguments; gives executable -> command line, as launch_ros makes it.
+
+    launch and launch_ros are not on PyPI. What stands in for them here does what launch_ros/actions/node.py does with
+    names and parameters: a dictionary becomes a file, below the node's full name if name and namespace are given.
+    """
+
+    def node(**told):
+        named = {"name", "namespace"} <= told.keys()
+        full = f"/{told['namespace'].strip('/')}/{told['name']}" if named else "/**"
+        line = ["--ros-args", "-r", f"__node:={told['name']}", "-r", f"__ns:=/{told['namespace'].strip('/')}"]
+        for i, given in enumerate(told["parameters"]):
+            if isinstance(given, dict):
+                path = tmp_path / f"{told['executable']}{i}.yaml"
+                path.write_text(yaml.dump({full: {"ros__parameters": given}}))
+                given = str(path)
+            line += ["--params-file", given]
+        return told["executable"], line
+
+    parts = {
+        "launch": {"LaunchDescription": list},
+        "launch.actions": {
+            "DeclareLaunchArgument": lambda name, default_value, description: (name, default_value),
+            "OpaqueFunction": lambda function: function,
+        },
+        "launch_ros": {},
+        "launch_ros.actions": {"Node": node},
+        "launch_ros.parameter_descriptions": {"ParameterValue": lambda value, value_type: value_type(value)},
+        "ament_index_python": {},
+        "ament_index_python.packages": {
+            "get_package_share_directory": lambda package: str(WORKSPACE / package)
+        },
+    }
+    for name, contents in parts.items():
+        module = types.ModuleType(name)
+        module.__dict__.update(contents)
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.syspath_prepend(str(NODES))
+    for name in ("finssim_ros", "finssim_ros.launching"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+
+    def start(graph, **given):
+        *declared, function = runpy.run_path(str(NODES / f"launch/{graph}.launch.py"))[
+            "generate_launch_description"
+        ]()
+        values = dict(declared)
+        assert set(given) <= set(values), f"{graph}.launch.py does not declare {set(given) - set(values)}"
+        return dict(function(types.SimpleNamespace(launch_configurations={**values, **given})))
+
+    return start
 
 
-@pytest.mark.parametrize("name", ["sim", "pool", "robot"])
-def test_parameter_files_are_read_as_ros_reads_them(name):
-    """Each is a parameter file, and its values reach nodes in any namespace."""
-    from finssim.ros2.shim.parameter_files import overrides_for, read_parameters
+def parameters_of(lines, node, namespace="finsrov"):
+    """What a node gets of its command line."""
+    return overrides_for(f"/{namespace}/{node}", parse_arguments(lines[node]).parameters)
 
-    path = NODES / "config" / f"{name}.yaml"
-    assert all("ros__parameters" in below for below in yaml.safe_load(path.read_text()).values())
-    node = {"sim": "sim", "pool": "virtual_pool", "robot": "controller"}[name]
-    assert overrides_for(f"/finsrov/{node}", read_parameters(path))["vehicle"] == "finsrov"
+
+@pytest.mark.parametrize(
+    ("graph", "given", "node", "parameters"),
+    [
+        ("robot", {"robot": "udp://1.2.3.4:5"}, "hardware_bridge", {"robot": "udp://1.2.3.4:5"}),
+        ("robot", {"record": "a.mcap"}, "recorder", {"record": "a.mcap"}),
+        ("robot", {"policy": "pid-paper"}, "controller", {"policy": "pid-paper", "vehicle": "finsrov"}),
+        ("robot", {"policy": "runs/hold", "teleop": "true"}, "teleop", {"other": "policy"}),
+        ("robot", {"pool_file": "1.yaml"}, "localizer", {"pool_file": "1.yaml"}),
+        ("robot", {"vehicle": "warpauv"}, "camera", {"vehicle": "warpauv"}),
+        ("robot", {}, "controller", {"policy": "pid", "vehicle": "finsrov"}),
+        ("sim", {"policy": "pid-paper"}, "controller", {"policy": "pid-paper", "use_sim_time": True}),
+        ("sim", {"vehicle": "bluerov2_heavy"}, "sim", {"vehicle": "bluerov2_heavy", "seed": 0}),
+        ("pool", {"plant": "7"}, "virtual_pool", {"plant": "7", "severity": "realistic"}),
+    ],
+)
+def test_launch_arguments_win_over_parameter_files(launched, graph, given, node, parameters):
+    """Files that begin with /**, as ours do, lose against what is given at launch, and win over what is not."""
+    assert parameters.items() <= parameters_of(launched(graph, **given), node).items()
+
+
+def test_a_parameter_file_of_ones_own_keeps_what_launch_does_not_say(launched, tmp_path):
+    """Nothing that a launch file would have as default."""
+    path = tmp_path / "own.yaml"
+    path.write_text("/**:\n  ros__parameters: {vehicle: lauv, policy: runs/a, rate: 30.0}\n")
+    lines = launched("robot", params_file=str(path), namespace="deep/blue")
+    assert parameters_of(lines, "controller", "deep/blue") == {
+        "vehicle": "lauv",
+        "policy": "runs/a",
+        "rate": 30.0,
+    }
+    lines = launched("robot", params_file=str(path), policy="pid")
+    assert parameters_of(lines, "controller")["policy"] == "pid"
+
+
+def test_launch_files_start_what_is_installed(launched):
+    """Every executable has an entry point, and every node is one."""
+    started = [set(launched(graph)) for graph in ("sim", "pool", "robot")] + [
+        set(launched("robot", teleop="true"))
+    ]
+    assert set().union(*started) == entry_points() == set(GRAPH_NODES)
+    run = runpy.run_path(str(NODES / "finssim_ros/run.py"))
+    assert run["__getattr__"]("camera").args == ("finssim.ros2.nodes.camera",)
+    with pytest.raises(AttributeError, match="available: camera"):
+        run["__getattr__"]("kamera")
+
+
+def test_vehicles_that_pages_and_launch_files_name_exist():
+    """After `vehicle:=` and `--vehicle`."""
+    files = [*NODES.rglob("*.py"), *(WORKSPACE.parents[1] / "docs").glob("ros2*.md")]
+    named = {m for file in files for m in re.findall(r"(?:vehicle:=|--vehicle )([\w-]+)", file.read_text())}
+    assert {"finsrov", "bluerov2_heavy"} <= named <= set(catalogue())

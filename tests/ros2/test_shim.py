@@ -21,9 +21,11 @@ from rclpy.duration import Duration
 from rclpy.exceptions import (
     InvalidParameterTypeException,
     InvalidParameterValueException,
+    NameValidationException,
     NotInitializedException,
     ParameterAlreadyDeclaredException,
     ParameterNotDeclaredException,
+    ParameterUninitializedException,
 )
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -63,6 +65,8 @@ def test_init_works_again_after_shutdown():
     """A test suite or a notebook does so."""
     for name in ("first", "second"):
         rclpy.init(args=[])
+        with pytest.raises(RuntimeError, match="only be called once"):
+            rclpy.init(args=[])
         assert rclpy.ok() and Node(name).get_name() == name
         rclpy.shutdown()
         assert not rclpy.ok()
@@ -184,7 +188,7 @@ def test_a_volatile_publisher_does_not_serve_a_latched_subscription(context, cap
 def test_a_publisher_takes_its_own_type_only(context):
     """A wrong message never reaches the wire."""
     publisher = Node("a").create_publisher(String, "word", 10)
-    with pytest.raises(AssertionError, match="/word carries std_msgs/msg/String, found Float64"):
+    with pytest.raises(TypeError, match="/word carries std_msgs/msg/String, found Float64"):
         publisher.publish(Float64())
 
 
@@ -240,7 +244,7 @@ def test_a_parameter_without_default_must_be_given(context):
     assert given.declare_parameter("file", Parameter.Type.STRING).value == "x"
     missing = Node("b")
     missing.declare_parameter("file", Parameter.Type.STRING)
-    with pytest.raises(ValueError, match="has no value"):
+    with pytest.raises(ParameterUninitializedException, match="has no value"):
         missing.get_parameter("file")
 
 
@@ -275,7 +279,7 @@ def test_names_are_joined_and_renamed(context):
 @pytest.mark.parametrize(("name", "namespace"), [("1a", ""), ("a b", ""), ("a", "b c")])
 def test_bad_node_names_are_refused(context, name, namespace):
     """Before anybody sees them."""
-    with pytest.raises(ValueError, match="letters, digits"):
+    with pytest.raises(NameValidationException, match="letters, digits"):
         Node(name, namespace=namespace)
 
 

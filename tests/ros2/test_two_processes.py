@@ -79,7 +79,7 @@ def odometry():
 
 def image():
     """A picture of a megabyte."""
-    return Image(height=1000, width=1000, data=np.arange(10**6, dtype=np.uint8))
+    return Image(height=1000, width=1000, data=np.arange(10**6).astype(np.uint8).tobytes())
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import numpy as np
 from finssim.ros2.definitions import Nodetype
 from finssim.ros2.errors import MessageError
 
-__all__ = ["DTYPES", "Octet", "check_of", "spelled"]
+__all__ = ["DTYPES", "Numbers", "Octet", "check_of", "spelled"]
 
 INTEGERS = {
     **{f"int{b}": (-(2 ** (b - 1)), 2 ** (b - 1) - 1) for b in (8, 16, 32, 64)},
@@ -29,6 +29,23 @@ DTYPES = {
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 Check = Callable[[Any], Any]
+
+
+class Numbers(np.ndarray[Any, Any]):
+    """A sequence of numbers as messages keep it: a NumPy array with the manners of rclpy's `array.array`.
+
+    Its elements are Python's numbers, and what is computed from it is an ordinary NumPy array, which no field takes.
+    """
+
+    def __getitem__(self, index: Any) -> Any:
+        part = super().__getitem__(index)
+        return part.item() if isinstance(part, np.generic) else part
+
+    def __iter__(self) -> Any:
+        return iter(self.tolist())
+
+    def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False) -> Any:
+        return array[()] if return_scalar else np.asarray(array)
 
 
 class Octet(bytes):
@@ -120,26 +137,29 @@ def _octet(value: Any) -> Octet:
 
 
 def _numbers(base: str, count: int, fixed: bool) -> Check:
-    """Arrays of numbers are kept as NumPy arrays; bytes and `array.array` are not copied."""
+    """Arrays of numbers are kept as NumPy arrays; bytes and `array.array` are not copied.
+
+    As the messages of rosidl_generator_py on Humble: arrays of a fixed length take NumPy arrays, sequences do not.
+    """
     dtype, single = DTYPES[base], _integer("uint8") if base in ("byte", "octet") else _base(base, 0)
 
     def check(value: Any) -> Any:
-        if isinstance(value, np.ndarray) and value.dtype != dtype:
-            raise MessageError(
-                f"expected an array of {dtype}, found {value.dtype}: use .astype('{dtype}') or .tolist()"
-            )
-        if isinstance(value, (bytes, bytearray)):
+        if isinstance(value, np.ndarray) and not fixed and not isinstance(value, Numbers):
+            raise MessageError("expected a list, bytes or array.array, found a NumPy array: use .tolist()")
+        if isinstance(value, (bytes, bytearray)) and base in ("uint8", "char"):
             array = np.frombuffer(value, dtype)
         elif isinstance(value, (list, tuple)):
             array = np.array([single(v) for v in value], dtype)
-        elif isinstance(value, str) or not (isinstance(value, np.ndarray) or hasattr(value, "typecode")):
-            raise MessageError(f"expected a list or array of {dtype}, found {_shown(value)}")
+        elif isinstance(value, np.ndarray) or hasattr(value, "typecode"):
+            array = np.asarray(value)
         else:
-            array = np.ascontiguousarray(value, dtype)
+            raise MessageError(f"expected a list or array of {dtype}, found {_shown(value)}")
+        if array.dtype != dtype:
+            raise MessageError(f"expected an array of {dtype}, found {array.dtype}: use .tolist()")
         if array.ndim != 1:
             raise MessageError(f"expected one axis, found {array.ndim}: use .ravel()")
         _check_count(len(array), count, fixed)
-        return array
+        return np.ascontiguousarray(array) if fixed else np.ascontiguousarray(array).view(Numbers)
 
     return check
 

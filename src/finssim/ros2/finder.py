@@ -28,6 +28,7 @@ PARTS = (
     "logging",
     "node",
     "parameter",
+    "parameter_service",
     "publisher",
     "qos",
     "serialization",

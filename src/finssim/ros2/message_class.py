@@ -10,7 +10,7 @@ import numpy as np
 
 from finssim.ros2.definitions import Definitions, Nodetype
 from finssim.ros2.errors import MessageError
-from finssim.ros2.field_checks import DTYPES, Octet, check_of, spelled
+from finssim.ros2.field_checks import DTYPES, Numbers, Octet, check_of, spelled
 
 __all__ = ["Message", "message_class"]
 
@@ -93,14 +93,16 @@ def message_class(
 def _maker(cls: type[Message], described: Mapping[str, Any]) -> Callable[..., Message]:
     """Make a message from values that need no check: the slots are set directly, which is several times faster."""
     names = list(described)
-    octets = {
-        i for i, d in enumerate(described.values()) if d[0] == Nodetype.BASE and d[1][0] in ("byte", "octet")
-    }
     lines = [f"def make({', '.join(f'v{i}' for i in range(len(names)))}):", "    m = new(cls)"]
-    for i in range(len(names)):
-        lines.append(f"    set{i}(m, {f'octet(v{i})' if i in octets else f'v{i}'})")
+    for i, (kind, what) in enumerate(described.values()):
+        kept = f"v{i}"
+        if kind == Nodetype.BASE and what[0] in ("byte", "octet"):
+            kept = f"octet(v{i})"
+        elif kind == Nodetype.SEQUENCE and what[0][0] == Nodetype.BASE and what[0][1][0] in DTYPES:
+            kept = f"v{i}.view(numbers)"
+        lines.append(f"    set{i}(m, {kept})")
     scope: dict[str, Any] = {f"set{i}": cls.__dict__[n].__set__ for i, n in enumerate(names)}
-    scope |= {"new": object.__new__, "cls": cls, "octet": Octet.of}
+    scope |= {"new": object.__new__, "cls": cls, "octet": Octet.of, "numbers": Numbers}
     exec("\n".join([*lines, "    return m"]), scope)
     return scope["make"]  # type: ignore[no-any-return]
 
@@ -120,7 +122,7 @@ def _zero(described: Any, nested: Callable[[str], type[Message]], default: Any) 
     count = length if kind == Nodetype.ARRAY else 0
     if inner_kind == Nodetype.BASE and inner[0] in DTYPES:
         dtype = DTYPES[inner[0]]
-        return lambda: np.zeros(count, dtype)
+        return lambda: np.zeros(count, dtype) if kind == Nodetype.ARRAY else np.zeros(0, dtype).view(Numbers)
     element = _zero((inner_kind, inner), nested, None)
     return lambda: [element() for _ in range(count)]
 

@@ -191,10 +191,10 @@ def test_pictures_come_back_as_they_were():
     jpeg = compressed_of(wire(MAKE.compressed(STAMP, image)))
     assert np.abs(jpeg.astype(int) - image).max() < 10
     colour = MAKE.image(STAMP, image)
-    colour.encoding, colour.step, colour.data = "rgb8", 192, np.repeat(image, 3, axis=1).ravel()
+    colour.encoding, colour.step, colour.data = "rgb8", 192, np.repeat(image, 3, axis=1).tobytes()
     assert np.array_equal(image_of(colour), image)
     padded = MAKE.image(STAMP, image)
-    padded.step, padded.data = 70, np.pad(image, ((0, 0), (0, 6))).ravel()
+    padded.step, padded.data = 70, np.pad(image, ((0, 0), (0, 6))).tobytes()
     assert np.array_equal(image_of(padded), image)
 
 

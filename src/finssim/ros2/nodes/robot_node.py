@@ -160,18 +160,26 @@ def run(make: Callable[[], Made], spin: Callable[[Made], None] = rclpy.spin, *, 
     node: Made | None = None
     try:
         rclpy.init()
+    except (RuntimeError, ValueError) as error:  # the command line, or a setting of the wire
+        return _refused(error)
+    try:
         node = make()
         spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (ValueError, ParameterException) as error:
-        print(f"finssim: {' '.join(str(error).split())}", file=sys.stderr)
-        return REFUSED
+        return _refused(error)
     finally:
         if node is not None:
             node.close()
         rclpy.try_shutdown()
     return 0
+
+
+def _refused(error: Exception) -> int:
+    """Say in one sentence what cannot be done."""
+    print(f"finssim: {' '.join(str(error).split())}", file=sys.stderr)
+    return REFUSED
 
 
 def _follow_parent() -> None:

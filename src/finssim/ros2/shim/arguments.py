@@ -6,21 +6,19 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-import yaml
-
-from finssim.ros2.errors import Ros2Error
+from finssim.ros2.shim.exceptions import RosArgumentsError
 from finssim.ros2.shim.logging import LoggingSeverity
-from finssim.ros2.shim.names import Remap
-from finssim.ros2.shim.parameter_files import Assignment, read_parameters
+from finssim.ros2.shim.names import TOKEN, Remap
+from finssim.ros2.shim.parameter_files import Overrides, parsed_value, read_parameters
 
 __all__ = ["RosArguments", "parse_arguments"]
 
 _SWITCHES = {
     f"--{way}-{what}-logs" for way in ("enable", "disable") for what in ("rosout", "stdout", "external-lib")
 }
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
+_TARGETS = {"__node": TOKEN, "__name": TOKEN, "__ns": rf"/|(/{TOKEN})+"}
+"""What a node's name or namespace may be replaced with."""
 
 
 @dataclass
@@ -28,7 +26,7 @@ class RosArguments:
     """Arguments in the order given."""
 
     remaps: list[Remap] = field(default_factory=list)
-    parameters: list[Assignment] = field(default_factory=list)
+    parameters: Overrides = field(default_factory=dict)
     levels: list[tuple[str, LoggingSeverity]] = field(default_factory=list)
     enclave: str = "/"
     rest: list[str] = field(default_factory=list)
@@ -39,7 +37,7 @@ def parse_arguments(arguments: Sequence[str]) -> RosArguments:
     """Read a command line.
 
     Raises:
-        Ros2Error: An argument for ROS that is malformed or not known.
+        RosArgumentsError: An argument for ROS that is malformed or not known.
     """
     found, words, ros = RosArguments(), list(arguments), False
     while words:
@@ -52,7 +50,7 @@ def parse_arguments(arguments: Sequence[str]) -> RosArguments:
             ros = False
         elif word not in _SWITCHES:
             if not words:
-                raise Ros2Error(f"--ros-args: {word} stands at the end: give its value after it")
+                raise RosArgumentsError(f"--ros-args: {word} stands at the end: give its value after it")
             _take(found, word, words.pop(0))
     return found
 
@@ -62,20 +60,31 @@ def _take(found: RosArguments, flag: str, value: str) -> None:
     if flag in ("-r", "--remap"):
         source, target = _pair(flag, value)
         node, _, source = source.rpartition(":")
+        if not re.fullmatch(_TARGETS.get(source, ".+"), target):
+            raise RosArgumentsError(
+                f"--ros-args {flag} {value}: '{target}' is no name, or a namespace without its slash"
+            )
         found.remaps.append(Remap(node, source, target))
     elif flag in ("-p", "--param"):
         name, text = _pair(flag, value)
         node, _, name = name.rpartition(":")
-        found.parameters.append(Assignment(f"/**/{node}" if node else "/**", name, parsed_value(text)))
+        try:
+            found.parameters.setdefault(node or "/**", {})[name] = parsed_value(text)
+        except ValueError as error:
+            raise RosArgumentsError(f"--ros-args {flag} {value}: {error}") from None
     elif flag == "--params-file":
-        found.parameters += read_parameters(Path(value))
+        read_parameters(Path(value), found.parameters)
     elif flag == "--log-level":
-        logger, _, level = value.rpartition(":=")
-        found.levels.append((logger, _severity(level)))
+        logger, mark, level = value.rpartition(":=")
+        if level.upper() not in LoggingSeverity.__members__ or (mark and not logger):
+            raise RosArgumentsError(
+                f"--log-level {value}: expected [LOGGER:=] and debug, info, warn, error or fatal"
+            )
+        found.levels.append((logger, LoggingSeverity[level.upper()]))
     elif flag in ("-e", "--enclave"):
         found.enclave = value
-    elif flag != "--log-config-file":
-        raise Ros2Error(
+    elif flag not in ("--log-config-file", "--log-file-name"):
+        raise RosArgumentsError(
             f"--ros-args: unknown argument '{flag}': known are -r, -p, --params-file, --log-level and -e"
         )
 
@@ -83,21 +92,5 @@ def _take(found: RosArguments, flag: str, value: str) -> None:
 def _pair(flag: str, value: str) -> tuple[str, str]:
     left, mark, right = value.partition(":=")
     if not (left and mark and right):
-        raise Ros2Error(f"--ros-args {flag} {value}: expected NAME:=VALUE")
+        raise RosArgumentsError(f"--ros-args {flag} {value}: expected NAME:=VALUE")
     return left, right
-
-
-def _severity(word: str) -> LoggingSeverity:
-    if word.upper() not in LoggingSeverity.__members__:
-        raise Ros2Error(f"--log-level {word}: expected debug, info, warn, error or fatal")
-    return LoggingSeverity[word.upper()]
-
-
-def parsed_value(text: str) -> Any:
-    """A parameter's value as YAML has it; `1e-3` is a number, as in ROS."""
-    if _NUMBER.fullmatch(text):
-        return float(text)
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise Ros2Error(f"parameter value '{text}' is not valid YAML: quote it") from None

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Any
 
 from finssim.ros2.codec import Message
-from finssim.ros2.errors import MessageError
 from finssim.ros2.shim.endpoint import Endpoint
 from finssim.ros2.shim.task import Future
 from finssim.ros2.wire.services import ClientEnd
@@ -33,7 +32,7 @@ class Client(Endpoint):
     def call_async(self, request: Message) -> Future:
         """Ask; the answer comes while an executor spins."""
         if not isinstance(request, self.srv_type.Request):
-            raise MessageError(
+            raise TypeError(
                 f"{self.srv_name} takes {self.srv_type.Request.TYPE}, found {type(request).__name__}"
             )
         future = Future()

@@ -6,7 +6,6 @@ import inspect
 from typing import Any
 
 from finssim.ros2.codec import Message
-from finssim.ros2.errors import Ros2Error
 from finssim.ros2.shim.qos import quality_of
 from finssim.ros2.wire.quality import Quality
 
@@ -47,7 +46,7 @@ class Endpoint:
     def _settle(self, node: Any, msg_type: Any, topic: str, qos_profile: Any) -> Quality:
         """Take over the arguments; returns the policies."""
         if not (isinstance(msg_type, type) and issubclass(msg_type, Message)):
-            raise Ros2Error(
+            raise TypeError(
                 f"{topic}: {msg_type!r} is no message type: import one from a package such as nav_msgs.msg"
             )
         self.node, self.msg_type, self.topic_name = node, msg_type, node.resolve_topic_name(topic)
@@ -62,13 +61,22 @@ POLICY_WORDS = {
 }
 
 
-def check_callback(callback: Any) -> None:
-    """Refuse what would silently never run.
+def check_callback(callback: Any, takes: int) -> None:
+    """Refuse what would silently never run, or fail when it does.
 
     Raises:
         TypeError: Not callable, or a coroutine function.
+        RuntimeError: It does not take that many arguments.
     """
     if not callable(callback):
         raise TypeError(f"the callback is a {type(callback).__name__}: give a function")
     if inspect.iscoroutinefunction(callback):
         raise TypeError("a coroutine as callback needs a sourced ROS 2: give an ordinary function")
+    try:
+        signature = inspect.signature(callback)
+    except ValueError:  # one of Python's own, which tells nothing
+        return
+    try:
+        signature.bind(*range(takes))
+    except TypeError:
+        raise RuntimeError(f"the callback takes {signature}, expected {takes} arguments") from None

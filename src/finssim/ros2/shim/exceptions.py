@@ -1,6 +1,4 @@
-"""`rclpy.exceptions`: the errors that code written for rclpy catches."""
-
-from finssim.ros2.errors import Ros2Error
+"""`rclpy.exceptions`: the errors that code written for rclpy catches, with rclpy's bases: none is a ValueError."""
 
 __all__ = [
     "InvalidNamespaceException",
@@ -8,33 +6,48 @@ __all__ = [
     "InvalidParameterException",
     "InvalidParameterTypeException",
     "InvalidParameterValueException",
+    "InvalidServiceNameException",
     "InvalidTopicNameException",
+    "NameValidationException",
     "NotInitializedException",
     "ParameterAlreadyDeclaredException",
     "ParameterException",
     "ParameterImmutableException",
     "ParameterNotDeclaredException",
     "ParameterUninitializedException",
+    "RosArgumentsError",
 ]
 
 
-class NotInitializedException(Ros2Error):
+class RosArgumentsError(RuntimeError):
+    """Arguments after `--ros-args` that ROS refuses; in rclpy RCLInvalidROSArgsError or UnknownROSArgsError."""
+
+
+class NotInitializedException(Exception):
     """`rclpy.init` has not been called, or `rclpy.shutdown` has."""
 
 
-class InvalidNodeNameException(Ros2Error):
+class NameValidationException(Exception):
+    """A name is malformed."""
+
+
+class InvalidNodeNameException(NameValidationException):
     """A node's name holds something other than letters, digits and underscores."""
 
 
-class InvalidNamespaceException(Ros2Error):
+class InvalidNamespaceException(NameValidationException):
     """A namespace is malformed."""
 
 
-class InvalidTopicNameException(Ros2Error):
-    """A topic's or service's name is malformed."""
+class InvalidTopicNameException(NameValidationException):
+    """A topic's name is malformed."""
 
 
-class ParameterException(Ros2Error):
+class InvalidServiceNameException(NameValidationException):
+    """A service's name is malformed."""
+
+
+class ParameterException(Exception):
     """Something is wrong with a parameter."""
 
 

@@ -12,10 +12,12 @@ from finssim.ros2.shim.exceptions import (
     InvalidTopicNameException,
 )
 
-__all__ = ["Remap", "check_node", "expanded", "full_node_name", "remapped"]
+__all__ = ["TOKEN", "Remap", "check_node", "expanded", "full_node_name", "remapped"]
 
-_TOKEN = r"[A-Za-z_][A-Za-z0-9_]*"
-_TOPIC = re.compile(rf"^(~|(~/|/)?{_TOKEN}(/{_TOKEN})*)$")
+TOKEN = r"[A-Za-z_][A-Za-z0-9_]*"
+_TOPIC = re.compile(rf"^(~|(~/|/)?{TOKEN}(/{TOKEN})*)$")
+LONGEST_NODE, LONGEST_NAMESPACE, LONGEST_TOPIC = 255, 245, 247
+"""As rmw counts them: RMW_NODE_NAME_MAX_NAME_LENGTH, RMW_NAMESPACE_MAX_LENGTH, RMW_TOPIC_MAX_NAME_LENGTH."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +37,14 @@ def check_node(name: str, namespace: str) -> str:
         InvalidNodeNameException: Not a name.
         InvalidNamespaceException: Not a namespace.
     """
-    if not re.fullmatch(_TOKEN, name):
+    if not re.fullmatch(TOKEN, name) or len(name) > LONGEST_NODE:
         raise InvalidNodeNameException(
-            f"node name '{name}': use letters, digits and underscores, no digit first"
+            f"node name '{name}': use at most {LONGEST_NODE} letters, digits and underscores, no digit first"
         )
-    full = "/" + namespace.strip("/")
-    if full != "/" and not re.fullmatch(rf"(/{_TOKEN})+", full):
+    full = namespace if namespace.startswith("/") else f"/{namespace}"
+    if full != "/" and not re.fullmatch(rf"(/{TOKEN})+", full) or len(full) > LONGEST_NAMESPACE:
         raise InvalidNamespaceException(
-            f"namespace '{namespace}': use names of letters, digits and _ between slashes"
+            f"namespace '{namespace}': use names of letters, digits and _ between slashes, none at the end"
         )
     return full
 
@@ -63,10 +65,16 @@ def expanded(topic: str, name: str, namespace: str) -> str:
             f"topic or service name '{topic}': use names of letters, digits and single _"
         )
     if topic.startswith("/"):
-        return topic
-    if topic.startswith("~"):
-        return full_node_name(name, namespace) + topic[1:]
-    return f"{namespace.rstrip('/')}/{topic}"
+        full = topic
+    elif topic.startswith("~"):
+        full = full_node_name(name, namespace) + topic[1:]
+    else:
+        full = full_node_name(topic, namespace)
+    if len(full) > LONGEST_TOPIC:
+        raise InvalidTopicNameException(
+            f"topic or service name '{full}': longer than {LONGEST_TOPIC} characters"
+        )
+    return full
 
 
 def remapped(topic: str, name: str, namespace: str, rules: Sequence[Remap]) -> str:

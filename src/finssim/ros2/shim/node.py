@@ -16,8 +16,9 @@ from finssim.ros2.shim.node_graph import NodeGraph
 from finssim.ros2.shim.node_parameters import NodeParameters
 from finssim.ros2.shim.parameter import Parameter
 from finssim.ros2.shim.parameter_files import overrides_for
+from finssim.ros2.shim.parameter_service import ParameterService
 from finssim.ros2.shim.publisher import Publisher
-from finssim.ros2.shim.qos import qos_profile_services_default
+from finssim.ros2.shim.qos import qos_profile_parameter_events, qos_profile_services_default
 from finssim.ros2.shim.service import Service
 from finssim.ros2.shim.subscription import Subscription
 from finssim.ros2.shim.time_source import TimeSource
@@ -42,8 +43,8 @@ class Node(NodeParameters, NodeGraph):
         parameter_overrides: Values that win over files and command line.
         allow_undeclared_parameters: Whether parameters need no declaration.
         automatically_declare_parameters_from_overrides: Declare every parameter that is given from outside.
-        **services: `start_parameter_services`, `enable_rosout` and `enable_logger_service` are accepted; the shim has
-            neither parameter services nor /rosout.
+        start_parameter_services: Whether `ros2 param` reaches it.
+        **services: `enable_rosout` and `enable_logger_service` are accepted; the shim has neither.
     """
 
     def __init__(
@@ -57,31 +58,39 @@ class Node(NodeParameters, NodeGraph):
         parameter_overrides: Sequence[Parameter] | None = None,
         allow_undeclared_parameters: bool = False,
         automatically_declare_parameters_from_overrides: bool = False,
+        start_parameter_services: bool = True,
         **services: bool,
     ) -> None:
-        unknown = set(services) - {"start_parameter_services", "enable_rosout", "enable_logger_service"}
+        unknown = set(services) - {"enable_rosout", "enable_logger_service"}
         if unknown:
             raise TypeError(f"Node takes no argument '{min(unknown)}'")
         self.context = context or get_default_context()
-        sources = [parse_arguments(cli_args)] if cli_args is not None else []
-        sources += [self.context.arguments] if use_global_arguments else []
-        self._rules = [rule for source in sources for rule in source.remaps]
+        own = parse_arguments(cli_args or ())
+        sources = [self.context.arguments, own] if use_global_arguments else [own]
+        self._rules = [rule for source in reversed(sources) for rule in source.remaps]
         self._name, self._namespace = self._named(node_name, namespace or "")
         self._logger = get_logger(self.get_fully_qualified_name().strip("/").replace("/", "."))
         self.context.participant.codec  # noqa: B018 - refuses a context that is not initialized, before anything else
         self.timers: list[Timer] = []
         self._ends: list[Any] = []
-        assignments = [a for source in reversed(sources) for a in source.parameters]
-        overrides = overrides_for(self.get_fully_qualified_name(), assignments)
+        overrides: dict[str, Any] = {}
+        for source in sources:
+            overrides |= overrides_for(self.get_fully_qualified_name(), source.parameters)
         overrides |= {p.name: p.value for p in parameter_overrides or ()}
         NodeParameters.__init__(self, overrides, allow_undeclared_parameters)
         self._clock = ROSClock()
         self.context.nodes.append(self)
-        self.context.announce()
-        self._time_source = TimeSource(self, self._clock)
+        event = self.context.participant.codec.message("rcl_interfaces/msg/ParameterEvent")
+        self._parameter_events = self.create_publisher(
+            event, "/parameter_events", qos_profile_parameter_events
+        )
+        self._time_source: TimeSource | None = None
         if automatically_declare_parameters_from_overrides:
-            for name in set(overrides) - {"use_sim_time"}:
-                self.declare_parameter(name, overrides[name])
+            for name, value in overrides.items():
+                self.declare_parameter(name, value, ignore_override=True)
+        self._time_source = TimeSource(self, self._clock)
+        if start_parameter_services:
+            ParameterService(self)
 
     def get_name(self) -> str:
         """Its name."""
@@ -235,10 +244,22 @@ class Node(NodeParameters, NodeGraph):
         self.context.announce()
         return True
 
-    def _parameters_changed(self, parameters: Sequence[Parameter]) -> None:
-        for parameter in parameters:
-            if parameter.name == "use_sim_time":
+    def _parameters_changed(
+        self, new: list[Parameter], changed: list[Parameter], gone: list[Parameter]
+    ) -> None:
+        """Tell everybody on /parameter_events, and follow `use_sim_time`."""
+        for parameter in (*new, *changed):
+            if parameter.name == "use_sim_time" and self._time_source is not None:
                 self._time_source.use_simulated(bool(parameter.value))
+        self._parameter_events.publish(
+            self._parameter_events.msg_type(
+                stamp=self._clock.now().to_msg(),
+                node=self.get_fully_qualified_name(),
+                new_parameters=[p.to_parameter_msg() for p in new],
+                changed_parameters=[p.to_parameter_msg() for p in changed],
+                deleted_parameters=[p.to_parameter_msg() for p in gone],
+            )
+        )
 
 
 def _check_options(options: dict[str, Any]) -> None:

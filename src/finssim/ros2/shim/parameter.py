@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from enum import IntEnum
+import array
+from enum import Enum
 from typing import Any
 
 from finssim.ros2.codec import codec_of
-from finssim.ros2.shim.exceptions import InvalidParameterTypeException
 
-__all__ = ["Parameter", "parameter_value"]
+__all__ = ["PARAMETER_SEPARATOR_STRING", "Parameter", "parameter_value_to_python"]
+
+PARAMETER_SEPARATOR_STRING = "."
 
 
-class _Type(IntEnum):
-    """Types of parameters, numbered as in rcl_interfaces."""
+class _Type(Enum):
+    """Types of parameters, numbered as in rcl_interfaces; no integers, as in rclpy."""
 
     NOT_SET = 0
     BOOL = 1
@@ -27,36 +29,49 @@ class _Type(IntEnum):
 
     @classmethod
     def from_parameter_value(cls, value: Any) -> _Type:
-        """The type of a Python value; lists are of one type throughout.
+        """The type of a Python value; lists are of one type throughout, and an empty one is of bytes.
 
         Raises:
             TypeError: A value that no parameter can hold.
         """
         if value is None:
             return cls.NOT_SET
-        for kind, single, many in _KINDS:
-            if isinstance(value, kind):
-                return cls[single]
-            # An empty list could be of any type; rclpy calls it a byte array.
-            if isinstance(value, (list, tuple)) and value and all(type(v) is kind for v in value):
-                return cls[many]
-        if isinstance(value, (list, tuple)) and (not value or all(isinstance(v, bytes) for v in value)):
-            return cls.BYTE_ARRAY
+        for kind, single, _ in _KINDS:
+            if single is not None and isinstance(value, kind):
+                return single
+        if isinstance(value, (list, tuple, array.array)):
+            for kind, _, many in _KINDS:
+                if all(isinstance(v, kind) for v in value):
+                    return many
         raise TypeError(
             f"no parameter can hold {value!r}: use bool, int, float, str, or a list of one of them"
         )
 
+    def check(self, value: Any) -> bool:
+        """Whether a value is of this type."""
+        if self is _Type.NOT_SET:
+            return value is None
+        for kind, single, many in _KINDS:
+            if self is single:
+                return isinstance(value, kind)
+            if self is many:
+                return isinstance(value, (list, tuple, array.array)) and all(
+                    isinstance(v, kind) for v in value
+                )
+        return False
+
 
 _KINDS = (
-    (bool, "BOOL", "BOOL_ARRAY"),
-    (int, "INTEGER", "INTEGER_ARRAY"),
-    (float, "DOUBLE", "DOUBLE_ARRAY"),
-    (str, "STRING", "STRING_ARRAY"),
+    (bytes, None, _Type.BYTE_ARRAY),
+    (bool, _Type.BOOL, _Type.BOOL_ARRAY),
+    (int, _Type.INTEGER, _Type.INTEGER_ARRAY),
+    (float, _Type.DOUBLE, _Type.DOUBLE_ARRAY),
+    (str, _Type.STRING, _Type.STRING_ARRAY),
 )
 
 
 class Parameter:
-    """A name, a type and a value.
+    """A name, a type and a value, none of which changes.
 
     Args:
         name: As declared.
@@ -64,38 +79,44 @@ class Parameter:
         value: What it holds.
 
     Raises:
-        InvalidParameterTypeException: Value and type disagree.
+        TypeError: A value that no parameter can hold, or `type_` is no `Parameter.Type`.
+        ValueError: Value and type disagree.
     """
 
     Type = _Type
 
     def __init__(self, name: str, type_: _Type | None = None, value: Any = None) -> None:
-        try:
-            found = _Type.from_parameter_value(value)
-        except TypeError as error:
-            raise InvalidParameterTypeException(f"parameter '{name}': {error}") from None
-        empty = (
-            isinstance(value, (list, tuple)) and not value and type_ is not None and type_ >= _Type.BYTE_ARRAY
-        )
-        if type_ is not None and type_ != found and not empty:
-            raise InvalidParameterTypeException(
-                f"parameter '{name}' is {type_.name}, found {value!r} ({found.name}): give a value of that type"
+        type_ = _Type.from_parameter_value(value) if type_ is None else type_
+        if not isinstance(type_, _Type):
+            raise TypeError(f"parameter '{name}': {type_!r} is no Parameter.Type")
+        if not type_.check(value):
+            raise ValueError(
+                f"parameter '{name}' is {type_.name}, found {value!r}: give a value of that type"
             )
-        self.name, self.value = name, value
-        self.type_ = found if type_ is None else type_
+        self._name, self._type, self._value = name, type_, value
+
+    @property
+    def name(self) -> str:
+        """As declared."""
+        return self._name
+
+    @property
+    def type_(self) -> _Type:
+        """Of the value."""
+        return self._type
+
+    @property
+    def value(self) -> Any:
+        """What it holds."""
+        return self._value
 
     def __repr__(self) -> str:
         return f"Parameter(name={self.name!r}, type_={self.type_.name}, value={self.value!r})"
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Parameter) and vars(self) == vars(other)
-
-    __hash__ = None  # type: ignore[assignment]
-
     def get_parameter_value(self) -> Any:
         """As rcl_interfaces/ParameterValue."""
-        message = codec_of().message("rcl_interfaces/msg/ParameterValue")(type=int(self.type_))
-        if self.type_ != _Type.NOT_SET:
+        message = codec_of().message("rcl_interfaces/msg/ParameterValue")(type=self.type_.value)
+        if self.type_ is not _Type.NOT_SET:
             setattr(message, f"{self.type_.name.lower()}_value", self.value)
         return message
 
@@ -107,13 +128,15 @@ class Parameter:
     @classmethod
     def from_parameter_msg(cls, message: Any) -> Parameter:
         """From rcl_interfaces/Parameter."""
-        return cls(message.name, _Type(message.value.type), parameter_value(message.value))
+        return cls(message.name, _Type(message.value.type), parameter_value_to_python(message.value))
 
 
-def parameter_value(message: Any) -> Any:
+def parameter_value_to_python(message: Any) -> Any:
     """What a rcl_interfaces/ParameterValue holds."""
     kind = _Type(message.type)
-    if kind == _Type.NOT_SET:
+    if kind is _Type.NOT_SET:
         return None
     value = getattr(message, f"{kind.name.lower()}_value")
-    return list(value) if kind >= _Type.BYTE_ARRAY else value
+    if kind is _Type.BYTE_ARRAY:
+        return [bytes([v]) for v in value]
+    return value.tolist() if hasattr(value, "tolist") else value

@@ -1,68 +1,168 @@
-"""ROS 2's parameter files: values by node name, with wildcards."""
+"""Parameters from outside, files and `-p`, read as rcl reads them (rcl_yaml_param_parser/src/parse.c)."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from finssim.ros2.errors import Ros2Error
-from finssim.yaml_file import read_mapping
+import yaml
 
-__all__ = ["Assignment", "overrides_for", "read_parameters"]
+from finssim.ros2.shim.exceptions import RosArgumentsError
 
-_KEY = "ros__parameters"
+__all__ = ["Overrides", "overrides_for", "parsed_value", "read_parameters"]
+
+Overrides = dict[str, dict[str, Any]]
+"""Node name or pattern -> parameter -> value, in the order in which the patterns were first mentioned.
+
+That order is their precedence: of several patterns that fit a node the last counts, and a pattern that is mentioned
+again keeps the rank of its first mention. So `/**` of a later file loses against `/**/controller` of an earlier one
+that began with `/**`.
+"""
+
+KEY = "ros__parameters"
+STRING = "tag:yaml.org,2002:str"
+TRUE = {"Y", "y", "yes", "Yes", "YES", "true", "True", "TRUE", "on", "On", "ON"}
+FALSE = {"N", "n", "no", "No", "NO", "false", "False", "FALSE", "off", "Off", "OFF"}
+
+_INTEGER = re.compile(r"[-+]?(0[xX][0-9a-fA-F]+|0[0-7]*|[1-9][0-9]*)")
+_FLOAT = re.compile(
+    r"(?P<number>[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?)|[-+]?\.?(inf|Inf|INF)|[-+]?(infinity|nan|NaN|NAN)|\.(nan|NaN|NAN)"
+)
+_NAME = re.compile(r"/?(\*\*?|[A-Za-z_]\w*)(/(\*\*?|[A-Za-z_]\w*))*")
+
+Tree = Any
+"""A scalar's event, a list of trees, or a list of (key, tree) in a tuple."""
 
 
-@dataclass(frozen=True)
-class Assignment:
-    """A value for a parameter of every node whose full name fits a pattern."""
-
-    pattern: str
-    """Full node name; `*` stands for one part of it, `**` for any number."""
-    name: str
-    """Dotted where the file nests it."""
-    value: Any
-
-
-def read_parameters(path: Path) -> list[Assignment]:
-    """Assignments of a parameter file, in its order.
+def read_parameters(path: Path, overrides: Overrides) -> None:
+    """Add the values of a parameter file.
 
     Raises:
-        Ros2Error: No such file, not YAML, or not laid out as a parameter file.
+        RosArgumentsError: No such file, or one that rcl refuses.
     """
-    tree = read_mapping(path, Ros2Error, such_as=f"/**: {{{_KEY}: ...}}")
-    return list(_nodes(path, "", tree))
+    try:
+        tree = _document(path.read_text(encoding="utf-8"))
+        if tree is not None:
+            _add_nodes("", tree, overrides)
+    except OSError as error:
+        raise RosArgumentsError(f"--params-file {path}: {error.strerror}") from None
+    except (yaml.YAMLError, ValueError) as error:
+        raise RosArgumentsError(f"--params-file {path}: {' '.join(str(error).split())}") from None
 
 
-def overrides_for(node: str, assignments: Sequence[Assignment]) -> dict[str, Any]:
-    """Values for one node by its full name; of several for a parameter the last counts."""
-    return {a.name: a.value for a in assignments if _pattern(a.pattern).fullmatch(node)}
+def parsed_value(text: str) -> Any:
+    """A parameter's value as it stands after `-p name:=`; None for an empty list, whose type nobody knows.
+
+    Raises:
+        ValueError: It is empty, not YAML, a mapping, or a list of different types.
+    """
+    try:
+        tree = _document(text)
+    except yaml.YAMLError:
+        raise ValueError(f"'{text}' is not valid YAML: quote it") from None
+    if tree is None or isinstance(tree, tuple):
+        raise ValueError(f"'{text}' is no value: give a number, a word or a list")
+    return _value(tree)
 
 
-def _nodes(path: Path, above: str, tree: Mapping[Any, Any]) -> Iterator[Assignment]:
-    for key, below in tree.items():
-        if not isinstance(below, Mapping):
-            raise Ros2Error(f"{path}: {key}: expected '{_KEY}:' below a node's name, found {below!r}")
-        if key == _KEY:
-            yield from _values(path, above or "/**", "", below)
+def overrides_for(node: str, overrides: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Values for one node by its full name, such as `/finsrov/controller`."""
+    values: dict[str, Any] = {}
+    for pattern, given in overrides.items():
+        pattern = pattern if pattern.startswith("/") else f"/{pattern}"
+        # As rclpy has it: "/*" is one name, and "/**", which becomes that with a star, any number.
+        if re.fullmatch(pattern.replace("/*", r"(/\w+)"), node):
+            values.update(given)
+    return values
+
+
+def _document(text: str) -> Tree:
+    """The first document's tree; None of an empty one."""
+    events = yaml.parse(text, Loader=yaml.SafeLoader)
+    for event in events:
+        if isinstance(event, (yaml.StreamEndEvent, yaml.DocumentEndEvent)):
+            break
+        if not isinstance(event, (yaml.StreamStartEvent, yaml.DocumentStartEvent)):
+            return _tree(event, events)
+    return None
+
+
+def _tree(event: Any, events: Iterator[Any]) -> Tree:
+    if isinstance(event, yaml.AliasEvent):
+        raise ValueError(f"line {event.start_mark.line + 1}: rcl takes no aliases: write the value out")
+    if isinstance(event, yaml.SequenceStartEvent):
+        parts = []
+        while not isinstance(part := next(events), yaml.SequenceEndEvent):
+            parts.append(_tree(part, events))
+        return parts
+    if isinstance(event, yaml.MappingStartEvent):
+        pairs = []
+        while not isinstance(key := next(events), yaml.MappingEndEvent):
+            if not isinstance(key, yaml.ScalarEvent) or not key.value:
+                raise ValueError(f"line {key.start_mark.line + 1}: expected a name before the colon")
+            pairs.append((key.value, _tree(next(events), events)))
+        return tuple(pairs)
+    return event
+
+
+def _add_nodes(above: str, tree: Tree, overrides: Overrides) -> None:
+    """Descend to `ros__parameters`; the keys on the way make up a node's name."""
+    if not isinstance(tree, tuple):
+        raise ValueError(f"{above or 'its top'}: expected '{KEY}:' below a node's name")
+    for key, below in tree:
+        if key != KEY:
+            _add_nodes(f"{above}/{key.lstrip('/')}" if above else key, below, overrides)
+        elif not _NAME.fullmatch(above):
+            raise ValueError(
+                f"{KEY} stands below '{above}', expected the name of a node such as /**/controller"
+            )
+        elif not isinstance(below, tuple):
+            raise ValueError(f"{above}: expected parameters and values below {KEY}")
         else:
-            yield from _nodes(path, f"{above}/{str(key).strip('/')}", below)
+            overrides.setdefault(above, {}).update(_values("", below))
 
 
-def _values(path: Path, pattern: str, prefix: str, tree: Mapping[Any, Any]) -> Iterator[Assignment]:
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            yield from _values(path, pattern, f"{prefix}{key}.", value)
-        elif value is None:
-            raise Ros2Error(f"{path}: {prefix}{key}: has no value: give one or leave the line out")
-        else:
-            yield Assignment(pattern, f"{prefix}{key}", value)
+def _values(prefix: str, tree: Tree) -> Iterator[tuple[str, Any]]:
+    for key, below in tree:
+        if isinstance(below, tuple):
+            yield from _values(f"{prefix}{key}.", below)
+            continue
+        try:
+            yield f"{prefix}{key}", _value(below)
+        except ValueError as error:
+            raise ValueError(f"{prefix}{key}: {error}") from None
 
 
-def _pattern(text: str) -> re.Pattern[str]:
-    parts = {"**": ".*", "*": "[^/]*"}
-    words = re.split(r"(/\*\*/|\*\*|\*)", text)
-    return re.compile("".join("/(.*/)?" if w == "/**/" else parts.get(w, re.escape(w)) for w in words))
+def _value(tree: Tree) -> Any:
+    if not isinstance(tree, list):
+        return _scalar(tree)
+    if any(isinstance(part, (list, tuple)) for part in tree):
+        raise ValueError("a list holds plain values only")
+    values = [_scalar(part) for part in tree]
+    if len({type(value) for value in values}) > 1:
+        raise ValueError(
+            f"{values}: the values of a list are all of one type: write 1.0 beside 2.0, and quote words"
+        )
+    return values or None
+
+
+def _scalar(event: Any) -> bool | int | float | str:
+    """What rcl's `get_value` makes of it, which is neither YAML 1.1 nor 1.2."""
+    text: str = event.value
+    if event.style in ("'", '"') or event.tag == STRING:
+        return text
+    if not text:
+        raise ValueError("has no value: give one or leave the line out")
+    if text in TRUE or text in FALSE:
+        return text in TRUE
+    if _INTEGER.fullmatch(text):
+        digits = text.lstrip("+-")
+        base = 16 if digits[1:2] in ("x", "X") else 8 if digits[0] == "0" else 10
+        number = int(text, base)
+        if -(2**63) <= number < 2**63:
+            return number
+        return float(number)
+    found = _FLOAT.fullmatch(text)
+    return float(found["number"] or re.sub(r"\.", "", text)) if found else text

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from finssim.ros2.codec import HEADER, Message
-from finssim.ros2.errors import MessageError
 from finssim.ros2.shim.endpoint import Endpoint
 
 __all__ = ["Publisher"]
@@ -24,14 +23,15 @@ class Publisher(Endpoint):
         """Send a message, or ready CDR bytes.
 
         Raises:
-            MessageError: A message of another type, or one with a field that does not fit.
+            TypeError: A message of another type.
+            MessageError: One with a field that does not fit.
         """
         if type(msg) is self.msg_type:
             buffer = self._codec.serialize(msg)
         elif isinstance(msg, bytes) and msg[:2] == HEADER[:2]:
             buffer = bytearray(msg) + bytes(-len(msg) % 4)
         else:
-            raise MessageError(f"{self.topic_name} carries {self.msg_type.TYPE}, found {type(msg).__name__}")
+            raise TypeError(f"{self.topic_name} carries {self.msg_type.TYPE}, found {type(msg).__name__}")
         if not self._writer.write(buffer):
             self.node.get_logger().warning(
                 f"a message on {self.topic_name} was left out: readers are too slow",

@@ -5,13 +5,13 @@ from __future__ import annotations
 from enum import Enum, IntEnum
 from typing import Any
 
-from finssim.ros2.errors import Ros2Error
 from finssim.ros2.shim.duration import Duration
 from finssim.ros2.wire.quality import Quality
 
 __all__ = [
     "DurabilityPolicy",
     "HistoryPolicy",
+    "InvalidQoSProfileException",
     "LivelinessPolicy",
     "QoSDurabilityPolicy",
     "QoSHistoryPolicy",
@@ -63,23 +63,51 @@ QoSHistoryPolicy, QoSReliabilityPolicy = HistoryPolicy, ReliabilityPolicy
 QoSDurabilityPolicy, QoSLivelinessPolicy = DurabilityPolicy, LivelinessPolicy
 
 
+class InvalidQoSProfileException(Exception):
+    """A profile without a depth."""
+
+
+POLICIES = {
+    "history": HistoryPolicy.KEEP_LAST,
+    "depth": 10,
+    "reliability": ReliabilityPolicy.RELIABLE,
+    "durability": DurabilityPolicy.VOLATILE,
+    "lifespan": Duration(),
+    "deadline": Duration(),
+    "liveliness": LivelinessPolicy.SYSTEM_DEFAULT,
+}
+"""Policy -> default (rmw_qos_profile_default), which has its type."""
+
+
 class QoSProfile:
-    """Policies of an endpoint; arguments and defaults as in rclpy."""
+    """Policies of an endpoint; arguments, defaults and refusals as in rclpy."""
+
+    history: HistoryPolicy
+    depth: int
+    reliability: ReliabilityPolicy
+    durability: DurabilityPolicy
+    lifespan: Duration
+    deadline: Duration
+    liveliness: LivelinessPolicy
 
     def __init__(self, **policies: Any) -> None:
-        if "depth" not in policies and "history" not in policies:
-            raise Ros2Error("QoSProfile: give the number of samples kept as depth=10, or a history")
-        self.depth: int = policies.pop("depth", 0)
-        self.history = HistoryPolicy(policies.pop("history", HistoryPolicy.KEEP_LAST))
-        self.reliability = ReliabilityPolicy(policies.pop("reliability", ReliabilityPolicy.RELIABLE))
-        self.durability = DurabilityPolicy(policies.pop("durability", DurabilityPolicy.VOLATILE))
-        self.liveliness = LivelinessPolicy(policies.pop("liveliness", LivelinessPolicy.SYSTEM_DEFAULT))
-        self.deadline: Duration = policies.pop("deadline", Duration())
-        self.lifespan: Duration = policies.pop("lifespan", Duration())
-        if policies:
-            raise Ros2Error(f"QoSProfile: '{min(policies)}' needs a sourced ROS 2: leave it out")
-        if self.history == HistoryPolicy.KEEP_LAST and self.depth < 1:
-            raise Ros2Error(f"QoSProfile: depth is {self.depth}, expected at least 1 with KEEP_LAST")
+        unknown = set(policies) - set(POLICIES)
+        assert not unknown, (
+            f"QoSProfile: '{min(unknown)}' is no policy, or needs a sourced ROS 2: leave it out"
+        )
+        if (
+            "depth" not in policies
+            and policies.get("history", HistoryPolicy.KEEP_LAST) == HistoryPolicy.KEEP_LAST
+        ):
+            raise InvalidQoSProfileException("QoSProfile: give the number of samples kept, such as depth=10")
+        for name, value in (POLICIES | policies).items():
+            setattr(self, name, value)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        kind = type(POLICIES[name])
+        fits = isinstance(value, int) if issubclass(kind, int) else isinstance(value, kind)
+        assert fits, f"QoSProfile: {name} is {value!r}, expected a {kind.__name__}"
+        object.__setattr__(self, name, kind(value) if issubclass(kind, IntEnum) else value)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, QoSProfile) and vars(self) == vars(other)
@@ -91,9 +119,17 @@ class QoSProfile:
 
 
 def quality_of(profile: QoSProfile | int) -> Quality:
-    """A profile, or a depth alone, as the wire has it."""
+    """A profile, or a depth alone, as the wire has it.
+
+    Raises:
+        TypeError, ValueError: Neither, or a negative depth.
+    """
     if isinstance(profile, int):
+        if profile < 0:
+            raise ValueError(f"a depth of {profile}: expected zero or more")
         profile = QoSProfile(depth=profile)
+    if not isinstance(profile, QoSProfile):
+        raise TypeError(f"{profile!r}: expected a QoSProfile or a depth")
     return Quality(
         depth=0 if profile.history == HistoryPolicy.KEEP_ALL else profile.depth or 1,
         reliable=profile.reliability != ReliabilityPolicy.BEST_EFFORT,
@@ -117,3 +153,4 @@ class QoSPresetProfiles(Enum):
     SENSOR_DATA = qos_profile_sensor_data
     SERVICES_DEFAULT = qos_profile_services_default
     PARAMETERS = qos_profile_parameters
+    PARAMETER_EVENTS = qos_profile_parameter_events

@@ -24,7 +24,7 @@ class Subscription(Endpoint):
         qos_profile: Any,
         raw: bool = False,
     ) -> None:
-        check_callback(callback)
+        check_callback(callback, takes=1)
         quality = self._settle(node, msg_type, topic, qos_profile)
         self.callback, self.raw = callback, raw
         self._reader = node.context.participant.reader(f"rt{self.topic_name}", msg_type.TYPE, quality)

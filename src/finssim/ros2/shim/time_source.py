@@ -17,7 +17,9 @@ class TimeSource:
 
     def __init__(self, node: Any, clock: ROSClock) -> None:
         self._node, self._clock, self._subscription = node, clock, None
-        self.use_simulated(bool(node.declare_parameter("use_sim_time", False).value))
+        if not node.has_parameter("use_sim_time"):
+            node.declare_parameter("use_sim_time", False)
+        self.use_simulated(bool(node.get_parameter("use_sim_time").value))
 
     def use_simulated(self, simulated: bool) -> None:
         """Follow /clock, or the system's time."""

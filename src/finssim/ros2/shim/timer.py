@@ -20,9 +20,9 @@ class Timer:
     def __init__(
         self, callback: Callable[[], Any], timer_period_ns: int, clock: Clock, *, autostart: bool = True
     ) -> None:
-        check_callback(callback)
+        check_callback(callback, takes=0)
         if timer_period_ns < 0:
-            raise ValueError(f"timer period {timer_period_ns / 1e9} s: expected zero or more")
+            raise RuntimeError(f"timer period {timer_period_ns / 1e9} s: expected zero or more")
         self.callback, self.clock, self._period = callback, clock, timer_period_ns
         self._cancelled = not autostart
         self._last = clock.tick()
