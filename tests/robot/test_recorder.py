@@ -4,16 +4,20 @@ import json
 
 import numpy as np
 import pytest
+import yaml
 
 from finssim.files import OutputError
 from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
 from finssim.robot.messages import CommandEcho, Picture, TagCorners, Telemetry
+from finssim.robot.record_topics import TOPICS
 from finssim.robot.robot import Reading
 from finssim.vehicles import load_vehicle
 
 pytest.importorskip("mcap")
 pytest.importorskip("rosbags")
+from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag2.metadata import dump_qos_v8, parse_qos
 
 from finssim.robot.record_messages import Messages
 from finssim.robot.record_reader import open_record
@@ -95,6 +99,20 @@ def test_rosbags_reads_back_what_the_robot_knew(full):
     assert (status.mode, status.vision_age) == ("coast", 0.5) and np.isnan(status.imu_age)
     _, tree = found["/tf"][0]
     assert tree.transforms[0].child_frame_id == "base_link"
+
+
+def test_channels_offer_the_quality_of_their_topics(full):
+    """As rosbag2 keeps it: rosbags' own reader of that YAML takes it, in the form of Humble, which Jazzy reads too."""
+    with full.open("rb") as file:
+        channels = make_reader(file).get_summary().channels.values()
+    keys = {topic.under("finsrov"): key for key, topic in TOPICS.items()}
+    for channel in channels:
+        text, quality = channel.metadata["offered_qos_profiles"], TOPICS[keys[channel.topic]].quality
+        (profile,) = parse_qos(text)
+        assert yaml.safe_load(dump_qos_v8([profile])) == yaml.safe_load(text)
+        assert (profile.durability.name == "TRANSIENT_LOCAL") == (quality == "latched")
+        assert (profile.reliability.name == "BEST_EFFORT") == (quality == "sensor")
+    assert len(channels) > 10
 
 
 def test_rosbags_reads_back_what_the_robot_did(full):

@@ -16,6 +16,7 @@ from finssim.ros2.definitions import INTERFACES
 from finssim.ros2.graphs import NODES as GRAPH_NODES
 from finssim.ros2.shim.arguments import parse_arguments
 from finssim.ros2.shim.parameter_files import overrides_for
+from finssim.ros2.topics import SERVICES, TOPICS
 from finssim.vehicles.loader import catalogue
 
 MESSAGES = sorted(INTERFACES.glob("*/msg/*.msg"))
@@ -91,6 +92,13 @@ def test_messages_depend_on_every_package_they_use():
     assert {e.text for e in root.findall("depend")} == {
         u for u in used if u.endswith(("_msgs", "_interfaces"))
     }
+
+
+def test_nodes_depend_on_every_package_whose_types_they_use():
+    """Topics, services and what nodes import."""
+    root = ElementTree.parse(NODES / "package.xml").getroot()
+    used = {kind.type.split("/")[0] for kind in (*TOPICS.values(), *SERVICES.values())}
+    assert used | {"rclpy", "rcl_interfaces"} <= {e.text for e in root.findall("exec_depend")}
 
 
 @pytest.mark.parametrize("path", sorted(NODES.rglob("*.py")), ids=lambda path: path.name)

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from finssim.robot.record_types import TOPICS as RECORDED
 from finssim.ros2.codec import codec_of
 from finssim.ros2.topics import FRAMES, QUALITIES, SERVICES, TOPICS
 
@@ -34,12 +33,6 @@ def test_services_qualities_and_frames_are_on_the_page():
         row(f"`{name}`", text) for name, text in FRAMES.items()
     ]
     assert not [line for line in lines if line not in PAGE]
-
-
-@pytest.mark.parametrize("key", RECORDED)
-def test_records_use_the_same_names_and_types(key):
-    """What is recorded can be played onto the topics it came from."""
-    assert (TOPICS[key].name, TOPICS[key].type) == (RECORDED[key].name, RECORDED[key].kind)
 
 
 def test_topics_stand_below_the_vehicle():

@@ -78,14 +78,14 @@ class McapWriter:
             AttachmentIndex(offset=at, length=self._at - at, data_size=len(data), **told)
         )
 
-    def channel(self, topic: str, kind: str, definition: str, qos: str = "") -> int:
+    def channel(self, topic: str, kind: str, definition: str, qos: str) -> int:
         """Announce a topic of ROS 2 messages in CDR; returns its number.
 
         Args:
             topic: Name of the topic.
             kind: Type, such as `sensor_msgs/msg/Imu`.
             definition: Text of the type and of all that it uses, as in a rosbag.
-            qos: Offered profiles as rosbag2 keeps them, in YAML.
+            qos: Offered profiles as rosbag2 keeps them (`record_topics.offered_qos`).
         """
         from mcap.records import Channel, Schema
 

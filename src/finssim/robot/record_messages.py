@@ -24,6 +24,11 @@ MAP, BASE, IMU = "map", "base_link", "imu_link"
 IMU_VARIANCES = ((0.02, 0.02, 0.05), (0.01,) * 3, (0.1,) * 3)
 """Of attitude [rad²], rates [rad²/s²] and specific force [m²/s⁴], as the published bridge sends them."""
 
+UNKNOWN = 1.0e6
+"""Variance of what is not known [m², rad², m²/s²]."""
+
+DIAGONAL = np.diag_indices(6)
+
 PRESSURE_VARIANCE = (0.05 * 9.81e3) ** 2
 """Of 0.05 m of water [Pa²]: the published 0.0025 m²."""
 
@@ -109,18 +114,27 @@ class Messages:
         return self._of["sensor_msgs/msg/JointState"](self.header(stamp, BASE), self.names, none, speed, none)
 
     def odometry(self, stamp: int, reading: Reading) -> Any:
-        """Pose in the map, velocity in body axes; the variances of x, y, z, yaw and velocity on the diagonals."""
+        """Pose in the map, velocity in body axes; covariances of one reading's standard deviations, all numbers.
+
+        Roll, pitch and rates, which a reading does not judge, are as uncertain as in `imu`; what is not known has
+        `UNKNOWN`.
+        """
         variance = np.square(np.asarray(reading.std, float))
+        R = quat_to_matrix(reading.quaternion)
+        pose, twist = np.zeros((6, 6)), np.zeros((6, 6))
+        pose[DIAGONAL] = [*variance[:3], *IMU_VARIANCES[0][:2], variance[6]]
+        twist[:3, :3] = R.T @ np.diag(variance[3:6]) @ R
+        twist[3:, 3:] = np.diag(IMU_VARIANCES[1])
         of = self._of
         return of["nav_msgs/msg/Odometry"](
             self.header(stamp, MAP),
             BASE,
             of["geometry_msgs/msg/PoseWithCovariance"](
-                self.pose(reading.position, reading.quaternion), diagonal(variance[:3], variance[6])
+                self.pose(reading.position, reading.quaternion), numbers_of(pose)
             ),
             of["geometry_msgs/msg/TwistWithCovariance"](
                 of["geometry_msgs/msg/Twist"](self.vector(reading.nu[:3]), self.vector(reading.nu[3:])),
-                diagonal(variance[3:6], math.nan),
+                numbers_of(twist),
             ),
         )
 
@@ -256,10 +270,9 @@ def floats(values: Any) -> npt.NDArray[np.float64]:
     return np.array(values, dtype=np.float64).ravel()
 
 
-def diagonal(linear: Any, last: float) -> npt.NDArray[np.float64]:
-    """A covariance, (36,): three variances and that of the turn about z; those of the other turns are not known."""
-    covariance = np.zeros(36)
-    covariance[[0, 7, 14]] = linear
-    covariance[[21, 28]] = math.nan
-    covariance[35] = last
-    return covariance
+def numbers_of(covariance: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """A covariance (6, 6) row by row, (36,): unknown variances large and uncorrelated, for filters take no NaN."""
+    unknown = ~np.isfinite(covariance.sum(axis=0))
+    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
+    covariance[unknown, unknown] = UNKNOWN
+    return covariance.ravel()

@@ -18,7 +18,8 @@ from finssim.robot.messages import CommandEcho, Picture, Telemetry
 from finssim.robot.record_messages import Messages
 from finssim.robot.record_pictures import jpeg
 from finssim.robot.record_sink import RecordSink
-from finssim.robot.record_types import METADATA, TOPICS, definition
+from finssim.robot.record_topics import TOPICS, offered_qos
+from finssim.robot.record_types import METADATA, definition
 from finssim.robot.robot import Reading
 from finssim.vehicles import Vehicle, load_vehicle
 
@@ -191,12 +192,16 @@ class Recorder:
         self.close()
 
     def _announce(self, writer: McapWriter, key: str) -> int:
-        name, kind = TOPICS[key]
-        topic = name if name.startswith("/") else f"/{self._name}/{name}"
-        return writer.channel(topic, kind, definition(kind))
+        topic = TOPICS[key]
+        return writer.channel(
+            self._topic_name(key), topic.type, definition(topic.type), offered_qos(topic.quality)
+        )
+
+    def _topic_name(self, key: str) -> str:
+        return TOPICS[key].under(self._name)
 
     def _put(self, key: str, at: int, message: Any) -> None:
-        data = self._messages.cdr(message, TOPICS[key].kind)
+        data = self._messages.cdr(message, TOPICS[key].type)
         self._sink.put(key, at, data, len(data))
 
     def _compressed(self, stamp: int, image: npt.NDArray[np.uint8]) -> bytes | None:
@@ -204,7 +209,7 @@ class Recorder:
         packed = jpeg(image)
         if packed is None:
             return None
-        return self._messages.cdr(self._messages.picture(stamp, packed), TOPICS["picture"].kind)
+        return self._messages.cdr(self._messages.picture(stamp, packed), TOPICS["picture"].type)
 
     def _ns(self, seconds: float) -> int:
         # An MCAP has no time before 0: a clock that was set back further is recorded as standing there.

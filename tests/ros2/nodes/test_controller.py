@@ -14,6 +14,8 @@ activate(announce=False)
 
 import rclpy
 from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from finssim.control.controllers import controller
 from finssim.control.guidance import Station, goal_at
@@ -164,6 +166,27 @@ def test_without_a_goal_it_keeps_the_place_where_it_was_armed(wire):
     assert stage.node.runtime.guide.at(0.0).position == pytest.approx([0.5, -0.3, -0.6])
     stage.send("trajectory", data="no such shape")
     assert stage.until(lambda: len(stage.events("refused")) == 3)
+
+
+@pytest.mark.parametrize("durability", ["VOLATILE", "TRANSIENT_LOCAL"])
+def test_a_goal_that_is_given_again_is_followed_again(wire, capfd, durability):
+    """From publishers of either durability, as RViz and `ros2 topic pub` are, and no policy is said not to fit."""
+    stage = wire(Controller)
+    policies = QoSProfile(depth=1, durability=DurabilityPolicy[durability])
+    publisher = stage.peer.create_publisher(ros_type(TOPICS["goal"].type), "goal", policies)
+    assert stage.until(lambda: publisher.get_subscription_count() == 1), "one subscription, not two"
+    goal = stage.make.goal(0, (0.5, -0.3, -0.6), 0.7)
+    for count in (1, 2):
+        publisher.publish(goal)
+        assert stage.until(lambda count=count: len(stage.events("goal")) == count)
+    assert "incompatible" not in capfd.readouterr().err
+
+
+def test_parameters_of_a_running_node_stay_as_they_are(wire):
+    """`ros2 param set` says so, in place of a success without effect."""
+    stage = wire(Controller, "-p", "policy:=pid-paper")
+    (result,) = stage.node.set_parameters([Parameter("policy", value="pid")])
+    assert not result.successful and "read-only: set it at the start" in result.reason
 
 
 def test_a_silent_estimator_ends_commands(wire):

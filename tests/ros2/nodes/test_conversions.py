@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from finssim.control.guidance import Station
-from finssim.geometry.rotations import quat_from_euler
+from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
 from finssim.robot.messages import Picture, TagCorners, Telemetry
 from finssim.robot.robot import Reading
 from finssim.ros2.codec import codec_of
@@ -118,15 +118,28 @@ def reading(**changes):
 
 
 def test_a_reading_comes_back_as_it_was():
-    """From Odometry and EstimatorStatus together, covariances on their diagonals."""
+    """From Odometry and EstimatorStatus together."""
     odometry, status = wire(MAKE.odometry(STAMP, reading())), wire(MAKE.estimator(STAMP, reading(), {}))
     back = reading_of(status, odometry, 12.5)
     for name in ("position", "quaternion", "nu", "std"):
         assert getattr(back, name) == pytest.approx(getattr(reading(), name), abs=1e-15)
     assert (back.time, back.ready, back.mode, back.reason) == (12.5, True, "coast", "")
-    covariance = np.array(odometry.pose.covariance).reshape(6, 6)
-    assert np.diag(covariance)[[0, 1, 2, 5]] == pytest.approx([1e-4, 4e-4, 9e-4, 25e-4])
     assert (odometry.header.frame_id, odometry.child_frame_id) == ("map", "base_link")
+
+
+def test_covariances_hold_numbers_only():
+    """As filters take them: turned into the axes of the twist, and large where nothing is known."""
+    odometry = MAKE.odometry(STAMP, reading())
+    pose, twist = (np.reshape(c.covariance, (6, 6)) for c in (odometry.pose, odometry.twist))
+    assert np.diag(pose) == pytest.approx([1e-4, 4e-4, 9e-4, 0.02, 0.02, 25e-4])
+    R = quat_to_matrix(reading().quaternion)
+    assert R @ twist[:3, :3] @ R.T == pytest.approx(np.diag([0.01, 0.04, 0.09]))
+    assert twist[3:, 3:] == pytest.approx(0.01 * np.eye(3)) and not twist[:3, 3:].any()
+    for std in (np.full(7, np.nan), np.array([0.01, np.nan, 0.03, np.nan, 0.2, 0.3, np.inf])):
+        odometry = MAKE.odometry(STAMP, reading(std=std))
+        for c in (odometry.pose, odometry.twist):
+            matrix = np.reshape(c.covariance, (6, 6))
+            assert np.isfinite(matrix).all() and np.linalg.eigvalsh(matrix)[0] > 0.0 and matrix.max() == 1e6
 
 
 @given(numbers=st.lists(ANY, min_size=13, max_size=13))

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from finssim.robot.mcap_writer import McapWriter
-from finssim.robot.record_types import definition
 from finssim.robot.recorder import Recorder
 from finssim.ros2.nodes.robot_node import RobotNode, run
 from finssim.ros2.topics import TOPICS
@@ -76,9 +74,8 @@ class _WireRecord(Recorder):
         """One message that came at a time [ns]."""
         self._sink.put(key, at, data, len(data))
 
-    def _announce(self, writer: McapWriter, key: str) -> int:
-        kind = TOPICS[key].type
-        return writer.channel(self._names[key], kind, definition(kind))
+    def _topic_name(self, key: str) -> str:
+        return self._names[key]
 
 
 def main() -> None:

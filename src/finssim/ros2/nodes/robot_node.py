@@ -12,6 +12,7 @@ from contextlib import suppress
 from typing import Any, TypeVar
 
 import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
@@ -19,7 +20,7 @@ from rclpy.node import Node
 from finssim.ros2.graphs import PARENT
 from finssim.ros2.nodes.conversions import nanoseconds
 from finssim.ros2.nodes.ros_messages import RosMessages, ros_type
-from finssim.ros2.topics import LATCHED, STREAM, TOPICS, quality_profile
+from finssim.ros2.topics import TOPICS, quality_profile
 from finssim.vehicles import load_vehicle
 
 __all__ = ["RobotNode", "run"]
@@ -58,8 +59,8 @@ class RobotNode(Node):
     # -- parameters and time ------------------------------------------------------------------------------------
 
     def parameter(self, name: str, default: Any) -> Any:
-        """Declare a parameter; its value."""
-        return self.declare_parameter(name, default).value
+        """Declare a parameter that is set at the start only, for nothing looks at it again; its value."""
+        return self.declare_parameter(name, default, ParameterDescriptor(read_only=True)).value
 
     def now(self) -> float:
         """The robot's clock [s]."""
@@ -99,14 +100,9 @@ class RobotNode(Node):
         return bool(self._out[key].get_subscription_count())
 
     def hears(self, key: str, take: Callable[[Any], None], *, raw: bool = False) -> Any:
-        """Listen to a topic; the subscription. What is latched is taken from others too, each news once."""
-        kind, quality = ros_type(TOPICS[key].type), TOPICS[key].quality
-        if quality != LATCHED:
-            return self.create_subscription(kind, self.topic(key), take, quality_profile(quality), raw=raw)
-        news = _News(take)
-        for one in (LATCHED, STREAM):
-            found = self.create_subscription(kind, self.topic(key), news, quality_profile(one), raw=raw)
-        return found
+        """Listen to a topic; the subscription. Commands are taken from publishers of any durability, as they come."""
+        kind, quality = ros_type(TOPICS[key].type), quality_profile(TOPICS[key].quality)
+        return self.create_subscription(kind, self.topic(key), take, quality, raw=raw)
 
     # -- what every node says of itself ---------------------------------------------------------------------------
 
@@ -128,18 +124,6 @@ class RobotNode(Node):
 
     def close(self) -> None:
         """Put in order what is not the middleware's; called once at the end, however it came."""
-
-
-class _News:
-    """Passes on what differs from the message before."""
-
-    def __init__(self, take: Callable[[Any], None]) -> None:
-        self._take, self._last = take, None
-
-    def __call__(self, message: Any) -> None:
-        if self._last is None or message != self._last:
-            self._last = message
-            self._take(message)
 
 
 def run(make: Callable[[], Made], spin: Callable[[Made], None] = rclpy.spin, *, urgent: bool = True) -> int:

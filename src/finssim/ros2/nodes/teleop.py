@@ -12,7 +12,7 @@ from finssim.robot.teleop import Hands, TeleopError
 from finssim.ros2.nodes.remote import RemoteBridge
 from finssim.ros2.nodes.robot_node import RobotNode, run
 from finssim.ros2.nodes.ros_messages import ros_type
-from finssim.ros2.topics import LATCHED, SENSOR, quality_profile
+from finssim.ros2.topics import SENSOR, quality_profile
 
 __all__ = ["JoyDevice", "Teleop", "main"]
 
@@ -25,10 +25,7 @@ class Teleop(RobotNode):
 
     def __init__(self) -> None:
         super().__init__("teleop")
-        self.sends("wrench", "event", "diagnostics")
-        self._mode = self.create_publisher(
-            ros_type("std_msgs/msg/String"), self.topic("mode"), quality_profile(LATCHED)
-        )
+        self.sends("wrench", "mode", "event", "diagnostics")
         self._other, self._mine = self.parameter("other", "pid"), False
         self._stack = ExitStack()
         device = self._device(self.parameter("device", "joy"))
@@ -64,7 +61,7 @@ class Teleop(RobotNode):
 
     def _swap(self) -> None:
         self._mine = not self._mine
-        self._mode.publish(ros_type("std_msgs/msg/String")(data="teleop" if self._mine else self._other))
+        self.send("mode", ros_type("std_msgs/msg/String")(data="teleop" if self._mine else self._other))
 
     def close(self) -> None:
         """Put the device back, and leave without thrust where the wire still carries it."""
