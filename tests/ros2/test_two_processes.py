@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
+from cyclonedds.qos import Policy
 
 from finssim.ros2.backend import activate
 
@@ -126,6 +128,18 @@ def test_the_node_list_shows_the_other_process(node, echo):
     topics = dict(node.get_topic_names_and_types())
     assert topics["/peer/thruster_cmd"] == ["finssim_msgs/msg/ThrusterCommand"]
     assert node.count_subscribers("thruster_cmd") == 1
+
+
+def test_every_endpoint_of_the_other_process_tells_its_hash(node, echo):
+    """The node list too: without it each `ros2` command warns. Services tell which ends belong together instead."""
+    participant = rclpy.get_default_context().participant
+    told = {"rt": b"typehash=RIHS01_", "ro": b"typehash=RIHS01_", "rq": b"id=", "rr": b"id="}
+    for topic in (BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription):
+        reader = BuiltinDataReader(participant.entity, topic)
+        assert until(node, lambda reader=reader: any("odom" in s.topic_name for s in reader.read(N=1000)))
+        for sample in reader.read(N=1000):
+            data = next((p.data for p in sample.qos if isinstance(p, Policy.Userdata)), b"")
+            assert told.get(sample.topic_name[:2], b"") in data, sample.topic_name
 
 
 def test_a_parameter_file_and_a_new_name_reach_the_other_process(node, tmp_path):

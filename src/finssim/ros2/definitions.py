@@ -53,6 +53,7 @@ class Definitions:
 
     def __init__(self, distro: str) -> None:
         self.store: Typestore = get_typestore(getattr(Stores, f"ROS2_{distro.upper()}"))
+        self.store.fielddefs.update({n: _without_char(d) for n, d in self.store.fielddefs.items()})
         self.defaults: dict[str, dict[str, Any]] = {"geometry_msgs/msg/Quaternion": {"w": 1.0}}
         self.services: set[str] = set()
         for name, text in STANDARD_SERVICES.items():
@@ -82,7 +83,7 @@ class Definitions:
         Raises:
             Ros2Error: The text is no definition, or another one of that name is known.
         """
-        fields = _parsed(name, text)
+        fields = _without_char(_parsed(name, text))
         try:
             self.store.register({name: fields})
         except TypesysError as error:
@@ -135,6 +136,19 @@ def _parsed(name: str, text: str) -> Any:
         return get_types_from_msg(text, as_message)[as_message]
     except TypesysError as error:
         raise Ros2Error(f"{package}/{kind}/{short}: not a message definition: {error}") from None
+
+
+def _without_char(definition: Any) -> Any:
+    """Constants and fields with uint8 for char: what rosidl makes of it, and hashes, where rosbags keeps the word."""
+    constants, fields = definition
+
+    def plain(described: Any) -> Any:
+        kind, what = described
+        if kind == Nodetype.BASE:
+            return (kind, ("uint8", what[1])) if what[0] == "char" else described
+        return described if kind == Nodetype.NAME else (kind, (plain(what[0]), what[1]))
+
+    return constants, [(name, plain(described)) for name, described in fields]
 
 
 def _defaults(text: str) -> dict[str, Any]:

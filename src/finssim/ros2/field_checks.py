@@ -16,11 +16,10 @@ __all__ = ["DTYPES", "Numbers", "Octet", "check_of", "spelled"]
 INTEGERS = {
     **{f"int{b}": (-(2 ** (b - 1)), 2 ** (b - 1) - 1) for b in (8, 16, 32, 64)},
     **{f"uint{b}": (0, 2**b - 1) for b in (8, 16, 32, 64)},
-    "char": (0, 255),
 }
 DTYPES = {
-    **{name: np.dtype(name) for name in INTEGERS if name != "char"},
-    **{name: np.dtype("uint8") for name in ("char", "byte", "octet")},
+    **{name: np.dtype(name) for name in INTEGERS},
+    **dict.fromkeys(("byte", "octet"), np.dtype("uint8")),
     "float32": np.dtype("float32"),
     "float64": np.dtype("float64"),
     "bool": np.dtype("bool"),
@@ -146,7 +145,7 @@ def _numbers(base: str, count: int, fixed: bool) -> Check:
     def check(value: Any) -> Any:
         if isinstance(value, np.ndarray) and not fixed and not isinstance(value, Numbers):
             raise MessageError("expected a list, bytes or array.array, found a NumPy array: use .tolist()")
-        if isinstance(value, (bytes, bytearray)) and base in ("uint8", "char"):
+        if isinstance(value, (bytes, bytearray)) and base == "uint8":
             array = np.frombuffer(value, dtype)
         elif isinstance(value, (list, tuple)):
             array = np.array([single(v) for v in value], dtype)
@@ -192,7 +191,7 @@ def spelled(described: Any) -> str:
         return f"{package}/{short}"
     if kind == Nodetype.BASE:
         base, bound = what
-        words = {"bool": "boolean", "float32": "float", "float64": "double", "byte": "octet", "char": "uint8"}
+        words = {"bool": "boolean", "float32": "float", "float64": "double", "byte": "octet"}
         return f"string<{bound}>" if base == "string" and bound else words.get(base, base)
     inner, count = what
     if kind == Nodetype.ARRAY:

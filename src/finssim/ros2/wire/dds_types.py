@@ -16,7 +16,7 @@ PRIMITIVES: dict[str, Any] = {
     **{
         f"{sign}int{bits}": getattr(idl, f"{sign}int{bits}") for sign in ("", "u") for bits in (8, 16, 32, 64)
     },
-    **dict.fromkeys(("byte", "octet", "char"), idl.uint8),
+    **dict.fromkeys(("byte", "octet"), idl.uint8),
     "float32": idl.float32,
     "float64": idl.float64,
     "bool": bool,

@@ -62,18 +62,18 @@ class Participant:
         self._topics: dict[tuple[str, str], Topic] = {}
         self._builtin: dict[str, Any] = {}
         self._lock = threading.Lock()
-        self._node_list = self._plain_writer("ros_discovery_info", NODE_LIST, LATCHED)
+        self._node_list = self.writer("ros_discovery_info", NODE_LIST, LATCHED)
         keep_all = Quality(depth=0, transient_local=True)
-        self._others = self._plain_reader("ros_discovery_info", NODE_LIST, keep_all)
+        self._others = self.reader("ros_discovery_info", NODE_LIST, keep_all)
         self._seen: dict[bytes, list[NodeRecord]] = {}
 
     def writer(self, topic: str, name: str, quality: Quality) -> Writer:
         """A writer of messages of type `name` on a topic with its prefix, e.g. `rt/odom`."""
-        return self._plain_writer(topic, name, quality, self._type_hash(name))
+        return Writer(self._publisher, self._topic(topic, name), dds_qos(quality, self._type_hash(name)))
 
     def reader(self, topic: str, name: str, quality: Quality) -> Reader:
         """A reader of messages of type `name` on a topic with its prefix."""
-        return self._plain_reader(topic, name, quality, self._type_hash(name))
+        return Reader(self._subscriber, self._topic(topic, name), dds_qos(quality, self._type_hash(name)))
 
     def service_writer(self, topic: str, name: str, quality: Quality, user_data: bytes) -> Writer:
         """A writer of one half of a service, its samples led by client and sequence number."""
@@ -126,12 +126,6 @@ class Participant:
     def close(self) -> None:
         """Leave the wire at once: peers are told, and wait for nothing."""
         self.entity.__del__()
-
-    def _plain_writer(self, topic: str, name: str, quality: Quality, user_data: bytes = b"") -> Writer:
-        return Writer(self._publisher, self._topic(topic, name), dds_qos(quality, user_data))
-
-    def _plain_reader(self, topic: str, name: str, quality: Quality, user_data: bytes = b"") -> Reader:
-        return Reader(self._subscriber, self._topic(topic, name), dds_qos(quality, user_data))
 
     def _topic(self, topic: str, name: str, *, service: bool = False) -> Topic:
         self.codec.message(name)
