@@ -182,6 +182,21 @@ def test_a_second_publisher_is_a_fault(world, source):
     assert "two publishers" in world.heard["thrusters"][-1].reason
 
 
+@pytest.mark.parametrize("attempt", range(10))
+def test_a_second_publisher_that_leaves_at_once_is_a_fault(world, attempt):
+    """Under the same name, and gone before anybody could count: its one command moves nothing."""
+    assert world.armed()
+    rival = world.publisher("command")
+    assert world.until(lambda: rival.get_subscription_count() == 1, lambda: world.ask(np.zeros(world.count)))
+    rival.publish(world.make.command(world.sim.ns(world.sim.time), np.full(world.count, 3.0), "peer"))
+    world.peer.destroy_publisher(rival)
+    time.sleep(0.05 * attempt % 0.2)
+    world.steps(3)
+    assert world.until(lambda: world.state == "fault")
+    assert "two publishers" in world.heard["thrusters"][-1].reason
+    assert not np.any([m.force for m in world.heard["thrusters"]])
+
+
 def test_malformed_commands_are_no_sign_of_life(world):
     """Wrong names, NaN, too few, an old stamp: none raises, none moves anything, and the vehicle holds."""
     assert world.armed()

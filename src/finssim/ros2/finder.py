@@ -23,6 +23,7 @@ PARTS = (
     "clock_type",
     "context",
     "duration",
+    "event_handler",
     "exceptions",
     "executors",
     "logging",

@@ -182,6 +182,16 @@ def test_a_goal_that_is_given_again_is_followed_again(wire, capfd, durability):
     assert "incompatible" not in capfd.readouterr().err
 
 
+def test_commands_say_who_asks_and_in_which_mode(wire):
+    """The node is one commander whatever its mode."""
+    stage = wire(Controller)
+    stage.state = "armed"
+    assert stage.until(lambda: stage.heard["command"])
+    assert stage.heard["command"][-1].source == "controller/pid"
+    stage.send("mode", data="teleop")
+    assert stage.until(lambda: stage.heard["command"][-1].source == "controller/teleop")
+
+
 def test_parameters_of_a_running_node_stay_as_they_are(wire):
     """`ros2 param set` says so, in place of a success without effect."""
     stage = wire(Controller, "-p", "policy:=pid-paper")

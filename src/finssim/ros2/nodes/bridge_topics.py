@@ -15,7 +15,7 @@ from finssim.ros2.topics import SERVICES
 __all__ = ["BridgeTopics"]
 
 LOOK = 0.5
-"""Between looks how many publish commands [s]."""
+"""Between two counts of those who publish commands [s]."""
 
 
 class BridgeTopics:
@@ -29,9 +29,12 @@ class BridgeTopics:
             readings: Whether to hear the estimator; False where the node knows the state itself.
         """
         self._node, self._bridge = node, bridge
-        self._rivals = 0
+        self._publishers = self._matched = 0
+        self._label = ""
         node.sends("thrusters", "event", "diagnostics")
-        self._commands = node.hears("command", self._on_command)
+        matched = _callbacks(self._on_match)
+        self._tells = matched is not None
+        self._commands = node.hears("command", self._on_command, event_callbacks=matched)
         node.hears("arm", lambda message: self._arm(bool(message.data)))
         node.hears("stop", lambda message: bridge.stop(node.now(), "emergency stop by topic"))
         node.hears("acknowledge", lambda message: bridge.acknowledge(node.now()))
@@ -46,7 +49,7 @@ class BridgeTopics:
         bridge, node = self._bridge, self._node
         known = {
             "reason": bridge.reason,
-            "source": bridge.source,
+            "source": self._label if bridge.source else "",
             "requested": bridge.requested,
             "force": bridge.force,
             "achieved": bridge.force,
@@ -62,37 +65,57 @@ class BridgeTopics:
             self._bridge.disarm(now)
             return ""
         self._count()
-        if self._rivals > 1:
-            why = f"{self._rivals} publishers on {self._node.topic('command')}: leave one"
+        if self._publishers > 1:
+            why = f"{self._publishers} publishers on {self._node.topic('command')}: leave one"
             self._bridge.log.repeat(now, "refused", f"topic may not arm: {why}")
             return why
         return self._bridge.arm(now, "topic")
 
     def _on_command(self, message: Any) -> None:
+        if not self._tells:
+            self._count()
         now, source = self._node.now(), str(message.source) or "unnamed"
         force = force_of(message, self._node.make.names)
         if isinstance(force, str):
             self._bridge.log.repeat(now, "command refused", f"{source}: {force}")
-        else:
-            stamp = self._node.seconds(message.header.stamp)
-            self._bridge.command(now, force, source, stamp=stamp)
+            return
+        stamp = self._node.seconds(message.header.stamp)
+        # Who commands is a node; what it names after a slash, its mode, may change.
+        self._bridge.command(now, force, source.partition("/")[0], stamp=stamp)
+        self._label = source
 
     def _on_reading(self, reading: Reading) -> None:
         self._bridge.reading(self._node.now(), reading)
 
-    def _count(self) -> None:
-        """Two that publish commands are a fault, even under one name."""
-        self._rivals = self._publishers()
-        if self._rivals > 1 and self._bridge.state in ("armed", "hold"):
-            why = f"two publishers command the thrusters: {self._rivals} on {self._node.topic('command')}"
-            self._bridge.stop(self._node.now(), why)
+    def _on_match(self, info: Any) -> None:
+        """Publishers came or went: two are a fault at once, even if one has left again before this is told."""
+        most = self._matched + info.total_count_change
+        self._matched = info.current_count
+        self._judge(most)
 
-    def _publishers(self) -> int:
-        """How many are known; Humble's rclpy can only look through the whole graph for it."""
+    def _count(self) -> None:
+        """The same, seen twice a second; all that Humble has, whose rclpy looks through the whole graph for it."""
         count = getattr(self._commands, "get_publisher_count", None)
-        return int(count() if count else self._node.count_publishers(self._node.topic("command")))
+        topic = self._node.topic("command")
+        self._publishers = int(count() if count else self._node.count_publishers(topic))
+        self._judge(self._publishers)
+
+    def _judge(self, publishers: int) -> None:
+        """Two that publish commands are a fault, even under one name."""
+        if publishers > 1 and self._bridge.state in ("armed", "hold"):
+            why = f"two publishers command the thrusters: {publishers} on {self._node.topic('command')}"
+            self._bridge.stop(self._node.now(), why)
 
     def _on_service(self, request: Any, response: Any) -> Any:
         why = self._arm(bool(request.data))
         response.success, response.message = not why, why
         return response
+
+
+def _callbacks(matched: Any) -> Any:
+    """What has rclpy tell of publishers that come and go; None on Humble, which cannot."""
+    try:
+        from rclpy.event_handler import SubscriptionEventCallbacks
+    except ImportError:
+        return None
+    return SubscriptionEventCallbacks(matched=matched)

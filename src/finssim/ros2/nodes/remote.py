@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -92,8 +93,13 @@ class RemoteState:
 class RemoteBridge:
     """The bridge of another process: what it is told travels as messages, its state comes back as one."""
 
-    def __init__(self, node: RobotNode) -> None:
-        self._node = node
+    def __init__(self, node: RobotNode, source: Callable[[], str] | None = None) -> None:
+        """
+        Args:
+            node: That hears and sends.
+            source: Tells what commands are signed with; by who gives them where there is none.
+        """
+        self._node, self._source = node, source
         self._state, self.reason, self._at = "disarmed", "", -math.inf
         node.sends("arm", "stop", "acknowledge")
         node.hears("thrusters", self._on_state)
@@ -128,7 +134,7 @@ class RemoteBridge:
 
     def command(self, now: float, force: npt.ArrayLike, source: str, stamp: float | None = None) -> Array:
         """Ask for thrusts, canonical order [N], (n,)."""
-        wanted = np.asarray(force, float)
+        wanted, source = np.asarray(force, float), source if self._source is None else self._source()
         self._node.send("command", self._node.make.command(self._node.ns(now), wanted, source))
         return wanted
 

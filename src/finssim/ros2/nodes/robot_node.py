@@ -99,10 +99,10 @@ class RobotNode(Node):
         """Whether somebody listens to what we publish."""
         return bool(self._out[key].get_subscription_count())
 
-    def hears(self, key: str, take: Callable[[Any], None], *, raw: bool = False) -> Any:
+    def hears(self, key: str, take: Callable[[Any], None], **options: Any) -> Any:
         """Listen to a topic; the subscription. Commands are taken from publishers of any durability, as they come."""
         kind, quality = ros_type(TOPICS[key].type), quality_profile(TOPICS[key].quality)
-        return self.create_subscription(kind, self.topic(key), take, quality, raw=raw)
+        return self.create_subscription(kind, self.topic(key), take, quality, **options)
 
     # -- what every node says of itself ---------------------------------------------------------------------------
 

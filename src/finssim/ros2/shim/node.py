@@ -10,6 +10,7 @@ from finssim.ros2.shim.client import Client
 from finssim.ros2.shim.clock import Clock, ROSClock
 from finssim.ros2.shim.context import Context
 from finssim.ros2.shim.endpoint import Endpoint
+from finssim.ros2.shim.event_handler import SubscriptionEventCallbacks
 from finssim.ros2.shim.logging import RcutilsLogger, get_logger
 from finssim.ros2.shim.names import check_node, full_node_name, remapped
 from finssim.ros2.shim.node_graph import NodeGraph
@@ -131,11 +132,12 @@ class Node(NodeParameters, NodeGraph):
         qos_profile: Any,
         *,
         raw: bool = False,
+        event_callbacks: SubscriptionEventCallbacks | None = None,
         **options: Any,
     ) -> Subscription:
         """A subscription; with `raw` the callback gets CDR bytes."""
         _check_options(options)
-        return self._added(Subscription(self, msg_type, topic, callback, qos_profile, raw))
+        return self._added(Subscription(self, msg_type, topic, callback, qos_profile, raw, event_callbacks))
 
     def create_service(
         self,

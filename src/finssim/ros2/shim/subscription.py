@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from finssim.ros2.codec import Message
 from finssim.ros2.errors import Ros2Error
 from finssim.ros2.shim.endpoint import Endpoint, check_callback
+from finssim.ros2.shim.event_handler import QoSSubscriptionMatchedInfo, SubscriptionEventCallbacks
 
 __all__ = ["Subscription"]
 
@@ -23,6 +25,7 @@ class Subscription(Endpoint):
         callback: Callable[[Any], None],
         qos_profile: Any,
         raw: bool = False,
+        event_callbacks: SubscriptionEventCallbacks | None = None,
     ) -> None:
         check_callback(callback, takes=1)
         quality = self._settle(node, msg_type, topic, qos_profile)
@@ -30,9 +33,16 @@ class Subscription(Endpoint):
         self._reader = node.context.participant.reader(f"rt{self.topic_name}", msg_type.TYPE, quality)
         self._codec = node.context.participant.codec
         self.wires = (self._reader,)
+        self._on_match = event_callbacks.matched if event_callbacks is not None else None
+        if self._on_match is not None:
+            self._reader.watch_matches()
 
     def take(self) -> Callable[[], None] | None:
-        """What calls back with the oldest waiting message; None without one."""
+        """What calls back with news of publishers, or the oldest waiting message; None without either."""
+        if self._on_match is not None:
+            info = QoSSubscriptionMatchedInfo(*self._reader.matches())
+            if info.total_count_change or info.current_count_change:
+                return partial(self._on_match, info)
         sample = self._reader.take()
         if sample is None:
             return None

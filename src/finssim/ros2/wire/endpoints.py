@@ -122,6 +122,20 @@ class Reader(Endpoint):
         self.condition.__del__()
         super().close()
 
+    def watch_matches(self) -> None:
+        """Let `matches` wake who waits."""
+        self.entity.set_status_mask(DDSStatus.RequestedIncompatibleQos | DDSStatus.SubscriptionMatched)
+
+    def matches(self) -> tuple[int, int, int, int]:
+        """Writers ever matched, those newly so since last asked, those matched now, and that number's change."""
+        status = self.entity.get_subscription_matched_status()
+        return (
+            status.total_count,
+            status.total_count_change,
+            status.current_count,
+            status.current_count_change,
+        )
+
     def matched(self) -> int:
         """How many writers are known."""
         return len(self.entity.get_matched_publications())
