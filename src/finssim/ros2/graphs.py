@@ -79,7 +79,16 @@ class Plan:
             for key, values in self.parameters.items()
             if values
         }
-        path.write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
+        path.write_text(yaml.dump(tree, Dumper=_Quoting, sort_keys=False), encoding="utf-8")
+
+
+class _Quoting(yaml.SafeDumper):
+    """Puts words into quotes: rcl would read `1e3`, `inf` and `y` as numbers and true where YAML reads words."""
+
+
+_Quoting.add_representer(
+    str, lambda dumper, word: dumper.represent_scalar("tag:yaml.org,2002:str", word, style='"')
+)
 
 
 def topics_of(plan: Plan) -> list[tuple[str, Topic]]:

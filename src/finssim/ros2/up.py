@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 from finssim.robot.goals import check_reachable, guide_of
 from finssim.robot.interrupt import interruptible
@@ -15,6 +16,9 @@ from finssim.ros2.errors import Ros2Error
 from finssim.ros2.graphs import MCU_PORT, Plan, topics_of
 from finssim.ros2.supervisor import Supervisor
 from finssim.vehicles import load_vehicle
+
+if TYPE_CHECKING:
+    from finssim.ros2.watcher import Watcher
 
 __all__ = ["DIED", "FAULT", "Options", "plan_of", "up"]
 
@@ -111,21 +115,35 @@ def up(graph: str, options: Options, say: Callable[[str], None]) -> int:
 
     Returns:
         Exit status: 0, `DIED` or `FAULT`.
+
+    Raises:
+        TwinError: Another graph of the same namespace is on the wire.
     """
+    import rclpy
+
+    from finssim.ros2.watcher import Watcher
+
     with TemporaryDirectory(prefix="finssim-ros2-") as folder:
         pool_file = (options.pool_file or Path(folder) / "pool.yaml").resolve()
         plan, parameters = plan_of(graph, options, pool_file), Path(folder) / "parameters.yaml"
         plan.write(parameters)
         for name, topic in topics_of(plan):
             say(f"  {name}  {topic.type}  {topic.meaning}")
-        with interruptible() as interrupted, Supervisor(plan, parameters, say) as nodes:
-            if graph == "pool":
-                nodes.start("virtual_pool")
-                _await(pool_file, nodes, interrupted)
-            for name in plan.nodes:
-                if name != "virtual_pool":
-                    nodes.start(name)
-            return _watch(plan, options, nodes, interrupted, say)
+        with interruptible() as interrupted:
+            vehicle = f"vehicle:='{options.vehicle}'"
+            rclpy.init(args=["--ros-args", "-r", f"__ns:=/{plan.namespace}", "-p", vehicle])
+            try:
+                watcher = Watcher(plan.nodes, arm=options.arm)
+                with Supervisor(plan, parameters, say) as nodes:
+                    if graph == "pool":
+                        nodes.start("virtual_pool")
+                        _await(pool_file, nodes, interrupted)
+                    for name in plan.nodes:
+                        if name != "virtual_pool":
+                            nodes.start(name)
+                    return _watch(watcher, options, nodes, interrupted, say)
+            finally:
+                rclpy.try_shutdown()
 
 
 def _await(pool_file: Path, nodes: Supervisor, interrupted: Callable[[], bool]) -> None:
@@ -140,30 +158,22 @@ def _await(pool_file: Path, nodes: Supervisor, interrupted: Callable[[], bool]) 
 
 
 def _watch(
-    plan: Plan,
+    watcher: Watcher,
     options: Options,
     nodes: Supervisor,
     interrupted: Callable[[], bool],
     say: Callable[[str], None],
 ) -> int:
-    import rclpy
-
-    from finssim.ros2.watcher import Watcher
-
-    rclpy.init(args=["--ros-args", "-r", f"__ns:=/{plan.namespace}", "-p", f"vehicle:={options.vehicle}"])
-    watcher, died = Watcher(arm=options.arm), False
+    died = False
     if not options.arm:
         say("disarmed: thrusters will not turn until somebody publishes true on the topic arm, or with --arm")
     end = time.monotonic() + (float("inf") if options.duration is None else options.duration)
-    try:
-        while not interrupted() and time.monotonic() < end:
-            watcher.turn(0.2)
-            died = bool(nodes.look()) or died
-            if all(child.dead for child in nodes.children):
-                break
-        watcher.bridge.disarm(watcher.now())
-        watcher.turn(0.1)
-    finally:
-        rclpy.try_shutdown()
+    while not interrupted() and time.monotonic() < end:
+        watcher.turn(0.2)
+        died = bool(nodes.look()) or died
+        if all(child.dead for child in nodes.children):
+            break
+    watcher.bridge.disarm(watcher.now())
+    watcher.turn(0.1)
     sys.stdout.flush()
     return DIED if died else FAULT if watcher.state == "fault" else 0

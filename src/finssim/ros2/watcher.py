@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
 import rclpy
 
 from finssim.robot.robot import Reading
 from finssim.ros2.nodes.remote import Readings, RemoteBridge
-from finssim.ros2.nodes.robot_node import RobotNode
+from finssim.ros2.nodes.robot_node import LISTENING, RobotNode
 
 __all__ = ["Watcher"]
 
@@ -19,12 +20,18 @@ ASK_EVERY = 1.0
 class Watcher(RobotNode):
     """Looks at one vehicle. It arms only where it was told to, and only once."""
 
-    def __init__(self, *, arm: bool) -> None:
+    listening = LISTENING
+
+    def __init__(self, nodes: Sequence[str], *, arm: bool) -> None:
         """
         Args:
+            nodes: Those that are to be started, of which there must be no others.
             arm: Ask for arming as soon as the state is ready and a controller is there, until it is granted once.
+
+        Raises:
+            TwinError: There are others.
         """
-        super().__init__("ros2_up")
+        super().__init__("ros2_up", nodes)
         self._arm, self._asked = arm, 0.0
         self.sends("event", "diagnostics")
         self.bridge = RemoteBridge(self)

@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, TypeVar
 
@@ -23,7 +23,7 @@ from finssim.ros2.nodes.ros_messages import RosMessages, ros_type
 from finssim.ros2.topics import TOPICS, quality_profile
 from finssim.vehicles import load_vehicle
 
-__all__ = ["RobotNode", "run"]
+__all__ = ["LISTENING", "RobotNode", "TwinError", "run"]
 
 Made = TypeVar("Made", bound="RobotNode")
 
@@ -31,8 +31,16 @@ ORPHANED = 0.5
 """Between looks whether it is there [s]."""
 URGENCY = -10
 """Niceness of a node that others wait for; only a privileged user may have it, others do without."""
+LISTENING = 1.0
+"""How long a node that was started listens for another of its name [s]."""
+FORGOTTEN = 11.0
+"""When the wire has forgotten a node that was killed [s]: its lease of ten, and one to spare."""
 REFUSED = 2
 """Exit status of a node that cannot do what it is told."""
+
+
+class TwinError(ValueError):
+    """Another node of the same name is on the wire."""
 
 
 class RobotNode(Node):
@@ -42,10 +50,18 @@ class RobotNode(Node):
     seconds of the node's ROS clock from its start, so that no digits are lost; simulated time counts from 0.
     """
 
-    def __init__(self, name: str) -> None:
+    listening = 0.0
+    """How long a new node listens for another of its name before it says anything [s]; `run` sets it."""
+
+    def __init__(self, name: str, others: Sequence[str] = ()) -> None:
         """
+        Args:
+            name: Of the node.
+            others: Of nodes that there must not be yet, besides one of its own name.
+
         Raises:
             VehicleError: The parameter `vehicle` names none.
+            TwinError: There is one of those nodes.
         """
         super().__init__(name)
         self.vehicle = load_vehicle(self.parameter("vehicle", "finsrov"))
@@ -55,6 +71,25 @@ class RobotNode(Node):
         self.base = 0 if simulated else self.get_clock().now().nanoseconds // 10**9 * 10**9
         """What the ROS clock shows when the robot's shows 0 [ns]."""
         self._out: dict[str, Any] = {}
+        self._listen_for({self.get_name(), *others})
+
+    def _listen_for(self, names: set[str]) -> None:
+        """Listen whether there are other nodes of these names in the namespace; ones that were killed fade out."""
+        begun, here, warned = time.monotonic(), self.get_namespace(), False
+        while self.listening:
+            there, passed = self.get_node_names_and_namespaces(), time.monotonic() - begun
+            twins = sorted(n for n in names if there.count((n, here)) > (n == self.get_name()))
+            if not twins and (warned or passed > self.listening):
+                return
+            if twins and passed > FORGOTTEN:
+                raise TwinError(
+                    f"another node {here.rstrip('/')}/{twins[0]} is on ROS domain {self.context.get_domain_id()}: "
+                    "set ROS_DOMAIN_ID or another namespace, for two graphs in one command one vehicle"
+                )
+            if twins and not warned:
+                self.get_logger().warning(f"there is another {twins[0]} in {here}: waiting until it has gone")
+                warned = True
+            time.sleep(0.05)
 
     # -- parameters and time ------------------------------------------------------------------------------------
 
@@ -146,6 +181,7 @@ def run(make: Callable[[], Made], spin: Callable[[Made], None] = rclpy.spin, *, 
         rclpy.init()
     except (RuntimeError, ValueError) as error:  # the command line, or a setting of the wire
         return _refused(error)
+    RobotNode.listening = LISTENING
     try:
         node = make()
         spin(node)
