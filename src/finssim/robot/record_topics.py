@@ -135,7 +135,22 @@ TOPICS = {
         "pose from one picture, through the refracting water",
     ),
     "goal": Topic("goal", "geometry_msgs/msg/PoseStamped", COMMAND, "map", "you", "pose to hold"),
-    "path": Topic("path", "nav_msgs/msg/Path", LATCHED, "map", "controller", "trajectory that is followed"),
+    "path": Topic(
+        "path",
+        "nav_msgs/msg/Path",
+        LATCHED,
+        "map",
+        "controller",
+        "trajectory that is followed, each pose stamped with its time",
+    ),
+    "follow": Topic(
+        "follow_path",
+        "nav_msgs/msg/Path",
+        COMMAND,
+        "map",
+        "you",
+        "trajectory to follow from now on: a level pose at each time, counted from the first one's",
+    ),
     "trajectory": Topic(
         "trajectory",
         "std_msgs/msg/String",
@@ -233,7 +248,12 @@ TOPICS = {
         "diagnostics", "diagnostic_msgs/msg/DiagnosticArray", STREAM, "", "every node", "health of each part"
     ),
     "transform": Topic(
-        "/tf", "tf2_msgs/msg/TFMessage", STREAM, "map", "state_estimation, sim", "map to base_link"
+        "/tf",
+        "tf2_msgs/msg/TFMessage",
+        STREAM,
+        "map",
+        "state_estimation, sim",
+        "map to odom, odom to base_link",
     ),
     "fixed_transform": Topic(
         "/tf_static",
@@ -241,7 +261,15 @@ TOPICS = {
         LATCHED,
         "base_link",
         "state_estimation, sim",
-        "base_link to imu_link, map to odom, map to camera_optical",
+        "base_link to all that is mounted on it, map to camera_link, camera_link to camera_optical",
+    ),
+    "robot": Topic(
+        "robot_description",
+        "std_msgs/msg/String",
+        LATCHED,
+        "",
+        "state_estimation, sim",
+        "URDF of the vehicle file",
     ),
     "clock": Topic("/clock", "rosgraph_msgs/msg/Clock", SENSOR, "", "sim", "simulated time"),
 }

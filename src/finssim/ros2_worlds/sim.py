@@ -17,6 +17,7 @@ from finssim.robot.bridge_settings import BridgeSettings
 from finssim.robot.goals import station_of
 from finssim.robot.robot import Reading
 from finssim.ros2.nodes.bridge_topics import BridgeTopics
+from finssim.ros2.nodes.frames import Frames
 from finssim.ros2.nodes.robot_node import RobotNode, run
 from finssim.ros2.nodes.ros_messages import ros_type
 from finssim.ros2.topics import SERVICES
@@ -37,8 +38,7 @@ class Sim(RobotNode):
     def __init__(self) -> None:
         super().__init__("sim")
         self.base, self.time = 0, 0.0
-        self.sends("clock", "odometry", "transform", "fixed_transform", "estimator")
-        self.sends("imu", "pressure", "event", "diagnostics")
+        self.sends("clock", "odometry", "estimator", "imu", "pressure", "event", "diagnostics")
         hydrodynamics, seed = self.parameter("hydrodynamics", "calibrated"), self.parameter("seed", 0)
         self.sim = Simulator(
             self.vehicle, hydrodynamics=hydrodynamics, control_step=STEP, substeps=SUBSTEPS, seed=seed
@@ -51,7 +51,7 @@ class Sim(RobotNode):
         service = SERVICES["reset"]
         self.create_service(ros_type(service.type), self.below(service.name), self._on_reset)
         self._reset()
-        self.send("fixed_transform", self.make.fixed_transforms(0, self.vehicle, None))
+        self.frames = Frames(self)
         self._factor, steady = (
             self.parameter("real_time_factor", 1.0),
             Clock(clock_type=ClockType.STEADY_TIME),
@@ -84,7 +84,7 @@ class Sim(RobotNode):
         stamp, reading, make = self.ns(self.time), self._reading(), self.make
         self.send("clock", make.clock(stamp))
         self.send("odometry", make.odometry(stamp, reading))
-        self.send("transform", make.transform(stamp, reading))
+        self.frames.tell(stamp, reading)
         self.send("estimator", make.estimator(stamp, reading, {}))
         sample = self.sensors.sample(reading, STEP)
         self.send("imu", make.imu(stamp, sample))

@@ -22,15 +22,15 @@ from finssim.control.guidance import Station, goal_at
 from finssim.control.modes import Wrench6
 from finssim.robot.robot import Reading
 from finssim.ros2.nodes.controller import Controller
-from finssim.ros2.nodes.conversions import force_of
+from finssim.ros2.nodes.conversions import force_of, nanoseconds
 from finssim.ros2.nodes.ros_messages import RosMessages, ros_type
 from finssim.ros2.nodes.teleop import Teleop
 from finssim.ros2.topics import TOPICS, quality_profile
 from finssim.vehicles import load_vehicle
 
 PATIENCE = 30.0  # [s] on a busy machine
-HEARD = ("command", "policy", "event", "stop", "wrench", "arm", "mode", "acknowledge")
-SENT = ("odometry", "estimator", "thrusters", "goal", "trajectory", "mode", "wrench")
+HEARD = ("command", "policy", "event", "stop", "wrench", "arm", "mode", "acknowledge", "path")
+SENT = ("odometry", "estimator", "thrusters", "goal", "trajectory", "follow", "mode", "wrench")
 PLACE = np.array([0.2, 0.1, -0.5])
 
 
@@ -190,6 +190,65 @@ def test_commands_say_who_asks_and_in_which_mode(wire):
     assert stage.heard["command"][-1].source == "controller/pid"
     stage.send("mode", data="teleop")
     assert stage.until(lambda: stage.heard["command"][-1].source == "controller/teleop")
+
+
+def test_a_path_with_times_is_followed_and_shown_with_times(wire):
+    """Times count from the first pose; what is shown is stamped with when each pose is due."""
+    stage = wire(Controller)
+    stage.state = "armed"
+    assert stage.until(lambda: stage.heard["path"] and stage.heard["command"])
+    rows = [(0.0, (0.2, 0.1, -0.5), 0.0), (4.0, (0.4, 0.1, -0.5), 0.5), (10.0, (0.4, -0.3, -0.6), 1.0)]
+    times, places, yaws = zip(*[(7 * 10**9 + int(t * 1e9), p, yaw) for t, p, yaw in rows], strict=True)
+    stage.send("follow", stage.make.path(0, times, places, yaws))
+    assert stage.until(lambda: stage.heard["path"] and len(stage.heard["path"][-1].poses) == 200)
+    guide, shown = stage.node.runtime.guide, stage.heard["path"][-1]
+    assert (guide.name, guide.duration) == ("path", 10.0)
+    for t, place, yaw in rows:
+        at = guide.at(t)
+        assert at.position == pytest.approx(place) and float(at.yaw) == pytest.approx(yaw)
+    due = [nanoseconds(pose.header.stamp) * 1e-9 for pose in shown.poses]
+    assert np.diff(due) == pytest.approx(10.0 / 199, abs=1e-6)
+    assert due[0] == pytest.approx(stage.node.base * 1e-9 + stage.node.runtime.started, abs=1e-6)
+    assert shown.poses[-1].pose.position.y == pytest.approx(-0.3)
+
+
+def test_a_way_is_shown_again_when_it_begins(wire):
+    """Arming is when its time begins."""
+    stage = wire(Controller, "-p", "trajectory:=lemniscate")
+    assert stage.until(lambda: stage.heard["path"])
+    stage.turns(5)
+    stage.state = "armed"
+    assert stage.until(lambda: len(stage.heard["path"]) == 2 and stage.heard["command"])
+    first, second = (nanoseconds(path.poses[0].header.stamp) * 1e-9 for path in stage.heard["path"])
+    assert second > first and second == pytest.approx(
+        stage.node.base * 1e-9 + stage.node.runtime.started, abs=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            lambda path: [setattr(pose.header.stamp, "sec", 0) for pose in path.poses],
+            "not after the one before it",
+        ),
+        (lambda path: path.poses.clear(), "two or more rows"),
+        (lambda path: setattr(path.header, "frame_id", "odom"), "frame 'odom', expected map"),
+        (
+            lambda path: setattr(path.poses[1].pose.position, "x", math.nan),
+            "pose 2: a goal that is not finite",
+        ),
+        (lambda path: setattr(path.poses[1].pose.position, "x", 50.0), "outside the workspace"),
+    ],
+)
+def test_a_path_that_cannot_be_followed_is_refused(wire, change, words):
+    """In a sentence on `events`, and the way before it is kept."""
+    stage = wire(Controller, "-p", "goal:='0.6,0.1,-0.5,0'")
+    path = stage.make.path(0, (0, 10**9), [(0.2, 0.1, -0.5), (0.3, 0.1, -0.5)], (0.0, 0.0))
+    change(path)
+    stage.send("follow", path)
+    assert stage.until(lambda: stage.events("refused")) and words in stage.events("refused")[0]
+    assert stage.node.guide.name == "station"
 
 
 def test_parameters_of_a_running_node_stay_as_they_are(wire):

@@ -16,25 +16,36 @@ activate(announce=False)
 import rclpy
 from rclpy.node import Node
 
-from finssim.geometry.rotations import quat_from_euler, quat_yaw
+from finssim.geometry.rotations import quat_from_euler, quat_to_matrix, quat_yaw
 from finssim.localization.pool import write_pool
 from finssim.pool.camera import PoolCamera
 from finssim.pool.site import camera_of
 from finssim.robot.messages import Picture
 from finssim.robot.robot import Reading
-from finssim.ros2.nodes.conversions import nanoseconds, tags_of
+from finssim.ros2.nodes.conversions import nanoseconds, tags_of, xyz, xyzw
+from finssim.ros2.nodes.frames import Pose
 from finssim.ros2.nodes.localizer import Localizer
 from finssim.ros2.nodes.ros_messages import RosMessages, ros_type
 from finssim.ros2.nodes.state_estimation import StateEstimation
 from finssim.ros2.topics import TOPICS, quality_profile
+from finssim.ros2.urdf import urdf_of
 from finssim.ros2_worlds.ideal_sensors import IdealSensors
 from finssim.vehicles import load_vehicle
 
 PATIENCE = 40.0  # [s] on a busy machine
 VEHICLE = load_vehicle("finsrov")
 PLACE, TURN = np.array([0.25, -0.15, -0.5]), np.asarray(quat_from_euler(0.02, -0.03, 0.8))
-HEARD = ("fix", "tags", "odometry", "estimator", "fixed_transform", "diagnostics")
+HEARD = ("fix", "tags", "odometry", "estimator", "transform", "fixed_transform", "robot", "diagnostics")
 SENT = ("telemetry", "image", "picture", "tags")
+
+
+def chained(first, second):
+    """Position and quaternion of the second transform's child in the first one's parent."""
+    first, second = (
+        Pose(np.array(xyz(t.translation)), np.array(xyzw(t.rotation)))
+        for t in (first.transform, second.transform)
+    )
+    return first.times(second)
 
 
 class Album:
@@ -163,8 +174,28 @@ def test_tags_of_the_camera_become_the_true_pose(room):
         min(sent, key=lambda s: abs(s - nanoseconds(room.heard["fix"][-1].header.stamp))), abs=2_000
     )
     assert room.until(lambda: room.heard["fixed_transform"], show)
-    frames = {t.child_frame_id for t in room.heard["fixed_transform"][0].transforms}
-    assert frames == {"odom", "imu_link", "camera_optical"}
+    tree = {t.child_frame_id: t for t in room.heard["fixed_transform"][0].transforms}
+    assert {"imu_link", "pressure_link", "tag_15_link", "V_LF_link", "camera_link"} <= tree.keys()
+    pool = room.pool.T_wp
+    camera = chained(tree["camera_link"], tree["camera_optical"])
+    assert camera[0] == pytest.approx(pool[:3, :3] @ room.pool.camera.position + pool[:3, 3])
+    R = pool[:3, :3] @ quat_to_matrix(room.pool.camera.orientation)
+    assert quat_to_matrix(camera[1]) == pytest.approx(R, abs=1e-9)
+    assert room.until(lambda: room.heard["robot"], show)
+    assert room.heard["robot"][0].data == urdf_of(VEHICLE)
+    odometry = {nanoseconds(m.header.stamp): m.pose.pose for m in room.heard["odometry"]}
+    both = [
+        m.transforms for m in room.heard["transform"] if nanoseconds(m.transforms[0].header.stamp) in odometry
+    ]
+    for drift, odom in both:
+        assert (drift.header.frame_id, drift.child_frame_id) == ("map", "odom")
+        assert (odom.header.frame_id, odom.child_frame_id) == ("odom", "base_link")
+        pose = odometry[nanoseconds(odom.header.stamp)]
+        place, q = chained(drift, odom)
+        assert place == pytest.approx(xyz(pose.position)) and abs(
+            q @ xyzw(pose.orientation)
+        ) == pytest.approx(1.0)
+    assert both
     assert room.heard["estimator"][-1].fixes_accepted > 0
 
 

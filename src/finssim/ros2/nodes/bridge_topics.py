@@ -8,7 +8,7 @@ from finssim.robot.bridge import Bridge
 from finssim.robot.robot import Reading
 from finssim.ros2.nodes.conversions import force_of
 from finssim.ros2.nodes.remote import Readings
-from finssim.ros2.nodes.robot_node import RobotNode
+from finssim.ros2.nodes.robot_node import RobotNode, matched_callbacks
 from finssim.ros2.nodes.ros_messages import ros_type
 from finssim.ros2.topics import SERVICES
 
@@ -32,7 +32,7 @@ class BridgeTopics:
         self._publishers = self._matched = 0
         self._label = ""
         node.sends("thrusters", "event", "diagnostics")
-        matched = _callbacks(self._on_match)
+        matched = matched_callbacks(self._on_match)
         self._tells = matched is not None
         self._commands = node.hears("command", self._on_command, event_callbacks=matched)
         node.hears("arm", lambda message: self._arm(bool(message.data)))
@@ -110,12 +110,3 @@ class BridgeTopics:
         why = self._arm(bool(request.data))
         response.success, response.message = not why, why
         return response
-
-
-def _callbacks(matched: Any) -> Any:
-    """What has rclpy tell of publishers that come and go; None on Humble, which cannot."""
-    try:
-        from rclpy.event_handler import SubscriptionEventCallbacks
-    except ImportError:
-        return None
-    return SubscriptionEventCallbacks(matched=matched)

@@ -14,7 +14,7 @@ from finssim.geometry.rotations import quat_yaw
 from finssim.robot.goals import GoalError, check_reachable, guide_of
 from finssim.robot.robot import Reading
 from finssim.robot.runtime import Runtime
-from finssim.ros2.nodes.conversions import station_of_pose
+from finssim.ros2.nodes.conversions import station_of_pose, trajectory_of
 from finssim.ros2.nodes.modes import Modes
 from finssim.ros2.nodes.remote import RemoteBridge, RemoteState
 from finssim.ros2.nodes.robot_node import RobotNode, run
@@ -46,7 +46,8 @@ class Controller(RobotNode):
         goal, trajectory = self.parameter("goal", ""), self.parameter("trajectory", "")
         if goal or trajectory:
             self._follow(guide_of(goal or None, trajectory or None))
-        self.hears("goal", self._on_goal)
+        self.hears("goal", lambda message: self._take(station_of_pose(message)))
+        self.hears("follow", lambda message: self._take(trajectory_of(message)))
         self.hears("trajectory", self._on_trajectory)
         self.hears("mode", self._on_mode)
         self.create_timer(1.0 / self.parameter("rate", 60.0), self._turn)
@@ -63,8 +64,10 @@ class Controller(RobotNode):
             return
         if math.isnan(self.runtime.started):
             self.runtime.guide = self.guide or _here(self.state.reading(now))
-        before = self.runtime.counters.decisions
+        before, began = self.runtime.counters.decisions, self.runtime.started
         self.runtime.step(now, ())
+        if self.runtime.started != began and not math.isnan(self.runtime.started):
+            self._show(self.runtime.guide, self.runtime.started)
         if self.runtime.counters.decisions > before:
             self.send("policy", self.modes.told(self.ns(now), self.runtime))
 
@@ -76,19 +79,25 @@ class Controller(RobotNode):
         """
         check_reachable(guide, self.vehicle)
         self.guide = self.runtime.guide = guide
+        now = self.now()
         if not math.isnan(self.runtime.started):
-            self.runtime.start(self.now())
-        end = guide.duration if math.isfinite(guide.duration) else 0.0
-        way = guide.at(np.linspace(0.0, end, PATH_POINTS if end else 1))
-        self.send("path", self.make.path(self.ns(self.now()), way.position, way.yaw))
+            self.runtime.start(now)
+        self._show(guide, now)
         self.event("goal", guide.name)
 
-    def _on_goal(self, message: Any) -> None:
-        station = station_of_pose(message)
-        if isinstance(station, str):
-            self.event("refused", station)
+    def _show(self, guide: Guide, began: float) -> None:
+        """Publish the way and its times, as of a start then [s]."""
+        end = guide.duration if math.isfinite(guide.duration) else 0.0
+        times = np.linspace(0.0, end, PATH_POINTS if end else 1)
+        way, stamps = guide.at(times), [self.ns(began + float(t)) for t in times]
+        self.send("path", self.make.path(self.ns(self.now()), stamps, way.position, way.yaw))
+
+    def _take(self, guide: Guide | str) -> None:
+        """Follow what a message said, or say why it cannot be."""
+        if isinstance(guide, str):
+            self.event("refused", guide)
         else:
-            self._try(lambda: station)
+            self._try(lambda: guide)
 
     def _on_trajectory(self, message: Any) -> None:
         self._try(lambda: guide_of(None, str(message.data)))

@@ -10,7 +10,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from finssim.control.errors import ControlError
 from finssim.control.guidance import Station
+from finssim.control.trajectories import Trajectory
+from finssim.control.trajectory_file import through_points
 from finssim.geometry.rotations import quat_yaw
 from finssim.robot.messages import Picture, TagCorners, Telemetry
 from finssim.robot.record_messages import FIRST_TIME, LAST_TIME
@@ -26,6 +29,7 @@ __all__ = [
     "station_of_pose",
     "tags_of",
     "telemetry_of",
+    "trajectory_of",
     "wrench_of",
 ]
 
@@ -36,6 +40,7 @@ LEVEL = math.radians(20.0)
 GRAY = {"rgb8": (0.299, 0.587, 0.114), "bgr8": (0.114, 0.587, 0.299)}
 """Weights of the channels in brightness (ITU-R BT.601)."""
 MOST_TAGS = 1000
+MOST_POSES = 10_000
 
 
 def nanoseconds(stamp: Any) -> int:
@@ -91,7 +96,7 @@ def wrench_of(message: Any) -> Array | None:
 def station_of_pose(message: Any) -> Station | str:
     """The station of a PoseStamped, or why it is none."""
     frame = message.header.frame_id
-    if frame not in ("", "map", "odom"):
+    if frame not in ("", "map"):
         return f"a goal in frame '{frame}', expected map"
     place, q = np.array(xyz(message.pose.position)), np.array(xyzw(message.pose.orientation))
     if not (np.isfinite(place).all() and np.isfinite(q).all()):
@@ -104,6 +109,25 @@ def station_of_pose(message: Any) -> Station | str:
     if 1.0 - 2.0 * (x * x + y * y) < math.cos(LEVEL):
         return "a goal that is not level: give a turn about z alone"
     return Station((float(place[0]), float(place[1]), float(place[2])), float(quat_yaw(q / length)))
+
+
+def trajectory_of(message: Any) -> Trajectory | str:
+    """The trajectory through the poses of a Path at their times, or why there is none."""
+    if len(message.poses) > MOST_POSES:
+        return f"a path of {len(message.poses)} poses, expected at most {MOST_POSES}"
+    rows = []
+    for i, pose in enumerate(message.poses):
+        station = station_of_pose(pose)
+        if isinstance(station, str):
+            return f"a path with pose {i + 1}: {station}"
+        seconds = 1e-9 * (nanoseconds(pose.header.stamp) - nanoseconds(message.poses[0].header.stamp))
+        rows.append((seconds, *station.position, station.yaw))
+    if message.header.frame_id not in ("", "map"):
+        return f"a path in frame '{message.header.frame_id}', expected map"
+    try:
+        return through_points("path", rows)
+    except ControlError as error:
+        return f"a path whose {error}"
 
 
 def reading_of(status: Any, odometry: Any | None, time: float) -> Reading:

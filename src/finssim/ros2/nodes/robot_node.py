@@ -23,7 +23,7 @@ from finssim.ros2.nodes.ros_messages import RosMessages, ros_type
 from finssim.ros2.topics import TOPICS, quality_profile
 from finssim.vehicles import load_vehicle
 
-__all__ = ["LISTENING", "RobotNode", "TwinError", "run"]
+__all__ = ["LISTENING", "RobotNode", "TwinError", "matched_callbacks", "run"]
 
 Made = TypeVar("Made", bound="RobotNode")
 
@@ -194,6 +194,15 @@ def run(make: Callable[[], Made], spin: Callable[[Made], None] = rclpy.spin, *, 
             node.close()
         rclpy.try_shutdown()
     return 0
+
+
+def matched_callbacks(matched: Callable[[Any], None]) -> Any:
+    """Event callbacks that tell a subscription of publishers that come and go; None on Humble, which cannot."""
+    try:
+        from rclpy.event_handler import SubscriptionEventCallbacks
+    except ImportError:
+        return None
+    return SubscriptionEventCallbacks(matched=matched)
 
 
 def _refused(error: Exception) -> int:

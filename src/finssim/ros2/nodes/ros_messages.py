@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.rotations import matrix_to_quat, quat_from_yaw, quat_multiply
 from finssim.localization.pool import Pool
 from finssim.robot.messages import Picture
-from finssim.robot.record_messages import BASE, IMU, MAP, Messages, floats
+from finssim.robot.record_messages import MAP, Messages, floats
 from finssim.robot.record_pictures import jpeg
 from finssim.vehicles import Vehicle
 
@@ -89,18 +88,8 @@ class RosMessages(Messages):
             p=floats(P),
         )
 
-    def fixed_transforms(self, stamp: int, vehicle: Vehicle, pool: Pool | None) -> Any:
-        """base_link to imu_link, map to odom and, with a pool file, map to camera_optical."""
-        none = np.zeros(3)
-        imu = vehicle.sensors.imu
-        parts = [(MAP, "odom", none, quat_from_yaw(0.0))]
-        if imu is not None:
-            parts.append((BASE, IMU, np.asarray(imu.position), np.asarray(imu.orientation)))
-        if pool is not None:
-            T = pool.T_wp
-            place = T[:3, :3] @ pool.camera.position + T[:3, 3]
-            turn = quat_multiply(matrix_to_quat(T[:3, :3]), pool.camera.orientation)
-            parts.append((MAP, OPTICAL, place, turn))
+    def transforms(self, stamp: int, parts: Any) -> Any:
+        """Frames in frames: parent, child, and position [m] with quaternion."""
         of = self._of
         return of["tf2_msgs/msg/TFMessage"](
             [
@@ -109,13 +98,13 @@ class RosMessages(Messages):
                     child,
                     of["geometry_msgs/msg/Transform"](self.vector(p), self.quaternion(q)),
                 )
-                for parent, child, p, q in parts
+                for parent, child, (p, q) in parts
             ]
         )
 
-    def path(self, stamp: int, places: Any, yaws: Any) -> Any:
-        """A trajectory's poses, (n, 3) [m] and (n,) [rad]."""
-        poses = [self.goal(stamp, p, float(yaw)) for p, yaw in zip(places, yaws, strict=True)]
+    def path(self, stamp: int, times: Any, places: Any, yaws: Any) -> Any:
+        """A trajectory's poses, (n, 3) [m] and (n,) [rad], each stamped with its time, (n,) [ns]."""
+        poses = [self.goal(int(t), p, float(yaw)) for t, p, yaw in zip(times, places, yaws, strict=True)]
         return self._of["nav_msgs/msg/Path"](self.header(stamp, MAP), poses)
 
     def clock(self, stamp: int) -> Any:

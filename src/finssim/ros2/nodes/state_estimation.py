@@ -14,6 +14,7 @@ from finssim.robot.intake import USED
 from finssim.robot.perception import Perception
 from finssim.ros2.nodes.conversions import telemetry_of
 from finssim.ros2.nodes.fix_frame import FixFrame
+from finssim.ros2.nodes.frames import Frames
 from finssim.ros2.nodes.robot_node import RobotNode, run
 
 __all__ = ["StateEstimation", "health_values", "main"]
@@ -27,10 +28,9 @@ class StateEstimation(RobotNode):
         pool = load_pool(self.parameter("pool_file", "pool.yaml"))
         mode = self.parameter("mode", "constant-velocity")
         self.perception = Perception(self.vehicle, pool, mode=mode)
-        self.frame = FixFrame(pool, self.perception.estimator)
-        self.sends("odometry", "transform", "fixed_transform", "estimator", "diagnostics", "event")
-        stamp = self.ns(self.now())
-        self.send("fixed_transform", self.make.fixed_transforms(stamp, self.vehicle, pool))
+        self.fixes = FixFrame(pool, self.perception.estimator)
+        self.sends("odometry", "estimator", "diagnostics", "event")
+        self.frames = Frames(self, pool)
         self.hears("telemetry", self._on_telemetry)
         self.hears("fix", self._on_fix)
         self.create_timer(1.0 / self.parameter("rate", 60.0), self._estimate)
@@ -42,14 +42,14 @@ class StateEstimation(RobotNode):
 
     def _on_fix(self, message: Any) -> None:
         time = self.seconds(message.header.stamp)
-        self.perception.estimator.add(self.frame.from_map(message, time, self.now()))
+        self.perception.estimator.add(self.fixes.from_map(message, time, self.now()))
 
     def _estimate(self) -> None:
         now = self.now()
         reading, stamp = self.perception.reading(now), self.ns(now)
         if np.isfinite(reading.position).all():
             self.send("odometry", self.make.odometry(stamp, reading))
-            self.send("transform", self.make.transform(stamp, reading))
+            self.frames.tell(stamp, reading)
         self.send("estimator", self.make.estimator(stamp, reading, health_values(self.perception.health())))
 
     def _tell(self) -> None:
