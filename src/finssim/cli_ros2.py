@@ -41,17 +41,11 @@ def node(
     Example: finssim ros2 node state_estimation
     """
     import sys
-    from importlib import import_module
 
-    from finssim.quiet import start_warp
-    from finssim.ros2.errors import Ros2Error
-    from finssim.ros2.graphs import NODES
+    from finssim.ros2.graphs import run_node
 
-    if name not in NODES:
-        raise Ros2Error(f"unknown node '{name}'; available: {', '.join(sorted(NODES))}")
-    start_warp()
     sys.argv = [name, *context.args]
-    import_module(NODES[name]).main()
+    raise typer.Exit(run_node(name))
 
 
 @ros2_app.command()
@@ -168,6 +162,7 @@ def up(
 
     Example: finssim ros2 up pool --policy pid --goal 0.5,0,-0.5,90 --arm --duration 60
     """
+    chosen = {name: value for name, value in locals().items() if name != "graph"}
     from finssim.quiet import start_warp
 
     start_warp()
@@ -176,30 +171,6 @@ def up(
     from finssim.ros2.up import up as run
 
     activate()
-    options = Options(
-        vehicle=vehicle,
-        policy=policy,
-        task=task,
-        trim=trim,
-        goal=goal,
-        trajectory=trajectory,
-        arm=arm,
-        robot=robot,
-        bind=bind,
-        pictures=pictures,
-        pool_file=pool_file,
-        plant=plant,
-        severity=severity,
-        camera=camera,
-        port=port,
-        truth=truth,
-        start=start,
-        hydrodynamics=hydrodynamics,
-        record=record,
-        teleop=teleop,
-        duration=duration,
-        seed=seed,
-    )
-    status = run(graph, options, lambda line: typer.echo(line))
+    status = run(graph, Options(**chosen), typer.echo)
     if status:
         raise typer.Exit(status)

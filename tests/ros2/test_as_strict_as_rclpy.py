@@ -2,6 +2,8 @@
 """What rclpy refuses, the built-in rclpy refuses: docs/ros2.md lists each rule with its test here or beside."""
 
 import array
+import ast
+import importlib.util
 import re
 from pathlib import Path
 
@@ -39,6 +41,8 @@ from rclpy.qos import InvalidQoSProfileException, QoSProfile
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64, String
 from std_srvs.srv import Trigger
+
+from finssim.ros2.graphs import NODES
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "ros2.md"
 FREE = ParameterDescriptor(dynamic_typing=True)
@@ -370,6 +374,40 @@ def test_requests_are_of_their_service(node):
     client = node.create_client(Trigger, "go")
     with pytest.raises(TypeError, match="takes std_srvs/srv/Trigger_Request"):
         client.call_async(String())
+
+
+@pytest.mark.parametrize("name", ["timers", "publishers", "subscriptions", "services", "clients", "context"])
+def test_what_a_node_has_is_not_assigned_to(node, name):
+    """Names that a node's own attributes must not take."""
+    with pytest.raises(AttributeError):
+        setattr(node, name, [])
+
+
+OF_RCLPY = (
+    "_parameters _publishers _subscriptions _clients _services _timers _guards _descriptors _logger _clock _context "
+    "_default_callback_group _rate_group _allow_undeclared_parameters _parameter_overrides _time_source "
+    "_parameter_event_publisher _pre_set_parameters_callbacks _on_set_parameters_callbacks _parameter_service "
+    "_post_set_parameters_callbacks _type_description_service timers publishers subscriptions services clients guards "
+    "waitables executor context handle default_callback_group"
+).split()
+"""Attributes of rclpy's Node (node.py): one of ours by that name would break the node there and not here."""
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_our_nodes_take_no_name_of_rclpys_node(name):
+    """Neither assigned nor defined."""
+    module, _, cls = NODES[name].partition(":")
+    tree = ast.parse(Path(importlib.util.find_spec(module).origin).read_text())
+    shared = ast.parse(Path(importlib.util.find_spec("finssim.ros2.nodes.robot_node").origin).read_text())
+    for part in (tree, shared):
+        for made in (c for c in part.body if isinstance(c, ast.ClassDef) and c.name in (cls, "RobotNode")):
+            names = {
+                n.attr
+                for n in ast.walk(made)
+                if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store)
+            }
+            names |= {f.name for f in made.body if isinstance(f, ast.FunctionDef)}
+            assert names and not names & set(OF_RCLPY)
 
 
 def test_timers_do_not_run_backwards(node):

@@ -18,13 +18,13 @@ FILE = Path("/somewhere/pool.yaml")
 
 def source(node):
     """Source of a node's module."""
-    return Path(importlib.util.find_spec(NODES[node]).origin).read_text()
+    return Path(importlib.util.find_spec(NODES[node].partition(":")[0]).origin).read_text()
 
 
 @pytest.mark.parametrize("node", NODES)
-def test_each_node_is_a_module_with_a_main_and_stands_on_the_page(node):
+def test_each_node_is_a_class_and_stands_on_the_page(node):
     """With every parameter that it declares."""
-    assert "\ndef main() -> None:" in source(node)
+    assert f"\nclass {NODES[node].partition(':')[2]}(RobotNode):" in source(node)
     (row,) = re.findall(rf"^\| {node} \| .*$", PAGE, flags=re.MULTILINE)
     declared = set(re.findall(r'self\.parameter\("(\w+)"', source(node)))
     assert declared == set(re.findall(r"`(\w+)`", row.rsplit(" | ", 1)[1])), row

@@ -40,6 +40,7 @@ def test_every_vehicle_is_a_tree_of_fixed_joints(name):
         assert numbers(hull, "size") == pytest.approx(vehicle.body.size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["finsrov", "bluerov2_heavy"])
 def test_mujoco_reads_the_same_body(name):
     """Mass, centre of gravity and principal inertia, by a reader of URDF that is not ours."""

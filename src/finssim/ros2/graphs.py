@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -11,24 +12,20 @@ import yaml
 from finssim.ros2.errors import Ros2Error
 from finssim.ros2.topics import TOPICS, Topic
 
-__all__ = ["GRAPHS", "MCU_PORT", "NODES", "PARENT", "Plan", "topics_of"]
+__all__ = ["GRAPHS", "MCU_PORT", "NODES", "PARENT", "Plan", "run_node", "topics_of"]
 
 NODES = {
-    **{
-        name: f"finssim.ros2.nodes.{name}"
-        for name in (
-            "camera",
-            "controller",
-            "hardware_bridge",
-            "localizer",
-            "recorder",
-            "state_estimation",
-            "teleop",
-        )
-    },
-    **{name: f"finssim.ros2_worlds.{name}" for name in ("sim", "virtual_pool")},
+    "camera": "finssim.ros2.nodes.camera:Camera",
+    "controller": "finssim.ros2.nodes.controller:Controller",
+    "hardware_bridge": "finssim.ros2.nodes.hardware_bridge:HardwareBridge",
+    "localizer": "finssim.ros2.nodes.localizer:Localizer",
+    "recorder": "finssim.ros2.nodes.recorder:RecorderNode",
+    "sim": "finssim.ros2_worlds.sim:Sim",
+    "state_estimation": "finssim.ros2.nodes.state_estimation:StateEstimation",
+    "teleop": "finssim.ros2.nodes.teleop:Teleop",
+    "virtual_pool": "finssim.ros2_worlds.virtual_pool:VirtualPoolNode",
 }
-"""Node -> module with its `main`."""
+"""Node -> module and class."""
 
 ROBOT = ("hardware_bridge", "camera", "localizer", "state_estimation", "controller")
 
@@ -80,6 +77,21 @@ class Plan:
             if values
         }
         path.write_text(yaml.dump(tree, Dumper=_Quoting, sort_keys=False), encoding="utf-8")
+
+
+def run_node(name: str) -> int:
+    """Run a node in this process, its parameters from the command line; the exit status.
+
+    Raises:
+        Ros2Error: There is no such node.
+    """
+    from finssim.quiet import start_warp
+
+    if name not in NODES:
+        raise Ros2Error(f"unknown node '{name}'; available: {', '.join(NODES)}")
+    start_warp()
+    module, _, node = NODES[name].partition(":")
+    return int(getattr(import_module(module), node).run())
 
 
 class _Quoting(yaml.SafeDumper):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from typing import Any
 
 import numpy as np
@@ -11,19 +10,18 @@ from rclpy.clock import Clock, ClockType
 
 from finssim.engine import Simulator
 from finssim.geometry.rotations import quat_from_yaw
-from finssim.quiet import start_warp
 from finssim.robot.bridge import Bridge
 from finssim.robot.bridge_settings import BridgeSettings
 from finssim.robot.goals import station_of
 from finssim.robot.robot import Reading
 from finssim.ros2.nodes.bridge_topics import BridgeTopics
 from finssim.ros2.nodes.frames import Frames
-from finssim.ros2.nodes.robot_node import RobotNode, run
+from finssim.ros2.nodes.robot_node import RobotNode
 from finssim.ros2.nodes.ros_messages import ros_type
 from finssim.ros2.topics import SERVICES
 from finssim.ros2_worlds.ideal_sensors import IdealSensors
 
-__all__ = ["Sim", "main"]
+__all__ = ["Sim"]
 
 STEP = 1.0 / 60.0
 """Between commands, states and ticks of /clock [s]."""
@@ -109,9 +107,3 @@ class Sim(RobotNode):
         self._reset()
         response.success, response.message = True, f"at {self.start.position}"
         return response
-
-
-def main() -> None:
-    """Run the node."""
-    start_warp()
-    sys.exit(run(Sim))

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from finssim.pool.run import MCU_PORT
 from finssim.pool.run import run as serve
-from finssim.quiet import start_warp
 from finssim.robot.link.transports import DEFAULT_BIND
-from finssim.ros2.nodes.robot_node import RobotNode, run
+from finssim.ros2.nodes.robot_node import RobotNode
 
-__all__ = ["VirtualPoolNode", "main"]
+__all__ = ["VirtualPoolNode"]
 
 
 class VirtualPoolNode(RobotNode):
@@ -35,16 +33,10 @@ class VirtualPoolNode(RobotNode):
         self._vehicle_name = self.get_parameter("vehicle").value
         self.event("start", f"plant {self.plan['plant']}, {self.plan['severity']}")
 
-    def serve(self) -> None:
+    def spin(self) -> None:
         """Be the pool until SIGINT or SIGTERM."""
         serve(self._vehicle_name, lockstep=False, bind="127.0.0.1", duration=None, **self.plan)
 
 
 def _path(text: str) -> Path | None:
     return Path(text) if text else None
-
-
-def main() -> None:
-    """Run the node."""
-    start_warp()
-    sys.exit(run(VirtualPoolNode, spin=VirtualPoolNode.serve))

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-
 from finssim.localization.pool import load_pool
 from finssim.robot.messages import Picture
 from finssim.robot.picture_source import DEFAULT_CAMERA, DEFAULT_PICTURES, open_pictures
-from finssim.ros2.nodes.robot_node import RobotNode, run
+from finssim.ros2.nodes.robot_node import RobotNode
 
-__all__ = ["Camera", "main"]
+__all__ = ["Camera"]
 
 POLL = 90.0
 """Looks for a new picture [Hz]."""
@@ -53,8 +51,3 @@ class Camera(RobotNode):
     def close(self) -> None:
         """Let go of the wire."""
         self.source.close()
-
-
-def main() -> None:
-    """Run the node."""
-    sys.exit(run(Camera))

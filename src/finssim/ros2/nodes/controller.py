@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from typing import Any
 
 import numpy as np
@@ -17,9 +16,9 @@ from finssim.robot.runtime import Runtime
 from finssim.ros2.nodes.conversions import station_of_pose, trajectory_of
 from finssim.ros2.nodes.modes import Modes
 from finssim.ros2.nodes.remote import RemoteBridge, RemoteState
-from finssim.ros2.nodes.robot_node import RobotNode, run
+from finssim.ros2.nodes.robot_node import RobotNode
 
-__all__ = ["Controller", "main"]
+__all__ = ["Controller"]
 
 STATE_TIMEOUT = 0.5
 """Oldest reading to act on, where the vehicle file does not say [s]."""
@@ -122,8 +121,3 @@ def _here(reading: Reading) -> Guide:
     """The place and heading of a reading, to be kept."""
     x, y, z = (float(v) for v in reading.position)
     return Station((x, y, z), float(quat_yaw(reading.quaternion)), "here")
-
-
-def main() -> None:
-    """Run the node."""
-    sys.exit(run(Controller))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,9 +18,9 @@ from finssim.robot.messages import CommandEcho, Telemetry
 from finssim.robot.unlocated import Unlocated
 from finssim.robot.wiring import POOL_ADDRESS
 from finssim.ros2.nodes.bridge_topics import BridgeTopics
-from finssim.ros2.nodes.robot_node import RobotNode, run
+from finssim.ros2.nodes.robot_node import RobotNode
 
-__all__ = ["HardwareBridge", "main"]
+__all__ = ["HardwareBridge"]
 
 LAST_FRAMES = 3
 """Frames without thrust at the end."""
@@ -84,8 +83,3 @@ class HardwareBridge(RobotNode):
         for _ in range(LAST_FRAMES):
             self.transport.send(encode_command(self.bridge.tick(self.now())))
         self.transport.close()
-
-
-def main() -> None:
-    """Run the node."""
-    sys.exit(run(HardwareBridge))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from dataclasses import replace
 from typing import Any
@@ -20,9 +19,9 @@ from finssim.robot.messages import Picture, TagCorners
 from finssim.robot.perception import Perception
 from finssim.ros2.nodes.conversions import compressed_of, image_of, nanoseconds, tags_of, telemetry_of
 from finssim.ros2.nodes.fix_frame import FixFrame
-from finssim.ros2.nodes.robot_node import RobotNode, run
+from finssim.ros2.nodes.robot_node import RobotNode
 
-__all__ = ["Localizer", "main"]
+__all__ = ["Localizer"]
 
 FORMS = {"raw": ("image", image_of), "compressed": ("picture", compressed_of)}
 
@@ -105,8 +104,3 @@ class _Kept:
         whole = isinstance(found, VisionSample) and bool(np.isfinite(found.position).all())
         self.newest = found if isinstance(found, VisionSample) and whole else None
         return found
-
-
-def main() -> None:
-    """Run the node."""
-    sys.exit(run(Localizer))

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from finssim.robot.recorder import Recorder
-from finssim.ros2.nodes.robot_node import RobotNode, run
+from finssim.ros2.nodes.robot_node import RobotNode
 from finssim.ros2.topics import TOPICS
 from finssim.vehicles import Vehicle
 
-__all__ = ["RecorderNode", "main"]
+__all__ = ["RecorderNode"]
 
 LEFT_OUT = ("image", "clock")
 """Raw pictures fill disks, and their compressed ones are kept; simulated time is in every stamp."""
@@ -20,6 +19,8 @@ LEFT_OUT = ("image", "clock")
 
 class RecorderNode(RobotNode):
     """Records from its start to its end; a full disk ends the record, not the node."""
+
+    urgent = False
 
     def __init__(self) -> None:
         super().__init__("recorder")
@@ -76,8 +77,3 @@ class _WireRecord(Recorder):
 
     def _topic_name(self, key: str) -> str:
         return self._names[key]
-
-
-def main() -> None:
-    """Run the node."""
-    sys.exit(run(RecorderNode, urgent=False))

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Any, TypeVar
+from typing import Any
 
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
@@ -23,9 +23,7 @@ from finssim.ros2.nodes.ros_messages import RosMessages, ros_type
 from finssim.ros2.topics import TOPICS, quality_profile
 from finssim.vehicles import load_vehicle
 
-__all__ = ["LISTENING", "RobotNode", "TwinError", "matched_callbacks", "run"]
-
-Made = TypeVar("Made", bound="RobotNode")
+__all__ = ["LISTENING", "RobotNode", "TwinError", "matched_callbacks"]
 
 ORPHANED = 0.5
 """Between looks whether it is there [s]."""
@@ -52,6 +50,8 @@ class RobotNode(Node):
 
     listening = 0.0
     """How long a new node listens for another of its name before it says anything [s]; `run` sets it."""
+    urgent = True
+    """Whether it stands between a sensor and a thruster, and goes before other programs where it may."""
 
     def __init__(self, name: str, others: Sequence[str] = ()) -> None:
         """
@@ -157,43 +157,44 @@ class RobotNode(Node):
         name = f"{self.vehicle.name}: {self.get_name()}"
         self.send("diagnostics", self.make.diagnostics(self.ns(self.now()), name, level, text, values))
 
+    # -- a process of its own -------------------------------------------------------------------------------------
+
+    @classmethod
+    def run(cls) -> int:
+        """Be this node until SIGINT, SIGTERM, or the end of the launcher.
+
+        Returns:
+            Exit status: 0, or `REFUSED` with a sentence on standard error.
+        """
+        _follow_parent()
+        if cls.urgent:
+            with suppress(PermissionError):
+                os.nice(URGENCY)
+        try:
+            rclpy.init()
+        except (RuntimeError, ValueError) as error:  # the command line, or a setting of the wire
+            return _refused(error)
+        RobotNode.listening = LISTENING
+        node: RobotNode | None = None
+        try:
+            node = cls()
+            node.spin()
+        except (KeyboardInterrupt, ExternalShutdownException):
+            pass
+        except (ValueError, ParameterException) as error:
+            return _refused(error)
+        finally:
+            if node is not None:
+                node.close()
+            rclpy.try_shutdown()
+        return 0
+
+    def spin(self) -> None:
+        """Run callbacks."""
+        rclpy.spin(self)
+
     def close(self) -> None:
         """Put in order what is not the middleware's; called once at the end, however it came."""
-
-
-def run(make: Callable[[], Made], spin: Callable[[Made], None] = rclpy.spin, *, urgent: bool = True) -> int:
-    """Run a node until SIGINT, SIGTERM or the end of its launcher.
-
-    Args:
-        make: Makes it.
-        spin: Runs it.
-        urgent: Whether it stands between a sensor and a thruster, and goes before other programs where it may.
-
-    Returns:
-        Exit status: 0, or `REFUSED` with a sentence on standard error.
-    """
-    _follow_parent()
-    if urgent:
-        with suppress(PermissionError):
-            os.nice(URGENCY)
-    node: Made | None = None
-    try:
-        rclpy.init()
-    except (RuntimeError, ValueError) as error:  # the command line, or a setting of the wire
-        return _refused(error)
-    RobotNode.listening = LISTENING
-    try:
-        node = make()
-        spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except (ValueError, ParameterException) as error:
-        return _refused(error)
-    finally:
-        if node is not None:
-            node.close()
-        rclpy.try_shutdown()
-    return 0
 
 
 def matched_callbacks(matched: Callable[[Any], None]) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from typing import Any
 
 import numpy as np
@@ -15,9 +14,9 @@ from finssim.robot.perception import Perception
 from finssim.ros2.nodes.conversions import telemetry_of
 from finssim.ros2.nodes.fix_frame import FixFrame
 from finssim.ros2.nodes.frames import Frames
-from finssim.ros2.nodes.robot_node import RobotNode, run
+from finssim.ros2.nodes.robot_node import RobotNode
 
-__all__ = ["StateEstimation", "health_values", "main"]
+__all__ = ["StateEstimation", "health_values"]
 
 
 class StateEstimation(RobotNode):
@@ -71,8 +70,3 @@ def health_values(health: Health) -> dict[str, Any]:
         "reject_reason": health.reject_reason,
         "mahalanobis": health.mahalanobis.get("vision", math.nan),
     }
-
-
-def main() -> None:
-    """Run the node."""
-    sys.exit(run(StateEstimation))

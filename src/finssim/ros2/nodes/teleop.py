@@ -10,11 +10,11 @@ from finssim.robot.gamepad import XBOX
 from finssim.robot.operator import Device, Operator
 from finssim.robot.teleop import Hands, TeleopError
 from finssim.ros2.nodes.remote import RemoteBridge
-from finssim.ros2.nodes.robot_node import RobotNode, run
+from finssim.ros2.nodes.robot_node import RobotNode
 from finssim.ros2.nodes.ros_messages import ros_type
 from finssim.ros2.topics import SENSOR, quality_profile
 
-__all__ = ["JoyDevice", "Teleop", "main"]
+__all__ = ["JoyDevice", "Teleop"]
 
 LAST_WRENCHES = 3
 """Wrenches of zero at the end."""
@@ -105,8 +105,3 @@ class JoyDevice:
         if value != 0.0:
             self._moved.add(axis)
         return (1.0 - value) / 2.0 if axis in self._moved else 0.0
-
-
-def main() -> None:
-    """Run the node."""
-    sys.exit(run(Teleop))

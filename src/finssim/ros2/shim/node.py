@@ -65,14 +65,14 @@ class Node(NodeParameters, NodeGraph):
         unknown = set(services) - {"enable_rosout", "enable_logger_service"}
         if unknown:
             raise TypeError(f"Node takes no argument '{min(unknown)}'")
-        self.context = context or get_default_context()
+        self._context = context or get_default_context()
         own = parse_arguments(cli_args or ())
         sources = [self.context.arguments, own] if use_global_arguments else [own]
         self._rules = [rule for source in reversed(sources) for rule in source.remaps]
         self._name, self._namespace = self._named(node_name, namespace or "")
         self._logger = get_logger(self.get_fully_qualified_name().strip("/").replace("/", "."))
         self.context.participant.codec  # noqa: B018 - refuses a context that is not initialized, before anything else
-        self.timers: list[Timer] = []
+        self._timers: list[Timer] = []
         self._ends: list[Any] = []
         overrides: dict[str, Any] = {}
         for source in sources:
@@ -92,6 +92,36 @@ class Node(NodeParameters, NodeGraph):
         self._time_source = TimeSource(self, self._clock)
         if start_parameter_services:
             ParameterService(self)
+
+    @property
+    def context(self) -> Context:
+        """What it belongs to."""
+        return self._context
+
+    @property
+    def timers(self) -> Iterator[Timer]:
+        """Its timers; like the properties below, not to be assigned to."""
+        yield from self._timers
+
+    @property
+    def publishers(self) -> Iterator[Publisher]:
+        """Its publishers."""
+        yield from (end for end in self._ends if isinstance(end, Publisher))
+
+    @property
+    def subscriptions(self) -> Iterator[Subscription]:
+        """Its subscriptions."""
+        yield from (end for end in self._ends if isinstance(end, Subscription))
+
+    @property
+    def services(self) -> Iterator[Service]:
+        """Its services."""
+        yield from (end for end in self._ends if isinstance(end, Service))
+
+    @property
+    def clients(self) -> Iterator[Client]:
+        """Its clients."""
+        yield from (end for end in self._ends if isinstance(end, Client))
 
     def get_name(self) -> str:
         """Its name."""
@@ -169,15 +199,15 @@ class Node(NodeParameters, NodeGraph):
     ) -> Timer:
         """A timer with a period [s] of the node's clock, or of another."""
         timer = Timer(callback, int(timer_period_sec * 1e9), clock or self._clock, autostart=autostart)
-        self.timers.append(timer)
+        self._timers.append(timer)
         self.context.wake()
         return timer
 
     def destroy_timer(self, timer: Timer) -> bool:
         """Remove a timer; whether it was the node's."""
-        known = timer in self.timers
+        known = timer in self._timers
         timer.cancel()
-        self.timers = [t for t in self.timers if t is not timer]
+        self._timers = [t for t in self._timers if t is not timer]
         return known
 
     def destroy_publisher(self, publisher: Publisher) -> bool:
@@ -198,9 +228,9 @@ class Node(NodeParameters, NodeGraph):
 
     def destroy_node(self) -> None:
         """Remove the node with all it has."""
-        for timer in self.timers:
+        for timer in self._timers:
             timer.cancel()
-        self.timers = []
+        self._timers = []
         if self in self.context.nodes:
             self.context.nodes.remove(self)
             ends, self._ends = self._ends, []
