@@ -26,6 +26,7 @@ from rcl_interfaces.msg import (
 from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
 from rclpy.duration import Duration
 from rclpy.exceptions import (
+    InvalidHandle,
     InvalidParameterException,
     InvalidParameterTypeException,
     InvalidParameterValueException,
@@ -38,6 +39,8 @@ from rclpy.exceptions import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import InvalidQoSProfileException, QoSProfile
+from rclpy.task import Future
+from rclpy.time import Time
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64, String
 from std_srvs.srv import Trigger
@@ -413,6 +416,58 @@ def test_our_nodes_take_no_name_of_rclpys_node(name):
 def test_timers_do_not_run_backwards(node):
     with pytest.raises(RuntimeError, match="expected zero or more"):
         node.create_timer(-1.0, lambda: None)
+
+
+def test_what_was_destroyed_is_not_used(node):
+    """A RuntimeError, and nothing on the wire."""
+    publisher, other = node.create_publisher(String, "word", 10), Node("b")
+    node.destroy_publisher(publisher)
+    with pytest.raises(InvalidHandle, match="was destroyed"):
+        publisher.publish(String())
+    other.destroy_node()
+    with pytest.raises(RuntimeError, match="was destroyed"):
+        other.create_publisher(String, "word", 10)
+
+
+def test_a_callback_does_not_spin(node):
+    """Neither its own executor nor for an answer."""
+    found = []
+
+    def callback():
+        for spin in (lambda: rclpy.spin_once(node), lambda: rclpy.spin_until_future_complete(node, Future())):
+            with pytest.raises(RuntimeError, match="already spinning") as error:
+                spin()
+            found.append(error)
+
+    node.create_timer(0.0, callback)
+    rclpy.spin_once(node, timeout_sec=10.0)
+    assert len(found) == 2
+    rclpy.spin_once(node, timeout_sec=10.0)
+    assert len(found) == 4, "and goes on afterwards"
+
+
+def test_a_log_line_is_a_str(node):
+    for message in (1, ValueError("a"), None):
+        with pytest.raises(TypeError, match="give a str"):
+            node.get_logger().info(message)
+    with pytest.raises(ValueError, match="no name"):
+        node.get_logger().get_child("")
+
+
+@pytest.mark.parametrize(
+    ("make", "error"),
+    [
+        (lambda: Time(seconds=-1), ValueError),
+        (lambda: Time(seconds=1, nanoseconds=-1), ValueError),
+        (lambda: Time(nanoseconds=2**63), OverflowError),
+        (lambda: Time(clock_type=1), TypeError),
+        (lambda: Duration(seconds=1e10), OverflowError),
+        (lambda: Time() - Duration(seconds=1), ValueError),
+    ],
+)
+def test_times_and_durations_fit_their_64_bits(make, error):
+    with pytest.raises(error):
+        make()
 
 
 @pytest.mark.parametrize("namespace", ["a/", "/a/", "//a", "a//b", "1a", "a b", "a" * 250])

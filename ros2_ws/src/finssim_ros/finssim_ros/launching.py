@@ -36,7 +36,10 @@ def description(graph, arguments, nodes):
                 # /**, which loses against every node that a file names after a /** of its own.
                 name=executable,
                 namespace=given["namespace"],
-                parameters=[given["params_file"] or own, _typed({"vehicle": given["vehicle"], **parameters})],
+                parameters=[
+                    given["params_file"] or own,
+                    *_given({"vehicle": given["vehicle"], **parameters}),
+                ],
                 output="screen",
             )
             for executable, parameters in nodes(given).items()
@@ -53,10 +56,11 @@ def description(graph, arguments, nodes):
     )
 
 
-def _typed(parameters):
-    """Those that were given; words stay words, whatever they look like."""
-    return {
+def _given(parameters):
+    """A dictionary of those that were given, if any; words stay words, whatever they look like."""
+    given = {
         name: ParameterValue(value, value_type=str) if isinstance(value, str) else value
         for name, value in parameters.items()
         if value != ""
     }
+    return [given] if given else []

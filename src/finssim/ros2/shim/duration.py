@@ -15,7 +15,9 @@ class Duration:
     """A span of time, kept in nanoseconds."""
 
     def __init__(self, *, seconds: float = 0, nanoseconds: int = 0) -> None:
-        self.nanoseconds = int(seconds * 1e9) + int(nanoseconds)
+        self.nanoseconds = int(seconds * 10**9) + int(nanoseconds)
+        if not -(2**63) <= self.nanoseconds < 2**63:
+            raise OverflowError(f"a duration of {self.nanoseconds} ns: expected less than 2^63")
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Duration) and self.nanoseconds == other.nanoseconds

@@ -1,6 +1,7 @@
 """`rclpy.exceptions`: the errors that code written for rclpy catches, with rclpy's bases: none is a ValueError."""
 
 __all__ = [
+    "InvalidHandle",
     "InvalidNamespaceException",
     "InvalidNodeNameException",
     "InvalidParameterException",
@@ -21,6 +22,10 @@ __all__ = [
 
 class RosArgumentsError(RuntimeError):
     """Arguments after `--ros-args` that ROS refuses; in rclpy RCLInvalidROSArgsError or UnknownROSArgsError."""
+
+
+class InvalidHandle(RuntimeError):
+    """Something is used that was destroyed."""
 
 
 class NotInitializedException(Exception):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from finssim.ros2.shim.context import Context
@@ -48,7 +49,7 @@ class SingleThreadedExecutor:
         self._round: Iterator[Callable[[], Any]] = iter(())
         self._watching: tuple[int, tuple[int, ...]] = (-1, ())
         self._looked = 0.0
-        self._stopped = False
+        self._stopped = self._spins = False
 
     def add_node(self, node: Any) -> bool:
         """Run a node's callbacks too; whether it is new."""
@@ -83,8 +84,9 @@ class SingleThreadedExecutor:
         Raises:
             ExternalShutdownException: The context was shut down from outside its callbacks.
         """
-        while self.context.ok() and not self._stopped:
-            self.spin_once()
+        with self._spinning():
+            while self.context.ok() and not self._stopped:
+                self._spin_once(None)
         if self.context.asked_to_leave:
             raise ExternalShutdownException("SIGTERM came while an executor spun")
 
@@ -96,7 +98,33 @@ class SingleThreadedExecutor:
 
         Raises:
             ExternalShutdownException: The context was shut down while waiting.
+            RuntimeError: It spins already, as within a callback.
         """
+        with self._spinning():
+            self._spin_once(timeout_sec)
+
+    def spin_until_future_complete(self, future: Future, timeout_sec: float | None = None) -> None:
+        """Run callbacks until an answer has come, or a time has passed [s]."""
+        end = float("inf") if timeout_sec is None or timeout_sec < 0 else time.monotonic() + timeout_sec
+        future.add_done_callback(lambda _: self.wake())
+        with self._spinning():
+            while self.context.ok() and not self._stopped and not future.done():
+                left = end - time.monotonic()
+                if left <= 0:
+                    return
+                self._spin_once(min(left, LONGEST_WAIT))
+
+    @contextmanager
+    def _spinning(self) -> Iterator[None]:
+        if self._spins:
+            raise RuntimeError("Executor is already spinning: wait for an answer by a callback of its future")
+        self._spins = True
+        try:
+            yield
+        finally:
+            self._spins = False
+
+    def _spin_once(self, timeout_sec: float | None) -> None:
         endless = timeout_sec is None or timeout_sec < 0
         end = float("inf") if endless else time.monotonic() + (timeout_sec or 0.0)
         work = next(self._round, None) or self._search()
@@ -109,16 +137,6 @@ class SingleThreadedExecutor:
             self._tell_mismatches(now=happened and work is None)
         if work is not None:
             work()
-
-    def spin_until_future_complete(self, future: Future, timeout_sec: float | None = None) -> None:
-        """Run callbacks until an answer has come, or a time has passed [s]."""
-        end = float("inf") if timeout_sec is None or timeout_sec < 0 else time.monotonic() + timeout_sec
-        future.add_done_callback(lambda _: self.wake())
-        while self.context.ok() and not self._stopped and not future.done():
-            left = end - time.monotonic()
-            if left <= 0:
-                return
-            self.spin_once(min(left, LONGEST_WAIT))
 
     def _search(self) -> Callable[[], Any] | None:
         """Begin a new round over everything that may have work; the first that has."""

@@ -51,6 +51,8 @@ class RcutilsLogger:
 
     def get_child(self, name: str) -> RcutilsLogger:
         """The logger below this one."""
+        if not name:
+            raise ValueError("the logger below this one has no name: give one")
         return get_logger(f"{self.name}.{name}" if self.name else name)
 
     def set_level(self, level: int) -> None:
@@ -65,7 +67,7 @@ class RcutilsLogger:
         """Whether lines of a severity are shown."""
         return severity >= self.get_effective_level()
 
-    def log(self, message: Any, severity: int, **when: Any) -> bool:
+    def log(self, message: str, severity: int, **when: Any) -> bool:
         """Write a line.
 
         Args:
@@ -78,9 +80,11 @@ class RcutilsLogger:
 
         Raises:
             ValueError: The same call in the program had another severity or other conditions before, as in rclpy.
-            TypeError: An unknown condition.
+            TypeError: An unknown condition, or a message that is no str.
         """
         severity = LoggingSeverity(severity)
+        if not isinstance(message, str):
+            raise TypeError(f"a log line is {message!r} ({type(message).__name__}): give a str")
         site = self._site(severity, when)
         if not self.is_enabled_for(severity) or not _due(site):
             return False
@@ -107,25 +111,25 @@ class RcutilsLogger:
             raise ValueError("Logging filter parameters cannot be changed between calls.")
         return site
 
-    def debug(self, message: Any, **when: Any) -> bool:
+    def debug(self, message: str, **when: Any) -> bool:
         """For whoever looks for a fault."""
         return self.log(message, LoggingSeverity.DEBUG, **when)
 
-    def info(self, message: Any, **when: Any) -> bool:
+    def info(self, message: str, **when: Any) -> bool:
         """As it should be."""
         return self.log(message, LoggingSeverity.INFO, **when)
 
-    def warning(self, message: Any, **when: Any) -> bool:
+    def warning(self, message: str, **when: Any) -> bool:
         """Worth a look."""
         return self.log(message, LoggingSeverity.WARN, **when)
 
     warn = warning
 
-    def error(self, message: Any, **when: Any) -> bool:
+    def error(self, message: str, **when: Any) -> bool:
         """Something does not work."""
         return self.log(message, LoggingSeverity.ERROR, **when)
 
-    def fatal(self, message: Any, **when: Any) -> bool:
+    def fatal(self, message: str, **when: Any) -> bool:
         """Nothing works."""
         return self.log(message, LoggingSeverity.FATAL, **when)
 

@@ -11,6 +11,7 @@ from finssim.ros2.shim.clock import Clock, ROSClock
 from finssim.ros2.shim.context import Context
 from finssim.ros2.shim.endpoint import Endpoint
 from finssim.ros2.shim.event_handler import SubscriptionEventCallbacks
+from finssim.ros2.shim.exceptions import InvalidHandle
 from finssim.ros2.shim.logging import RcutilsLogger, get_logger
 from finssim.ros2.shim.names import check_node, full_node_name, remapped
 from finssim.ros2.shim.node_graph import NodeGraph
@@ -264,6 +265,9 @@ class Node(NodeParameters, NodeGraph):
         return name, check_node(name, namespace)
 
     def _added(self, end: Made) -> Made:
+        if self not in self.context.nodes:
+            end.close()
+            raise InvalidHandle(f"node {self._name} was destroyed: make another")
         self._ends.append(end)
         self.context.announce()
         return end

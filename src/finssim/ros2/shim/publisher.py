@@ -6,6 +6,7 @@ from typing import Any
 
 from finssim.ros2.codec import HEADER, Message
 from finssim.ros2.shim.endpoint import Endpoint
+from finssim.ros2.shim.exceptions import InvalidHandle
 
 __all__ = ["Publisher"]
 
@@ -23,9 +24,12 @@ class Publisher(Endpoint):
         """Send a message, or ready CDR bytes.
 
         Raises:
+            InvalidHandle: It was destroyed.
             TypeError: A message of another type.
             MessageError: One with a field that does not fit.
         """
+        if self._writer.closed:
+            raise InvalidHandle(f"the publisher of {self.topic_name} was destroyed: make another")
         if type(msg) is self.msg_type:
             buffer = self._codec.serialize(msg)
         elif isinstance(msg, bytes) and msg[:2] == HEADER[:2]:

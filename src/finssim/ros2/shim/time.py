@@ -19,10 +19,14 @@ class Time:
     def __init__(
         self, *, seconds: float = 0, nanoseconds: int = 0, clock_type: ClockType = ClockType.SYSTEM_TIME
     ) -> None:
-        self.nanoseconds = int(seconds * 1e9) + int(nanoseconds)
+        if not isinstance(clock_type, ClockType):
+            raise TypeError(f"a clock type of {clock_type!r}: expected a ClockType")
+        if seconds < 0 or nanoseconds < 0:
+            raise ValueError(f"a time of {seconds} s and {nanoseconds} ns: expected zero or more of both")
+        self.nanoseconds = int(seconds * 10**9) + int(nanoseconds)
         self.clock_type = clock_type
-        if self.nanoseconds < 0:
-            raise ValueError(f"a time of {self.nanoseconds} ns: expected zero or more")
+        if self.nanoseconds >= 2**63:
+            raise OverflowError(f"a time of {self.nanoseconds} ns: expected less than 2^63")
 
     def seconds_nanoseconds(self) -> tuple[int, int]:
         """Whole seconds, and the nanoseconds beyond them."""
