@@ -109,6 +109,24 @@ def test_a_command_line_is_split_into_ros_and_the_rest():
 
 
 @pytest.mark.parametrize(
+    ("values", "taken"),
+    [
+        ("1.0 2.0", 2.0),
+        ("1 2.0", 1),
+        ("1.0 2", 2),
+        ("a 1.0 b", 1.0),
+        ("[a] [1,2]", [1, 2]),
+        ("[1] 2.0", 2.0),
+        ("1 []", 1),
+    ],
+)
+def test_of_values_of_several_types_one_type_counts(values, taken):
+    """rcl keeps one of each type, and rclpy takes bool before integer, float, word and lists."""
+    line = [word for value in values.split() for word in ("-p", f"a:={value}")]
+    assert overrides_for("/n", parse_arguments(["--ros-args", *line]).parameters) == {"a": taken}
+
+
+@pytest.mark.parametrize(
     "line",
     [
         "-p gain",

@@ -10,7 +10,7 @@ from pathlib import Path
 from finssim.ros2.shim.exceptions import RosArgumentsError
 from finssim.ros2.shim.logging import LoggingSeverity
 from finssim.ros2.shim.names import TOKEN, Remap
-from finssim.ros2.shim.parameter_files import Overrides, parsed_value, read_parameters
+from finssim.ros2.shim.parameter_files import Overrides, override, parsed_value, read_parameters
 
 __all__ = ["RosArguments", "parse_arguments"]
 
@@ -69,7 +69,7 @@ def _take(found: RosArguments, flag: str, value: str) -> None:
         name, text = _pair(flag, value)
         node, _, name = name.rpartition(":")
         try:
-            found.parameters.setdefault(node or "/**", {})[name] = parsed_value(text)
+            override(found.parameters, node or "/**", name, parsed_value(text))
         except ValueError as error:
             raise RosArgumentsError(f"--ros-args {flag} {value}: {error}") from None
     elif flag == "--params-file":

@@ -11,7 +11,7 @@ import yaml
 
 from finssim.ros2.shim.exceptions import RosArgumentsError
 
-__all__ = ["Overrides", "overrides_for", "parsed_value", "read_parameters"]
+__all__ = ["Overrides", "override", "overrides_for", "parsed_value", "read_parameters"]
 
 Overrides = dict[str, dict[str, Any]]
 """Node name or pattern -> parameter -> value, in the order in which the patterns were first mentioned.
@@ -23,6 +23,7 @@ that began with `/**`.
 
 KEY = "ros__parameters"
 STRING = "tag:yaml.org,2002:str"
+TYPES = (bool, int, float, str)
 TRUE = {"Y", "y", "yes", "Yes", "YES", "true", "True", "TRUE", "on", "On", "ON"}
 FALSE = {"N", "n", "no", "No", "NO", "false", "False", "FALSE", "off", "Off", "OFF"}
 
@@ -67,6 +68,16 @@ def parsed_value(text: str) -> Any:
     return _value(tree)
 
 
+def override(overrides: Overrides, pattern: str, name: str, value: Any) -> None:
+    """Give a value: the last counts, but of several types the one that comes first in `TYPES`.
+
+    rcl keeps a value of each type, and rclpy takes the first that it finds (node.cpp, `_parameter_from_rcl_variant`).
+    """
+    values = overrides.setdefault(pattern, {})
+    if name not in values or _rank(value) <= _rank(values[name]):
+        values[name] = value
+
+
 def overrides_for(node: str, overrides: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Values for one node by its full name, such as `/finsrov/controller`."""
     values: dict[str, Any] = {}
@@ -76,6 +87,14 @@ def overrides_for(node: str, overrides: Mapping[str, Mapping[str, Any]]) -> dict
         if re.fullmatch(pattern.replace("/*", r"(/\w+)"), node):
             values.update(given)
     return values
+
+
+def _rank(value: Any) -> int:
+    """Place among the types; lists come after single values, and an empty one, which is no value, last."""
+    if value is None:
+        return 2 * len(TYPES)
+    many = isinstance(value, list)
+    return TYPES.index(type(value[0] if many else value)) + many * len(TYPES)
 
 
 def _document(text: str) -> Tree:
@@ -121,7 +140,8 @@ def _add_nodes(above: str, tree: Tree, overrides: Overrides) -> None:
         elif not isinstance(below, tuple):
             raise ValueError(f"{above}: expected parameters and values below {KEY}")
         else:
-            overrides.setdefault(above, {}).update(_values("", below))
+            for name, value in _values("", below):
+                override(overrides, above, name, value)
 
 
 def _values(prefix: str, tree: Tree) -> Iterator[tuple[str, Any]]:
