@@ -17,7 +17,7 @@ import warp as wp
 from finssim.engine.state import State
 from finssim.tasks import ObservationPart, Task
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.terms import End, RewardTerm, Terms, one
+from finssim.tasks.terms import End, RewardTerm, Terms, one, place_at_rest
 
 BEST = 0.5
 """c."""
@@ -49,7 +49,7 @@ def draw(state: State, arrays: TaskArrays, key: int, w: int):
     rng = wp.rand_init(key, w)
     arrays.goal_position[w] = wp.vec3(wp.where(wp.randf(rng) < 0.5, -1.0, 1.0), 0.0, 0.0)
     for a in range(arrays.agent_reward.shape[1]):
-        state.position[w, a] = wp.vec3(2.0 * float(a), 0.0, -0.5)
+        place_at_rest(state, w, a, wp.vec3(2.0 * float(a), 0.0, -0.5), 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ import warp as wp
 from finssim.engine.state import State
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.task import ObservationPart, Task
-from finssim.tasks.terms import End, RewardTerm, Terms, uniform3
+from finssim.tasks.terms import End, RewardTerm, Terms, place_at_rest, uniform3
 
 
 @wp.func
@@ -56,8 +56,9 @@ def begin_pair(state: State, arrays: TaskArrays, key: int, w: int):
     arrays.goal_position[w] = uniform3(wp.rand_init(key, 4 * w), low, high)
     for a in range(2):
         beside = wp.vec3(0.0, 0.5 - 1.0 * float(a), 0.0)
-        state.position[w, a] = beside + uniform3(wp.rand_init(key, 4 * w + 1 + a), low, high)
-    state.position[w, 2] = wp.vec3(2.0, 0.0, -0.5)
+        x = beside + uniform3(wp.rand_init(key, 4 * w + 1 + a), low, high)
+        place_at_rest(state, w, a, x, 0.0)
+    place_at_rest(state, w, 2, wp.vec3(2.0, 0.0, -0.5), 0.0)
 
 
 @wp.func

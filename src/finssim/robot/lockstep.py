@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from typing import Protocol
 
@@ -18,7 +18,7 @@ from finssim.robot.lockstep_codec import (
 from finssim.robot.messages import Delivery
 from finssim.robot.runtime import Runtime
 
-__all__ = ["DEFAULT_PORT", "Exchange", "LockstepClient", "run_lockstep"]
+__all__ = ["DEFAULT_PORT", "Carrier", "Exchange", "LockstepClient", "run_lockstep", "run_together"]
 
 DEFAULT_PORT = 58768
 """Where a pool listens for a robot in lock-step, on this machine."""
@@ -39,6 +39,16 @@ class Exchange(Protocol):
         Returns:
             What has reached the robot's computer meanwhile.
         """
+
+
+class Carrier(Protocol):
+    """Brings datagrams from one robot to the others."""
+
+    def send(self, now: float, sender: str, datagram: bytes) -> None:
+        """Take one at a time [s]."""
+
+    def receive(self, now: float, name: str) -> Sequence[bytes]:
+        """What has reached a robot by a time [s]."""
 
 
 class LockstepClient:
@@ -121,22 +131,71 @@ def run_lockstep(
     Returns:
         Robot's clock at the end [s].
     """
+    return run_together(
+        {"": (runtime, world)},
+        duration,
+        rate=rate,
+        start=start,
+        gentle=gentle,
+        show=None if show is None else lambda: show(runtime),
+        until=None if until is None else lambda: until(runtime),
+    )
+
+
+def run_together(
+    stacks: Mapping[str, tuple[Runtime, Exchange]],
+    duration: float,
+    *,
+    carrier: Carrier | None = None,
+    rate: float = 60.0,
+    start: float = 0.0,
+    gentle: bool = False,
+    show: Callable[[], None] | None = None,
+    until: Callable[[], bool] | None = None,
+) -> float:
+    """Run several robots, each against its world, on one clock; as `run_lockstep`.
+
+    Args:
+        stacks: Robot and world by name.
+        duration: How long [s].
+        carrier: Of what the robots tell each other; None: they tell nothing.
+        rate: Steps a second [Hz].
+        start: Robots' clock at the beginning [s].
+        gentle: As of `run_lockstep`.
+        show: Called after every step of all.
+        until: Ends the run early where it says so; asked after every step of all.
+
+    Returns:
+        Robots' clock at the end [s].
+    """
     now: float = start
-    sent: list[bytes] = []
+    sent: dict[str, list[bytes]] = {name: [] for name in stacks}
     with interruptible() if gentle else nullcontext(_never) as interrupted:
         for k in itertools.count(1):
             if interrupted() or k > duration * rate + 1e-6:
                 break
-            delivery = world.exchange(start + k / rate, sent)
-            now = delivery.time
-            sent = runtime.step(now, delivery.frames, delivery.pictures)
-            runtime.sent(now)
+            deliveries = {
+                name: world.exchange(start + k / rate, sent[name]) for name, (_, world) in stacks.items()
+            }
+            for name, (runtime, _) in stacks.items():
+                delivery = deliveries[name]
+                now = delivery.time
+                heard = carrier.receive(now, name) if carrier is not None else ()
+                sent[name] = runtime.step(now, delivery.frames, delivery.pictures, heard)
+                runtime.sent(now)
+            for name, (runtime, _) in stacks.items() if carrier is not None else ():
+                for datagram in runtime.told:
+                    carrier.send(now, name, datagram)
             if show is not None:
-                show(runtime)
-            if until is not None and until(runtime):
+                show()
+            if until is not None and until():
                 break
     # A world that broke off above stands still: only one that goes on needs to hear of the end.
-    return world.exchange(now + 1.0 / rate, runtime.stop(now, LAST_FRAMES)).time
+    last = [
+        world.exchange(now + 1.0 / rate, runtime.stop(now, LAST_FRAMES)).time
+        for runtime, world in stacks.values()
+    ]
+    return last[0]
 
 
 def _never() -> bool:

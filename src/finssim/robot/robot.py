@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from finssim.control.tracking import Track
 from finssim.vehicles import Vehicle
 
 __all__ = ["Reading", "Robot"]
@@ -33,6 +35,8 @@ class Reading:
     """Of vision: uninitialized, fresh, coast, hold or lost."""
     reason: str = ""
     """Why it is not ready; empty if it is."""
+    tracks: Mapping[str, Track] = field(default_factory=dict)
+    """What is known of other vehicles, by name."""
     std: Array = field(default_factory=lambda: np.full(7, np.nan))
     """Standard deviations of position [m], velocity [m/s] and yaw [rad], (7,)."""
 

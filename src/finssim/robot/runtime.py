@@ -19,6 +19,7 @@ from finssim.robot.messages import Picture, ThrusterCommand
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import Pilot
 from finssim.robot.robot import Reading
+from finssim.robot.team import Team
 from finssim.vehicles import Vehicle
 
 if TYPE_CHECKING:
@@ -46,6 +47,7 @@ class Runtime:
         perception: Perception | None = None,
         bridge: Bridge | None = None,
         recorder: Recorder | None = None,
+        team: Team | None = None,
     ) -> None:
         """
         Args:
@@ -57,11 +59,14 @@ class Runtime:
             perception: Otherwise than by default.
             bridge: Otherwise than by default.
             recorder: Takes down everything.
+            team: Hears of others and tells them of this vehicle; None: it is alone.
         """
         self.vehicle, self.pilot, self.guide = vehicle, pilot, guide
         self.perception = perception or Perception(vehicle, pool)
         self.bridge = bridge or Bridge(vehicle)
-        self.recorder = recorder
+        self.recorder, self.team = recorder, team
+        self.told: list[bytes] = []
+        """Datagrams for the others of the last step."""
         self.counters = Counters()
         self.reading: Reading | None = None
         """The latest."""
@@ -76,7 +81,11 @@ class Runtime:
         self.intake = Intake(self.perception, self.bridge, self.counters, recorder)
 
     def step(
-        self, now: float, frames: Sequence[tuple[float, bytes]], pictures: Sequence[Picture] = ()
+        self,
+        now: float,
+        frames: Sequence[tuple[float, bytes]],
+        pictures: Sequence[Picture] = (),
+        heard: Sequence[bytes] = (),
     ) -> list[bytes]:
         """One turn of the loop.
 
@@ -84,13 +93,19 @@ class Runtime:
             now: Robot's clock [s].
             frames: Datagrams from the motor controller, each with its time of arrival [s].
             pictures: From the camera.
+            heard: Datagrams from the others.
 
         Returns:
-            Datagrams to send to the motor controller now.
+            Datagrams to send to the motor controller now; those for the others are `told`.
         """
         self.counters.steps += 1
         self.intake.take(now, frames, pictures)
-        self.reading = reading = self.perception.reading(now)
+        reading = self.perception.reading(now)
+        if self.team is not None:
+            self.told = self.team.tell(now, reading)
+            self.team.hear(now, heard)
+            reading = self.team.known(now, reading)
+        self.reading = reading
         self.bridge.reading(now, reading)
         self._begin(now, reading)
         self._decide(now, reading)

@@ -20,14 +20,14 @@ from finssim.engine.state import State
 from finssim.geometry.rotations import quat_from_yaw, quat_inverse_rotate, quat_rotate
 from finssim.physics.types import vec6
 from finssim.tasks.actions import action_size
-from finssim.tasks.arrays import task_arrays
+from finssim.tasks.arrays import TaskArrays, task_arrays
 from finssim.tasks.given import EnvironmentSetupError, crew
 from finssim.tasks.make import task_named
 from finssim.tasks.reference import fill_table
 from finssim.tasks.task import Batch, Task
 from finssim.vehicles import Vehicle
 
-__all__ = ["Observer", "fitted_task"]
+__all__ = ["Observer", "fitted_task", "one_world"]
 
 Array = NDArray[np.float64]
 
@@ -139,24 +139,12 @@ class Observer:
 
     def _build(self, task: Task) -> None:
         """Arrays of one world, and what observes it."""
-        device, vehicles = wp.get_device("cpu"), len(task.vehicles)
-        self._arrays = arrays = task_arrays(
-            1, len(task.agents), len(task.others), task.observation_size, self._action_size, device, len(task.totals),
-            len(task.earnings),
-        )  # fmt: skip
-        task.allocate(arrays, 1, device)
-        for name, dtype in (("position", wp.vec3), ("quaternion", wp.quat), ("velocity", vec6)):
-            setattr(arrays, name, wp.zeros((1, vehicles), dtype=dtype, device=device))
-        arrays.quaternion.fill_(wp.quat(0.0, 0.0, 0.0, 1.0))
-        state = State()
-        for name in ("position", "quaternion", "velocity"):
-            setattr(state, name, getattr(arrays, name))
-        for name in ("steps", "episode", "frozen"):
-            setattr(state, name, wp.zeros(1, dtype=wp.int32, device=device))
+        state, self._arrays = one_world(task, self._action_size)
         self._steps = state.steps.numpy()
-        everywhere = wp.ones(1, dtype=wp.int32, device=device)
-        self._pipeline = Pipeline(1, device)
-        task.add_observe(self._pipeline, Batch(state, arrays, 0), everywhere)
+        self._pipeline = Pipeline(1, state.steps.device)
+        everywhere = wp.ones(1, dtype=wp.int32, device=state.steps.device)
+        # An episode's first observation: what has been heard of the others is what is known of them now.
+        task.add_observe(self._pipeline, Batch(state, self._arrays, 0), everywhere)
 
     def _aim(self, guide: Guide) -> None:
         """What of a guide is looked at ahead of time."""
@@ -176,15 +164,12 @@ class Observer:
 
     def _put_others(self, tracks: Mapping[str, Measured], now: Reference) -> None:
         """What is known of everything that is not this vehicle."""
-        a, agents = self._arrays, len(self.task.agents)
+        a = self._arrays
         for v, name in enumerate(self.task.vehicles):
             if v == self._place:
                 continue
             track = self._track(name, tracks, now if name in self.task.others else None)
             self._put(v, track.position, track.quaternion, track.nu)
-            if a.messages.on and v < agents:
-                a.messages.position.numpy()[0, self._place * agents + v] = track.position
-                a.messages.velocity.numpy()[0, self._place * agents + v] = _velocity(track)
         if a.net.target is not None:
             target = self._track("target", tracks, None)
             a.net.target.numpy()[0] = target.position
@@ -207,3 +192,31 @@ class Observer:
 def _velocity(track: Measured) -> Array:
     """World frame [m/s], (3,)."""
     return quat_rotate(np.asarray(track.quaternion), np.asarray(track.nu)[:3])
+
+
+def one_world(task: Task, action_size: int) -> tuple[State, TaskArrays]:
+    """State and arrays of one world of a task on the CPU, without a simulator: what is true is what is measured.
+
+    Args:
+        task: Fitted to its vehicles.
+        action_size: Numbers in the action of a vehicle.
+    """
+    device, vehicles = wp.get_device("cpu"), len(task.vehicles)
+    arrays = task_arrays(
+        1, len(task.agents), len(task.others), task.observation_size, action_size, device, len(task.totals),
+        len(task.earnings),
+    )  # fmt: skip
+    task.allocate(arrays, 1, device)
+    dock = task.dock()
+    if dock is not None:
+        arrays.funnel = funnel = dock.struct(1, vehicles, device)
+        arrays.goal_position, arrays.goal_quaternion = funnel.position, funnel.quaternion
+    state = State()
+    for name, dtype in (("position", wp.vec3), ("quaternion", wp.quat), ("velocity", vec6)):
+        rows = wp.zeros((1, vehicles), dtype=dtype, device=device)
+        setattr(arrays, name, rows)
+        setattr(state, name, rows)
+    arrays.quaternion.fill_(wp.quat(0.0, 0.0, 0.0, 1.0))
+    for name in ("steps", "episode", "frozen"):
+        setattr(state, name, wp.zeros(1, dtype=wp.int32, device=device))
+    return state, arrays

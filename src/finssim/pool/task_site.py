@@ -1,0 +1,274 @@
+"""A task played through the deployed software: its places, what it moves and commands, and how it scores.
+
+Every vehicle has a plant, a motor controller and the stack of a robot of its own; they share the water. Where they
+start, where a target goes and what counts as a success is the task's own code, on the true state, as in training.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from finssim.control.guidance import Guide, Reference
+from finssim.control.modes import action_mode
+from finssim.control.tracking import Track
+from finssim.engine.launch import Pipeline
+from finssim.geometry.rotations import quat_yaw
+from finssim.localization.pool import Pool
+from finssim.pool.medium import Medium
+from finssim.pool.others import ScriptedPilot, TrueState, truth_of
+from finssim.pool.plant_spec import Basin, PlantSpec
+from finssim.pool.virtual_pool import VirtualPool
+from finssim.robot.bridge import Bridge
+from finssim.robot.bridge_settings import BridgeSettings
+from finssim.robot.lockstep import run_together
+from finssim.robot.perception import Perception
+from finssim.robot.pilots import Pilot
+from finssim.robot.runtime import Runtime
+from finssim.robot.team import Team, encode_track
+from finssim.tasks.communication import Communication
+from finssim.tasks.observer import fitted_task, one_world
+from finssim.tasks.reference import fill_table
+from finssim.tasks.task import Batch, Task
+from finssim.vehicles import Vehicle
+
+__all__ = ["Referee", "TaskSite", "open_water"]
+
+Array = NDArray[np.float64]
+
+ROOM = 2.0
+"""Walls of open water are this many times farther than what ends an episode."""
+SITE = "site"
+"""Who tells where a target is that no vehicle is."""
+
+
+class Referee:
+    """The task itself, of one episode, on the true state.
+
+    Attributes:
+        task: Fitted to the vehicles.
+        over: Whether the episode has ended.
+    """
+
+    def __init__(
+        self, task: str | Task, vehicles: Sequence[Vehicle], *, seed: int, guide: Guide | None = None
+    ) -> None:
+        """Draw where everybody starts.
+
+        Args:
+            task: A task, its name, or FILE.py:CLASS of one's own.
+            vehicles: One for each of its places.
+            seed: Of the episode.
+            guide: The reference, of a task that follows one; drawn as in training if None.
+        """
+        self.task = task = fitted_task(task, vehicles)
+        self._state, self.arrays = one_world(task, len(action_mode(task.action, vehicles[0]).labels))
+        device = self._state.steps.device
+        if guide is not None:
+            fill_table(self.arrays.reference, [guide])
+        batch, mask = Batch(self._state, self.arrays, seed), wp.ones(1, dtype=wp.int32, device=device)
+        self._evaluate, start = Pipeline(1, device), Pipeline(1, device)
+        task.add_spawn(start, batch, mask)
+        task.add_observe(start, batch, mask)
+        start.run()
+        task.add_evaluate(self._evaluate, batch)
+        self.over = False
+
+    def places(self) -> list[tuple[Array, Array]]:
+        """Position and quaternion where every vehicle starts."""
+        rows = (self._state.position.numpy()[0], self._state.quaternion.numpy()[0])
+        return [(x.astype(float), q.astype(float)) for x, q in zip(*rows, strict=True)]
+
+    def look(self, truth: Mapping[str, Track], actions: Mapping[str, Array]) -> None:
+        """Score the control step that ends now.
+
+        Args:
+            truth: Where everybody is, by place.
+            actions: What the agents did, in [-1, 1].
+        """
+        if self.over:
+            return
+        a, state = self.arrays, self._state
+        for v, name in enumerate(self.task.vehicles):
+            one = truth[name]
+            for row, value in (
+                ("position", one.position),
+                ("quaternion", one.quaternion),
+                ("velocity", one.nu),
+            ):
+                getattr(state, row).numpy()[0, v] = value
+        for i, name in enumerate(self.task.agents):
+            action = actions.get(name, np.zeros(0))
+            a.action.numpy()[0, i * a.action_size : i * a.action_size + len(action)] = action
+        state.steps.numpy()[0] += 1
+        self._evaluate.run()
+        self.over = bool(a.terminated.numpy()[0] or a.truncated.numpy()[0])
+
+    def metrics(self) -> dict[str, float]:
+        """How the episode went; see `Task.metrics`."""
+        return {name: float(values[0]) for name, values in self.task.metrics(self.arrays).items()}
+
+
+class _Goal:
+    """Where the task's goal is now, as a guide; it knows nothing of what comes."""
+
+    name, duration = "task", np.inf
+
+    def __init__(self, referee: Referee) -> None:
+        self._referee = referee
+
+    def at(self, t: Any) -> Reference:
+        """The goal's pose and velocity now, whatever the time."""
+        a, shape = self._referee.arrays, np.shape(t)
+        moving = a.target.velocity is not None
+        velocity = a.target.velocity.numpy()[0].astype(float) if moving else np.zeros(3)
+        place = a.goal_position.numpy()[0].astype(float)
+        yaw = float(quat_yaw(a.goal_quaternion.numpy()[0].astype(float)))
+        rows = (np.broadcast_to(row, (*shape, 3)).copy() for row in (place, velocity))
+        return Reference(*rows, np.full(shape, yaw), np.zeros(shape))
+
+
+class TaskSite:
+    """One episode of a task in the virtual site, in lock-step.
+
+    Attributes:
+        referee: The task.
+        worlds: Plants and motor controllers, by place.
+        runtimes: The robots' software, by place.
+    """
+
+    def __init__(
+        self,
+        task: str | Task,
+        vehicles: Sequence[Vehicle],
+        spec: Callable[[Vehicle], PlantSpec],
+        pilots: Callable[[str], Pilot],
+        pool: Pool,
+        *,
+        seed: int = 0,
+        guide: Guide | None = None,
+        communication: Communication | None = None,
+        camera: Callable[[Vehicle], Any] | None = None,
+        perception: Callable[[VirtualPool], Any] | None = None,
+    ) -> None:
+        """Put everybody where the task starts.
+
+        Args:
+            task: A task, its name, or FILE.py:CLASS of one's own.
+            vehicles: One for each of its places.
+            spec: Makes the plant of a vehicle.
+            pilots: Who steers an agent, by its place.
+            pool: Camera, water and frames, as the robots know them.
+            seed: Of the episode, of instruments and of what is lost.
+            guide: The reference, of a task that follows one; drawn as in training if None.
+            communication: Of what the vehicles tell each other; None: everything arrives at once.
+            camera: Makes the overhead camera of a vehicle; None: there is none.
+            perception: How an agent knows where it is; by camera and telemetry if None.
+        """
+        self.referee = referee = Referee(task, vehicles, seed=seed, guide=guide)
+        self.task, goal = referee.task, guide or _Goal(referee)
+        names = self.task.vehicles
+        self.worlds = {
+            name: VirtualPool(
+                vehicle, spec(vehicle), camera=camera(vehicle) if camera else None, start=place, seed=seed + i
+            )
+            for i, (name, vehicle, place) in enumerate(zip(names, vehicles, referee.places(), strict=True))
+        }
+        site = (SITE,) if self._target() is not None else ()
+        self._medium = Medium(self._positions, communication, seed)
+        self.runtimes: dict[str, Runtime] = {}
+        period = self.task.control_step if communication is None else communication.period
+        locate = perception or (lambda world: Perception(world.vehicle, pool))
+        for i, (name, vehicle) in enumerate(zip(names, vehicles, strict=True)):
+            world = self.worlds[name]
+            agent = name in self.task.agents
+            others = (*(other for other in names if other != name), *(("target",) if site else ()))
+            team = Team(name, others if agent else (), period=period, turn=period * i / len(names))
+            self.runtimes[name] = Runtime(
+                vehicle,
+                pool,
+                pilots(name)
+                if agent
+                else ScriptedPilot(self.task, vehicles, lambda: truth_of(self.worlds), seed=seed),
+                goal,
+                arm=True,
+                perception=locate(world) if agent else TrueState(world),
+                bridge=Bridge(vehicle, _limits(vehicle, world.spec.basin)),
+                team=team if len(names) > 1 else None,
+            )
+
+    def run(self, duration: float | None = None) -> dict[str, float]:
+        """Play until the task ends, or for a time from the start of the last robot [s]; its time limit if None.
+
+        Returns:
+            The task's metrics.
+        """
+        step, scored = self.task.control_step, 0
+
+        def look() -> None:
+            nonlocal scored
+            t = min(runtime.t for runtime in self.runtimes.values())
+            if not t >= (scored + 1) * step - 1e-6:
+                return
+            scored += 1
+            actions = {name: getattr(one.pilot, "action", np.zeros(0)) for name, one in self.runtimes.items()}
+            self.referee.look(truth_of(self.worlds), actions)
+            self._tell_target()
+
+        self._tell_target()
+        longest = (duration or self.task.time_limit) + 10.0
+        stacks = {name: (runtime, self.worlds[name]) for name, runtime in self.runtimes.items()}
+        try:
+            run_together(
+                stacks,
+                longest,
+                carrier=self._medium if len(stacks) > 1 else None,
+                show=look,
+                until=lambda: self.referee.over or (duration is not None and scored * step >= duration),
+            )
+        finally:
+            for world in self.worlds.values():
+                world.close()
+        return self.referee.metrics()
+
+    def _target(self) -> Track | None:
+        """What drifts in the water, of a task with such a thing."""
+        net = self.referee.arrays.net
+        if net.target is None:
+            return None
+        level = np.array([0.0, 0.0, 0.0, 1.0])
+        nu = np.array([*net.motion.numpy()[0].astype(float), 0.0, 0.0, 0.0])
+        return Track(net.target.numpy()[0].astype(float), level, nu)
+
+    def _tell_target(self) -> None:
+        """The site's own positioning tells everybody of the target."""
+        target = self._target()
+        if target is not None:
+            now = max(world.time for world in self.worlds.values())
+            self._medium.send(now, SITE, encode_track("target", target, now), lossless=True)
+
+    def _positions(self) -> dict[str, Array]:
+        return {name: np.asarray(world.plant.position, float) for name, world in self.worlds.items()}
+
+
+def open_water(spec: PlantSpec, task: Task, vehicle: Vehicle) -> PlantSpec:
+    """The same plant in water so wide and deep that its walls are out of a task's reach."""
+    longest = float(max(vehicle.body.size))
+    bounds, tank = getattr(task, "bounds", 0.0), getattr(task, "tank", (0.0, 0.0))
+    width = ROOM * max(2.0 * bounds if isinstance(bounds, float) else 0.0, tank[0] * longest)
+    depth = ROOM * max(getattr(task, "depth", 0.0), tank[1] * longest)
+    return spec.model_copy(update={"basin": Basin(length=width, width=width, depth=depth)})
+
+
+def _limits(vehicle: Vehicle, basin: Basin) -> BridgeSettings:
+    """The bridge's limits, with the basin for a workspace."""
+    half = np.array([0.5 * basin.length, 0.5 * basin.width])
+    return BridgeSettings.of(
+        vehicle,
+        workspace_lower=np.array([*-half, -basin.depth]),
+        workspace_upper=np.array([*half, 0.0]),
+    )

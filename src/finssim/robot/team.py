@@ -1,0 +1,143 @@
+"""Vehicles tell each other where they are: a datagram each, and what is known of the others from them.
+
+What is sent is the sender's name and its estimate: an acoustic modem, a radio on a float or a computer beside the pool
+carries it. What has not arrived is not known; how old it is, is.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from finssim.control.tracking import Track
+from finssim.robot.counters import Ticks
+from finssim.robot.robot import Reading
+
+__all__ = ["LONGEST_NAME", "Team", "decode_track", "encode_track"]
+
+MAGIC = b"FST1"
+LAYOUT = struct.Struct("<4s32s14d")
+"""Magic, name in UTF-8 filled up with zeros, age [s], position [m], quaternion xyzw, nu [m/s, rad/s]; then CRC-32."""
+CHECK = struct.Struct("<I")
+LONGEST_NAME = 32
+"""Bytes of a name in UTF-8."""
+OLDEST = 60.0
+"""A track may be this old when it is sent [s]."""
+FARTHEST = 1.0e5
+"""A position or velocity beyond this is none [m, m/s, rad/s]."""
+
+
+def encode_track(name: str, track: Track, now: float) -> bytes:
+    """A datagram.
+
+    Args:
+        name: Whose track.
+        track: With the time at which it was measured.
+        now: Sender's clock [s].
+
+    Raises:
+        ValueError: The name takes more than `LONGEST_NAME` bytes, or none.
+    """
+    whose = name.encode("utf-8")
+    if not 0 < len(whose) <= LONGEST_NAME:
+        raise ValueError(f"name '{name}' takes {len(whose)} bytes, expected 1 to {LONGEST_NAME}")
+    age = 0.0 if math.isnan(track.time) else now - track.time
+    numbers = [float(x) for row in (track.position, track.quaternion, track.nu) for x in row]
+    body = LAYOUT.pack(MAGIC, whose, age, *numbers)
+    return body + CHECK.pack(zlib.crc32(body))
+
+
+def decode_track(data: bytes, now: float) -> tuple[str, Track] | None:
+    """Name and track of a datagram that has just come; None where it is no such datagram, or says what cannot be.
+
+    Args:
+        data: The datagram.
+        now: Receiver's clock [s]; the track's time is on it.
+    """
+    if len(data) != LAYOUT.size + CHECK.size or CHECK.unpack(data[LAYOUT.size :])[0] != zlib.crc32(
+        data[: LAYOUT.size]
+    ):
+        return None
+    magic, whose, age, *numbers = LAYOUT.unpack(data[: LAYOUT.size])
+    values = np.array(numbers)
+    quaternion = values[3:7]
+    length = float(np.linalg.norm(quaternion))
+    whole = np.isfinite(values).all() and np.abs(values).max() <= FARTHEST and abs(length - 1.0) < 1e-3
+    if magic != MAGIC or not whole or not 0.0 <= age <= OLDEST:
+        return None
+    try:
+        name = whose.rstrip(b"\0").decode("utf-8")
+    except UnicodeDecodeError:
+        return None
+    return (
+        (name, Track(values[:3], quaternion / length, values[7:], now - age))
+        if name.isprintable() and name
+        else None
+    )
+
+
+class Team:
+    """One vehicle's end of the wire.
+
+    Attributes:
+        name: Its own place in the task.
+        tracks: What has been heard of the others, by name: the newest that was measured.
+        refused: Datagrams that were none.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        others: tuple[str, ...],
+        *,
+        period: float = 0.1,
+        turn: float = 0.0,
+        stale: float = 10.0,
+    ) -> None:
+        """
+        Args:
+            name: This vehicle's place in the task.
+            others: Names that are listened to: of the task's other vehicles, and of what else it goes to.
+            period: Between two messages of its own [s].
+            turn: When in the period it is its turn [s].
+            stale: A track that was measured so long ago is forgotten [s]; never, as in training, if infinite.
+        """
+        self.name, self.tracks, self.refused = name, dict[str, Track](), 0
+        self._others, self._period, self._turn, self._stale = frozenset(others), period, turn, stale
+        self._ticks: Ticks | None = None
+
+    def hear(self, now: float, datagrams: Sequence[bytes]) -> None:
+        """Take in what has come."""
+        for data in datagrams:
+            heard = decode_track(data, now)
+            if heard is None or heard[0] not in self._others:
+                self.refused += 1
+                continue
+            name, track = heard
+            known = self.tracks.get(name)
+            if known is None or track.time > known.time:
+                self.tracks[name] = track
+
+    def known(self, now: float, reading: Reading) -> Reading:
+        """The reading with what is known of the others; not ready before all have been heard of."""
+        self.tracks = {name: one for name, one in self.tracks.items() if now - one.time <= self._stale}
+        missing = sorted(self._others - self.tracks.keys())
+        reading = replace(reading, tracks=dict(self.tracks))
+        if not missing or not reading.ready:
+            return reading
+        return replace(reading, ready=False, reason=f"nothing heard of {', '.join(missing)}")
+
+    def tell(self, now: float, reading: Reading) -> list[bytes]:
+        """What to send now: nothing while it is not this vehicle's turn, or while it does not know where it is."""
+        if self._ticks is None:
+            self._ticks = Ticks(now + self._turn)
+        due, _ = self._ticks.due(now, self._period)
+        if not due or not np.isfinite(reading.position).all() or not np.isfinite(reading.nu).all():
+            return []
+        own = Track(reading.position, reading.quaternion, reading.nu, reading.time)
+        return [encode_track(self.name, own, now)]

@@ -1,0 +1,93 @@
+"""Every task through the deployed software: stack, wire, motor controller and plant of each vehicle, in lock-step."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from finssim.control.trajectories import TRAJECTORIES
+from finssim.experiments.stack import site_of
+from finssim.pool.medium import Medium
+from finssim.robot.pilots import ObservingPilot
+from finssim.tasks import TASKS, task_named
+from finssim.tasks.baselines import BASELINES
+from finssim.tasks.communication import Communication
+from finssim.vehicles import load_vehicle
+from reference.policies import written
+
+FINSROV = load_vehicle("finsrov")
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+SHORT = {"t1": 14.0, "t2": 14.0, "t3": 12.0, "docking": 25.0}
+"""Time limits that are long enough for a success of the baseline [s]."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TASKS)
+def test_the_baseline_of_every_task_succeeds_through_the_stack(name):
+    """Scored by the task itself on the true state; nobody is stopped, everybody decides at the task's rate."""
+    (who, *_), task = BASELINES[name], task_named(name)
+    task = replace(task, time_limit=SHORT.get(name, task.time_limit))
+    guide = TRAJECTORIES["lemniscate"] if name == "t2" else None
+    site = site_of(task, who, [FINSROV] * len(task.vehicles), seed=1, guide=guide)
+    measured = site.run()
+    assert measured["success"] == 1.0
+    for runtime in site.runtimes.values():
+        assert not runtime.bridge.reason and runtime.counters.missed == 0
+        assert runtime.counters.decisions >= measured["length"] - 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("example", ["own_task", "own_task_torch"])
+def test_a_policy_of_ones_own_task_runs_through_the_stack(example, tmp_path):
+    """In Warp and in torch; a linear policy directory holds the depth within 5 cm for 5 s."""
+    words = f"{EXAMPLES / f'{example}.py'}:KeepDepth"
+    task = task_named(words)
+    gain = np.zeros((6, 2), np.float32)
+    gain[2] = 5.0, -2.0
+    policy = written(linear(gain), tmp_path / "depth", task, 6)
+    site = site_of(words, str(policy), [FINSROV], seed=3)
+    assert site.run()["success"] == 1.0
+    pilot = site.runtimes["vehicle"].pilot
+    assert isinstance(pilot, ObservingPilot) and pilot.describe()["task"] == "keep-depth"
+
+
+def linear(gain):
+    import torch
+    from torch import nn
+
+    layer = nn.Linear(gain.shape[1], gain.shape[0], bias=False)
+    layer.weight.data = torch.from_numpy(gain)
+    return nn.Sequential(layer)
+
+
+@pytest.mark.slow
+def test_a_lost_vehicle_stops_alone():
+    """The right netter falls silent after a second and is stopped; the others go on with what they heard last."""
+    site = site_of("team-pursuit", "formation", [FINSROV] * 4, seed=2)
+    lost = site.worlds["right_netter"]
+    before = lost.exchange
+
+    def silent(until, sent=()):
+        lost.faults.drop = 1.0 if until > 1.0 else 0.0
+        return before(until, sent)
+
+    lost.exchange = silent
+    site.run(duration=8.0)
+    reasons = {name: runtime.bridge.reason for name, runtime in site.runtimes.items()}
+    assert "telemetry" in reasons.pop("right_netter") and not any(reasons.values())
+    assert site.runtimes["left_netter"].counters.decisions > 70
+    assert site.runtimes["right_netter"].counters.decisions < 20
+
+
+def test_messages_are_late_by_the_way_and_lost_as_often_as_told():
+    """15 m at 1500 m/s and 0.1 s; a loss of one in four of 4000 datagrams, to 3 standard deviations."""
+    places = {"a": np.zeros(3), "b": np.array([15.0, 0.0, 0.0])}
+    medium = Medium(lambda: places, Communication(loss=0.25), seed=1)
+    heard = 0
+    for k in range(4000):
+        medium.send(float(k), "a", b"x")
+        assert not medium.receive(k + 0.109, "b")
+        heard += len(medium.receive(k + 0.111, "b"))
+        assert not medium.receive(k + 0.2, "a")
+    assert abs(heard / 4000 - 0.75) < 3.0 * np.sqrt(0.25 * 0.75 / 4000)
