@@ -9,7 +9,7 @@ import typer
 
 from finssim.cli_options import Json, Seed, Steps, Vehicle
 
-__all__ = ["ablation", "everything", "faults", "soak", "t1", "t2", "timing"]
+__all__ = ["ablation", "everything", "faults", "soak", "stack", "t1", "t2", "timing"]
 
 Out = Annotated[
     Path,
@@ -224,3 +224,48 @@ def timing(
     from finssim.experiments.reliability.timing import run
 
     run(out=out, minutes=minutes, camera=camera, policy=policy, seed=seed, vehicle=vehicle, as_json=as_json)
+
+
+def stack(
+    task: Annotated[str, typer.Argument(help="Task, or FILE.py:CLASS of one's own.", metavar="TASK")],
+    policy: Annotated[
+        str, typer.Option(help="A policy's directory, or a baseline of the task.", metavar="DIR|NAME")
+    ],
+    episodes: Annotated[int, typer.Option(help="How many.", min=1, max=10000)] = 20,
+    vehicle: Vehicle = "finsrov",
+    plant: Annotated[int, typer.Option(help="Seed of every vehicle's plant.", min=0)] = 0,
+    severity: Severity = "nominal",
+    seed: Seed = 1,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Directory that keeps every episode; one that was interrupted goes on.", metavar="DIR"
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Play any task through the deployed software, all its vehicles in lock-step; print it beside the batch.
+
+    Every vehicle has its plant, motor controller, bridge and pilot; robots tell each other where they are, and the task
+    itself scores what is true. A task of the pool is located by the overhead camera; in open water the site tells every
+    vehicle its true pose.
+
+    Example: finssim experiment stack team-pursuit --policy runs/team --episodes 20 --out runs/team-stack
+    """
+    from finssim.quiet import start_warp
+
+    start_warp()
+    from finssim.experiments.stack import play
+
+    play(
+        task,
+        policy,
+        vehicle=vehicle,
+        episodes=episodes,
+        plant=plant,
+        severity=severity,  # type: ignore[arg-type]
+        seed=seed,
+        out=out,
+        as_json=as_json,
+        show=lambda line: typer.echo(line, err=True),
+    )

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
 from finssim.control.guidance import Guide
+from finssim.control.modes import Thruster8
+from finssim.control.trajectories import TRAJECTORIES
+from finssim.experiments.episodes import summarize_episodes
+from finssim.files import atomic_write
 from finssim.pool.camera import PoolCamera
 from finssim.pool.draw_plant import draw_plant
 from finssim.pool.others import TrueState
@@ -13,12 +24,16 @@ from finssim.pool.plant_spec import Severity
 from finssim.pool.site import camera_of
 from finssim.pool.task_site import TaskSite, open_water
 from finssim.robot.pilots import ObservingPilot
-from finssim.tasks import Task
+from finssim.tasks import Environment, Task
 from finssim.tasks.communication import Communication
 from finssim.tasks.observer import fitted_task
-from finssim.vehicles import Vehicle
+from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["site_of"]
+__all__ = ["BATCH", "play", "site_of"]
+
+BATCH = 256
+"""Episodes in the batch, beside those through the stack."""
+ROWS = "episodes.json"
 
 
 def site_of(
@@ -71,3 +86,128 @@ def site_of(
         else None,
         perception=None if pool else TrueState,
     )
+
+
+def play(
+    task: str,
+    who: str,
+    *,
+    vehicle: str = "finsrov",
+    episodes: int = 20,
+    plant: int = 0,
+    severity: Severity = "nominal",
+    seed: int = 1,
+    out: Path | None = None,
+    as_json: bool = False,
+    show: Callable[[str], None] = lambda line: None,
+) -> dict[str, Any]:
+    """Play episodes through the stack and print how they went, beside the same controller in the batch.
+
+    Args:
+        task: Its name, or FILE.py:CLASS of one's own.
+        who: A policy's directory, or a baseline of the task.
+        vehicle: Name or file, for every place.
+        episodes: How many.
+        plant: Seed of every vehicle's plant.
+        severity: How far the plants are from the vehicle file.
+        seed: Of the first episode; the others follow.
+        out: Folder that keeps each episode as it ends; what is there already is not played again.
+        as_json: Print one JSON object.
+        show: Called with a line after each episode.
+
+    Returns:
+        `stack` and `batch`: as `summarize_episodes`, with what was played.
+
+    Raises:
+        PolicyError, ControlError, BaselineError, VehicleError, OutputError: As they say.
+    """
+    body = load_vehicle(vehicle)
+    fitted = fitted_task(task, body)
+    vehicles = [body] * len(fitted.vehicles)
+    about = {
+        "task": fitted.name, "controller": who, "vehicle": body.sha256,
+        "plant": plant, "severity": severity, "seed": seed,
+    }  # fmt: skip
+    rows = _kept(out, about)
+    for k in range(len(rows), episodes):
+        guide = list(TRAJECTORIES.values())[k % len(TRAJECTORIES)] if _follows(fitted) else None
+        site = site_of(task, who, vehicles, seed=seed + k, plant=plant, severity=severity, guide=guide)
+        measured = site.run()
+        rows.append({"trial": k, **{name: x if np.isfinite(x) else None for name, x in measured.items()}})
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+            with atomic_write(out / ROWS) as path:
+                path.write_text(json.dumps({**about, "episodes": rows}, indent=1) + "\n", encoding="utf-8")
+        show(f"episode {k + 1} of {episodes}: success {measured.get('success', float('nan')):g}")
+    batch = _batch(task, who, vehicles, seed)
+    told = {**about, "stack": summarize_episodes(rows[:episodes]), "batch": summarize_episodes(batch)}
+    if as_json:
+        print(json.dumps(told, allow_nan=False))
+    else:
+        _print(told)
+    return told
+
+
+def _kept(out: Path | None, about: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Episodes of an earlier run with the same settings."""
+    if out is None or not (out / ROWS).is_file():
+        return []
+    data = json.loads((out / ROWS).read_text(encoding="utf-8"))
+    return list(data["episodes"]) if {**about, "episodes": data.get("episodes")} == data else []
+
+
+def _follows(task: Task) -> bool:
+    """Whether it follows a reference that is known ahead."""
+    return hasattr(task, "knot_spacing")
+
+
+def _batch(task: str, who: str, vehicles: Sequence[Vehicle], seed: int) -> list[dict[str, Any]]:
+    """The first episode of every world of the batch, of the vehicle file's own model, with exact states."""
+    fitted = fitted_task(task, vehicles)
+    words: Any = task
+    pilot = ObservingPilot(who, vehicles[0], task=words, agent=fitted.agents[0])
+    wrench = not isinstance(pilot.mode, Thruster8)
+    env = Environment(
+        fitted,
+        vehicles,
+        worlds=BATCH,
+        action=pilot.mode.name,
+        wrench_scale=pilot.mode.scale if wrench else 1.0,
+        seed=seed,
+    )
+    memory, running = pilot.fresh(BATCH * env.agents), np.ones(BATCH, bool)
+    rows: dict[int, dict[str, Any]] = {}
+    while running.any():
+        observation = env.arrays.observation.numpy().reshape(BATCH * env.agents, -1)
+        action, memory = pilot.decide(memory, observation)
+        shape = (BATCH, env.action_size) if env.agents == 1 else (BATCH, env.agents, -1)
+        step = env.step(np.asarray(action, np.float32).reshape(shape))
+        ended = running & (step.terminated | step.truncated)
+        if ended.any():
+            metrics = fitted.metrics(env.arrays)
+            for w in np.flatnonzero(ended):
+                values = {name: float(column[w]) for name, column in metrics.items()}
+                rows[w] = {"trial": int(w), **{n: x if np.isfinite(x) else None for n, x in values.items()}}
+            running &= ~ended
+    return [rows[w] for w in range(BATCH)]
+
+
+def _print(told: Mapping[str, Any]) -> None:
+    stack, batch = told["stack"], told["batch"]
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for head in (
+        f"{told['task']}, {told['controller']}",
+        f"stack, {stack['trials']}",
+        f"batch, {batch['trials']}",
+    ):
+        table.add_column(head, overflow="fold")
+    for name in stack["metrics"]:
+        table.add_row(name, *(_value(one["metrics"].get(name)) for one in (stack, batch)))
+    Console().print(table)
+
+
+def _value(one: Mapping[str, Any] | None) -> str:
+    if one is None or one["value"] is None:
+        return ""
+    low, high = one["ci95"]
+    return f"{one['value']:.3g} [{low:.3g}, {high:.3g}]"

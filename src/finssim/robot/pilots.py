@@ -97,7 +97,13 @@ class PidPilot:
 
 
 class ObservingPilot:
-    """Who acts on a task's observation: a policy directory, run with onnxruntime, or one of the task's baselines."""
+    """Who acts on a task's observation: a policy directory, run with onnxruntime, or one of the task's baselines.
+
+    Attributes:
+        mode: What its actions mean.
+        decide: Memory and observations (n, size) -> actions (n, size) and the memory after.
+        period: Time between two decisions [s].
+    """
 
     needs_state = True
 
@@ -133,21 +139,21 @@ class ObservingPilot:
         self._trim = trim
         if task is not None and str(who) in BASELINES.get(task, {}):
             self._observer = Observer(task, vehicle, agent=agent)
-            self._mode = action_mode(self._observer.task.action, vehicle)
+            self.mode = action_mode(self._observer.task.action, vehicle)
             self._who: Any = baseline(task, str(who), vehicle)
-            self.period, self._act = self._who.period, self._who.act
+            self.period, self.decide = self._who.period, self._who.act
             self._about: dict[str, Any] = {"kind": "baseline", "task": task, "trim": None}
             self.reset()
             return
         trained = read_description(Path(who))
-        self._mode = mode_from_dict(trained.action, vehicle)
+        self.mode = mode_from_dict(trained.action, vehicle)
         self._observer = Observer(
             task or trained.task, vehicle, agent=agent, action=str(trained.action["mode"])
         )
         self._who = policy = Policy.load(
             who, vehicle=vehicle, task=self._observer.describe(), control_period=period
         )
-        self._act = policy.step
+        self.decide = policy.step
         self.period = trained.control_period
         self._about = {
             "kind": "policy",
@@ -161,13 +167,17 @@ class ObservingPilot:
 
     def describe(self) -> dict[str, Any]:
         """Name, network, and what it was trained in."""
-        about = {"name": self.name, **self._about, "action": self._mode.name, "period_s": self.period}
+        about = {"name": self.name, **self._about, "action": self.mode.name, "period_s": self.period}
         several = len(self._observer.task.agents) > 1
         return {**about, "agent": self._observer.agent} if several else about
 
+    def fresh(self, n: int) -> Any:
+        """What `decide` is to remember before the first of n rows."""
+        return self._who.reset(n)
+
     def reset(self) -> None:
         """Forget what was seen, and the trim's shift."""
-        self._memory = self._who.reset(1)
+        self._memory = self.fresh(1)
         self._shift = np.zeros(3)
         self.observation, self.action = np.zeros(0, np.float32), np.zeros(0, np.float32)
         """What was seen, and done in [-1, 1], at the last decision; empty before the first."""
@@ -181,9 +191,9 @@ class ObservingPilot:
         if self._trim is not None:
             self._shift = self._trim.update(self._shift, reading, guide.at(t).position, self.period)
             observation = self._trim.shown(observation, reading, self._shift, self._observer.schema)
-        action, self._memory = self._act(self._memory, observation[None])
+        action, self._memory = self.decide(self._memory, observation[None])
         self.observation, self.action = np.asarray(observation), np.clip(action[0], -1.0, 1.0)
-        return self._mode.to_thrusters(action[0])
+        return self.mode.to_thrusters(action[0])
 
 
 class WrenchPilot:
