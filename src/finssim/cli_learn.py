@@ -108,12 +108,17 @@ def train(
 
 def evaluate(
     controller: Annotated[
-        str, typer.Argument(help="A policy's directory, or pid, or pid-paper.", metavar="DIR|pid|pid-paper")
+        list[str],
+        typer.Argument(
+            help="A policy's directory, or pid, or pid-paper; or records of one controller on a robot (.mcap).",
+            metavar="DIR|pid|pid-paper|RECORD",
+        ),
     ],
     task: Annotated[
         str,
         typer.Option(
-            help="Task to be tried on; finssim tasks lists them. One's own: FILE.py:CLASS.", metavar="TASK"
+            help="Task to be tried on; finssim tasks lists them. One's own: FILE.py:CLASS. Of records t1 or t2.",
+            metavar="TASK",
         ),
     ] = "t1",
     vehicle: Vehicle = "finsrov",
@@ -145,6 +150,14 @@ def evaluate(
         bool,
         typer.Option("--trim", help="Put the integral of the position error in front of a policy."),
     ] = False,
+    truth: Annotated[
+        Path | None,
+        typer.Option(
+            help="By which records are measured, in place of the robot's own estimate: a table (.csv, .parquet) of "
+            "motion capture, t [s], x, y, z [m] and qx, qy, qz, qw or yaw [rad], or the truth file of finssim pool.",
+            metavar="TABLE",
+        ),
+    ] = None,
     seed: Seed = 42,
     out: Annotated[
         Path | None, typer.Option(help="Directory for evaluation.json, the figure and trajectories.")
@@ -156,12 +169,25 @@ def evaluate(
     Example: finssim evaluate runs/hold --plant current --trials 64 --out runs/hold-current
 
     Example: finssim evaluate runs/track --task t2 --trajectory ellipse --trajectory my-way.csv
+
+    Example: finssim evaluate run.mcap --task t1 --truth mocap.csv
     """
     start_warp()
     from finssim.experiments.evaluate import evaluate as run
 
+    records = [Path(word) for word in controller if word.endswith(".mcap")]
+    if len(controller) > 1 and len(records) < len(controller):
+        raise typer.BadParameter(
+            "one controller at a time, or records of one: give a single name, or .mcap files"
+        )
+    simulated = {"--plant": plant, "--trials": trials, "--trim": trim or None}
+    unheeded = [name for name, value in simulated.items() if value is not None]
+    if records and unheeded:
+        raise typer.BadParameter(f"a record was made once and for all: leave {', '.join(unheeded)} out")
+    if truth is not None and not records:
+        raise typer.BadParameter("--truth tells of records: a simulation knows its own")
     run(
-        controller,
+        records or controller[0],
         task=task,
         vehicle=vehicle,
         hydrodynamics=hydrodynamics,
@@ -169,6 +195,7 @@ def evaluate(
         trajectories=trajectory or (),
         trials=trials,
         trim=trim,
+        truth=truth,
         seed=seed,
         out=out,
         json=as_json,

@@ -58,7 +58,7 @@ class Evaluation:
 
 
 def evaluate(
-    controller: str | Path,
+    controller: str | Path | Sequence[Path],
     *,
     task: str = "t1",
     vehicle: str | Vehicle = "finsrov",
@@ -67,6 +67,7 @@ def evaluate(
     trajectories: Sequence[str | Path] = (),
     trials: int | None = None,
     trim: bool = False,
+    truth: Path | None = None,
     seed: int = 42,
     out: Path | None = None,
     json: bool = False,
@@ -75,14 +76,15 @@ def evaluate(
     """Run the trials in every plant, print the table (or one JSON object) and write the directory.
 
     Args:
-        controller: A policy directory, pid or pid-paper.
-        task: Key of `TASKS`, or FILE.py:CLASS of one's own.
+        controller: A policy directory, pid or pid-paper; or records of one, which are measured as they are.
+        task: Key of `TASKS`, or FILE.py:CLASS of one's own; of records t1 or t2.
         vehicle: A vehicle, a catalogue name or a file.
         hydrodynamics: Model, unless the plant names one.
         plant: Name or file, or several.
         trajectories: Names or files of what is followed in T2, in turn; the published four if none.
         trials: How many in each plant; the eight setpoints, or the four trajectories, once if None.
         trim: Put the integral of the position error (`control.trim`) in front of a policy.
+        truth: Truth file or table of motion capture by which records are measured; their own estimate if None.
         seed: Of what the plant draws.
         out: Directory for `evaluation.json`, the figure and the trajectories; an earlier evaluation is replaced.
         json: Print the result in place of the table.
@@ -94,8 +96,14 @@ def evaluate(
     Raises:
         EvaluationError, PolicyError, ControlError, PlantError, VehicleError, OutputError: As they say.
     """
-    plants = _plants([plant] if isinstance(plant, str | Path) else plant)
     form = _form(task)
+    if not isinstance(controller, str | Path):
+        evaluations = [_recorded(controller, task, vehicle, trajectories, truth)]
+        if out is not None:
+            with atomic_directory(out, replaces=EVALUATION_FILE) as folder:
+                _write(evaluations, folder, form)
+        return _tell(evaluations, form, out, json, console)
+    plants = _plants([plant] if isinstance(plant, str | Path) else plant)
     options: dict[str, Any] = {
         "task": task,
         "vehicle": vehicle,
@@ -117,6 +125,13 @@ def evaluate(
                 for one in plants
             ]
             _write(evaluations, folder, form)
+    return _tell(evaluations, form, out, json, console)
+
+
+def _tell(
+    evaluations: list[Evaluation], form: Form, out: Path | None, json: bool, console: Console | None
+) -> list[Evaluation]:
+    """Print the table, or one JSON object."""
     if json:
         print(json_module.dumps(_document(evaluations), allow_nan=False))
         return evaluations
@@ -128,6 +143,24 @@ def evaluate(
     if out is not None:
         console.print(f"written: {out}", highlight=False, soft_wrap=True)
     return evaluations
+
+
+def _recorded(
+    records: Sequence[Path],
+    task: str,
+    vehicle: str | Vehicle,
+    trajectories: Sequence[str | Path],
+    truth: Path | None,
+) -> Evaluation:
+    """The evaluation of records of one controller."""
+    from finssim.experiments.recorded import measured_records
+
+    if len(trajectories) > 1:
+        raise EvaluationError("records follow one trajectory each: give at most one --trajectory")
+    body = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
+    way = trajectories[0] if trajectories else None
+    described, measures, trials = measured_records(records, task, body, trajectory=way, truth=truth)
+    return Evaluation({**described, **_form(task).summarize(measures), "provenance": provenance()}, trials)
 
 
 def _plants(names: Sequence[str | Path]) -> list[Plant]:

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from finssim.control.controllers import CONTROLLERS
 from finssim.control.policy import Policy
 from finssim.experiments.evaluate import Evaluation
 from finssim.experiments.metrics import summarize
+from finssim.experiments.motion import Motion, on_grid
 from finssim.experiments.setpoints import T1_SETPOINTS, in_room
 from finssim.experiments.transfer.job import Job
 from finssim.experiments.transfer.series import read_series
@@ -20,11 +20,6 @@ from finssim.experiments.trials import DURATION, Trials
 from finssim.vehicles import load_vehicle
 
 __all__ = ["pool_evaluation", "pool_jobs"]
-
-Array = NDArray[np.float64]
-
-PERIOD = 0.1
-"""Between the samples of the series [s]."""
 
 
 def pool_jobs(controllers: Mapping[str, str], targets: Sequence[str], **settings: Any) -> list[Job]:
@@ -95,17 +90,8 @@ def _described(job: Job) -> dict[str, Any]:
 
 def _trials(jobs: Sequence[Job], paths: Sequence[Path]) -> Trials:
     """The true motion on one grid; NaN after a trial that ended early."""
-    t = np.arange(round(DURATION / PERIOD) + 1) * PERIOD
-    position, yaw = np.full((len(t), len(jobs), 3), np.nan), np.full((len(t), len(jobs)), np.nan)
-    for i, path in enumerate(paths):
-        series = read_series(path)
-        if not len(series["t"]):
-            continue
-        # The series' own first and last samples lie within a period of the grid's.
-        inside = (t >= series["t"][0] - PERIOD) & (t <= series["t"][-1] + PERIOD)
-        for axis in range(3):
-            position[inside, i, axis] = np.interp(t[inside], series["t"], series["position"][:, axis])
-        yaw[inside, i] = np.interp(t[inside], series["t"], np.unwrap(series["yaw"]))
+    series = [read_series(path) for path in paths]
+    motions = [Motion(t=s["t"], position=s["position"], yaw=s["yaw"]) for s in series]
     standing = load_vehicle(jobs[0].pool_vehicle)
     goals = np.array([in_room(T1_SETPOINTS[job.target], standing) for job in jobs])
-    return Trials(tuple(job.target for job in jobs), goals, t, position, yaw)
+    return Trials(tuple(job.target for job in jobs), goals, *on_grid(motions, DURATION))

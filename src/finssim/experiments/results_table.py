@@ -54,7 +54,7 @@ def paper_name(result: Mapping[str, Any]) -> str:
         return "PID"
     if result["plant"]["name"] == "noise" and controller["hydrodynamics"] == "calibrated":
         return "calibrated, localisation noise"
-    return f"{controller['hydrodynamics']}{' + DR' if controller['randomization'] else ''}"
+    return f"{controller['hydrodynamics']}{' + DR' if controller.get('randomization') else ''}"
 
 
 def print_results(result: Mapping[str, Any], console: Console) -> None:

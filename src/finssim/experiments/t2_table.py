@@ -42,7 +42,7 @@ def paper_kind(result: Mapping[str, Any]) -> str:
     controller = result["controller"]
     if controller["kind"] == "pid":
         return "PID"
-    return "calibrated + DR" if controller["randomization"] else "calibrated"
+    return "calibrated + DR" if controller.get("randomization") else "calibrated"
 
 
 def print_tracking(result: Mapping[str, Any], console: Console) -> None:

@@ -18,7 +18,7 @@ from finssim.learning.demonstrations import Episode
 from finssim.tasks.observer import Observer
 from finssim.vehicles import Vehicle
 
-__all__ = ["END", "episodes_of", "indices_of"]
+__all__ = ["END", "SAME_GOAL", "episodes_of", "indices_of", "station_at", "trajectory_of"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -127,7 +127,7 @@ def _on_grid(run: Indices, time: Array, period: float) -> list[Indices]:
 def _guides(drive: Drive, moving: bool, goal: Station | str | None) -> Callable[[Indices], Guide]:
     """What tells a stretch's guide from the indices of its decisions."""
     if moving:
-        trajectory = _trajectory(drive, str(goal or _recorded_name(drive)))
+        trajectory = trajectory_of(drive, None if goal is None else str(goal))
         return lambda rows: trajectory
     if isinstance(goal, Station):
         return lambda rows: goal
@@ -138,16 +138,17 @@ def _guides(drive: Drive, moving: bool, goal: Station | str | None) -> Callable[
             f"{drive.path}: was driven by hand to no goal: give --goal x,y,z,yaw_deg, where to, or --goal {END}: where "
             "each stretch ended"
         )
-    return lambda rows: _station(drive.goal[rows[0]])
+    return lambda rows: station_at(drive.goal[rows[0]])
 
 
-def _station(goal: Sequence[float] | Array) -> Station:
+def station_at(goal: Sequence[float] | Array) -> Station:
+    """The station of a goal: x, y, z [m], yaw [rad], world frame, (4,)."""
     x, y, z, yaw = map(float, goal)
     return Station((x, y, z), yaw)
 
 
 def _ended(drive: Drive, rows: Indices) -> Station:
-    return _station((*drive.position[rows[-1]], float(quat_yaw(drive.quaternion[rows[-1]]))))
+    return station_at((*drive.position[rows[-1]], float(quat_yaw(drive.quaternion[rows[-1]]))))
 
 
 def _recorded_name(drive: Drive) -> str:
@@ -160,8 +161,17 @@ def _recorded_name(drive: Drive) -> str:
     return drive.guide
 
 
-def _trajectory(drive: Drive, name: str) -> Guide:
-    """The trajectory that was followed, checked against the recorded goals."""
+def trajectory_of(drive: Drive, name: str | None = None) -> Guide:
+    """The trajectory that was followed, checked against the recorded goals.
+
+    Args:
+        drive: What was done.
+        name: Name or file; the recorded name if None.
+
+    Raises:
+        DriveError: The record does not tell, or its goals are not on the trajectory.
+    """
+    name = name or _recorded_name(drive)
     if np.isnan(drive.since).any():
         raise DriveError(f"{drive.path}: does not say when its trajectory began: not a record of finssim run")
     guide = load_trajectory(name)

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from finssim.control.guidance import Guide, Station
 from finssim.control.trajectories import load_trajectory
 from finssim.control.trim import Trim
-from finssim.experiments.metrics import measure_trial
+from finssim.experiments.motion import PERIOD, Motion, localization_errors, measure
 from finssim.experiments.setpoints import T1_SETPOINTS, T1_START, in_room
-from finssim.experiments.t2_metrics import ERRORS, measure_tracking
 from finssim.experiments.transfer.job import Job
 from finssim.experiments.transfer.series import write_series
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
@@ -44,9 +43,6 @@ Array = NDArray[np.float64]
 GETTING_READY = 10.0
 """Longest time until the estimator knows where the vehicle is [s]."""
 
-SERIES_PERIOD = 0.1
-"""Between the samples that are kept [s]."""
-
 
 class _Estimates:
     """What the robot believed, at the period of the series."""
@@ -56,7 +52,7 @@ class _Estimates:
 
     def __call__(self, runtime: Runtime) -> None:
         reading, t = runtime.reading, runtime.t
-        if reading is None or math.isnan(t) or (self.rows and t < self.rows[-1][0] + SERIES_PERIOD - 1e-6):
+        if reading is None or math.isnan(t) or (self.rows and t < self.rows[-1][0] + PERIOD - 1e-6):
             return
         self.rows.append((t, *reading.position, float(quat_yaw(reading.quaternion))))
 
@@ -100,12 +96,14 @@ def play(job: Job, path: Path) -> dict[str, Any]:
 
     series = _played(runtime, world, duration)
     write_series(path, series)
+    truth = Motion(**{name: series[name] for name in ("t", "position", "yaw", "quaternion", "thrust")})
+    estimate = Motion(t=series["estimate_t"], position=series["estimate"], yaw=series["estimate_yaw"])
     fault = _fault(runtime)
     return {
-        **_measures(job, guide, series, vehicle.force_limits, bool(fault)),
+        **measure(job.task, guide, truth, vehicle.force_limits, stopped=bool(fault)),
         "fault": fault,
         "room": room(standing.body.size),
-        "localization": _localization(series),
+        "localization": localization_errors(truth, estimate),
         "missed_decisions": runtime.counters.missed,
         "seconds": time.perf_counter() - began,
         "provenance": provenance(),
@@ -159,7 +157,7 @@ def _series(truth: Truth, started: float, duration: float, estimates: Array) -> 
     """Truth from the start of the guide's time, and the estimates at their own times."""
     t = truth.time - started
     kept = (t >= 0.0) & (t <= duration + 1e-6)
-    every = max(1, round(SERIES_PERIOD / np.median(np.diff(truth.time))))
+    every = max(1, round(PERIOD / np.median(np.diff(truth.time))))
     t, position, quaternion = t[kept][::every], truth.position[kept][::every], truth.quaternion[kept][::every]
     estimates = estimates.reshape(-1, 5)
     return {
@@ -172,42 +170,4 @@ def _series(truth: Truth, started: float, duration: float, estimates: Array) -> 
         "estimate_t": estimates[:, 0],
         "estimate": estimates[:, 1:4],
         "estimate_yaw": estimates[:, 4],
-    }
-
-
-def _measures(job: Job, guide: Guide, series: dict[str, Array], limits: Any, stopped: bool) -> dict[str, Any]:
-    if job.task == "t1":
-        goal = np.array([*guide.position, guide.yaw])  # type: ignore[attr-defined]
-        return {
-            "goal": [*guide.position, math.degrees(goal[3])],  # type: ignore[attr-defined]
-            **measure_trial(series["t"], series["position"], series["yaw"], goal),
-        }
-    measures = measure_tracking(
-        series["t"],
-        series["position"],
-        guide,
-        quaternion=series["quaternion"],
-        thrust=series["thrust"],
-        limits=limits,
-    )
-    if stopped:  # errors of half a way say nothing of the other half
-        measures |= dict.fromkeys(ERRORS)
-    return {"success": bool(measures["complete"]) and not stopped, **measures}
-
-
-def _localization(series: dict[str, Array]) -> dict[str, float] | None:
-    """Errors of the estimate at its own times: rms in 3-D and horizontally [m], and in heading [°]."""
-    t, estimate = series["estimate_t"], series["estimate"]
-    inside = (t >= series["t"][:1].max(initial=0.0)) & (t <= series["t"][-1:].max(initial=-1.0))
-    inside &= np.isfinite(estimate).all(axis=1)
-    if not inside.any():
-        return None
-    true = np.stack([np.interp(t[inside], series["t"], column) for column in series["position"].T], axis=1)
-    error = estimate[inside] - true
-    turn = series["estimate_yaw"][inside] - np.interp(t[inside], series["t"], np.unwrap(series["yaw"]))
-    turn = (turn + math.pi) % (2.0 * math.pi) - math.pi
-    return {
-        "position_m": float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),
-        "horizontal_m": float(np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1)))),
-        "heading_deg": math.degrees(float(np.sqrt(np.mean(turn**2)))),
     }

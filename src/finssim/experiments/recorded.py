@@ -1,0 +1,279 @@
+"""`finssim evaluate RECORD.mcap`: what a robot did, measured as in simulation, by its own estimate or by a truth."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.calibration.trials.table_file import read_table
+from finssim.control.guidance import Guide
+from finssim.control.trajectories import load_trajectory
+from finssim.experiments.driven.drive import Drive, read_drive
+from finssim.experiments.driven.episodes import SAME_GOAL, station_at, trajectory_of
+from finssim.experiments.motion import Motion, localization_errors, measure, on_grid
+from finssim.experiments.setpoints import T1_SETPOINTS
+from finssim.experiments.t2_trials import TrackingTrials
+from finssim.experiments.trials import DURATION, Trials
+from finssim.geometry.rotations import quat_yaw
+from finssim.pool.truth import read_truth
+from finssim.robot.record_reader import open_record
+from finssim.vehicles import Vehicle
+from finssim.viewer.frame import ViewError
+from finssim.viewer.sources.alignment import offset_between
+from finssim.viewer.sources.series import PoseSeries
+
+__all__ = ["RecordedError", "RecordedTrial", "measured_records", "read_record"]
+
+Array = NDArray[np.float64]
+
+MEASURED = ("t1", "t2")
+"""Tasks whose measures need no more than the motion and where the vehicle should have been."""
+EARLY = 0.5
+"""A trial that lacks more than this of its end was stopped [s]."""
+
+
+class RecordedError(ValueError):
+    """A record or a truth that cannot be measured."""
+
+
+@dataclass(frozen=True)
+class RecordedTrial:
+    """What one record shows."""
+
+    path: Path
+    guide: Guide
+    pilot: dict[str, Any]
+    """Who steered, as the record describes it."""
+    estimate: Motion
+    """What the robot knew at its decisions."""
+    motion: Motion
+    """By which it is measured: the truth, or the estimate."""
+    stopped: bool
+    """Whether it ended before its time."""
+    offset: float | None
+    """Added to the truth's times to put them on the robot's clock [s]; None without a truth."""
+
+    def measures(self, task: str, vehicle: Vehicle) -> dict[str, Any]:
+        """What `motion.measure` says, and how far the estimate was from the truth."""
+        return {
+            **measure(task, self.guide, self.motion, vehicle.force_limits, stopped=self.stopped),
+            "fault": "ended early" if self.stopped else "",
+            "localization": None if self.offset is None else localization_errors(self.motion, self.estimate),
+            "clock_offset_s": self.offset,
+        }
+
+
+def read_record(
+    path: Path,
+    task: str,
+    vehicle: Vehicle,
+    *,
+    guide: Guide | None = None,
+    truth: Path | None = None,
+    duration: float = DURATION,
+) -> RecordedTrial:
+    """The trial of a record, from the start of its guide's time.
+
+    Args:
+        path: MCAP file of `finssim run`, `experiment --robot` or the ROS 2 graph.
+        task: t1 or t2.
+        vehicle: The very one that was driven.
+        guide: What was followed in t2; by the record's own words if None.
+        truth: Truth file of a virtual pool, or a table (.csv, .parquet) of motion capture, world frame: columns t [s],
+            x, y, z of the body origin [m], and qx, qy, qz, qw or yaw [rad]. Its clock may be any: it is laid over the
+            robot's where the distance between the two motions is least.
+        duration: Of a trial of t1 [s].
+
+    Raises:
+        RecordedError: Another task, a record of a drive by hand, of several goals, or a truth of another run.
+        RecordError, DriveError: The record cannot be used.
+        CalibrationError, TruthError: The truth cannot be read.
+    """
+    if task not in MEASURED:
+        raise RecordedError(
+            f"records are measured in {' and '.join(MEASURED)}, not in '{task}': its measures need more than a motion"
+        )
+    drive = read_drive(path, vehicle)
+    pilot = _pilot(path)
+    steered = drive.stretch >= 0
+    if not (steered & (drive.since >= 0.0)).any():
+        raise RecordedError(f"{path}: the robot was never armed with its state known: nothing was done in it")
+    the_guide = _station(drive, steered) if task == "t1" else guide or trajectory_of(drive)
+    whole = min(the_guide.duration, duration) if task == "t1" else the_guide.duration
+    rows = steered & (drive.since >= 0.0) & (drive.since <= whole + 1e-6)
+    estimate = Motion(
+        t=drive.since[rows],
+        position=drive.position[rows],
+        yaw=np.asarray(quat_yaw(drive.quaternion[rows])),
+        quaternion=drive.quaternion[rows],
+        thrust=drive.force[rows],
+    )
+    last = float(estimate.t[-1])
+    stopped = last < whole - EARLY
+    motion, offset = estimate, None
+    if truth is not None:
+        motion, offset = _truth(truth, drive, last if stopped else whole)
+    return RecordedTrial(path, the_guide, pilot or {"name": drive.driver}, estimate, motion, stopped, offset)
+
+
+def measured_records(
+    records: Sequence[Path],
+    task: str,
+    vehicle: Vehicle,
+    *,
+    trajectory: str | Path | None = None,
+    truth: Path | None = None,
+) -> tuple[dict[str, Any], list[dict[str, Any]], Trials | TrackingTrials]:
+    """What an evaluation says of records: who and where, the measures by trial, and the motions for its figure.
+
+    Args:
+        records: MCAP files.
+        task: t1 or t2.
+        vehicle: The very one that was driven.
+        trajectory: Name or file of what was followed in t2; the record's own if None.
+        truth: As of `read_record`, of one record or of all.
+
+    Raises:
+        RecordedError: As `read_record`, or the records are of several controllers.
+    """
+    guide = None if trajectory is None else load_trajectory(trajectory, vehicle=vehicle)
+    found = [read_record(path, task, vehicle, guide=guide, truth=truth) for path in records]
+    pilots = [trial.pilot for trial in found]
+    if any(pilot != pilots[0] for pilot in pilots):
+        names = ", ".join(dict.fromkeys(str(pilot.get("name")) for pilot in pilots))
+        raise RecordedError(
+            f"the records are of several controllers ({names}): evaluate those of one at a time"
+        )
+    named = "setpoint" if task == "t1" else "trajectory"
+    measures = [
+        {
+            "trial": i,
+            named: _setpoint(trial.guide) if task == "t1" else trial.guide.name,
+            "record": trial.path.name,
+            **trial.measures(task, vehicle),
+        }
+        for i, trial in enumerate(found)
+    ]
+    described = {
+        "controller": {"kind": "pid", "action": "wrench6", "hydrodynamics": "calibrated"} | pilots[0],
+        "task": task,
+        "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
+        "hydrodynamics": "calibrated",
+        "plant": {
+            "name": "record",
+            "title": f"as recorded, by {'its own estimate' if truth is None else truth.name}",
+        },
+        "records": [
+            {"file": t.path.name, "sha256": hashlib.sha256(t.path.read_bytes()).hexdigest()} for t in found
+        ],
+        "truth": None if truth is None else truth.name,
+    }
+    return described, measures, _trials(found, task, vehicle)
+
+
+def _pilot(path: Path) -> dict[str, Any]:
+    """Who steered, as the record says; nothing where it does not."""
+    with open_record(path) as record:
+        text = record.metadata.get("pilot", "{}")
+    try:
+        return dict(json.loads(text))
+    except (ValueError, TypeError):
+        raise RecordedError(
+            f"{path}: its 'pilot' is '{text[:60]}', expected a mapping: not a record of ours"
+        ) from None
+
+
+def _station(drive: Drive, steered: NDArray[np.bool_]) -> Guide:
+    """The one goal that was held."""
+    if not drive.has_goal:
+        raise RecordedError(f"{drive.path}: was driven by hand to no goal: a record of finssim run has one")
+    goals = drive.goal[steered & (drive.since >= 0.0)]
+    if float(np.abs(goals - goals[0]).max()) > SAME_GOAL:
+        raise RecordedError(
+            f"{drive.path}: its goal moves: measure it with --task t2, or record each station by itself"
+        )
+    return station_at(goals[0])
+
+
+def _setpoint(guide: Guide) -> str:
+    """Name of the published setpoint that a station is, else its numbers."""
+    goal = _row(guide)
+    near = (name for name, known in T1_SETPOINTS.items() if np.abs(known - goal).max() <= SAME_GOAL)
+    return next(near, ",".join(f"{x:.3g}" for x in _goal(guide)))
+
+
+def _row(guide: Guide) -> Array:
+    goal = guide.at(0.0)
+    return np.array([*goal.position, float(goal.yaw)])
+
+
+def _goal(guide: Guide) -> list[float]:
+    x, y, z, yaw = _row(guide).tolist()
+    return [x, y, z, math.degrees(yaw)]
+
+
+def _truth(path: Path, drive: Drive, until: float) -> tuple[Motion, float]:
+    """The true motion from the guide's start to a time after it [s], and what was added to its times."""
+    time, position, yaw, quaternion = _table(path)
+    try:
+        offset = offset_between(PoseSeries(drive.time, drive.position, drive.quaternion), time, position)
+    except ViewError as error:
+        raise RecordedError(f"{path}: {error}") from None
+    t = time + offset - (drive.time[0] - drive.since[0])
+    rows = (t >= 0.0) & (t <= until + 1e-6)
+    return (
+        Motion(
+            t=t[rows],
+            position=position[rows],
+            yaw=yaw[rows],
+            quaternion=None if quaternion is None else quaternion[rows],
+        ),
+        offset,
+    )
+
+
+def _table(path: Path) -> tuple[Array, Array, Array, Array | None]:
+    """Times [s], positions [m], headings [rad] and orientations of a truth; the last None where it has none."""
+    if path.suffix.lower() not in (".csv", ".txt", ".tsv", ".parquet"):
+        found = read_truth(path)
+        return found.time, found.position, np.asarray(quat_yaw(found.quaternion)), found.quaternion
+    columns = read_table(path).numbers
+    attitude = ("qx", "qy", "qz", "qw")
+    turned = set(attitude) <= set(columns)
+    if not {"t", "x", "y", "z"} <= set(columns) or not (turned or "yaw" in columns):
+        raise RecordedError(
+            f"{path}: columns {', '.join(columns)[:80]}, expected t [s], x, y, z [m] (world frame, body origin) and "
+            "qx, qy, qz, qw or yaw [rad]"
+        )
+    names = ("t", "x", "y", "z", *(attitude if turned else ("yaw",)))
+    rows = np.stack([columns[name] for name in names], axis=1)
+    rows = rows[np.isfinite(rows).all(axis=1)]  # a body that the cameras did not see has empty cells
+    if len(rows) < 2 or np.any(np.diff(rows[:, 0]) <= 0.0):
+        raise RecordedError(
+            f"{path}: {len(rows)} rows with all numbers, expected 2 or more with t increasing"
+        )
+    quaternion = rows[:, 4:8] if turned else None
+    yaw = rows[:, 4] if quaternion is None else np.asarray(quat_yaw(quaternion))
+    return rows[:, 0], rows[:, 1:4], yaw, quaternion
+
+
+def _trials(found: Sequence[RecordedTrial], task: str, vehicle: Vehicle) -> Trials | TrackingTrials:
+    """The motions on one grid, for figures."""
+    guides = tuple(trial.guide for trial in found)
+    longest = DURATION if task == "t1" else max(guide.duration for guide in guides)
+    t, position, yaw = on_grid([trial.motion for trial in found], longest)
+    if task == "t1":
+        return Trials(
+            tuple(map(_setpoint, guides)), np.stack([_row(guide) for guide in guides]), t, position, yaw
+        )
+    shape = (len(t), len(found))
+    unknown = np.full((*shape, 4), np.nan), np.full((*shape, len(vehicle.thrusters)), np.nan)
+    return TrackingTrials(guides, t, position, *unknown, vehicle.force_limits)

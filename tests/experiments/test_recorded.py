@@ -1,0 +1,166 @@
+"""Records measured: the same measures of the same motion, from the robot's estimate, from a truth, on any clock."""
+
+import json
+
+import numpy as np
+import pytest
+
+from finssim import boundary
+from finssim.cli import app
+from finssim.control.guidance import Station
+from finssim.control.trajectories import load_trajectory
+from finssim.experiments.evaluate import evaluate
+from finssim.experiments.metrics import measure_trial
+from finssim.experiments.recorded import RecordedError, read_record
+from finssim.experiments.setpoints import T1_SETPOINTS
+from finssim.geometry.rotations import quat_from_yaw, quat_yaw
+from finssim.pool import draw_plant
+from finssim.pool.camera import PoolCamera
+from finssim.pool.site import camera_of
+from finssim.pool.truth import read_truth
+from finssim.pool.virtual_pool import VirtualPool
+from finssim.robot.lockstep import run_lockstep
+from finssim.robot.pilots import PidPilot
+from finssim.robot.recorder import Recorder
+from finssim.robot.runtime import Runtime
+from finssim.vehicles import load_vehicle
+
+pytestmark = pytest.mark.slow
+
+FINSROV = load_vehicle("finsrov")
+X, Y, Z, YAW = T1_SETPOINTS["P03"]
+
+
+def driven(folder, guide, seconds, task="t1", start=(0.0, 0.0, -0.5)):
+    """A recorded run of the tuned PID in a pool whose clock is the robot's, and its truth."""
+    true_site, known_site, settings = camera_of(FINSROV, 1, "realistic")
+    truth, record = folder / "truth", folder / "run.mcap"
+    camera = PoolCamera(FINSROV, true_site, mode="corners", settings=settings, seed=1)
+    pool = VirtualPool(
+        FINSROV,
+        draw_plant(FINSROV, 1, "realistic"),
+        camera=camera,
+        start=(start, quat_from_yaw(0.0)),
+        seed=1,
+        truth=truth,
+    )
+    pilot = PidPilot("pid", FINSROV, task)
+    about = {"command": "finssim run", "pilot": pilot.describe()}
+    with Recorder(record, FINSROV, about, pictures="none", epoch=1e9) as recorder:
+        runtime = Runtime(FINSROV, known_site, pilot, guide, arm=True, recorder=recorder)
+        run_lockstep(runtime, pool, seconds, until=lambda r: r.t >= 60.5)
+    pool.close()
+    return record, truth, runtime.started
+
+
+@pytest.fixture(scope="module")
+def held(tmp_path_factory):
+    """P03, held for a minute."""
+    return driven(tmp_path_factory.mktemp("held"), Station((X, Y, Z), YAW, name="P03"), 70.0)
+
+
+def captured(path, truth, late=0.0, yaw=False):
+    """A table of motion capture on a clock of its own, at 50 Hz, with a gap."""
+    found = read_truth(truth)
+    rows = np.arange(0, len(found.time), 2)
+    rows = rows[(rows < 400) | (rows > 410)]
+    heading = np.asarray(quat_yaw(found.quaternion))
+    tail = heading[:, None] if yaw else found.quaternion
+    table = np.column_stack([found.time + late, found.position, tail])[rows]
+    head = "t,x,y,z,yaw" if yaw else "t,x,y,z,qx,qy,qz,qw"
+    path.write_text(head + "\n" + "\n".join(",".join(map(repr, row)) for row in table.tolist()) + "\n")
+    return path
+
+
+def test_the_truth_gives_the_measures_of_the_true_motion(held):
+    """Those that the truth has when its clock is known; the found offset is within a step of the search."""
+    record, truth, started = held
+    trial = read_record(record, "t1", FINSROV, truth=truth)
+    measures, found = trial.measures("t1", FINSROV), read_truth(truth)
+    exact = measure_trial(
+        found.time - started, found.position, quat_yaw(found.quaternion), T1_SETPOINTS["P03"]
+    )
+    assert abs(trial.offset) < 0.06 and measures["success"] is exact["success"] is True
+    for name in ("e_p_m", "e_y_m", "e_psi_deg"):
+        assert measures[name] == pytest.approx(exact[name], rel=0.02)
+    assert abs(measures["t_s_s"] - exact["t_s_s"]) <= 0.2
+    assert 0.001 < measures["localization"]["position_m"] < 0.05
+
+
+def test_the_estimate_is_off_by_what_localization_is(held):
+    """Both are measured alike; they differ by no more than the error of the estimate."""
+    record, truth, _ = held
+    known = read_record(record, "t1", FINSROV).measures("t1", FINSROV)
+    true = read_record(record, "t1", FINSROV, truth=truth).measures("t1", FINSROV)
+    assert known["success"] and known["localization"] is None and known["fault"] == ""
+    assert abs(known["e_p_m"] - true["e_p_m"]) < true["localization"]["position_m"] + 1e-3
+
+
+@pytest.mark.parametrize("yaw", [False, True])
+def test_a_table_on_another_clock_is_laid_over_the_record(held, tmp_path, yaw):
+    """3 minutes behind: the offset comes out, and the measures are the same."""
+    record, truth, _ = held
+    known = read_record(record, "t1", FINSROV, truth=truth)
+    trial = read_record(record, "t1", FINSROV, truth=captured(tmp_path / "m.csv", truth, -180.0, yaw))
+    assert trial.offset == pytest.approx(known.offset + 180.0, abs=0.021)
+    first, second = (x.measures("t1", FINSROV) for x in (known, trial))
+    assert second["e_p_m"] == pytest.approx(first["e_p_m"], rel=0.02)
+
+
+def test_evaluate_takes_a_record_and_prints_what_it_prints_of_a_simulation(held, tmp_path, capsys):
+    """Setpoint by its published name, the paper's row beneath, one JSON object, the figure."""
+    record, truth, _ = held
+    words = ["evaluate", str(record), "--task", "t1", "--truth", str(truth)]
+    assert boundary.run(app, [*words, "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    assert "P03" in said and "1/1" in said and "paper" in said
+    assert (tmp_path / "out" / "error_envelope.png").stat().st_size > 10_000
+    assert boundary.run(app, [*words, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["controller"]["name"] == "pid" and told["truth"] == "truth" and told["success"] == 1
+    assert len(told["records"][0]["sha256"]) == 64
+
+
+def test_a_run_that_ended_early_counts_without_success(tmp_path):
+    """Three seconds: no errors late in the hold."""
+    record, _, _ = driven(tmp_path, Station((X, Y, Z), YAW), 5.0)
+    (done,) = evaluate([record], task="t1", json=True)
+    (trial,) = done.result["per_trial"]
+    assert not trial["success"] and trial["e_p_m"] is None and trial["fault"] == "ended early"
+
+
+def test_a_trajectory_is_measured_by_the_name_in_the_record(tmp_path, capsys):
+    """The way is whole, the errors are a PID's; a truth of another run, t1 and other tasks are refused."""
+    guide = load_trajectory("straight")
+    first = tuple(guide.at(0.0).position.tolist())
+    record, truth, _ = driven(tmp_path, guide, guide.duration + 5.0, "t2", first)
+    assert boundary.run(app, ["evaluate", str(record), "--task", "t2", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["complete"] == 1 and told["horizontal_rmse_m"] < 0.05 and told["energy"] > 0.0
+    (done,) = evaluate([record], task="t2", truth=truth, json=True)
+    assert done.result["per_trial"][0]["p95_m"] < 0.08 and done.result["per_trial"][0]["success"]
+    with pytest.raises(RecordedError, match="its goal moves"):
+        read_record(record, "t1", FINSROV)
+    with pytest.raises(RecordedError, match="not in 'docking'"):
+        read_record(record, "docking", FINSROV)
+    short = tmp_path / "short.csv"
+    short.write_text("t,x,y,z,yaw\n0,0,0,0,0\n1,0,0,0,0\n")
+    with pytest.raises(RecordedError, match="less than half of the record"):
+        read_record(record, "t2", FINSROV, truth=short)
+    short.write_text("time,x,y\n0,0,0\n")
+    with pytest.raises(RecordedError, match="columns time, x, y, expected t"):
+        read_record(record, "t2", FINSROV, truth=short)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["a.mcap", "pid"], "one controller at a time"),
+        (["a.mcap", "--trials", "3"], "leave --trials out"),
+        (["pid", "--truth", "m.csv"], "--truth tells of records"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(words, sentence, capsys):
+    """In one sentence."""
+    assert boundary.run(app, ["evaluate", *words]) == 2
+    assert sentence in capsys.readouterr().err
