@@ -7,7 +7,23 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["Device", "Hydrodynamics", "Json", "PixelStd", "Pool", "Seed", "Steps", "Vehicle"]
+__all__ = [
+    "Arm",
+    "Bind",
+    "ByHand",
+    "Device",
+    "Hydrodynamics",
+    "Json",
+    "Lockstep",
+    "Pictures",
+    "PixelStd",
+    "Pool",
+    "Robot",
+    "Seed",
+    "Steps",
+    "Unattended",
+    "Vehicle",
+]
 
 Vehicle = Annotated[
     str, typer.Option(help="Vehicle of the catalogue, or the path of a vehicle file.", metavar="NAME|FILE")
@@ -34,5 +50,52 @@ PixelStd = Annotated[
     float | None,
     typer.Option(
         help="Error of a detected corner, per axis [px]; what the pool's calibration found, else 0.5, if not given."
+    ),
+]
+Robot = Annotated[
+    str | None,
+    typer.Option(
+        help="Robot on which it is done: its motor controller's udp://HOST:PORT or serial:DEVICE, or pool for the "
+        "virtual pool on this machine. With --lockstep: pool, or HOST:PORT.",
+        metavar="ADDRESS",
+    ),
+]
+Bind = Annotated[
+    str,
+    typer.Option(
+        help="Address and port of this end, for udp; pictures come to the port after it. Loopback unless given.",
+        metavar="ADDRESS:PORT",
+    ),
+]
+Pictures = Annotated[
+    str | None,
+    typer.Option(
+        help="Overhead camera: udp://HOST:PORT, shm:NAME or none; the virtual pool's with --robot pool, "
+        "otherwise none, if not given.",
+        metavar="ADDRESS",
+    ),
+]
+Lockstep = Annotated[
+    bool,
+    typer.Option("--lockstep", help="Take turns with finssim pool --lockstep, as fast as both compute."),
+]
+Arm = Annotated[
+    bool,
+    typer.Option(
+        "--arm", help="Let thrusters turn, as soon as the state is known. Without it they never do."
+    ),
+]
+ByHand = Annotated[
+    bool,
+    typer.Option(
+        "--by-hand",
+        help="Somebody carries the vehicle to where each trial starts; the tuned PID steers it there if not given.",
+    ),
+]
+Unattended = Annotated[
+    bool,
+    typer.Option(
+        "--unattended",
+        help="Nobody presses enter before each trial; a fault ends the session, and nothing is armed after it.",
     ),
 ]

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from finssim.cli_options import Json, Vehicle
+from finssim.cli_options import Arm, Bind, Json, Lockstep, Pictures, Vehicle
 
-__all__ = ["run"]
+if TYPE_CHECKING:
+    from finssim.experiments.on_robot.session import OnRobot
+
+__all__ = ["on_robot", "run"]
 
 
 def run(
@@ -58,21 +61,8 @@ def run(
             metavar="ADDRESS",
         ),
     ] = "pool",
-    bind: Annotated[
-        str,
-        typer.Option(
-            help="Address and port of this end, for udp; pictures come to the port after it. Loopback unless given.",
-            metavar="ADDRESS:PORT",
-        ),
-    ] = "127.0.0.1:54321",
-    pictures: Annotated[
-        str | None,
-        typer.Option(
-            help="Overhead camera: udp://HOST:PORT, shm:NAME or none; the virtual pool's with --robot pool, "
-            "otherwise none, if not given.",
-            metavar="ADDRESS",
-        ),
-    ] = None,
+    bind: Bind = "127.0.0.1:54321",
+    pictures: Pictures = None,
     pool_file: Annotated[
         Path, typer.Option(help="Pool file: camera, water plane and frames (.yaml).", metavar="FILE")
     ] = Path("pool.yaml"),
@@ -96,16 +86,8 @@ def run(
             min=0.0,
         ),
     ] = None,
-    lockstep: Annotated[
-        bool,
-        typer.Option("--lockstep", help="Take turns with finssim pool --lockstep, as fast as both compute."),
-    ] = False,
-    arm: Annotated[
-        bool,
-        typer.Option(
-            "--arm", help="Let thrusters turn, as soon as the state is known. Without it they never do."
-        ),
-    ] = False,
+    lockstep: Lockstep = False,
+    arm: Arm = False,
     as_json: Json = False,
 ) -> None:
     """Run a controller on a vehicle: estimate, decide, command; print how it went. Ctrl-C stops the thrusters.
@@ -138,3 +120,29 @@ def run(
     )
     if status:
         raise typer.Exit(status)
+
+
+def on_robot(
+    robot: str,
+    *,
+    bind: str,
+    pictures: str | None,
+    lockstep: bool,
+    pool_file: Path | None,
+    arm: bool,
+    by_hand: bool,
+    unattended: bool,
+) -> OnRobot:
+    """The robot that options name."""
+    from finssim.experiments.on_robot.session import OnRobot
+    from finssim.robot.wiring import Wiring
+
+    if pool_file is None:
+        raise typer.BadParameter("a robot knows where it is by its pool file: give --pool-file")
+    return OnRobot(
+        wiring=Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep),
+        pool_file=pool_file,
+        arm=arm,
+        by_hand=by_hand,
+        unattended=unattended,
+    )

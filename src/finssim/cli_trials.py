@@ -8,7 +8,19 @@ from typing import Annotated
 
 import typer
 
-from finssim.cli_options import Hydrodynamics, Json, Seed, Vehicle
+from finssim.cli_options import (
+    Arm,
+    Bind,
+    ByHand,
+    Hydrodynamics,
+    Json,
+    Lockstep,
+    Pictures,
+    Robot,
+    Seed,
+    Unattended,
+    Vehicle,
+)
 from finssim.quiet import start_warp
 
 __all__ = ["excite", "trials_app"]
@@ -149,6 +161,17 @@ def excite(
             metavar="NAME|FILE",
         ),
     ] = None,
+    robot: Robot = None,
+    pool_file: Annotated[
+        Path | None,
+        typer.Option(help="Of that robot: camera, water plane and frames (.yaml).", metavar="FILE"),
+    ] = None,
+    bind: Bind = "127.0.0.1:54321",
+    pictures: Pictures = None,
+    lockstep: Lockstep = False,
+    arm: Arm = False,
+    by_hand: ByHand = False,
+    unattended: Unattended = False,
     hydrodynamics: Hydrodynamics = "calibrated",
     noise: Annotated[
         str, typer.Option(help="Noise of simulated trials: sensors, published or none.", metavar="NAME")
@@ -172,9 +195,32 @@ def excite(
     """Write excitation programmes (wrench [N, N m] and thrust [N] at 50 Hz) for a robot, or run them in a simulation.
 
     Example: finssim excite surge,yaw --vehicle finsrov --pool 1 --out trials
+
+    Example: finssim excite all --vehicle finsrov --robot udp://10.0.0.2:58766 --pool-file pool.yaml --arm --out trials
     """
     wanted = _levels(levels)
     start_warp()
+    plan = {"kind": kind, "levels": wanted, "repeats": repeats, "coast": coast, "duration": duration}
+    if robot is not None:
+        if simulate or pool is not None or severity is not None or pool_vehicle is not None:
+            raise typer.BadParameter(
+                "--robot is where it is done: leave --simulate, --pool and what tells of it out"
+            )
+        from finssim.cli_robot import on_robot
+        from finssim.experiments.excitation.command import excite_on_robot
+
+        where = on_robot(
+            robot, bind=bind, pictures=pictures, lockstep=lockstep, pool_file=pool_file, arm=arm, by_hand=by_hand,
+            unattended=unattended,
+        )  # fmt: skip
+        made = excite_on_robot(axes, vehicle=vehicle, out=out, robot=where, seed=seed, room=room, **plan)
+        _print_folders(made, as_json)
+        return
+    if arm or by_hand or unattended or lockstep or pool_file is not None or pictures is not None:
+        raise typer.BadParameter(
+            "--arm, --by-hand, --unattended, --lockstep, --pool-file and --pictures tell of a robot: name one "
+            "with --robot"
+        )
     if pool is not None:
         if simulate or room is not None:
             raise typer.BadParameter(
@@ -189,12 +235,8 @@ def excite(
             plant=pool,
             pool_vehicle=pool_vehicle,
             severity=severity or "realistic",
-            kind=kind,
-            levels=wanted,
-            repeats=repeats,
-            coast=coast,
-            duration=duration,
             seed=seed,
+            **plan,
         )
         _print_folders(made, as_json)
         return
@@ -209,17 +251,13 @@ def excite(
         vehicle=vehicle,
         out=out,
         simulate=simulate,
-        kind=kind,
-        levels=wanted,
-        repeats=repeats,
         rate=rate,
         noise=noise,
         seed=seed,
-        coast=coast,
-        duration=duration,
         room=room,
         hydrodynamics=hydrodynamics,
         inputs=tuple(word.strip() for word in inputs.split(",")),
+        **plan,
     )
     _print_folders(folders, as_json)
 

@@ -41,7 +41,7 @@ class Motion:
 def measure(
     task: str, guide: Guide, motion: Motion, limits: tuple[ArrayLike, ArrayLike], *, stopped: bool
 ) -> dict[str, Any]:
-    """What `measure_trial` says of a trial of T1, or `measure_tracking` of one of T2, with `success`; of T1 the `goal` [m, m, m, °].
+    """What `measure_trial` says of a trial of T1, with its goal, or `measure_tracking` of one of T2, with `success`.
 
     Args:
         task: t1 or t2.

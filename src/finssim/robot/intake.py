@@ -36,7 +36,7 @@ class Intake:
         self.decoder = Decoder(outputs=perception.vehicle.mcu.outputs)
         self.clock = ClockMap()
         self._perception, self._bridge = perception, bridge
-        self._counters, self._recorder = counters, recorder
+        self._counters, self.recorder = counters, recorder
 
     def take(
         self, now: float, frames: Sequence[tuple[float, bytes]], pictures: Sequence[Picture] = ()
@@ -57,18 +57,18 @@ class Intake:
         for picture in pictures:
             verdict = self._perception.picture(now, picture)
             self._counters.picture(picture.time, verdict in USED)
-            if self._recorder is not None:
-                self._recorder.picture(now, picture)
+            if self.recorder is not None:
+                self.recorder.picture(now, picture)
 
     def _telemetry(self, arrival: float, telemetry: Telemetry) -> None:
         time = self.clock.stamp(telemetry.mcu_ms, arrival)
         self._counters.telemetry += 1
         self._perception.telemetry(arrival, telemetry, time)
         self._bridge.telemetry(arrival, telemetry)
-        if self._recorder is not None:
-            self._recorder.telemetry(arrival, telemetry, time)
+        if self.recorder is not None:
+            self.recorder.telemetry(arrival, telemetry, time)
 
     def _echo(self, arrival: float, echo: CommandEcho) -> None:
         self._bridge.echo(arrival, echo)
-        if self._recorder is not None:
-            self._recorder.echo(arrival, echo)
+        if self.recorder is not None:
+            self.recorder.echo(arrival, echo)

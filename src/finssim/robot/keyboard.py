@@ -119,16 +119,22 @@ class Keyboard:
     ) -> None:
         self.close()
 
-    def read(self, now: float) -> Hands:
-        """What is held now; never waits. A terminal that was closed is a device that is lost."""
+    def pressed(self) -> list[str]:
+        """Keys since the last call; never waits."""
+        keys: list[str] = []
         while self._open and select.select([self._descriptor], [], [], 0.0)[0]:
             try:
                 data = os.read(self._descriptor, 256)
             except OSError:
                 data = b""
             self._open = bool(data)
-            for key in _keys(data.decode("utf-8", errors="ignore")):
-                self.keys.press(now, key)
+            keys += _keys(data.decode("utf-8", errors="ignore"))
+        return keys
+
+    def read(self, now: float) -> Hands:
+        """What is held now; never waits. A terminal that was closed is a device that is lost."""
+        for key in self.pressed():
+            self.keys.press(now, key)
         return self.keys.hands(now) if self._open else Hands(present=False)
 
     def close(self) -> None:

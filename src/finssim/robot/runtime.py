@@ -125,6 +125,24 @@ class Runtime:
         if self.recorder is not None:
             self.recorder.event(now, "trial_start", self.guide.name)
 
+    def hand_over(
+        self, now: float, pilot: Pilot, guide: Guide, *, arm: bool, recorder: Recorder | None = None
+    ) -> None:
+        """Disarm, and begin anew with another pilot and guide, once all stands for arming again.
+
+        Args:
+            now: Robot's clock [s].
+            pilot: Who steers from then on.
+            guide: Where to; its time starts when the vehicle is armed again.
+            arm: Arm once, as soon as the state is ready.
+            recorder: Takes down everything from now on; nobody does if None.
+        """
+        self.bridge.disarm(now)
+        self._record_events()
+        self.pilot, self.guide, self._arm = pilot, guide, arm
+        self.started, self.refusal, self.force = math.nan, "", np.zeros_like(self.force)
+        self.recorder = self.intake.recorder = recorder
+
     def stop(self, now: float, frames: int = 3) -> list[bytes]:
         """Disarm; returns frames without thrust to send."""
         self._arm = False

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from finssim.localization.pool import Pool
 from finssim.robot.link.layout import LinkError
@@ -52,7 +53,9 @@ class Drive(Protocol):
 
 @contextmanager
 def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool) -> Iterator[Drive]:
-    """Everything open, for as long as it is needed.
+    """Everything open, for as long as it is needed: for one run, or for several one after the other.
+
+    A later run goes on at the clock at which the one before ended, and is given nothing that came between them.
 
     Args:
         wiring: What to open.
@@ -65,13 +68,27 @@ def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool) -> Iterator[Drive]:
     with ExitStack() as stack:
         if wiring.lockstep:
             world = stack.enter_context(LockstepClient(_lockstep_address(wiring)))
-            yield lambda runtime, **how: run_lockstep(runtime, world, gentle=True, **how)
+            clock = 0.0
+
+            def take_turns(runtime: Runtime, **how: Any) -> float:
+                nonlocal clock
+                began, clock = clock, run_lockstep(runtime, world, start=clock, gentle=True, **how)
+                return clock - began
+
+            yield take_turns
             return
         transport = open_transport(POOL_ADDRESS if wiring.robot == "pool" else wiring.robot, wiring.bind)
         stack.callback(transport.close)
         camera = open_camera(wiring, vehicle, pool)
         stack.callback(camera.close)
-        yield lambda runtime, **how: run_realtime(runtime, transport, camera, **how)
+
+        def run(runtime: Runtime, **how: Any) -> float:
+            while transport.receive():
+                pass
+            camera.receive(time.monotonic())
+            return run_realtime(runtime, transport, camera, **how)
+
+        yield run
 
 
 def open_camera(wiring: Wiring, vehicle: Vehicle, pool: Pool) -> PictureSource:

@@ -1,4 +1,4 @@
-"""Where in a pool a programme begins, and how far it may go, so that no wall, floor or surface is met."""
+"""Where in its water a programme begins, and how far it may go, so that no wall, floor or surface is met."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from finssim.pool.plant_spec import Basin
 from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.defaults import room
 
-__all__ = ["Place", "place_of"]
+__all__ = ["Box", "Place", "box_of", "place_of"]
+
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Lower and upper corner of the water that a vehicle may be in, world frame [m]."""
 
 Array = NDArray[np.float64]
 
@@ -38,40 +41,49 @@ class Place:
     """Way after which the excitation ends [m]; None where it goes nowhere."""
 
 
-def place_of(programme: Programme, vehicle: Vehicle, basin: Basin) -> Place:
-    """The start of a programme: its way then lies in the middle of the pool, surge and sway along the pool's length.
+def box_of(where: Basin | Vehicle) -> Box:
+    """The water of a basin, or the workspace of a vehicle, which is taken for walls."""
+    if isinstance(where, Basin):
+        half = 0.5 * where.length, 0.5 * where.width
+        return (-half[0], -half[1], -where.depth), (*half, 0.0)
+    lower, upper = where.safety.workspace_lower, where.safety.workspace_upper
+    return tuple(map(float, lower)), tuple(map(float, upper))  # type: ignore[return-value]
+
+
+def place_of(programme: Programme, vehicle: Vehicle, box: Box) -> Place:
+    """The start of a programme: its way then lies in the middle of the water, surge and sway along x.
 
     One that goes both ways begins in the middle itself, and has half of the way to either side.
 
     Args:
         programme: On one axis; several at once begin in the middle.
         vehicle: Whose envelope keeps off the walls.
-        basin: The pool.
+        box: The water.
 
     Raises:
-        CalibrationError: The pool has no room for it.
+        CalibrationError: The water has no room for it.
     """
+    (x0, y0, z0), (x1, y1, z1) = box
     length, width, height = vehicle.body.size
     scale = room(vehicle.body.size)
-    top, bottom = -(0.5 * height + scale * SURFACE), -basin.depth + 0.5 * height + scale * FLOOR
-    middle = (0.0, 0.0, 0.5 * (top + bottom))
+    top, bottom = z1 - 0.5 * height - scale * SURFACE, z0 + 0.5 * height + scale * FLOOR
+    x, y, z = 0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.5 * (top + bottom)
     if len(programme.axes) != 1 or programme.axes[0] in ("roll", "pitch", "yaw"):
-        return Place(middle, 0.0, 0.5 * basin.width - 0.5 * math.hypot(length, width))
+        return Place((x, y, z), 0.0, 0.5 * (y1 - y0) - 0.5 * math.hypot(length, width))
     axis = programme.axes[0]
     sign = _sign(programme)
     if axis == "heave":
         way = top - bottom
-        z = middle[2] - 0.5 * sign * way
-        start = Place((0.0, 0.0, z), 0.0, way * (1.0 if sign else 0.5) - scale * STOPPING[axis])
+        start = Place(
+            (x, y, z - 0.5 * sign * way), 0.0, way * (1.0 if sign else 0.5) - scale * STOPPING[axis]
+        )
     else:
-        half = 0.5 * basin.length - 0.5 * (length if axis == "surge" else width) - scale * WALL
-        # Heading along the pool for surge; across it for sway, so that its left is where x falls.
+        half = 0.5 * (x1 - x0) - 0.5 * (length if axis == "surge" else width) - scale * WALL
+        # Heading along x for surge; across it for sway, so that its left is where x falls.
         ahead = 1.0 if axis == "surge" else -1.0
         yaw = 0.0 if axis == "surge" else 0.5 * math.pi
         start = Place(
-            (-sign * ahead * half, 0.0, middle[2]),
-            yaw,
-            half * (2.0 if sign else 1.0) - scale * STOPPING[axis],
+            (x - sign * ahead * half, y, z), yaw, half * (2.0 if sign else 1.0) - scale * STOPPING[axis]
         )
     if start.room is None or not start.room >= LEAST_ROOM:
         raise CalibrationError(

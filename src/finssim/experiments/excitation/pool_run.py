@@ -6,16 +6,21 @@ import hashlib
 import json
 import math
 import zlib
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from finssim.calibration.excitation.programmes import Programme
-from finssim.calibration.importers.dispatch import read_trials
-from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import write_trial
-from finssim.control.guidance import Station
-from finssim.experiments.excitation.places import place_of
+from finssim.experiments.excitation.places import box_of, place_of
+from finssim.experiments.excitation.programme_trial import (
+    ESTIMATOR,
+    about_programme,
+    fastest,
+    programme_trial,
+    trial_of_record,
+)
+from finssim.experiments.on_robot.play import play
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.pool.camera import PoolCamera
 from finssim.pool.draw_plant import draw_plant
@@ -24,18 +29,10 @@ from finssim.pool.virtual_pool import VirtualPool
 from finssim.quiet import start_warp
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.perception import Perception
-from finssim.robot.programme_pilot import ProgrammePilot
 from finssim.robot.recorder import Recorder
-from finssim.robot.runtime import Runtime
-from finssim.vehicles import AXES, Vehicle, load_vehicle
+from finssim.vehicles import load_vehicle
 
-__all__ = ["PoolRun", "play_programme", "trial_of_record"]
-
-GETTING_READY = 10.0
-"""Longest time until the estimator knows where the vehicle is [s]."""
-
-ESTIMATOR = "error-state"
-"""Mode of the estimator: it predicts with the accelerometer, so that its velocity does not lag behind the motion."""
+__all__ = ["PoolRun", "play_programme"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,21 +77,6 @@ class PoolRun:
         return f"{self.row}_{self.target}_{digest}"
 
 
-class _Phases:
-    """Tells the record when the programme's phase changes, and remembers how fast the vehicle was."""
-
-    def __init__(self, pilot: ProgrammePilot, recorder: Recorder, axis: int) -> None:
-        self._pilot, self._recorder, self._said = pilot, recorder, ""
-        self._axis, self.fastest = axis, 0.0
-
-    def __call__(self, runtime: Runtime) -> None:
-        if self._said and runtime.reading is not None:
-            self.fastest = max(self.fastest, abs(float(runtime.reading.nu[self._axis])))
-        if self._pilot.phase != self._said and runtime.reading is not None:
-            self._said = self._pilot.phase
-            self._recorder.event(runtime.reading.time, "phase", self._said)
-
-
 def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
     """Play a programme.
 
@@ -110,22 +92,10 @@ def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
     path.mkdir(parents=True, exist_ok=True)
     record = path.with_name(f"{path.name}.mcap")
     record.unlink(missing_ok=True)
-    fault, duration, fastest = _record(run, record)
+    fault, duration, speed = _record(run, record)
     trial = trial_of_record(record, run.programme.name, run.row)
     write_trial(trial, path, format="parquet")
-    return {"fault": fault, "duration": duration, "fastest": fastest, "notes": list(trial.notes)}
-
-
-def trial_of_record(record: Path, name: str, role: str) -> Trial:
-    """The trial of a record, from where its programme began.
-
-    Args:
-        record: MCAP of one programme.
-        name: Of the trial.
-        role: fit or held-out.
-    """
-    trial = read_trials([record], split="phase")[0]
-    return replace(trial, name=name, header=trial.header.model_copy(update={"role": role}))
+    return {"fault": fault, "duration": duration, "fastest": speed, "notes": list(trial.notes)}
 
 
 def _record(run: PoolRun, record: Path) -> tuple[str, float, float]:
@@ -133,57 +103,26 @@ def _record(run: PoolRun, record: Path) -> tuple[str, float, float]:
     vehicle, standing = load_vehicle(run.vehicle), load_vehicle(run.pool_vehicle)
     spec = draw_plant(standing, run.plant, run.severity)  # type: ignore[arg-type]
     true_site, known_site, settings = camera_of(standing, run.plant, run.severity)  # type: ignore[arg-type]
-    place = place_of(run.programme, vehicle, spec.basin)
+    place = place_of(run.programme, vehicle, box_of(spec.basin))
     seed = zlib.crc32(f"{run.seed} {run.row} {run.target}".encode()) & 0x7FFFFFFF
-    pilot = _pilot(run.programme, vehicle, place.room, run.hold)
-    about = {"trial": {"axis": list(run.programme.axes), "description": f"virtual pool: {run.target}"}}
-    with Recorder(record, vehicle, {**about, "seed": run.seed}, pictures="none") as recorder:
-        runtime = Runtime(
+    trial = programme_trial(run.programme, vehicle, place, hold=run.hold)
+    world = VirtualPool(
+        standing,
+        spec,
+        camera=PoolCamera(standing, true_site, mode="corners", settings=settings, seed=seed),
+        start=(place.position, quat_from_yaw(place.yaw)),
+        seed=seed,
+    )
+    about = {**about_programme(run.programme, "virtual pool"), "seed": run.seed}
+    with Recorder(record, vehicle, about, pictures="none") as recorder:
+        outcome = play(
+            trial,
+            lambda runtime, **how: run_lockstep(runtime, world, **how),
             vehicle,
             known_site,
-            pilot,
-            Station(place.position, place.yaw, name=run.target),
-            arm=True,
             perception=Perception(vehicle, known_site, mode=ESTIMATOR),
             recorder=recorder,
         )
-        world = VirtualPool(
-            standing,
-            spec,
-            camera=PoolCamera(standing, true_site, mode="corners", settings=settings, seed=seed),
-            start=(place.position, quat_from_yaw(place.yaw)),
-            seed=seed,
-        )
-        phases = _Phases(pilot, recorder, AXES.index(run.programme.axes[0]))
-        run_lockstep(
-            runtime,
-            world,
-            GETTING_READY + run.programme.duration,
-            show=phases,
-            until=lambda r: pilot.finished or r.bridge.state == "fault",
-        )
         world.close()
-    return _fault(runtime, pilot), 0.0 if math.isnan(runtime.t) else runtime.t, phases.fastest
-
-
-def _pilot(programme: Programme, vehicle: Vehicle, room: float | None, hold: str | None) -> ProgrammePilot:
-    return ProgrammePilot(
-        programme.tau_desired,
-        programme.phase,
-        programme.rate,
-        programme.axes,
-        vehicle,
-        room=room,
-        ascent_speed=programme.ascent_speed,
-        ascent_time=programme.ascent_time,
-        hold=hold,
-    )
-
-
-def _fault(runtime: Runtime, pilot: ProgrammePilot) -> str:
-    """Why the programme ended before its time, or never began; empty if it did neither."""
-    if math.isnan(runtime.started):
-        return f"never armed: {runtime.refusal or 'no state'}"
-    if runtime.bridge.state == "fault":
-        return runtime.bridge.reason
-    return "" if pilot.finished else "not finished"
+    t = outcome.runtime.t
+    return outcome.fault, 0.0 if math.isnan(t) else t, fastest(trial)

@@ -11,7 +11,7 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation.programmes import Programme
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import load_trial
-from finssim.experiments.excitation.places import place_of
+from finssim.experiments.excitation.places import box_of, place_of
 from finssim.experiments.excitation.pool_run import PoolRun, play_programme
 from finssim.experiments.running import Say
 from finssim.experiments.transfer.campaign import Show, run_jobs
@@ -75,9 +75,9 @@ def pool_trials(
         for programme in plan
     ]
     body, standing = load_vehicle(vehicle), load_vehicle(pool_vehicle)
-    basin = draw_plant(standing, plant, severity).basin  # type: ignore[arg-type]
+    box = box_of(draw_plant(standing, plant, severity).basin)  # type: ignore[arg-type]
     for run in runs:  # what cannot be is refused before anything is played
-        place_of(run.programme, body, basin)
+        place_of(run.programme, body, box)
     with tempfile.TemporaryDirectory() as scratch:
         results = run_jobs(
             runs,  # type: ignore[arg-type]

@@ -6,7 +6,6 @@ import math
 import tempfile
 import time
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,8 @@ from finssim.control.guidance import Guide, Station
 from finssim.control.trajectories import load_trajectory
 from finssim.control.trim import Trim
 from finssim.experiments.motion import PERIOD, Motion, localization_errors, measure
+from finssim.experiments.on_robot.play import RobotTrial
+from finssim.experiments.on_robot.play import play as play_trial
 from finssim.experiments.setpoints import T1_SETPOINTS, T1_START, in_room
 from finssim.experiments.transfer.job import Job
 from finssim.experiments.transfer.series import write_series
@@ -36,12 +37,41 @@ from finssim.robot.runtime import Runtime
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import room
 
-__all__ = ["play"]
+__all__ = ["job_trial", "play"]
 
 Array = NDArray[np.float64]
 
-GETTING_READY = 10.0
-"""Longest time until the estimator knows where the vehicle is [s]."""
+
+def job_trial(job: Job, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotTrial, Station]:
+    """The trial of a job, which ends when its time is over, and where it starts.
+
+    Args:
+        job: Who, and to what.
+        vehicle: As the robot knows it.
+        seed: Of noise on what the pilot sees.
+
+    Raises:
+        PolicyError, ControlError: The controller does not fit the vehicle or the task.
+    """
+    standing = load_vehicle(job.pool_vehicle)
+    guide: Guide
+    if job.task == "t1":
+        x, y, z, yaw = in_room(T1_SETPOINTS[job.target], standing).tolist()
+        guide, first = Station((x, y, z), yaw, name=job.target), in_room(T1_START, standing).tolist()
+    else:
+        guide = load_trajectory(job.target, vehicle=standing)
+        reference = guide.at(0.0)
+        first = [*reference.position.tolist(), float(reference.yaw)]
+    duration = guide.duration if math.isfinite(guide.duration) else job.duration
+    trial = RobotTrial(
+        name=f"{job.row}, {job.target}",
+        pilot=_pilot(job, vehicle, seed),
+        guide=guide,
+        duration=duration,
+        over=lambda runtime: runtime.t >= duration,
+        watch=_Estimates(),
+    )
+    return trial, Station((first[0], first[1], first[2]), first[3])
 
 
 class _Estimates:
@@ -71,82 +101,46 @@ def play(job: Job, path: Path) -> dict[str, Any]:
     start_warp()
     began = time.perf_counter()
     vehicle, standing = load_vehicle(job.vehicle), load_vehicle(job.pool_vehicle)
-    guide, start = _guide(job, standing)
     true_site, known_site, settings = camera_of(standing, job.plant, job.severity)
     seed = zlib.crc32(f"{job.seed} {job.target}".encode()) & 0x7FFFFFFF
-    runtime = Runtime(
-        vehicle,
-        known_site,
-        _pilot(job, vehicle, seed),
-        guide,
-        arm=True,
-        perception=Perception(vehicle, known_site, fusion=job.fusion),
-    )
-    duration = guide.duration if math.isfinite(guide.duration) else job.duration
-
-    def world(truth: Path) -> VirtualPool:
-        return VirtualPool(
+    trial, start = job_trial(job, vehicle, seed=seed)
+    with tempfile.TemporaryDirectory() as folder:
+        world = VirtualPool(
             standing,
             draw_plant(standing, job.plant, job.severity),
             camera=PoolCamera(standing, true_site, mode=job.camera, settings=settings, seed=seed),
-            start=(start[:3], quat_from_yaw(start[3])),
+            start=(np.asarray(start.position), quat_from_yaw(start.yaw)),
             seed=seed,
-            truth=truth,
+            truth=Path(folder) / "truth",
         )
-
-    series = _played(runtime, world, duration)
+        try:
+            outcome = play_trial(
+                trial,
+                lambda runtime, **how: run_lockstep(runtime, world, **how),
+                vehicle,
+                known_site,
+                perception=Perception(vehicle, known_site, fusion=job.fusion),
+            )
+        finally:
+            world.close()
+        found = read_truth(Path(folder) / "truth")
+    assert isinstance(trial.watch, _Estimates)
+    series = _series(found, outcome.runtime.started, trial.duration, np.array(trial.watch.rows))
     write_series(path, series)
     truth = Motion(**{name: series[name] for name in ("t", "position", "yaw", "quaternion", "thrust")})
     estimate = Motion(t=series["estimate_t"], position=series["estimate"], yaw=series["estimate_yaw"])
-    fault = _fault(runtime)
     return {
-        **measure(job.task, guide, truth, vehicle.force_limits, stopped=bool(fault)),
-        "fault": fault,
+        **measure(job.task, trial.guide, truth, vehicle.force_limits, stopped=bool(outcome.fault)),
+        "fault": outcome.fault,
         "room": room(standing.body.size),
         "localization": localization_errors(truth, estimate),
-        "missed_decisions": runtime.counters.missed,
+        "missed_decisions": outcome.runtime.counters.missed,
         "seconds": time.perf_counter() - began,
         "provenance": provenance(),
     }
 
 
-def _played(runtime: Runtime, world: Callable[[Path], VirtualPool], duration: float) -> dict[str, Array]:
-    """Let robot and world run for a time after arming; the series of truth and estimate."""
-    estimates = _Estimates()
-    with tempfile.TemporaryDirectory() as folder:
-        pool = world(Path(folder) / "truth")
-        try:
-            run_lockstep(
-                runtime,
-                pool,
-                GETTING_READY + duration,
-                show=estimates,
-                until=lambda r: r.t >= duration or r.bridge.state == "fault",
-            )
-        finally:
-            pool.close()
-        truth = read_truth(Path(folder) / "truth")
-    return _series(truth, runtime.started, duration, np.array(estimates.rows))
-
-
-def _fault(runtime: Runtime) -> str:
-    """Why the trial ended before its time, or never began; empty if it did neither."""
-    if math.isnan(runtime.started):
-        return f"never armed: {runtime.refusal or 'no state'}"
-    return runtime.bridge.reason if runtime.bridge.state == "fault" else ""
-
-
-def _guide(job: Job, standing: Vehicle) -> tuple[Guide, Array]:
-    """The wanted motion, and the pose at which the vehicle is put into the pool: [x, y, z, yaw]."""
-    if job.task == "t1":
-        x, y, z, yaw = in_room(T1_SETPOINTS[job.target], standing).tolist()
-        return Station((x, y, z), yaw, name=job.target), in_room(T1_START, standing)
-    trajectory = load_trajectory(job.target, vehicle=standing)
-    first = trajectory.at(0.0)
-    return trajectory, np.array([*first.position, float(first.yaw)])
-
-
-def _pilot(job: Job, vehicle: Any, seed: int) -> Pilot:
+def _pilot(job: Job, vehicle: Vehicle, seed: int) -> Pilot:
     pilot: Pilot = make_pilot(job.controller, vehicle, task=job.task, trim=Trim() if job.trim else None)
     if job.position_noise or job.yaw_noise:
         return NoisyInput(pilot, position_std=job.position_noise, yaw_std=job.yaw_noise, seed=seed)

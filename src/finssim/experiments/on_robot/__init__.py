@@ -1,0 +1,1 @@
+"""Trials on a robot: real or virtual, the same software, the same steps."""

@@ -1,0 +1,60 @@
+"""A virtual pool in lock-step behind a port, as `finssim pool --lockstep` serves it, and a person beside it."""
+
+import threading
+from contextlib import contextmanager
+
+from finssim.geometry.rotations import quat_from_yaw
+from finssim.localization.pool import write_pool
+from finssim.pool.camera import PoolCamera
+from finssim.pool.draw_plant import draw_plant
+from finssim.pool.server import LockstepServer
+from finssim.pool.site import camera_of
+from finssim.pool.virtual_pool import VirtualPool
+from finssim.quiet import start_warp
+from finssim.robot.wiring import Wiring
+
+
+@contextmanager
+def lockstep_pool(
+    vehicle, pool_file, *, position=(0.0, 0.0, -0.5), yaw=0.0, plant=1, severity="nominal", truth=None
+):
+    """The wiring to a pool that lives for as long as the block; its pool file is written."""
+    start_warp()
+    true_site, known_site, settings = camera_of(vehicle, plant, severity)
+    write_pool(known_site, pool_file)
+    world = VirtualPool(
+        vehicle,
+        draw_plant(vehicle, plant, severity),
+        camera=PoolCamera(vehicle, true_site, mode="corners", settings=settings, seed=1),
+        start=(position, quat_from_yaw(yaw)),
+        seed=1,
+        truth=truth,
+    )
+    server = LockstepServer(("127.0.0.1", 0))
+    thread = threading.Thread(target=server.serve, args=(world,), daemon=True)
+    thread.start()
+    try:
+        yield Wiring(robot="{}:{}".format(*server.address), lockstep=True)
+    finally:
+        thread.join(20.0)
+        server.close()
+        world.close()
+
+
+class Person:
+    """Presses keys, each at the first line that holds its words; after the last one enter whenever asked to."""
+
+    def __init__(self, *presses, then="\r"):
+        self._presses, self._then, self.read, self._key = list(presses), then, [], ""
+
+    def line(self, text):
+        if not self.read or self.read[-1] != text:
+            self.read.append(text)
+        if self._presses and self._presses[0][0] in text:
+            self._key = self._presses.pop(0)[1]
+        elif not self._presses and text.startswith("enter:"):
+            self._key = self._then
+
+    def keys(self):
+        key, self._key = self._key, ""
+        return [key] if key else []
