@@ -3,11 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from finssim.cli_options import Json, Seed, Steps, Vehicle
+from finssim.cli_options import (
+    Arm,
+    Bind,
+    ByHand,
+    Json,
+    Lockstep,
+    Pictures,
+    Robot,
+    RobotPool,
+    Seed,
+    Steps,
+    Unattended,
+    Vehicle,
+)
+
+if TYPE_CHECKING:
+    from finssim.experiments.on_robot.session import OnRobot
 
 __all__ = ["ablation", "everything", "faults", "soak", "stack", "t1", "t2", "timing"]
 
@@ -53,6 +69,24 @@ def _options(rows: str | None, targets: str | None, **options: Any) -> dict[str,
     return options | {key: tuple(words.split(",")) for key, words in chosen.items() if words is not None}
 
 
+def _robot(address: str | None, options: dict[str, Any], **how: Any) -> OnRobot | None:
+    """The robot of an experiment, or none; what tells of pools does not go with it."""
+    if address is None:
+        if any(how[name] for name in ("arm", "by_hand", "unattended", "lockstep", "pool_file", "pictures")):
+            raise typer.BadParameter(
+                "--arm, --by-hand, --unattended, --lockstep, --pool-file and --pictures tell of a robot: name one "
+                "with --robot"
+            )
+        return None
+    if (options["plants"], options["severity"], options["camera"]) != (3, "realistic", "corners"):
+        raise typer.BadParameter(
+            "a robot has its own plant and camera: leave --plants, --severity and --camera out"
+        )
+    from finssim.cli_robot import on_robot
+
+    return on_robot(address, **how)
+
+
 def t1(
     out: Out,
     plants: Plants = 3,
@@ -65,11 +99,23 @@ def t1(
     vehicle: Vehicle = "finsrov",
     steps: Steps = None,
     processes: Processes = None,
+    robot: Robot = None,
+    pool_file: RobotPool = None,
+    bind: Bind = "127.0.0.1:54321",
+    pictures: Pictures = None,
+    lockstep: Lockstep = False,
+    arm: Arm = False,
+    by_hand: ByHand = False,
+    unattended: Unattended = False,
     as_json: Json = False,
 ) -> None:
     """Station keeping in the virtual pool (the paper's Table IV): success, errors [m, deg], time to settle [s], jitter.
 
+    With --robot the published protocol on a vehicle, guided on the screen, marked as hardware.
+
     Example: finssim experiment t1 --rows calibrated,pid --seeds 1 --out t1
+
+    Example: finssim experiment t1 --rows pid --seeds 1 --robot serial:/dev/ttyUSB0 --pool-file p.yaml --arm --out hw
     """
     from finssim.experiments.transfer.experiment import run
     from finssim.experiments.transfer.t1 import T1
@@ -77,6 +123,10 @@ def t1(
     options = _options(
         rows, setpoints, plants=plants, seeds=seeds, seed=seed, severity=severity, camera=camera
     )
+    options["robot"] = _robot(
+        robot, options, bind=bind, pictures=pictures, lockstep=lockstep, pool_file=pool_file, arm=arm,
+        by_hand=by_hand, unattended=unattended,
+    )  # fmt: skip
     run(T1, out=out, vehicle=vehicle, steps=steps, processes=processes, as_json=as_json, **options)
 
 
@@ -92,9 +142,19 @@ def t2(
     vehicle: Vehicle = "finsrov",
     steps: Steps = None,
     processes: Processes = None,
+    robot: Robot = None,
+    pool_file: RobotPool = None,
+    bind: Bind = "127.0.0.1:54321",
+    pictures: Pictures = None,
+    lockstep: Lockstep = False,
+    arm: Arm = False,
+    by_hand: ByHand = False,
+    unattended: Unattended = False,
     as_json: Json = False,
 ) -> None:
     """Trajectory tracking in the virtual pool (the paper's Table V): horizontal and vertical RMSE, 3-D P95 [m].
+
+    With --robot the published protocol on a vehicle, guided on the screen, marked as hardware.
 
     Example: finssim experiment t2 --rows calibrated-dr,pid --trajectories lemniscate --seeds 1 --out t2
     """
@@ -104,6 +164,10 @@ def t2(
     options = _options(
         rows, trajectories, plants=plants, seeds=seeds, seed=seed, severity=severity, camera=camera
     )
+    options["robot"] = _robot(
+        robot, options, bind=bind, pictures=pictures, lockstep=lockstep, pool_file=pool_file, arm=arm,
+        by_hand=by_hand, unattended=unattended,
+    )  # fmt: skip
     run(T2, out=out, vehicle=vehicle, steps=steps, processes=processes, as_json=as_json, **options)
 
 

@@ -19,6 +19,7 @@ __all__ = [
     "PixelStd",
     "Pool",
     "Robot",
+    "RobotPool",
     "Seed",
     "Steps",
     "Unattended",
@@ -59,6 +60,10 @@ Robot = Annotated[
         "virtual pool on this machine. With --lockstep: pool, or HOST:PORT.",
         metavar="ADDRESS",
     ),
+]
+RobotPool = Annotated[
+    Path | None,
+    typer.Option(help="Of that robot: camera, water plane and frames (.yaml).", metavar="FILE"),
 ]
 Bind = Annotated[
     str,

@@ -1,7 +1,9 @@
 """A virtual pool in lock-step behind a port, as `finssim pool --lockstep` serves it, and a person beside it."""
 
+import math
 import threading
 from contextlib import contextmanager
+from dataclasses import replace
 
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.localization.pool import write_pool
@@ -14,15 +16,33 @@ from finssim.quiet import start_warp
 from finssim.robot.wiring import Wiring
 
 
+class Silent(VirtualPool):
+    """Its motor controller says nothing more from a time on [s]."""
+
+    silent_from = math.inf
+
+    def exchange(self, until, sent):
+        delivery = super().exchange(until, sent)
+        return replace(delivery, frames=()) if delivery.time >= self.silent_from else delivery
+
+
 @contextmanager
 def lockstep_pool(
-    vehicle, pool_file, *, position=(0.0, 0.0, -0.5), yaw=0.0, plant=1, severity="nominal", truth=None
+    vehicle,
+    pool_file,
+    *,
+    position=(0.0, 0.0, -0.5),
+    yaw=0.0,
+    plant=1,
+    severity="nominal",
+    truth=None,
+    silent_from=math.inf,
 ):
     """The wiring to a pool that lives for as long as the block; its pool file is written."""
     start_warp()
     true_site, known_site, settings = camera_of(vehicle, plant, severity)
     write_pool(known_site, pool_file)
-    world = VirtualPool(
+    world = Silent(
         vehicle,
         draw_plant(vehicle, plant, severity),
         camera=PoolCamera(vehicle, true_site, mode="corners", settings=settings, seed=1),
@@ -30,6 +50,7 @@ def lockstep_pool(
         seed=1,
         truth=truth,
     )
+    world.silent_from = silent_from
     server = LockstepServer(("127.0.0.1", 0))
     thread = threading.Thread(target=server.serve, args=(world,), daemon=True)
     thread.start()

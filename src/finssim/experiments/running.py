@@ -26,6 +26,7 @@ def run_experiment(
     out: Path,
     as_json: bool,
     console: Console | None,
+    bar: bool = True,
 ) -> dict[str, Any]:
     """Run an experiment with a progress bar on standard error and print what it found.
 
@@ -36,15 +37,16 @@ def run_experiment(
         out: The directory.
         as_json: Print one JSON object in place of the table.
         console: Where the table goes; standard output if None.
+        bar: Show it; False where the work has a line of its own on the screen.
 
     Returns:
         What `work` returned.
     """
     start_warp()
     screen = Console(stderr=True)
-    with Progress(console=screen, transient=True, disable=not screen.is_terminal) as progress:
-        bar = progress.add_task(name, total=1.0)
-        result = work(lambda part, what: progress.update(bar, completed=part, description=what))
+    with Progress(console=screen, transient=True, disable=not bar or not screen.is_terminal) as progress:
+        task = progress.add_task(name, total=1.0)
+        result = work(lambda part, what: progress.update(task, completed=part, description=what))
     if as_json:
         print(json.dumps(result, allow_nan=False))
         return result

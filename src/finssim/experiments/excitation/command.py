@@ -27,6 +27,7 @@ from finssim.experiments.on_robot.play import Attendant, RobotTrial
 from finssim.experiments.on_robot.session import OnRobot, RobotError, Session, check_starts, session
 from finssim.files import atomic_directory, atomic_write
 from finssim.quiet import start_warp
+from finssim.robot.perception import Perception
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
 __all__ = ["excite_in_pool", "excite_on_robot", "robot_trials"]
@@ -164,7 +165,14 @@ def robot_trials(
 
         if not record.is_file():
             about = {"command": "finssim excite", **about_programme(programme, opened.robot.title)}
-            outcome = opened.trial(attempt, starts[name], record, counts=False, mode=ESTIMATOR, about=about)
+            outcome = opened.trial(
+                attempt,
+                starts[name],
+                record,
+                counts=False,
+                perception=lambda: Perception(vehicle, opened.site, mode=ESTIMATOR),
+                about=about,
+            )
             if outcome is None:
                 continue
             unit = "m/s" if programme.axes[0] in AXES[:3] else "rad/s"

@@ -93,7 +93,7 @@ class Session:
         record: Path,
         *,
         counts: bool,
-        mode: str = "constant-velocity",
+        perception: Callable[[], Perception] | None = None,
         about: Mapping[str, Any] | None = None,
     ) -> Outcome | None:
         """Play a trial until it is done, the operator skips it, or it cannot be.
@@ -104,7 +104,7 @@ class Session:
             record: File of its record, made once it is done; records of attempts that do not count go to `aborted/`.
             counts: Whether a trial that the bridge stopped counts as it is; it is played again if not. One that the
                 operator stopped never counts.
-            mode: Of the estimator.
+            perception: Otherwise than by default, made anew for every attempt.
             about: Metadata of the record.
 
         Returns:
@@ -118,7 +118,7 @@ class Session:
             trial = make()
             x, y, z = start.position
             self._say(f"{trial.name}: from {x:.2f}, {y:.2f}, {z:.2f} m, {math.degrees(start.yaw):.0f}°")
-            outcome, partial = self._attempt(trial, start, record, mode, about or {})
+            outcome, partial = self._attempt(trial, start, record, perception, about or {})
             stopped_by_hand = outcome.fault == "stopped by the operator"
             done = outcome.ended == "over" or (
                 counts and outcome.begun and outcome.ended == "fault" and not stopped_by_hand
@@ -144,7 +144,7 @@ class Session:
         trial: RobotTrial,
         start: Station,
         record: Path,
-        mode: str,
+        perception: Callable[[], Perception] | None,
         about: Mapping[str, Any],
     ) -> tuple[Outcome, Path]:
         """One attempt and its record, which is not yet in its place."""
@@ -167,7 +167,7 @@ class Session:
                 self._drive,
                 self.vehicle,
                 self.site,
-                perception=Perception(self.vehicle, self.site, mode=mode),
+                perception=perception and perception(),
                 recorder=recorder,
                 placing=Placing(start=start, by_hand=self.robot.by_hand, attendant=self._attendant),
             )

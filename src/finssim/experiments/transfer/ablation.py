@@ -103,7 +103,7 @@ def _table(spec: Spec, result: Mapping[str, Any]) -> Shown:
             rows.append((["  paper", *cells], THEIRS))
     return Shown(
         title=f"Ablation, {spec.name.upper()}: differences from {spec.rows[spec.base].title}",
-        headline=f"{spec.name.upper()} in the {where(result, 'targets')}",
+        headline=f"{spec.name.upper()} {where(result, 'targets')}",
         heads=["", *(UNITS[key][0] for key in spec.differences)],
         rows=rows,
         note=NOTE,

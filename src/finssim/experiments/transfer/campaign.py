@@ -17,7 +17,7 @@ from finssim.experiments.running import Say
 from finssim.experiments.transfer.job import Job
 from finssim.files import atomic_write
 
-__all__ = ["Play", "Show", "run_jobs"]
+__all__ = ["Play", "Show", "run_in_turn", "run_jobs"]
 
 WATCH = 1.0
 """Time between two looks of a worker at its parent [s]."""
@@ -58,6 +58,34 @@ def run_jobs(
     if missing:
         _play_all(missing, folder, play, processes or os.cpu_count() or 1, len(set(keys)), say, show)
     return [json.loads((folder / f"{key}.json").read_text(encoding="utf-8")) for key in keys]
+
+
+def run_in_turn(
+    jobs: Sequence[Job],
+    folder: Path,
+    play: Callable[[Job, Path], dict[str, Any] | None],
+    *,
+    show: Show = lambda job, result: None,
+) -> list[dict[str, Any]]:
+    """The same in this process, one after the other, for what there is only one of.
+
+    Args:
+        jobs: Trials; equal ones are played once, and those without a result are left out.
+        folder: Takes KEY.json of each, made if missing.
+        play: Its result; None: there is none yet, and the next call tries again.
+        show: Given each trial that is played now and its result.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    results = []
+    for job in {job.key(): job for job in jobs}.values():
+        file = folder / f"{job.key()}.json"
+        if not file.is_file():
+            result = play(job, folder / job.key())
+            if result is None:
+                continue
+            show(job, _write(job, folder, result))
+        results.append(json.loads(file.read_text(encoding="utf-8")))
+    return results
 
 
 def _play_all(
@@ -105,11 +133,13 @@ def _end_with(parent: int) -> None:
 
 
 def _play_one(key: str, job: Job, folder: Path, play: Play) -> dict[str, Any]:
-    result = {
-        "key": key,
-        "job": {**job.described(), "row": job.row, "target": job.target},
-        **play(job, folder / key),
-    }
+    return _write(job, folder, play(job, folder / key))
+
+
+def _write(job: Job, folder: Path, played: Mapping[str, Any]) -> dict[str, Any]:
+    """Write KEY.json of a result, with its job."""
+    key = job.key()
+    result = {"key": key, "job": {**job.described(), "row": job.row, "target": job.target}, **played}
     with atomic_write(folder / f"{key}.json") as temporary:
         temporary.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     return result

@@ -10,6 +10,8 @@ from typing import Any
 
 from rich.console import Console
 
+from finssim.experiments.on_robot.play import Attendant
+from finssim.experiments.on_robot.session import OnRobot
 from finssim.experiments.running import Say, run_experiment
 from finssim.experiments.transfer.campaign import run_jobs
 from finssim.experiments.transfer.intervals import Interval
@@ -17,6 +19,7 @@ from finssim.experiments.transfer.job import Job
 from finssim.experiments.transfer.policies import Training, trained
 from finssim.experiments.transfer.pool_trial import play
 from finssim.experiments.transfer.ranges import INTERVALS, interval_ranges
+from finssim.experiments.transfer.robot_trial import HARDWARE, run_on_robot
 from finssim.experiments.transfer.scores import difference, row_figures
 from finssim.experiments.transfer.sentences import sentence
 from finssim.experiments.transfer.spec import Row, Spec
@@ -48,6 +51,7 @@ def run(
         out=out,
         as_json=as_json,
         console=console,
+        bar=options.get("robot") is None,
     )
 
 
@@ -65,6 +69,8 @@ def transfer_experiment(
     vehicle: str = "finsrov",
     steps: int | None = None,
     processes: int | None = None,
+    robot: OnRobot | None = None,
+    attendant: Attendant | None = None,
     say: Say = lambda part, what: None,
 ) -> dict[str, Any]:
     """Train what the rows need, play every target in every plant with every seed, and write the table.
@@ -85,6 +91,8 @@ def transfer_experiment(
         vehicle: Name or file.
         steps: Of each training; the task's own if None.
         processes: Trials at once; as many as processors if None.
+        robot: Play on a robot, one trial after the other, instead of in pools; plants, severity and camera are its own.
+        attendant: The person beside that robot, instead of the terminal's keyboard.
         say: Told the share that is done and what comes next.
 
     Returns:
@@ -106,6 +114,8 @@ def transfer_experiment(
     policies = _policies(
         spec, chosen, run_seeds, folder, vehicle, steps, lambda part, what: say(TRAINING_SHARE * part, what)
     )
+    if robot is not None:  # there is one plant, and nobody chose its severity
+        places, severity, camera = range(1), HARDWARE, HARDWARE
     jobs = [
         Job(
             row=name, controller=row.controller or str(policies[row.training or "", s]), target=target,
@@ -114,14 +124,18 @@ def transfer_experiment(
         )
         for name, row in chosen.items() for plant in places for s in run_seeds for target in targets
     ]  # fmt: skip
-    results = run_jobs(
-        jobs, folder / "trials", play, processes=processes,
-        say=lambda part, what: say(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, what),
-    )  # fmt: skip
+    if robot is None:
+        results = run_jobs(
+            jobs, folder / "trials", play, processes=processes,
+            say=lambda part, what: say(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, what),
+        )  # fmt: skip
+    else:
+        results = run_on_robot(jobs, folder / "trials", robot, attendant=attendant)
     by_row: Results = {name: [r for r in results if r["job"]["row"] == name] for name in chosen}
+    by_row = {name: played for name, played in by_row.items() if played}  # all of a row may have been skipped
     told = {
         "experiment": spec.name, "severity": severity, "camera": camera, "plants": list(places),
-        "seeds": list(run_seeds), "targets": list(targets),
+        "seeds": list(run_seeds), "targets": list(targets), "robot": robot and robot.title,
         "vehicle": {"name": load_vehicle(vehicle).name, "sha256": load_vehicle(vehicle).sha256},
     }  # fmt: skip
     result = {**told, **_scores(spec, by_row), "trials": results, "provenance": provenance()}

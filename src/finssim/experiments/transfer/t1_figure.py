@@ -35,4 +35,6 @@ def draw_t1(
             envelopes[titles[name]] = error_envelope(trials)
     if not envelopes:
         return None
-    return save_envelopes(envelopes, folder / FIGURE_FILE, "T1 in the virtual pool: median and middle half")
+    severities = {result["job"]["severity"] for results in by_row.values() for result in results}
+    place = "on hardware" if "hardware" in severities else "in the virtual pool"
+    return save_envelopes(envelopes, folder / FIGURE_FILE, f"T1 {place}: median and middle half")

@@ -8,13 +8,12 @@ from typing import Any
 from finssim.experiments.paper_results import paper_row
 from finssim.experiments.results_table import COLUMNS, FORMATS, cells
 from finssim.experiments.transfer.spec import Row
-from finssim.experiments.transfer.table import OURS, THEIRS, Shown, where, with_ci
+from finssim.experiments.transfer.table import OURS, THEIRS, Shown, mark, ours, where, with_ci
 
 __all__ = ["t1_table"]
 
 NOTE = (
-    "ours: a virtual pool whose vehicle, water and camera no training has seen; mean, in brackets 95 % from a "
-    "bootstrap of plants and seeds. paper: its vehicle in its pool, one seed. errors: 40-60 s; e_y is vertical; "
+    ". paper: its vehicle in its pool, one seed. errors: 40-60 s; e_y is vertical; "
     "success: 0.10 m on each axis and 10° for 10 s. t_s (median) and jitter are of successful trials."
 )
 
@@ -29,15 +28,15 @@ def t1_table(result: Mapping[str, Any], known: Mapping[str, Row]) -> Shown:
     rows: list[tuple[list[str], str]] = []
     for name, figures in result["rows"].items():
         row = known[name]
-        ours = [with_ci(figures[key], form) for key, form in FORMATS.items()]
-        rows.append(([row.title, f"{figures['success']}/{figures['trials']}", *ours], OURS))
+        figured = [with_ci(figures[key], form) for key, form in FORMATS.items()]
+        rows.append(([mark(row.title, result), f"{figures['success']}/{figures['trials']}", *figured], OURS))
         if row.paper is not None:
             rows.append(([f"  paper: {row.paper}", *cells(paper_row(row.paper))], THEIRS))
     return Shown(
         title="Station keeping (T1)",
-        headline=f"T1 in the {where(result, 'setpoints')}",
+        headline=f"T1 {where(result, 'setpoints')}",
         heads=["", *COLUMNS.values()],
         rows=rows,
-        note=NOTE,
+        note=ours(result) + NOTE,
         sentences=result["sentences"],
     )

@@ -7,7 +7,7 @@ from typing import Any
 
 from finssim.experiments.paper_results import PAPER_T2
 from finssim.experiments.transfer.spec import Row
-from finssim.experiments.transfer.table import OURS, THEIRS, Shown, where, with_ci
+from finssim.experiments.transfer.table import OURS, THEIRS, Shown, mark, ours, where, with_ci
 
 __all__ = ["t2_table"]
 
@@ -17,10 +17,7 @@ COLUMNS = {
     "p95_m": "3-D P95 [m]",
 }
 
-NOTE = (
-    "ours: a virtual pool whose vehicle, water and camera no training has seen; mean, in brackets 95 % from a "
-    "bootstrap of plants and seeds; done: trials that reached the end. paper: its vehicle in its pool."
-)
+NOTE = "; done: trials that reached the end. paper: its vehicle in its pool."
 
 
 def t2_table(result: Mapping[str, Any], known: Mapping[str, Row]) -> Shown:
@@ -33,17 +30,22 @@ def t2_table(result: Mapping[str, Any], known: Mapping[str, Row]) -> Shown:
     rows: list[tuple[list[str], str]] = []
     for name, figures in result["rows"].items():
         for target, one in figures["by_target"].items():
-            ours = [with_ci(one[key], ".3f") for key in COLUMNS]
-            rows.append(([known[name].title, target, f"{one['success']}/{one['trials']}", *ours], OURS))
+            figured = [with_ci(one[key], ".3f") for key in COLUMNS]
+            rows.append(
+                (
+                    [mark(known[name].title, result), target, f"{one['success']}/{one['trials']}", *figured],
+                    OURS,
+                )
+            )
             paper = PAPER_T2.get(known[name].paper or "", {}).get(target)
             if paper is not None:
                 theirs = [f"{value:.3f}" for value in paper]
                 rows.append(([f"  paper: {known[name].paper}", target, "", *theirs], THEIRS))
     return Shown(
         title="Trajectory tracking (T2)",
-        headline=f"T2 in the {where(result, 'trajectories')}",
+        headline=f"T2 {where(result, 'trajectories')}",
         heads=["", "trajectory", "done", *COLUMNS.values()],
         rows=rows,
-        note=NOTE,
+        note=ours(result) + NOTE,
         sentences=result["sentences"],
     )
