@@ -27,7 +27,22 @@ from finssim import (
     cli_view,
     cli_vision,
 )
-from finssim.cli_options import Device, Hydrodynamics, Json, Seed, Steps, Vehicle
+from finssim.cli_options import (
+    Arm,
+    Bind,
+    ByHand,
+    Device,
+    Hydrodynamics,
+    Json,
+    Lockstep,
+    Pictures,
+    Robot,
+    RobotPool,
+    Seed,
+    Steps,
+    Unattended,
+    Vehicle,
+)
 from finssim.quiet import start_warp
 
 __all__ = ["app", "main"]
@@ -110,15 +125,29 @@ def demo(
     vehicle: Vehicle = "finsrov",
     seed: Seed = 1,
     steps: Steps = None,
+    robot: Robot = None,
+    pool_file: RobotPool = None,
+    bind: Bind = "127.0.0.1:54321",
+    pictures: Pictures = None,
+    lockstep: Lockstep = False,
+    arm: Arm = False,
+    by_hand: ByHand = False,
+    unattended: Unattended = False,
 ) -> None:
-    """Identify a vehicle in the virtual pool, train in it, deploy there beside two PIDs, write a report.
+    """Identify a vehicle in the virtual pool or on a robot, train in it, deploy there beside two PIDs, write a report.
 
     Example: finssim demo --vehicle bluerov2_heavy --out demo
+
+    Example: finssim demo --robot udp://10.0.0.2:58766 --pool-file pool.yaml --arm --out demo
     """
     start_warp()
     from finssim.experiments.demo import demo as run
 
-    run(out, vehicle=vehicle, seed=seed, steps=steps)
+    where = cli_robot.robot_or_none(
+        robot, bind=bind, pictures=pictures, lockstep=lockstep, pool_file=pool_file, arm=arm, by_hand=by_hand,
+        unattended=unattended,
+    )  # fmt: skip
+    run(out, vehicle=vehicle, seed=seed, steps=steps, robot=where)
 
 
 @app.command()

@@ -21,6 +21,7 @@ from finssim.cli_options import (
     Unattended,
     Vehicle,
 )
+from finssim.cli_robot import robot_or_none
 
 if TYPE_CHECKING:
     from finssim.experiments.on_robot.session import OnRobot
@@ -71,20 +72,12 @@ def _options(rows: str | None, targets: str | None, **options: Any) -> dict[str,
 
 def _robot(address: str | None, options: dict[str, Any], **how: Any) -> OnRobot | None:
     """The robot of an experiment, or none; what tells of pools does not go with it."""
-    if address is None:
-        if any(how[name] for name in ("arm", "by_hand", "unattended", "lockstep", "pool_file", "pictures")):
-            raise typer.BadParameter(
-                "--arm, --by-hand, --unattended, --lockstep, --pool-file and --pictures tell of a robot: name one "
-                "with --robot"
-            )
-        return None
-    if (options["plants"], options["severity"], options["camera"]) != (3, "realistic", "corners"):
+    own = (options["plants"], options["severity"], options["camera"]) == (3, "realistic", "corners")
+    if address is not None and not own:
         raise typer.BadParameter(
             "a robot has its own plant and camera: leave --plants, --severity and --camera out"
         )
-    from finssim.cli_robot import on_robot
-
-    return on_robot(address, **how)
+    return robot_or_none(address, **how)
 
 
 def t1(

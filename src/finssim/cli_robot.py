@@ -12,7 +12,7 @@ from finssim.cli_options import Arm, Bind, Json, Lockstep, Pictures, Vehicle
 if TYPE_CHECKING:
     from finssim.experiments.on_robot.session import OnRobot
 
-__all__ = ["on_robot", "run"]
+__all__ = ["robot_or_none", "run"]
 
 
 def run(
@@ -122,8 +122,8 @@ def run(
         raise typer.Exit(status)
 
 
-def on_robot(
-    robot: str,
+def robot_or_none(
+    robot: str | None,
     *,
     bind: str,
     pictures: str | None,
@@ -132,13 +132,20 @@ def on_robot(
     arm: bool,
     by_hand: bool,
     unattended: bool,
-) -> OnRobot:
-    """The robot that options name."""
+) -> OnRobot | None:
+    """The robot that options name; none where they name none, and nothing tells of one."""
+    if robot is None:
+        if arm or by_hand or unattended or lockstep or pool_file is not None or pictures is not None:
+            raise typer.BadParameter(
+                "--arm, --by-hand, --unattended, --lockstep, --pool-file and --pictures tell of a robot: name one "
+                "with --robot"
+            )
+        return None
+    if pool_file is None:
+        raise typer.BadParameter("a robot knows where it is by its pool file: give --pool-file")
     from finssim.experiments.on_robot.session import OnRobot
     from finssim.robot.wiring import Wiring
 
-    if pool_file is None:
-        raise typer.BadParameter("a robot knows where it is by its pool file: give --pool-file")
     return OnRobot(
         wiring=Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep),
         pool_file=pool_file,

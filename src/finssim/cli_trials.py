@@ -22,6 +22,7 @@ from finssim.cli_options import (
     Unattended,
     Vehicle,
 )
+from finssim.cli_robot import robot_or_none
 from finssim.quiet import start_warp
 
 __all__ = ["excite", "trials_app"]
@@ -199,26 +200,22 @@ def excite(
     wanted = _levels(levels)
     start_warp()
     plan = {"kind": kind, "levels": wanted, "repeats": repeats, "coast": coast, "duration": duration}
-    if robot is not None:
-        if simulate or pool is not None or severity is not None or pool_vehicle is not None:
-            raise typer.BadParameter(
-                "--robot is where it is done: leave --simulate, --pool and what tells of it out"
-            )
-        from finssim.cli_robot import on_robot
+    if robot is not None and (
+        simulate or pool is not None or severity is not None or pool_vehicle is not None
+    ):
+        raise typer.BadParameter(
+            "--robot is where it is done: leave --simulate, --pool and what tells of it out"
+        )
+    where = robot_or_none(
+        robot, bind=bind, pictures=pictures, lockstep=lockstep, pool_file=pool_file, arm=arm, by_hand=by_hand,
+        unattended=unattended,
+    )  # fmt: skip
+    if where is not None:
         from finssim.experiments.excitation.command import excite_on_robot
 
-        where = on_robot(
-            robot, bind=bind, pictures=pictures, lockstep=lockstep, pool_file=pool_file, arm=arm, by_hand=by_hand,
-            unattended=unattended,
-        )  # fmt: skip
         made = excite_on_robot(axes, vehicle=vehicle, out=out, robot=where, seed=seed, room=room, **plan)
         _print_folders(made, as_json)
         return
-    if arm or by_hand or unattended or lockstep or pool_file is not None or pictures is not None:
-        raise typer.BadParameter(
-            "--arm, --by-hand, --unattended, --lockstep, --pool-file and --pictures tell of a robot: name one "
-            "with --robot"
-        )
     if pool is not None:
         if simulate or room is not None:
             raise typer.BadParameter(

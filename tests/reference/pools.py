@@ -37,29 +37,46 @@ def lockstep_pool(
     severity="nominal",
     truth=None,
     silent_from=math.inf,
+    sessions=1,
 ):
-    """The wiring to a pool that lives for as long as the block; its pool file is written."""
+    """The wiring to a pool that lives for as long as the block; its pool file is written.
+
+    A pool ends when its robot leaves: with several `sessions` another one then begins on the same port.
+    """
     start_warp()
     true_site, known_site, settings = camera_of(vehicle, plant, severity)
     write_pool(known_site, pool_file)
-    world = Silent(
-        vehicle,
-        draw_plant(vehicle, plant, severity),
-        camera=PoolCamera(vehicle, true_site, mode="corners", settings=settings, seed=1),
-        start=(position, quat_from_yaw(yaw)),
-        seed=1,
-        truth=truth,
-    )
-    world.silent_from = silent_from
-    server = LockstepServer(("127.0.0.1", 0))
-    thread = threading.Thread(target=server.serve, args=(world,), daemon=True)
+
+    def world():
+        made = Silent(
+            vehicle,
+            draw_plant(vehicle, plant, severity),
+            camera=PoolCamera(vehicle, true_site, mode="corners", settings=settings, seed=1),
+            start=(position, quat_from_yaw(yaw)),
+            seed=1,
+            truth=truth,
+        )
+        made.silent_from = silent_from
+        return made
+
+    first = LockstepServer(("127.0.0.1", 0))
+
+    def serve():
+        server = first
+        for number in range(sessions):
+            pool = world()
+            server.serve(pool)
+            pool.close()
+            if number + 1 < sessions:
+                server = LockstepServer(first.address)
+
+    thread = threading.Thread(target=serve, daemon=True)
     thread.start()
     try:
-        yield Wiring(robot="{}:{}".format(*server.address), lockstep=True)
+        yield Wiring(robot="{}:{}".format(*first.address), lockstep=True)
     finally:
         thread.join(20.0)
-        server.close()
-        world.close()
+        first.close()
 
 
 class Person:

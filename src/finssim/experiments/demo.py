@@ -15,25 +15,30 @@ from typing import Any
 
 from rich.console import Console
 
-from finssim.calibration.excitation.programmes import programmes
+from finssim.calibration.excitation.programmes import Programme, programmes
 from finssim.calibration.trials.trial import Trial
 from finssim.control.policy import Policy
 from finssim.control.policy_description import DESCRIPTION_FILE
 from finssim.experiments.camera_view import camera_view
 from finssim.experiments.demo_files import PLANT_FILE, TRIALS_FOLDER, command_lines, write_demo
 from finssim.experiments.evaluate import Evaluation
+from finssim.experiments.excitation.command import trials_on_robot
 from finssim.experiments.excitation.levels import matched
 from finssim.experiments.excitation.pool_trials import pool_trials
 from finssim.experiments.excitation.shuttle import shuttles
 from finssim.experiments.excitation.terminal import compare_steps
 from finssim.experiments.identify import HELD_OUT, Identification, Record, identify, vehicle_files
+from finssim.experiments.on_robot.play import Attendant
+from finssim.experiments.on_robot.session import OnRobot, kept_folder
 from finssim.experiments.pool_evaluation import pool_evaluation, pool_jobs
 from finssim.experiments.results_table import print_comparison
 from finssim.experiments.running import Say
 from finssim.experiments.setpoints import T1_SETPOINTS
 from finssim.experiments.transfer.campaign import Show, run_jobs
 from finssim.experiments.transfer.job import Job
+from finssim.experiments.transfer.policies import finished
 from finssim.experiments.transfer.pool_trial import play
+from finssim.experiments.transfer.robot_trial import HARDWARE, run_on_robot
 from finssim.files import atomic_directory
 from finssim.learning.train import train
 from finssim.pool import draw_plant
@@ -106,6 +111,8 @@ def demo(
     console: Console | None = None,
     scope: Scope | None = None,
     processes: int | None = None,
+    robot: OnRobot | None = None,
+    attendant: Attendant | None = None,
 ) -> Path:
     """Identify a vehicle in the virtual pool, train T1 in what was identified, and let the policy hold setpoints there.
 
@@ -121,41 +128,48 @@ def demo(
         console: Where progress is shown; standard error if None.
         scope: How much of it; `FULL` if None.
         processes: As many as there are processors if None.
+        robot: Where trials are made and setpoints held, in place of the virtual pool. What is done stays in `out`, and
+            the next call goes on.
+        attendant: The person beside that robot, instead of the terminal's keyboard.
 
     Returns:
         Path of the report.
 
     Raises:
-        KeyboardInterrupt: After Ctrl-C. A policy so far is then in `OUT-training/interrupted`, and `out` as it was.
+        KeyboardInterrupt: After Ctrl-C. A policy so far is then in `OUT-training/interrupted`, and, but for a robot's,
+            `out` as it was.
     """
     console, standing = console or Console(stderr=True), load_vehicle(vehicle)
     scope = (scope or FULL).of(standing)
     start_warp()
     rescue = out.with_name(f"{out.name}-training") / "interrupted"
-    with atomic_directory(out, replaces=REPORT_FILE) as folder:
-        found = _identified(vehicle, folder, out, seed, scope, processes, console)
+    place = _Place(vehicle, robot, attendant, processes, console)
+    with atomic_directory(out, replaces=REPORT_FILE) if robot is None else kept_folder(out) as folder:
+        found = _identified(folder, out, seed, scope, place)
         began = time.perf_counter()
-        policy = train(
-            "t1",
-            out=folder / "policy",
-            vehicle=found.vehicle,
-            randomize=RANGES,
-            seed=seed,
-            steps=steps,
-            console=console,
-            shown=out / "policy",
-            interrupted=rescue,
-        )
+        policy = folder / "policy"
+        if robot is None or not finished(policy, found.vehicle):
+            train(
+                "t1",
+                out=policy,
+                vehicle=found.vehicle,
+                randomize=RANGES,
+                seed=seed,
+                steps=steps,
+                console=console,
+                shown=out / "policy",
+                interrupted=rescue,
+            )
         training = {
             "seconds": time.perf_counter() - began,
             "seed": seed,
             "steps": Policy.load(policy).description.training["steps"],
         }
         with _rescued(policy, rescue, console):
-            evaluations, picture = _deployed(vehicle, folder, policy, seed, scope, processes, console)
-            commands = command_lines(out, vehicle, PLANT, SEVERITY, RANGES, training)
+            evaluations, picture = _deployed(folder, policy, seed, scope, place)
+            commands = command_lines(out, vehicle, PLANT, SEVERITY, RANGES, training, robot)
             write_demo(folder, found, evaluations, policy, training, commands, picture)
-    print_comparison([e.result for e in evaluations if e.result["camera"] == "corners"], Console())
+    print_comparison([e.result for e in evaluations if e.result["camera"] != "pictures"], Console())
     report = Path(out) / REPORT_FILE
     print(f"report: {report}")
     if _has_display():
@@ -163,11 +177,27 @@ def demo(
     return report
 
 
-def _identified(
-    name: str, folder: Path, out: Path, seed: int, scope: Scope, processes: int | None, console: Console
-) -> Identification:
-    """Trials in the pool, the vehicle they tell of, and how its speeds compare with the plant's."""
-    standing = load_vehicle(name)
+@dataclass(frozen=True)
+class _Place:
+    """With what and where it is done."""
+
+    vehicle: str
+    """Name or file, as the catalogue has it."""
+    robot: OnRobot | None
+    attendant: Attendant | None
+    processes: int | None
+    console: Console
+
+
+def _identified(folder: Path, out: Path, seed: int, scope: Scope, place: _Place) -> Identification:
+    """Trials, the vehicle they tell of, and in a pool how its speeds compare with the plant's."""
+    standing, console = load_vehicle(place.vehicle), place.console
+    if place.robot is not None:
+        console.print("recording trials on the robot", highlight=False)
+        found = identify(
+            folder, place.vehicle, seed=seed, shown=out, record=_robot_recorder(standing, scope, place)
+        )
+        return _told(found, console)
     spec = draw_plant(standing, PLANT, SEVERITY)
     spec.write(folder / PLANT_FILE)
     console.print("recording trials in the virtual pool", highlight=False)
@@ -182,16 +212,21 @@ def _identified(
             told = f"  {run.target}: up to {result['fastest']:.2f} {unit} in {result['duration']:.0f} s"
             console.print(told, highlight=False)
 
-        record = _recorder(name, standing, scope, processes, say, show)
-        found = identify(folder, name, seed=seed, shown=out, record=record)
+        record = _recorder(place.vehicle, standing, scope, place.processes, say, show)
+        found = identify(folder, place.vehicle, seed=seed, shown=out, record=record)
         linear = {axis: levels for axis, levels in scope.levels.items() if axis not in ("roll", "pitch")}
         found = found.with_steps(compare_steps(found.vehicle, standing, spec, linear))
+    return _told(found, console)
+
+
+def _told(found: Identification, console: Console) -> Identification:
+    """Say what was identified."""
+    speeds = f", terminal speeds within {100.0 * _farthest(found):.0f} % of the pool's own vehicle"
     told = sum(e.identifiable for e in found.fit.estimates.values())
     console.print(
         f"identified from {len(found.fit.trials)} trials in {found.seconds:.0f} s: {told} of "
         f"{len(found.fit.estimates)} parameters told, NRMSE on {len(found.replay.pairs)} other trials "
-        f"{found.replay.aggregate('calibrated').value:.3f}, terminal speeds within {100.0 * _farthest(found):.0f} % of "
-        "the pool's own vehicle",
+        f"{found.replay.aggregate('calibrated').value:.3f}{speeds if found.steps else ''}",
         highlight=False,
     )
     return found
@@ -199,7 +234,8 @@ def _identified(
 
 def _farthest(found: Identification) -> float:
     """Largest error of an identified terminal speed, part of the plant's."""
-    return max(abs(float(s["model_speed"]) / float(s["plant_speed"]) - 1.0) for s in found.steps)
+    far = (abs(float(s["model_speed"]) / float(s["plant_speed"]) - 1.0) for s in found.steps)
+    return max(far, default=0.0)
 
 
 def _recorder(
@@ -208,13 +244,8 @@ def _recorder(
     """Trials of the virtual pool."""
 
     def record(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
-        plans = {
-            role: programmes(tuple(levels), standing, levels=levels, coast=COAST)
-            for role, levels in (("fit", scope.levels), ("held-out", scope.held_out))
-        }
-        plans["fit"] += shuttles(scope.shuttles, standing) if scope.shuttles else []
         return pool_trials(
-            plans,
+            _plans(standing, scope),
             folder,
             vehicle=str(rough),
             pool_vehicle=name,
@@ -229,19 +260,55 @@ def _recorder(
     return record
 
 
+def _plans(standing: Vehicle, scope: Scope) -> dict[str, list[Programme]]:
+    """Programmes by role."""
+    plans = {
+        role: programmes(tuple(levels), standing, levels=levels, coast=COAST)
+        for role, levels in (("fit", scope.levels), ("held-out", scope.held_out))
+    }
+    plans["fit"] += shuttles(scope.shuttles, standing) if scope.shuttles else []
+    return plans
+
+
+def _robot_recorder(standing: Vehicle, scope: Scope, place: _Place) -> Record:
+    """Trials of a robot, those of an earlier call among them."""
+
+    def record(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
+        return trials_on_robot(
+            _plans(standing, scope),
+            folder,
+            load_vehicle(rough),
+            place.robot,  # type: ignore[arg-type]
+            attendant=place.attendant,
+            console=place.console,
+        )
+
+    return record
+
+
 def _deployed(
-    name: str, folder: Path, policy: Path, seed: int, scope: Scope, processes: int | None, console: Console
+    folder: Path, policy: Path, seed: int, scope: Scope, where: _Place
 ) -> tuple[list[Evaluation], bytes | None]:
-    """All controllers in the pool, the policy with pictures too, and one of those pictures."""
+    """All controllers in the pool, the policy with pictures too, and one of those pictures; or all on the robot."""
+    console = where.console
     common: dict[str, Any] = {
-        "vehicle": str(folder / vehicle_files(load_vehicle(name).name)[1]),
-        "pool_vehicle": name,
+        "vehicle": str(folder / vehicle_files(load_vehicle(where.vehicle).name)[1]),
+        "pool_vehicle": where.vehicle,
         "plant": PLANT,
         "severity": SEVERITY,
         "seed": seed,
         "duration": scope.duration,
     }
-    names = {who: str(policy) if who == "policy" else who for who in CONTROLLERS}
+    names = {name: str(policy) if name == "policy" else name for name in CONTROLLERS}
+    if where.robot is not None:
+        common |= {"pool_vehicle": common["vehicle"], "plant": 0, "severity": HARDWARE}
+        jobs = pool_jobs(names, scope.setpoints, camera=HARDWARE, **common)
+        results = run_on_robot(
+            jobs, folder / TRIALS_FOLDER, where.robot, attendant=where.attendant, console=console
+        )
+        played = {result["key"]: result for result in results}
+        jobs = [job for job in jobs if job.key() in played]
+        return _by_row(jobs, [played[job.key()] for job in jobs], folder / TRIALS_FOLDER), None
     # Pictures first: they take longest, and the other processor has time for the rest.
     jobs = pool_jobs({"policy-with-pictures": str(policy)}, scope.pictures, camera="pictures", **common)
     seen = jobs[:1]
@@ -257,7 +324,7 @@ def _deployed(
                 held += f", {result['e_p_m']:.3f} m and {result['e_psi_deg']:.1f}° off"
             console.print(f"  {job.row} at {job.target}: {held}", highlight=False)
 
-        results = run_jobs(jobs, place, play, processes=processes, say=say, show=show)
+        results = run_jobs(jobs, place, play, processes=where.processes, say=say, show=show)
         evaluations = _by_row(jobs, results, place)
         picture = camera_view(seen[0], place / seen[0].key(), VIEW_AT, seed) if seen else None
     return evaluations, picture

@@ -10,6 +10,7 @@ from typing import Any
 
 from finssim.experiments.evaluate import Evaluation
 from finssim.experiments.identify import TRIALS, Identification, commands, vehicle_files
+from finssim.experiments.on_robot.session import OnRobot
 from finssim.vehicles import load_vehicle
 
 __all__ = ["PLANT_FILE", "TRIALS_FOLDER", "command_lines", "write_demo"]
@@ -21,7 +22,13 @@ TRIALS_FOLDER = "deployed"
 
 
 def command_lines(
-    out: Path, vehicle: str, plant: int, severity: str, ranges: str, training: Mapping[str, Any]
+    out: Path,
+    vehicle: str,
+    plant: int,
+    severity: str,
+    ranges: str,
+    training: Mapping[str, Any],
+    robot: OnRobot | None = None,
 ) -> list[str]:
     """Command lines that repeat the demonstration's steps by hand.
 
@@ -32,9 +39,19 @@ def command_lines(
         severity: Of the pool.
         ranges: That the policy was trained in.
         training: `seed` and `steps`.
+        robot: On which it was done; in the pool if None.
     """
     rough, identified = (out / file for file in vehicle_files(load_vehicle(vehicle).name))
     seed, steps = training["seed"], training["steps"]
+    if robot is not None:
+        place = f"{robot.options} --arm"
+        return [
+            f"finssim excite all --vehicle {rough} {place} --coast 4 --out more-trials",
+            *commands(out, load_vehicle(vehicle).name, seed),
+            f"finssim train t1 --vehicle {identified} --randomize {ranges} --seed {seed} --steps {steps} --out policy",
+            f"finssim run --policy policy --vehicle {identified} --goal 1,0.3,-0.5,90 {place} --record run.mcap",
+            f"finssim evaluate run.mcap --task t1 --vehicle {identified}",
+        ]
     return [
         f"finssim trials import {out / TRIALS / 'fit' / 'records'}/*.mcap --split phase --out trials",
         f"finssim excite all --vehicle {rough} --pool {plant} --severity {severity} --pool-vehicle {vehicle} --coast 4 "

@@ -14,6 +14,16 @@ __all__ = ["identification_section"]
 HEADS = ("parameter", "estimate", "95 % interval", "catalogue", "unit", "state")
 STEPS = ("axis", "push", "identified", "in the plant", "ratio", "time constant", "in the plant")
 
+UNSURE = (
+    "unsure: told together with another number and not alone, as a part of the drag. file kept: the trials do not "
+    "determine the number, and the vehicle keeps its guess."
+)
+POOL = (
+    " The catalogue's vehicle is the one around which the pool drew its own: the plant's coefficients are known to the "
+    "pool alone. Its propellers push up to 15 % more or less than the bench said, so what is found are effective "
+    "masses and dampings: those of the thrust that the vehicle file promises."
+)
+
 
 def identification_section(found: Identification) -> list[str]:
     """HTML of the section."""
@@ -39,13 +49,7 @@ def identification_section(found: Identification) -> list[str]:
         "<h2>Identification</h2>",
         f"<p>{escape(_lead(found))}</p>",
         html_table(HEADS, rows),
-        '<p class="note">'
-        "unsure: told together with another number and not alone, as a part of the drag. file kept: the trials do not "
-        "determine the number, and the vehicle keeps its guess. The catalogue's vehicle is the one around which the "
-        "pool drew its own: the plant's coefficients are known to the pool alone. Its propellers push up to "
-        "15 % more or less than the bench said, so what is found are effective masses and dampings: "
-        "those of the thrust that the vehicle file promises."
-        "</p>",
+        f'<p class="note">{UNSURE}{POOL if found.steps else ""}</p>',
         *_steps(found),
         *(f'<p class="note">{escape(warning)}</p>' for warning in found.warnings),
         html_picture(found.picture, "Held-out trials: measured and replayed by the identified vehicle"),
@@ -55,11 +59,14 @@ def identification_section(found: Identification) -> list[str]:
 def _lead(found: Identification) -> str:
     score = found.replay.aggregate(found.replay.models[0])
     value = "unknown" if score.value is None else f"{score.value:.3f}"
+    source, same = (
+        ("the virtual pool", "in the same pool") if found.steps else ("a robot", "on the same robot")
+    )
     return (
-        f"Identified in {found.seconds:.0f} s from {len(found.fit.trials)} trials of the virtual pool, beginning with "
+        f"Identified in {found.seconds:.0f} s from {len(found.fit.trials)} trials of {source}, beginning with "
         "guessed hydrodynamics: the robot's own software played each programme, and its record became a trial. "
         f"{len(found.replay.pairs)} other trials, at levels that the fit has not seen, are replayed with an NRMSE of "
-        f"{value}. What follows was trained and tuned in the identified vehicle, and tried in the same pool."
+        f"{value}. What follows was trained and tuned in the identified vehicle, and tried {same}."
     )
 
 

@@ -60,16 +60,20 @@ def pool_evaluation(jobs: Sequence[Job], results: Sequence[Mapping[str, Any]], f
         "task": "t1",
         "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
         "hydrodynamics": "calibrated",
-        "plant": {
-            "name": "pool",
-            "title": f"virtual pool {first.plant}, {first.severity}, around {first.pool_vehicle}",
-        },
+        "plant": _plant(first, results[0]),
         "camera": first.camera,
         "seed": first.seed,
         **summarize(measures),
         "provenance": dict(results[0]["provenance"]),
     }
     return Evaluation(result, _trials(jobs, [folder / str(r["key"]) for r in results]))
+
+
+def _plant(job: Job, result: Mapping[str, Any]) -> dict[str, str]:
+    """Where it was, as evaluations describe it."""
+    if result.get("robot"):
+        return {"name": "hardware", "title": f"robot {result['robot']}, by its own estimate"}
+    return {"name": "pool", "title": f"virtual pool {job.plant}, {job.severity}, around {job.pool_vehicle}"}
 
 
 def _described(job: Job) -> dict[str, Any]:

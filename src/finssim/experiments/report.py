@@ -22,9 +22,13 @@ __all__ = ["report_html"]
 
 NOTE = (
     "e_y is the vertical error. Gray rows are the paper's own, on hardware: its real vehicle in its pool. The others "
-    "are of the virtual pool: the robot's whole software, from the camera's tags to the motor controller's frames, "
+    "are of "
+)
+POOL = (
+    "the virtual pool: the robot's whole software, from the camera's tags to the motor controller's frames, "
     "against a plant that no training has seen. Errors are those of the true pose."
 )
+ROBOT = "hardware, too. Errors are those of the robot's own estimate, whose error is not in them."
 
 
 def report_html(
@@ -55,7 +59,7 @@ def report_html(
         *first,
         "<h2>Results</h2>",
         _comparison(evaluations),
-        f'<p class="note">{escape(CAPTION)} {NOTE}</p>',
+        f'<p class="note">{escape(CAPTION)} {NOTE}{ROBOT if _hardware(result) else POOL}</p>',
         "<h2>Error against time</h2>",
         _picture(draw_envelopes(envelopes), "Position and yaw error against time, median and middle half"),
         "<h2>Paths of the policy</h2>",
@@ -73,6 +77,10 @@ def report_html(
     return html_page(_title(result), sections)
 
 
+def _hardware(result: Mapping[str, Any]) -> bool:
+    return bool(result["plant"]["name"] == "hardware")
+
+
 def _title(result: Mapping[str, Any]) -> str:
     return f"Station keeping of {result['vehicle']['name']}"
 
@@ -82,10 +90,11 @@ def _lead(evaluations: Sequence[Evaluation], training: Mapping[str, Any]) -> str
     errors = ""
     if r["e_p_m"] is not None:
         errors = f", with {100.0 * r['e_p_m']:.1f} cm and {r['e_psi_deg']:.1f}° of error once settled"
+    place = "on hardware" if _hardware(r) else "in the virtual pool"
     others = " and ".join(f"{e.label} {e.result['success']}" for e in evaluations[1:])
     return escape(
         f"A policy trained here in {training['seconds']:.0f} s, from nothing to a file that runs on the vehicle, holds "
-        f"{r['success']} of {r['trials']} published setpoints in the virtual pool{errors}. On the same trials, "
+        f"{r['success']} of {r['trials']} published setpoints {place}{errors}. On the same trials, "
         f"successes: {others}."
     )
 

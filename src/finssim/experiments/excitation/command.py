@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from finssim.calibration.excitation.programmes import Programme, programmes
-from finssim.calibration.trials.trial_files import write_trial
+from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial_files import load_trials, write_trial
 from finssim.control.guidance import Station
 from finssim.experiments.excitation.places import box_of, place_of
 from finssim.experiments.excitation.pool_trials import RECORDS, pool_trials
@@ -30,7 +32,7 @@ from finssim.quiet import start_warp
 from finssim.robot.perception import Perception
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
-__all__ = ["excite_in_pool", "excite_on_robot", "robot_trials"]
+__all__ = ["excite_in_pool", "excite_on_robot", "robot_trials", "trials_on_robot"]
 
 PLAN_FILE = "programmes.yaml"
 
@@ -181,6 +183,48 @@ def robot_trials(
             write_trial(trial_of_record(record, name, role), folder / name, format="parquet")
         made.append(folder / name)
     return made
+
+
+def trials_on_robot(
+    plans: Mapping[str, Sequence[Programme]],
+    folder: Path,
+    vehicle: Vehicle,
+    robot: OnRobot,
+    *,
+    attendant: Attendant | None = None,
+    console: Console | None = None,
+) -> dict[str, list[Trial]]:
+    """What `pool_trials` does in a pool, on a robot: the trials by role, without those that were skipped.
+
+    Args:
+        plans: Role of the trials (fit, held-out) -> programmes.
+        folder: Takes ROLE/NAME and ROLE/records/NAME.mcap; what is there is not played again.
+        vehicle: As the robot knows it.
+        robot: Which, and how; not opened where nothing is left to play.
+        attendant: Instead of the terminal's keyboard.
+        console: Where it is told how it stands; standard error if None.
+
+    Raises:
+        As `excite_on_robot`; CalibrationError too where every programme of a role was skipped.
+    """
+    console = console or Console(stderr=True)
+    missing = [p for role, plan in plans.items() for p in plan if not (folder / role / p.name).is_dir()]
+    with (
+        session(robot, vehicle, attendant=attendant, console=console) if missing else nullcontext() as opened
+    ):
+        for role, plan in plans.items():
+            if opened is not None:
+                robot_trials(
+                    plan,
+                    folder / role,
+                    opened,
+                    role=role,
+                    say=lambda text: console.print(text, highlight=False),
+                )
+    return {
+        role: load_trials([folder / role / p.name for p in plan if (folder / role / p.name).is_dir()])
+        for role, plan in plans.items()
+    }
 
 
 def _about(

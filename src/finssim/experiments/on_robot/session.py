@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,16 +17,20 @@ from rich.status import Status
 
 from finssim.control.guidance import Station
 from finssim.experiments.on_robot.play import Attendant, Outcome, Placing, RobotTrial, play
+from finssim.files import atomic_directory, refuse_unwritable
 from finssim.localization.pool import Pool, load_pool
 from finssim.robot.goals import check_reachable
 from finssim.robot.keyboard import Keyboard
+from finssim.robot.link.transports import DEFAULT_BIND
 from finssim.robot.perception import Perception
 from finssim.robot.recorder import Recorder
 from finssim.robot.wiring import Drive, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["OnRobot", "RobotError", "Session", "check_starts", "session"]
+__all__ = ["OnRobot", "RobotError", "Session", "check_starts", "kept_folder", "session"]
 
+MARK = ".on-robot"
+"""File by which a folder of such trials is known."""
 ABORTED = "aborted"
 """Folder of the records of trials that were stopped and do not count."""
 
@@ -53,6 +58,15 @@ class OnRobot:
     def title(self) -> str:
         """The robot's address."""
         return f"{self.wiring.robot}{', lock-step' if self.wiring.lockstep else ''}"
+
+    @property
+    def options(self) -> str:
+        """Words of a command line that name it."""
+        wiring = self.wiring
+        words = ["--robot", wiring.robot, "--pool-file", str(self.pool_file)]
+        words += ["--bind", wiring.bind] if wiring.bind != DEFAULT_BIND else []
+        words += ["--pictures", wiring.pictures] if wiring.pictures else []
+        return shlex.join([*words, *(["--lockstep"] if wiring.lockstep else [])])
 
 
 class _Screen:
@@ -229,6 +243,20 @@ def session(
             console.print(text, highlight=False, markup=False)
 
         yield Session(robot, vehicle, site, drive, attendant, say)
+
+
+@contextmanager
+def kept_folder(out: Path) -> Iterator[Path]:
+    """A folder in which trials on a robot stay as they are made: new, empty, or begun by an earlier call.
+
+    Raises:
+        OutputError: It holds somebody's files.
+    """
+    if out.exists() and not (out / MARK).is_file():
+        refuse_unwritable(atomic_directory(out))
+    out.mkdir(parents=True, exist_ok=True)
+    (out / MARK).touch()
+    yield out
 
 
 def check_starts(starts: Mapping[str, Station], vehicle: str | Vehicle) -> None:

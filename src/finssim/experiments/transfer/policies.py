@@ -12,8 +12,9 @@ from finssim.control.policy import Policy
 from finssim.control.policy_description import PolicyError
 from finssim.experiments.running import Say
 from finssim.learning.train import train
+from finssim.vehicles import Vehicle
 
-__all__ = ["Training", "trained"]
+__all__ = ["Training", "finished", "trained"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +55,7 @@ def trained(
     for done, (training, seed) in enumerate(plan):
         place = folder / f"{training.name}-seed{seed}"
         say(done / len(plan), f"training {training.name}, seed {seed}")
-        if not _finished(place):
+        if not finished(place):
             train(
                 training.task,
                 out=place,
@@ -69,9 +70,14 @@ def trained(
     return found
 
 
-def _finished(place: Path) -> bool:
-    """Whether a whole policy lies there: not one that was interrupted, or cut short while it was written."""
+def finished(place: Path, vehicle: Vehicle | None = None) -> bool:
+    """Whether a whole policy lies there: not one that was interrupted, or cut short while it was written.
+
+    Args:
+        place: Directory.
+        vehicle: That it must be for; any if None.
+    """
     try:
-        return bool(Policy.load(place).description.training.get("complete"))
+        return bool(Policy.load(place, vehicle=vehicle).description.training.get("complete"))
     except PolicyError:
         return False
