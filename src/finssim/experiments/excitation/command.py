@@ -172,6 +172,7 @@ def robot_trials(
                 starts[name],
                 record,
                 counts=False,
+                exact=False,
                 perception=lambda: Perception(vehicle, opened.site, mode=ESTIMATOR),
                 about=about,
             )

@@ -30,6 +30,10 @@ SLOW, TURNING = 0.05, math.radians(5.0)
 """... and no faster than this [m/s, rad/s] ..."""
 SETTLED = 2.0
 """... for so long [s]."""
+ROUGHLY, ROUGHLY_TURNED, ROUGHLY_SLOW = 0.15, math.radians(20.0), 0.1
+"""The same where the start need not be exact [m, rad, m/s] ..."""
+PATIENCE = 10.0
+"""... after so long [s]: a PID tuned from guesses may circle its goal for ever."""
 APPROACH = 60.0
 """Longest way to a start [s]."""
 
@@ -69,6 +73,8 @@ class Placing:
     start: Station
     by_hand: bool = False
     """Somebody carries it there, and presses enter. False: the tuned PID steers it there."""
+    exact: bool = True
+    """Whether the trial is worth nothing from elsewhere; an excitation is."""
     attendant: Attendant | None = None
     """Nobody is asked if None: the way to the start begins as soon as the state is known."""
 

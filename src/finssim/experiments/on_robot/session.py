@@ -107,6 +107,7 @@ class Session:
         record: Path,
         *,
         counts: bool,
+        exact: bool = True,
         perception: Callable[[], Perception] | None = None,
         about: Mapping[str, Any] | None = None,
     ) -> Outcome | None:
@@ -118,6 +119,7 @@ class Session:
             record: File of its record, made once it is done; records of attempts that do not count go to `aborted/`.
             counts: Whether a trial that the bridge stopped counts as it is; it is played again if not. One that the
                 operator stopped never counts.
+            exact: Whether the vehicle must be at its start to the centimetre and at rest, however long that takes.
             perception: Otherwise than by default, made anew for every attempt.
             about: Metadata of the record.
 
@@ -132,7 +134,8 @@ class Session:
             trial = make()
             x, y, z = start.position
             self._say(f"{trial.name}: from {x:.2f}, {y:.2f}, {z:.2f} m, {math.degrees(start.yaw):.0f}°")
-            outcome, partial = self._attempt(trial, start, record, perception, about or {})
+            placing = Placing(start=start, by_hand=self.robot.by_hand, exact=exact, attendant=self._attendant)
+            outcome, partial = self._attempt(trial, placing, record, perception, about or {})
             stopped_by_hand = outcome.fault == "stopped by the operator"
             done = outcome.ended == "over" or (
                 counts and outcome.begun and outcome.ended == "fault" and not stopped_by_hand
@@ -156,7 +159,7 @@ class Session:
     def _attempt(
         self,
         trial: RobotTrial,
-        start: Station,
+        placing: Placing,
         record: Path,
         perception: Callable[[], Perception] | None,
         about: Mapping[str, Any],
@@ -183,7 +186,7 @@ class Session:
                 self.site,
                 perception=perception and perception(),
                 recorder=recorder,
-                placing=Placing(start=start, by_hand=self.robot.by_hand, attendant=self._attendant),
+                placing=placing,
             )
         if recorder.problem and outcome.ended == "over":
             raise RobotError(f"{record}: {recorder.problem}")
