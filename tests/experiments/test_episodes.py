@@ -9,8 +9,9 @@ from rich.console import Console
 from finssim.experiments.episodes import EpisodeError, run_episodes, summarize_episodes
 from finssim.experiments.evaluate import evaluate
 from finssim.experiments.plants import load_plant
-from finssim.experiments.players import make_player
 from finssim.tasks import TASKS, Environment, task_named
+from finssim.tasks.actions import action_size
+from finssim.tasks.agents import agent_for
 from finssim.tasks.baselines import BASELINES
 from finssim.vehicles import load_vehicle
 
@@ -27,11 +28,10 @@ class Still:
         self.task, self.action, self.period = task, task.action, period or task.control_step
 
     def reset(self, n):
-        self.rows = n
+        pass
 
-    def act(self, memory, arrays, goal):
-        size = arrays.action.shape[1] // len(self.task.agents)
-        return np.zeros((self.rows, size), np.float32), None
+    def act(self, memory, readings, goal):
+        return np.zeros((len(readings.observation), action_size(self.action, 8)), np.float32), None
 
     def describe(self):
         return {"name": "still", "kind": "still"}
@@ -105,7 +105,7 @@ def test_means_have_intervals_and_what_is_missing_is_counted():
 def test_baselines_are_evaluated_by_name(name, tmp_path):
     """Table, JSON and figure; a row for each plant where there are two."""
     who = next(iter(BASELINES[name]))
-    assert make_player(who, FINSROV, task_named(name)).describe()["kind"] == "baseline"
+    assert agent_for(who, FINSROV, task_named(name)).describe()["kind"] == "baseline"
     with (tmp_path / "screen").open("w", encoding="utf-8") as file:
         console = Console(file=file, width=100)
         evaluate(who, task=name, plant=["nominal", "noise"], trials=2, out=tmp_path / "out", console=console)

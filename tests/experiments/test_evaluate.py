@@ -17,12 +17,12 @@ from finssim.experiments import trials as trials_module
 from finssim.experiments.evaluate import EvaluationError, evaluate, evaluate_controller
 from finssim.experiments.paper_results import PAPER_T1
 from finssim.experiments.plants import Plant, PlantError, available_plants, load_plant
-from finssim.experiments.players import PidPlayer
 from finssim.experiments.setpoints import T1_SETPOINTS, T1_START
 from finssim.experiments.trials import run_trials
 from finssim.files import OutputError
 from finssim.learning.export import export_policy
-from finssim.tasks import EnvironmentSetupError, StationKeeping
+from finssim.tasks import Environment, EnvironmentSetupError, StationKeeping
+from finssim.tasks.agents import PidAgent
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")
@@ -75,7 +75,7 @@ def test_a_policy_directory_is_flown(policy):
 
 def test_trials_are_those_of_the_protocol():
     """60 s from the published start, level and at rest, the eight setpoints in turn, at the controller's rate."""
-    player = PidPlayer("pid", FINSROV)
+    player = PidAgent("pid", FINSROV)
     done = run_trials(player, StationKeeping(), FINSROV, NOMINAL, trials=10)
     assert done.setpoints == (*T1_SETPOINTS, "P01", "P02")
     np.testing.assert_allclose(done.position[0], np.broadcast_to(T1_START[:3], (10, 3)), atol=1e-6)
@@ -174,20 +174,19 @@ def test_several_plants_are_one_table_one_object_and_one_directory(tmp_path, cap
 
 def test_a_world_that_breaks_fails_its_trial_alone(tmp_path, monkeypatch):
     """From then on it has no numbers, and no success; the other trials are as if nothing had been."""
-    act, calls = PidPlayer.act, []
+    step, calls = Environment.step, []
 
-    def breaking(self, memory, arrays, goal):
+    def breaking(self, action):
         calls.append(None)
         if len(calls) == 100:
-            velocity = arrays.velocity.numpy()
+            velocity = self.simulator.state.velocity.numpy().copy()
             velocity[2, 0, 0] = np.nan
-            arrays.velocity.assign(velocity)
-            return np.zeros((8, 6), np.float32), memory
-        return act(self, memory, arrays, goal)
+            self.simulator.state.velocity.assign(velocity)
+        return step(self, action)
 
-    monkeypatch.setattr(PidPlayer, "act", breaking)
+    monkeypatch.setattr(Environment, "step", breaking)
     done = run_trials(
-        PidPlayer("pid", FINSROV), StationKeeping(), FINSROV, NOMINAL, trials=8, crash_directory=tmp_path
+        PidAgent("pid", FINSROV), StationKeeping(), FINSROV, NOMINAL, trials=8, crash_directory=tmp_path
     )
     assert np.isfinite(done.position[:100]).all()
     assert np.isnan(done.position[100:, 2]).all() and np.isfinite(np.delete(done.position, 2, axis=1)).all()

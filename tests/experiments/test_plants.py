@@ -11,10 +11,11 @@ from finssim.engine.ranges_file import load_ranges
 from finssim.experiments import trials as trials_module
 from finssim.experiments.episodes import run_episodes
 from finssim.experiments.plants import Plant, PlantError, available_plants, load_plant
-from finssim.experiments.players import make_player
 from finssim.experiments.t2_trials import run_tracking
 from finssim.experiments.trials import run_trials
 from finssim.tasks import Environment, EnvironmentSetupError, task_named
+from finssim.tasks.actions import action_size
+from finssim.tasks.agents import agent_for
 from finssim.vehicles import VehicleError, load_vehicle
 
 FINSROV = load_vehicle("finsrov")
@@ -130,7 +131,7 @@ def commands_and_thrusts(run, plant, folder):
 def t1_trials(controller):
     def run(plant, folder):
         task = task_named("t1")
-        run_trials(make_player(controller, FINSROV, task), task, FINSROV, plant, trials=8, record=folder)
+        run_trials(agent_for(controller, FINSROV, task), task, FINSROV, plant, trials=8, record=folder)
 
     return run
 
@@ -139,7 +140,7 @@ def t2_trials(plant, folder):
     task = task_named("t2")
     guides = [load_trajectory("lemniscate")]
     run_tracking(
-        make_player("pid", FINSROV, task), task, FINSROV, plant, guides=guides, trials=1, record=folder
+        agent_for("pid", FINSROV, task), task, FINSROV, plant, guides=guides, trials=1, record=folder
     )
 
 
@@ -162,8 +163,9 @@ class Restless:
     def reset(self, n):
         return np.random.default_rng(3)
 
-    def act(self, rng, arrays, goal):
-        return rng.uniform(-1.0, 1.0, arrays.action.shape).astype(np.float32), rng
+    def act(self, rng, readings, goal):
+        shape = (len(readings.observation), action_size(self.action, 8))
+        return rng.uniform(-1.0, 1.0, shape).astype(np.float32), rng
 
 
 EVERY_EVALUATION = {

@@ -17,13 +17,13 @@ from finssim.control.trajectories import TRAJECTORIES
 from finssim.experiments.evaluate import EvaluationError, evaluate, evaluate_controller
 from finssim.experiments.paper_results import PAPER_T2, paper_t2_row
 from finssim.experiments.plants import load_plant
-from finssim.experiments.players import make_player
 from finssim.experiments.t2_figure import draw_tracking
 from finssim.experiments.t2_metrics import MEASURES
 from finssim.experiments.t2_table import by_trajectory
 from finssim.experiments.t2_trials import T2_TRAJECTORIES, run_tracking
 from finssim.learning.export import export_policy
 from finssim.tasks import TrajectoryTracking
+from finssim.tasks.agents import agent_for
 from finssim.vehicles import load_vehicle
 
 pytestmark = pytest.mark.slow
@@ -78,7 +78,7 @@ def test_the_table_has_a_row_per_trajectory_and_the_papers(nominal, capsys):
 def test_a_current_and_the_number_of_trials_are_heard():
     """Still water differs from a current, and the trajectories are taken in turn."""
     guides = [TRAJECTORIES["straight"]]
-    player = make_player("pid", FINSROV, TASK)
+    player = agent_for("pid", FINSROV, TASK)
     still, current = (
         run_tracking(player, TASK, FINSROV, load_plant(plant), trials=2, guides=guides)
         for plant in ("nominal", "current")
@@ -90,7 +90,7 @@ def test_a_current_and_the_number_of_trials_are_heard():
 
 def test_a_feed_forward_of_acceleration_halves_the_error():
     """The straight line within 1 mm; without the goal's acceleration it was 2.6 mm."""
-    player = make_player("pid", FINSROV, TASK)
+    player = agent_for("pid", FINSROV, TASK)
     trials = run_tracking(player, TASK, FINSROV, NOMINAL, guides=[TRAJECTORIES["straight"]], trials=1)
     assert trials.measures()[0]["horizontal_rmse_m"] < 1e-3
 
@@ -99,7 +99,7 @@ def test_the_published_baseline_has_a_profile_for_trajectories():
     """As published: other gains for T2; its errors are those of centimetres to decimetres that the paper reports."""
     assert controller_for("t2", "pid-paper", FINSROV).profile == TRAJECTORY_PROFILE
     assert controller_for("t1", "pid-paper", FINSROV).profile == PAPER_PROFILE
-    player = make_player("pid-paper", FINSROV, TASK)
+    player = agent_for("pid-paper", FINSROV, TASK)
     trials = run_tracking(player, TASK, FINSROV, NOMINAL, guides=[TRAJECTORIES["straight"]], trials=1)
     published = paper_t2_row("PID", "straight")["horizontal_rmse_m"]
     assert trials.measures()[0]["horizontal_rmse_m"] == pytest.approx(published, rel=0.2)
@@ -124,7 +124,7 @@ def test_the_papers_table_is_transcribed_whole():
 def test_equal_seeds_are_equal_trials():
     guides = [TRAJECTORIES["lemniscate"]]
     plant = load_plant("randomised")
-    player = make_player("pid", FINSROV, TASK)
+    player = agent_for("pid", FINSROV, TASK)
     one, again, other = (
         run_tracking(player, TASK, FINSROV, plant, trials=1, guides=guides, seed=seed).position
         for seed in (1, 1, 2)

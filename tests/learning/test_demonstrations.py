@@ -10,8 +10,9 @@ from finssim import boundary
 from finssim.cli import app
 from finssim.learning.collect import collect, record_episodes
 from finssim.learning.demonstrations import DatasetError, about, load, save
-from finssim.learning.experts import ExpertError, expert_for
 from finssim.tasks import Environment, make, task_named
+from finssim.tasks.agents import AgentError, expert_for
+from finssim.vehicles import load_vehicle
 
 SHORT = {"time_limit": 1.0}
 
@@ -27,11 +28,8 @@ class Constant:
     def reset(self, n):
         return np.zeros(n)
 
-    def act(self, memory, observation):
-        return np.full((len(observation), 6), self.value, np.float32), memory + 1
-
-    def restarted(self, memory, fresh, mask):
-        return np.where(mask, fresh, memory)
+    def act(self, memory, readings, goal):
+        return np.full((len(readings.observation), 6), self.value, np.float32), memory + 1
 
 
 def environment(worlds=3, seed=7):
@@ -129,12 +127,12 @@ def test_numbers_that_do_not_fit_are_refused(tmp_path, options):
 
 def test_who_is_no_expert_is_refused():
     with pytest.raises(
-        ExpertError,
+        AgentError,
         match="'nobody' is neither a policy directory nor a baseline of task 't1'; baselines: pid",
     ):
-        expert_for(environment(), "nobody")
-    with pytest.raises(ExpertError, match="acts by wrench6, expected thruster8"):
-        expert_for(make("t1", action="thruster8"), "pid")
+        expert_for("nobody", load_vehicle("finsrov"), task_named("t1"), "wrench6")
+    with pytest.raises(AgentError, match="acts by wrench6, expected thruster8"):
+        expert_for("pid", load_vehicle("finsrov"), task_named("t1"), "thruster8")
 
 
 def test_commands(tmp_path, capsys):

@@ -14,9 +14,6 @@ from finssim.control.guidance import Station
 from finssim.control.modes import action_mode
 from finssim.control.policy import Policy
 from finssim.control.policy_description import PolicyError
-from finssim.experiments.episodes import NOWHERE
-from finssim.experiments.players import make_player
-from finssim.learning.experts import expert_for
 from finssim.learning.export import ExportError
 from finssim.learning.held_evaluation import HeldEvaluation
 from finssim.learning.learners import learner_named
@@ -24,6 +21,7 @@ from finssim.learning.recurrent import RecurrentNetwork
 from finssim.robot.pilots import ObservingPilot
 from finssim.robot.robot import Reading
 from finssim.tasks import StationKeeping
+from finssim.tasks.agents import NOWHERE, Known, WorldReadings, agent_for, expert_for
 from finssim.tasks.baselines import restarted
 from finssim.tasks.observer import Observer
 from reference.guess import Guess
@@ -118,25 +116,23 @@ def test_a_pilot_remembers_until_it_is_reset(policy):
     np.testing.assert_array_equal(pilot.act(READING, STATION, 0.0), given[0])
 
 
-def test_a_player_and_an_expert_remember(policy):
-    """Both are the policy's own steps, row by row; the expert begins anew where an episode does."""
-    environment = finssim.make("t1", worlds=3, seed=4)
-    player, expert, run = (
-        make_player(policy, FINSROV, StationKeeping()),
-        expert_for(environment, policy),
-        Policy.load(policy),
-    )
-    played, shown, memory = player.reset(3), expert.reset(3), run.reset(3)
+def test_an_agent_remembers_and_begins_anew_where_an_episode_does(policy):
+    """The policy's own steps, row by row, evaluated or imitated."""
+    environment, task = finssim.make("t1", worlds=3, seed=4), StationKeeping()
+    agent, run = agent_for(policy, FINSROV, task), Policy.load(policy)
+    expert = expert_for(policy, FINSROV, task, "wrench6")
+    readings = WorldReadings(environment.arrays)
+    played, shown, memory = agent.reset(3), expert.reset(3), run.reset(3)
     anew = np.array([False, True, False])
     for k in range(3):
         seen = environment.arrays.observation.numpy().copy()
         expected, memory = run.step(memory, seen)
-        action, played = player.act(played, environment.arrays, NOWHERE)
+        action, played = agent.act(played, readings, NOWHERE)
         np.testing.assert_array_equal(action, expected)
         if k == 2:
             expected[1] = run.step(run.reset(3), seen)[0][1]
-            shown = expert.restarted(shown, expert.reset(3), anew)
-        wanted, shown = expert.act(shown, seen)
+            shown = restarted(shown, expert.reset(3), anew)
+        wanted, shown = expert.act(shown, Known(seen), NOWHERE)
         np.testing.assert_array_equal(wanted, expected)
         environment.step(action)
 

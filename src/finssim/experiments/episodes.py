@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.control.tracking import Goal
-from finssim.engine import Recorder
 from finssim.experiments.plants import Plant
-from finssim.experiments.players import Player
-from finssim.tasks import Environment, Task
+from finssim.tasks import Task
+from finssim.tasks.agents import NOWHERE, Agent
+from finssim.tasks.rollout import rollout
 from finssim.vehicles import Vehicle
 
 __all__ = ["EPISODES", "Episodes", "run_episodes", "summarize_episodes"]
@@ -24,8 +22,6 @@ EPISODES = 64
 """Unless told otherwise: an interval of a rate is then some ±0.12."""
 RESAMPLES = 2000
 SEED = 20261122
-NOWHERE = Goal(np.zeros((0, 3)), np.zeros((0, 4)))
-"""What a player of episodes is told of a goal: nothing, its observation has what it may know."""
 
 
 class EpisodeError(ValueError):
@@ -50,7 +46,7 @@ class Episodes:
 
 
 def run_episodes(
-    player: Player,
+    agent: Agent,
     task: Task,
     vehicle: Vehicle,
     plant: Plant,
@@ -65,9 +61,9 @@ def run_episodes(
     """Run one episode in each of `trials` worlds to its end; starts and goals are those of training, drawn with `seed`.
 
     Args:
-        player: Who acts; several agents of a world share it.
+        agent: Who acts; several agents of a world share it.
         task: What is to be done.
-        vehicle: As its file has it and the player knows it, every one of a world; the plant changes what they deliver.
+        vehicle: As its file has it and the agent knows it, every one of a world; the plant changes what they deliver.
         plant: What differs.
         trials: How many episodes.
         hydrodynamics: Model, unless the plant names one.
@@ -77,58 +73,39 @@ def run_episodes(
         show: Called with the part done.
 
     Raises:
-        EpisodeError: The player acts at another rate than the task.
+        EpisodeError: The agent acts at another rate than the task.
     """
-    if abs(player.period - task.control_step) > 1e-9:
+    if abs(agent.period - task.control_step) > 1e-9:
         raise EpisodeError(
-            f"the controller acts every {player.period:g} s, expected {task.control_step:g} s: "
+            f"the controller acts every {agent.period:g} s, expected {task.control_step:g} s: "
             f"episodes of '{task.name}' are measured at the rate of the task"
         )
-    environment = Environment(
+    environment = plant.environment(
+        agent,
         task,
-        plant.changed(vehicle),
-        nominal=vehicle,
+        vehicle,
         worlds=trials,
-        hydrodynamics=plant.hydrodynamics or hydrodynamics,
-        action=player.action,
-        wrench_scale=player.wrench_scale,
+        hydrodynamics=hydrodynamics,
         seed=seed,
         crash_directory=crash_directory,
-        **plant.environment_arguments(),
     )
-    with nullcontext() if record is None else Recorder(environment.simulator, record) as recorder:
-        return Episodes(_play(player, environment, recorder, show))
-
-
-def _play(
-    player: Player, environment: Environment, recorder: Recorder | None, show: Callable[[float], None]
-) -> dict[str, NDArray[np.float64]]:
-    """The metrics of the first episode of every world."""
-    task, arrays, worlds = environment.task, environment.arrays, environment.worlds
-    running = np.ones(worlds, dtype=np.bool_)
-    found = {name: np.full(worlds, np.nan) for name in task.metrics(arrays)}
-    rows = worlds * environment.agents
-    memory = player.reset(rows)
+    running = np.ones(trials, dtype=np.bool_)
+    found = {name: np.full(trials, np.nan) for name in task.metrics(environment.arrays)}
     longest = round(task.time_limit / task.control_step) + 1
-    for k in range(longest):
-        if recorder is not None:
-            recorder.record()
-        action, memory = player.act(memory, arrays, NOWHERE)
-        shape = (
-            (worlds, environment.action_size) if environment.agents == 1 else (worlds, environment.agents, -1)
-        )
-        step = environment.step(np.asarray(action, dtype=np.float32).reshape(shape))
+    for k, step in rollout(agent, environment, longest, lambda t: NOWHERE, record=record):
+        if step is None:
+            continue
         ended = running & (step.terminated | step.truncated)
         if ended.any():
             # A world that broke is terminated but not done; having begun anew, it is not frozen any more.
-            whole = ended & (arrays.done.numpy() != 0)
-            for name, values in task.metrics(arrays).items():
+            whole = ended & (environment.arrays.done.numpy() != 0)
+            for name, values in task.metrics(environment.arrays).items():
                 found[name][whole] = values[whole]
             running &= ~ended
-        show(max(k + 1, 1) / longest)
+        show(k / longest)
         if not running.any():
             break
-    return found
+    return Episodes(found)
 
 
 def summarize_episodes(trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

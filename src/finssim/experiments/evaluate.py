@@ -17,7 +17,6 @@ from finssim.experiments.episodes import EPISODES, run_episodes, summarize_episo
 from finssim.experiments.episodes_table import draw_episodes, print_episodes, print_episodes_by_plant
 from finssim.experiments.metrics import summarize
 from finssim.experiments.plants import Plant, load_plant
-from finssim.experiments.players import PolicyPlayer, make_player
 from finssim.experiments.results_table import print_plants, print_results
 from finssim.experiments.setpoints import T1_SETPOINTS
 from finssim.experiments.t2_metrics import summarize_tracking
@@ -28,6 +27,7 @@ from finssim.files import atomic_directory, plain_name
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.tasks import task_named
+from finssim.tasks.agents import PolicyAgent, agent_for
 from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["EVALUATION_FILE", "Evaluation", "EvaluationError", "evaluate", "evaluate_controller"]
@@ -206,14 +206,14 @@ def evaluate_controller(
     body = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
     the_task = task_named(task)
     guides = {"guides": [load_trajectory(x, vehicle=body) for x in trajectories]} if trajectories else {}
-    player = make_player(controller, body, the_task, Trim() if trim else None)
-    if trim and not isinstance(player, PolicyPlayer):
+    agent = agent_for(controller, body, the_task, Trim() if trim else None)
+    if trim and not isinstance(agent, PolicyAgent):
         raise EvaluationError(f"'{controller}' has an integral of its own: trim a policy, or leave it out")
     screen = Console(stderr=True)
     with Progress(console=screen, transient=True, disable=not screen.is_terminal) as progress:
         bar = progress.add_task(f"{trials} trials", total=1.0)
         done = form.run(
-            player,
+            agent,
             the_task,
             body,
             plant,
@@ -225,7 +225,7 @@ def evaluate_controller(
             **guides,
         )
     result = {
-        "controller": player.describe(),
+        "controller": agent.describe(),
         "task": task,
         "vehicle": {"name": body.name, "sha256": body.sha256},
         "hydrodynamics": plant.hydrodynamics or hydrodynamics,

@@ -14,7 +14,8 @@ from finssim.engine import Water
 from finssim.engine.randomize import Randomization
 from finssim.engine.ranges_file import Ranges, load_ranges
 from finssim.engine.surroundings import Wave
-from finssim.tasks import MeasurementNoise
+from finssim.tasks import Environment, MeasurementNoise, Task
+from finssim.tasks.agents import Agent
 from finssim.vehicles import Vehicle
 from finssim.yaml_file import read_mapping
 
@@ -90,6 +91,29 @@ class Plant(BaseModel):
             "noise": MeasurementNoise(**self.noise) if self.noise else None,
             "randomization": Randomization(self.ranges).at_full_width() if self.ranges else None,
         }
+
+    def environment(
+        self, agent: Agent, task: Task, vehicle: Vehicle, *, hydrodynamics: str, **options: Any
+    ) -> Environment:
+        """Worlds in which an agent acts in this plant.
+
+        Args:
+            agent: Who: its action mode and the part of the limits that action 1 stands for.
+            task: What is to be done.
+            vehicle: As its file has it and the agent knows it; the plant changes what it delivers.
+            hydrodynamics: Model, unless the plant names one.
+            options: Of the `Environment`: worlds, seed, ...
+        """
+        return Environment(
+            task,
+            self.changed(vehicle),
+            nominal=vehicle,
+            hydrodynamics=self.hydrodynamics or hydrodynamics,
+            action=agent.action,
+            wrench_scale=agent.wrench_scale,
+            **self.environment_arguments(),
+            **options,
+        )
 
 
 def available_plants() -> list[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,13 +14,13 @@ from numpy.typing import NDArray
 from finssim.control.guidance import Guide, acceleration_at
 from finssim.control.tracking import Goal
 from finssim.control.trajectories import load_trajectory
-from finssim.engine import Recorder
 from finssim.experiments.plants import Plant
-from finssim.experiments.players import Player
 from finssim.experiments.t2_metrics import measure_tracking
 from finssim.experiments.trials import PHYSICS_STEP
 from finssim.geometry.rotations import quat_from_yaw
-from finssim.tasks import Environment, TrajectoryTracking, follow
+from finssim.tasks import TrajectoryTracking, follow
+from finssim.tasks.agents import Agent
+from finssim.tasks.rollout import rollout
 from finssim.vehicles import Vehicle
 
 __all__ = ["T2_TRAJECTORIES", "TrackingTrials", "run_tracking"]
@@ -69,7 +68,7 @@ class TrackingTrials:
 
 
 def run_tracking(
-    player: Player,
+    agent: Agent,
     task: TrajectoryTracking,
     vehicle: Vehicle,
     plant: Plant,
@@ -85,9 +84,9 @@ def run_tracking(
     """Follow trajectories, each from rest on its first pose.
 
     Args:
-        player: Who acts.
-        task: Its observation is what the player sees.
-        vehicle: As its file has it and the player knows it; the plant changes what it delivers.
+        agent: Who acts.
+        task: Its observation is what the agent sees.
+        vehicle: As its file has it and the agent knows it; the plant changes what it delivers.
         plant: What differs.
         trials: How many, all at once.
         guides: What is followed, in turn; the four published trajectories if None.
@@ -100,58 +99,39 @@ def run_tracking(
     ways = guides or [load_trajectory(name, vehicle=vehicle) for name in T2_TRAJECTORIES]
     chosen = tuple(ways[i % len(ways)] for i in range(trials))
     longest = max(guide.duration for guide in chosen)
-    environment = Environment(
+    environment = plant.environment(
+        agent,
         replace(
             task,
-            control_step=player.period,
-            substeps=math.ceil(player.period / PHYSICS_STEP - 1e-9),
+            control_step=agent.period,
+            substeps=math.ceil(agent.period / PHYSICS_STEP - 1e-9),
             time_limit=longest + 1.0,
             knot_spacing=0.1,
         ),
-        plant.changed(vehicle),
-        nominal=vehicle,
+        vehicle,
         worlds=trials,
-        hydrodynamics=plant.hydrodynamics or hydrodynamics,
-        action=player.action,
-        wrench_scale=player.wrench_scale,
+        hydrodynamics=hydrodynamics,
         seed=seed,
         auto_reset=False,
         crash_directory=crash_directory,
-        **plant.environment_arguments(),
     )
     follow(environment, chosen)
-    steps = round(longest / player.period)
-    with nullcontext() if record is None else Recorder(environment.simulator, record) as recorder:
-        series = _play(player, environment, chosen, steps, recorder, show)
-    t = np.arange(steps + 1, dtype=np.float64) * player.period
-    lower, upper = environment.simulator.vehicles[0].force_limits
-    return TrackingTrials(chosen, t, *series, (np.asarray(lower, float), np.asarray(upper, float)))
-
-
-def _play(
-    player: Player,
-    environment: Environment,
-    guides: Sequence[Guide],
-    steps: int,
-    recorder: Recorder | None,
-    show: Callable[[float], None],
-) -> tuple[Array, Array, Array]:
-    n, thrusters = len(guides), len(environment.simulator.vehicles[0].thrusters)
-    series = tuple(np.full((steps + 1, n, width), np.nan) for width in (3, 4, thrusters))
+    steps = round(longest / agent.period)
+    thrusters = len(environment.simulator.vehicles[0].thrusters)
+    position, quaternion, thrust = (np.full((steps + 1, trials, n), np.nan) for n in (3, 4, thrusters))
     state = environment.simulator.state
     episode = state.episode.numpy().copy()
-    memory = player.reset(n)
-    for k in range(steps + 1):
+    for k, _ in rollout(agent, environment, steps, lambda t: _goals(chosen, t), record=record):
         same = state.episode.numpy() == episode  # a world that broke has started over
-        for values, array in zip(series, (state.position, state.quaternion, state.thrust), strict=True):
-            values[k, same] = array.numpy()[same, 0, : values.shape[-1]]
-        if recorder is not None:
-            recorder.record()
-        if k < steps:
-            action, memory = player.act(memory, environment.arrays, _goals(guides, k * player.period))
-            environment.step(action)
+        position[k, same] = state.position.numpy()[same, 0]
+        quaternion[k, same] = state.quaternion.numpy()[same, 0]
+        thrust[k, same] = state.thrust.numpy()[same, 0, :thrusters]
         show(k / steps)
-    return series  # type: ignore[return-value]
+    t = np.arange(steps + 1, dtype=np.float64) * agent.period
+    lower, upper = environment.simulator.vehicles[0].force_limits
+    return TrackingTrials(
+        chosen, t, position, quaternion, thrust, (np.asarray(lower, float), np.asarray(upper, float))
+    )
 
 
 def _goals(guides: Sequence[Guide], t: float) -> Goal:

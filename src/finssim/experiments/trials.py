@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.control.tracking import Goal
-from finssim.engine import Recorder
 from finssim.experiments.metrics import measure_trial
 from finssim.experiments.plants import Plant
-from finssim.experiments.players import Player
 from finssim.experiments.setpoints import T1_SETPOINTS, T1_START, in_room
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
-from finssim.tasks import Environment, Task
+from finssim.tasks import Task
+from finssim.tasks.agents import Agent
+from finssim.tasks.rollout import rollout
 from finssim.vehicles import Vehicle
 
 __all__ = ["Trials", "run_trials"]
@@ -66,7 +65,7 @@ class Trials:
 
 
 def run_trials(
-    player: Player,
+    agent: Agent,
     task: Task,
     vehicle: Vehicle,
     plant: Plant,
@@ -81,9 +80,9 @@ def run_trials(
     """Run trials of 60 s from the published start, level and at rest, towards the eight setpoints in turn.
 
     Args:
-        player: Who acts.
-        task: Its observation is what the player sees.
-        vehicle: As its file has it and the player knows it; the plant changes what it delivers.
+        agent: Who acts.
+        task: Its observation is what the agent sees.
+        vehicle: As its file has it and the agent knows it; the plant changes what it delivers.
         plant: What differs.
         trials: How many, all at once.
         hydrodynamics: Model, unless the plant names one.
@@ -95,46 +94,25 @@ def run_trials(
     names = tuple(list(T1_SETPOINTS)[i % len(T1_SETPOINTS)] for i in range(trials))
     goals = np.array([in_room(T1_SETPOINTS[name], vehicle) for name in names])
     start = in_room(T1_START, vehicle)
-    environment = Environment(
-        replace(task, control_step=player.period, substeps=math.ceil(player.period / PHYSICS_STEP - 1e-9)),
-        plant.changed(vehicle),
-        nominal=vehicle,
+    environment = plant.environment(
+        agent,
+        replace(task, control_step=agent.period, substeps=math.ceil(agent.period / PHYSICS_STEP - 1e-9)),
+        vehicle,
         worlds=trials,
-        hydrodynamics=plant.hydrodynamics or hydrodynamics,
-        action=player.action,
-        wrench_scale=player.wrench_scale,
+        hydrodynamics=hydrodynamics,
         seed=seed,
         auto_reset=False,
         crash_directory=crash_directory,
-        **plant.environment_arguments(),
     )
     environment.start(start[:3], quat_from_yaw(start[3]), goals[:, :3], quat_from_yaw(goals[:, 3]))
-    with nullcontext() if record is None else Recorder(environment.simulator, record) as recorder:
-        t, position, yaw = _play(player, environment, goals, recorder, show)
-    return Trials(names, goals, t, position, yaw)
-
-
-def _play(
-    player: Player,
-    environment: Environment,
-    goals: Array,
-    recorder: Recorder | None,
-    show: Callable[[float], None],
-) -> tuple[Array, Array, Array]:
-    n, steps = len(goals), round(DURATION / player.period)
-    position, yaw = np.full((steps + 1, n, 3), np.nan), np.full((steps + 1, n), np.nan)
+    steps = round(DURATION / agent.period)
+    position, yaw = np.full((steps + 1, trials, 3), np.nan), np.full((steps + 1, trials), np.nan)
     goal = Goal(goals[:, :3], quat_from_yaw(goals[:, 3]))
     state = environment.simulator.state
     episode = state.episode.numpy().copy()
-    memory = player.reset(n)
-    for k in range(steps + 1):
+    for k, _ in rollout(agent, environment, steps, lambda t: goal, record=record):
         same = state.episode.numpy() == episode  # a world that broke has started over
         position[k, same] = state.position.numpy()[same, 0]
         yaw[k, same] = quat_yaw(state.quaternion.numpy()[same, 0])
-        if recorder is not None:
-            recorder.record()
-        if k < steps:
-            action, memory = player.act(memory, environment.arrays, goal)
-            environment.step(action)
         show(k / steps)
-    return np.arange(steps + 1, dtype=np.float64) * player.period, position, yaw
+    return Trials(names, goals, np.arange(steps + 1, dtype=np.float64) * agent.period, position, yaw)

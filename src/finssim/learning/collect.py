@@ -13,9 +13,10 @@ from finssim.control.modes import action_mode
 from finssim.control.policy_description import plain_data
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.learning.demonstrations import DATASET_FILE, DatasetError, Episode, save
-from finssim.learning.experts import Expert, expert_for
 from finssim.provenance import provenance
 from finssim.tasks import Environment, make
+from finssim.tasks.agents import NOWHERE, Agent, Known, expert_for
+from finssim.tasks.baselines import restarted
 
 __all__ = ["collect", "record_episodes"]
 
@@ -60,7 +61,7 @@ def collect(
 
     Raises:
         DatasetError: A number does not fit.
-        EnvironmentSetupError, ExpertError, PolicyError, VehicleError, OutputError: As they say.
+        EnvironmentSetupError, AgentError, PolicyError, VehicleError, OutputError: As they say.
     """
     if episodes < 1 or not 0.0 <= disturb < 1.0:
         raise DatasetError(f"episodes {episodes} and disturb {disturb}: expected 1 or more, and 0 to below 1")
@@ -69,9 +70,9 @@ def collect(
         task, worlds=min(episodes, WORLDS), vehicle=vehicle, hydrodynamics=hydrodynamics, action=action,
         randomize=randomize, observe=observe, seed=seed,
     )  # fmt: skip
-    who = expert_for(environment, expert)
-    found = record_episodes(environment, who, episodes, disturb=disturb, seed=seed, show=show)
     body = environment.simulator.vehicles[0]
+    who = expert_for(expert, body, environment.task, environment.action_mode)
+    found = record_episodes(environment, who, episodes, disturb=disturb, seed=seed, show=show)
     described = {
         "task": environment.task.name,
         "expert": who.name,
@@ -98,7 +99,7 @@ def collect(
 
 def record_episodes(
     environment: Environment,
-    expert: Expert,
+    expert: Agent,
     count: int,
     *,
     disturb: float = 0.0,
@@ -127,7 +128,7 @@ def record_episodes(
     running: list[list[Any]] = [[] for _ in range(rows)]
     found: list[Episode] = []
     while len(found) < count and quota.any():
-        wanted, memory = expert.act(memory, seen)
+        wanted, memory = expert.act(memory, Known(seen), NOWHERE)
         wanted = np.clip(wanted, -1.0, 1.0)
         done = np.clip(wanted + disturb * rng.standard_normal(wanted.shape), -1.0, 1.0).astype(np.float32)
         shape = (worlds, -1) if agents == 1 else (worlds, agents, -1)
@@ -150,7 +151,7 @@ def record_episodes(
                     if not broke[w]:
                         found.append(_episode(running[i], last[i], bool(step.terminated[w]), whole))
                     running[i] = []
-            memory = expert.restarted(memory, fresh, np.repeat(ended, agents))
+            memory = restarted(memory, fresh, np.repeat(ended, agents))
         seen = step.observation.reshape(rows, -1).copy()
         show(min(len(found) / count, 1.0))
     return found[:count]

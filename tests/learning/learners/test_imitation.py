@@ -11,6 +11,7 @@ from finssim.learning.demonstrations import Episode, save
 from finssim.learning.learners import LearningError, learner_named
 from finssim.learning.resume import read_state, write_state
 from finssim.tasks import make, task_named
+from finssim.tasks.agents import NOWHERE, Known
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")
@@ -76,7 +77,7 @@ def test_dagger_keeps_what_the_expert_says_of_where_the_learner_came(shown):
     assert rows.shape == (20 * 4, 16) and told.shape == (20 * 4, 6)
     memory = learner._expert.reset(4)
     for k in range(20):  # 2 s episodes: none ends before its first is over, but shortened ones do
-        wanted, memory = learner._expert.act(memory, rows[4 * k : 4 * k + 4])
+        wanted, memory = learner._expert.act(memory, Known(rows[4 * k : 4 * k + 4]), NOWHERE)
         if k == 0:
             assert np.allclose(told[:4], np.clip(wanted, -1.0, 1.0), atol=1e-6)
     assert np.abs(told).max() <= 1.0

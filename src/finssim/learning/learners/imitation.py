@@ -11,7 +11,6 @@ from torch import nn
 
 from finssim.learning.demonstrations import Demonstrations, load
 from finssim.learning.expert_memory import memory_from, memory_numbers
-from finssim.learning.experts import expert_for
 from finssim.learning.learners.acting import ActingLearner
 from finssim.learning.learners.catalogue import LearningError
 from finssim.learning.learners.networks import stack
@@ -19,6 +18,8 @@ from finssim.learning.learners.task_settings import applied
 from finssim.learning.served import age_episodes
 from finssim.learning.tensors import Tensors
 from finssim.tasks import Environment, Task
+from finssim.tasks.agents import NOWHERE, Known, expert_for
+from finssim.tasks.baselines import restarted
 
 __all__ = ["Bc", "Dagger", "demonstrations_for", "settings_for"]
 
@@ -184,7 +185,8 @@ class Dagger(_Cloner):
     ) -> None:
         """Find the expert and what it has shown already."""
         super().__init__(environment, settings, seed=seed, device=device)
-        self._expert = expert_for(environment, settings.expert)
+        body = environment.simulator.vehicles[0]
+        self._expert = expert_for(settings.expert, body, environment.task, environment.action_mode)
         rows = environment.worlds * environment.agents
         self._fresh = self._expert.reset(rows)
         self._memory = self._fresh
@@ -216,7 +218,7 @@ class Dagger(_Cloner):
         agents, expert_drives = self.environment.agents, self._rounds < self.settings.expert_rounds
         for _ in range(self.settings.rollout):
             rows = self._worlds.observation.flatten(0, 1).cpu().clone()
-            wanted, self._memory = self._expert.act(self._memory, rows.numpy())
+            wanted, self._memory = self._expert.act(self._memory, Known(rows.numpy()), NOWHERE)
             label = torch.from_numpy(np.clip(wanted, -1.0, 1.0).astype(np.float32))
             seen.append(rows)
             told.append(label)
@@ -226,7 +228,7 @@ class Dagger(_Cloner):
             ended = (terminated | truncated).cpu().numpy()
             if ended.any():
                 mask = np.repeat(ended, agents)
-                self._memory = self._expert.restarted(self._memory, self._fresh, mask)
+                self._memory = restarted(self._memory, self._fresh, mask)
         return torch.cat(seen), torch.cat(told)
 
     def learned(self) -> dict[str, Any]:
