@@ -19,7 +19,7 @@ from finssim.pool.camera import PoolCamera
 from finssim.pool.site import camera_of
 from finssim.quiet import start_warp
 from finssim.robot.lockstep import run_lockstep
-from finssim.robot.pilots import PidPilot
+from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import load_vehicle
 
@@ -32,7 +32,7 @@ def main() -> None:
     vehicle = load_vehicle("finsrov")
     true_camera, calibrated_camera, settings = camera_of(vehicle, SEED, "realistic")
     station = Station((0.8, -0.3, -0.5), yaw=1.0)
-    robot = Runtime(vehicle, calibrated_camera, PidPilot("pid", vehicle), station, arm=True)
+    robot = Runtime(vehicle, calibrated_camera, make_pilot("pid", vehicle), station, arm=True)
     with tempfile.TemporaryDirectory() as folder:
         pool = VirtualPool(
             vehicle,

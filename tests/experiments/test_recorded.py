@@ -20,7 +20,7 @@ from finssim.pool.site import camera_of
 from finssim.pool.truth import read_truth
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.lockstep import run_lockstep
-from finssim.robot.pilots import PidPilot
+from finssim.robot.pilots import make_pilot
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import load_vehicle
@@ -44,7 +44,7 @@ def driven(folder, guide, seconds, task="t1", start=(0.0, 0.0, -0.5)):
         seed=1,
         truth=truth,
     )
-    pilot = PidPilot("pid", FINSROV, task)
+    pilot = make_pilot("pid", FINSROV, task=task)
     about = {"command": "finssim run", "pilot": pilot.describe()}
     with Recorder(record, FINSROV, about, pictures="none", epoch=1e9) as recorder:
         runtime = Runtime(FINSROV, known_site, pilot, guide, arm=True, recorder=recorder)

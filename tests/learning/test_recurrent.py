@@ -18,7 +18,7 @@ from finssim.learning.export import ExportError
 from finssim.learning.held_evaluation import HeldEvaluation
 from finssim.learning.learners import learner_named
 from finssim.learning.recurrent import RecurrentNetwork
-from finssim.robot.pilots import ObservingPilot
+from finssim.robot.pilots import make_pilot
 from finssim.robot.robot import Reading
 from finssim.tasks import StationKeeping
 from finssim.tasks.agents import NOWHERE, Known, WorldReadings, agent_for, expert_for
@@ -104,7 +104,7 @@ def test_a_network_that_remembers_otherwise_is_not_exported(tmp_path):
 
 def test_a_pilot_remembers_until_it_is_reset(policy):
     """The thrusts of the policy's own steps; after `reset` the first ones again."""
-    pilot, run = ObservingPilot(policy, FINSROV), Policy.load(policy)
+    pilot, run = make_pilot(policy, FINSROV), Policy.load(policy)
     mode, seen = action_mode("wrench6", FINSROV), Observer("t1", FINSROV).observe(READING, STATION, 0.0)
     memory, given = run.reset(1), []
     for _ in range(3):

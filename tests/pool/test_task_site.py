@@ -9,7 +9,7 @@ import pytest
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.experiments.stack import site_of
 from finssim.pool.medium import Medium
-from finssim.robot.pilots import ObservingPilot
+from finssim.robot.pilots import AgentPilot
 from finssim.tasks import TASKS, task_named
 from finssim.tasks.baselines import BASELINES
 from finssim.tasks.communication import Communication
@@ -49,7 +49,7 @@ def test_a_policy_of_ones_own_task_runs_through_the_stack(example, tmp_path):
     site = site_of(words, str(policy), [FINSROV], seed=3)
     assert site.run()["success"] == 1.0
     pilot = site.runtimes["vehicle"].pilot
-    assert isinstance(pilot, ObservingPilot) and pilot.describe()["task"] == "keep-depth"
+    assert isinstance(pilot, AgentPilot) and pilot.describe()["task"] == "keep-depth"
 
 
 def linear(gain):

@@ -14,7 +14,7 @@ from finssim.robot.link.decoder import MCU, Decoder
 from finssim.robot.link.frames import encode_telemetry
 from finssim.robot.link.transports import memory_pair
 from finssim.robot.messages import Picture
-from finssim.robot.pilots import PidPilot
+from finssim.robot.pilots import make_pilot
 from finssim.robot.realtime import run_realtime
 from finssim.robot.runtime import Runtime
 from finssim.robot.tag_finder import TagFinder
@@ -55,7 +55,7 @@ class Acted:
         self.closed = True
 
     def runtime(self):
-        return Runtime(VEHICLE, POOL, PidPilot("pid", VEHICLE), Station((0.5, 0.2, -0.5), 0.3), arm=True)
+        return Runtime(VEHICLE, POOL, make_pilot("pid", VEHICLE), Station((0.5, 0.2, -0.5), 0.3), arm=True)
 
     def run(self, runtime, **options):
         return run_realtime(runtime, self.ours, self, clock=self.clock, wait=self.wait, **options)

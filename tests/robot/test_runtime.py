@@ -11,7 +11,7 @@ from finssim.robot.link.decoder import MCU, Decoder
 from finssim.robot.link.frames import encode_telemetry
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.messages import Delivery
-from finssim.robot.pilots import PidPilot
+from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import load_vehicle
 from reference.rounds import Rounds, overhead, without_latency
@@ -167,7 +167,7 @@ def test_the_latency_counts_from_the_newest_picture_in_the_state():
 def test_any_bytes_are_survived():
     """Garbage, parts of frames and frames of another kind leave the loop running."""
     runtime, rng = (
-        Runtime(VEHICLE, POOL, PidPilot("pid", VEHICLE), STATION, arm=True),
+        Runtime(VEHICLE, POOL, make_pilot("pid", VEHICLE), STATION, arm=True),
         np.random.default_rng(0),
     )
     world = Shown()

@@ -23,10 +23,8 @@ def test_a_track_comes_back_with_its_age():
     """Sent 0.3 s after it was measured; the receiver's clock is another."""
     name, track = decode_track(encode_track("left_netter", HERE, 4.3), 100.0)
     assert name == "left_netter" and track.time == pytest.approx(99.7)
-    for one, other in zip(
-        (track.position, track.quaternion, track.nu), (HERE.position, HERE.quaternion, HERE.nu)
-    ):
-        np.testing.assert_allclose(one, other, atol=1e-15)
+    for part in ("position", "quaternion", "nu"):
+        np.testing.assert_allclose(getattr(track, part), getattr(HERE, part), atol=1e-15)
 
 
 @given(st.binary(max_size=200))

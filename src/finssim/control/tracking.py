@@ -20,7 +20,16 @@ from finssim.geometry.rotations import (
     wrap_angle,
 )
 
-__all__ = ["Controller", "Goal", "Measured", "Track", "TrackingError", "tracking_error", "velocity_at"]
+__all__ = [
+    "Controller",
+    "Goal",
+    "Known",
+    "Measured",
+    "Track",
+    "TrackingError",
+    "tracking_error",
+    "velocity_at",
+]
 
 Array = npt.NDArray[np.float64]
 
@@ -53,6 +62,16 @@ class Track:
     """Body frame [m/s, rad/s], (6,)."""
     time: float = math.nan
     """When that was measured [s]; NaN where it is not told."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """Readings as plain arrays; what nobody looks at may be left out."""
+
+    observation: Any
+    position: Any = None
+    quaternion: Any = None
+    nu: Any = None
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ from rich.console import Console
 from rich.table import Table
 
 from finssim.control.guidance import Guide
-from finssim.control.modes import Thruster8
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.experiments.episodes import summarize_episodes
 from finssim.files import atomic_write
@@ -23,10 +22,12 @@ from finssim.pool.others import TrueState
 from finssim.pool.plant_spec import Severity
 from finssim.pool.site import camera_of
 from finssim.pool.task_site import TaskSite, open_water
-from finssim.robot.pilots import ObservingPilot
+from finssim.robot.pilots import make_pilot
 from finssim.tasks import Environment, Task
+from finssim.tasks.agents import NOWHERE
 from finssim.tasks.communication import Communication
 from finssim.tasks.observer import fitted_task
+from finssim.tasks.rollout import rollout
 from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["BATCH", "play", "site_of"]
@@ -76,7 +77,7 @@ def site_of(
         lambda v: (
             draw_plant(v, plant, severity) if pool else open_water(draw_plant(v, plant, severity), fitted, v)
         ),
-        lambda name: ObservingPilot(who, vehicles[fitted.vehicles.index(name)], task=words, agent=name),
+        lambda name: make_pilot(who, vehicles[fitted.vehicles.index(name)], task=words, agent=name),
         known,
         seed=seed,
         guide=guide,
@@ -163,32 +164,21 @@ def _follows(task: Task) -> bool:
 
 def _batch(task: str, who: str, vehicles: Sequence[Vehicle], seed: int) -> list[dict[str, Any]]:
     """The first episode of every world of the batch, of the vehicle file's own model, with exact states."""
-    fitted = fitted_task(task, vehicles)
-    words: Any = task
-    pilot = ObservingPilot(who, vehicles[0], task=words, agent=fitted.agents[0])
-    wrench = not isinstance(pilot.mode, Thruster8)
-    env = Environment(
-        fitted,
-        vehicles,
-        worlds=BATCH,
-        action=pilot.mode.name,
-        wrench_scale=pilot.mode.scale if wrench else 1.0,
-        seed=seed,
-    )
-    memory, running = pilot.fresh(BATCH * env.agents), np.ones(BATCH, bool)
+    pilot = make_pilot(who, vehicles[0], task=task)
+    fitted, agent = fitted_task(task, vehicles), pilot.agent
+    scale = agent.wrench_scale
+    env = Environment(fitted, vehicles, worlds=BATCH, action=agent.action, wrench_scale=scale, seed=seed)
     rows: dict[int, dict[str, Any]] = {}
-    while running.any():
-        observation = env.arrays.observation.numpy().reshape(BATCH * env.agents, -1)
-        action, memory = pilot.decide(memory, observation)
-        shape = (BATCH, env.action_size) if env.agents == 1 else (BATCH, env.agents, -1)
-        step = env.step(np.asarray(action, np.float32).reshape(shape))
-        ended = running & (step.terminated | step.truncated)
-        if ended.any():
-            metrics = fitted.metrics(env.arrays)
-            for w in np.flatnonzero(ended):
-                values = {name: float(column[w]) for name, column in metrics.items()}
-                rows[w] = {"trial": int(w), **{n: x if np.isfinite(x) else None for n, x in values.items()}}
-            running &= ~ended
+    steps = round(fitted.time_limit / fitted.control_step) + 1
+    for _, step in rollout(agent, env, steps, lambda t: NOWHERE):
+        ended = np.flatnonzero(step.terminated | step.truncated) if step is not None else ()
+        metrics = fitted.metrics(env.arrays) if len(ended) else {}
+        for w in ended:
+            values = {name: float(column[w]) for name, column in metrics.items()}
+            told = {name: x if np.isfinite(x) else None for name, x in values.items()}
+            rows.setdefault(int(w), {"trial": int(w), **told})
+        if len(rows) == BATCH:
+            break
     return [rows[w] for w in range(BATCH)]
 
 

@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from finssim.control.controllers import CONTROLLERS, controller_for
+from finssim.control.controllers import CONTROLLERS
 from finssim.control.errors import ControlError
 from finssim.control.guidance import Guide, goal_at
 from finssim.control.modes import Wrench6, action_mode, mode_from_dict
-from finssim.control.policy import Policy
 from finssim.control.policy_description import PolicyError, read_description
-from finssim.control.tracking import Measured
+from finssim.control.tracking import Goal, Known, Measured
 from finssim.control.trim import Trim
 from finssim.vehicles import Vehicle
 
-__all__ = ["ModeSwitch", "ObservingPilot", "PidPilot", "Pilot", "WrenchPilot", "make_pilot"]
+if TYPE_CHECKING:
+    from finssim.tasks.agents import Agent
+    from finssim.tasks.observer import Observer
+
+__all__ = ["AgentPilot", "ModeSwitch", "Pilot", "WrenchPilot", "make_pilot"]
 
 Array = npt.NDArray[np.float64]
 
@@ -56,144 +58,63 @@ class Pilot(Protocol):
         """
 
 
-class PidPilot:
-    """A PID by name; its wrench goes through the same limits and allocation as a policy's."""
-
-    needs_state = True
-
-    def __init__(self, name: str, vehicle: Vehicle, task: str = "t1") -> None:
-        """
-        Args:
-            name: pid or pid-paper.
-            vehicle: Its model gives the gains.
-            task: What it is for: pid-paper has a published profile of its own for t2.
-
-        Raises:
-            ControlError: Unknown name.
-        """
-        self.name = name
-        self._controller = controller_for(task, name, vehicle)
-        self._mode = Wrench6.from_vehicle(vehicle)
-        self._limits = np.asarray(vehicle.wrench_limits, float)
-        self._memory: Any = self._controller.reset()
-
-    @property
-    def period(self) -> float:
-        """Time between two decisions [s]."""
-        return self._controller.period
-
-    def describe(self) -> dict[str, Any]:
-        """Name and rate."""
-        return {"name": self.name, "kind": "pid", "action": self._mode.name, "period_s": self.period}
-
-    def reset(self) -> None:
-        """Empty the integrals."""
-        self._memory = self._controller.reset()
-
-    def act(self, reading: Measured, guide: Guide, t: float) -> Array:
-        """Wanted thrusts in canonical order [N], (n,)."""
-        tau, self._memory = self._controller.command(self._memory, reading, goal_at(guide, t))
-        return self._mode.allocator.allocate(np.clip(tau, -self._limits, self._limits))[0]
-
-
-class ObservingPilot:
-    """Who acts on a task's observation: a policy directory, run with onnxruntime, or one of the task's baselines.
+class AgentPilot:
+    """An agent at the helm: a PID, a policy or a baseline of a task, fed with the reading of one vehicle.
 
     Attributes:
+        agent: Who decides, as in a batch.
+        observer: What of the reading it sees; None for a controller that looks at state and goal alone.
         mode: What its actions mean.
-        decide: Memory and observations (n, size) -> actions (n, size) and the memory after.
         period: Time between two decisions [s].
+        observation: What was seen at the last decision; empty before the first.
+        action: What was done, in [-1, 1]; empty before the first.
     """
 
     needs_state = True
 
-    def __init__(
-        self,
-        who: str | Path,
-        vehicle: Vehicle,
-        *,
-        task: str | None = None,
-        agent: str | None = None,
-        period: float | None = None,
-        trim: Trim | None = None,
-    ) -> None:
-        """Load a policy and check that it fits, or make a baseline.
-
-        Args:
-            who: A policy's directory, or the name of a baseline of the task.
-            vehicle: It must be the very one that a policy was trained for.
-            task: Its name, or FILE.py:CLASS of one's own; a policy must have been trained for it; None: whatever a
-                policy was trained for.
-            agent: Its place in a task of several; the first if None.
-            period: Time between two decisions at which it would be asked [s]; None: its own.
-            trim: An integral in front of it, for a steady current or weight; none if None.
-
-        Raises:
-            PolicyError, ControlError, BaselineError: Another vehicle, task, observation, rate or other limits, in one
-                sentence.
+    def __init__(self, agent: Agent, vehicle: Vehicle, observer: Observer | None = None) -> None:
         """
-        from finssim.tasks.baselines import BASELINES, baseline
-        from finssim.tasks.observer import Observer
-
-        self.name = Path(who).resolve().name
-        self._trim = trim
-        if task is not None and str(who) in BASELINES.get(task, {}):
-            self._observer = Observer(task, vehicle, agent=agent)
-            self.mode = action_mode(self._observer.task.action, vehicle)
-            self._who: Any = baseline(task, str(who), vehicle)
-            self.period, self.decide = self._who.period, self._who.act
-            self._about: dict[str, Any] = {"kind": "baseline", "task": task, "trim": None}
-            self.reset()
-            return
-        trained = read_description(Path(who))
-        self.mode = mode_from_dict(trained.action, vehicle)
-        self._observer = Observer(
-            task or trained.task, vehicle, agent=agent, action=str(trained.action["mode"])
-        )
-        self._who = policy = Policy.load(
-            who, vehicle=vehicle, task=self._observer.describe(), control_period=period
-        )
-        self.decide = policy.step
-        self.period = trained.control_period
-        self._about = {
-            "kind": "policy",
-            "task": trained.task,
-            "trim": asdict(trim) if trim else None,
-            "hydrodynamics": trained.hydrodynamics,
-            "seed": trained.seed,
-            "files": dict(trained.files),
-        }
+        Args:
+            agent: Made for the vehicle.
+            vehicle: Its thrusters are commanded.
+            observer: Of the task that the agent does; None where it sees no observation.
+        """
+        self.agent, self.observer, self.period, self.name = agent, observer, agent.period, agent.name
+        self.mode = action_mode(agent.action, vehicle, agent.wrench_scale)
         self.reset()
 
     def describe(self) -> dict[str, Any]:
-        """Name, network, and what it was trained in."""
-        about = {"name": self.name, **self._about, "action": self.mode.name, "period_s": self.period}
-        several = len(self._observer.task.agents) > 1
-        return {**about, "agent": self._observer.agent} if several else about
-
-    def fresh(self, n: int) -> Any:
-        """What `decide` is to remember before the first of n rows."""
-        return self._who.reset(n)
+        """Who it is, as plain data."""
+        about = self.agent.describe()
+        if self.observer is None:
+            return about
+        task = self.observer.task
+        return {
+            **about,
+            "task": task.name,
+            **({"agent": self.observer.agent} if len(task.agents) > 1 else {}),
+        }
 
     def reset(self) -> None:
-        """Forget what was seen, and the trim's shift."""
-        self._memory = self.fresh(1)
-        self._shift = np.zeros(3)
-        self.observation, self.action = np.zeros(0, np.float32), np.zeros(0, np.float32)
-        """What was seen, and done in [-1, 1], at the last decision; empty before the first."""
-        self._observer.restart()
+        """Forget what was seen and done."""
+        self._memory = self.agent.reset(1)
+        self.observation = self.action = np.zeros(0, np.float32)
+        if self.observer is not None:
+            self.observer.restart()
 
     def act(self, reading: Measured, guide: Guide, t: float) -> Array:
         """Wanted thrusts in canonical order [N], (n,)."""
-        observation: Any = self._observer.observe(
-            reading, guide, t, self.action if self.action.size else None
+        if self.observer is not None:
+            previous = self.action if self.action.size else None
+            self.observation = self.observer.observe(reading, guide, t, previous)
+        known = Known(self.observation[None], *(np.asarray(x, float)[None] for x in _state(reading)))
+        goal = goal_at(guide, t)
+        rows = (goal.position, goal.quaternion, goal.velocity, goal.acceleration)
+        action, self._memory = self.agent.act(
+            self._memory, known, Goal(*(np.asarray(x, float)[None] for x in rows))
         )
-        if self._trim is not None:
-            self._shift = self._trim.update(self._shift, reading, guide.at(t).position, self.period)
-            observation = self._trim.shown(observation, reading, self._shift, self._observer.schema)
-        action, self._memory = self.decide(self._memory, observation[None])
-        self.observation, self.action = np.asarray(observation), np.clip(action[0], -1.0, 1.0)
-        return self.mode.to_thrusters(action[0])
+        self.action = np.clip(action[0], -1.0, 1.0)
+        return self.mode.to_thrusters(self.action)
 
 
 class WrenchPilot:
@@ -299,23 +220,44 @@ def make_pilot(
     *,
     task: str | None = None,
     agent: str | None = None,
+    period: float | None = None,
     trim: Trim | None = None,
-) -> PidPilot | ObservingPilot:
+) -> AgentPilot:
     """A PID by its name, the policy of a directory, or a baseline of the task; only a policy takes a trim.
 
-    Raises:
-        PolicyError, ControlError: It does not fit the vehicle or the task.
-    """
-    if str(name_or_directory) in CONTROLLERS and task in (None, "t1", "t2"):
-        return PidPilot(str(name_or_directory), vehicle, task or "t1")
-    if Path(name_or_directory).exists():
-        return ObservingPilot(name_or_directory, vehicle, task=task, agent=agent, trim=trim)
-    from finssim.tasks.baselines import BASELINES
+    Args:
+        name_or_directory: Who.
+        vehicle: It must be the very one that a policy was trained for.
+        task: Its name, or FILE.py:CLASS of one's own, which a policy was trained for; None: whatever a policy
+            was trained for, and T1 of a PID.
+        agent: Its place in a task of several; the first if None.
+        period: Time between two decisions at which a policy would be asked [s]; None: its own.
+        trim: An integral in front of a policy, for a steady current or weight; none if None.
 
-    known = BASELINES.get(task or "", {})
-    if str(name_or_directory) not in known:
-        names = dict.fromkeys([*(CONTROLLERS if task in (None, "t1", "t2") else ()), *known])
-        raise PolicyError(
-            f"{name_or_directory}: neither {' nor '.join(names)} nor a policy directory: give one of these"
-        )
-    return ObservingPilot(name_or_directory, vehicle, task=task, agent=agent)
+    Raises:
+        PolicyError, ControlError: It does not fit the vehicle or the task, in one sentence.
+    """
+    from finssim.tasks.agents import TASKS_OF_PIDS, BaselineAgent, PidAgent, PolicyAgent
+    from finssim.tasks.baselines import BASELINES
+    from finssim.tasks.observer import Observer
+
+    who = str(name_or_directory)
+    if who in CONTROLLERS and task in (None, *TASKS_OF_PIDS):
+        return AgentPilot(PidAgent(who, vehicle, task or "t1"), vehicle)
+    if not Path(who).exists():
+        known = BASELINES.get(task or "", {})
+        if who not in known:
+            names = dict.fromkeys([*(CONTROLLERS if task in (None, *TASKS_OF_PIDS) else ()), *known])
+            raise PolicyError(
+                f"{who}: neither {' nor '.join(names)} nor a policy directory: give one of these"
+            )
+        seen = Observer(str(task), vehicle, agent=agent)
+        return AgentPilot(BaselineAgent(who, vehicle, seen.task), vehicle, seen)
+    trained = read_description(Path(who))
+    mode = mode_from_dict(trained.action, vehicle)
+    seen = Observer(task or trained.task, vehicle, agent=agent, action=mode.name)
+    return AgentPilot(PolicyAgent(who, vehicle, seen.task, trim, period=period), vehicle, seen)
+
+
+def _state(reading: Measured) -> tuple[Any, Any, Any]:
+    return reading.position, reading.quaternion, reading.nu

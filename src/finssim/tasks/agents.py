@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,7 +13,7 @@ from finssim.control.controllers import CONTROLLERS, controller_for
 from finssim.control.modes import mode_from_dict
 from finssim.control.policy import Policy
 from finssim.control.policy_description import DESCRIPTION_FILE
-from finssim.control.tracking import Controller, Goal
+from finssim.control.tracking import Controller, Goal, Known
 from finssim.control.trim import Trim
 from finssim.tasks.baselines import BASELINES, baseline
 from finssim.tasks.task import Task
@@ -93,16 +93,6 @@ class WorldReadings:
         return np.asarray(array.numpy()[:, 0], dtype=float)
 
 
-@dataclass(frozen=True)
-class Known:
-    """Readings as plain arrays; what nobody looks at may be left out."""
-
-    observation: NDArray[Any]
-    position: Any = None
-    quaternion: Any = None
-    nu: Any = None
-
-
 class Agent(Protocol):
     """Sees readings and goals, nothing else, and keeps no state: its memory goes in with every call and comes back."""
 
@@ -127,14 +117,30 @@ class Agent(Protocol):
 class PolicyAgent:
     """A policy directory, run with onnxruntime."""
 
-    def __init__(self, directory: str | Path, vehicle: Vehicle, task: Task, trim: Trim | None = None) -> None:
+    def __init__(
+        self,
+        directory: str | Path,
+        vehicle: Vehicle,
+        task: Task,
+        trim: Trim | None = None,
+        *,
+        period: float | None = None,
+    ) -> None:
         """Load a policy for the vehicle and task, with an integral in front of it or none.
+
+        Args:
+            directory: Of the policy.
+            vehicle: It must be the very one that the policy was trained for.
+            task: It must have been trained for.
+            trim: Integral, or none.
+            period: Time between two decisions at which it would be asked [s]; None: its own.
 
         Raises:
             PolicyError, ControlError: It was trained for another vehicle, task, observation or other limits.
         """
         schema = task.schema.model_dump(mode="json")
-        policy = Policy.load(directory, vehicle=vehicle, task={"name": task.name, "observation": schema})
+        known = {"name": task.name, "observation": schema}
+        policy = Policy.load(directory, vehicle=vehicle, task=known, control_period=period)
         mode = mode_from_dict(policy.description.action, vehicle)
         self.period = policy.description.control_period
         self.action = mode.name

@@ -17,10 +17,11 @@ from finssim.pool.camera import PoolCamera
 from finssim.pool.site import camera_of
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.lockstep import run_lockstep
-from finssim.robot.pilots import PidPilot
+from finssim.robot.pilots import AgentPilot
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.tasks import make
+from finssim.tasks.agents import PidAgent
 from finssim.vehicles import load_vehicle
 
 pytestmark = pytest.mark.slow
@@ -31,27 +32,18 @@ STATIONS = (Station((0.6, 0.25, -0.4), 0.5), Station((-0.6, -0.25, -0.6), -0.5))
 SECONDS = 6.0
 
 
-class Watched(PidPilot):
-    """Keeps what it saw, as the task's observation, and the wrench that it wanted, in parts of its limits."""
+class Watched(AgentPilot):
+    """Keeps what it saw, as the task's observation, and what it did, in parts of its limits."""
 
     def __init__(self):
-        super().__init__("pid", FINSROV)
+        super().__init__(PidAgent("pid", FINSROV), FINSROV)
         self.seen, self.said = [], []
-        inner, kept = self._controller, self.said
-
-        class Heard:
-            period, reset = inner.period, inner.reset
-
-            def command(self, memory, measured, goal):
-                tau, memory = inner.command(memory, measured, goal)
-                kept.append(np.clip(tau / LIMITS, -1.0, 1.0))
-                return tau, memory
-
-        self._controller = Heard()
 
     def act(self, reading, guide, t):
         self.seen.append(published_t1(reading, guide, t))
-        return super().act(reading, guide, t)
+        force = super().act(reading, guide, t)
+        self.said.append(self.action)
+        return force
 
 
 def driven(path, station, seed):

@@ -13,7 +13,7 @@ from finssim.control.guidance import Guide, Station
 from finssim.geometry.rotations import quat_yaw, wrap_angle
 from finssim.localization.pool import Pool
 from finssim.robot.perception import Perception
-from finssim.robot.pilots import PidPilot, Pilot, WrenchPilot
+from finssim.robot.pilots import Pilot, WrenchPilot, make_pilot
 from finssim.robot.recorder import Recorder
 from finssim.robot.robot import Reading
 from finssim.robot.runtime import Runtime
@@ -202,7 +202,7 @@ class _Stages:
         if self._placing.by_hand:
             self._begin(runtime, now)
         else:
-            pilot = PidPilot("pid", self._vehicle)
+            pilot = make_pilot("pid", self._vehicle)
             runtime.hand_over(now, pilot, self._placing.start, arm=True)
             self._stage, self._since, self._there_since = self._approach, now, math.nan
         return False

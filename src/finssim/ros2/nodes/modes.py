@@ -15,7 +15,7 @@ from finssim.control.guidance import Guide
 from finssim.control.policy_description import NETWORK_FILE
 from finssim.control.tracking import Measured
 from finssim.control.trim import Trim
-from finssim.robot.pilots import ModeSwitch, ObservingPilot, PidPilot, WrenchPilot
+from finssim.robot.pilots import AgentPilot, ModeSwitch, WrenchPilot, make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.ros2.nodes.conversions import wrench_of
 from finssim.ros2.nodes.robot_node import RobotNode
@@ -44,10 +44,10 @@ class Modes:
         """
         self._node = node
         self._wrench, self._wrench_at = np.zeros(6), -math.inf
-        pilots: dict[str, Any] = {name: PidPilot(name, node.vehicle) for name in CONTROLLERS}
-        self._policy: ObservingPilot | None = None
+        pilots: dict[str, Any] = {name: make_pilot(name, node.vehicle) for name in CONTROLLERS}
+        self._policy: AgentPilot | None = None
         if policy not in pilots:
-            pilots["policy"] = self._policy = ObservingPilot(
+            pilots["policy"] = self._policy = make_pilot(
                 policy, node.vehicle, task=task or None, trim=Trim() if trim else None
             )
         pilots["teleop"] = WrenchPilot(self._newest, node.vehicle)
