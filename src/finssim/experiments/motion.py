@@ -52,9 +52,9 @@ def measure(
     """
     if task == "t1":
         at = guide.at(0.0)
-        x, y, z, yaw = *at.position.tolist(), float(at.yaw)
-        measures = measure_trial(motion.t, motion.position, motion.yaw, (x, y, z, yaw))
-        return {"goal": [x, y, z, math.degrees(yaw)], **measures}
+        x, y, z = map(float, at.position)
+        measures = measure_trial(motion.t, motion.position, motion.yaw, (x, y, z, float(at.yaw)))
+        return {"goal": [x, y, z, math.degrees(at.yaw)], **measures}
     measures = measure_tracking(
         motion.t,
         motion.position,
@@ -96,7 +96,7 @@ def on_grid(motions: Sequence[Motion], duration: float) -> tuple[Array, Array, A
     Returns:
         Times [s], (T,); positions [m], (T, n, 3); headings [rad], (T, n).
     """
-    t = np.arange(round(duration / PERIOD) + 1) * PERIOD
+    t: Array = np.arange(round(duration / PERIOD) + 1, dtype=np.float64) * PERIOD
     position, yaw = np.full((len(t), len(motions), 3), np.nan), np.full((len(t), len(motions)), np.nan)
     for i, motion in enumerate(motions):
         if not len(motion.t):

@@ -19,7 +19,7 @@ from finssim.control.trajectories import load_trajectory
 from finssim.experiments.driven.drive import Drive, read_drive
 from finssim.experiments.driven.episodes import SAME_GOAL, station_at, trajectory_of
 from finssim.experiments.motion import Motion, localization_errors, measure, on_grid
-from finssim.experiments.setpoints import T1_SETPOINTS
+from finssim.experiments.setpoints import T1_SETPOINTS, in_room
 from finssim.experiments.t2_trials import TrackingTrials
 from finssim.experiments.trials import DURATION, Trials
 from finssim.geometry.rotations import quat_yaw
@@ -106,7 +106,7 @@ def read_record(
     steered = drive.stretch >= 0
     if not (steered & (drive.since >= 0.0)).any():
         raise RecordedError(f"{path}: the robot was never armed with its state known: nothing was done in it")
-    the_guide = _station(drive, steered) if task == "t1" else guide or trajectory_of(drive)
+    the_guide = _station(drive, steered) if task == "t1" else guide or trajectory_of(drive, vehicle)
     whole = min(the_guide.duration, duration) if task == "t1" else the_guide.duration
     rows = steered & (drive.since >= 0.0) & (drive.since <= whole + 1e-6)
     estimate = Motion(
@@ -156,7 +156,7 @@ def measured_records(
     measures = [
         {
             "trial": i,
-            named: _setpoint(trial.guide) if task == "t1" else trial.guide.name,
+            named: _setpoint(trial.guide, vehicle) if task == "t1" else trial.guide.name,
             "record": trial.path.name,
             **trial.measures(task, vehicle),
         }
@@ -203,10 +203,11 @@ def _station(drive: Drive, steered: NDArray[np.bool_]) -> Guide:
     return station_at(goals[0])
 
 
-def _setpoint(guide: Guide) -> str:
+def _setpoint(guide: Guide, vehicle: Vehicle) -> str:
     """Name of the published setpoint that a station is, else its numbers."""
     goal = _row(guide)
-    near = (name for name, known in T1_SETPOINTS.items() if np.abs(known - goal).max() <= SAME_GOAL)
+    known = {name: in_room(pose, vehicle) for name, pose in T1_SETPOINTS.items()}
+    near = (name for name, pose in known.items() if np.abs(pose - goal).max() <= SAME_GOAL)
     return next(near, ",".join(f"{x:.3g}" for x in _goal(guide)))
 
 
@@ -272,7 +273,11 @@ def _trials(found: Sequence[RecordedTrial], task: str, vehicle: Vehicle) -> Tria
     t, position, yaw = on_grid([trial.motion for trial in found], longest)
     if task == "t1":
         return Trials(
-            tuple(map(_setpoint, guides)), np.stack([_row(guide) for guide in guides]), t, position, yaw
+            tuple(_setpoint(guide, vehicle) for guide in guides),
+            np.stack([_row(guide) for guide in guides]),
+            t,
+            position,
+            yaw,
         )
     shape = (len(t), len(found))
     unknown = np.full((*shape, 4), np.nan), np.full((*shape, len(vehicle.thrusters)), np.nan)

@@ -64,7 +64,7 @@ def episodes_of(
             f"{drive.path}: {drive.driver} decided every {drive.period:g} s, expected at most {period:g} s, the period "
             f"of {task.name}: it cannot be taken for a controller of that task"
         )
-    guide_of = _guides(drive, task.moving, goal)
+    guide_of = _guides(drive, vehicle, task.moving, goal)
     stretches = indices_of(drive, period, split_goals=not task.moving and goal is None)
     if not stretches:
         return []
@@ -124,10 +124,12 @@ def _on_grid(run: Indices, time: Array, period: float) -> list[Indices]:
     return [run[p] for p in (*pieces, piece)]
 
 
-def _guides(drive: Drive, moving: bool, goal: Station | str | None) -> Callable[[Indices], Guide]:
+def _guides(
+    drive: Drive, vehicle: Vehicle, moving: bool, goal: Station | str | None
+) -> Callable[[Indices], Guide]:
     """What tells a stretch's guide from the indices of its decisions."""
     if moving:
-        trajectory = trajectory_of(drive, None if goal is None else str(goal))
+        trajectory = trajectory_of(drive, vehicle, None if goal is None else str(goal))
         return lambda rows: trajectory
     if isinstance(goal, Station):
         return lambda rows: goal
@@ -161,11 +163,12 @@ def _recorded_name(drive: Drive) -> str:
     return drive.guide
 
 
-def trajectory_of(drive: Drive, name: str | None = None) -> Guide:
+def trajectory_of(drive: Drive, vehicle: Vehicle, name: str | None = None) -> Guide:
     """The trajectory that was followed, checked against the recorded goals.
 
     Args:
         drive: What was done.
+        vehicle: Which followed it: a published trajectory is as large as its room.
         name: Name or file; the recorded name if None.
 
     Raises:
@@ -174,7 +177,7 @@ def trajectory_of(drive: Drive, name: str | None = None) -> Guide:
     name = name or _recorded_name(drive)
     if np.isnan(drive.since).any():
         raise DriveError(f"{drive.path}: does not say when its trajectory began: not a record of finssim run")
-    guide = load_trajectory(name)
+    guide = load_trajectory(name, vehicle=vehicle)
     off = float(np.linalg.norm(guide.at(drive.since).position - drive.goal[:, :3], axis=1).max())
     if off > SAME_GOAL:
         raise DriveError(

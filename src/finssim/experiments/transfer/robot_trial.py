@@ -23,6 +23,7 @@ from finssim.provenance import provenance
 from finssim.robot.goals import check_reachable
 from finssim.robot.perception import Perception
 from finssim.vehicles import load_vehicle
+from finssim.vehicles.defaults import room
 
 __all__ = ["HARDWARE", "run_on_robot"]
 
@@ -110,6 +111,7 @@ def _play(job: Job, path: Path, opened: Session) -> dict[str, Any] | None:
     return {
         **measure(job.task, trial.guide, motion, vehicle.force_limits, stopped=bool(outcome.fault)),
         "fault": outcome.fault,
+        "room": room(vehicle.body.size),
         "localization": None,
         "robot": opened.robot.title,
         "record": record.name,
