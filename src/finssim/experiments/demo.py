@@ -23,7 +23,7 @@ from finssim.experiments.camera_view import camera_view
 from finssim.experiments.demo_files import PLANT_FILE, TRIALS_FOLDER, command_lines, write_demo
 from finssim.experiments.evaluate import Evaluation
 from finssim.experiments.excitation.command import trials_on_robot
-from finssim.experiments.excitation.levels import matched
+from finssim.experiments.excitation.levels import matched, trimmed
 from finssim.experiments.excitation.pool_trials import pool_trials
 from finssim.experiments.excitation.shuttle import shuttles
 from finssim.experiments.excitation.terminal import compare_steps
@@ -209,6 +209,9 @@ def _identified(folder: Path, out: Path, seed: int, scope: Scope, place: _Place)
 
         def show(run: Any, result: Mapping[str, Any]) -> None:
             unit = "m/s" if run.programme.axes[0] in AXES[:3] else "rad/s"
+            if result["fault"]:
+                console.print(f"  {run.target}: left out: {result['fault']}", highlight=False)
+                return
             told = f"  {run.target}: up to {result['fastest']:.2f} {unit} in {result['duration']:.0f} s"
             console.print(told, highlight=False)
 
@@ -245,13 +248,14 @@ def _recorder(
 
     def record(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
         return pool_trials(
-            _plans(standing, scope),
+            {role: [trimmed(one, standing) for one in plan] for role, plan in _plans(standing, scope).items()},
             folder,
             vehicle=str(rough),
             pool_vehicle=name,
             plant=PLANT,
             severity=SEVERITY,
             seed=seed,
+            leave_out=True,
             processes=processes,
             say=say,
             show=show,

@@ -102,12 +102,24 @@ class Dvl(Sensor):
     """Greatest height above the floor with an echo [m]."""
 
 
+class Compass(Sensor):
+    """Heading of the body's x axis from world x, left positive, of a compass that knows its tilt."""
+
+    noise_std: NonNegative
+    """[rad]"""
+    bias_initial: NonNegative = 0.0
+    """Standard deviation of what calibration leaves of hard iron and declination [rad]."""
+    quantisation: NonNegative = 0.0
+    """[rad]; 0 for none."""
+
+
 class Sensors(Part):
     """The sensors aboard; None where there is none."""
 
     imu: Imu | None = None
     depth: DepthSensor | None = None
     dvl: Dvl | None = None
+    compass: Compass | None = None
 
 
 class Tags(Part):

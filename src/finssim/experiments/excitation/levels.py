@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
+from finssim.calibration.excitation.programmes import Programme
 from finssim.control.pole_placement import AxisModel, axis_model
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.capability import level_speed, terminal_speed
 from finssim.vehicles.defaults import room
 
-__all__ = ["matched"]
+__all__ = ["matched", "trimmed"]
 
 SHARE = 0.9
 """Largest level, part of the wrench limit: the rest is for the controller that holds the other axes."""
+BALLASTED = 0.25
+"""Weight less buoyancy of a vehicle that floats well enough by itself [N]."""
 STEADY = 0.8
 """Fastest surge and sway, part of `level_speed` [-]."""
 
@@ -48,6 +52,23 @@ def matched(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> dict[str
         most = SHARE * float(vehicle.wrench_limits[i])
         found[axis] = list(dict.fromkeys(float(f"{min(x, most):.3g}") for x in wanted))
     return found
+
+
+def trimmed(programme: Programme, vehicle: Vehicle) -> Programme:
+    """The programme with the vehicle's weight less its buoyancy carried by the thrusters, where it is not ballasted.
+
+    A BlueROV2 that rises with 2 N is out of a shallow pool before its first step; the fit takes what acted.
+
+    Args:
+        programme: On any axis.
+        vehicle: Whose weight and displaced volume are known.
+    """
+    net = vehicle.weight - vehicle.buoyancy
+    if abs(net) < BALLASTED:
+        return programme
+    tau = programme.tau_desired.copy()
+    tau[:, 2] += net
+    return replace(programme, tau_desired=tau)
 
 
 def _speed(model: AxisModel, i: int, level: float) -> float:

@@ -34,6 +34,7 @@ def pool_trials(
     severity: str = "realistic",
     seed: int = 1,
     hold: str | None = "pid",
+    leave_out: bool = False,
     processes: int | None = None,
     say: Say = lambda part, what: None,
     show: Show = lambda job, result: None,
@@ -49,6 +50,7 @@ def pool_trials(
         severity: nominal, realistic or hard.
         seed: Of noise.
         hold: PID that keeps the axes that a programme does not excite; None leaves them alone.
+        leave_out: Leave out the trials that the bridge stopped, instead of refusing all; `show` is given their fault.
         processes: As many as there are processors if None.
         say: Told the share that is done and what is left.
         show: Given each run and its result, of `play_programme`, as soon as there is one.
@@ -88,15 +90,24 @@ def pool_trials(
             show=show,
         )
         for run, result in zip(runs, results, strict=True):
+            if result["fault"] and leave_out:
+                continue
             if result["fault"]:
                 raise CalibrationError(
                     f"{run.target} in the virtual pool: {result['fault']}: give lower levels, or fewer axes at once"
                 )
             _keep(Path(scratch) / run.key(), folder / run.row, run.target)
-    return {
-        role: [load_trial(folder / role / programme.name) for programme in plan]
+    done = {(run.row, run.target) for run, result in zip(runs, results, strict=True) if not result["fault"]}
+    found = {
+        role: [load_trial(folder / role / p.name) for p in plan if (role, p.name) in done]
         for role, plan in plans.items()
     }
+    for role, trials in found.items():
+        if not trials:
+            raise CalibrationError(
+                f"the bridge stopped every {role} trial in the virtual pool: {results[0]['fault']}: give lower levels"
+            )
+    return found
 
 
 def _keep(made: Path, folder: Path, name: str) -> None:

@@ -3,31 +3,36 @@
 Nominal state: position and velocity of the IMU in the pool frame, attitude, gyro bias, accelerometer bias. Error state
 (15): [δp, δv, δθ, δb_g, δb_a], with the attitude error in pool axes, R = exp([δθ]x) R̂.
 
+With a Doppler log or a compass it has five more (20): [δb_c, δs, δb_v], their offsets and the log's scale.
+
     p_dot = v,  v_dot = R (f - b_a) + g,  R_dot = R [ω - b_g]x
     δp_dot = δv,  δv_dot = -[R (f - b_a)]x δθ - R δb_a + n_a,  δθ_dot = -R δb_g + n_g
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.rotations import quat_from_rotvec, quat_multiply, quat_to_matrix, skew
+from finssim.geometry.rotations import cross, quat_from_rotvec, quat_multiply, quat_to_matrix, skew
 from finssim.localization.fusion.changed import changed
 from finssim.localization.fusion.position_filter import Motion, process_noise, transition
 
 __all__ = [
+    "AIDED",
     "ErrorStateNoise",
     "InertialState",
     "correct",
     "depth_model",
     "drift",
     "error_innovation",
+    "heading_model",
     "position_model",
     "predict",
+    "velocity_model",
     "yaw_model",
 ]
 
@@ -35,7 +40,11 @@ Array = npt.NDArray[np.float64]
 
 P, V, A, G, B = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
 """Where δp, δv, δθ, δb_g and δb_a stand in the error state."""
-_I15 = np.eye(15)
+C, S, D = 15, 16, slice(17, 20)
+"""Where the offset of the compass, the scale and the offset of the Doppler log stand in the aided one."""
+AIDED = 5
+"""Numbers that log and compass add."""
+_I = {n: np.eye(n) for n in (15, 15 + AIDED)}
 
 
 @dataclass(frozen=True)
@@ -53,7 +62,9 @@ class InertialState:
     accel_bias: Array
     """Body frame [m/s²], (..., 3)."""
     covariance: Array
-    """Of the error state, (..., 15, 15)."""
+    """Of the error state, (..., n, n): n = 15, or 20 with `extra`."""
+    extra: Array = field(default_factory=lambda: np.zeros(0))
+    """Offset of the compass [rad], scale error [-] and offset of the Doppler log [m/s], (..., 5); none: (0,)."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +79,8 @@ class ErrorStateNoise:
     """[rad/s²/√Hz]"""
     accel_walk: float
     """[m/s³/√Hz]"""
+    log_walk: float = 0.0
+    """Of the Doppler log's offset [m/s²/√Hz]."""
 
 
 def predict(
@@ -88,13 +101,14 @@ def predict(
     pushed = (R @ (force - state.accel_bias)[..., None])[..., 0]
     a = pushed + gravity
     q = quat_multiply(state.q, quat_from_rotvec(turn))
-    F = np.broadcast_to(_I15, (*turn.shape[:-1], 15, 15)).copy()
-    F[..., P, V] = dt * _I15[:3, :3]
-    S, turned = dt * skew(pushed), dt * R
-    F[..., V, A], F[..., P, A] = -S, (-0.5 * dt) * S
+    n = state.covariance.shape[-1]
+    F = np.broadcast_to(_I[n], (*turn.shape[:-1], n, n)).copy()
+    F[..., P, V] = dt * _I[15][:3, :3]
+    swing, turned = dt * skew(pushed), dt * R
+    F[..., V, A], F[..., P, A] = -swing, (-0.5 * dt) * swing
     F[..., V, B], F[..., P, B] = -turned, (-0.5 * dt) * turned
     F[..., A, G] = -turned
-    covariance = F @ state.covariance @ np.swapaxes(F, -1, -2) + _noise(dt, noise)
+    covariance = F @ state.covariance @ np.swapaxes(F, -1, -2) + _noise(dt, noise, n)
     return changed(
         state,
         p=state.p + dt * state.v + 0.5 * dt**2 * a,
@@ -113,9 +127,10 @@ def drift(state: InertialState, dt: float, motion: Motion, turning: float) -> In
         motion: How the vehicle may move.
         turning: Noise density of its rates [rad/s/√Hz].
     """
-    F = np.eye(15)
+    n = state.covariance.shape[-1]
+    F = np.eye(n)
     F[:6, :6] = transition(dt, motion)
-    Q = np.zeros((15, 15))
+    Q = np.zeros((n, n))
     Q[:6, :6] = process_noise(dt, motion)
     Q[A, A] = turning**2 * dt * np.eye(3)
     moved = np.concatenate([state.p, state.v], axis=-1) @ F[:6, :6].T
@@ -123,16 +138,18 @@ def drift(state: InertialState, dt: float, motion: Motion, turning: float) -> In
     return changed(state, p=moved[..., :3], v=moved[..., 3:], covariance=covariance)
 
 
-def _noise(dt: float, noise: ErrorStateNoise) -> Array:
-    """Covariance that one step adds, (15, 15): the same in every direction, so that no axes need to turn."""
-    first, second, third = _noise_powers(noise)
+def _noise(dt: float, noise: ErrorStateNoise, n: int) -> Array:
+    """Covariance that one step adds, (n, n): the same in every direction, so that no axes need to turn."""
+    first, second, third = _noise_powers(noise, n)
     return dt * first + (0.5 * dt**2) * second + (dt**3 / 3.0) * third
 
 
 @lru_cache(maxsize=8)
-def _noise_powers(noise: ErrorStateNoise) -> tuple[Array, Array, Array]:
-    """What goes with dt, dt²/2 and dt³/3 in the noise of a step, (15, 15) each."""
-    first, second, third = np.zeros((3, 15, 15))
+def _noise_powers(noise: ErrorStateNoise, n: int) -> tuple[Array, Array, Array]:
+    """What goes with dt, dt²/2 and dt³/3 in the noise of a step, (n, n) each."""
+    first, second, third = np.zeros((3, n, n))
+    if n > 15:
+        first[D, D] = noise.log_walk**2 * np.eye(3)
     i = np.arange(3)
     third[i, i] = second[i, i + 3] = second[i + 3, i] = first[i + 3, i + 3] = noise.accel**2
     first[i + 6, i + 6] = noise.gyro**2
@@ -152,7 +169,7 @@ def position_model(state: InertialState, lever: Array) -> tuple[Array, Array]:
         Position, pool frame [m], (..., 3), and its Jacobian, (..., 3, 15).
     """
     arm = (quat_to_matrix(state.q) @ lever[:, None])[..., 0]
-    H = np.zeros((*arm.shape[:-1], 3, 15))
+    H = np.zeros((*arm.shape[:-1], 3, state.covariance.shape[-1]))
     H[..., range(3), range(3)] = 1.0
     H[..., A] = -skew(arm)
     return state.p + arm, H
@@ -184,11 +201,45 @@ def yaw_model(state: InertialState) -> tuple[Array, Array]:
     """
     c = quat_to_matrix(state.q)[..., :, 0]
     level = c[..., 0] ** 2 + c[..., 1] ** 2
-    H = np.zeros((*c.shape[:-1], 1, 15))
+    H = np.zeros((*c.shape[:-1], 1, state.covariance.shape[-1]))
     H[..., 0, 6] = -c[..., 2] * c[..., 0] / level
     H[..., 0, 7] = -c[..., 2] * c[..., 1] / level
     H[..., 0, 8] = 1.0
     return np.arctan2(c[..., 1], c[..., 0])[..., None], H
+
+
+def heading_model(state: InertialState) -> tuple[Array, Array]:
+    """What a compass reads: yaw and its own offset.
+
+    Returns:
+        Heading [rad], (..., 1), and its Jacobian, (..., 1, 20).
+    """
+    yaw, H = yaw_model(state)
+    H[..., 0, C] = 1.0
+    return yaw + state.extra[..., :1], H
+
+
+def velocity_model(state: InertialState, omega: Array, lever: Array) -> tuple[Array, Array]:
+    """What a Doppler log reads: (1 + s) [R' v + (ω - b_g) x l] + b_v.
+
+    Args:
+        state: The state.
+        omega: Angular rate as measured, body frame [rad/s], (..., 3).
+        lever: The log from the IMU, body frame [m], (3,).
+
+    Returns:
+        Velocity, body frame [m/s], (..., 3), and its Jacobian, (..., 3, 20).
+    """
+    back = np.swapaxes(quat_to_matrix(state.q), -1, -2)
+    own = (back @ state.v[..., None])[..., 0] + cross(omega - state.gyro_bias, lever)
+    gain = 1.0 + state.extra[..., 1]
+    H = np.zeros((*own.shape[:-1], 3, state.covariance.shape[-1]))
+    H[..., V] = gain * back
+    H[..., A] = gain * (back @ skew(state.v))
+    H[..., G] = gain * skew(lever)
+    H[..., S] = own
+    H[..., D] = _I[15][:3, :3]
+    return gain * own + state.extra[..., 2:], H
 
 
 def error_innovation(state: InertialState, residual: Array, H: Array, R: Array) -> tuple[Array, Array]:
@@ -221,7 +272,7 @@ def correct(state: InertialState, residual: Array, H: Array, R: Array, gain: Arr
         gain: As `error_innovation` gives it.
     """
     d = (gain @ residual[..., None])[..., 0]
-    kept = _I15 - gain @ H
+    kept = _I[gain.shape[-2]] - gain @ H
     covariance = kept @ state.covariance @ np.swapaxes(kept, -1, -2)
     covariance = covariance + gain @ R @ np.swapaxes(gain, -1, -2)
     q = quat_multiply(quat_from_rotvec(d[..., A]), state.q)
@@ -232,4 +283,5 @@ def correct(state: InertialState, residual: Array, H: Array, R: Array, gain: Arr
         state.gyro_bias + d[..., G],
         state.accel_bias + d[..., B],
         0.5 * (covariance + np.swapaxes(covariance, -1, -2)),
+        state.extra + d[..., 15:],
     )

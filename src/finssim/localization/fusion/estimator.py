@@ -10,14 +10,22 @@ from finssim.localization.fusion.fuse_constant_velocity import ConstantVelocity
 from finssim.localization.fusion.fuse_error_state import ErrorState
 from finssim.localization.fusion.fuse_settings import Settings, Site
 from finssim.localization.fusion.health import Estimate, Health, Outcome, health_of
-from finssim.localization.fusion.streams import DepthSample, ImuSample, Sample, VisionSample, refusal
+from finssim.localization.fusion.streams import (
+    DepthSample,
+    HeadingSample,
+    ImuSample,
+    Sample,
+    VelocitySample,
+    VisionSample,
+    refusal,
+)
 from finssim.localization.fusion.timeline import Surroundings, Timeline
 
 __all__ = ["MODELS", "Estimator", "Model"]
 
 S = TypeVar("S")
 
-STREAMS = ("imu", "depth", "vision", "yaw")
+STREAMS = ("imu", "depth", "vision", "yaw", "velocity", "heading")
 AGREED = 10
 """Samples on one other clock after which that clock is believed."""
 UNHEARD = 10.0
@@ -34,6 +42,8 @@ class Model(Protocol[S]):
     def imu(self, track: S, sample: ImuSample) -> tuple[S, tuple[Outcome, ...]]: ...
     def depth(self, track: S, sample: DepthSample) -> tuple[S, tuple[Outcome, ...]]: ...
     def vision(self, track: S, sample: VisionSample) -> tuple[S, tuple[Outcome, ...]]: ...
+    def velocity(self, track: S, sample: VelocitySample) -> tuple[S, tuple[Outcome, ...]]: ...
+    def heading(self, track: S, sample: HeadingSample) -> tuple[S, tuple[Outcome, ...]]: ...
     def estimate(self, track: S, time: float) -> Estimate: ...
 
 
@@ -42,7 +52,8 @@ MODELS: dict[str, Any] = {"constant-velocity": ConstantVelocity, "error-state": 
 
 
 class Estimator:
-    """Position, velocity and attitude of one vehicle from camera, depth and IMU.
+    """Position, velocity and attitude of one vehicle from what it has: IMU and depth; fixes of a camera, of motion
+    capture or of acoustics; Doppler velocity and compass.
 
     Samples are put in the order of their times, whatever the order in which they come: the state is the same for any
     delivery within the horizon. What cannot be used is counted with its reason, and never raises.
@@ -67,7 +78,9 @@ class Estimator:
         self._counts: dict[str, dict[str, int]] = {stream: {} for stream in STREAMS}
         self._latest: dict[str, float] = {}
         self._reason = ""
-        self.nis: dict[str, tuple[float, int]] = dict.fromkeys(("vision", "yaw", "depth"), (0.0, 0))
+        self.nis: dict[str, tuple[float, int]] = dict.fromkeys(
+            ("vision", "yaw", "depth", "velocity", "heading"), (0.0, 0)
+        )
         """Stream -> sum of squared Mahalanobis distances of accepted measurements, and of their dimensions."""
         self._arrived = -math.inf
         self._other: list[float] = []

@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
 from finssim.localization.fusion import position_filter, yaw_filter
 from finssim.localization.fusion.attitude import (
     Tilt,
@@ -24,7 +25,13 @@ from finssim.localization.fusion.fuse_settings import Settings, Site
 from finssim.localization.fusion.gate import GateMemory, judge
 from finssim.localization.fusion.health import Estimate, Outcome
 from finssim.localization.fusion.position_filter import Motion, PositionState
-from finssim.localization.fusion.streams import DepthSample, ImuSample, VisionSample
+from finssim.localization.fusion.streams import (
+    DepthSample,
+    HeadingSample,
+    ImuSample,
+    VelocitySample,
+    VisionSample,
+)
 from finssim.localization.fusion.yaw_filter import YawNoise, YawState, yaw_rate
 
 __all__ = ["ConstantVelocity", "Track", "motion_of", "vision_covariance"]
@@ -60,6 +67,9 @@ class Track:
     """Time of the latest vision yaw that was believed [s]."""
     depth_time: float | None = None
     imu_time: float | None = None
+    velocity_time: float | None = None
+    compass: bool = False
+    """Whether yaw is what a compass says, offset included."""
     gates: tuple[GateMemory, GateMemory, GateMemory] = (GateMemory(), GateMemory(), GateMemory())
     """Memories of the gates of position, yaw and depth."""
 
@@ -137,8 +147,38 @@ class ConstantVelocity:
         track, seen = self._fixed(track, sample, R[:2, :2])
         if sample.yaw is None:
             return track, (seen,)
-        track, turned = self._turned(track, sample, float(R[2, 2]))
+        track, turned = self._turned(track, sample.time, sample.yaw, float(R[2, 2]))
+        track = changed(track, compass=track.compass and not turned.used)
         return track, (seen, turned)
+
+    def velocity(self, track: Track, sample: VelocitySample) -> tuple[Track, tuple[Outcome, ...]]:
+        """Take in a velocity over the floor, turned into the pool frame by the heading so far."""
+        if track.yaw_seen is None or self.settings.aids is None:
+            return track, (Outcome("velocity", "no heading"),)
+        track = changed(self._positioned(track, sample.time), yaw=self._yaw_at(track, sample.time))
+        track = changed(track, yaw_time=_later(track.yaw_time, sample.time))
+        R_pb = quat_to_matrix(quat_from_euler(track.roll, track.pitch, track.yaw.yaw))
+        z = R_pb @ np.array(sample.velocity)
+        turned = track.yaw.variance * float(z @ z) + self.settings.aids.velocity_bias**2
+        R = (self.settings.aids.velocity_std**2 + turned) * np.eye(3)
+        found = position_filter.innovation(track.position, _H_VELOCITY, z, R)
+        position = position_filter.correct(track.position, found, _H_VELOCITY, R)
+        track = changed(track, position=position, velocity_time=sample.time)
+        return track, (Outcome("velocity", "accepted", float(found.mahalanobis), 3),)
+
+    def heading(self, track: Track, sample: HeadingSample) -> tuple[Track, tuple[Outcome, ...]]:
+        """Take in a heading: as a yaw of the camera, with the compass's offset in its variance."""
+        aids = self.settings.aids
+        if aids is None:
+            return track, (Outcome("heading", "no compass"),)
+        track = changed(track, yaw=self._yaw_at(track, sample.time))
+        track = changed(track, yaw_time=_later(track.yaw_time, sample.time))
+        variance = aids.heading_std**2 + aids.heading_bias**2
+        track, turned = self._turned(track, sample.time, sample.yaw, variance)
+        # Its offset is in every sample: many of them know no better than one.
+        if track.yaw.variance < aids.heading_bias**2:
+            track = changed(track, yaw=changed(track.yaw, variance=aids.heading_bias**2))
+        return changed(track, compass=track.compass or turned.used), (replace(turned, stream="heading"),)
 
     def estimate(self, track: Track, time: float) -> Estimate:
         """The state at a time, not before its own; what is not known yet is NaN."""
@@ -165,6 +205,7 @@ class ConstantVelocity:
             vision_time=track.vision_time,
             depth_time=track.depth_time,
             imu_time=track.imu_time,
+            velocity_time=track.velocity_time,
         )
 
     def _fixed(self, track: Track, sample: VisionSample, R: Array) -> tuple[Track, Outcome]:
@@ -183,19 +224,19 @@ class ConstantVelocity:
         track = changed(track, position=position, vision_time=then, gates=(memory, *track.gates[1:]))
         return track, Outcome("vision", verdict, float(found.mahalanobis), 2)
 
-    def _turned(self, track: Track, sample: VisionSample, variance: float) -> tuple[Track, Outcome]:
+    def _turned(self, track: Track, time: float, seen: float, variance: float) -> tuple[Track, Outcome]:
         s = self.settings
-        found = yaw_filter.innovation(track.yaw, sample.yaw or 0.0, variance)
+        found = yaw_filter.innovation(track.yaw, seen, variance)
         # Flipped yaws agree with one another as distances from the prediction, which turns with the vehicle.
         apart, R = np.array([found.residual]), np.array([[variance]])
-        verdict, memory = judge(s.gate, track.gates[1], sample.time, apart, R, found.mahalanobis, 0.05)
+        verdict, memory = judge(s.gate, track.gates[1], time, apart, R, found.mahalanobis, 0.05)
         if verdict == "accepted":
             yaw = yaw_filter.correct(track.yaw, found, variance)
         elif verdict == "gate":
             yaw = track.yaw
         else:
-            yaw = yaw_filter.restarted(track.yaw, sample.yaw or 0.0, variance, s.bias_std)
-        then = track.yaw_seen if verdict == "gate" else sample.time
+            yaw = yaw_filter.restarted(track.yaw, seen, variance, s.bias_std)
+        then = track.yaw_seen if verdict == "gate" else time
         gates = (track.gates[0], memory, track.gates[2])
         track = changed(track, yaw=yaw, yaw_seen=then, gates=gates)
         return track, Outcome("yaw", verdict, found.mahalanobis, 1)
@@ -221,7 +262,7 @@ class ConstantVelocity:
         if math.isnan(then) or time <= then:
             return changed(track, position_time=_later(then, time))
         position = track.position
-        seen = -math.inf if track.vision_time is None else track.vision_time
+        seen = max(-math.inf if t is None else t for t in (track.vision_time, track.velocity_time))
         dived = -math.inf if track.depth_time is None else track.depth_time
         for until in _steps(then, time, (seen + s.coast, seen + s.hold, dived + s.coast, dived + s.hold)):
             middle = 0.5 * (then + until)
@@ -253,6 +294,7 @@ class ConstantVelocity:
 
 
 _H_VISION = np.eye(6)[:2]
+_H_VELOCITY = np.eye(6)[3:]
 
 
 def vision_covariance(sample: VisionSample, settings: Settings) -> Array:

@@ -30,7 +30,13 @@ from finssim.localization.fusion.fuse_constant_velocity import (
 from finssim.localization.fusion.fuse_settings import Settings, Site
 from finssim.localization.fusion.gate import GateMemory, judge
 from finssim.localization.fusion.health import Estimate, Outcome
-from finssim.localization.fusion.streams import DepthSample, ImuSample, VisionSample
+from finssim.localization.fusion.streams import (
+    DepthSample,
+    HeadingSample,
+    ImuSample,
+    VelocitySample,
+    VisionSample,
+)
 from finssim.localization.poses.measurement import axes_of_up
 
 __all__ = ["ErrorState", "InertialTrack"]
@@ -56,7 +62,9 @@ class InertialTrack:
     vision_time: float | None = None
     depth_time: float | None = None
     imu_time: float | None = None
-    gates: tuple[GateMemory, GateMemory, GateMemory] = (GateMemory(), GateMemory(), GateMemory())
+    velocity_time: float | None = None
+    gates: tuple[GateMemory, ...] = (GateMemory(),) * 5
+    """Memories of the gates of position, yaw, depth, Doppler velocity and compass."""
     roll: float = 0.0
     pitch: float = 0.0
 
@@ -75,8 +83,13 @@ class ErrorState:
         self._up = np.array(site.up)
         self._gravity = -site.gravity * self._up
         self._body, self._port = -np.array(site.imu), np.array(site.depth_port) - np.array(site.imu)
+        self._log = np.array(site.dvl) - np.array(site.imu)
         self._noise = ErrorStateNoise(
-            settings.gyro.rate, settings.accel_noise, settings.gyro.bias_walk, settings.accel_bias_walk
+            settings.gyro.rate,
+            settings.accel_noise,
+            settings.gyro.bias_walk,
+            settings.accel_bias_walk,
+            settings.aids.velocity_walk if settings.aids else 0.0,
         )
         self._drifts = {slow: motion_of(settings, slow, False) for slow in (False, True)}
 
@@ -128,7 +141,7 @@ class ErrorState:
         elif verdict == "reacquired":
             state = fuse_restart.restarted(state, [2], state.p[2:] + residual / self._up[2], R, s.speed_std)
         then = track.depth_time if verdict == "gate" else sample.time
-        gates = (*track.gates[:2], memory)
+        gates = (*track.gates[:2], memory, *track.gates[3:])
         track = self._kept(changed(track, inertial=state, depth_time=then, gates=gates))
         return track, (Outcome("depth", verdict, float(distance), 1),)
 
@@ -144,6 +157,50 @@ class ErrorState:
         track, turned = self._turned(track, sample, R[2:, 2:])
         return self._kept(track), (seen, turned)
 
+    def velocity(
+        self, track: InertialTrack, sample: VelocitySample
+    ) -> tuple[InertialTrack, tuple[Outcome, ...]]:
+        """Take in a velocity over the floor."""
+        s = self.settings
+        if track.inertial is None or s.aids is None:
+            before, outcomes = self._before.velocity(track.before, sample)
+            return changed(track, before=before), outcomes
+        track = self._until(track, sample.time)
+        state = track.inertial
+        assert state is not None
+        expected, H = error_state.velocity_model(state, np.array(track.omega), self._log)
+        seen, R = np.array(sample.velocity), s.aids.velocity_std**2 * np.eye(3)
+        distance, gain = error_state.error_innovation(state, seen - expected, H, R)
+        verdict, memory = judge(s.gate, track.gates[3], sample.time, seen, R, float(distance), 1.0)
+        if (
+            verdict != "gate"
+        ):  # what the log says of velocity is believed in the end, whatever was thought before
+            state = error_state.correct(state, seen - expected, H, R, gain)
+        then = track.velocity_time if verdict == "gate" else sample.time
+        gates = (*track.gates[:3], memory, track.gates[4])
+        track = self._kept(changed(track, inertial=state, velocity_time=then, gates=gates))
+        return track, (Outcome("velocity", verdict, float(distance), 3),)
+
+    def heading(
+        self, track: InertialTrack, sample: HeadingSample
+    ) -> tuple[InertialTrack, tuple[Outcome, ...]]:
+        """Take in a heading."""
+        s = self.settings
+        if track.inertial is None or s.aids is None:
+            before, outcomes = self._before.heading(track.before, sample)
+            return self._begun(changed(track, before=before), sample.time), outcomes
+        track = self._until(track, sample.time)
+        state = track.inertial
+        assert state is not None
+        expected, H = error_state.heading_model(state)
+        residual, R = wrap_angle(np.array([sample.yaw]) - expected), np.array([[s.aids.heading_std**2]])
+        distance, gain = error_state.error_innovation(state, residual, H, R)
+        verdict, memory = judge(s.gate, track.gates[4], sample.time, residual, R, float(distance), 0.05)
+        if verdict != "gate":
+            state = error_state.correct(state, residual, H, R, gain)
+        track = changed(track, inertial=state, gates=(*track.gates[:4], memory))
+        return self._kept(track), (Outcome("heading", verdict, float(distance), 1),)
+
     def estimate(self, track: InertialTrack, time: float) -> Estimate:
         """The state at a time, not before its own."""
         if track.inertial is None:
@@ -152,7 +209,8 @@ class ErrorState:
         state = track.inertial
         assert state is not None
         T, x = self._to_body(state, np.array(track.omega))
-        old = track.vision_time is None or time - track.vision_time > self.settings.hold
+        aided = _aided(track)
+        old = aided is None or time - aided > self.settings.hold
         if old:
             x[3:5] = 0.0
         yaw, H = error_state.yaw_model(state)
@@ -169,14 +227,15 @@ class ErrorState:
             vision_time=track.vision_time,
             depth_time=track.depth_time,
             imu_time=track.imu_time,
+            velocity_time=track.velocity_time,
         )
 
     def _to_body(self, state: InertialState, omega: Array) -> tuple[Array, Array]:
-        """Jacobian (6, 15) of the body origin's position and velocity, and their values (6,)."""
+        """Jacobian (6, n) of the body origin's position and velocity, and their values (6,)."""
         position, H = error_state.position_model(state, self._body)
         R = quat_to_matrix(state.q)
         swing = R @ cross(omega - state.gyro_bias, self._body)
-        T = np.zeros((6, 15))
+        T = np.zeros((6, H.shape[-1]))
         T[:3] = H
         T[3:, 3:6] = np.eye(3)
         return T, np.concatenate([position, state.v + swing])
@@ -191,14 +250,30 @@ class ErrorState:
         from_level = axes_of_up(self.site.up)
         R = from_level @ quat_to_matrix(level)
         q = quat_multiply(matrix_to_quat(from_level), level)
-        covariance = np.zeros((15, 15))
+        extra = 0 if s.aids is None else error_state.AIDED
+        covariance = np.zeros((15 + extra, 15 + extra))
         covariance[:6, :6] = known.P
         covariance[6:9, 6:9] = np.diag([s.tilt_std**2, s.tilt_std**2, known.yaw_variance])
-        covariance[9:, 9:] = np.diag([s.bias_std**2] * 3 + [s.accel_bias_std**2] * 3)
+        covariance[9:15, 9:15] = np.diag([s.bias_std**2] * 3 + [s.accel_bias_std**2] * 3)
+        if s.aids is not None:
+            a = s.aids
+            covariance[15:, 15:] = np.diag(
+                np.square([a.heading_bias, a.velocity_scale, *[a.velocity_bias] * 3])
+            )
+            if before.compass:  # yaw is then what the compass said, less its offset
+                covariance[8, 8] += a.heading_bias**2
+                covariance[8, 15] = covariance[15, 8] = -(a.heading_bias**2)
         state = InertialState(
-            known.x[:3] - R @ self._body, known.x[3:], q, np.zeros(3), np.zeros(3), covariance
+            known.x[:3] - R @ self._body,
+            known.x[3:],
+            q,
+            np.zeros(3),
+            np.zeros(3),
+            covariance,
+            np.zeros(extra),
         )
-        track = changed(track, inertial=state, time=time, vision_time=before.vision_time, gates=before.gates)
+        gates = (*before.gates, GateMemory(1), GateMemory(1))
+        track = changed(track, inertial=state, time=time, vision_time=before.vision_time, gates=gates)
         return self._kept(changed(track, depth_time=before.depth_time))
 
     def _fixed(self, track: InertialTrack, sample: VisionSample, R: Array) -> tuple[InertialTrack, Outcome]:
@@ -228,7 +303,7 @@ class ErrorState:
             state = error_state.correct(state, residual, H, R, gain)
         elif verdict == "reacquired":
             state = fuse_restart.turned(state, float(residual[0]), float(R[0, 0]))
-        track = changed(track, inertial=state, gates=(track.gates[0], memory, track.gates[2]))
+        track = changed(track, inertial=state, gates=(track.gates[0], memory, *track.gates[2:]))
         return track, Outcome("yaw", verdict, float(distance), 1)
 
     def _until(self, track: InertialTrack, time: float) -> InertialTrack:
@@ -236,14 +311,15 @@ class ErrorState:
         s, then = self.settings, track.time
         if time <= then:
             return track
-        cuts = [track.vision_time + limit for limit in (s.coast, s.hold) if track.vision_time is not None]
+        aided = _aided(track)
+        cuts = [] if aided is None else [aided + limit for limit in (s.coast, s.hold)]
         heard = -math.inf if track.imu_time is None else track.imu_time + GYRO_HOLD
         ends = [*sorted({cut for cut in (*cuts, heard) if then < cut < time}), time]
         state = track.inertial
         assert state is not None
         for until in ends:
             middle = 0.5 * (then + until)
-            age = math.inf if track.vision_time is None else middle - track.vision_time
+            age = math.inf if aided is None else middle - aided
             state = self._step(state, track, until - then, blind=middle > heard, age=age)
             then = until
         return self._kept(
@@ -267,7 +343,7 @@ class ErrorState:
         ):  # the place is no longer told by the accelerometer, only that the vehicle may be anywhere near
             walk = 2.0 * s.speed_std**2 / s.decay * dt
             after = fuse_restart.parted(changed(after, p=np.append(state.p[:2], after.p[2])), [0, 1], walk)
-        H = np.eye(15)[3:5]
+        H = np.eye(len(after.covariance))[3:5]
         R = np.eye(2) * s.speed_std**2 / (s.decay * dt)
         residual = -after.v[:2]
         gain = error_state.error_innovation(after, residual, H, R)[1]
@@ -278,6 +354,12 @@ class ErrorState:
         assert track.inertial is not None
         roll, pitch = roll_pitch(self._up @ quat_to_matrix(track.inertial.q))
         return changed(track, roll=float(roll), pitch=float(pitch))
+
+
+def _aided(track: InertialTrack) -> float | None:
+    """Time of the latest fix or Doppler velocity [s]; None before the first."""
+    told = [t for t in (track.vision_time, track.velocity_time) if t is not None]
+    return max(told) if told else None
 
 
 def _mean(a: tuple[float, float, float], b: tuple[float, float, float]) -> tuple[float, float, float]:

@@ -76,7 +76,7 @@ def capped(state: InertialState, variance: float, tilt: float) -> InertialState:
         tilt: Largest standard deviation of roll and pitch [rad].
     """
     d = np.diagonal(state.covariance)
-    limit = np.array([variance] * 3 + [np.inf] * 3 + [tilt**2] * 2 + [10.0] + [np.inf] * 6)
+    limit = np.array([variance] * 3 + [np.inf] * 3 + [tilt**2] * 2 + [10.0] + [np.inf] * (len(d) - 9))
     if np.all(d <= limit):
         return state
     scale = np.sqrt(np.minimum(1.0, limit / np.maximum(d, 1e-300)))

@@ -15,9 +15,27 @@ from finssim.localization.fusion.yaw_filter import YawNoise
 from finssim.localization.pool import Pool
 from finssim.vehicles import Vehicle
 
-__all__ = ["PROFILES", "Settings", "Site", "settings_of", "site_of"]
+__all__ = ["PROFILES", "Aids", "Settings", "Site", "settings_of", "site_of"]
 
 Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Aids:
+    """Errors of Doppler log and compass; those that last since power-on are a part of the error state."""
+
+    velocity_std: float = 0.01
+    """Of one sample, per axis [m/s]."""
+    velocity_bias: float = 0.001
+    """Standard deviation of the offset, per axis [m/s]."""
+    velocity_scale: float = 0.001
+    """Standard deviation of the scale's error [-]."""
+    velocity_walk: float = 0.0
+    """Of the offset [m/s²/√Hz]."""
+    heading_std: float = 0.01
+    """Of one sample [rad]."""
+    heading_bias: float = 0.005
+    """Standard deviation of the compass's offset [rad]."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +87,9 @@ class Settings:
     """Largest variance of a position with which the state is ready [m²]."""
     ready_yaw: float = 0.03
     """And of yaw [rad²]."""
+    aids: Aids | None = None
+    """Of Doppler log and compass; None where there are none. Between fixes the position then drifts, as its covariance
+    tells, and is ready up to `largest_variance`."""
 
     @classmethod
     def published(cls) -> Settings:
@@ -94,6 +115,8 @@ class Settings:
 
 
 PROFILES = ("default", "published")
+LOST = 100.0
+"""Standard deviation per axis with which a vehicle that navigates by log and compass is lost [m]."""
 
 
 @dataclass(frozen=True)
@@ -108,14 +131,16 @@ class Site:
     """Pressure port, body frame [m]."""
     imu: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Accelerometer, body frame [m]."""
+    dvl: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Doppler log, body frame [m]."""
     gravity: float = 9.81
     """[m/s²]"""
     R_wp: tuple[tuple[float, float, float], ...] = field(default=((1, 0, 0), (0, 1, 0), (0, 0, 1)))
     """Pool axes to world axes, for velocities in the report."""
 
 
-def site_of(pool: Pool, vehicle: Vehicle) -> Site:
-    """The site of a pool file and a vehicle file.
+def site_of(pool: Pool | None, vehicle: Vehicle) -> Site:
+    """The site of a pool file and a vehicle file; without a pool file the pool frame is the world's.
 
     Heights are measured from the water plane itself, tilt included, where that plane is a surface; behind a wall from
     the world frame's origin.
@@ -123,8 +148,10 @@ def site_of(pool: Pool, vehicle: Vehicle) -> Site:
     Raises:
         LocalizationError: The pool frame's z does not point up.
     """
-    R_wp = pool.T_wp[:3, :3]
-    if pool.is_surface:
+    R_wp = np.eye(3) if pool is None else pool.T_wp[:3, :3]
+    if pool is None:
+        up, offset = np.array([0.0, 0.0, 1.0]), 0.0
+    elif pool.is_surface:
         up, offset = np.asarray(pool.interface.normal, float), float(pool.interface.offset)
     else:
         up, offset = R_wp[2], float(pool.T_wp[2, 3])
@@ -139,6 +166,7 @@ def site_of(pool: Pool, vehicle: Vehicle) -> Site:
         offset=offset,
         depth_port=_three(sensors.depth.position) if sensors.depth else (0.0, 0.0, 0.0),
         imu=_three(sensors.imu.position) if sensors.imu else (0.0, 0.0, 0.0),
+        dvl=_three(sensors.dvl.position) if sensors.dvl else (0.0, 0.0, 0.0),
         gravity=float(vehicle.water.gravity),
         R_wp=tuple(_three(row) for row in R_wp),
     )
@@ -169,7 +197,25 @@ def settings_of(vehicle: Vehicle, profile: str = "default") -> Settings:
         )
     if depth is not None:
         settings = replace(settings, depth_std=max(depth.noise_std, settings.depth_std))
-    return settings
+    dvl, compass = vehicle.sensors.dvl, vehicle.sensors.compass
+    if dvl is None and compass is None:
+        return settings
+    aids = Aids()
+    if dvl is not None:
+        aids = replace(
+            aids,
+            velocity_std=math.hypot(dvl.noise_std, 0.3 * dvl.quantisation),
+            velocity_bias=dvl.bias_initial,
+            velocity_scale=dvl.scale_error,
+            velocity_walk=dvl.bias_walk,
+        )
+    if compass is not None:
+        aids = replace(
+            aids,
+            heading_std=math.hypot(compass.noise_std, 0.3 * compass.quantisation),
+            heading_bias=compass.bias_initial,
+        )
+    return replace(settings, aids=aids, ready_position=LOST**2, largest_variance=LOST**2)
 
 
 def _three(values: npt.ArrayLike) -> tuple[float, float, float]:

@@ -56,6 +56,8 @@ class Estimate:
     """Time of the latest position fix that was believed [s]."""
     depth_time: float | None
     imu_time: float | None
+    velocity_time: float | None = None
+    """Time of the latest Doppler velocity that was believed [s]."""
 
     def std(self) -> Array:
         """Standard deviations of position, velocity and yaw, (7,)."""
@@ -130,7 +132,10 @@ def health_of(
         math.nan if then is None else estimate.time - then
         for then in (estimate.vision_time, estimate.imu_time, estimate.depth_time)
     )
-    mode = mode_of(vision, settings)
+    told = [t for t in (estimate.vision_time, estimate.velocity_time) if t is not None]
+    mode = mode_of(
+        estimate.time - max(told) if told and estimate.vision_time is not None else vision, settings
+    )
     variances = estimate.P.diagonal().tolist()
     vx, vy, vz = estimate.x[3:].tolist()
     imu_fresh, depth_fresh = imu <= settings.imu_fresh + 1e-9, depth <= settings.depth_fresh + 1e-9

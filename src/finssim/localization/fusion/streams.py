@@ -6,7 +6,15 @@ import math
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
-__all__ = ["DepthSample", "ImuSample", "Sample", "VisionSample", "refusal"]
+__all__ = [
+    "DepthSample",
+    "HeadingSample",
+    "ImuSample",
+    "Sample",
+    "VelocitySample",
+    "VisionSample",
+    "refusal",
+]
 
 
 @dataclass(frozen=True)
@@ -41,7 +49,7 @@ class DepthSample:
 
 @dataclass(frozen=True)
 class VisionSample:
-    """Where the camera sees the vehicle."""
+    """Where the camera, motion capture or an acoustic positioning system sees the vehicle."""
 
     time: float
     """Middle of the exposure [s]: the picture's stamp less the camera's latency."""
@@ -56,7 +64,33 @@ class VisionSample:
     stream: str = field(default="vision", init=False)
 
 
-Sample: TypeAlias = "ImuSample | DepthSample | VisionSample"
+@dataclass(frozen=True)
+class VelocitySample:
+    """Velocity over the floor, of a Doppler velocity log."""
+
+    time: float
+    """When it was measured [s]."""
+    velocity: tuple[float, float, float]
+    """Of the log's place, body axes [m/s]."""
+    arrival: float | None = None
+    """When it was delivered [s]; None: with its time."""
+    stream: str = field(default="velocity", init=False)
+
+
+@dataclass(frozen=True)
+class HeadingSample:
+    """Heading of a compass."""
+
+    time: float
+    """When it was measured [s]."""
+    yaw: float
+    """Left positive, pool frame [rad]."""
+    arrival: float | None = None
+    """When it was delivered [s]; None: with its time."""
+    stream: str = field(default="heading", init=False)
+
+
+Sample: TypeAlias = "ImuSample | DepthSample | VisionSample | VelocitySample | HeadingSample"
 
 
 def refusal(sample: Sample) -> str | None:
@@ -68,6 +102,9 @@ def refusal(sample: Sample) -> str | None:
         return None if all(map(math.isfinite, values)) else "not finite"
     if isinstance(sample, DepthSample):
         return None if math.isfinite(sample.depth) else "not finite"
+    if isinstance(sample, VelocitySample | HeadingSample):
+        numbers = sample.velocity if isinstance(sample, VelocitySample) else (sample.yaw,)
+        return None if all(map(math.isfinite, numbers)) else "not finite"
     values = (*sample.position, *(() if sample.yaw is None else (sample.yaw,)))
     if not all(map(math.isfinite, values)):
         return "not finite"

@@ -15,7 +15,7 @@ __all__ = ["Surroundings", "Timeline"]
 
 S = TypeVar("S")
 
-_RANK = {"imu": 0, "depth": 1, "vision": 2}
+_RANK = {"imu": 0, "depth": 1, "vision": 2, "heading": 3, "velocity": 4}
 """Order of samples of one time, so that delivery decides nothing."""
 SAME = 1e-7
 """Stamps nearer than this are the same [s]."""
