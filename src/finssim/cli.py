@@ -76,6 +76,7 @@ cli_calibrate.experiment_app.command("localization")(cli_vision.experiment_local
 cli_calibrate.experiment_app.command()(cli_experiments.t1)
 cli_calibrate.experiment_app.command()(cli_experiments.t2)
 cli_calibrate.experiment_app.command()(cli_experiments.ablation)
+cli_calibrate.experiment_app.command("open-water")(cli_experiments.open_water)
 cli_calibrate.experiment_app.command("all")(cli_experiments.everything)
 cli_calibrate.experiment_app.command()(cli_experiments.faults)
 cli_calibrate.experiment_app.command()(cli_experiments.soak)

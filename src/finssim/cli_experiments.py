@@ -26,7 +26,7 @@ from finssim.cli_robot import robot_or_none
 if TYPE_CHECKING:
     from finssim.experiments.on_robot.session import OnRobot
 
-__all__ = ["ablation", "everything", "faults", "soak", "stack", "t1", "t2", "timing"]
+__all__ = ["ablation", "everything", "faults", "open_water", "soak", "stack", "t1", "t2", "timing"]
 
 Out = Annotated[
     Path,
@@ -185,6 +185,32 @@ def ablation(
     run(
         out=out, plants=plants, seeds=seeds, seed=seed, severity=severity, camera=camera, vehicle=vehicle,
         steps=steps, processes=processes, as_json=as_json,
+    )  # fmt: skip
+
+
+def open_water(
+    out: Annotated[Path, typer.Option(help="Directory for the result.", metavar="DIR")],
+    vehicle: Vehicle = "bluerov2_heavy",
+    minutes: Annotated[float, typer.Option(help="Of each way [min].", min=0.1)] = 10.0,
+    speed: Annotated[float, typer.Option(help="[m/s]", min=0.01)] = 0.3,
+    way: Annotated[str, typer.Option(help="line or square (of 10 m).", metavar="WORD")] = "line",
+    positioning: Annotated[
+        str, typer.Option(help="Fixes: none, motion-capture or usbl.", metavar="NAME")
+    ] = "none",
+    seeds: Annotated[int, typer.Option(help="Ways, each with its own water and noise.", min=1, max=1000)] = 3,
+    seed: Seed = 1,
+    severity: Severity = "realistic",
+    as_json: Json = False,
+) -> None:
+    """Drift of Doppler log, depth, IMU and compass in open water [m], and whether the estimator's ellipse holds it.
+
+    Example: finssim experiment open-water --seeds 1 --out drift
+    """
+    from finssim.experiments.open_water import run
+
+    run(
+        out=out, vehicle=vehicle, minutes=minutes, speed=speed, shape=way, positioning=positioning, seeds=seeds,
+        seed=seed, severity=severity, as_json=as_json,
     )  # fmt: skip
 
 

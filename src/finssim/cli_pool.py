@@ -76,6 +76,14 @@ def pool(
             metavar="X,Y,Z,YAW",
         ),
     ] = None,
+    site: Annotated[
+        str,
+        typer.Option(help="Where: pool, tank or open-water (current, waves, 20 m of water).", metavar="NAME"),
+    ] = "pool",
+    positioning: Annotated[
+        str,
+        typer.Option(help="Fixes on the robot's wire: none, motion-capture or usbl.", metavar="NAME"),
+    ] = "none",
     duration: Annotated[
         float | None, typer.Option(help="When to end, pool's clock [s]; never if not given.", min=0.0)
     ] = None,
@@ -103,4 +111,6 @@ def pool(
         start=start,
         duration=duration,
         seed=seed,
+        site=site,
+        positioning=positioning,
     )

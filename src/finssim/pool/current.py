@@ -19,6 +19,7 @@ class Gyre:
     width: float  # [m]
     depth: float  # [m]
     floor_share: float
+    stream: wp.vec3  # the same everywhere [m/s]
     cells: wp.array(dtype=float)
     speed: wp.array(dtype=float)  # signed by the sense of rotation [m/s]
     unsteadiness: wp.array(dtype=float)
@@ -40,12 +41,12 @@ def circulation_at(gyre: Gyre, position: wp.vec3, t: float) -> wp.vec3:
         t: Time [s].
 
     Returns:
-        Horizontal; zero outside the walls.
+        The stream, and horizontally what the eddies add to it within the walls.
     """
     X = position[0] / gyre.length + 0.5
     Y = position[1] / gyre.width + 0.5
     if X <= 0.0 or X >= 1.0 or Y <= 0.0 or Y >= 1.0:
-        return wp.vec3(0.0)
+        return gyre.stream
     sx = wp.sin(wp.pi * X)
     cx = wp.cos(wp.pi * X)
     sy = wp.sin(wp.pi * Y)
@@ -63,7 +64,7 @@ def circulation_at(gyre: Gyre, position: wp.vec3, t: float) -> wp.vec3:
         A = now * wp.min(gyre.width, gyre.length / c) / wp.pi
         u += A * sx * sc * (2.0 * wp.pi / gyre.width) * sy * cy
         v -= A * (wp.pi / gyre.length) * (cx * sc + c * sx * cc) * sy * sy
-    return share * wp.vec3(u, v, 0.0)
+    return gyre.stream + share * wp.vec3(u, v, 0.0)
 
 
 def gyre(circulation: Circulation, basin: Basin, device: Any = "cpu") -> Gyre:
@@ -72,7 +73,7 @@ def gyre(circulation: Circulation, basin: Basin, device: Any = "cpu") -> Gyre:
     modes = circulation.eddies
     out.count = len(modes)
     out.length, out.width, out.depth = basin.length, basin.width, basin.depth
-    out.floor_share = circulation.floor_share
+    out.floor_share, out.stream = circulation.floor_share, wp.vec3(*circulation.stream)
     columns = {
         "cells": [float(m.cells) for m in modes],
         "speed": [m.sense * m.speed for m in modes],

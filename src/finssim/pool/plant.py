@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.engine import Pool, Simulator, Water
+from finssim.engine import Pool, Simulator, Water, Wave
 from finssim.engine.plant_arrays import NO_LIMIT
 from finssim.physics.hydrostatics import submerged_fraction
 from finssim.physics.kinematics import up_in_body
@@ -167,11 +167,14 @@ class Plant:
             hydrodynamics="mesh" if meshed else "calibrated",
             control_step=self.step,
             substeps=1,
-            water=Water(depth=spec.basin.depth),
+            water=Water(
+                depth=spec.basin.depth,
+                waves=[Wave(**wave.model_dump()) for wave in spec.circulation.waves],
+            ),
             pool=Pool(length=spec.basin.length, width=spec.basin.width, depth=spec.basin.depth),
             tether=dragged_line(spec.tether),
             threads=1,
-            water_moves=bool(spec.circulation.eddies),
+            water_moves=bool(spec.circulation.eddies or any(spec.circulation.stream)),
         )
         for name, value in _engine_fields(vehicle, spec).items():
             view = simulator.plant.fields[name].numpy()

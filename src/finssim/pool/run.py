@@ -8,7 +8,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,6 +24,7 @@ from finssim.pool.picture_wire import PictureSink
 from finssim.pool.plant_spec import Basin, PlantSpec, PlantSpecError, Severity, load_plant_spec
 from finssim.pool.server import LockstepServer, serve_realtime
 from finssim.pool.site import camera_of
+from finssim.pool.sites import positioning_of, site_of, vehicle_at
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.goals import station_of
 from finssim.robot.link.layout import LinkError
@@ -49,6 +50,8 @@ class PoolPlan:
     camera: CameraPlan | None
     calibrated: Pool | None
     """What a robot may know of the camera."""
+    positioning: str = "none"
+    """Name of the positioning system."""
 
     def world(self, camera: Any, *, start: Station, seed: int, truth: Path | None) -> VirtualPool:
         """The living pool.
@@ -60,7 +63,15 @@ class PoolPlan:
             truth: File that is written.
         """
         pose = np.asarray(start.position), quat_from_yaw(start.yaw)
-        return VirtualPool(self.vehicle, self.spec, camera=camera, start=pose, seed=seed, truth=truth)
+        return VirtualPool(
+            self.vehicle,
+            self.spec,
+            camera=camera,
+            positioning=positioning_of(self.positioning, seed),
+            start=pose,
+            seed=seed,
+            truth=truth,
+        )
 
 
 def make_plan(
@@ -70,6 +81,7 @@ def make_plan(
     *,
     camera: Literal["pictures", "corners", "none"] = "pictures",
     seed: int = 0,
+    site: str = "pool",
 ) -> PoolPlan:
     """Draw a plant and its camera, or read the plant from its file.
 
@@ -79,12 +91,18 @@ def make_plan(
         severity: Of a drawn plant.
         camera: What it sends.
         seed: Of ripples, noise, jitter and losses.
+        site: pool, tank or open-water; a camera hangs over the pool and the tank alone.
 
     Raises:
         PlantSpecError: The plant cannot be made, or there is no such severity or camera.
     """
     ours = load_vehicle(vehicle)
     spec = draw_plant(ours, int(plant), severity) if plant.isdecimal() else load_plant_spec(plant)
+    spec, ours = site_of(site, spec), vehicle_at(site, ours)
+    if site == "open-water" and camera != "none":
+        raise PlantSpecError(
+            "no camera hangs over open water: give --camera none, and a positioning if there is one"
+        )
     if camera not in ("pictures", "corners", "none"):
         raise PlantSpecError(f"unknown camera '{camera}'; available: pictures, corners, none")
     if camera == "none":
@@ -110,10 +128,14 @@ def run(
     start: str | None,
     duration: float | None,
     seed: int,
+    site: str = "pool",
+    positioning: str = "none",
 ) -> None:
     """Run a virtual pool; arguments as of the command."""
     logging.basicConfig(level=logging.WARNING, format="finssim: %(message)s", stream=sys.stderr)
-    plan = make_plan(vehicle, plant, severity, camera=camera, seed=seed)
+    positioning_of(positioning, seed)  # refuses what is none
+    plan = make_plan(vehicle, plant, severity, camera=camera, seed=seed, site=site)
+    plan = replace(plan, positioning=positioning)
     start = start or f"0,0,{-0.5 * plan.spec.basin.depth:g},0"
     begin = station_of(start)
     _check_start(begin, plan.spec.basin, start)

@@ -10,6 +10,7 @@ import warp as wp
 
 from finssim.pool.plant import Plant, captured
 from finssim.pool.plant_spec import Instruments
+from finssim.robot.messages import HEADING, VELOCITY, NavigationAid
 from finssim.sensors import SensorSuite
 from finssim.vehicles import Vehicle
 
@@ -52,7 +53,8 @@ class PoolSensors:
         """Between samples [s]."""
         vehicle = with_instruments(plant.vehicle, plant.spec.instruments)
         key = int(np.random.SeedSequence([seed, 72]).generate_state(1)[0] >> 1)
-        suite = SensorSuite(vehicle, worlds=1, control_step=self.period, seed=key)
+        floor = plant.spec.basin.depth
+        suite = SensorSuite(vehicle, worlds=1, control_step=self.period, seed=key, floor_depth=floor)
         state = plant.simulator.state
         self._state = SimpleNamespace(
             position=state.position,
@@ -73,6 +75,15 @@ class PoolSensors:
         assert imu is not None and gauge is not None  # draw_plant refuses a vehicle without them
         self._gyro, self._accel = view(imu.gyro)[0], view(imu.accel)[0]
         self._depth, self._pressure = view(gauge.depth), view(gauge.pressure)
+        self._aids = [
+            (kind, view(batch.fresh), view(batch.stamp), np.atleast_2d(view(reading)))
+            for kind, batch, reading in (
+                (VELOCITY, suite.dvl, suite.dvl and suite.dvl.velocity),
+                (HEADING, suite.compass, suite.compass and suite.compass.heading),
+            )
+            if batch is not None
+        ]
+        self._sent = 0
 
     def sample(self) -> Sample:
         """Read both; the gauge gives its newest sample that has arrived."""
@@ -84,6 +95,20 @@ class PoolSensors:
             float(self._depth[0]),
             float(self._pressure[0]),
         )
+
+    def aids(self) -> list[NavigationAid]:
+        """What Doppler log and compass have delivered at the newest `sample`."""
+        found = []
+        for kind, fresh, stamp, reading in self._aids:
+            if not fresh[0]:
+                continue
+            values = [*reading[0].tolist(), 0.0, 0.0]
+            age = max(float(self._count[0]) * self.period - float(stamp[0]), 0.0)
+            self._sent += 1
+            found.append(
+                NavigationAid(self._sent & 0xFFFF, kind, age, (values[0], values[1], values[2]), (0.0, 0.0))
+            )
+        return found
 
 
 def with_instruments(vehicle: Vehicle, instruments: Instruments) -> Vehicle:
@@ -105,7 +130,6 @@ def with_instruments(vehicle: Vehicle, instruments: Instruments) -> Vehicle:
         update={
             "imu": imu.model_copy(update={**scaled, "latency": 0.0}),
             "depth": gauge.model_copy(update=drifting),
-            "dvl": None,
         }
     )
     return vehicle.model_copy(update={"sensors": sensors})

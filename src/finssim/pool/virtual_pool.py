@@ -7,6 +7,7 @@ import random
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Protocol
@@ -19,8 +20,10 @@ from finssim.pool.firmware import Firmware
 from finssim.pool.motors import RPM
 from finssim.pool.plant import Plant
 from finssim.pool.plant_spec import PlantSpec
+from finssim.pool.positioning import Positioning
 from finssim.pool.sensors import PoolSensors
 from finssim.pool.truth import TruthWriter
+from finssim.robot.link.frames import encode_navigation
 from finssim.robot.messages import Delivery, Picture
 from finssim.vehicles import Vehicle
 
@@ -61,6 +64,7 @@ class VirtualPool:
         spec: PlantSpec,
         *,
         camera: Camera | None = None,
+        positioning: Positioning | None = None,
         start: tuple[ArrayLike, ArrayLike] = ((0.0, 0.0, -0.5), (0.0, 0.0, 0.0, 1.0)),
         seed: int = 0,
         truth: str | Path | None = None,
@@ -72,6 +76,7 @@ class VirtualPool:
             vehicle: Its file.
             spec: The plant.
             camera: Overhead; none if None.
+            positioning: Motion capture or acoustics, whose fixes come on the robot's wire; none if None.
             start: Position, world frame [m], and quaternion, body to world, xyzw.
             seed: Of instruments, speed measurements and the wire.
             truth: File that is written; none if None.
@@ -82,7 +87,7 @@ class VirtualPool:
         """
         imu = vehicle.sensors.imu
         period = 1.0 / imu.rate if imu is not None else 0.01
-        self.vehicle, self.spec, self.camera = vehicle, spec, camera
+        self.vehicle, self.spec, self.camera, self.positioning = vehicle, spec, camera, positioning
         self.plant = Plant(vehicle, spec, seed=seed, period=period, position=start[0], quaternion=start[1])
         self.sensors = PoolSensors(self.plant, seed)
         self.firmware = Firmware(vehicle, spec)
@@ -126,6 +131,9 @@ class VirtualPool:
             arrival, _, data = heapq.heappop(self._up)
             frames.append((arrival, data))
         before, self.time = self.time, until
+        if self.positioning is not None:
+            frames += self.positioning.advance(before, until, self.pose_at)
+            frames.sort(key=lambda frame: frame[0])
         pictures = self.camera.advance(before, until, self.pose_at) if self.camera is not None else ()
         return Delivery(until, tuple(frames), tuple(pictures))
 
@@ -160,7 +168,7 @@ class VirtualPool:
         firmware.watch(now)
         plant.target[:] = firmware.target
         plant.advance()
-        if self.camera is not None:
+        if self.camera is not None or self.positioning is not None:
             self._remember()
         if plant.steps % plant.steps_per_period == 0:
             sample = self.sensors.sample()
@@ -168,6 +176,8 @@ class VirtualPool:
             telemetry = firmware.telemetry(leaves, sample, plant.measured_speed, plant.throttle)
             if telemetry is not None:
                 self._transmit(leaves, self.faults.encode(telemetry))
+                for aid in self.sensors.aids():
+                    self._transmit(leaves, encode_navigation(replace(aid, age=aid.age + self._imu_latency)))
         if self._truth is not None and plant.steps % self._truth_steps == 0:
             self._write_truth(self._truth)
 

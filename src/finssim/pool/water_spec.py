@@ -120,9 +120,25 @@ class Eddy(Section):
     """1: anticlockwise from above."""
 
 
-class Circulation(Section):
-    """The current: eddies that vanish at the walls."""
+class Swell(Section):
+    """One linear wave."""
 
+    amplitude: float = Field(ge=0.0)
+    """Half the height from trough to crest [m]."""
+    wavelength: float = Field(gt=0.0)
+    """[m]"""
+    heading: float = 0.0
+    """Direction of travel, from world x towards y [rad]."""
+    phase: float = 0.0
+    """[rad]"""
+
+
+class Circulation(Section):
+    """The current: eddies that vanish at the walls, and in open water a stream and waves."""
+
+    stream: Three = (0.0, 0.0, 0.0)
+    """The same everywhere, world frame [m/s]."""
+    waves: tuple[Swell, ...] = ()
     eddies: tuple[Eddy, ...] = ()
     floor_share: float = Field(default=0.5, ge=0.0, le=1.0)
     """Speed at the floor over that at the surface [-]."""

@@ -5,9 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable
 
+import numpy as np
+
 from finssim.geometry.rotations import quat_to_matrix
-from finssim.localization.fusion.streams import DepthSample, ImuSample
-from finssim.robot.messages import Telemetry
+from finssim.localization.fusion.streams import (
+    DepthSample,
+    HeadingSample,
+    ImuSample,
+    Sample,
+    VelocitySample,
+    VisionSample,
+)
+from finssim.robot.messages import HEADING, POSE, POSITION, VELOCITY, NavigationAid, Telemetry
 from finssim.vehicles import Vehicle
 
 __all__ = ["Aboard", "Stuck"]
@@ -16,6 +25,8 @@ Three = tuple[float, float, float]
 
 FASTEST, STRONGEST, DEEPEST = 100.0, 1000.0, 1.0e4
 """Rates [rad/s], specific forces [m/s²] and depths [m] beyond these are no measurements."""
+POSITION_STD, YAW_STD = 0.5, 0.1
+"""Of a fix that does not tell its own [m, rad]."""
 IMU_STUCK, DEPTH_STUCK = 0.2, 1.0
 """A sensor that has noise and repeats one value for this long has frozen [s]."""
 
@@ -49,6 +60,8 @@ class Aboard:
         """
         imu, depth = vehicle.sensors.imu, vehicle.sensors.depth
         R = quat_to_matrix(imu.orientation if imu else (0.0, 0.0, 0.0, 1.0))
+        log = vehicle.sensors.dvl
+        self._R_bl = quat_to_matrix(log.orientation if log else (0.0, 0.0, 0.0, 1.0))
         self._R_bs = tuple(tuple(row) for row in R.tolist())
         self._imu_latency = imu.latency if imu else 0.0
         self._depth_latency = depth.latency if depth else 0.0
@@ -88,6 +101,28 @@ class Aboard:
             return ""
         self._depth, self._depth_time = depth, time
         return DepthSample(time - self._depth_latency, depth, arrival)
+
+    def aid(self, aid: NavigationAid, arrival: float) -> Sample | str:
+        """The sample of a navigation aid, or in a word why there is none.
+
+        Args:
+            aid: As it came.
+            arrival: When it came [s].
+        """
+        time = arrival - max(aid.age, 0.0)
+        x, y, z = aid.values
+        if aid.kind == VELOCITY:
+            velocity = self._R_bl @ np.array(aid.values)
+            if not _within(aid.values, FASTEST):
+                return "implausible"
+            return VelocitySample(time, (velocity[0], velocity[1], velocity[2]), arrival)
+        if aid.kind == HEADING:
+            return HeadingSample(time, math.remainder(x, math.tau), arrival)
+        if aid.kind not in (POSITION, POSE):
+            return "unknown aid"
+        std, turn = aid.std[0] or POSITION_STD, aid.std[1] or YAW_STD
+        rows = ((std**2, 0.0, 0.0), (0.0, std**2, 0.0), (0.0, 0.0, turn**2))
+        return VisionSample(time, (x, y), z if aid.kind == POSE else None, rows, arrival)
 
     def to_body(self, vector_s: Three) -> Three:
         """A vector of the IMU's frame in body axes."""

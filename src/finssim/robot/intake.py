@@ -9,7 +9,7 @@ from finssim.robot.bridge import Bridge
 from finssim.robot.counters import Counters
 from finssim.robot.link.clock import ClockMap
 from finssim.robot.link.decoder import Decoder
-from finssim.robot.messages import CommandEcho, Picture, Telemetry
+from finssim.robot.messages import CommandEcho, NavigationAid, Picture, Telemetry
 from finssim.robot.perception import Perception
 
 if TYPE_CHECKING:
@@ -54,6 +54,8 @@ class Intake:
                     self._telemetry(arrival, message)
                 elif isinstance(message, CommandEcho):
                     self._echo(arrival, message)
+                elif isinstance(message, NavigationAid):
+                    self._perception.aid(arrival, message)
         for picture in pictures:
             verdict = self._perception.picture(now, picture)
             self._counters.picture(picture.time, verdict in USED)

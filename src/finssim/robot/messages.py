@@ -7,7 +7,19 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["CommandEcho", "Delivery", "Picture", "Telemetry", "TagCorners", "ThrusterCommand"]
+__all__ = [
+    "HEADING",
+    "POSE",
+    "POSITION",
+    "VELOCITY",
+    "CommandEcho",
+    "Delivery",
+    "NavigationAid",
+    "Picture",
+    "TagCorners",
+    "Telemetry",
+    "ThrusterCommand",
+]
 
 Array = npt.NDArray[np.float64]
 
@@ -62,6 +74,27 @@ class CommandEcho:
     applied: tuple[float, ...]
     debug_mask: int
     decimation: int
+
+
+@dataclass(frozen=True)
+class NavigationAid:
+    """What a navigation instrument says, aboard (Doppler log, compass) or beside the water (positioning)."""
+
+    sequence: int
+    """Counts up, modulo 2¹⁶."""
+    kind: int
+    """`VELOCITY`, `HEADING`, `POSITION` or `POSE`."""
+    age: float
+    """Since it was measured, when it was sent [s]."""
+    values: tuple[float, float, float]
+    """VELOCITY: over the floor, log's axes [m/s]. HEADING: left positive from world x [rad], 0, 0. POSITION: x, y, z
+    and POSE: x, y, yaw of the body origin, world frame [m, rad]."""
+    std: tuple[float, float]
+    """Of a position, per axis [m], and of its yaw [rad]; 0 where the instrument does not tell."""
+
+
+VELOCITY, HEADING, POSITION, POSE = 1, 2, 3, 4
+"""Kinds of `NavigationAid`."""
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from finssim.localization.fusion.streams import DepthSample, ImuSample, VisionSa
 from finssim.localization.pool import Pool
 from finssim.localization.poses.measurement import axes_of_up
 from finssim.robot.aboard import Aboard, Stuck
-from finssim.robot.messages import Picture, Telemetry
+from finssim.robot.messages import NavigationAid, Picture, Telemetry
 from finssim.robot.robot import Reading
 from finssim.robot.unfused import Unfused
 from finssim.vehicles import Vehicle
@@ -38,12 +38,13 @@ JUMP = 1.0
 
 
 class Perception:
-    """The state of one vehicle from its telemetry and an overhead camera."""
+    """The state of one vehicle from its telemetry and what else there is: an overhead camera, position fixes on the
+    wire, Doppler log and compass."""
 
     def __init__(
         self,
         vehicle: Vehicle,
-        pool: Pool,
+        pool: Pool | None,
         *,
         method: str = "refractive",
         mode: str = "constant-velocity",
@@ -54,7 +55,7 @@ class Perception:
         """
         Args:
             vehicle: Its tags and sensors.
-            pool: Camera, water and frames.
+            pool: Camera, water and frames; None where no camera looks: the pool frame is then the world's.
             method: How tags become fixes, a name of `localization.poses.methods.METHODS`.
             mode: Of the estimator: constant-velocity or error-state.
             fusion: False: no filter, for the ablation "without EKF" (`robot.unfused`).
@@ -65,7 +66,7 @@ class Perception:
             LocalizationError: Unknown method, mode or library; a vehicle without tags; a pool whose z is not up.
         """
         self.vehicle, self.pool = vehicle, pool
-        self.fixes = Fixes(pool, vehicle, method=method, pixel_std=pool.pixel_std)
+        self.fixes = None if pool is None else Fixes(pool, vehicle, method=method, pixel_std=pool.pixel_std)
         self.estimator = Estimator(settings or settings_of(vehicle), site_of(pool, vehicle), mode=mode)
         self.unfused = None if fusion else Unfused()
         self._aboard = Aboard(vehicle)
@@ -119,12 +120,28 @@ class Perception:
         seen = tuple(tuple(d.corners.ravel().tolist()) for d in found)
         if seen and self._pictures.look(seen, time):
             return self.estimator.refuse("vision", "frozen")
+        assert self.fixes is not None  # found is None without a pool
         fix = self.fixes.fix(Frame(time, "", tuple(found)), self.estimator)
         if not isinstance(fix, VisionSample):
             return self.estimator.refuse("vision", fix)
         if self.unfused is not None:
             self.unfused.fix(fix.position, fix.yaw, fix.time)
         return self.estimator.add(fix)
+
+    def aid(self, arrival: float, aid: NavigationAid) -> str:
+        """Take in what a navigation instrument sent.
+
+        Args:
+            arrival: When it came [s].
+            aid: As it was decoded.
+
+        Returns:
+            `accepted`, or why it was refused.
+        """
+        sample = self._aboard.aid(aid, arrival)
+        if isinstance(sample, str):
+            return self.estimator.refuse("aid", sample)
+        return self.estimator.add(sample)
 
     def reading(self, now: float) -> Reading:
         """The state at a time [s], in world and body axes."""
@@ -175,6 +192,8 @@ class Perception:
         return -telemetry.depth - site.offset - height_above_origin(site.depth_port, *tilt)
 
     def _detections(self, picture: Picture, time: float) -> list[Detection] | None:
+        if self.pool is None:
+            return None
         if picture.image is None or picture.tags:
             return [Detection(tag.tag_id, np.asarray(tag.corners, float)) for tag in picture.tags]
         lens = self.pool.camera.lens
@@ -192,8 +211,8 @@ class Perception:
 class _WorldFrame:
     """Turns what is known in the pool frame into world and body axes."""
 
-    def __init__(self, pool: Pool, up: tuple[float, float, float]) -> None:
-        T = pool.T_wp
+    def __init__(self, pool: Pool | None, up: tuple[float, float, float]) -> None:
+        T = np.eye(4) if pool is None else pool.T_wp
         self._R_wp, self._t = T[:3, :3].copy(), T[:3, 3].copy()
         self._R_wg = self._R_wp @ axes_of_up(up)
         self._q_wg = tuple(matrix_to_quat(self._R_wg).tolist())

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from finssim.geometry.rotations import quat_conjugate, quat_multiply, quat_to_matrix
-from finssim.robot.messages import Picture, Telemetry
+from finssim.robot.messages import NavigationAid, Picture, Telemetry
 from finssim.robot.robot import Reading
 from finssim.vehicles import Vehicle
 
@@ -31,6 +31,9 @@ class Unlocated:
         if np.isfinite(q).all() and np.isfinite(gyro).all():
             self._quaternion = quat_multiply(q, quat_conjugate(self._q_body_imu))
             self._nu[3:] = gyro
+
+    def aid(self, arrival: float, aid: NavigationAid) -> None:
+        """Nothing is located, so nothing is aided."""
 
     def picture(self, now: float, picture: Picture) -> Any:
         """Pictures say nothing without a pool file."""

@@ -9,6 +9,7 @@ from typing import Any
 import warp as wp
 
 from finssim.sensors.batch import SensorBatch, SensorError
+from finssim.sensors.compass import CompassBatch
 from finssim.sensors.depth import DepthBatch
 from finssim.sensors.dvl import DvlBatch
 from finssim.sensors.imu import ImuBatch
@@ -31,6 +32,7 @@ class SensorSuite:
     """None where no vehicle has one, and so for the others."""
     depth: DepthBatch | None
     dvl: DvlBatch | None
+    compass: CompassBatch | None
 
     def __init__(
         self,
@@ -75,6 +77,7 @@ class SensorSuite:
             return kind(entries, worlds, control_step, seed, device) if any(entries) else None
 
         self.imu, self.depth, self.dvl = batch(ImuBatch), batch(DepthBatch), batch(DvlBatch)
+        self.compass = batch(CompassBatch)
         if self.dvl is not None and floor_depth is not None:
             self.dvl.floor_depth = floor_depth
         for v, vehicle in enumerate(vehicles):
@@ -86,11 +89,14 @@ class SensorSuite:
                 self.depth.use(v, vehicle.sensors.depth, rho * g)
             if self.dvl is not None and vehicle.sensors.dvl is not None:
                 self.dvl.use(v, vehicle.sensors.dvl)
+            if self.compass is not None and vehicle.sensors.compass is not None:
+                self.compass.use(v, vehicle.sensors.compass)
 
     @property
     def batches(self) -> tuple[SensorBatch, ...]:
         """The kinds of sensor that at least one vehicle has."""
-        return tuple(batch for batch in (self.imu, self.depth, self.dvl) if batch is not None)
+        kinds = (self.imu, self.depth, self.dvl, self.compass)
+        return tuple(batch for batch in kinds if batch is not None)
 
     def update_stages(self, state: SensedState, water_velocity: Any = None) -> list[Stage]:
         """What `update` launches, for a program that records its launches.

@@ -6,12 +6,12 @@ import re
 from collections import Counter
 from collections.abc import Iterable
 
-from finssim.robot.link.frames import COMMAND, DEBUG_CONFIG, ECHO, TELEMETRY, Message
+from finssim.robot.link.frames import COMMAND, DEBUG_CONFIG, ECHO, NAVIGATION, TELEMETRY, Message
 from finssim.robot.link.layout import Form, Layout, crc16_modbus, forms
 
 __all__ = ["HOST", "MCU", "Decoder"]
 
-HOST = (TELEMETRY, ECHO)
+HOST = (TELEMETRY, ECHO, NAVIGATION)
 """What the robot's computer listens for."""
 MCU = (COMMAND, DEBUG_CONFIG)
 """What the motor controller listens for."""

@@ -12,7 +12,7 @@ from enum import IntFlag
 from typing import TypeAlias
 
 from finssim.robot.link.layout import Field, Layout, LinkError, crc16_modbus, forms
-from finssim.robot.messages import CommandEcho, Telemetry, ThrusterCommand
+from finssim.robot.messages import CommandEcho, NavigationAid, Telemetry, ThrusterCommand
 
 __all__ = [
     "COMMAND",
@@ -20,6 +20,7 @@ __all__ = [
     "DEBUG_ECHO",
     "ECHO",
     "LAYOUTS",
+    "NAVIGATION",
     "TELEMETRY",
     "DebugConfig",
     "LinkError",
@@ -31,6 +32,7 @@ __all__ = [
     "encode_command",
     "encode_debug_config",
     "encode_echo",
+    "encode_navigation",
     "encode_telemetry",
 ]
 
@@ -47,7 +49,7 @@ class DebugConfig:
     """One echo for this many commands."""
 
 
-Message: TypeAlias = Telemetry | CommandEcho | ThrusterCommand | DebugConfig
+Message: TypeAlias = Telemetry | CommandEcho | NavigationAid | ThrusterCommand | DebugConfig
 
 DEBUG_ECHO = 1
 """Bit of `DebugConfig.mask`: echo commands."""
@@ -157,7 +159,24 @@ DEBUG_CONFIG = Layout(
         Field("reserved", "H", "not looked at", constant=0),
     ),
 )
-LAYOUTS = (COMMAND, TELEMETRY, ECHO, DEBUG_CONFIG)
+NAVIGATION = Layout(
+    "navigation aid",
+    NavigationAid,
+    magic=b"\xa5\x5a",
+    header=_head(3),
+    payload=(
+        Field("kind", "B", "1 velocity, 2 heading, 3 position, 4 pose"),
+        Field("age", "f", "since it was measured [s]"),
+        Field(
+            "values",
+            "f",
+            "by kind: velocity [m/s]; heading [rad], 0, 0; x y z [m]; x y [m] yaw [rad]",
+            values=3,
+        ),
+        Field("std", "f", "of a position per axis [m] and of its yaw [rad]; 0: not known", values=2),
+    ),
+)
+LAYOUTS = (COMMAND, TELEMETRY, ECHO, NAVIGATION, DEBUG_CONFIG)
 """Every kind of frame: the first and the last go to the motor controller, the others come from it."""
 
 
@@ -185,6 +204,11 @@ def encode_telemetry(telemetry: Telemetry) -> bytes:
 def encode_echo(echo: CommandEcho) -> bytes:
     """Frame of an echo, 36 + 8 n bytes; raises LinkError as `Form.encode`."""
     return forms(ECHO, _outputs(echo.received))[0].encode(echo)
+
+
+def encode_navigation(aid: NavigationAid) -> bytes:
+    """Frame of a navigation aid, 35 bytes; raises LinkError as `Form.encode`."""
+    return forms(NAVIGATION, 0)[0].encode(aid)
 
 
 def encode_debug_config(sequence: int, mask: int, decimation: int) -> bytes:

@@ -1,0 +1,257 @@
+"""How far off a vehicle is after minutes in open water: Doppler log, depth, IMU and compass, with fixes or without."""
+
+from __future__ import annotations
+
+import json
+import math
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from rich.table import Table
+
+from finssim.control.trajectories import Trajectory
+from finssim.experiments.running import Say, run_experiment
+from finssim.files import atomic_write
+from finssim.geometry.rotations import quat_from_yaw, quat_yaw
+from finssim.pool.draw_plant import draw_plant
+from finssim.pool.plant_spec import PlantSpec
+from finssim.pool.sites import positioning_of, site_of, vehicle_at
+from finssim.pool.truth import read_truth
+from finssim.pool.virtual_pool import VirtualPool
+from finssim.provenance import provenance
+from finssim.quiet import start_warp
+from finssim.robot.lockstep import run_lockstep
+from finssim.robot.messages import POSITION, NavigationAid
+from finssim.robot.perception import Perception
+from finssim.robot.pilots import make_pilot
+from finssim.robot.runtime import Runtime
+from finssim.vehicles import Vehicle, load_vehicle
+
+__all__ = ["WAYS", "open_water", "run", "swim", "way_of"]
+
+Array = npt.NDArray[np.float64]
+
+DEPTH = -5.0
+"""Height of the way [m]."""
+SIDE = 10.0
+"""Of the square [m]."""
+GETTING_READY = 10.0
+"""Longest time until the estimator knows where the vehicle is [s]."""
+PERIOD = 0.5
+"""Between compared estimates [s]."""
+START_STD = 0.05
+"""Standard deviation of the place where the vehicle is let in, per axis [m]."""
+INSIDE = 5.991
+"""95 % of squared Mahalanobis distances in the plane are smaller."""
+WAYS = ("line", "square")
+
+
+def way_of(shape: str, duration: float, speed: float) -> Trajectory:
+    """A straight way along x, or squares of 10 m, at a constant speed.
+
+    Args:
+        shape: A name of `WAYS`.
+        duration: At least [s]; squares are finished.
+        speed: [m/s]
+
+    Raises:
+        ValueError: There is no such shape.
+    """
+    if shape not in WAYS:
+        raise ValueError(f"unknown way '{shape}'; available: {', '.join(WAYS)}")
+    corners = [[0.0, 0.0], [speed * duration, 0.0]]
+    if shape == "square":
+        around = [[SIDE, 0.0], [SIDE, SIDE], [0.0, SIDE], [0.0, 0.0]]
+        corners = [[0.0, 0.0], *around * math.ceil(duration * speed / (4.0 * SIDE))]
+    points = np.column_stack([np.array(corners), np.full(len(corners), DEPTH)])
+    steps = np.diff(points, axis=0)
+    times = np.linalg.norm(steps, axis=1) / speed
+    starts = np.concatenate([[0.0], np.cumsum(times)])
+
+    def motion(t: Array) -> tuple[Array, Array]:
+        i = np.clip(np.searchsorted(starts, t, side="right") - 1, 0, len(times) - 1)
+        return points[i] + ((t - starts[i]) / times[i])[..., None] * steps[i], steps[i] / times[i][..., None]
+
+    return Trajectory(name=shape, duration=float(starts[-1]), motion=motion)
+
+
+class _Watch:
+    """Tells the estimator once where the vehicle was let in, and keeps what it says of itself."""
+
+    def __init__(self, perception: Perception, seed: int) -> None:
+        self.rows: list[tuple[float, ...]] = []
+        self._perception, self._placed = perception, False
+        self._start = np.random.default_rng([seed, 0x57A]).normal(0.0, START_STD, 2)
+
+    def __call__(self, runtime: Runtime) -> None:
+        reading = runtime.reading
+        if reading is None:
+            return
+        if not self._placed and reading.time > 0.5:
+            x, y = self._start.tolist()
+            aid = NavigationAid(0, POSITION, 0.1, (x, y, DEPTH), (START_STD, 0.0))
+            self._perception.aid(reading.time, aid)
+            self._placed = True
+        if math.isnan(runtime.t) or (self.rows and reading.time < self.rows[-1][0] + PERIOD - 1e-6):
+            return
+        found = self._perception.estimator.estimate(reading.time)
+        P = found.P[:2, :2].ravel().tolist()
+        self.rows.append((reading.time, *found.x[:2].tolist(), found.yaw, *P))
+
+
+def swim(
+    vehicle: Vehicle,
+    spec: PlantSpec,
+    way: Trajectory,
+    *,
+    positioning: str = "none",
+    controller: str = "pid",
+    seed: int = 1,
+) -> dict[str, Any]:
+    """One way through open water, by the robot's whole software in lock-step.
+
+    Args:
+        vehicle: Of the catalogue or a file; it is equipped by `vehicle_at`.
+        spec: Drawn for the pool.
+        way: What is followed, by its own estimate.
+        positioning: none, motion-capture or usbl.
+        controller: PID.
+        seed: Of instruments and wire.
+
+    Returns:
+        `way_m`; `drift_m`, the error in the plane at the end, `worst_m` on the way, `std_m`, its own estimate of it;
+        `inside`, share of estimates inside their own 95 % ellipse; `nees`, the squared Mahalanobis distance at the end;
+        `off_m`, the largest distance from the wanted motion; `heading_deg`; `fault`.
+
+    Raises:
+        ValueError: The robot was never ready.
+    """
+    start_warp()
+    equipped = vehicle_at("open-water", vehicle)
+    perception = Perception(equipped, None, mode="error-state")
+    watch = _Watch(perception, seed)
+    pilot = make_pilot(controller, equipped, task="t2")
+    runtime = Runtime(equipped, None, pilot, way, arm=True, perception=perception)
+    with tempfile.TemporaryDirectory() as folder:
+        world = VirtualPool(
+            equipped,
+            site_of("open-water", spec),
+            positioning=positioning_of(positioning, seed),
+            start=((0.0, 0.0, DEPTH), quat_from_yaw(0.0)),
+            seed=seed,
+            truth=Path(folder) / "truth",
+        )
+        try:
+            run_lockstep(
+                runtime,
+                world,
+                GETTING_READY + way.duration,
+                show=watch,
+                until=lambda r: r.t >= way.duration or r.bridge.state == "fault",
+            )
+        finally:
+            world.close()
+        truth = read_truth(Path(folder) / "truth")
+    if not watch.rows:
+        raise ValueError(f"open water: never armed: {runtime.refusal or 'no state'}")
+    a = np.array(watch.rows)
+    true = np.stack([np.interp(a[:, 0], truth.time, column) for column in truth.position.T], axis=1)
+    yaw = np.interp(a[:, 0], truth.time, np.unwrap(quat_yaw(truth.quaternion)))
+    error, P = a[:, 1:3] - true[:, :2], a[:, 4:8].reshape(-1, 2, 2)
+    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error)
+    off = np.linalg.norm(true - way.at(a[:, 0] - runtime.started).position, axis=1)
+    far = np.linalg.norm(error, axis=1)
+    return {
+        "seed": seed,
+        "way_m": float(np.sum(np.linalg.norm(np.diff(true[:, :2], axis=0), axis=1))),
+        "drift_m": float(far[-1]),
+        "worst_m": float(far.max()),
+        "std_m": float(np.sqrt(np.trace(P[-1]))),
+        "nees": float(nees[-1]),
+        "inside": float(np.mean(nees <= INSIDE)),
+        "heading_deg": math.degrees(math.remainder(float(a[-1, 3] - yaw[-1]), math.tau)),
+        "off_m": float(off.max()),
+        "fault": runtime.bridge.reason,
+    }
+
+
+def open_water(
+    *,
+    out: Path,
+    vehicle: str = "bluerov2_heavy",
+    minutes: float = 10.0,
+    speed: float = 0.3,
+    shape: str = "line",
+    positioning: str = "none",
+    seeds: int = 3,
+    seed: int = 1,
+    severity: str = "realistic",
+    say: Say = lambda part, what: None,
+) -> dict[str, Any]:
+    """Some ways through open water, each with its own plant, water and instruments; writes `open_water.json`.
+
+    Args:
+        out: Directory.
+        vehicle: Name or file.
+        minutes: Of each way.
+        speed: [m/s]
+        shape: A name of `WAYS`.
+        positioning: none, motion-capture or usbl.
+        seeds: How many.
+        seed: The first.
+        severity: nominal, realistic or hard.
+        say: Told the share that is done and what comes next.
+    """
+    ours, way = load_vehicle(vehicle), way_of(shape, 60.0 * minutes, speed)
+    positioning_of(positioning, seed)  # refuses what is none
+    trials = []
+    for k, s in enumerate(range(seed, seed + seeds)):
+        say(k / seeds, f"seed {s}")
+        plant = draw_plant(ours, s, severity)  # type: ignore[arg-type]
+        trials.append(swim(ours, plant, way, positioning=positioning, seed=s))
+    result = {
+        "experiment": "open-water",
+        "vehicle": {"name": ours.name, "sha256": ours.sha256},
+        "minutes": minutes,
+        "speed": speed,
+        "shape": shape,
+        "positioning": positioning,
+        "severity": severity,
+        "trials": trials,
+        "provenance": provenance(),
+    }
+    with atomic_write(Path(out) / "open_water.json") as temporary:
+        temporary.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return result
+
+
+def run(
+    *, out: Path, as_json: bool = False, console: Console | None = None, **options: Any
+) -> dict[str, Any]:
+    """As `open_water`, with a progress bar and a table."""
+    return run_experiment(
+        "experiment open-water",
+        lambda say: open_water(out=out, say=say, **options),
+        _print,
+        out=out,
+        as_json=as_json,
+        console=console,
+    )
+
+
+def _print(result: Mapping[str, Any], console: Console) -> None:
+    title = f"{result['vehicle']['name']}, {result['shape']}, positioning {result['positioning']}"
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for name in ("seed", "way [m]", "drift [m]", "drift [%]", "std [m]", "NEES", "inside", "off way [m]", ""):
+        table.add_column(name, justify="right")
+    for t in result["trials"]:
+        table.add_row(
+            str(t["seed"]), f"{t['way_m']:.1f}", f"{t['drift_m']:.2f}", f"{100.0 * t['drift_m'] / t['way_m']:.2f}",
+            f"{t['std_m']:.2f}", f"{t['nees']:.2f}", f"{100.0 * t['inside']:.0f} %", f"{t['off_m']:.2f}", t["fault"],
+        )  # fmt: skip
+    console.print(table)

@@ -1,0 +1,114 @@
+"""Tank and open water instead of the pool, and position fixes on the wire."""
+
+import math
+
+import numpy as np
+import pytest
+
+from finssim.experiments.open_water import swim, way_of
+from finssim.pool.draw_plant import draw_plant
+from finssim.pool.plant_spec import PlantSpec, PlantSpecError
+from finssim.pool.positioning import POSITIONING, Positioning
+from finssim.pool.run import make_plan
+from finssim.pool.sites import OPEN, SITES, positioning_of, site_of, vehicle_at
+from finssim.pool.virtual_pool import VirtualPool
+from finssim.robot.link.decoder import Decoder
+from finssim.robot.messages import HEADING, POSE, POSITION, VELOCITY, NavigationAid
+from finssim.vehicles import load_vehicle
+
+HEAVY = load_vehicle("bluerov2_heavy")
+
+
+def still(time):
+    return np.array([3.0, -2.0, -5.0]), np.array([0.0, 0.0, math.sin(0.25), math.cos(0.25)])
+
+
+def test_open_water_has_no_walls_in_reach_but_a_stream_waves_and_a_vehicle_that_navigates():
+    """The body stays the one that was drawn for the pool, and the plant's file holds all of it."""
+    spec = draw_plant(HEAVY, 1, "realistic")
+    open_, there = site_of("open-water", spec), vehicle_at("open-water", HEAVY)
+    assert open_.body == spec.body and open_.basin == OPEN and open_.tether is None
+    assert (
+        math.hypot(*open_.circulation.stream[:2]) == pytest.approx(0.1) and len(open_.circulation.waves) == 3
+    )
+    assert PlantSpec.model_validate(open_.model_dump(mode="json")) == open_
+    assert there.sensors.dvl is not None and there.sensors.compass is not None and HEAVY.sensors.dvl is None
+    assert there.safety.workspace_lower[2] == -OPEN.depth
+    assert site_of("pool", spec) is spec and vehicle_at("pool", HEAVY) is HEAVY
+    assert site_of("tank", spec).basin.depth == 5.0
+
+
+def test_sites_and_systems_that_do_not_exist_are_refused():
+    """With what there is; so is a camera over open water, and a vehicle without room in the tank."""
+    spec = draw_plant(HEAVY, 1, "nominal")
+    with pytest.raises(PlantSpecError, match=", ".join(SITES)):
+        site_of("pond", spec)
+    with pytest.raises(PlantSpecError, match="none, motion-capture, usbl"):
+        positioning_of("gps", 1)
+    with pytest.raises(PlantSpecError, match="no camera hangs over open water"):
+        make_plan("bluerov2_heavy", "1", "nominal", camera="corners", site="open-water")
+    with pytest.raises(PlantSpecError, match="take open-water"):
+        site_of("tank", draw_plant(load_vehicle("rexrov"), 1, "nominal"))
+    assert make_plan("rexrov", "1", "nominal", camera="none", site="open-water").spec.basin == OPEN
+
+
+@pytest.mark.parametrize(("name", "kind"), [("motion-capture", POSE), ("usbl", POSITION)])
+def test_fixes_come_at_their_rate_late_and_with_their_noise(name, kind):
+    """Over many fixes of a vehicle at rest; outliers are as frequent as they are said to be."""
+    s, system = POSITIONING[name], Positioning(POSITIONING[name], 3)
+    duration = 1000.0 / s.rate
+    frames = [
+        f for k in range(100) for f in system.advance(k * duration / 100, (k + 1) * duration / 100, still)
+    ]
+    aids = [aid for _, data in frames for aid in Decoder().feed(data)]
+    assert len(aids) == len(frames) == pytest.approx(1000 * (1.0 - s.dropout), rel=0.05)
+    assert all(isinstance(aid, NavigationAid) and aid.kind == kind for aid in aids)
+    assert np.mean([aid.age for aid in aids]) == pytest.approx(s.latency, rel=0.1)
+    error = np.array([aid.values[:2] for aid in aids]) - [3.0, -2.0]
+    wrong = np.abs(error).max(axis=1) > 5.0 * s.std
+    assert wrong.mean() == pytest.approx(s.outliers, abs=0.03)
+    assert error[~wrong].std() == pytest.approx(s.std, rel=0.1)
+    if kind == POSE:
+        assert np.mean([aid.values[2] for aid in aids]) == pytest.approx(0.5, abs=0.01)
+
+
+def test_log_and_compass_speak_on_the_wire_of_the_motor_controller():
+    """At their rates and with the stream's velocity over the floor of a vehicle that drifts; no frame without them."""
+    spec = site_of("open-water", draw_plant(HEAVY, 1, "realistic"))
+    for vehicle, expected in ((vehicle_at("open-water", HEAVY), True), (HEAVY, False)):
+        world = VirtualPool(vehicle, spec, start=((0.0, 0.0, -5.0), (0.0, 0.0, 0.0, 1.0)), seed=2)
+        frames = world.exchange(20.0).frames
+        aids = [
+            m for _, data in frames for m in Decoder(outputs=8).feed(data) if isinstance(m, NavigationAid)
+        ]
+        assert bool(aids) is expected
+        if not expected:
+            continue
+        log = np.array([aid.values for aid in aids if aid.kind == VELOCITY])
+        assert len(log) == pytest.approx(160, rel=0.05)
+        assert sum(aid.kind == HEADING for aid in aids) == pytest.approx(400, rel=0.05)
+        # Added to the water's drag it takes a while: after 20 s it goes with the stream.
+        np.testing.assert_allclose(np.linalg.norm(log[-20:, :2].mean(axis=0)), 0.1, atol=0.03)
+        np.testing.assert_allclose(log[-1, :2], world.plant.nu[:2], atol=0.04)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("positioning", ["none", "usbl"])
+def test_a_vehicle_finds_its_way_in_open_water(positioning):
+    """20 s through stream and waves by its own estimate: near the way, and its error within its own doubt."""
+    told = swim(
+        HEAVY, draw_plant(HEAVY, 2, "realistic"), way_of("line", 20.0, 0.3), positioning=positioning, seed=2
+    )
+    assert told["fault"] == "" and told["way_m"] == pytest.approx(6.0, abs=0.5)
+    assert told["drift_m"] < 0.25 and told["off_m"] < 0.5 and told["nees"] < 13.8
+
+
+def test_ways_keep_their_speed():
+    """A square of 10 m is finished; a line is as long as it takes."""
+    for shape in ("line", "square"):
+        way = way_of(shape, 100.0, 0.3)
+        speed = np.linalg.norm(way.at(np.linspace(0.1, way.duration - 0.1, 333)).velocity, axis=1)
+        np.testing.assert_allclose(speed, 0.3)
+    assert way_of("square", 100.0, 0.3).duration == pytest.approx(40.0 / 0.3)
+    with pytest.raises(ValueError, match="line, square"):
+        way_of("spiral", 1.0, 0.3)
