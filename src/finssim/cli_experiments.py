@@ -330,8 +330,7 @@ def stack(
     """Play any task through the deployed software, all its vehicles in lock-step; print it beside the batch.
 
     Every vehicle has its plant, motor controller, bridge and pilot; robots tell each other where they are, and the task
-    itself scores what is true. A task of the pool is located by the overhead camera; in open water the site tells every
-    vehicle its true pose.
+    itself scores what is true. In the pool the overhead camera locates vehicles, in open water motion capture does.
 
     Example: finssim experiment stack team-pursuit --policy runs/team --episodes 20 --out runs/team-stack
     """

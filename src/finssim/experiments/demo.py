@@ -248,7 +248,10 @@ def _recorder(
 
     def record(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
         return pool_trials(
-            {role: [trimmed(one, standing) for one in plan] for role, plan in _plans(standing, scope).items()},
+            {
+                role: [trimmed(one, standing) for one in plan]
+                for role, plan in _plans(standing, scope).items()
+            },
             folder,
             vehicle=str(rough),
             pool_vehicle=name,

@@ -22,6 +22,7 @@ from finssim.localization.pool import Pool
 from finssim.pool.medium import Medium
 from finssim.pool.others import ScriptedPilot, TrueState, truth_of
 from finssim.pool.plant_spec import Basin, PlantSpec
+from finssim.pool.sites import positioning_of
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.bridge import Bridge
 from finssim.robot.bridge_settings import BridgeSettings
@@ -36,12 +37,10 @@ from finssim.tasks.reference import fill_table
 from finssim.tasks.task import Batch, Task
 from finssim.vehicles import Vehicle
 
-__all__ = ["Referee", "TaskSite", "open_water"]
+__all__ = ["Referee", "TaskSite"]
 
 Array = NDArray[np.float64]
 
-ROOM = 2.0
-"""Walls of open water are this many times farther than what ends an episode."""
 SITE = "site"
 """Who tells where a target is that no vehicle is."""
 
@@ -147,13 +146,13 @@ class TaskSite:
         vehicles: Sequence[Vehicle],
         spec: Callable[[Vehicle], PlantSpec],
         pilots: Callable[[str], Pilot],
-        pool: Pool,
+        pool: Pool | None,
         *,
         seed: int = 0,
         guide: Guide | None = None,
         communication: Communication | None = None,
         camera: Callable[[Vehicle], Any] | None = None,
-        perception: Callable[[VirtualPool], Any] | None = None,
+        positioning: str = "none",
     ) -> None:
         """Put everybody where the task starts.
 
@@ -162,19 +161,24 @@ class TaskSite:
             vehicles: One for each of its places.
             spec: Makes the plant of a vehicle.
             pilots: Who steers an agent, by its place.
-            pool: Camera, water and frames, as the robots know them.
+            pool: Camera, water and frames, as the robots know them; None: no camera looks.
             seed: Of the episode, of instruments and of what is lost.
             guide: The reference, of a task that follows one; drawn as in training if None.
             communication: Of what the vehicles tell each other; None: everything arrives at once.
             camera: Makes the overhead camera of a vehicle; None: there is none.
-            perception: How an agent knows where it is; by camera and telemetry if None.
+            positioning: Fixes on every robot's wire: none, motion-capture or usbl.
         """
         self.referee = referee = Referee(task, vehicles, seed=seed, guide=guide)
         self.task, goal = referee.task, guide or _Goal(referee)
         names = self.task.vehicles
         self.worlds = {
             name: VirtualPool(
-                vehicle, spec(vehicle), camera=camera(vehicle) if camera else None, start=place, seed=seed + i
+                vehicle,
+                spec(vehicle),
+                camera=camera(vehicle) if camera else None,
+                positioning=positioning_of(positioning, seed + i) if name in self.task.agents else None,
+                start=place,
+                seed=seed + i,
             )
             for i, (name, vehicle, place) in enumerate(zip(names, vehicles, referee.places(), strict=True))
         }
@@ -182,7 +186,6 @@ class TaskSite:
         self._medium = Medium(self._positions, communication, seed)
         self.runtimes: dict[str, Runtime] = {}
         period = self.task.control_step if communication is None else communication.period
-        locate = perception or (lambda world: Perception(world.vehicle, pool))
         for i, (name, vehicle) in enumerate(zip(names, vehicles, strict=True)):
             world = self.worlds[name]
             agent = name in self.task.agents
@@ -196,7 +199,7 @@ class TaskSite:
                 else ScriptedPilot(self.task, vehicles, lambda: truth_of(self.worlds), seed=seed),
                 goal,
                 arm=True,
-                perception=locate(world) if agent else TrueState(world),
+                perception=Perception(vehicle, pool) if agent else TrueState(world),
                 bridge=Bridge(vehicle, _limits(vehicle, world.spec.basin)),
                 team=team if len(names) > 1 else None,
             )
@@ -253,15 +256,6 @@ class TaskSite:
 
     def _positions(self) -> dict[str, Array]:
         return {name: np.asarray(world.plant.position, float) for name, world in self.worlds.items()}
-
-
-def open_water(spec: PlantSpec, task: Task, vehicle: Vehicle) -> PlantSpec:
-    """The same plant in water so wide and deep that its walls are out of a task's reach."""
-    longest = float(max(vehicle.body.size))
-    bounds, tank = getattr(task, "bounds", 0.0), getattr(task, "tank", (0.0, 0.0))
-    width = ROOM * max(2.0 * bounds if isinstance(bounds, float) else 0.0, tank[0] * longest)
-    depth = ROOM * max(getattr(task, "depth", 0.0), tank[1] * longest)
-    return spec.model_copy(update={"basin": Basin(length=width, width=width, depth=depth)})
 
 
 def _limits(vehicle: Vehicle, basin: Basin) -> BridgeSettings:
