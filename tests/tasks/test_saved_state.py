@@ -9,6 +9,9 @@ from finssim.engine.randomize import Randomization
 from finssim.engine.ranges_file import Ranges, load_ranges
 from finssim.engine.ranges_schedule import Curriculum
 from finssim.tasks import TASKS, EnvironmentSetupError, MeasurementNoise
+from finssim.tasks.sensing import Sensing
+from finssim.vehicles import load_vehicle
+from finssim.vehicles.equipment import DepthSensor, Dvl
 
 NOISE = MeasurementNoise(
     position_std=0.02, yaw_std=0.1, velocity_std=0.02, rate_std=0.02, position_bias=0.01, delay=0.2
@@ -58,6 +61,33 @@ def test_a_run_that_goes_on_is_the_run_that_was_not_interrupted(task):
     assert after.keys() == again.keys() and all(
         np.array_equal(after[k], again[k], equal_nan=True) for k in after
     )
+
+
+def test_instruments_and_filters_go_on():
+    """Late fixes and samples on their way, walking biases, and what the filters know."""
+    late = {"rate": 4.0, "latency": 0.3, "dropout": 0.2, "position": np.zeros(3)}
+    finsrov = load_vehicle("finsrov")
+    gauge, dvl = (
+        DepthSensor(**late, noise_std=0.01),
+        Dvl(**late, noise_std=0.01, bias_walk=0.01, scale_error=0.02),
+    )
+    sensors = finsrov.sensors.model_copy(update={"depth": gauge, "dvl": dvl})
+    vehicle = finsrov.model_copy(update={"sensors": sensors})
+    sensing = Sensing(
+        rate=15.0, fixes=MeasurementNoise(position_std=0.02, yaw_std=0.02, delay=0.2, dropout=0.2)
+    )
+    whole, other = (made("t1", vehicle=vehicle, observe=sensing, randomize=None) for _ in range(2))
+    act(whole, 7, seed=0)
+    saved = whole.state()
+    act(other, 4, seed=9)
+    other.reset(seed=77)
+    other.load_state(saved)
+    first, second = act(whole, 12, seed=1), act(other, 12, seed=1)
+    assert any(done.any() for done in first[3::5]), "no episode ended: the test proves less than it says"
+    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+    after, again = whole.state(), other.state()
+    assert {"readings.dvl.ring", "readings.gauge_samples.sent", "estimates.past_position"} <= after.keys()
+    assert all(np.array_equal(after[k], again[k], equal_nan=True) for k in after)
 
 
 @pytest.mark.parametrize("by", ["steps", "success"])

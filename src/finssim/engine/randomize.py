@@ -51,6 +51,11 @@ class Randomization:
         """Whether what the controller sees is drawn."""
         return self._draws("sensors.")
 
+    @property
+    def changes_velocities(self) -> bool:
+        """Whether errors of the velocities that the controller sees are drawn."""
+        return self._draws("sensors.velocity_", "sensors.rate_")
+
     def simulator_arguments(self, vehicle_delay: float, tether: TetherLine | None = None) -> dict[str, Any]:
         """What a simulator must make room for.
 

@@ -26,6 +26,7 @@ from finssim.tasks.given import (
 from finssim.tasks.measurement import MeasurementNoise, connect_measured, measure, measurements
 from finssim.tasks.placing import place
 from finssim.tasks.saved_state import load_state, save_state
+from finssim.tasks.sensing import Sensing, SensingBatch
 from finssim.tasks.task import Batch, Task
 from finssim.vehicles import Vehicle
 
@@ -60,7 +61,7 @@ class Environment:
         action: str | None = None,
         wrench_scale: ArrayLike = 1.0,
         randomization: Randomization | None = None,
-        noise: MeasurementNoise | None = None,
+        noise: MeasurementNoise | Sensing | None = None,
         water: Water | None = None,
         pool: Pool | None = None,
         tether: TetherLine | None = None,
@@ -84,7 +85,7 @@ class Environment:
             action: thruster8, wrench6 or wrench4; the task's own if None.
             wrench_scale: Part of each wrench limit that action 1 of an agent stands for, one number or (6,).
             randomization: Drawn anew for every episode; none if None.
-            noise: On what the controller sees; none if None.
+            noise: On what the controller sees, or the sensors that it sees with; none if None.
             water: Currents and waves.
             pool: Walls and floor; the task's own if None.
             tether: On the vehicle.
@@ -133,9 +134,30 @@ class Environment:
         self.randomization = randomization
         self._mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
         self._steps = 0
-        self._seen = measurements(self.noise, (worlds, len(vehicles)), self.device)
-        self._measured = self.noise.present or bool(randomization and randomization.changes_sensors)
+        drawn = bool(randomization and randomization.changes_sensors)
+        sensed = isinstance(self.noise, Sensing)
+        off_by = self.noise.fixes if isinstance(self.noise, Sensing) else self.noise
+        self._seen = measurements(off_by, (worlds, len(vehicles)), self.device)
+        self._measured = sensed or off_by.present or drawn
         connect_measured(self._measured, self.simulator.state, self.arrays)
+        self.sensing: SensingBatch | None = None
+        """Instruments and filters, where the controller sees with those."""
+        if isinstance(self.noise, Sensing):
+            if randomization and randomization.changes_velocities:
+                raise EnvironmentSetupError(
+                    "the ranges draw errors of velocities or rates, and these come from the vehicle's sensors: leave "
+                    "sensors.velocity_... and sensors.rate_... out of the ranges, or observe otherwise"
+                )
+            walls = pool or task.arena()
+            self.sensing = SensingBatch(
+                self.noise,
+                self.simulator,
+                self.arrays,
+                self._seen,
+                walls.depth if walls else None,
+                self.seed,
+                drawn,
+            )
         self.drawing = Drawing(randomization, self.simulator, self.arrays, self._seen, task, privileged)
         self.levels: Levels | None = None
         """How the task's level rises, after `climb` of `finssim.tasks.levels`."""
@@ -175,8 +197,11 @@ class Environment:
         self._start = self.simulator.pipeline()
         self._add_start(self._start, self._mask)
 
-    def _add_measure(self, pipeline: Any) -> None:
-        if self._measured:
+    def _add_measure(self, pipeline: Any, mask: wp.array | None = None) -> None:
+        """Append what is seen: after a step, or where an episode starts and mask is not 0."""
+        if self.sensing is not None:
+            self.sensing.add(pipeline, self.seed, mask)
+        elif self._measured:
             inputs = [self.simulator.state, self.arrays, self._seen.array, self.task.control_step, self.seed]
             pipeline.add(measure, inputs, vehicles=len(self.simulator.vehicles))
 
@@ -184,7 +209,7 @@ class Environment:
         self.simulator.add_reset(pipeline, mask)
         self.drawing.add_start(pipeline, mask, self.seed)
         self.task.add_spawn(pipeline, self._batch, mask)
-        self._add_measure(pipeline)
+        self._add_measure(pipeline, mask)
         self.task.add_observe(pipeline, self._batch, mask)
 
     def reset(self, mask: ArrayLike | None = None, seed: int | None = None) -> NDArray[np.float32]:
@@ -236,7 +261,7 @@ class Environment:
         self.reset()
         place(self, position, quaternion, goal_position, goal_quaternion)
         again = self.simulator.pipeline()
-        self._add_measure(again)
+        self._add_measure(again, self._mask)
         self.task.add_observe(again, self._batch, self._mask)
         again.run()
         return self.arrays.observation.numpy()

@@ -9,12 +9,32 @@ from typing import Any
 from finssim.engine.randomize import Randomization
 from finssim.tasks.catalogue import TASKS
 from finssim.tasks.environment import Environment, EnvironmentSetupError
-from finssim.tasks.measurement import OBSERVED, MeasurementNoise
+from finssim.tasks.measurement import ESTIMATOR, MeasurementNoise
 from finssim.tasks.own import own_task
+from finssim.tasks.sensing import Sensing
 from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle
 
-__all__ = ["make", "task_named"]
+__all__ = ["OBSERVED", "make", "observed", "task_named"]
+
+OBSERVED: dict[str, MeasurementNoise | Sensing] = {
+    "truth": MeasurementNoise(),
+    "estimator": ESTIMATOR,
+    "sensors": Sensing(),
+}
+"""What a controller may see, by name; besides them `training`, the noise that a task is trained with."""
+
+
+def observed(name: str, task: Task | None = None) -> MeasurementNoise | Sensing:
+    """What a controller sees under that name, in a task.
+
+    Raises:
+        EnvironmentSetupError: There is no such name.
+    """
+    known = {**OBSERVED, **({} if task is None else {"training": task.training_noise})}
+    if name not in known:
+        raise EnvironmentSetupError(f"observe is '{name}', expected {', '.join(known)}")
+    return known[name]
 
 
 def task_named(task: str | Task, **settings: Any) -> Task:
@@ -43,7 +63,7 @@ def make(
     hydrodynamics: str = "calibrated",
     action: str | None = None,
     randomize: Randomization | str | Path | None = None,
-    observe: MeasurementNoise | str = "truth",
+    observe: MeasurementNoise | Sensing | str = "truth",
     **options: Any,
 ) -> Environment:
     """The batched environment of a task; every adapter takes the same arguments.
@@ -56,7 +76,8 @@ def make(
         action: thruster8, wrench6 or wrench4; the task's own if None.
         randomize: Ranges, or the name or file of some, from which vehicle and water are drawn in every episode.
         observe: What the controller sees: truth, estimator (noise, offset and delay of the robot's own localization),
-            training (the noise that the task is trained with), or a noise.
+            training (the noise that the task is trained with), sensors (what the vehicle's own sensors and position
+            fixes say, through a filter), or a noise or `Sensing` of one's own.
         options: The rest of what `Environment` takes: seed, device, threads, water, pool, tether, ...
 
     Returns:
@@ -67,10 +88,7 @@ def make(
     """
     chosen = task_named(task)
     if isinstance(observe, str):
-        known = {**OBSERVED, "training": chosen.training_noise}
-        if observe not in known:
-            raise EnvironmentSetupError(f"observe is '{observe}', expected {', '.join(known)} or a noise")
-        observe = known[observe]
+        observe = observed(observe, chosen)
     ranges = Randomization(randomize) if isinstance(randomize, str | Path) else randomize
     return Environment(
         chosen,

@@ -69,9 +69,6 @@ ESTIMATOR = MeasurementNoise(
 )
 """About what the robot's own localization and fusion are off by in a virtual pool of severity realistic."""
 
-OBSERVED = {"truth": MeasurementNoise(), "estimator": ESTIMATOR}
-"""What a controller may see, by name."""
-
 
 def connect_measured(present: bool, state: State, arrays: TaskArrays) -> None:
     """Give the task arrays for what is measured: without noise those of the state itself, so that nothing is copied."""

@@ -87,6 +87,9 @@ def _arrays(environment: "Environment") -> Iterator[tuple[str, wp.array]]:
         ("task", environment.arrays),
     ):
         yield from _members(name, struct)
+    if environment.sensing is not None:
+        for name, struct in environment.sensing.arrays():
+            yield from _members(name, struct)
 
 
 def _members(prefix: str, struct: Any) -> Iterator[tuple[str, wp.array]]:

@@ -1,0 +1,572 @@
+"""What the vehicle's own instruments and position fixes say, put together by a filter in the batch, world by world.
+
+Gyro and accelerometer give rates, roll and pitch (the complementary filter of `localization.fusion.attitude`); fixes
+from outside give x, y and yaw, and z where there is no pressure gauge; a DVL gives velocity where there is one.
+Position and velocity of each axis follow white acceleration and yaw the gyro with an unknown bias (the paper's
+equations 14 and 15, as `localization.fusion` has them), each a Kalman filter of two states: the same equations.
+A measurement that comes late is compared with the estimate of its own time and moves the path since.
+"""
+# mypy: disable-error-code="valid-type,misc,index,no-any-return,no-untyped-def,untyped-decorator,attr-defined"
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import warp as wp
+
+from finssim.engine import Simulator
+from finssim.engine.launch import Pipeline
+from finssim.engine.measured import Measurement
+from finssim.engine.packed import Packed
+from finssim.engine.state import HISTORY, State
+from finssim.localization.fusion.attitude import TiltGains
+from finssim.localization.fusion.position_filter import Motion
+from finssim.localization.fusion.yaw_filter import YawNoise
+from finssim.physics.types import join
+from finssim.sensors import SensorSuite
+from finssim.sensors.depth import DepthArrays, DepthParameters
+from finssim.sensors.dvl import DvlArrays, DvlParameters
+from finssim.sensors.imu import ImuArrays, ImuParameters
+from finssim.sensors.noise import (
+    DROPOUT,
+    TURN_ON,
+    TURN_ON_2,
+    WALK,
+    WALK_2,
+    WHITE,
+    WHITE_2,
+    normal,
+    normal3,
+    sample_key,
+)
+from finssim.sensors.sampling import Sampling, samples_until
+from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.given import EnvironmentSetupError
+from finssim.tasks.measurement import LONGEST_DELAY, MeasurementNoise
+from finssim.vehicles import Vehicle
+
+__all__ = ["Sensing", "SensingBatch", "instruments_of"]
+
+FIX = 100
+"""Number of the fixes in the random key, apart from those of the kinds of sensor."""
+STANDING = 400
+"""Control steps after which a filter's doubt has settled."""
+FASTEST = 0.3
+"""Deviation of a vehicle's speed per axis where nothing tells it [m/s], as `localization.fusion` takes it."""
+PER_FIX = ("position_std", "yaw_std", "position_bias", "yaw_bias", "dropout", "delay")
+"""Fields of a measurement noise that a fix has."""
+
+_q, _gyro, _tilt = Motion().density, YawNoise(), TiltGains()
+ACCELERATION = wp.vec3(*_q)
+"""Spectral density of the acceleration that a vehicle may have, world axes [m²/s³]."""
+GYRO_FLOOR, GYRO_WALK = _gyro.rate, _gyro.bias_walk
+"""Least noise density of a rate [rad/s/√Hz], which mounting and sampling leave, and walk of its bias."""
+TILT_P, TILT_I, TILT_TOLERANCE = _tilt.proportional, _tilt.integral, _tilt.tolerance
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensing:
+    """The sensors of the vehicle files, and position fixes from outside; see `finssim.tasks.sensing`.
+
+    The defaults are about those of the overhead camera of a virtual pool of severity realistic.
+    """
+
+    rate: float = 30.0
+    """Fixes a second [Hz]; 0: none, from a known start on."""
+    fixes: MeasurementNoise = MeasurementNoise(
+        position_std=0.0035,
+        yaw_std=math.radians(0.18),
+        position_bias=0.01,
+        yaw_bias=math.radians(0.2),
+        dropout=0.005,
+        delay=0.045,
+    )
+    """Noise of a fix, an offset by episode, the chance that it is lost, and how late it comes."""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.rate) and self.rate >= 0.0):
+            raise ValueError(f"rate of the fixes is {self.rate} Hz, expected a finite number of 0 or more")
+        others = [name for name, x in asdict(self.fixes).items() if x and name not in PER_FIX]
+        if others:
+            raise ValueError(
+                f"{others[0]} of the fixes is given, expected of: {', '.join(PER_FIX)}; "
+                "what velocities and rates are off by is said under sensors in the vehicle file"
+            )
+
+
+def instruments_of(vehicle: Vehicle) -> dict[str, dict[str, Any]]:
+    """The sensors that a vehicle carries with their errors, as plain data; what is nothing or unlimited is left out."""
+    return {
+        kind: {name: x for name, x in given.items() if x and x != math.inf}
+        for kind, given in vehicle.sensors.model_dump(mode="json").items()
+        if given
+    }
+
+
+@wp.struct
+class Aboard:
+    """What the filter knows of one vehicle: a doubt is variance, covariance, variance of a value and its rate."""
+
+    gauge: wp.bool  # whether z comes from a pressure gauge
+    plane: wp.vec3  # settled doubt of x, and of y
+    height: wp.vec3  # of z
+    yaw: wp.vec3  # of yaw
+
+
+@wp.struct
+class Estimates:
+    """Memory of the filters, by (world, vehicle); position and attitude stand in the task's arrays."""
+
+    aboard: wp.array(dtype=Aboard)  # by vehicle
+    velocity: wp.array2d(dtype=wp.vec3)  # world frame [m/s]
+    bias: wp.array2d(dtype=wp.vec3)  # of the gyro, body frame [rad/s]
+    rate: wp.array2d(dtype=wp.vec3)  # of turn, a step ago, body frame [rad/s]
+    plane: wp.array2d(dtype=wp.vec3)  # doubts, as in `Aboard`
+    height: wp.array2d(dtype=wp.vec3)
+    yaw: wp.array2d(dtype=wp.vec3)
+    past_position: wp.array3d(dtype=wp.vec3)  # of earlier control steps, a ring
+    past_velocity: wp.array3d(dtype=wp.vec3)
+    past_quaternion: wp.array3d(dtype=wp.quat)
+
+
+@wp.struct
+class Readings:
+    """What the instruments show; arrays of a kind that no vehicle has are empty."""
+
+    imu_errors: wp.array2d(dtype=ImuParameters)
+    imu: ImuArrays
+    imu_samples: Sampling
+    gauge_errors: wp.array2d(dtype=DepthParameters)
+    gauge: DepthArrays
+    gauge_samples: Sampling
+    dvl_errors: wp.array2d(dtype=DvlParameters)
+    dvl: DvlArrays
+    dvl_samples: Sampling
+
+
+@wp.func
+def grown(P: wp.vec3, q: float, dt: float) -> wp.vec3:
+    """Doubt of a value and its rate a time later, P <- A P A' + Q, of a rate driven by white noise of density q."""
+    return wp.vec3(
+        P[0] + 2.0 * dt * P[1] + dt * dt * P[2] + q * dt * dt * dt / 3.0,
+        P[1] + dt * P[2] + 0.5 * q * dt * dt,
+        P[2] + q * dt,
+    )
+
+
+@wp.func
+def value_gain(P: wp.vec3, R: float) -> wp.vec2:
+    """Gain of value and rate for a measured value of variance R."""
+    return wp.vec2(P[0], P[1]) / (P[0] + R)
+
+
+@wp.func
+def value_known(P: wp.vec3, R: float) -> wp.vec3:
+    """Doubt after it."""
+    s = P[0] + R
+    return wp.vec3(P[0] * R / s, P[1] * R / s, P[2] - P[1] * P[1] / s)
+
+
+@wp.func
+def rate_gain(P: wp.vec3, R: float) -> wp.vec2:
+    """Gain of value and rate for a measured rate of variance R."""
+    return wp.vec2(P[1], P[2]) / (P[2] + R)
+
+
+@wp.func
+def rate_known(P: wp.vec3, R: float) -> wp.vec3:
+    """Doubt after it."""
+    s = P[2] + R
+    return wp.vec3(P[0] - P[1] * P[1] / s, P[1] * R / s, P[2] * R / s)
+
+
+@wp.func
+def counted(noise: float, quantum: float) -> float:
+    """Variance of what has this noise and is rounded to a multiple of the quantum; never 0."""
+    return noise * noise + quantum * quantum / 12.0 + 1.0e-10
+
+
+@wp.func
+def about_z(angle: float) -> wp.quat:
+    """Rotation about world z [rad]."""
+    return wp.quat(0.0, 0.0, wp.sin(0.5 * angle), wp.cos(0.5 * angle))
+
+
+@wp.func
+def turned_by(rotation: wp.vec3) -> wp.quat:
+    """Rotation vector of less than half a turn to a quaternion."""
+    angle = wp.length(rotation)
+    k = 0.5 - angle * angle / 48.0
+    if angle > 1.0e-3:
+        k = wp.sin(0.5 * angle) / angle
+    return wp.quat(k * rotation[0], k * rotation[1], k * rotation[2], wp.cos(0.5 * angle))
+
+
+@wp.func
+def turn_about_z(q: wp.quat, p: wp.quat) -> float:
+    """Yaw of attitude q beyond p, the short way round [rad]."""
+    d = q * wp.quat_inverse(p)
+    return 2.0 * wp.atan2(wp.where(d[3] < 0.0, -d[2], d[2]), wp.abs(d[3]))
+
+
+@wp.func
+def doubted(P: wp.vec3, a: float, b: float) -> wp.vec2:
+    """Errors of value and rate with the covariance P, from two standard normal numbers."""
+    std = wp.sqrt(wp.max(P[0], 1.0e-12))
+    return wp.vec2(std * a, P[1] / std * a + wp.sqrt(wp.max(P[2] - P[1] * P[1] / (std * std), 0.0)) * b)
+
+
+@wp.func
+def lateness(delay: int, step: int, past: wp.array3d(dtype=wp.vec3)) -> int:
+    """Control steps that a measurement is old, no more than are kept and than the episode has."""
+    return wp.min(wp.min(delay, past.shape[2] - 1), step)
+
+
+@wp.func
+def move_past(
+    e: Estimates, w: int, v: int, step: int, late: int, dt: float, dx: wp.vec3, dv: wp.vec3, turn: wp.vec2
+):
+    """Move the path since `late` steps ago by what was learned of there: offsets, and rates that go on growing."""
+    for j in range(step - late, step):
+        k = j % e.past_position.shape[2]
+        t = float(j - step + late) * dt
+        e.past_position[w, v, k] = e.past_position[w, v, k] + dx + t * dv
+        e.past_velocity[w, v, k] = e.past_velocity[w, v, k] + dv
+        e.past_quaternion[w, v, k] = about_z(turn[0] + t * turn[1]) * e.past_quaternion[w, v, k]
+
+
+@wp.func
+def begin(
+    state: State, arrays: TaskArrays, m: Measurement, r: Readings, e: Estimates, has_fixes: bool, seed: int, w: int,
+    v: int,
+):  # fmt: skip
+    """Start where the filter would be had it run before: off by its settled doubt and by what lasts."""
+    key = sample_key(seed, FIX, w, v, state.episode[w], 0)
+    known = e.aboard[v]
+    x = state.position[w, v]
+    q = state.quaternion[w, v]
+    a = normal3(key, WHITE)
+    b = normal3(key, WALK)
+    px = doubted(known.plane, a[0], b[0])
+    py = doubted(known.plane, a[1], b[1])
+    pz = doubted(known.height, a[2], b[2])
+    turn = doubted(known.yaw, normal(key, WHITE_2), normal(key, WALK_2))
+    lasting = wp.vec3()
+    if has_fixes:
+        lasting = m.position_bias * normal3(key, TURN_ON)
+        turn[0] = turn[0] + m.yaw_bias * normal(key, TURN_ON_2)
+    if known.gauge:
+        lasting[2] = -r.gauge.bias[w, v]
+    imu = r.imu_errors[w, v]
+    up = wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
+    felt = wp.normalize(imu.gravity * up + wp.quat_rotate(imu.q_bs, r.imu.accel_bias[w, v]))
+    arrays.position[w, v] = x + wp.vec3(px[0], py[0], pz[0]) + lasting
+    arrays.quaternion[w, v] = wp.normalize(about_z(turn[0]) * q * turned_by(wp.cross(felt, up)))
+    nu = state.velocity[w, v]
+    e.velocity[w, v] = wp.quat_rotate(q, wp.vec3(nu[0], nu[1], nu[2])) + wp.vec3(px[1], py[1], pz[1])
+    e.bias[w, v] = wp.quat_rotate(imu.q_bs, r.imu.gyro_bias[w, v]) - turn[1] * up
+    e.rate[w, v] = wp.quat_rotate(imu.q_bs, r.imu.gyro[w, v]) - e.bias[w, v]
+    e.plane[w, v] = known.plane
+    e.height[w, v] = known.height
+    e.yaw[w, v] = known.yaw
+
+
+@wp.func
+def go_on(r: Readings, arrays: TaskArrays, e: Estimates, dt: float, w: int, v: int):
+    """The state a control step later: the gyro turns it, the accelerometer says where up is, velocity goes on."""
+    imu = r.imu_errors[w, v]
+    rate = wp.quat_rotate(imu.q_bs, r.imu.gyro[w, v]) - e.bias[w, v]
+    q = arrays.quaternion[w, v] * turned_by(0.5 * dt * (rate + e.rate[w, v]))
+    if r.imu_samples.fresh[w, v]:
+        force = wp.quat_rotate(imu.q_bs, r.imu.accel[w, v])
+        size = wp.max(wp.length(force), 1.0e-6)
+        off = (size - imu.gravity) / TILT_TOLERANCE
+        up = wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
+        error = wp.exp(-0.5 * off * off) * wp.cross(force / size, up)
+        q = q * turned_by(TILT_P * dt * error)
+        e.bias[w, v] = e.bias[w, v] - TILT_I * dt * error
+        rate += TILT_I * dt * error
+    arrays.quaternion[w, v] = wp.normalize(q)
+    e.rate[w, v] = rate
+    arrays.position[w, v] = arrays.position[w, v] + dt * e.velocity[w, v]
+    noise = wp.max(imu.gyro_noise * imu.gyro_noise * dt, GYRO_FLOOR * GYRO_FLOOR) * dt
+    e.yaw[w, v] = grown(e.yaw[w, v], GYRO_WALK * GYRO_WALK, dt) + wp.vec3(noise, 0.0, 0.0)
+    e.plane[w, v] = grown(e.plane[w, v], ACCELERATION[0], dt)
+    e.height[w, v] = grown(e.height[w, v], ACCELERATION[2], dt)
+
+
+@wp.func
+def take_fix(
+    state: State, arrays: TaskArrays, m: Measurement, e: Estimates, rate: wp.float64, dt: float, seed: int, w: int,
+    v: int,
+):  # fmt: skip
+    """What was fixed as long ago as fixes take, if any of it has come: of several in a control step the mean."""
+    step = state.steps[w]
+    late = lateness(int(wp.rint(m.delay / dt)), step, e.past_position)
+    taken = step - late
+    if taken < 1:
+        return
+    key = sample_key(seed, FIX, w, v, state.episode[w], taken)
+    came = float(0.0)
+    for i in range(samples_until(rate, taken) - samples_until(rate, taken - 1)):
+        if wp.randf(wp.rand_init(int(key), DROPOUT + i)) >= m.dropout:
+            came += 1.0
+    if came == 0.0:
+        return
+    x = state.position[w, v]
+    q = state.quaternion[w, v]
+    seen = arrays.position[w, v]
+    heading = arrays.quaternion[w, v]
+    if late > 0:
+        true = state.history[(taken - 1) % wp.static(HISTORY), w, v]
+        x = wp.vec3(true[0], true[1], true[2])
+        q = wp.quat(true[3], true[4], true[5], true[6])
+        k = taken % e.past_position.shape[2]
+        seen = e.past_position[w, v, k]
+        heading = e.past_quaternion[w, v, k]
+    begun = sample_key(seed, FIX, w, v, state.episode[w], 0)
+    fewer = 1.0 / wp.sqrt(came)
+    off = x + m.position_bias * normal3(begun, TURN_ON) + fewer * m.position_std * normal3(key, WHITE) - seen
+    angle = m.yaw_bias * normal(begun, TURN_ON_2) + fewer * m.yaw_std * normal(key, WHITE_2)
+    turn_off = turn_about_z(about_z(angle) * q, heading)
+    R = counted(fewer * m.position_std, 0.0)
+    K = value_gain(e.plane[w, v], R)
+    gain, push = wp.vec3(K[0], K[0], 0.0), wp.vec3(K[1], K[1], 0.0)
+    e.plane[w, v] = value_known(e.plane[w, v], R)
+    if not e.aboard[v].gauge:
+        K = value_gain(e.height[w, v], R)
+        gain, push = wp.vec3(gain[0], gain[0], K[0]), wp.vec3(push[0], push[0], K[1])
+        e.height[w, v] = value_known(e.height[w, v], R)
+    R_yaw = counted(fewer * m.yaw_std, 0.0)
+    turn = value_gain(e.yaw[w, v], R_yaw) * turn_off
+    e.yaw[w, v] = value_known(e.yaw[w, v], R_yaw)
+    shift(arrays, e, w, v, step, late, dt, wp.cw_mul(gain, off), wp.cw_mul(push, off), turn)
+
+
+@wp.func
+def shift(
+    arrays: TaskArrays, e: Estimates, w: int, v: int, step: int, late: int, dt: float, dx: wp.vec3, dv: wp.vec3,
+    turn: wp.vec2,
+):  # fmt: skip
+    """Take in what was learned of `late` steps ago: of the path since, of now, and of the gyro's bias."""
+    move_past(e, w, v, step, late, dt, dx, dv, turn)
+    t = float(late) * dt
+    arrays.position[w, v] = arrays.position[w, v] + dx + t * dv
+    e.velocity[w, v] = e.velocity[w, v] + dv
+    q = arrays.quaternion[w, v]
+    change = turn[1] * wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
+    e.bias[w, v] = e.bias[w, v] - change
+    e.rate[w, v] = e.rate[w, v] + change
+    arrays.quaternion[w, v] = about_z(turn[0] + t * turn[1]) * q
+
+
+@wp.func
+def take_depth(r: Readings, arrays: TaskArrays, e: Estimates, step: int, dt: float, w: int, v: int):
+    """A depth that has come: of the gauge's port, -z - (R r)_z."""
+    late = lateness(r.gauge_samples.timing[v].latency, step, e.past_position)
+    z = arrays.position[w, v][2]
+    q = arrays.quaternion[w, v]
+    if late > 0:
+        k = (step - late) % e.past_position.shape[2]
+        z = e.past_position[w, v, k][2]
+        q = e.past_quaternion[w, v, k]
+    gauge = r.gauge_errors[w, v]
+    off = -r.gauge.depth[w, v] - wp.quat_rotate(q, gauge.r)[2] - z
+    R = counted(gauge.noise, gauge.quantum)
+    K = value_gain(e.height[w, v], R) * off
+    e.height[w, v] = value_known(e.height[w, v], R)
+    shift(
+        arrays, e, w, v, step, late, dt, wp.vec3(0.0, 0.0, K[0]), wp.vec3(0.0, 0.0, K[1]), wp.vec2(0.0, 0.0)
+    )
+
+
+@wp.func
+def take_velocity(r: Readings, arrays: TaskArrays, e: Estimates, step: int, dt: float, w: int, v: int):
+    """A velocity of the DVL that has come: of the body's origin, v = R_bs z - ω × r, in world axes."""
+    late = lateness(r.dvl_samples.timing[v].latency, step, e.past_position)
+    speed = e.velocity[w, v]
+    q = arrays.quaternion[w, v]
+    if late > 0:
+        k = (step - late) % e.past_position.shape[2]
+        speed = e.past_velocity[w, v, k]
+        q = e.past_quaternion[w, v, k]
+    dvl = r.dvl_errors[w, v]
+    own = wp.quat_rotate(dvl.q_bs, r.dvl.velocity[w, v]) - wp.cross(e.rate[w, v], dvl.r)
+    off = wp.quat_rotate(q, own) - speed
+    R = counted(dvl.noise, dvl.quantum) + dvl.turn_on * dvl.turn_on
+    A = rate_gain(e.plane[w, v], R)
+    B = rate_gain(e.height[w, v], R)
+    e.plane[w, v] = rate_known(e.plane[w, v], R)
+    e.height[w, v] = rate_known(e.height[w, v], R)
+    dx = wp.cw_mul(wp.vec3(A[0], A[0], B[0]), off)
+    shift(arrays, e, w, v, step, late, dt, dx, wp.cw_mul(wp.vec3(A[1], A[1], B[1]), off), wp.vec2(0.0, 0.0))
+
+
+@wp.kernel(enable_backward=False)
+def estimate(
+    state: State,
+    arrays: TaskArrays,
+    seen: wp.array2d(dtype=Measurement),
+    r: Readings,
+    e: Estimates,
+    rate: wp.float64,
+    dt: float,
+    seed: int,
+    mask: wp.array(dtype=int),
+    starting: bool,
+    world_offset: int,
+):
+    """What is known of every vehicle: after a control step of all, or where an episode starts and mask is not 0."""
+    i, v = wp.tid()
+    w = world_offset + i
+    if mask[w] == 0 or state.frozen[w] != 0:
+        return
+    step = state.steps[w]
+    if starting:
+        begin(state, arrays, seen[w, v], r, e, rate > wp.float64(0.0), seed, w, v)
+    else:
+        go_on(r, arrays, e, dt, w, v)
+        if rate > wp.float64(0.0):
+            take_fix(state, arrays, seen[w, v], e, rate, dt, seed, w, v)
+        if r.gauge_errors.shape[0] > 0 and r.gauge_samples.fresh[w, v]:
+            take_depth(r, arrays, e, step, dt, w, v)
+        if r.dvl_errors.shape[0] > 0 and r.dvl_samples.fresh[w, v]:
+            take_velocity(r, arrays, e, step, dt, w, v)
+    x = arrays.position[w, v]
+    q = arrays.quaternion[w, v]
+    speed = e.velocity[w, v]
+    arrays.velocity[w, v] = join(wp.quat_rotate_inv(q, speed), e.rate[w, v])
+    k = step % e.past_position.shape[2]
+    e.past_position[w, v, k] = x
+    e.past_velocity[w, v, k] = speed
+    e.past_quaternion[w, v, k] = q
+
+
+class SensingBatch:
+    """The instruments and filters of all vehicles of all worlds of one environment."""
+
+    def __init__(
+        self,
+        sensing: Sensing,
+        simulator: Simulator,
+        arrays: TaskArrays,
+        seen: Packed,
+        floor_depth: float | None,
+        seed: int,
+        drawn: bool,
+    ) -> None:
+        """
+        Args:
+            sensing: The fixes.
+            simulator: The worlds.
+            arrays: Where what is known goes.
+            seen: Noise of the fixes by (world, vehicle).
+            floor_depth: Of the water, for a DVL [m]; None is out of reach of nothing.
+            seed: Of all errors.
+            drawn: Whether noise and delay of the fixes are drawn.
+
+        Raises:
+            EnvironmentSetupError: A vehicle has no IMU.
+        """
+        for vehicle in simulator.vehicles:
+            if vehicle.sensors.imu is None:
+                raise EnvironmentSetupError(
+                    f"vehicle {vehicle.name} has no IMU, and nothing else tells its attitude: give sensors.imu in its "
+                    "file, or observe otherwise"
+                )
+        self._simulator, self._arrays, self._seen = simulator, arrays, seen
+        dt = simulator.control_step
+        self.suite = SensorSuite(
+            simulator.vehicles, worlds=simulator.worlds, control_step=dt, seed=seed, device=simulator.device,
+            floor_depth=floor_depth,
+        )  # fmt: skip
+        self._rate = sensing.rate * dt
+        self.readings = self._readings()
+        delay = LONGEST_DELAY if drawn else sensing.fixes.delay
+        slow = [
+            b.sampling.timing.numpy()["latency"].max()
+            for b in (self.suite.depth, self.suite.dvl)
+            if b is not None
+        ]
+        late = min(max(round(delay / dt), *slow, 0) if slow else round(delay / dt), HISTORY - 1)
+        shape, device = (simulator.worlds, len(simulator.vehicles)), simulator.device
+        self.estimates = e = Estimates()
+        for name in ("velocity", "bias", "rate", "plane", "height", "yaw"):
+            setattr(e, name, wp.zeros(shape, dtype=wp.vec3, device=device))
+        for name, dtype in (("position", wp.vec3), ("velocity", wp.vec3), ("quaternion", wp.quat)):
+            setattr(e, f"past_{name}", wp.zeros((*shape, late + 1), dtype=dtype, device=device))
+        e.aboard = wp.array(
+            [_aboard(one, sensing, dt) for one in simulator.vehicles], dtype=Aboard, device=device
+        )
+
+    def _readings(self) -> Any:
+        r = Readings()
+        for name, batch in (("imu", self.suite.imu), ("gauge", self.suite.depth), ("dvl", self.suite.dvl)):
+            if batch is not None:
+                setattr(r, name, batch.arrays)
+                setattr(r, f"{name}_errors", batch.parameters)
+                setattr(r, f"{name}_samples", batch.sampling)
+        return r
+
+    def add(self, pipeline: Pipeline, seed: int, mask: wp.array | None = None) -> None:
+        """Append what comes after a control step; or where an episode starts, in the worlds where mask is not 0."""
+        state, count = self._simulator.state, len(self._simulator.vehicles)
+        for batch in self.suite.batches:
+            batch.seed = seed
+        starting = mask is not None
+        stages = self.suite.reset_stages(state, mask) if starting else self.suite.update_stages(state)
+        for kernel, inputs in stages:
+            pipeline.add(kernel, inputs, vehicles=count)
+        where = mask if starting else self._simulator._all
+        pipeline.add(
+            estimate,
+            [
+                state, self._arrays, self._seen.array, self.readings, self.estimates, self._rate,
+                self._simulator.control_step, seed, where, starting,
+            ],
+            vehicles=count,
+        )  # fmt: skip
+
+    def arrays(self) -> Iterator[tuple[str, Any]]:
+        """Structs of all that decides what is seen next, by name; parameters that `suite` was given are not in it."""
+        yield "estimates", self.estimates
+        yield "readings", self.readings
+
+
+def _aboard(vehicle: Vehicle, sensing: Sensing, dt: float) -> Any:
+    """What the filter knows of a vehicle; its doubt is that after many control steps."""
+    sensors, fixes = vehicle.sensors, sensing.fixes
+    known = Aboard()
+    known.gauge = sensors.depth is not None
+    start = (0.0, 0.0, FASTEST**2)
+    plane, height = (wp.vec3(*start) for _ in range(2))
+    yaw = wp.vec3(0.0, 0.0, sensors.imu.gyro_bias_initial**2 if sensors.imu else 0.0)
+    noise = 0.0 if sensors.imu is None else sensors.imu.gyro_noise_density**2 * sensors.imu.rate * dt
+    for step in range(1, STANDING + 1):
+        plane, height = grown(plane, ACCELERATION[0], dt), grown(height, ACCELERATION[2], dt)
+        yaw = grown(yaw, GYRO_WALK**2, dt) + wp.vec3(max(noise, GYRO_FLOOR**2) * dt, 0.0, 0.0)
+        came = _due(sensing.rate, step, dt)
+        if came:
+            R = counted(fixes.position_std, 0.0) / came
+            plane = value_known(plane, R)
+            height = height if known.gauge else value_known(height, R)
+            yaw = value_known(yaw, counted(fixes.yaw_std, 0.0) / came)
+        if sensors.depth is not None and _due(sensors.depth.rate, step, dt):
+            height = value_known(height, counted(sensors.depth.noise_std, sensors.depth.quantisation))
+        if sensors.dvl is not None and _due(sensors.dvl.rate, step, dt):
+            R = counted(sensors.dvl.noise_std, sensors.dvl.quantisation) + sensors.dvl.bias_initial**2
+            plane, height = rate_known(plane, R), rate_known(height, R)
+    if not sensing.rate:  # nothing says where it is: it starts where it is known to be
+        plane, yaw = wp.vec3(0.0, 0.0, min(plane[2], FASTEST**2)), wp.vec3(0.0, 0.0, yaw[2])
+        if not known.gauge:
+            height = wp.vec3(0.0, 0.0, min(height[2], FASTEST**2))
+    known.plane, known.height, known.yaw = plane, height, yaw
+    return known
+
+
+def _due(rate: float, step: int, dt: float) -> int:
+    """Samples that fall due in a control step."""
+    return math.floor(step * rate * dt + 1e-6) - math.floor((step - 1) * rate * dt + 1e-6)
