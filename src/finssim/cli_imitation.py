@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from finssim.cli_options import Hydrodynamics, Json, Seed, Vehicle
+from finssim.cli_options import Hydrodynamics, Json, Observe, Seed, Vehicle
 from finssim.quiet import start_warp
 
 __all__ = ["collect", "datasets"]
@@ -37,9 +37,7 @@ def collect(
         str | None,
         typer.Option(help="Ranges that vehicle and water are drawn from, by name or file.", metavar="FILE"),
     ] = None,
-    observe: Annotated[
-        str, typer.Option(help="What the expert sees: truth, estimator or training.", metavar="NAME")
-    ] = "training",
+    observe: Observe = "training",
     disturb: Annotated[
         float,
         typer.Option(

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from finssim.cli_options import Device, Hydrodynamics, Json, Seed, Steps, Vehicle
+from finssim.cli_options import Device, Hydrodynamics, Json, Observe, Seed, Steps, Vehicle
 from finssim.quiet import start_warp
 
 __all__ = ["evaluate", "train"]
@@ -50,6 +50,7 @@ def train(
             metavar="FILE",
         ),
     ] = None,
+    observe: Observe = "training",
     seed: Seed = 42,
     worlds: Annotated[int | None, typer.Option(help="Worlds simulated at once.", min=1)] = None,
     steps: Steps = None,
@@ -97,6 +98,7 @@ def train(
         hydrodynamics=hydrodynamics,
         action=action,
         randomize=randomize,
+        observe=observe,
         seed=seed,
         worlds=worlds,
         steps=steps,
@@ -127,8 +129,15 @@ def evaluate(
         list[str] | None,
         typer.Option(
             help="What differs from the vehicle file: nominal (nothing), current, lag, mesh, noise, "
-            "randomised, simplified, waves, or a file. May be given several times.",
+            "randomised, sensors, simplified, waves, or a file. May be given several times.",
             metavar="FILE|NAME",
+        ),
+    ] = None,
+    observe: Annotated[
+        str | None,
+        typer.Option(
+            help="What is seen in every plant: truth, estimator or sensors; what the plant says if not given.",
+            metavar="NAME",
         ),
     ] = None,
     trajectory: Annotated[
@@ -168,6 +177,8 @@ def evaluate(
 
     Example: finssim evaluate runs/hold --plant current --trials 64 --out runs/hold-current
 
+    Example: finssim evaluate runs/hold --observe sensors
+
     Example: finssim evaluate runs/track --task t2 --trajectory ellipse --trajectory my-way.csv
 
     Example: finssim evaluate run.mcap --task t1 --truth mocap.csv
@@ -180,7 +191,7 @@ def evaluate(
         raise typer.BadParameter(
             "one controller at a time, or records of one: give a single name, or .mcap files"
         )
-    simulated = {"--plant": plant, "--trials": trials, "--trim": trim or None}
+    simulated = {"--plant": plant, "--observe": observe, "--trials": trials, "--trim": trim or None}
     unheeded = [name for name, value in simulated.items() if value is not None]
     if records and unheeded:
         raise typer.BadParameter(f"a record was made once and for all: leave {', '.join(unheeded)} out")
@@ -192,6 +203,7 @@ def evaluate(
         vehicle=vehicle,
         hydrodynamics=hydrodynamics,
         plant=plant or "nominal",
+        observe=observe,
         trajectories=trajectory or (),
         trials=trials,
         trim=trim,

@@ -104,3 +104,11 @@ Unattended = Annotated[
         help="Nobody presses enter before each trial; a fault ends the session, and nothing is armed after it.",
     ),
 ]
+Observe = Annotated[
+    str,
+    typer.Option(
+        help="What is seen: training (the task's noise), sensors (the vehicle's own and position fixes, "
+        "through a filter), estimator (about what localization is off by) or truth.",
+        metavar="NAME",
+    ),
+]

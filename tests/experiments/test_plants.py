@@ -13,7 +13,7 @@ from finssim.experiments.episodes import run_episodes
 from finssim.experiments.plants import Plant, PlantError, available_plants, load_plant
 from finssim.experiments.t2_trials import run_tracking
 from finssim.experiments.trials import run_trials
-from finssim.tasks import Environment, EnvironmentSetupError, task_named
+from finssim.tasks import Environment, EnvironmentSetupError, MeasurementNoise, Sensing, task_named
 from finssim.tasks.actions import action_size
 from finssim.tasks.agents import agent_for
 from finssim.vehicles import VehicleError, load_vehicle
@@ -22,10 +22,22 @@ FINSROV = load_vehicle("finsrov")
 
 
 def test_the_plants_of_the_protocol_ship():
-    """Nominal, randomised, current, waves, noise, lag, and the other two models."""
-    expected = ["current", "lag", "mesh", "noise", "nominal", "randomised", "simplified", "waves"]
+    """Nominal, randomised, current, waves, noise, sensors, lag, and the other two models."""
+    expected = ["current", "lag", "mesh", "noise", "nominal", "randomised", "sensors", "simplified", "waves"]
     assert available_plants() == expected
     assert all(load_plant(name).title for name in expected)
+
+
+def test_a_plant_is_seen_with_what_is_asked_for():
+    """In place of its noise; the environment has the sensors, and the result says so."""
+    assert load_plant("sensors").environment_arguments()["noise"] == Sensing()
+    seen = load_plant("noise").seen("sensors")
+    assert seen.observe == "sensors" and not seen.noise and seen.title.endswith("; seen: sensors")
+    assert load_plant("nominal").seen("truth").environment_arguments()["noise"] == MeasurementNoise()
+    with pytest.raises(PlantError, match="observe is 'eyes', expected truth, estimator, sensors"):
+        load_plant("nominal").seen("eyes")
+    with pytest.raises(ValueError, match="noise and observe: sensors are both given"):
+        Plant(name="both", noise={"yaw_std": 0.1}, observe="sensors")
 
 
 def test_nominal_changes_nothing():

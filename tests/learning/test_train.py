@@ -71,6 +71,7 @@ def test_the_description_is_enough_to_repeat_the_training(trained):
     training = told["training"]
     assert told["seed"] == 5 and told["vehicle"]["sha256"] == load_vehicle("finsrov").sha256
     assert training["worlds"] == 16 and training["steps"] == 8192 and training["steps_done"] == 8192
+    assert training["observe"]["name"] == "training" and training["observe"]["position_std"] == 0.01
     assert training["complete"] is True and training["randomization"] is None
     assert training["task"]["reward"]["position"] == StationKeeping().reward.position
     assert "revision" in told["provenance"]
@@ -95,18 +96,21 @@ def test_equal_seeds_are_equal_policies(trained, tmp_path):
 
 
 def test_options_reach_the_policy(tmp_path):
-    """Action mode, model and ranges are recorded as they were used."""
+    """Action mode, model, ranges and what is seen are recorded as they were used."""
     out = train(
         "t1",
         out=tmp_path / "p",
         action="thruster8",
         hydrodynamics="simplified",
         randomize="fossen_learn_to_swim",
+        observe="sensors",
         **TINY,
     )
     told = Policy.load(out).description
     assert told.action["mode"] == "thruster8" and told.action_size == 8
     assert told.hydrodynamics == "simplified" and told.training["randomization"]["mass"] == [0.98, 1.02]
+    seen = told.training["observe"]
+    assert seen["name"] == "sensors" and seen["fixes"]["rate"] == 30.0 and seen["depth"]["noise_std"] == 0.005
 
 
 def interrupt_after(updates, monkeypatch):
@@ -254,6 +258,11 @@ def test_a_learner_whose_numbers_run_away_is_stopped(tmp_path, learner):
     [
         ({"task": "t9"}, EnvironmentSetupError, "unknown task 't9'; available: t1"),
         ({"vehicle": "finsro"}, VehicleError, "did you mean 'finsrov'"),
+        (
+            {"observe": "eyes"},
+            EnvironmentSetupError,
+            "observe is 'eyes', expected truth, estimator, sensors, training",
+        ),
         ({"randomize": "hold"}, RangesError, "no ranges 'hold'"),
         ({"action": "wrench5"}, ValueError, "unknown action mode 'wrench5'"),
         ({"hydrodynamics": "fosen"}, ValueError, "unknown hydrodynamic model 'fosen'"),

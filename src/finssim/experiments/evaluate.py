@@ -64,6 +64,7 @@ def evaluate(
     vehicle: str | Vehicle = "finsrov",
     hydrodynamics: str = "calibrated",
     plant: str | Path | Sequence[str | Path] = "nominal",
+    observe: str | None = None,
     trajectories: Sequence[str | Path] = (),
     trials: int | None = None,
     trim: bool = False,
@@ -81,6 +82,7 @@ def evaluate(
         vehicle: A vehicle, a catalogue name or a file.
         hydrodynamics: Model, unless the plant names one.
         plant: Name or file, or several.
+        observe: What is seen in every plant: truth, estimator or sensors; what the plant says if None.
         trajectories: Names or files of what is followed in T2, in turn; the published four if none.
         trials: How many in each plant; the eight setpoints, or the four trajectories, once if None.
         trim: Put the integral of the position error (`control.trim`) in front of a policy.
@@ -104,6 +106,7 @@ def evaluate(
                 _write(evaluations, folder, form)
         return _tell(evaluations, form, out, json, console)
     plants = _plants([plant] if isinstance(plant, str | Path) else plant)
+    plants = plants if observe is None else [one.seen(observe) for one in plants]
     options: dict[str, Any] = {
         "task": task,
         "vehicle": vehicle,

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from finssim.engine import Water
 from finssim.engine.randomize import Randomization
@@ -16,6 +16,7 @@ from finssim.engine.ranges_file import Ranges, load_ranges
 from finssim.engine.surroundings import Wave
 from finssim.tasks import Environment, MeasurementNoise, Task
 from finssim.tasks.agents import Agent
+from finssim.tasks.make import OBSERVED, observed
 from finssim.vehicles import Vehicle
 from finssim.yaml_file import read_mapping
 
@@ -46,6 +47,8 @@ class Plant(BaseModel):
     """Arguments of `finssim.engine.Water`: current, shear, drift_std, drift_time, depth, waves."""
     noise: dict[str, float] = Field(default_factory=dict)
     """Arguments of `finssim.tasks.MeasurementNoise` [m, rad, m/s, rad/s]."""
+    observe: str | None = None
+    """In place of `noise`: truth, estimator, or sensors, those of the vehicle file with position fixes."""
     extra_time_constant: float = Field(default=0.0, ge=0.0, le=LONGEST_LAG, allow_inf_nan=False)
     """Added to every thruster's [s]."""
     extra_delay: float = Field(default=0.0, ge=0.0, le=LONGEST_LAG, allow_inf_nan=False)
@@ -70,6 +73,26 @@ class Plant(BaseModel):
         _made(MeasurementNoise, value)
         return value
 
+    @model_validator(mode="after")
+    def _sees_one_way(self) -> Plant:
+        if self.observe is not None and self.observe not in OBSERVED:
+            raise ValueError(f"observe is '{self.observe}', expected {', '.join(OBSERVED)}")
+        if self.observe and self.noise:
+            raise ValueError(f"noise and observe: {self.observe} are both given, expected one of them")
+        return self
+
+    def seen(self, observe: str) -> Plant:
+        """The same plant, seen otherwise.
+
+        Raises:
+            PlantError: There is no such way to see.
+        """
+        title = f"{self.title}; seen: {observe}".removeprefix("; ")
+        try:
+            return Plant.model_validate({**dict(self), "noise": {}, "observe": observe, "title": title})
+        except ValidationError as error:
+            raise PlantError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None
+
     def changed(self, vehicle: Vehicle) -> Vehicle:
         """The vehicle with this plant's numbers.
 
@@ -88,7 +111,11 @@ class Plant(BaseModel):
         """Arguments of `finssim.tasks.Environment`: water, noise, randomization."""
         return {
             "water": _water(self.water) if self.water else None,
-            "noise": MeasurementNoise(**self.noise) if self.noise else None,
+            "noise": observed(self.observe)
+            if self.observe
+            else MeasurementNoise(**self.noise)
+            if self.noise
+            else None,
             "randomization": Randomization(self.ranges).at_full_width() if self.ranges else None,
         }
 

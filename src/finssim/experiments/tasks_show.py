@@ -85,6 +85,7 @@ def _head(told: Mapping[str, Any]) -> list[str]:
         f"{told['time_limit_s']:g} s",
         f"baselines: {', '.join(told['baselines']) or 'none'}",
         "noise in training: " + (_words(told["training_noise"]) or "none"),
+        *(f"seen with sensors, {name}: {_words(one)}" for name, one in told["sensors"].items()),
     ]
     if told["others"]:
         others = ", ".join(f"{name} ({vehicles[name]['name']})" for name in told["others"])

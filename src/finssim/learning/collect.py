@@ -50,7 +50,7 @@ def collect(
         hydrodynamics: calibrated, mesh or simplified.
         action: Mode; the task's own if None.
         randomize: Name or file of ranges; none if None.
-        observe: What the expert sees: truth, estimator or training.
+        observe: What the expert sees: truth, estimator, sensors or training.
         disturb: Standard deviation of a noise that is added to what is done, and not to what is written: the expert
             is then seen to recover from where it would not have gone by itself. In parts of full action.
         seed: Of everything random.

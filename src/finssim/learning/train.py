@@ -25,6 +25,7 @@ from finssim.quiet import start_warp
 from finssim.tasks import Environment, Task, make, task_named
 from finssim.tasks.fitting import authority
 from finssim.tasks.levels import LevelPlan, climb
+from finssim.tasks.sensing import seen_with
 from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["TrainingError", "settings_of_words", "train"]
@@ -43,6 +44,7 @@ def train(
     hydrodynamics: str = "calibrated",
     action: str | None = None,
     randomize: str | Path | None = None,
+    observe: str = "training",
     seed: int = 42,
     worlds: int | None = None,
     steps: int | None = None,
@@ -67,6 +69,7 @@ def train(
         hydrodynamics: calibrated, mesh or simplified.
         action: wrench6, wrench4 or thruster8; the task's own if None.
         randomize: Name or file of ranges that vehicle and water are drawn from in every episode.
+        observe: What the policy sees: training (the task's noise), sensors, estimator or truth; see `finssim.make`.
         seed: Of everything random.
         worlds: Worlds at once; the settings' own if None.
         steps: Control steps of all worlds together; the settings' own if None.
@@ -120,7 +123,7 @@ def train(
     def worlds_of(count: int, ranges: Randomization | None, its_seed: int, **more: Any) -> Environment:
         return make(
             the_task, worlds=count, vehicle=chosen, hydrodynamics=hydrodynamics, action=action,
-            randomize=ranges, observe="training", device=device, seed=its_seed, wrench_scale=scale, **more,
+            randomize=ranges, observe=observe, device=device, seed=its_seed, wrench_scale=scale, **more,
         )  # fmt: skip
 
     asymmetric = randomized and getattr(values, "asymmetric", False)
@@ -146,6 +149,7 @@ def train(
             **asdict(values),
             "device": device,
             "randomization": randomization.ranges.model_dump(mode="json") if randomization else None,
+            "observe": {"name": observe, **seen_with(environment.noise, chosen)},
             "task": the_task.record(),
             "agents": list(the_task.agents),
             "levels": asdict(plan) if plan else None,

@@ -7,6 +7,7 @@ from finssim.tasks.make import make, task_named
 from finssim.tasks.measurement import MeasurementNoise
 from finssim.tasks.moving_target import MovingTarget
 from finssim.tasks.reference import follow
+from finssim.tasks.sensing import Sensing
 from finssim.tasks.station_keeping import StationKeeping
 from finssim.tasks.task import ObservationPart, Task
 from finssim.tasks.trajectory_tracking import TrajectoryTracking
@@ -19,6 +20,7 @@ __all__ = [
     "MeasurementNoise",
     "MovingTarget",
     "ObservationPart",
+    "Sensing",
     "StationKeeping",
     "Step",
     "Task",

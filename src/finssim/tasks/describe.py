@@ -13,6 +13,7 @@ from finssim.tasks.attribute_docs import attribute_docs
 from finssim.tasks.baselines import BASELINES
 from finssim.tasks.given import crew
 from finssim.tasks.make import task_named
+from finssim.tasks.sensing import Sensing, seen_with
 from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle
 
@@ -44,7 +45,6 @@ def describe_task(
     mode = action or the_task.action
     vehicles = crew(vehicle, the_task, mode)
     the_task = the_task.fitted(vehicles)
-    noise = asdict(the_task.training_noise)
     return {
         "name": the_task.name,
         "title": title_of(the_task),
@@ -66,7 +66,8 @@ def describe_task(
         "inside": _told(the_task, the_task.terms().inside),
         "success": the_task.success_rule(),
         "settings": _settings(the_task),
-        "training_noise": {name: value for name, value in noise.items() if value},
+        "training_noise": seen_with(the_task.training_noise, vehicles[0]),
+        "sensors": seen_with(Sensing(), vehicles[0]),
         "baselines": list(BASELINES.get(the_task.name, {})),
     }
 

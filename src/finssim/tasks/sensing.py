@@ -48,7 +48,7 @@ from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.measurement import LONGEST_DELAY, MeasurementNoise
 from finssim.vehicles import Vehicle
 
-__all__ = ["Sensing", "SensingBatch", "instruments_of"]
+__all__ = ["Sensing", "SensingBatch", "seen_with"]
 
 FIX = 100
 """Number of the fixes in the random key, apart from those of the kinds of sensor."""
@@ -56,6 +56,7 @@ STANDING = 400
 """Control steps after which a filter's doubt has settled."""
 FASTEST = 0.3
 """Deviation of a vehicle's speed per axis where nothing tells it [m/s], as `localization.fusion` takes it."""
+MOUNT = ("position", "orientation")
 PER_FIX = ("position_std", "yaw_std", "position_bias", "yaw_bias", "dropout", "delay")
 """Fields of a measurement noise that a fix has."""
 
@@ -97,12 +98,18 @@ class Sensing:
             )
 
 
-def instruments_of(vehicle: Vehicle) -> dict[str, dict[str, Any]]:
-    """The sensors that a vehicle carries with their errors, as plain data; what is nothing or unlimited is left out."""
+def seen_with(noise: MeasurementNoise | Sensing, vehicle: Vehicle) -> dict[str, Any]:
+    """What a controller sees, as plain data: errors, or fixes and the sensors aboard; no mounts, nothing that is 0."""
+    if isinstance(noise, MeasurementNoise):
+        return {name: value for name, value in asdict(noise).items() if value}
+    fixes = {"rate": noise.rate, **seen_with(noise.fixes, vehicle)} if noise.rate else None
     return {
-        kind: {name: x for name, x in given.items() if x and x != math.inf}
-        for kind, given in vehicle.sensors.model_dump(mode="json").items()
-        if given
+        "fixes": fixes,
+        **{
+            kind: {name: x for name, x in given.items() if name not in MOUNT and x and x != math.inf}
+            for kind, given in vehicle.sensors.model_dump(mode="json").items()
+            if given
+        },
     }
 
 
