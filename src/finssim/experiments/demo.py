@@ -274,7 +274,7 @@ def _plans(standing: Vehicle, scope: Scope) -> dict[str, list[Programme]]:
         for role, levels in (("fit", scope.levels), ("held-out", scope.held_out))
     }
     plans["fit"] += shuttles(scope.shuttles, standing) if scope.shuttles else []
-    return plans
+    return {role: [trimmed(programme, standing) for programme in plan] for role, plan in plans.items()}
 
 
 def _robot_recorder(standing: Vehicle, scope: Scope, place: _Place) -> Record:
