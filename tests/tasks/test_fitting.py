@@ -32,7 +32,7 @@ def test_lengths_of_t1_and_t2_grow_with_the_vehicle_and_their_tolerance_stays(na
     small, large = make(name, worlds=200), make(name, worlds=200, vehicle="rexrov")
     assert small.simulator.surroundings[1] == Pool()
     assert large.simulator.surroundings[1].depth == pytest.approx(SIZE)
-    assert large.parameters.tolerance == small.parameters.tolerance
+    assert large.task.tolerance == small.task.tolerance
     starts = [e.simulator.state.position.numpy()[:, 0] for e in (small, large)]
     np.testing.assert_allclose(starts[1], SIZE * starts[0], rtol=1e-4, atol=1e-5)
     again = large.task.fitted([load_vehicle("rexrov")])
