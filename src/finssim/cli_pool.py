@@ -76,6 +76,15 @@ def pool(
             metavar="X,Y,Z,YAW",
         ),
     ] = None,
+    task: Annotated[
+        str | None,
+        typer.Option(
+            help="The site of a task in open water, in real time. Every agent has a motor controller, at --port, ten "
+            "ports on, and so on, for a robot at --robot, ten ports on, and so on; their messages go to the port five "
+            "after --port. What the task commands is commanded here, and the task scores what is true.",
+            metavar="TASK",
+        ),
+    ] = None,
     site: Annotated[
         str,
         typer.Option(help="Where: pool, tank or open-water (current, waves, 20 m of water).", metavar="NAME"),
@@ -94,8 +103,33 @@ def pool(
     Example: finssim pool --plant 1 --severity realistic --pool-file pool.yaml --truth truth.fst
     """
     start_warp()
-    from finssim.pool.run import run
+    from finssim.pool.run import run, run_task
 
+    if task is not None:
+        if (
+            not plant.isdecimal()
+            or lockstep
+            or pool_file is not None
+            or truth is not None
+            or start is not None
+        ):
+            raise typer.BadParameter(
+                "--task draws its plants, its time is real and its starts are its own: give a seed for --plant, leave "
+                "--lockstep, --pool-file, --truth and --start out"
+            )
+        run_task(
+            task,
+            vehicle,
+            plant=int(plant),
+            severity=severity,  # type: ignore[arg-type]
+            positioning=positioning,
+            port=port,
+            bind=bind,
+            robot=robot,
+            duration=duration,
+            seed=seed,
+        )
+        return
     run(
         vehicle,
         plant=plant,

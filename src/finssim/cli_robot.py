@@ -64,8 +64,27 @@ def run(
     bind: Bind = "127.0.0.1:54321",
     pictures: Pictures = None,
     pool_file: Annotated[
-        Path, typer.Option(help="Pool file: camera, water plane and frames (.yaml).", metavar="FILE")
-    ] = Path("pool.yaml"),
+        str,
+        typer.Option(
+            help="Pool file: camera, water plane and frames (.yaml); none where no camera looks.",
+            metavar="FILE|none",
+        ),
+    ] = "pool.yaml",
+    site: Annotated[
+        str,
+        typer.Option(
+            help="Where: pool, tank or open-water. The workspace, and in open water Doppler log and compass, are then "
+            "those of finssim pool --site.",
+            metavar="NAME",
+        ),
+    ] = "pool",
+    team: Annotated[
+        str,
+        typer.Option(
+            help="What carries messages between vehicles, such as finssim pool --task: HOST:PORT.",
+            metavar="ADDRESS",
+        ),
+    ] = "",
     vehicle: Vehicle = "finsrov",
     trim: Annotated[
         bool,
@@ -99,8 +118,10 @@ def run(
     from finssim.quiet import start_warp
 
     start_warp()
+    from finssim.pool.sites import vehicle_at
     from finssim.robot.run import Wiring
     from finssim.robot.run import run as drive
+    from finssim.vehicles import load_vehicle
 
     status = drive(
         policy,
@@ -108,9 +129,9 @@ def run(
         agent=agent,
         goal=goal,
         trajectory=trajectory,
-        pool_file=pool_file,
-        vehicle=vehicle,
-        wiring=Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep),
+        pool_file=None if pool_file == "none" else Path(pool_file),
+        vehicle=vehicle_at(site, load_vehicle(vehicle)),
+        wiring=Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep, team=team),
         record=record,
         duration=duration,
         mode=mode,

@@ -248,10 +248,7 @@ def _recorder(
 
     def record(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
         return pool_trials(
-            {
-                role: [trimmed(one, standing) for one in plan]
-                for role, plan in _plans(standing, scope).items()
-            },
+            _plans(standing, scope),
             folder,
             vehicle=str(rough),
             pool_vehicle=name,

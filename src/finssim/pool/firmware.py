@@ -194,6 +194,11 @@ class Firmware:
             motor_rpm=tuple(self._rpm_outputs.tolist()),
         )
 
+    @property
+    def driving(self) -> bool:
+        """Whether the newest command lets thrusters turn."""
+        return self._enabled
+
     def _flags(self, throttled: bool) -> int:
         flags = ALWAYS | (self.commands & 0xFF) << 16
         flags |= RECEIVED if self.commands else 0

@@ -25,18 +25,23 @@ from finssim.pool.plant_spec import Basin, PlantSpec, PlantSpecError, Severity, 
 from finssim.pool.server import LockstepServer, serve_realtime
 from finssim.pool.site import camera_of
 from finssim.pool.sites import positioning_of, site_of, vehicle_at
+from finssim.pool.task_server import MediumServer, serve_task
+from finssim.pool.task_site import TaskSite
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.goals import station_of
 from finssim.robot.link.layout import LinkError
 from finssim.robot.link.transports import host_port
 from finssim.robot.link.udp import UdpTransport
 from finssim.robot.picture_memory import memory_path
+from finssim.tasks.observer import fitted_task
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["MCU_PORT", "PoolPlan", "make_plan", "run"]
+__all__ = ["MCU_PORT", "PoolPlan", "make_plan", "run", "run_task"]
 
 MCU_PORT = 58766
 """Of the motor controller; pictures come from the next port, lock-step is the one after."""
+MESSAGES = 5
+"""The messages of a team are this far from the first port."""
 MEMORY = "pool"
 """Name of the shared memory of a pool on the default port; on others the port follows: pool-40000."""
 
@@ -161,6 +166,57 @@ def run(
     else:
         wire = PictureWire((bind, port + 1), _next(robot), memory)
         _realtime(plan, make_world, (bind, port), host_port(robot, "--robot"), wire, longest)
+
+
+def run_task(
+    task: str,
+    vehicle: str,
+    *,
+    plant: int,
+    severity: Severity,
+    positioning: str,
+    port: int,
+    bind: str,
+    robot: str,
+    duration: float | None,
+    seed: int,
+) -> None:
+    """Run the site of a task in open water, with a robot for each of its agents; arguments as of the command."""
+    logging.basicConfig(level=logging.WARNING, format="finssim: %(message)s", stream=sys.stderr)
+    body = load_vehicle(vehicle)
+    fitted = fitted_task(task, body)
+    vehicles = [body] * len(fitted.vehicles)
+    if not 0 < port <= 65535 - 10 * len(fitted.agents):
+        raise LinkError(
+            f"port {port}: expected room for ten ports to each of {len(fitted.agents)} vehicles after it"
+        )
+    host, theirs = host_port(robot, "--robot")
+    site = TaskSite(
+        task,
+        vehicles,
+        lambda v: site_of("open-water", draw_plant(v, plant, severity)),
+        None,
+        None,
+        seed=seed,
+        communication=getattr(fitted, "communication", None),
+        positioning=positioning,
+    )
+    with _stoppable() as asked, ExitStack() as stack:
+        messages = MediumServer((bind, port + MESSAGES), site.medium, fitted.agents)
+        stack.callback(messages.close)
+        transports = {}
+        for i, name in enumerate(fitted.agents):
+            transports[name] = UdpTransport((bind, port + 10 * i), (host, theirs + 10 * i))
+            stack.callback(transports[name].close)
+            _say(f"{name}: {_name(transports[name].address)}, for {_name(transports[name].peer)} alone")
+        _say(f"messages: {_name(messages.address)}")
+        took = serve_task(
+            site, transports, messages, duration=math.inf if duration is None else duration, until=asked
+        )
+    _say(
+        f"{took:.1f} s, {site.scored} control steps: "
+        + ", ".join(f"{k} {v:.4g}" for k, v in site.referee.metrics().items())
+    )
 
 
 def memory_of(pictures: str, port: int) -> str:

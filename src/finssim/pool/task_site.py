@@ -6,6 +6,7 @@ start, where a target goes and what counts as a success is the task's own code, 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -138,6 +139,8 @@ class TaskSite:
         referee: The task.
         worlds: Plants and motor controllers, by place.
         runtimes: The robots' software, by place.
+        medium: What carries their messages.
+        scored: Control steps of the episode so far.
     """
 
     def __init__(
@@ -145,7 +148,7 @@ class TaskSite:
         task: str | Task,
         vehicles: Sequence[Vehicle],
         spec: Callable[[Vehicle], PlantSpec],
-        pilots: Callable[[str], Pilot],
+        pilots: Callable[[str], Pilot] | None,
         pool: Pool | None,
         *,
         seed: int = 0,
@@ -160,7 +163,7 @@ class TaskSite:
             task: A task, its name, or FILE.py:CLASS of one's own.
             vehicles: One for each of its places.
             spec: Makes the plant of a vehicle.
-            pilots: Who steers an agent, by its place.
+            pilots: Who steers an agent, by its place; None: they are elsewhere, and `runtimes` holds the others alone.
             pool: Camera, water and frames, as the robots know them; None: no camera looks.
             seed: Of the episode, of instruments and of what is lost.
             guide: The reference, of a task that follows one; drawn as in training if None.
@@ -183,19 +186,22 @@ class TaskSite:
             for i, (name, vehicle, place) in enumerate(zip(names, vehicles, referee.places(), strict=True))
         }
         site = (SITE,) if self._target() is not None else ()
-        self._medium = Medium(self._positions, communication, seed)
+        self.medium = Medium(self._positions, communication, seed)
         self.runtimes: dict[str, Runtime] = {}
+        self.scored, self._since = 0, math.nan
         period = self.task.control_step if communication is None else communication.period
         for i, (name, vehicle) in enumerate(zip(names, vehicles, strict=True)):
             world = self.worlds[name]
             agent = name in self.task.agents
+            if agent and pilots is None:
+                continue
             others = (*(other for other in names if other != name), *(("target",) if site else ()))
             team = Team(name, others if agent else (), period=period, turn=period * i / len(names))
             self.runtimes[name] = Runtime(
                 vehicle,
                 pool,
                 pilots(name)
-                if agent
+                if agent and pilots is not None
                 else ScriptedPilot(self.task, vehicles, lambda: truth_of(self.worlds), seed=seed),
                 goal,
                 arm=True,
@@ -210,33 +216,42 @@ class TaskSite:
         Returns:
             The task's metrics.
         """
-        step, scored = self.task.control_step, 0
+        step = self.task.control_step
 
         def look() -> None:
-            nonlocal scored
-            t = min(runtime.t for runtime in self.runtimes.values())
-            if not t >= (scored + 1) * step - 1e-6:
-                return
-            scored += 1
-            actions = {name: getattr(one.pilot, "action", np.zeros(0)) for name, one in self.runtimes.items()}
-            self.referee.look(truth_of(self.worlds), actions)
-            self._tell_target()
+            self.score(min(runtime.t for runtime in self.runtimes.values()), since=0.0)
 
-        self._tell_target()
+        self.tell_target()
         longest = (duration or self.task.time_limit) + 10.0
         stacks = {name: (runtime, self.worlds[name]) for name, runtime in self.runtimes.items()}
         try:
             run_together(
                 stacks,
                 longest,
-                carrier=self._medium if len(stacks) > 1 else None,
+                carrier=self.medium if len(stacks) > 1 else None,
                 show=look,
-                until=lambda: self.referee.over or (duration is not None and scored * step >= duration),
+                until=lambda: self.referee.over or (duration is not None and self.scored * step >= duration),
             )
         finally:
             for world in self.worlds.values():
                 world.close()
         return self.referee.metrics()
+
+    def score(self, now: float, since: float | None = None) -> None:
+        """Let the task score what is true, as often as a control step has passed.
+
+        Args:
+            now: [s]; NaN while nobody has begun.
+            since: When the episode began [s]; with the first call if None.
+        """
+        if math.isnan(self._since):
+            self._since = now if since is None else since
+            self.tell_target()
+        if now - self._since >= (self.scored + 1) * self.task.control_step - 1e-6:
+            self.scored += 1
+            actions = {name: getattr(one.pilot, "action", np.zeros(0)) for name, one in self.runtimes.items()}
+            self.referee.look(truth_of(self.worlds), actions)
+            self.tell_target()
 
     def _target(self) -> Track | None:
         """What drifts in the water, of a task with such a thing."""
@@ -247,12 +262,12 @@ class TaskSite:
         nu = np.array([*net.motion.numpy()[0].astype(float), 0.0, 0.0, 0.0])
         return Track(net.target.numpy()[0].astype(float), level, nu)
 
-    def _tell_target(self) -> None:
+    def tell_target(self) -> None:
         """The site's own positioning tells everybody of the target."""
         target = self._target()
         if target is not None:
             now = max(world.time for world in self.worlds.values())
-            self._medium.send(now, SITE, encode_track("target", target, now), lossless=True)
+            self.medium.send(now, SITE, encode_track("target", target, now), lossless=True)
 
     def _positions(self) -> dict[str, Array]:
         return {name: np.asarray(world.plant.position, float) for name, world in self.worlds.items()}

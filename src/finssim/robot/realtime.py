@@ -34,6 +34,7 @@ def run_realtime(
     transport: Transport,
     pictures: PictureSource | None = None,
     *,
+    mates: Transport | None = None,
     rate: float = 60.0,
     duration: float = math.inf,
     until: Callable[[Runtime], bool] | None = None,
@@ -50,6 +51,7 @@ def run_realtime(
         runtime: The robot.
         transport: To the motor controller.
         pictures: From the camera; None: there is none.
+        mates: To what carries messages between vehicles; None: this one is alone.
         rate: Steps a second [Hz].
         duration: How long [s].
         until: Ends the run where it says so; asked after every step.
@@ -66,8 +68,11 @@ def run_realtime(
         try:
             while not interrupted() and (now := clock()) - start < duration:
                 frames = [(now, data) for data in transport.receive()]
-                for data in runtime.step(now, frames, pictures.receive(now) if pictures else ()):
+                heard = mates.receive() if mates is not None else ()
+                for data in runtime.step(now, frames, pictures.receive(now) if pictures else (), heard):
                     transport.send(data)
+                for data in runtime.told if mates is not None else ():
+                    mates.send(data)
                 runtime.sent(clock())
                 if show is not None:
                     show(runtime)

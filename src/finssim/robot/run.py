@@ -14,6 +14,7 @@ from rich.console import Console
 
 from finssim.control.controllers import CONTROLLERS
 from finssim.control.errors import ControlError
+from finssim.control.guidance import Station
 from finssim.control.trim import Trim
 from finssim.localization.pool import load_pool
 from finssim.robot.goals import check_reachable, guide_of
@@ -22,6 +23,7 @@ from finssim.robot.pilots import Pilot, make_pilot
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.robot.summary import Summary, show
+from finssim.robot.team import Team
 from finssim.robot.wiring import POOL_ADDRESS, Drive, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
 
@@ -31,6 +33,8 @@ FAULT = 3
 """Exit status of a run that ended in a fault of the vehicle."""
 UNHEARD = 4
 """Exit status of a run in which the vehicle said nothing."""
+_GO = Station((0.0, 0.0, 0.0), 0.0, name="team")
+"""The guide of a vehicle that goes by the others alone."""
 AFTERWARDS = 2.0
 """A trajectory's end is held for so long before the run ends [s]."""
 MUTE = 3.0
@@ -42,8 +46,8 @@ def run(
     *,
     goal: str | None,
     trajectory: str | None,
-    pool_file: Path,
-    vehicle: str = "finsrov",
+    pool_file: Path | None,
+    vehicle: str | Vehicle = "finsrov",
     task: str | None = None,
     agent: str | None = None,
     wiring: Wiring | None = None,
@@ -60,8 +64,8 @@ def run(
         policy: A policy's directory, or the name of a PID.
         goal: "x,y,z,yaw_deg" or a file.
         trajectory: Name or file, in place of a goal.
-        pool_file: Camera, water and frames.
-        vehicle: Name or file.
+        pool_file: Camera, water and frames; None: no camera looks, and the pool frame is the world's.
+        vehicle: A vehicle, its name or file.
         task: That the policy must have been trained for, or whose baseline acts.
         agent: Place of this vehicle in a task of several.
         wiring: How the robot is connected; to the virtual pool of this machine if None.
@@ -76,8 +80,10 @@ def run(
         Exit status: 0, `FAULT` or `UNHEARD`.
     """
     wiring, console = wiring or Wiring(), Console(stderr=True)
-    ours, guide = load_vehicle(vehicle), guide_of(goal, trajectory)
-    check_reachable(guide, ours)
+    ours = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
+    guide = _GO if wiring.team and goal is None and trajectory is None else guide_of(goal, trajectory)
+    if guide is not _GO:
+        check_reachable(guide, ours)
     if ours.defaults:
         console.print(
             f"{ours.name}: {', '.join(ours.defaults)} are defaults, fit for the virtual world; give a real vehicle "
@@ -85,14 +91,29 @@ def run(
             highlight=False,
         )
     pilot = _pilot(policy, ours, task, trim, agent=agent, follows=trajectory is not None)
-    pool = load_pool(pool_file)
+    pool = None if pool_file is None else load_pool(pool_file)
     perception = Perception(ours, pool, mode=mode)
     meta = {"command": "finssim run", "pilot": pilot.describe(), "guide": guide.name, "armed": arm}
-    record_with = (record, ours, {**meta, "pool_sha256": pool.sha256}, pool_file, wiring)
+    record_with = (
+        record,
+        ours,
+        {**meta, **({"pool_sha256": pool.sha256} if pool else {})},
+        pool_file,
+        wiring,
+    )
     with _opened(connected(wiring, ours, pool), *record_with) as (drive, recorder):
         if not arm:
             console.print("dry run: thrusters will not turn without --arm")
-        runtime = Runtime(ours, pool, pilot, guide, arm=arm, perception=perception, recorder=recorder)
+        runtime = Runtime(
+            ours,
+            pool,
+            pilot,
+            guide,
+            arm=arm,
+            perception=perception,
+            recorder=recorder,
+            team=_team(pilot, wiring),
+        )
         watch, summary = _Watch(runtime, duration, wiring.robot, console), Summary()
         with _progress(console) as say:
 
@@ -126,6 +147,26 @@ def _pilot(
             raise ControlError(f"{policy} has an integral of its own: leave --trim out")
         task = task or ("t2" if follows else None)
     return make_pilot(policy, vehicle, task=task, agent=agent, trim=Trim() if trim else None)
+
+
+def _team(pilot: Pilot, wiring: Wiring) -> Team | None:
+    """This vehicle's end of the team's wire; None where it is alone.
+
+    Raises:
+        ControlError: The task has one vehicle, or several and no wire between them.
+    """
+    observer = getattr(pilot, "observer", None)
+    names = observer.task.vehicles if observer is not None else ()
+    if not wiring.team:
+        return None
+    if len(names) < 2:
+        raise ControlError(
+            "--team is for a policy or baseline of a task of several vehicles: give it with --task"
+        )
+    talk = getattr(observer.task, "communication", None)
+    period = observer.task.control_step if talk is None else talk.period
+    others = (*(name for name in names if name != observer.agent), *observer.targets)
+    return Team(observer.agent, others, period=period, turn=period * names.index(observer.agent) / len(names))
 
 
 @contextmanager
@@ -174,14 +215,16 @@ class _Watch:
 
 @contextmanager
 def _recording(
-    path: Path | None, vehicle: Any, meta: dict[str, Any], pool_file: Path, wiring: Wiring
+    path: Path | None, vehicle: Any, meta: dict[str, Any], pool_file: Path | None, wiring: Wiring
 ) -> Iterator[Recorder | None]:
     """A recorder for as long as the run lasts, or none."""
     if path is None:
         yield None
         return
     epoch = 0.0 if wiring.lockstep else time.time() - time.monotonic()
-    with Recorder(path, vehicle, meta, epoch=epoch, files={"pool.yaml": pool_file}) as recorder:
+    with Recorder(
+        path, vehicle, meta, epoch=epoch, files={"pool.yaml": pool_file} if pool_file else {}
+    ) as recorder:
         yield recorder
 
 

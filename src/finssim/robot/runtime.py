@@ -39,7 +39,7 @@ class Runtime:
     def __init__(
         self,
         vehicle: Vehicle,
-        pool: Pool,
+        pool: Pool | None,
         pilot: Pilot,
         guide: Guide,
         *,
@@ -52,7 +52,7 @@ class Runtime:
         """
         Args:
             vehicle: As its file has it.
-            pool: Camera, water and frames.
+            pool: Camera, water and frames; None: no camera looks.
             pilot: Who steers.
             guide: Where to; its time starts when the vehicle is armed.
             arm: Arm once, as soon as the state is ready. False: thrusters never turn.

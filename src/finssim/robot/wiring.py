@@ -11,6 +11,7 @@ from typing import Any, Protocol
 from finssim.localization.pool import Pool
 from finssim.robot.link.layout import LinkError
 from finssim.robot.link.transports import DEFAULT_BIND, host_port, open_transport
+from finssim.robot.link.udp import UdpTransport
 from finssim.robot.lockstep import DEFAULT_PORT, LockstepClient, run_lockstep
 from finssim.robot.picture_source import DEFAULT_CAMERA, NoPictures, PictureSource, open_pictures
 from finssim.robot.realtime import run_realtime
@@ -36,6 +37,8 @@ class Wiring:
     """Address of the camera; that of the virtual pool for `pool`, else none, if None."""
     lockstep: bool = False
     """Take turns with a virtual pool."""
+    team: str = ""
+    """HOST:PORT of what carries messages between vehicles; empty: this one is alone."""
 
 
 class Drive(Protocol):
@@ -52,7 +55,7 @@ class Drive(Protocol):
 
 
 @contextmanager
-def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool) -> Iterator[Drive]:
+def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> Iterator[Drive]:
     """Everything open, for as long as it is needed: for one run, or for several one after the other.
 
     A later run goes on at the clock at which the one before ended, and is given nothing that came between them.
@@ -60,12 +63,16 @@ def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool) -> Iterator[Drive]:
     Args:
         wiring: What to open.
         vehicle: Its tags are looked for.
-        pool: Its camera tells the size of pictures.
+        pool: Its camera tells the size of pictures; None: there is no camera.
 
     Raises:
         LinkError, LockstepError: Something cannot be opened.
     """
     with ExitStack() as stack:
+        if wiring.lockstep and wiring.team:
+            raise LinkError(
+                "a team takes turns within one process: finssim experiment stack; or leave --lockstep out"
+            )
         if wiring.lockstep:
             world = stack.enter_context(LockstepClient(_lockstep_address(wiring)))
             clock = 0.0
@@ -79,14 +86,18 @@ def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool) -> Iterator[Drive]:
             return
         transport = open_transport(POOL_ADDRESS if wiring.robot == "pool" else wiring.robot, wiring.bind)
         stack.callback(transport.close)
-        camera = open_camera(wiring, vehicle, pool)
+        camera = open_camera(wiring, vehicle, pool) if pool is not None else NoPictures()
         stack.callback(camera.close)
+        mates = None
+        if wiring.team:
+            mates = UdpTransport((host_port(wiring.bind, "--bind")[0], 0), host_port(wiring.team, "--team"))
+            stack.callback(mates.close)
 
         def run(runtime: Runtime, **how: Any) -> float:
             while transport.receive():
                 pass
             camera.receive(time.monotonic())
-            return run_realtime(runtime, transport, camera, **how)
+            return run_realtime(runtime, transport, camera, mates=mates, **how)
 
         yield run
 

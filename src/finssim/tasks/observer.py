@@ -96,6 +96,11 @@ class Observer:
         self._guide: Guide | None = None
         self._build(task)
 
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Names of tracks that are needed besides those of vehicles."""
+        return () if self._arrays.net.target is None else ("target",)
+
     def describe(self) -> dict[str, Any]:
         """The task as `Policy.load` compares it."""
         return {"name": self.task.name, "observation": self.schema.model_dump(mode="json")}
