@@ -1,6 +1,6 @@
 """Sensors: what a vehicle measures of its own motion, with the noise, delays and losses of real instruments."""
 
 from finssim.sensors.batch import SensorError
-from finssim.sensors.suite import SensorSuite
+from finssim.sensors.suite import SensorSuite, add_sensor
 
-__all__ = ["SensorError", "SensorSuite"]
+__all__ = ["SensorError", "SensorSuite", "add_sensor"]

@@ -24,6 +24,8 @@ class SensorBatch:
 
     kind: ClassVar[str]
     """Its key under `sensors` in a vehicle file."""
+    schema: ClassVar[Any] = None
+    """What a vehicle file says of it, a `vehicles.equipment.Sensor`; for `add_sensor`."""
     kernel: ClassVar[Any]
     parameter_struct: ClassVar[Any]
     array_struct: ClassVar[Any]
@@ -86,6 +88,19 @@ class SensorBatch:
         measured = self.state_arrays(state, water_velocity)
         memory = [self.parameters, self.arrays, self.sampling]
         return [*measured, state.steps, state.episode, *memory, mask, restarting, self.seed]
+
+    def use(self, vehicle: int, entry: Any, *, gravity: float, density: float) -> None:
+        """Take one vehicle's parameters from its file.
+
+        Args:
+            vehicle: Index.
+            entry: `vehicle.sensors.KIND`.
+            gravity: [m/s²]
+            density: Of the water [kg/m³].
+        """
+        raise NotImplementedError(
+            f"sensor '{self.kind}' does not say what it takes of a vehicle: define use()"
+        )
 
     def numpy(self) -> dict[str, NDArray[Any]]:
         """Copies of the readings with `stamp` and `fresh`, each (W, V, ...)."""

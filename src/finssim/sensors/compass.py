@@ -105,12 +105,14 @@ class CompassBatch(SensorBatch):
         """Attitude."""
         return [state.quaternion]
 
-    def use(self, vehicle: int, entry: Any) -> None:
+    def use(self, vehicle: int, entry: Any, *, gravity: float, density: float) -> None:
         """Take one vehicle's parameters from its file.
 
         Args:
             vehicle: Index.
             entry: `vehicle.sensors.compass`.
+            gravity: Not used.
+            density: Not used.
         """
         self.set(
             vehicle,

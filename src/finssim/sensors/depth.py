@@ -136,19 +136,20 @@ class DepthBatch(SensorBatch):
         """Position and attitude."""
         return [state.position, state.quaternion]
 
-    def use(self, vehicle: int, entry: Any, specific_weight: float) -> None:
+    def use(self, vehicle: int, entry: Any, *, gravity: float, density: float) -> None:
         """Take one vehicle's parameters from its file.
 
         Args:
             vehicle: Index.
             entry: `vehicle.sensors.depth`.
-            specific_weight: rho g of the water [N/m³].
+            gravity: [m/s²]
+            density: Of the water [kg/m³].
         """
         self.set(
             vehicle,
             dropout=entry.dropout,
             r=entry.position,
-            specific_weight=specific_weight,
+            specific_weight=density * gravity,
             noise=entry.noise_std,
             walk=entry.bias_walk,
             turn_on=entry.bias_initial,

@@ -184,12 +184,14 @@ class DvlBatch(SensorBatch):
         """Pose, velocity and the water."""
         return [state.position, state.quaternion, state.velocity, water_velocity, self.floor_depth]
 
-    def use(self, vehicle: int, entry: Any) -> None:
+    def use(self, vehicle: int, entry: Any, *, gravity: float, density: float) -> None:
         """Take one vehicle's parameters from its file.
 
         Args:
             vehicle: Index.
             entry: `vehicle.sensors.dvl`.
+            gravity: Not used.
+            density: Not used.
         """
         knows_floor = math.isfinite(self.floor_depth)
         self.set(

@@ -172,13 +172,14 @@ class ImuBatch(SensorBatch):
         """Attitude, velocity and acceleration."""
         return [state.quaternion, state.velocity, state.acceleration]
 
-    def use(self, vehicle: int, entry: Any, gravity: float) -> None:
+    def use(self, vehicle: int, entry: Any, *, gravity: float, density: float) -> None:
         """Take one vehicle's parameters from its file.
 
         Args:
             vehicle: Index.
             entry: `vehicle.sensors.imu`.
             gravity: [m/s²]
+            density: Not used.
         """
         # White noise of density σ has the standard deviation σ √rate in each of `rate` samples a second.
         root_rate = math.sqrt(entry.rate)

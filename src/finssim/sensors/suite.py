@@ -15,8 +15,33 @@ from finssim.sensors.dvl import DvlBatch
 from finssim.sensors.imu import ImuBatch
 from finssim.sensors.sampling import SensedState
 from finssim.vehicles import Vehicle
+from finssim.vehicles.equipment import OWN_SENSORS
 
 Stage = tuple[Any, list[Any]]
+
+KINDS: dict[str, type[SensorBatch]] = {
+    batch.kind: batch for batch in (ImuBatch, DepthBatch, DvlBatch, CompassBatch)
+}
+"""Key under `sensors` in a vehicle file -> its batch."""
+
+
+def add_sensor(batch: type[SensorBatch]) -> type[SensorBatch]:
+    """Make a kind of sensor known, from anywhere: vehicle files may then have it under its `kind`.
+
+    Args:
+        batch: With `kind`, a `schema` of what a vehicle file says of it, a kernel and `use`; one file holds all of it.
+
+    Raises:
+        SensorError: It has no schema, or there is another of that kind.
+    """
+    if batch.schema is None:
+        raise SensorError(
+            f"sensor '{batch.kind}' has no schema: say what a vehicle file gives, from vehicles.equipment.Sensor"
+        )
+    if KINDS.setdefault(batch.kind, batch) is not batch:
+        raise SensorError(f"there is a sensor '{batch.kind}' already: give yours another kind")
+    OWN_SENSORS[batch.kind] = batch.schema
+    return batch
 
 
 class SensorSuite:
@@ -73,30 +98,29 @@ class SensorSuite:
         self._everywhere = wp.full(worlds, 1, dtype=int, device=device)
 
         def batch(kind: type[SensorBatch]) -> Any:
-            entries = [getattr(vehicle.sensors, kind.kind) for vehicle in vehicles]
+            entries = [getattr(vehicle.sensors, kind.kind, None) for vehicle in vehicles]
             return kind(entries, worlds, control_step, seed, device) if any(entries) else None
 
-        self.imu, self.depth, self.dvl = batch(ImuBatch), batch(DepthBatch), batch(DvlBatch)
-        self.compass = batch(CompassBatch)
+        self.by_kind: dict[str, SensorBatch] = {
+            name: made for name, kind in KINDS.items() if (made := batch(kind)) is not None
+        }
+        """The kinds of sensor that at least one vehicle has, one's own among them."""
+        for name in ("imu", "depth", "dvl", "compass"):
+            setattr(self, name, self.by_kind.get(name))
         if self.dvl is not None and floor_depth is not None:
             self.dvl.floor_depth = floor_depth
         for v, vehicle in enumerate(vehicles):
             g = vehicle.water.gravity if gravity is None else gravity
             rho = vehicle.water.density if density is None else density
-            if self.imu is not None and vehicle.sensors.imu is not None:
-                self.imu.use(v, vehicle.sensors.imu, g)
-            if self.depth is not None and vehicle.sensors.depth is not None:
-                self.depth.use(v, vehicle.sensors.depth, rho * g)
-            if self.dvl is not None and vehicle.sensors.dvl is not None:
-                self.dvl.use(v, vehicle.sensors.dvl)
-            if self.compass is not None and vehicle.sensors.compass is not None:
-                self.compass.use(v, vehicle.sensors.compass)
+            for name, made in self.by_kind.items():
+                entry = getattr(vehicle.sensors, name, None)
+                if entry is not None:
+                    made.use(v, entry, gravity=g, density=rho)
 
     @property
     def batches(self) -> tuple[SensorBatch, ...]:
         """The kinds of sensor that at least one vehicle has."""
-        kinds = (self.imu, self.depth, self.dvl, self.compass)
-        return tuple(batch for batch in kinds if batch is not None)
+        return tuple(self.by_kind.values())
 
     def update_stages(self, state: SensedState, water_velocity: Any = None) -> list[Stage]:
         """What `update` launches, for a program that records its launches.

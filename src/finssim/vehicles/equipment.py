@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from finssim.vehicles.part import (
     NonNegative,
@@ -16,6 +16,7 @@ from finssim.vehicles.part import (
     Quaternion,
     Vector3,
     Vector6,
+    did_you_mean,
     identity_quaternion,
     refuse_section,
 )
@@ -113,8 +114,28 @@ class Compass(Sensor):
     """[rad]; 0 for none."""
 
 
+OWN_SENSORS: dict[str, type[Sensor]] = {}
+"""Kind -> schema of sensors that `finssim.sensors.add_sensor` made known."""
+
+
 class Sensors(Part):
-    """The sensors aboard; None where there is none."""
+    """The sensors aboard; None where there is none. One's own (`OWN_SENSORS`) stand beside them under their kind."""
+
+    model_config = ConfigDict(frozen=True, extra="allow", arbitrary_types_allowed=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys_only(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
+            return data
+        own = {key: OWN_SENSORS[key].model_validate(data[key]) for key in data if key in OWN_SENSORS}
+        for key in data:
+            if key not in own and key not in cls.model_fields:
+                known = [*cls.model_fields, *OWN_SENSORS]
+                raise refuse_section(
+                    f"unknown key '{key}'{did_you_mean(str(key), known)} known keys: {', '.join(known)}"
+                )
+        return {**data, **own}
 
     imu: Imu | None = None
     depth: DepthSensor | None = None

@@ -1,0 +1,156 @@
+"""A sensor that the package does not know: one file with its schema and its kernel, and one line."""
+# mypy: disable-error-code="valid-type,misc,index,no-any-return,no-untyped-def,untyped-decorator"
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import warp as wp
+
+from finssim.physics.types import vec6
+from finssim.sensors import SensorError, SensorSuite, add_sensor
+from finssim.sensors.batch import SensorBatch
+from finssim.sensors.noise import WHITE, normal, sample_key
+from finssim.sensors.sampling import Sampling, arrival, begin_update, restart, sample_due, slot_of
+from finssim.vehicles import VehicleError, load_vehicle
+from finssim.vehicles.equipment import Sensor
+from finssim.vehicles.part import NonNegative
+
+PINGER = 77
+
+
+class Pinger(Sensor):
+    """Range to a beacon at the world's origin."""
+
+    noise_std: NonNegative
+    """[m]"""
+
+
+@wp.struct
+class PingerParameters:
+    noise: float
+
+
+@wp.struct
+class PingerArrays:
+    range: wp.array2d(dtype=float)
+    ring: wp.array3d(dtype=float)
+
+
+@wp.kernel(enable_backward=False)
+def sample_pinger(
+    position: wp.array2d(dtype=wp.vec3),
+    steps: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    parameters: wp.array2d(dtype=PingerParameters),
+    pinger: PingerArrays,
+    sampling: Sampling,
+    mask: wp.array(dtype=int),
+    restarting: bool,
+    seed: int,
+    world_offset: int,
+):
+    i, v = wp.tid()
+    w = world_offset + i
+    if mask[w] == 0:
+        return
+    step = steps[w]
+    if restarting:
+        restart(sampling, w, v, step)
+    if not begin_update(sampling, w, v, step):
+        return
+    if restarting or sample_due(sampling, w, v, step):
+        key = sample_key(seed, PINGER, w, v, episode[w], step)
+        slot = slot_of(sampling, step)
+        pinger.ring[w, v, slot] = wp.length(position[w, v]) + parameters[w, v].noise * normal(key, WHITE)
+        sampling.sent[w, v, slot] = True
+        sampling.last[w, v] = step
+    slot = arrival(sampling, w, v, step, restarting)
+    if slot >= 0:
+        pinger.range[w, v] = pinger.ring[w, v, slot]
+
+
+class PingerBatch(SensorBatch):
+    """The pingers of all vehicles of all worlds."""
+
+    kind = "pinger"
+    schema = Pinger
+    kernel = sample_pinger
+    parameter_struct = PingerParameters
+    array_struct = PingerArrays
+    readings = ("range",)
+
+    def state_arrays(self, state: Any, water_velocity: Any) -> list[Any]:
+        return [state.position]
+
+    def use(self, vehicle: int, entry: Any, *, gravity: float, density: float) -> None:
+        self.set(vehicle, noise=entry.noise_std)
+
+
+FILE = """
+extends: bluerov2
+sensors:
+  pinger:
+    origin: measured
+    rate: 5.0
+    position: [0.1, 0.0, 0.0]
+    noise_std: 0.2
+"""
+
+
+@pytest.fixture(autouse=True)
+def known():
+    """The one line; the next test may say it again."""
+    assert add_sensor(PingerBatch) is PingerBatch
+
+
+def state(worlds):
+    full = lambda value, dtype: wp.full((worlds, 1), value=value, dtype=dtype, device="cpu")  # noqa: E731
+    return SimpleNamespace(
+        position=full(wp.vec3(3.0, 0.0, -4.0), wp.vec3), quaternion=full(wp.quat(0.0, 0.0, 0.0, 1.0), wp.quat),
+        velocity=full(vec6(), vec6), acceleration=full(vec6(), vec6),
+        steps=wp.zeros(worlds, dtype=int, device="cpu"), episode=wp.zeros(worlds, dtype=int, device="cpu"),
+    )  # fmt: skip
+
+
+def test_a_vehicle_file_may_have_it_and_a_suite_samples_it(tmp_path):
+    """Ranges of 5 m with the file's noise, at the file's rate, beside the sensors of the catalogue's vehicle."""
+    (tmp_path / "mine.yaml").write_text(FILE, encoding="utf-8")
+    vehicle = load_vehicle(tmp_path / "mine.yaml")
+    assert vehicle.sensors.pinger.noise_std == 0.2 and vehicle.sensors.imu is not None
+    assert vehicle.origin_of("sensors.pinger.noise_std").origin == "measured"
+    again = vehicle.replace({"sensors.pinger.noise_std": 0.1})
+    assert again.sensors.pinger.noise_std == 0.1 and again.sha256 != vehicle.sha256
+    suite, now = SensorSuite(vehicle, worlds=2000, control_step=0.1, seed=1), state(2000)
+    suite.reset(now)
+    read = suite.by_kind["pinger"].numpy()["range"][:, 0]
+    assert abs(read.mean() - 5.0) < 0.03 and read.std() == pytest.approx(0.2, rel=0.1)
+    fresh = []
+    for _ in range(4):
+        now.steps.assign(now.steps.numpy() + 1)
+        suite.update(now)
+        fresh.append(bool(suite.by_kind["pinger"].fresh.numpy()[0, 0]))
+    assert fresh == [False, True, False, True]
+    assert "pinger" not in SensorSuite(load_vehicle("bluerov2"), worlds=1, control_step=0.1).by_kind
+
+
+def test_its_mistakes_are_told_like_those_of_others(tmp_path):
+    """A key that it does not have, a number that it may not be, a kind that nobody knows."""
+    for change, said in (
+        ("noise_std: -1.0", "noise_std is -1.0, expected >= 0"),
+        ("noise: 1.0", "unknown key 'noise'"),
+    ):
+        (tmp_path / "bad.yaml").write_text(FILE.replace("noise_std: 0.2", change), encoding="utf-8")
+        with pytest.raises(VehicleError, match=said):
+            load_vehicle(tmp_path / "bad.yaml")
+    (tmp_path / "bad.yaml").write_text(FILE.replace("pinger", "pingre"), encoding="utf-8")
+    with pytest.raises(VehicleError, match="unknown key 'pingre', did you mean 'pinger'"):
+        load_vehicle(tmp_path / "bad.yaml")
+
+
+def test_a_kind_is_taken_once_and_needs_a_schema():
+    """Another class of the same kind, and one without a schema."""
+    with pytest.raises(SensorError, match="already"):
+        add_sensor(type("Other", (PingerBatch,), {}))
+    with pytest.raises(SensorError, match="has no schema"):
+        add_sensor(type("Bare", (PingerBatch,), {"schema": None, "kind": "bare"}))
