@@ -109,13 +109,12 @@ class Plant(BaseModel):
 
     def environment_arguments(self) -> dict[str, Any]:
         """Arguments of `finssim.tasks.Environment`: water, noise, randomization."""
+        noise = observed(self.observe) if self.observe else None
+        if self.noise:
+            noise = MeasurementNoise(**self.noise)
         return {
             "water": _water(self.water) if self.water else None,
-            "noise": observed(self.observe)
-            if self.observe
-            else MeasurementNoise(**self.noise)
-            if self.noise
-            else None,
+            "noise": noise,
             "randomization": Randomization(self.ranges).at_full_width() if self.ranges else None,
         }
 
