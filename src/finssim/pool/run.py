@@ -16,7 +16,7 @@ import numpy as np
 import typer
 
 from finssim.control.guidance import Station
-from finssim.geometry.rotations import quat_from_yaw
+from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.localization.pool import Pool, write_pool
 from finssim.pool.draw_plant import draw_plant
 from finssim.pool.picture_process import CameraPlan, PictureProcess, PictureWire
@@ -190,6 +190,11 @@ def run_task(
         raise LinkError(
             f"port {port}: expected room for ten ports to each of {len(fitted.agents)} vehicles after it"
         )
+    if fitted.moving and len(fitted.vehicles) == 1:
+        raise PlantSpecError(
+            f"task '{fitted.name}' moves its goal, of which a robot elsewhere is not told: take finssim experiment "
+            "stack, or a task of several vehicles"
+        )
     host, theirs = host_port(robot, "--robot")
     site = TaskSite(
         task,
@@ -209,6 +214,10 @@ def run_task(
             transports[name] = UdpTransport((bind, port + 10 * i), (host, theirs + 10 * i))
             stack.callback(transports[name].close)
             _say(f"{name}: {_name(transports[name].address)}, for {_name(transports[name].peer)} alone")
+        if not fitted.moving:
+            x, y, z = site.referee.arrays.goal_position.numpy()[0]
+            yaw = math.degrees(float(quat_yaw(site.referee.arrays.goal_quaternion.numpy()[0].astype(float))))
+            _say(f"goal: {x:.3f},{y:.3f},{z:.3f},{yaw:.1f}")
         _say(f"messages: {_name(messages.address)}")
         took = serve_task(
             site, transports, messages, duration=math.inf if duration is None else duration, until=asked

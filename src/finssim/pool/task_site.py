@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from finssim.control.errors import ControlError
 from finssim.control.guidance import Guide, Reference
 from finssim.control.modes import action_mode
 from finssim.control.tracking import Track
@@ -170,8 +171,15 @@ class TaskSite:
             communication: Of what the vehicles tell each other; None: everything arrives at once.
             camera: Makes the overhead camera of a vehicle; None: there is none.
             positioning: Fixes on every robot's wire: none, motion-capture or usbl.
+
+        Raises:
+            ControlError, PlantSpecError: Task, vehicles and guide do not fit, or there is no such positioning.
         """
         self.referee = referee = Referee(task, vehicles, seed=seed, guide=guide)
+        if guide is None and referee.arrays.reference.position is not None:
+            raise ControlError(
+                f"task '{referee.task.name}' follows a reference that is known ahead: give a trajectory"
+            )
         self.task, goal = referee.task, guide or _Goal(referee)
         names = self.task.vehicles
         self.worlds = {
