@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -219,13 +220,20 @@ def run_task(
             yaw = math.degrees(float(quat_yaw(site.referee.arrays.goal_quaternion.numpy()[0].astype(float))))
             _say(f"goal: {x:.3f},{y:.3f},{z:.3f},{yaw:.1f}")
         _say(f"messages: {_name(messages.address)}")
-        took = serve_task(
-            site, transports, messages, duration=math.inf if duration is None else duration, until=asked
-        )
-    _say(
-        f"{took:.1f} s, {site.scored} control steps: "
-        + ", ".join(f"{k} {v:.4g}" for k, v in site.referee.metrics().items())
-    )
+        longest = math.inf if duration is None else duration
+        tell = partial(_tell_episode, site)
+        took = serve_task(site, transports, messages, duration=longest, until=asked, over=tell)
+    if not site.referee.over:
+        _tell_episode(site)
+    _say(f"ended after {took:.1f} s")
+
+
+def _tell_episode(site: TaskSite) -> None:
+    """How the episode went, in a line."""
+    if site.referee.over:
+        _say("episode: " + ", ".join(f"{name} {value:.4g}" for name, value in site.referee.metrics().items()))
+    else:
+        _say(f"episode: not ended after {site.scored} control steps")
 
 
 def memory_of(pictures: str, port: int) -> str:
