@@ -136,8 +136,9 @@ def evaluate(
     observe: Annotated[
         str | None,
         typer.Option(
-            help="What is seen in every plant: truth, estimator or sensors; what the plant says if not given.",
-            metavar="NAME",
+            help="What is seen in every plant: truth, estimator, sensors or a file of fixes; what the plant says if "
+            "not given.",
+            metavar="FILE|NAME",
         ),
     ] = None,
     trajectory: Annotated[

@@ -108,7 +108,7 @@ Observe = Annotated[
     str,
     typer.Option(
         help="What is seen: training (the task's noise), sensors (the vehicle's own and position fixes, "
-        "through a filter), estimator (about what localization is off by) or truth.",
-        metavar="NAME",
+        "through a filter), a file of other fixes, estimator (about what localization is off by) or truth.",
+        metavar="FILE|NAME",
     ),
 ]

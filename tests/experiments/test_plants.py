@@ -34,6 +34,9 @@ def test_a_plant_is_seen_with_what_is_asked_for():
     seen = load_plant("noise").seen("sensors")
     assert seen.observe == "sensors" and not seen.noise and seen.title.endswith("; seen: sensors")
     assert load_plant("nominal").seen("truth").environment_arguments()["noise"] == MeasurementNoise()
+    told = seen.told_of_sight(FINSROV)["observe"]
+    assert told["name"] == "sensors" and told["fixes"]["rate"] == 30.0 and told["imu"]["rate"] == 100.0
+    assert load_plant("noise").told_of_sight(FINSROV) == {}
     with pytest.raises(PlantError, match="observe is 'eyes', expected truth, estimator, sensors"):
         load_plant("nominal").seen("eyes")
     with pytest.raises(ValueError, match="noise and observe: sensors are both given"):

@@ -268,6 +268,28 @@ def test_nothing_is_made_where_sensors_are_not_asked_for():
     assert not any(name.startswith(("estimates", "readings")) for name in env.state())
 
 
+def test_fixes_of_another_site_are_a_file(tmp_path):
+    """What is left out of a fix is 0; mistakes are told with file and key."""
+    file = tmp_path / "usbl.yaml"
+    file.write_text("rate: 1\nfixes: {position_std: 0.2, delay: 0.5}\n")
+    env = finssim.make("t1", worlds=1, observe=str(file))
+    assert env.noise == Sensing(rate=1.0, fixes=MeasurementNoise(position_std=0.2, delay=0.5))
+    for text, sentence in (
+        ("fixes: {}", "rate is missing: give the fixes a second"),
+        ("rate: fast", "rate is 'fast', expected a number"),
+        ("rate: 1\nfix: {}", "unknown key 'fix', expected rate, fixes"),
+        ("rate: 1\nfixes: 3", "fixes is 3, expected keys such as position_std"),
+        ("rate: 1\nfixes: {velocity_std: 0.1}", "unknown key 'velocity_std', expected position_std"),
+        ("rate: 1\nfixes: {delay: 9}", "delay of the measurement is 9 s, expected at most 2 s"),
+        ("rate: -1", "rate of the fixes is -1.0 Hz"),
+    ):
+        file.write_text(text)
+        with pytest.raises(EnvironmentSetupError, match=f"usbl.yaml: {sentence}"):
+            finssim.make("t1", observe=str(file))
+    with pytest.raises(EnvironmentSetupError, match="nowhere.yaml"):
+        finssim.make("t1", observe="nowhere.yaml")
+
+
 def test_what_cannot_be_sensed_is_refused():
     with pytest.raises(EnvironmentSetupError, match=r"finsrov has no IMU.*give sensors\.imu"):
         made(vehicle=carrying(imu=None), worlds=1)

@@ -233,6 +233,7 @@ def evaluate_controller(
         "vehicle": {"name": body.name, "sha256": body.sha256},
         "hydrodynamics": plant.hydrodynamics or hydrodynamics,
         "plant": plant.model_dump(mode="json", exclude_defaults=True),
+        **plant.told_of_sight(body),
         "seed": seed,
         **form.summarize(done.measures()),
         "provenance": provenance(),

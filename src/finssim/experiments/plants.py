@@ -16,7 +16,8 @@ from finssim.engine.ranges_file import Ranges, load_ranges
 from finssim.engine.surroundings import Wave
 from finssim.tasks import Environment, MeasurementNoise, Task
 from finssim.tasks.agents import Agent
-from finssim.tasks.make import OBSERVED, observed
+from finssim.tasks.make import observed
+from finssim.tasks.sensing import seen_with
 from finssim.vehicles import Vehicle
 from finssim.yaml_file import read_mapping
 
@@ -48,7 +49,8 @@ class Plant(BaseModel):
     noise: dict[str, float] = Field(default_factory=dict)
     """Arguments of `finssim.tasks.MeasurementNoise` [m, rad, m/s, rad/s]."""
     observe: str | None = None
-    """In place of `noise`: truth, estimator, or sensors, those of the vehicle file with position fixes."""
+    """In place of `noise`: truth, estimator, or sensors, those of the vehicle file with position fixes; or a file of
+    fixes."""
     extra_time_constant: float = Field(default=0.0, ge=0.0, le=LONGEST_LAG, allow_inf_nan=False)
     """Added to every thruster's [s]."""
     extra_delay: float = Field(default=0.0, ge=0.0, le=LONGEST_LAG, allow_inf_nan=False)
@@ -75,8 +77,8 @@ class Plant(BaseModel):
 
     @model_validator(mode="after")
     def _sees_one_way(self) -> Plant:
-        if self.observe is not None and self.observe not in OBSERVED:
-            raise ValueError(f"observe is '{self.observe}', expected {', '.join(OBSERVED)}")
+        if self.observe is not None:
+            observed(self.observe)  # which refuses what there is not
         if self.observe and self.noise:
             raise ValueError(f"noise and observe: {self.observe} are both given, expected one of them")
         return self
@@ -92,6 +94,12 @@ class Plant(BaseModel):
             return Plant.model_validate({**dict(self), "noise": {}, "observe": observe, "title": title})
         except ValidationError as error:
             raise PlantError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None
+
+    def told_of_sight(self, vehicle: Vehicle) -> dict[str, Any]:
+        """What a result says of `observe`, with its numbers, as a policy's description does; empty if there is none."""
+        if self.observe is None:
+            return {}
+        return {"observe": {"name": self.observe, **seen_with(observed(self.observe), self.changed(vehicle))}}
 
     def changed(self, vehicle: Vehicle) -> Vehicle:
         """The vehicle with this plant's numbers.

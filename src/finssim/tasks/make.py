@@ -11,7 +11,7 @@ from finssim.tasks.catalogue import TASKS
 from finssim.tasks.environment import Environment, EnvironmentSetupError
 from finssim.tasks.measurement import ESTIMATOR, MeasurementNoise
 from finssim.tasks.own import own_task
-from finssim.tasks.sensing import Sensing
+from finssim.tasks.sensing import Sensing, load_sensing
 from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle
 
@@ -26,14 +26,18 @@ OBSERVED: dict[str, MeasurementNoise | Sensing] = {
 
 
 def observed(name: str, task: Task | None = None) -> MeasurementNoise | Sensing:
-    """What a controller sees under that name, in a task.
+    """What a controller sees under that name, in a task; or with the fixes of a file.
 
     Raises:
-        EnvironmentSetupError: There is no such name.
+        EnvironmentSetupError: There is no such name, or the file is wrong.
     """
     known = {**OBSERVED, **({} if task is None else {"training": task.training_noise})}
+    if name not in known and name.endswith((".yaml", ".yml")):
+        return load_sensing(name)
     if name not in known:
-        raise EnvironmentSetupError(f"observe is '{name}', expected {', '.join(known)}")
+        raise EnvironmentSetupError(
+            f"observe is '{name}', expected {', '.join(known)} or a file of fixes (.yaml)"
+        )
     return known[name]
 
 
@@ -77,7 +81,8 @@ def make(
         randomize: Ranges, or the name or file of some, from which vehicle and water are drawn in every episode.
         observe: What the controller sees: truth, estimator (noise, offset and delay of the robot's own localization),
             training (the noise that the task is trained with), sensors (what the vehicle's own sensors and position
-            fixes say, through a filter), or a noise or `Sensing` of one's own.
+            fixes say, through a filter), a file of fixes (.yaml) for the same on another site, or a noise or `Sensing`
+            of one's own.
         options: The rest of what `Environment` takes: seed, device, threads, water, pool, tether, ...
 
     Returns:

@@ -11,8 +11,9 @@ A measurement that comes late is compared with the estimate of its own time and 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import warp as wp
@@ -47,8 +48,9 @@ from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.measurement import LONGEST_DELAY, MeasurementNoise
 from finssim.vehicles import Vehicle
+from finssim.yaml_file import read_mapping
 
-__all__ = ["Sensing", "SensingBatch", "seen_with"]
+__all__ = ["Sensing", "SensingBatch", "load_sensing", "seen_with"]
 
 FIX = 100
 """Number of the fixes in the random key, apart from those of the kinds of sensor."""
@@ -96,6 +98,30 @@ class Sensing:
                 f"{others[0]} of the fixes is given, expected of: {', '.join(PER_FIX)}; "
                 "what velocities and rates are off by is said under sensors in the vehicle file"
             )
+
+
+def load_sensing(path: str | Path) -> Sensing:
+    """Fixes of a site from a YAML file: `rate`, and under `fixes` what is not 0 of a fix.
+
+    Raises:
+        EnvironmentSetupError: The file is not there or wrong; names it and the key.
+    """
+    data = read_mapping(Path(path), EnvironmentSetupError, such_as="rate: 1.0")
+    fixes = data.get("fixes", {})
+    if not isinstance(fixes, Mapping):
+        raise EnvironmentSetupError(f"{path}: fixes is {fixes!r}, expected keys such as position_std: 0.2")
+    for given, known in ((data, ("rate", "fixes")), (fixes, PER_FIX)):
+        for key, value in given.items():
+            if key not in known:
+                raise EnvironmentSetupError(f"{path}: unknown key '{key}', expected {', '.join(known)}")
+            if key != "fixes" and (isinstance(value, bool) or not isinstance(value, int | float)):
+                raise EnvironmentSetupError(f"{path}: {key} is {value!r}, expected a number")
+    if "rate" not in data:
+        raise EnvironmentSetupError(f"{path}: rate is missing: give the fixes a second [Hz], 0 for none")
+    try:
+        return Sensing(rate=float(data["rate"]), fixes=MeasurementNoise(**fixes))
+    except ValueError as error:
+        raise EnvironmentSetupError(f"{path}: {error}") from None
 
 
 def seen_with(noise: MeasurementNoise | Sensing, vehicle: Vehicle) -> dict[str, Any]:
