@@ -22,7 +22,7 @@ CRUISE = 0.7
 """Speed at which a far goal is approached, as a part of the terminal speed at the wrench limit."""
 
 LEAST_LAG = 0.15
-"""Of a loop, however quick the thrusters [s]: what the controller sees lags too, by exposure, wire and filter."""
+"""Of a loop of place or heading, however quick the thrusters [s]: what is seen of them lags by exposure, wire, filter."""
 
 INTEGRAL_SHARE = 0.5
 """Largest integral, as a part of the wrench limit."""
@@ -96,7 +96,10 @@ class Pid:
             raise ControlError(f"period is {period}, expected a positive time in seconds")
         model = axis_model(vehicle, hydrodynamics)
         thrusters = vehicle.thrusters.values()
-        lag = max(float(np.mean([t.time_constant + t.delay for t in thrusters])), LEAST_LAG) + 0.5 * period
+        own = float(np.mean([t.time_constant + t.delay for t in thrusters]))
+        lag = np.full(6, max(own, LEAST_LAG))
+        lag[3:5] = own  # roll and pitch come straight from the IMU
+        lag += 0.5 * period
         placed = place_poles(model, lag, speed)
         limits = np.asarray(vehicle.wrench_limits, float)
         able = limits > 0.0

@@ -88,7 +88,7 @@ def axis_model(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> AxisModel
     )
 
 
-def place_poles(model: AxisModel, lag: float, speed: npt.ArrayLike = 0.0) -> Gains:
+def place_poles(model: AxisModel, lag: float | Array, speed: npt.ArrayLike = 0.0) -> Gains:
     """Gains for poles at -w, -w, -w/5 and -b of every axis behind a first-order lag.
 
         lag m s^4 + (m + d lag) s^3 + (d + k lag + kd) s^2 + (k + Kp) s + Ki = lag m (s + w)^2 (s + w/5) (s + b)
@@ -108,7 +108,7 @@ def place_poles(model: AxisModel, lag: float, speed: npt.ArrayLike = 0.0) -> Gai
 
     Args:
         model: The axes.
-        lag: Of the actuators: time constant, delay and half a control period [s].
+        lag: Of the actuators: time constant, delay and half a control period [s], one or (6,).
         speed: Operating speed about which d = d1 + 2 d2 |speed| is taken, body frame [m/s, rad/s], (6,).
     """
     m, k = model.inertia, model.stiffness
