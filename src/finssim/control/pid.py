@@ -22,7 +22,7 @@ CRUISE = 0.7
 """Speed at which a far goal is approached, as a part of the terminal speed at the wrench limit."""
 
 LEAST_LAG = 0.15
-"""Of a loop of place or heading, however quick the thrusters [s]: what is seen of them lags by exposure, wire, filter."""
+"""Of a loop of place or heading, however quick the thrusters [s]: what is seen lags by exposure, wire and filter."""
 
 INTEGRAL_SHARE = 0.5
 """Largest integral, as a part of the wrench limit."""
