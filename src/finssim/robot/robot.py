@@ -35,10 +35,10 @@ class Reading:
     """Of vision: uninitialized, fresh, coast, hold or lost."""
     reason: str = ""
     """Why it is not ready; empty if it is."""
-    tracks: Mapping[str, Track] = field(default_factory=dict)
-    """What is known of other vehicles, by name."""
     std: Array = field(default_factory=lambda: np.full(7, np.nan))
     """Standard deviations of position [m], velocity [m/s] and yaw [rad], (7,)."""
+    tracks: Mapping[str, Track] = field(default_factory=dict)
+    """What is known of other vehicles, by name."""
 
 
 class Robot(Protocol):
