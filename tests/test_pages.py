@@ -12,6 +12,7 @@ import pytest
 from finssim.engine.ranges_file import load_ranges
 from finssim.experiments.plants import load_plant
 from finssim.tasks import TASKS
+from finssim.tasks.sensing import load_sensing
 from finssim.vehicles import VehicleError, load_vehicle
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -51,8 +52,10 @@ def test_the_vehicle_on_the_page_loads(tmp_path):
 
 def test_the_ranges_and_the_plant_on_the_pages_load(tmp_path):
     """The example files of the learning and evaluation pages are what the commands take."""
-    for page, load in (("learning", load_ranges), ("evaluation", load_plant)):
-        (example,) = blocks(ROOT / "docs" / f"{page}.md", "yaml")
+    for page, load in (("learning", load_sensing), ("learning", load_ranges), ("evaluation", load_plant)):
+        examples = blocks(ROOT / "docs" / f"{page}.md", "yaml")
+        example = examples[1] if load is load_ranges else examples[0]
+        assert len(examples) == (2 if page == "learning" else 1)
         (tmp_path / f"{page}.yaml").write_text(example, encoding="utf-8")
         load(tmp_path / f"{page}.yaml")
 

@@ -80,6 +80,7 @@ class Pid:
         hydrodynamics: str = "calibrated",
         period: float = 0.05,
         speed: npt.ArrayLike = 0.0,
+        least_lag: float = LEAST_LAG,
     ) -> Pid:
         """Controller of a vehicle, gains by pole placement.
 
@@ -88,6 +89,7 @@ class Pid:
             hydrodynamics: Set whose coefficients are the model.
             period: Time between two commands [s].
             speed: Operating speed about which damping is linearised, body frame [m/s, rad/s], (6,).
+            least_lag: Of the loops of place and heading [s]; 0 where nothing delays what is seen.
 
         Raises:
             ControlError: The set has no coefficients, or the period is not positive.
@@ -97,7 +99,7 @@ class Pid:
         model = axis_model(vehicle, hydrodynamics)
         thrusters = vehicle.thrusters.values()
         own = float(np.mean([t.time_constant + t.delay for t in thrusters]))
-        lag = np.full(6, max(own, LEAST_LAG))
+        lag = np.full(6, max(own, least_lag))
         lag[3:5] = own  # roll and pitch come straight from the IMU
         lag += 0.5 * period
         placed = place_poles(model, lag, speed)

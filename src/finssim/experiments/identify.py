@@ -83,7 +83,7 @@ def rough_vehicle(truth: Vehicle) -> Vehicle:
     force, moment, inertia = size**2, size**4, 0.1 * size**5
     guess = {
         f"{SET}.added_mass": [half, half, half, inertia, inertia, inertia],
-        f"{SET}.linear_damping": [20.0 * force] * 3 + [0.1 * moment] * 3,
+        f"{SET}.linear_damping": [20.0 * force] * 3 + [0.5 * moment] * 3,
         f"{SET}.quadratic_damping": [50.0 * force] * 3 + [moment] * 3,
     }
     origin = Provenance("guessed", "", "the order of other small vehicles, before any trial")

@@ -53,8 +53,8 @@ class WrenchPid:
 
     @classmethod
     def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD) -> WrenchPid:
-        """Gains by pole placement for a vehicle and the time between two actions [s]."""
-        return cls(Pid.from_vehicle(vehicle, coefficients_of(vehicle), period))
+        """Gains by pole placement for a vehicle and the time between two actions [s]; a batch shows it the present."""
+        return cls(Pid.from_vehicle(vehicle, coefficients_of(vehicle), period, least_lag=0.0))
 
     def command(self, memory: PidMemory, seen: Seen, goal: Goal) -> tuple[NDArray[np.float32], PidMemory]:
         """Actions (n, 6), limited to ±1, and the memory after."""

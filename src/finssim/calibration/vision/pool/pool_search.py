@@ -232,8 +232,8 @@ def _choose(runs: list[tuple[float, PoolModel, bool]], count: int) -> tuple[floa
         level = min(surfaces, key=lambda run: run[0])
         upright = abs(float(best[1].interface.normal[2])) > np.cos(np.radians(5.0))
         spare = 2.0 * count - 9.0  # a wall's parameters are nine, two more than a surface's
-        freedom = np.sqrt((spare + 2.0) / spare) if spare > 0.0 else np.inf
-        if level[0] <= SAME * freedom * best[0] + 0.02 or upright:
+        freedom = np.sqrt((spare + 2.0) / spare) if spare > 0.0 else 1.0
+        if spare <= 0.0 or level[0] <= SAME * freedom * best[0] + 0.02 or upright:
             return level
     return best
 
