@@ -1,13 +1,17 @@
 """Every task through the deployed software: stack, wire, motor controller and plant of each vehicle, in lock-step."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from finssim import boundary
+from finssim.cli import app
+from finssim.control.errors import ControlError
 from finssim.control.trajectories import TRAJECTORIES
-from finssim.experiments.stack import site_of
+from finssim.experiments.stack import BATCH, site_of
 from finssim.pool.medium import Medium
 from finssim.robot.pilots import AgentPilot
 from finssim.tasks import TASKS, task_named
@@ -59,6 +63,37 @@ def linear(gain):
     layer = nn.Linear(gain.shape[1], gain.shape[0], bias=False)
     layer.weight.data = torch.from_numpy(gain)
     return nn.Sequential(layer)
+
+
+@pytest.mark.slow
+def test_the_command_keeps_its_episodes_and_goes_on(tmp_path, capsys):
+    """The second call plays the second episode alone, and prints both beside the batch."""
+    words = [
+        "experiment",
+        "stack",
+        "docking",
+        "--policy",
+        "align-insert",
+        "--out",
+        str(tmp_path),
+        "--json",
+        "--episodes",
+    ]
+    assert boundary.run(app, [*words, "1"]) == 0
+    capsys.readouterr()
+    assert boundary.run(app, [*words, "2"]) == 0
+    said = capsys.readouterr()
+    told = json.loads(said.out)
+    assert "episode 1 of" not in said.err and "episode 2 of 2" in said.err
+    assert told["stack"]["trials"] == 2 and told["batch"]["trials"] == BATCH
+    assert told["batch"]["metrics"]["success"]["value"] > 0.9
+
+
+def test_a_site_without_what_its_task_needs_is_refused(capsys):
+    with pytest.raises(ControlError, match="'t2' follows a reference that is known ahead: give a trajectory"):
+        site_of("t2", "pid", [FINSROV])
+    assert boundary.run(app, ["pool", "--task", "t3"]) == 2
+    assert "task 't3' moves its goal" in capsys.readouterr().err
 
 
 @pytest.mark.slow
