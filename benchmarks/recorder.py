@@ -48,7 +48,7 @@ def measure(folder: Path) -> dict[str, float]:
     """Microseconds a message, by what is recorded."""
     vehicle = load_vehicle("finsrov")
     make, picture = Messages(vehicle), np.zeros((480, 640), np.uint8)
-    imu, odometry = TOPICS["imu"].kind, TOPICS["odometry"].kind
+    imu, odometry = TOPICS["imu"].type, TOPICS["odometry"].type
     figures = {
         "imu_encode_us": microseconds(lambda i: make.cdr(make.imu(i, TELEMETRY), imu)),
         "odometry_encode_us": microseconds(lambda i: make.cdr(make.odometry(i, READING), odometry)),
