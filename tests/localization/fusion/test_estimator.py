@@ -251,6 +251,37 @@ def test_dropouts_of_three_seconds_are_survived(mode):
 
 
 @pytest.mark.slow
+def flipped(samples, start, end, turn):
+    """Every yaw of a time turned."""
+    return [
+        replace(s, yaw=s.yaw + turn) if s.stream == "vision" and start <= s.time < end else s for s in samples
+    ]
+
+
+@pytest.mark.slow
+@both
+@pytest.mark.parametrize("lasts, turn", [(1.5, 0.47), (4.0, 0.47), (4.0, np.pi / 2)])
+def test_a_flip_that_lasts_is_not_believed_surely(mode, lasts, turn):
+    """The camera's yaw is wrong by 27 or 90 degrees for seconds: the gyro carries the right one, or the doubt is told,
+    and when the camera is right again the heading is back at once."""
+    samples = flipped(streams(26.0, seed=3), 12.0, 12.0 + lasts, turn)
+    times = np.arange(8.0, 25.5, 0.1)
+    found = run(estimator(mode), samples, times)
+    wrong = np.abs(errors(found, times)[:, 3])
+    told = np.array([math.sqrt(x.yaw_variance) for x in found])
+    assert np.all(wrong < 3.5 * told), (wrong / told).max()
+    assert np.all(wrong[times > 12.5 + lasts] < math.radians(3.0))
+    assert np.all(wrong[times < 12.0] < math.radians(2.5))
+
+
+@both
+def test_a_heading_that_was_wrong_from_the_start_is_left(mode):
+    """The first second of the camera's yaws is turned: what comes after outvotes it within a second."""
+    times = np.arange(3.5, 8.0, 0.1)
+    found = run(estimator(mode), flipped(streams(8.0, seed=4), 0.0, 1.0, 0.6), times)
+    assert np.all(np.abs(errors(found, times)[:, 3]) < math.radians(4.0))
+
+
 @both
 def test_outliers_and_flips_are_refused(mode):
     """5 % of fixes off by 0.5 to 1 m and 5 % of yaws off by 90 or 180 degrees: the path is followed as without.

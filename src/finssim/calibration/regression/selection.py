@@ -22,6 +22,9 @@ DAMPING: tuple[Damping, ...] = ("auto", "linear", "quadratic", "both")
 AKAIKE = 0.157
 """Akaike's criterion keeps one more term when it is significant at this level (χ² of one degree above 2)."""
 
+TELLING = 6.0
+"""Twice a logarithm of likelihoods below which linear drag is not preferred to quadratic: odds of 20 to 1."""
+
 D1, D2 = TERMS.index("d1"), TERMS.index("d2")
 
 
@@ -45,7 +48,9 @@ def select(data: AxisData, damping: str = "auto") -> Selection:
     """Fit an axis with the dampings that the data support.
 
     `auto` starts from both and leaves out a term that is negative or that Akaike's criterion, with the standard error
-    from the disagreement of the trials, does not keep; of two such terms the one with less evidence. One always stays.
+    from the disagreement of the trials, does not keep; of two such terms the one with less evidence. One always stays,
+    and where the data hardly tell linear from quadratic it is the quadratic one: a bluff body's drag is, and a linear
+    one would be far off at higher speeds. The intervals hold both answers.
 
     Raises:
         CalibrationError: An unknown `damping`.
@@ -70,12 +75,38 @@ def select(data: AxisData, damping: str = "auto") -> Selection:
         interval = _with_lag(data, _interval(full), smoothed)
         return Selection(fit=full, full=full, dropped=(), p_value=p_value, interval=interval)
     dropped = max(weak, key=lambda name: p_value[name])
-    terms[TERMS.index(dropped)] = False
-    fit = fit_axis(data, terms)
-    wide, narrow = _interval(full), _interval(fit)
-    hull = np.stack([np.fmin(wide[:, 0], narrow[:, 0]), np.fmax(wide[:, 1], narrow[:, 1])], axis=-1)
+    fit = fit_axis(data, _without(terms, dropped))
+    tried = [full, fit]
+    if dropped == "d2":
+        other = fit_axis(data, _without(terms, "d1"))
+        if _evidence(data, fit, other) < TELLING:
+            dropped, fit = "d1", other
+            tried.append(other)
+    ends = np.stack([_interval(one) for one in tried])
+    with np.errstate(all="ignore"):
+        hull = np.stack([np.fmin.reduce(ends[..., 0]), np.fmax.reduce(ends[..., 1])], axis=-1)
     interval = _with_lag(data, hull, smoothed)
     return Selection(fit=fit, full=full, dropped=(dropped,), p_value=p_value, interval=interval)
+
+
+def _without(terms: NDArray[np.bool_], name: str) -> NDArray[np.bool_]:
+    out = terms.copy()
+    out[TERMS.index(name)] = False
+    return out
+
+
+def _evidence(data: AxisData, one: AxisFit, other: AxisFit) -> float:
+    """Twice the logarithm of the likelihood of one fit over another's with as many terms."""
+    if not (one.theta[0] > 0.0 and other.theta[0] > 0.0) or other.active[D2]:
+        return np.inf
+    rss = [
+        sum(
+            float(np.sum((rows.y - line)[used] ** 2))
+            for rows, line, used in zip(data.rows, fit.fitted, fit.used, strict=True)
+        )
+        for fit in (one, other)
+    ]
+    return one.independent * float(np.log(max(rss[1], 1e-300) / max(rss[0], 1e-300)))
 
 
 def _without_needless_smoothing(data: AxisData, fit: AxisFit) -> AxisFit:

@@ -22,7 +22,7 @@ from finssim.localization.fusion.attitude import (
 )
 from finssim.localization.fusion.changed import changed
 from finssim.localization.fusion.fuse_settings import Settings, Site
-from finssim.localization.fusion.gate import GateMemory, judge
+from finssim.localization.fusion.gate import GateMemory, judge, judge_carried
 from finssim.localization.fusion.health import Estimate, Outcome
 from finssim.localization.fusion.position_filter import Motion, PositionState
 from finssim.localization.fusion.streams import (
@@ -198,7 +198,7 @@ class ConstantVelocity:
             x=x,
             P=P,
             yaw=yaw.yaw if seen else math.nan,
-            yaw_variance=yaw.variance if seen else math.nan,
+            yaw_variance=yaw.variance + track.gates[1].doubt if seen else math.nan,
             yaw_rate=math.nan if silent else (track.rate or 0.0) - yaw.bias,
             roll=track.roll if track.imu_time is not None else math.nan,
             pitch=track.pitch if track.imu_time is not None else math.nan,
@@ -228,8 +228,11 @@ class ConstantVelocity:
         s = self.settings
         found = yaw_filter.innovation(track.yaw, seen, variance)
         # Flipped yaws agree with one another as distances from the prediction, which turns with the vehicle.
-        apart, R = np.array([found.residual]), np.array([[variance]])
-        verdict, memory = judge(s.gate, track.gates[1], time, apart, R, found.mahalanobis, 0.05)
+        carried = track.imu_time is not None and time - track.imu_time <= GYRO_HOLD
+        distance = float(found.mahalanobis)
+        verdict, memory = judge_carried(
+            s.gate, track.gates[1], time, float(found.residual), variance, distance, 0.05, carried
+        )
         if verdict == "accepted":
             yaw = yaw_filter.correct(track.yaw, found, variance)
         elif verdict == "gate":

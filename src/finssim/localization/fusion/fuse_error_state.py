@@ -28,7 +28,7 @@ from finssim.localization.fusion.fuse_constant_velocity import (
     vision_covariance,
 )
 from finssim.localization.fusion.fuse_settings import Settings, Site
-from finssim.localization.fusion.gate import GateMemory, judge
+from finssim.localization.fusion.gate import GateMemory, judge, judge_carried
 from finssim.localization.fusion.health import Estimate, Outcome
 from finssim.localization.fusion.streams import (
     DepthSample,
@@ -220,7 +220,7 @@ class ErrorState:
             x=x,
             P=T @ state.covariance @ T.T,
             yaw=float(yaw[0]),
-            yaw_variance=float((H @ state.covariance @ H.T)[0, 0]),
+            yaw_variance=float((H @ state.covariance @ H.T)[0, 0]) + track.gates[1].doubt,
             yaw_rate=float(H[0, 6:9] @ rates),
             roll=track.roll,
             pitch=track.pitch,
@@ -298,7 +298,11 @@ class ErrorState:
         yaw, H = error_state.yaw_model(state)
         residual = wrap_angle(np.array([sample.yaw]) - yaw)
         distance, gain = error_state.error_innovation(state, residual, H, R)
-        verdict, memory = judge(s.gate, track.gates[1], sample.time, residual, R, float(distance), 0.05)
+        carried = track.imu_time is not None and sample.time - track.imu_time <= GYRO_HOLD
+        apart, variance = float(residual[0]), float(R[0, 0])
+        verdict, memory = judge_carried(
+            s.gate, track.gates[1], sample.time, apart, variance, float(distance), 0.05, carried
+        )
         if verdict == "accepted":
             state = error_state.correct(state, residual, H, R, gain)
         elif verdict == "reacquired":

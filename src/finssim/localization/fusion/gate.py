@@ -10,9 +10,16 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtri
 
-__all__ = ["Gate", "GateMemory", "Suspects", "due", "judge", "remember"]
+__all__ = ["Gate", "GateMemory", "Rival", "Suspects", "due", "judge", "judge_carried", "remember"]
 
 Array = npt.NDArray[np.float64]
+
+
+LONGEST_SUPPORT = 200
+"""Believed measurements that are counted."""
+
+OUTVOTED = 4
+"""A state that a gyro carries gives way to a run of refused measurements with this part of its own support."""
 
 
 @lru_cache(maxsize=64)
@@ -103,12 +110,36 @@ def due(suspects: Suspects, gate: Gate) -> bool:
 
 
 @dataclass(frozen=True)
+class Rival:
+    """What a state that was taken over said, kept alive in case that it was right."""
+
+    offset: float
+    """From what is believed now [units of the measurement]."""
+    held: int
+    """Measurements that supported it."""
+    won: int
+    """Measurements that support what is believed now."""
+
+
+@dataclass(frozen=True)
 class GateMemory:
     """All that a gate remembers."""
 
     support: int = 0
     """Measurements believed since the state was last started from one; counted up to `reacquire_samples`."""
     suspects: Suspects | None = None
+    believed: int = 0
+    """The same, counted up to `LONGEST_SUPPORT`."""
+    rival: Rival | None = None
+
+    @property
+    def doubt(self) -> float:
+        """Variance that a rival, or a run of refused measurements, adds to that of the state [units²]."""
+        if self.rival is not None:
+            return self.rival.offset**2 * self.rival.held / (self.rival.held + self.rival.won)
+        if self.suspects is not None and self.suspects.hits > 1:
+            return self.suspects.value[0] ** 2 * self.suspects.hits / (self.suspects.hits + self.believed)
+        return 0.0
 
 
 def judge(
@@ -147,3 +178,54 @@ def judge(
     if due(suspects, gate) or (outvoted and math.isfinite(gate.reacquire_after)):
         return "reacquired", GateMemory(min(suspects.hits, gate.reacquire_samples))
     return "gate", GateMemory(memory.support, suspects)
+
+
+def judge_carried(
+    gate: Gate,
+    memory: GateMemory,
+    time: float,
+    residual: float,
+    variance: float,
+    distance: float,
+    drift: float,
+    carried: bool,
+) -> tuple[str, GateMemory]:
+    """As `judge`, for the distance of a measurement from a state that another sensor carries on, as a gyro does yaw.
+
+    Between two measurements the state is right to a fraction of a degree, so that a jump is the measurement's error, or
+    the state was wrong all along. What has been believed for long gives way only to a run of a quarter of its support,
+    and is kept as a rival: a measurement that agrees with a rival of more support brings it back at once.
+
+    Args:
+        gate: The gate.
+        memory: What it remembers.
+        time: Of the measurement [s].
+        residual: Measurement less prediction [units].
+        variance: Of the measurement [units²].
+        distance: Squared Mahalanobis distance of the measurement from its prediction.
+        drift: How fast residuals that agree may change [units/s].
+        carried: Whether that other sensor speaks; `judge` has to do where it does not.
+    """
+    value, R = np.array([residual]), np.array([[variance]])
+    if not carried:
+        return judge(gate, memory, time, value, R, distance, drift)
+    rival = memory.rival
+    refused = memory.support > 0 and distance > gate.limit(1)
+    if refused and rival is not None and rival.held >= rival.won and math.isfinite(gate.reacquire_after):
+        S = max(residual**2 / distance, variance)
+        if (residual - rival.offset) ** 2 / S <= gate.limit(1):
+            back = Rival(-residual, rival.won, rival.held)
+            return "reacquired", GateMemory(gate.reacquire_samples, None, rival.held, back)
+    verdict, after = judge(gate, memory, time, value, R, distance, drift)
+    if verdict == "reacquired":
+        hits = memory.suspects.hits + 1 if memory.suspects is not None else 1
+        if hits * OUTVOTED < memory.believed:
+            suspects = remember(memory.suspects, time, value, R, drift, gate)
+            return "gate", GateMemory(memory.support, suspects, memory.believed, rival)
+        return verdict, GateMemory(after.support, None, hits, Rival(-residual, memory.believed, hits))
+    if verdict == "gate":
+        return verdict, GateMemory(after.support, after.suspects, memory.believed, rival)
+    believed = min(memory.believed + 1, LONGEST_SUPPORT)
+    if rival is not None:
+        rival = Rival(rival.offset, rival.held, rival.won + 1) if rival.won < 2 * rival.held else None
+    return verdict, GateMemory(after.support, None, believed, rival)
