@@ -75,15 +75,9 @@ def vehicle_parameters(vehicle: "Vehicle", model: str) -> dict[str, Any]:
         "D2": np.asarray(getattr(hydro, "quadratic_damping", zeros), dtype=float),
         "form_drag": getattr(hydro, "form_drag", 0.0),
         "skin_drag": getattr(hydro, "skin_drag", 0.0),
-        **term_parameters(hydro),
+        **getattr(hydro, "term_parameters", {}),
         **thruster_parameters(vehicle),
     }
-
-
-def term_parameters(hydro: Any) -> dict[str, Any]:
-    """Path -> value of the parameters of the terms that a hydrodynamic set has, such as `lift.coefficient`."""
-    given = getattr(hydro, "terms", {}).items()
-    return {path: x for name, value in given for path, x in TERMS[name].numbers(value).items()}
 
 
 def terms_of(vehicles: Sequence["Vehicle"], model: str) -> tuple["Term", ...]:

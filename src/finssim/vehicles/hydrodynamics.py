@@ -58,7 +58,8 @@ class HydrodynamicSet(Part):
 
     @model_serializer(mode="wrap")
     def _plain(self, handler: Any) -> dict[str, Any]:
-        return {key: TERMS[key].plain(v) if key in TERMS else v for key, v in handler(self).items()}
+        own = {key: TERMS[key].plain(value) for key, value in self.terms.items()}
+        return {key: own.get(key, value) for key, value in handler(self).items()}
 
     def __getattr__(self, name: str) -> Any:
         try:
@@ -72,6 +73,12 @@ class HydrodynamicSet(Part):
     def terms(self) -> dict[str, Any]:
         """Key -> value of the terms that the file has."""
         return dict(sorted((self.model_extra or {}).items()))
+
+    @property
+    def term_parameters(self) -> dict[str, Any]:
+        """Path -> number or array of every parameter of its terms, such as `lift.coefficient`."""
+        given = self.terms.items()
+        return {path: x for name, value in given for path, x in TERMS[name].numbers(value).items()}
 
     @property
     def axis_drag(self) -> NDArray[np.float64]:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.engine.plant_arrays import twist_shift
+from finssim.physics.terms.composed import parameter_row, term_wrenches
 from finssim.vehicles import HydrodynamicSet, Vehicle
+from finssim.vehicles.terms import TERMS, Term
 
 __all__ = ["Matrices", "known_wrench", "matrices"]
 
@@ -26,7 +30,12 @@ class Matrices:
     M_A: Array
     D1: Array
     D2: Array
-    Du: Array
+    terms: tuple[Term, ...] = ()
+    """Further terms of the wrench."""
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    """Of these, by path."""
+    density: float
+    """Of the water [kg/m³]."""
     excess: float
     """Buoyancy less weight, submerged [N]."""
     arm: Array
@@ -83,7 +92,9 @@ def matrices(vehicle: Vehicle, density: float | None = None, hydrodynamics: str 
         M_A=np.array(chosen.added_mass, float),
         D1=np.array(chosen.linear_damping, float),
         D2=np.array(chosen.quadratic_damping, float),
-        Du=np.array(chosen.surge_damping, float),
+        terms=tuple(TERMS[name] for name in sorted(chosen.terms)),
+        parameters=chosen.term_parameters,
+        density=vehicle.water.density if density is None else density,
         excess=buoyancy - vehicle.weight,
         arm=buoyancy * (body.center_of_buoyancy - r) - vehicle.weight * (body.center_of_gravity - r),
         centre_of_buoyancy=np.asarray(body.center_of_buoyancy, float),
@@ -91,16 +102,17 @@ def matrices(vehicle: Vehicle, density: float | None = None, hydrodynamics: str 
     )
 
 
-def known_wrench(nu: Array, up: Array, rate: float, plant: Matrices) -> Array:
+def known_wrench(nu: Array, up: Array, depth: Array, rate: float, plant: Matrices) -> Array:
     """What has to be taken off the applied wrench before an axis' own model is fitted.
 
-    C(nu) nu + offdiag(M) nu_dot + offdiag(D1) nu + offdiag(D2) |nu| nu + Du |u| nu - (hydrostatics that are not fitted)
+    C(nu) nu + offdiag(M) nu_dot + offdiag(D1) nu + offdiag(D2) |nu| nu - (terms and hydrostatics that are not fitted)
 
     Fitted, hence not taken off, are the buoyancy excess in heave and the restoring moments of roll and pitch.
 
     Args:
         nu: About the reference point, zero where unknown, (n, 6).
         up: World z in the body frame, (n, 3).
+        depth: Of the body origin [m], zero where unknown, (n,).
         rate: [Hz]
         plant: The vehicle.
 
@@ -117,7 +129,9 @@ def known_wrench(nu: Array, up: Array, rate: float, plant: Matrices) -> Array:
     if (M * off).any() and len(nu) > 1:
         known += np.gradient(smooth, 1.0 / rate, axis=0) @ (M * off).T
     known += smooth @ (plant.D1 * off).T + (np.abs(smooth) * smooth) @ (plant.D2 * off).T
-    known += np.abs(smooth[:, :1]) * (smooth @ plant.Du.T)
+    if plant.terms:
+        row = parameter_row(plant.terms, plant.parameters)
+        known -= term_wrenches(plant.terms, [row], smooth, up, depth, plant.density)[:, 0]
 
     known[:, :2] -= plant.excess * up[:, :2]
     x, y, _ = plant.arm

@@ -148,7 +148,11 @@ def signals(
     nu = np.where(known, shifted, np.nan)
     tau = motion.tau @ np.linalg.inv(matrices.H)  # wrench moves with the inverse transpose
     left = tau - known_wrench(
-        np.where(np.isfinite(nu), nu, 0.0), np.where(np.isfinite(up), up, [0, 0, 1.0]), motion.rate, matrices
+        np.where(np.isfinite(nu), nu, 0.0),
+        np.where(np.isfinite(up), up, [0, 0, 1.0]),
+        np.nan_to_num(-motion.position[:, 2]),
+        motion.rate,
+        matrices,
     )
     phase = motion.phase
     named = bool(np.isin(phase, ["excitation", "coast"]).any())

@@ -16,7 +16,7 @@ the part of the vehicle that is under water, and moves it from the reference poi
 import hashlib
 import inspect
 import linecache
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, get_type_hints
@@ -29,7 +29,16 @@ from finssim.physics.types import mat66, vec6
 from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
 from finssim.vehicles.terms import TERMS, Term
 
-__all__ = ["Slot", "TermError", "add_term", "composed", "layout", "row_length", "term_wrenches"]
+__all__ = [
+    "Slot",
+    "TermError",
+    "add_term",
+    "composed",
+    "layout",
+    "parameter_row",
+    "row_length",
+    "term_wrenches",
+]
 
 STATE: dict[str, Any] = {"nu_r": vec6, "up": wp.vec3, "depth": float, "density": float}
 """What a term's functions may take besides its parameters."""
@@ -140,6 +149,14 @@ def row_length(terms: tuple[Term, ...]) -> int:
     return PIECE * max(1, -(-sum(slot.size for slot in layout(terms)) // PIECE))
 
 
+def parameter_row(terms: tuple[Term, ...], numbers: Mapping[str, Any]) -> NDArray[np.float64]:
+    """The row of parameters by path, zero where one is not given, (`row_length`,)."""
+    row = np.zeros(row_length(terms))
+    for slot in layout(terms):
+        row[slot.first : slot.first + slot.size] = np.ravel(numbers.get(slot.path, 0.0))
+    return row
+
+
 @cache
 def composed(terms: tuple[Term, ...], what: str) -> Any:
     """Sum of what the terms give, as a `wp.func` of (x, w, v, nu_r, up, depth, density) -> vec6.
@@ -200,7 +217,7 @@ def _sampler(terms: tuple[Term, ...]) -> wp.Kernel:
 
 
 def term_wrenches(
-    terms: Sequence[Term], rows: ArrayLike, nu_r: ArrayLike, up: ArrayLike, depth: ArrayLike, density: float
+    terms: tuple[Term, ...], rows: ArrayLike, nu_r: ArrayLike, up: ArrayLike, depth: ArrayLike, density: float
 ) -> NDArray[np.float64]:
     """The wrench of terms in given motions, by the functions that simulations run.
 
@@ -226,7 +243,5 @@ def term_wrenches(
         wp.array(a, dtype=kind, device="cpu", copy=False)
         for a, kind in zip((x, *single, tau), (float, vec6, wp.vec3, float, vec6), strict=True)
     ]
-    wp.launch(
-        _sampler(tuple(terms)), dim=(n, k), inputs=[*arrays[:4], float(density), arrays[4]], device="cpu"
-    )
+    wp.launch(_sampler(terms), dim=(n, k), inputs=[*arrays[:4], float(density), arrays[4]], device="cpu")
     return tau.astype(float)
