@@ -12,7 +12,7 @@ from finssim.engine.plant_arrays import NO_LIMIT, vehicle_parameters
 from finssim.engine.ranges_file import AXES, Ranges
 from finssim.engine.ranges_table import ENTRIES, INDEX, drawn_entries
 from finssim.vehicles import Vehicle
-from finssim.vehicles.terms import TERMS
+from finssim.vehicles.terms import unit_of
 
 __all__ = ["Row", "rows_of"]
 
@@ -90,8 +90,7 @@ def _body(
     for name in ranges.terms:
         if name in drawn and ENTRIES[INDEX[name]].unit == "1":
             one = np.ndim(p.get(name, np.zeros(1))) == 0
-            term, _, own = name.rpartition(".")
-            unit = TERMS[term or name].units[own] if one else "factor"
+            unit = unit_of(name) if one else "factor"
             yield _scaled(name, float(p[name]) if one else 1.0, unit, [drawn[name]])
 
 

@@ -81,6 +81,11 @@ class HydrodynamicSet(Part):
         return {path: x for name, value in given for path, x in TERMS[name].numbers(value).items()}
 
     @property
+    def term_scalars(self) -> dict[str, tuple[float, float]]:
+        """Path -> least and greatest value of the parameters of its terms that are one number: fits may move these."""
+        return {path: ends for name in self.terms for path, ends in TERMS[name].scalars().items()}
+
+    @property
     def axis_drag(self) -> NDArray[np.float64]:
         """d2 of steady motion along each axis alone, where drag is d1 v + d2 v|v|, (6,)."""
         shares = (TERMS[name].quadratic(value) for name, value in self.terms.items())

@@ -18,7 +18,7 @@ from pydantic import BaseModel, create_model
 
 from finssim.vehicles.part import Part
 
-__all__ = ["TERMS", "Term", "find_term", "term_names"]
+__all__ = ["TERMS", "Term", "find_term", "term_names", "unit_of"]
 
 Array = NDArray[np.float64]
 
@@ -107,6 +107,12 @@ class Term:
                 low, high = bounds.get("ge", bounds.get("gt")), bounds.get("le", bounds.get("lt"))
                 out[path] = (-np.inf if low is None else low, np.inf if high is None else high)
         return out
+
+
+def unit_of(path: str) -> str:
+    """Unit of a term's parameter, by its path within a hydrodynamic set."""
+    term, _, name = path.rpartition(".")
+    return TERMS[term or name].units[name]
 
 
 def term_names() -> list[str]:

@@ -121,7 +121,10 @@ def calibrate_hydrodynamics(
         raise CalibrationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
     further = tuple(name for name in (word.strip() for word in estimate.split(",")) if name)
     if method == "regression":
-        for given, option in ((full, "--full"), (further, "--estimate"), (horizon is not None, "--horizon")):
+        from finssim.calibration.simulation.fit import ESTIMATE
+
+        words = [name for name in further if name in ESTIMATE]
+        for given, option in ((full, "--full"), (words, "--estimate"), (horizon is not None, "--horizon")):
             if given:
                 raise CalibrationError(
                     f"{option} {ONLY_SIMULATION}: a regression looks at one axis at a time"
@@ -148,7 +151,7 @@ def calibrate_hydrodynamics(
     if method == "regression":
         from finssim.calibration.regression.regress import regress
 
-        fit = regress(used, body, axes=chosen, damping=damping, seed=seed)
+        fit = regress(used, body, axes=chosen, damping=damping, estimate=further, seed=seed)
     else:
         from finssim.calibration.simulation.fit import fit_by_simulation
 

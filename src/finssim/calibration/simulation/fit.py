@@ -9,7 +9,7 @@ from finssim.calibration.fit import Fit
 from finssim.calibration.regression.selection import AKAIKE, DAMPING
 from finssim.calibration.simulation.estimates import estimates
 from finssim.calibration.simulation.excited import excited, observable, speeds, telling
-from finssim.calibration.simulation.parameters import EXTRAS, free_parameters
+from finssim.calibration.simulation.parameters import EXTRAS
 from finssim.calibration.simulation.report import Clock
 from finssim.calibration.simulation.segments import Streams, streams
 from finssim.calibration.simulation.stages import Stages
@@ -99,7 +99,7 @@ def _check(
     if damping not in DAMPING:
         raise CalibrationError(f"unknown damping '{damping}'; available: {', '.join(DAMPING)}")
     chosen = vehicle.hydrodynamics.get("calibrated")
-    known = [*ESTIMATE, *(free_parameters(chosen) if isinstance(chosen, HydrodynamicSet) else ())]
+    known = [*ESTIMATE, *(chosen.term_scalars if isinstance(chosen, HydrodynamicSet) else ())]
     for word in estimate:
         if word not in known:
             raise CalibrationError(

@@ -15,9 +15,9 @@ from finssim.engine.plant_arrays import twist_shift, vehicle_parameters
 from finssim.physics.terms.composed import parameter_row, term_wrenches
 from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
-from finssim.vehicles.terms import TERMS
+from finssim.vehicles.terms import TERMS, unit_of
 
-__all__ = ["EXTRAS", "Coordinate", "Parameters", "Plants", "free_parameters", "term_unit"]
+__all__ = ["EXTRAS", "Coordinate", "Parameters", "Plants"]
 
 Array = NDArray[np.float64]
 
@@ -66,17 +66,6 @@ class Plants:
     """[s], (W,)"""
 
 
-def free_parameters(chosen: HydrodynamicSet) -> dict[str, tuple[float, float]]:
-    """Path -> least and greatest value of the parameters of a set's terms that are one number."""
-    return {path: ends for name in chosen.terms for path, ends in TERMS[name].scalars().items()}
-
-
-def term_unit(path: str) -> str:
-    """Unit of a term's parameter."""
-    term, _, name = path.rpartition(".")
-    return TERMS[term or name].units[name]
-
-
 def term_coordinate(chosen: HydrodynamicSet, vehicle: Vehicle, path: str) -> Coordinate:
     """A parameter of a term; a large change of it makes a force of `FELT` of the weight at `USUAL_SPEED`."""
     terms = tuple(TERMS[name] for name in sorted(chosen.terms))
@@ -87,7 +76,7 @@ def term_coordinate(chosen: HydrodynamicSet, vehicle: Vehicle, path: str) -> Coo
     tau = term_wrenches(terms, rows, nu, [[0.0, 0.0, 1.0]], 1.0, vehicle.water.density)[0]
     change = float(np.abs(tau[1] - tau[0]).max())
     scale = max(abs(start), FELT * vehicle.weight / change if change > 0.0 else 1.0)
-    return Coordinate(path, term_unit(path), start, *free_parameters(chosen)[path], scale)
+    return Coordinate(path, unit_of(path), start, *chosen.term_scalars[path], scale)
 
 
 class Parameters:
@@ -138,7 +127,7 @@ class Parameters:
             raise CalibrationError(
                 f"{vehicle.name}: hydrodynamics.{hydrodynamics} has no damping coefficients to fit: give another set"
             )
-        own = free_parameters(chosen)
+        own = chosen.term_scalars
         unknown = sorted(set(extras) - {*EXTRAS, *own})
         if unknown:
             raise CalibrationError(
