@@ -1,6 +1,11 @@
 """A hydrodynamic term that the package does not know: one file with all of it, and one line."""
 # mypy: disable-error-code="valid-type,misc,index,no-any-return,no-untyped-def,untyped-decorator"
 
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import warp as wp
@@ -12,41 +17,15 @@ from finssim.physics.terms import Term, add_term
 from finssim.physics.terms.composed import TermError, composed
 from finssim.physics.types import vec6
 from finssim.vehicles import VehicleError, check_vehicle, load_vehicle
-from finssim.vehicles.part import NonNegative, Number, Part
+from finssim.vehicles.terms import TERMS
 from reference.draws import column, draw
 
-
-class Wing(Part):
-    """A wing that lifts with the speed ahead and holds the nose down the more, the deeper it is."""
-
-    lift: NonNegative
-    """[N s²/m²]"""
-    moment: Number = 0.0
-    """[N s²/m]"""
-
-
-@wp.func
-def wing_wrench(nu_r: vec6, lift: float, moment: float) -> vec6:
-    """Z = -lift |u| w, M = moment |u| q: at right angles to the flow, and a damping in pitch."""
-    speed = wp.abs(nu_r[0])
-    return vec6(0.0, 0.0, -lift * speed * nu_r[2], 0.0, -moment * speed * nu_r[4], 0.0)
-
-
-@wp.func
-def wing_slope(nu_r: vec6, lift: float, moment: float) -> vec6:
-    """How fast they fall with w and q."""
-    speed = wp.abs(nu_r[0])
-    return vec6(0.0, 0.0, lift * speed, 0.0, moment * speed, 0.0)
-
-
-def _check(wing):
-    return wing.lift < 500.0, f"lift {wing.lift:g} N s²/m², expected < 500"
-
-
-WING = Term(
-    name="wing", schema=Wing, units={"lift": "N s²/m²", "moment": "N s²/m"}, wrench=wing_wrench, slope=wing_slope,
-    check=_check,
-)  # fmt: skip
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+spec = importlib.util.spec_from_file_location("own_term", EXAMPLES / "own_term.py")
+own_term = importlib.util.module_from_spec(spec)
+sys.modules["own_term"] = own_term
+spec.loader.exec_module(own_term)
+WING, Wing, wing_wrench = own_term.WING, own_term.Wing, own_term.wing_wrench
 
 FILE = """
 extends: bluerov2
@@ -263,3 +242,121 @@ def test_a_term_that_cannot_be_is_refused():
             add_term(term)
     with pytest.raises(TermError, match="not zero where all its parameters are"):
         composed((Term(name="fin", schema=Wing, units=units, wrench=pushing),), "wrench")
+
+
+@pytest.fixture(scope="module")
+def trials():
+    """A multisine on surge and heave together of the vehicle with the wing, with noise of its sensors."""
+    from finssim.calibration.excitation.programmes import programmes
+    from finssim.calibration.excitation.synthetic import simulate_programme
+
+    vehicle = load_vehicle("bluerov2").replace(
+        {"hydrodynamics.calibrated.wing": {"lift": 40.0, "moment": 1.5}}
+    )
+    return simulate_programme(programmes(("surge", "heave"), vehicle, kind="multisine"), vehicle, seed=3)
+
+
+def believed(lift):
+    """The vehicle as somebody has it who does not know the lift."""
+    return load_vehicle("bluerov2").replace({"hydrodynamics.calibrated.wing": {"lift": lift, "moment": 1.5}})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["regression", "simulation"])
+def test_a_calibration_estimates_its_parameter(trials, method, tmp_path):
+    """40 N s²/m² from trials of a vehicle whose file says 0: within the interval, which is narrower than a tenth."""
+    from finssim.calibration.output.calibrate import calibrated
+    from finssim.calibration.output.calibrated_ranges import write_ranges
+    from finssim.calibration.regression.regress import regress
+    from finssim.calibration.simulation.fit import fit_by_simulation
+
+    fit_by = regress if method == "regression" else fit_by_simulation
+    fit = fit_by(trials, believed(0.0), axes=("surge", "heave"), estimate=("wing.lift",))
+    found = fit.estimates["wing.lift"]
+    assert found.identifiable and found.unit == "N s²/m²"
+    assert found.ci95[0] <= 40.0 <= found.ci95[1] and np.ptp(found.ci95) < 4.0
+    vehicle = calibrated(fit)
+    assert vehicle.hydrodynamics["calibrated"].wing.lift == pytest.approx(found.estimate, rel=1e-6)
+    assert vehicle.origin_of("hydrodynamics.calibrated.wing.lift").origin == "measured"
+    write_vehicle(vehicle, tmp_path / "fitted.yaml")
+    assert load_vehicle(tmp_path / "fitted.yaml").sha256 == vehicle.sha256
+    write_ranges(fit, tmp_path / "ranges.yaml", vehicle)
+    assert set(load_ranges(tmp_path / "ranges.yaml").terms) == {"wing.lift", "wing.moment"}
+
+
+@pytest.mark.slow
+def test_a_known_wing_does_not_bias_what_is_fitted(trials):
+    """The damping of heave from trials with a wing: as the file has it where the file has the wing, not without."""
+    from finssim.calibration.regression.regress import regress
+
+    vehicle = believed(40.0)
+    chosen = vehicle.hydrodynamics["calibrated"]
+    drag = lambda fit: sum(fit.estimates[f"heave.d{i}"].estimate * 0.4**i for i in (1, 2))  # noqa: E731
+    true = chosen.linear_damping[2, 2] * 0.4 + chosen.quadratic_damping[2, 2] * 0.4**2
+    assert drag(regress(trials, vehicle, axes=("heave",))) == pytest.approx(true, rel=0.03)
+    assert drag(regress(trials, load_vehicle("bluerov2"), axes=("heave",))) > 1.2 * true
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["regression", "simulation"])
+def test_a_parameter_that_the_vehicle_does_not_have_is_refused(trials, method):
+    from finssim.calibration.errors import CalibrationError
+    from finssim.calibration.regression.regress import regress
+    from finssim.calibration.simulation.fit import fit_by_simulation
+
+    fit_by = regress if method == "regression" else fit_by_simulation
+    for vehicle, name in ((load_vehicle("bluerov2"), "wing.lift"), (believed(1.0), "wing.lft")):
+        with pytest.raises(CalibrationError, match=f"cannot estimate '{name}'"):
+            fit_by(trials, vehicle, axes=("heave",), estimate=(name,))
+
+
+def test_the_page_shows_the_example():
+    """Word for word, so that what is read is what runs."""
+    page = (EXAMPLES.parent / "docs" / "own_term.md").read_text(encoding="utf-8")
+    assert f"```py\n{(EXAMPLES / 'own_term.py').read_text(encoding='utf-8')}```" in page
+
+
+@pytest.mark.slow
+def test_the_example_runs():
+    """The wing takes heave out."""
+    run = subprocess.run(
+        [sys.executable, EXAMPLES / "own_term.py"], capture_output=True, text=True, check=True
+    )
+    without, with_wing = (
+        float(line.split()[-2]) for line in run.stdout.splitlines() if line.startswith("heave")
+    )
+    assert with_wing < 0.8 * without
+
+
+PACKAGE = """
+import warp as wp
+from finssim.physics.terms import Term, add_term
+from finssim.physics.types import vec6
+from finssim.vehicles.part import NonNegative
+
+@wp.func
+def fin_wrench(nu_r: vec6, fin_drag: float) -> vec6:
+    return vec6(0.0, -fin_drag * nu_r[1], 0.0, 0.0, 0.0, 0.0)
+
+add_term(Term(name="fin_drag", schema=NonNegative, units={"fin_drag": "N s/m"}, wrench=fin_wrench))
+"""
+
+
+def test_an_installed_package_brings_its_own(tmp_path, monkeypatch):
+    """A key that nobody imported is found by the entry point of a package: so commands know it too."""
+    (tmp_path / "finned_package.py").write_text(PACKAGE, encoding="utf-8")
+    about = tmp_path / "finned-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: finned\nVersion: 1.0\n", encoding="utf-8")
+    (about / "entry_points.txt").write_text("[finssim.terms]\nfin_drag = finned_package\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    try:
+        vehicle = load_vehicle("bluerov2").replace({"hydrodynamics.calibrated.fin_drag": 3.0})
+        assert vehicle.hydrodynamics["calibrated"].term_parameters == {"fin_drag": 3.0}
+        with pytest.raises(VehicleError, match="fin_drag is -3.0, expected >= 0"):
+            vehicle.replace({"hydrodynamics.calibrated.fin_drag": -3.0})
+        (tmp_path / "ranges.yaml").write_text("fin_drag: [0.5, 2.0]\n", encoding="utf-8")
+        assert load_ranges(tmp_path / "ranges.yaml").terms == {"fin_drag": (0.5, 2.0)}
+    finally:
+        TERMS.pop("fin_drag", None)
+        sys.modules.pop("finned_package", None)

@@ -29,6 +29,9 @@ CERTAIN = 0.2
 USEFUL = 0.5
 """The same, up to which an inertia is written to the vehicle file: better than a guess."""
 
+FORMED = 0.01
+"""Error of an estimate of a term's parameter by products of measured velocities, as a part of it; intervals hold it."""
+
 DECADE = 10.0
 
 GAP = np.full(1, np.nan)
@@ -226,7 +229,8 @@ def term_estimate(
     if not values:
         return None, [f"{path}: it acts on no axis that was fitted; the vehicle file keeps its number"]
     weight = np.asarray(halves) ** -2.0
-    value, half = float(weight @ values / weight.sum()), float(weight.sum() ** -0.5)
+    value = float(weight @ values / weight.sum())
+    half = float(np.hypot(weight.sum() ** -0.5, FORMED * value))
     sure, note = half <= CERTAIN * abs(value), f"from {', '.join(names)}"
     if not sure:
         note += f"; known to no better than {_percent(2.0 * half, value)}"
