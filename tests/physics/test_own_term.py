@@ -196,6 +196,19 @@ def test_its_parameters_are_drawn_by_name(winged, tmp_path):
     np.testing.assert_allclose(fields["wing.moment"].numpy()[:, 0], 1.5 + moment, rtol=1e-5)
 
 
+def test_ranges_of_a_record_read_back(tmp_path):
+    """What a training keeps of its ranges names the same entries again."""
+    from finssim.engine.ranges_file import Ranges
+
+    (tmp_path / "ranges.yaml").write_text(RANGES + "surge_damping: [0.9, 1.1]\n", encoding="utf-8")
+    kept = load_ranges(tmp_path / "ranges.yaml").model_dump(mode="json")
+    again = Ranges.model_validate(kept)
+    assert set(again.terms) == {"wing.lift", "wing.added_moment", "surge_damping"}
+    assert again.model_dump(mode="json") == kept
+    with pytest.raises(ValueError, match="wign"):
+        Ranges.model_validate({**kept, "terms": {"wign.lift": [0.5, 1.5]}})
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [

@@ -254,8 +254,11 @@ class Ranges(Part):
     def _terms_by_entry(cls, data: Any) -> Any:
         if not isinstance(data, Mapping):
             return data
-        out, terms = dict(data), dict(data.get("terms", {}))
-        for name in data.keys() - cls.model_fields.keys():
+        out, terms = dict(data), {}
+        for entry, drawn in dict(out.pop("terms", {})).items():  # as a record of a training has them
+            name, _, own = entry.partition(".")
+            out[name] = {**out.get(name, {}), own: drawn} if own else drawn
+        for name in [name for name in out if name not in cls.model_fields]:
             term = find_term(str(name))
             if term is not None:  # another is refused as an unknown entry
                 terms |= _of_term(term, out.pop(name))

@@ -46,7 +46,7 @@ class HydrodynamicSet(Part):
         if not isinstance(data, dict):
             return data
         out = dict(data)
-        for key in data.keys() - cls.model_fields.keys():
+        for key in [key for key in data if key not in cls.model_fields]:
             term = find_term(str(key))
             if term is None:
                 known = [*cls.model_fields, *term_names()]

@@ -123,7 +123,7 @@ def term_names() -> list[str]:
 def find_term(name: str) -> Term | None:
     """The term of that key, whose file is imported now if it was not; None where there is none."""
     if name not in TERMS:
-        places = SHIPPED | {p.name: p.value for p in entry_points(group=GROUP) if p.name == name}
-        if name in places:
-            import_module(places[name])
+        place = SHIPPED.get(name) or next((p.value for p in entry_points(group=GROUP, name=name)), None)
+        if place is not None:
+            import_module(place)
     return TERMS.get(name)
