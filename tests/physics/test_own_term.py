@@ -108,6 +108,11 @@ def test_show_lists_it_and_its_check_is_made(winged):
     page = StringIO()
     print_vehicle(winged, Console(file=page, width=120))
     assert "wing.lift" in page.getvalue() and "1.5 ?" in page.getvalue() and "N s²/m²" in page.getvalue()
+    page = StringIO()
+    print_vehicle(
+        believed(3.0).replace({"hydrodynamics.calibrated.wing": {"lift": 7.0}}), Console(file=page, width=120)
+    )
+    assert "7 ?" in page.getvalue() and "wing.moment" in page.getvalue()
     large = winged.replace({"hydrodynamics.calibrated.wing.lift": 900.0})
     findings = {finding.name: finding for finding in check_vehicle(large)}
     assert not findings["wing (calibrated)"].passed

@@ -164,7 +164,11 @@ def _terms(vehicle: Vehicle, name: str, chosen: HydrodynamicSet) -> Table:
             full = f"hydrodynamics.{name}.{path}"
             rows = np.atleast_2d(number)
             for i, row in enumerate(rows):
-                marks = _mark(vehicle, f"{full}.{i}" if len(rows) > 1 else full)
+                given = any(
+                    f"{full}.".startswith(f"{key}.") or key.startswith(f"{full}.")
+                    for key in vehicle.provenance
+                )
+                marks = _mark(vehicle, f"{full}.{i}" if len(rows) > 1 else full) if given else ""
                 table.add_row(path if i == 0 else "", _numbers(row) + marks, next(units) if i == 0 else "")
     return table
 
