@@ -244,7 +244,9 @@ def term_estimate(
             halves.append(max(high - values[-1], values[-1] - low))
             names.append(AXES[i])
     if not values:
-        return None, [f"{path}: it acts on no axis that was fitted; the vehicle file keeps its number"]
+        return None, [
+            f"{path}: no axis on which it acts has a fit to believe; the vehicle file keeps its number"
+        ]
     weight = np.asarray(halves) ** -2.0
     value = float(weight @ values / weight.sum())
     half = float(np.hypot(weight.sum() ** -0.5, FORMED * value))
