@@ -127,7 +127,8 @@ def hydrodynamics(
     estimate: Annotated[
         str,
         typer.Option(
-            help="Also fit, of thrust_scale,thrust_lag,thrust_delay,current,buoyancy_excess,k (simulation method).",
+            help="Also fit, of thrust_scale,thrust_lag,thrust_delay,current,buoyancy_excess,k (simulation method); "
+            "or parameters of the vehicle's terms, such as lift.coefficient (either method).",
             metavar="NAMES",
         ),
     ] = "",

@@ -73,7 +73,6 @@ def expected_plant(x, vehicle):
         "M_A": H.T @ family("added_mass") @ H,
         "D1": family("linear_damping"),
         "D2": family("quadratic_damping"),
-        "Du": x("surge_damping") * np.array(hydro.surge_damping),
         "gain": x("thrust.all")
         * np.array([x(f"thrust.each.{k}") * x(f"thrust.failure.{k}") for k in range(8)]),
         "time_constant": lag,
@@ -117,7 +116,7 @@ def test_surge_damping_scales_what_the_vehicle_has():
     coupled = np.diag([0.0, 4.0, 0.0, 0.0, 0.0, 2.0]).tolist()
     vehicle = vehicle.replace({"hydrodynamics.calibrated.surge_damping": coupled})
     simulator, draws = draw({"surge_damping": FACTOR}, worlds=12, vehicles=vehicle)
-    found = simulator.plant.Du.numpy()[:, 0]
+    found = simulator.plant.surge_damping.numpy()[:, 0]
     np.testing.assert_allclose(found, column(draws, "surge_damping")[:, None, None] * coupled, rtol=1e-6)
 
 

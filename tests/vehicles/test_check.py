@@ -36,6 +36,13 @@ def test_coupled_quadratic_damping_that_feeds_energy_in_is_found():
     assert "D2 couples axes" in failed(vehicle)["damping (calibrated)"]
 
 
+def test_surge_damping_that_feeds_energy_in_is_found():
+    vehicle = load_vehicle("remus100").replace(
+        {"hydrodynamics.calibrated.surge_damping": [0, -3, 0, 0, 0, 0]}
+    )
+    assert "Du: -3" in failed(vehicle)["surge_damping (calibrated)"]
+
+
 def test_an_axis_no_thruster_moves_is_found():
     vehicle = load_vehicle("bluerov2").replace(
         {"controlled_axes": ["surge", "sway", "heave", "roll", "pitch", "yaw"]}

@@ -79,7 +79,7 @@ def fit_hydrodynamics(
         axes: Axes to fit; those that the trials excite if None.
         method: One of `METHODS`.
         full: Also couplings; simulation only.
-        estimate: Further parameters; simulation only.
+        estimate: Further parameters: of the vehicle's terms, and by simulation only `ESTIMATE`.
         damping: `auto`, `linear`, `quadratic` or `both`.
         known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²]; regression only.
         horizon: Longest stretch that is simulated without a restart [s]; simulation only.
@@ -89,10 +89,12 @@ def fit_hydrodynamics(
     Raises:
         CalibrationError: No trial can be used, or an option is not the method's.
     """
+    from finssim.calibration.simulation.fit import ESTIMATE
+
     known = dict(known or {})
     only_simulation = {
         "couplings": full,
-        "further estimates": bool(estimate),
+        "further estimates": any(word in ESTIMATE for word in estimate),
         "a horizon": horizon is not None,
     }
     asked = [name for name, given in only_simulation.items() if given]
@@ -106,7 +108,7 @@ def fit_hydrodynamics(
         raise CalibrationError("known inertias need the regression: the simulation method fits every inertia")
 
     def regression(body: Vehicle) -> Fit:
-        return regress(trials, body, axes=axes, damping=damping, known=known, seed=seed)
+        return regress(trials, body, axes=axes, damping=damping, known=known, estimate=estimate, seed=seed)
 
     def simulation(body: Vehicle) -> Fit:
         from finssim.calibration.simulation.fit import fit_by_simulation
@@ -254,7 +256,8 @@ def _with_scale(fit: Fit, vehicle: Vehicle, scale: float, std: float) -> Fit:
     found = dict(fit.estimates)
     for name, e in fit.estimates.items():
         axis, _, kind = name.partition(".")
-        if name == "buoyancy_excess" or (axis in fitted and kind in MULTIPLIED):
+        in_term = e.path == f"hydrodynamics.calibrated.{name}"
+        if name == "buoyancy_excess" or in_term or (axis in fitted and kind in MULTIPLIED):
             rigid = found[f"{axis}.m_eff"].estimate - e.estimate if kind == "added_mass" else 0.0
             found[name] = _widened(e, rigid, low, high)
     found["thrust_scale"] = Estimate(

@@ -8,13 +8,15 @@ from finssim.engine.draw_places import (
     drawn_delay,
     write_body,
     write_sensors,
+    write_terms,
     write_tether,
     write_thrusters,
     write_water,
 )
 from finssim.engine.draw_table import DrawTable, draw_entry
 from finssim.engine.measured import Measurement
-from finssim.engine.ranges_table import INDEX, WORLD
+from finssim.engine.ranges_file import MOST_WAVES
+from finssim.engine.ranges_table import WORLD, WORLD_END
 from finssim.engine.state import State
 from finssim.physics.plant import VehicleParameters
 from finssim.physics.tether import Tether
@@ -56,7 +58,7 @@ def draw_values(t: DrawTable, d: DrawnArrays, w: int, v: int, own: int, shared: 
     for i in range(t.count):
         k = t.drawn[i]
         key = own
-        if k >= WORLD:
+        if k >= WORLD and k < WORLD_END:
             key = shared
         d.values[w, v, k] = draw_entry(t, k, key)
     probe = int(-1)
@@ -84,7 +86,7 @@ def finish_values(d: DrawnArrays, w: int, v: int):
     if d.water != 0:
         count = wp.floor(x[w, v, wp.static(COLUMN["waves.count"])])
         x[w, v, wp.static(COLUMN["waves.count"])] = count
-        for i in range(wp.static((len(INDEX) - INDEX["waves.0.amplitude"]) // 4)):
+        for i in range(MOST_WAVES):
             if float(i) >= count:
                 x[w, v, wp.static(COLUMN["waves.0.amplitude"]) + 4 * i] = 0.0
 
@@ -102,6 +104,7 @@ def tell(d: DrawnArrays, w: int, v: int):
 @wp.kernel(enable_backward=False)
 def draw_episode(
     plant: wp.array2d(dtype=VehicleParameters),
+    extra: wp.array3d(dtype=float),
     tether: wp.array2d(dtype=Tether),
     seen: wp.array2d(dtype=Measurement),
     water: WaterArrays,
@@ -132,6 +135,7 @@ def draw_episode(
     )
     finish_values(d, w, v)
     write_body(plant, nominal, d.values, w, v)
+    write_terms(extra, nominal, d.values, w, v)
     write_thrusters(plant, nominal, d.values, w, v)
     if d.tether != 0:
         write_tether(tether, d.values, w, v)

@@ -22,6 +22,9 @@ class Nominal:
     H: wp.array(dtype=mat66)  # twist at that point from the twist at the body origin
     current: wp.vec3  # of the given water; what is drawn adds to it [m/s]
     waves: int  # waves of the given water stay in the first slots
+    extra: wp.array3d(dtype=float)  # parameters of the vehicles' terms, one world
+    factor: wp.array(dtype=int)  # entry that multiplies each of them, -1 for none
+    added: wp.array(dtype=int)  # entry that is added to it
 
 
 @wp.func
@@ -82,10 +85,21 @@ def write_body(
     plant[w, v].D2 = scaled_matrix(
         n.plant[0, v].D2, factors(x, w, v, wp.static(COLUMN["quadratic_damping.all"]))
     )
-    plant[w, v].Du = x[w, v, wp.static(COLUMN["surge_damping"])] * n.plant[0, v].Du
     drag = x[w, v, wp.static(COLUMN["mesh_drag"])]
     plant[w, v].form_drag = drag * n.plant[0, v].form_drag
     plant[w, v].skin_drag = drag * n.plant[0, v].skin_drag
+
+
+@wp.func
+def write_terms(extra: wp.array3d(dtype=float), n: Nominal, x: wp.array3d(dtype=float), w: int, v: int):
+    """The parameters of the vehicle's terms."""
+    for i in range(n.factor.shape[0]):
+        y = n.extra[0, v, i]
+        if n.factor[i] >= 0:
+            y = y * x[w, v, n.factor[i]]
+        if n.added[i] >= 0:
+            y = y + x[w, v, n.added[i]]
+        extra[w, v, i] = y
 
 
 @wp.func

@@ -25,6 +25,7 @@ class DrawTable:
     ends: wp.array(dtype=wp.vec4)  # low, high, mean, standard deviation
     probability: wp.array(dtype=float)  # of being drawn at all
     nominal: wp.array(dtype=float)
+    stream: wp.array(dtype=int)
     first_choice: wp.array(dtype=int)
     choices: wp.array(dtype=int)
     choice: wp.array(dtype=float)
@@ -71,13 +72,13 @@ def quantile(t: DrawTable, k: int, u: float) -> float:
 @wp.func
 def draw_entry(t: DrawTable, k: int, key: int) -> float:
     """Entry k from the stream of its own that a key gives it: other entries do not change it."""
-    rng = wp.rand_init(key, 2 * k)
+    rng = wp.rand_init(key, 2 * t.stream[k])
     u = wp.randf(rng)
     gate = wp.randf(rng)
     if t.ties[k] > 0:
         z = float(0.0)
         for i in range(t.first_tie[k], t.first_tie[k] + t.ties[k]):
-            other = wp.rand_init(key, 2 * t.tied[i] + 1)
+            other = wp.rand_init(key, 2 * t.stream[t.tied[i]] + 1)
             z += t.tie_weight[i] * wp.randn(other)
         u = normal_part(z)
     x = quantile(t, k, u)
@@ -152,6 +153,7 @@ def draw_table(
     t = DrawTable()
     t.count, t.probes = len(drawn), 0
     whole = {"drawn": [INDEX[name] for name in drawn], "kind": kind, "first_choice": first, "choices": choices,
+             "stream": [e.stream for e in ENTRIES],
              "first_tie": first_tie, "ties": ties, "tied": tied, "probe": []}  # fmt: skip
     real = {"probability": probability, "nominal": nominal, "choice": choice, "cumulative": cumulative,
             "tie_weight": weights, "probe_share": [0.0]}  # fmt: skip

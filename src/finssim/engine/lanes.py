@@ -24,6 +24,7 @@ __all__ = [
     "LANES",
     "LaneError",
     "Loop",
+    "NumberArray",
     "StructArray",
     "Trace",
     "UniformStruct",
@@ -494,6 +495,17 @@ class StructArray:
                 if word
             ]
         return lines
+
+
+class NumberArray(StructArray):
+    """An array of numbers by three indices, world, vehicle and a number that is known, of which at least eight."""
+
+    def __init__(self, trace: Trace, name: str, size: int) -> None:
+        """Take its name in C++ and the size of the last axis."""
+        self.__dict__.update(_trace=trace, _name=name, _size=size, _pieces={}, _assigned={})
+
+    def __getitem__(self, index: Any) -> Any:
+        return self._trace.line("F", self._place(index[2]), 1.0, 0)
 
 
 class VectorArray:

@@ -9,10 +9,13 @@ from numpy.typing import NDArray
 
 from finssim.engine.packed import Packed
 from finssim.physics.plant import VehicleParameters
+from finssim.physics.terms.composed import layout, row_length
 from finssim.physics.types import MAX_THRUSTERS
+from finssim.vehicles.terms import TERMS
 
 if TYPE_CHECKING:
     from finssim.vehicles import Vehicle
+    from finssim.vehicles.terms import Term
 
 Matrix = NDArray[np.float64]
 
@@ -33,7 +36,7 @@ def twist_shift(r: Sequence[float]) -> Matrix:
 
 
 def vehicle_parameters(vehicle: "Vehicle", model: str) -> dict[str, Any]:
-    """Every field of `VehicleParameters` but the derived ones, for one vehicle and one hydrodynamic model.
+    """Every field of a `Plant` but the derived ones, for one vehicle and one hydrodynamic model.
 
     Args:
         vehicle: The vehicle.
@@ -70,11 +73,36 @@ def vehicle_parameters(vehicle: "Vehicle", model: str) -> dict[str, Any]:
         "r_h": r_h,
         "D1": np.asarray(getattr(hydro, "linear_damping", zeros), dtype=float),
         "D2": np.asarray(getattr(hydro, "quadratic_damping", zeros), dtype=float),
-        "Du": np.asarray(getattr(hydro, "surge_damping", zeros), dtype=float),
         "form_drag": getattr(hydro, "form_drag", 0.0),
         "skin_drag": getattr(hydro, "skin_drag", 0.0),
+        **getattr(hydro, "term_parameters", {}),
         **thruster_parameters(vehicle),
     }
+
+
+def terms_of(vehicles: Sequence["Vehicle"], model: str) -> tuple["Term", ...]:
+    """The terms that at least one of the vehicles has, in the order of their rows."""
+    names = {name for vehicle in vehicles for name in getattr(vehicle.hydrodynamics.get(model), "terms", {})}
+    return tuple(TERMS[name] for name in sorted(names))
+
+
+class Plant(Packed):
+    """Parameters of vehicles by (world, vehicle): those of `VehicleParameters`, and those of the vehicles' terms."""
+
+    def __init__(self, terms: tuple["Term", ...], shape: tuple[int, int], device: wp.Device) -> None:
+        """Zeros."""
+        super().__init__(VehicleParameters, shape, device)
+        self.terms = terms
+        rows = (*shape, row_length(terms)) if terms else (1, 1, row_length(terms))
+        self.extra: wp.array = wp.zeros(rows, dtype=wp.float32, device=device)
+        """Parameters of the terms, (worlds, vehicles, numbers) where there are terms."""
+        for slot in layout(terms):
+            view = wp.array(
+                ptr=self.extra.ptr + 4 * slot.first, dtype=slot.kind, shape=shape, strides=self.extra.strides[:2],
+                device=device,
+            )  # fmt: skip
+            view._ref = self.extra
+            self.fields[slot.path] = view
 
 
 def thruster_parameters(vehicle: "Vehicle") -> dict[str, Any]:
@@ -121,12 +149,13 @@ def _force_at(rpm: float | None, c: float | None) -> float:
 
 def build_plant(
     vehicles: Sequence["Vehicle"], model: str, worlds: int, hulls: Sequence[int], device: wp.Device
-) -> Packed:
+) -> Plant:
     """Parameters of `worlds` equal worlds that hold these vehicles; derived fields are zero until refreshed."""
     parameters = [{**vehicle_parameters(v, model), "hull": h} for v, h in zip(vehicles, hulls, strict=True)]
-    plant = Packed(VehicleParameters, (worlds, len(vehicles)), device)
-    for name in parameters[0]:
-        row = np.stack([np.asarray(p[name]) for p in parameters])
+    plant = Plant(terms_of(vehicles, model), (worlds, len(vehicles)), device)
+    for name in dict.fromkeys(name for p in parameters for name in p):
+        shape = next(np.shape(p[name]) for p in parameters if name in p)
+        row = np.stack([np.broadcast_to(p.get(name, 0.0), shape) for p in parameters])
         full = np.broadcast_to(row, (worlds, *row.shape))
         plant.fields[name].assign(np.ascontiguousarray(full, dtype=plant.fields[name].numpy().dtype))
     return plant

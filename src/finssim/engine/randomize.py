@@ -17,8 +17,9 @@ from finssim.engine.measured import SENSORS, Measurement
 from finssim.engine.packed import Packed
 from finssim.engine.plant_arrays import build_plant, twist_shift, vehicle_parameters
 from finssim.engine.ranges_file import Ranges, load_ranges
-from finssim.engine.ranges_table import ENTRIES, INDEX, TETHER, drawn_entries
+from finssim.engine.ranges_table import ENTRIES, INDEX, TETHER, added_entry, drawn_entries
 from finssim.engine.surroundings import TetherLine
+from finssim.physics.terms.composed import layout
 from finssim.physics.types import mat66
 
 if TYPE_CHECKING:
@@ -195,7 +196,7 @@ class Draws:
     def add(self, pipeline: Pipeline, mask: wp.array, seed: int) -> None:
         """Append the draw for the worlds where mask (by world, int32) is not 0; refresh the plant afterwards."""
         s = self.simulator
-        places = [s.plant.array, s.tether.array, self._seen, s.water]
+        places = [s.plant.array, s.plant.extra, s.tether.array, self._seen, s.water]
         inputs = [*places, self._nominal, self.table, self._arrays, s.state, seed, mask]
         pipeline.add(draw_episode, inputs, vehicles=len(s.vehicles))
 
@@ -226,7 +227,12 @@ def _nominal_values(simulator: "Simulator", seen: Packed | None) -> NDArray[np.f
 def _nominal_vehicles(simulator: "Simulator") -> Nominal:
     device, vehicles = simulator.device, simulator.vehicles
     out = Nominal()
-    out.plant = build_plant(vehicles, simulator.hydrodynamics, 1, [0] * len(vehicles), device).array
+    plant = build_plant(vehicles, simulator.hydrodynamics, 1, [0] * len(vehicles), device)
+    out.plant, out.extra = plant.array, plant.extra
+    slots = layout(plant.terms)
+    for field, name_of in (("factor", str), ("added", added_entry)):
+        columns = [INDEX.get(name_of(slot.path), -1) for slot in slots for _ in range(slot.size)]
+        setattr(out, field, wp.array(np.array(columns, np.int32), dtype=wp.int32, device=device))
     H, M_A = [], []
     for vehicle in vehicles:
         values = vehicle_parameters(vehicle, simulator.hydrodynamics)

@@ -6,7 +6,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
 
 from finssim.engine.distributions import (
     Above0,
@@ -18,9 +26,11 @@ from finssim.engine.distributions import (
     bounds_of,
     checked,
     sentence,
+    unknown,
 )
 from finssim.engine.ranges_schedule import Automatic, Curriculum
 from finssim.engine.surroundings import SurroundingsError, Wave
+from finssim.vehicles.terms import Term, find_term
 from finssim.yaml_file import read_mapping
 
 SHIPPED = Path(__file__).parent / "ranges"
@@ -210,8 +220,8 @@ class Ranges(Part):
     added_mass: AxisScales = AxisScales()
     linear_damping: AxisScales = AxisScales()
     quadratic_damping: AxisScales = AxisScales()
-    surge_damping: Scale = ONE
-    """Factor on the damping that is coupled to surge."""
+    terms: dict[str, Interval] = Field(default_factory=dict)
+    """Of the vehicle's terms by entry, see `term_entries`; in a file each term's stand under its name."""
     mesh_drag: Scale = ONE
     """Factor on form and skin drag of the mesh model."""
     thrust: ThrustScales = ThrustScales()
@@ -239,6 +249,21 @@ class Ranges(Part):
     curriculum: Curriculum | None = None
     automatic: Automatic | None = None
 
+    @model_validator(mode="before")
+    @classmethod
+    def _terms_by_entry(cls, data: Any) -> Any:
+        if not isinstance(data, Mapping):
+            return data
+        out, terms = dict(data), {}
+        for entry, drawn in dict(out.pop("terms", {})).items():  # as a record of a training has them
+            name, _, own = entry.partition(".")
+            out[name] = {**out.get(name, {}), own: drawn} if own else drawn
+        for name in [name for name in out if name not in cls.model_fields]:
+            term = find_term(str(name))
+            if term is not None:  # another is refused as an unknown entry
+                terms |= _of_term(term, out.pop(name))
+        return {**out, "terms": terms} if terms else out
+
     @model_validator(mode="after")
     def _together(self) -> "Ranges":
         from finssim.engine.ranges_table import check_correlated  # the table is made of this file's parts
@@ -247,6 +272,33 @@ class Ranges(Part):
         if self.curriculum is not None and self.automatic is not None:
             raise ValueError("curriculum and automatic both say how ranges grow: give one of them")
         return self
+
+
+def _of_term(term: Term, given: Any) -> dict[str, Any]:
+    """What is drawn of a term, by entry.
+
+    Raises:
+        ValueError: An entry that it does not have, or a range that cannot be; one sentence.
+    """
+    from finssim.engine.ranges_table import term_entries  # the table is made of this file's parts
+
+    entries = {entry.name: entry for entry in term_entries(term)}
+    if term.name in entries:
+        given = {term.name: given}
+    elif isinstance(given, Mapping):
+        given = {f"{term.name}.{key}": drawn for key, drawn in given.items()}
+    else:
+        raise ValueError(f"{term.name}: is {given!r}, expected ranges of {', '.join(entries)}")
+    out = {}
+    for name, drawn in given.items():
+        if name not in entries:
+            raise ValueError(f"{term.name}: {unknown(name, entries)}")
+        try:
+            kind: Any = Scale if entries[name].unit == "1" else Interval
+            out[name] = TypeAdapter(kind).validate_python(drawn)
+        except ValidationError as error:
+            raise ValueError(f"{name}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from None
+    return out
 
 
 def available() -> list[str]:

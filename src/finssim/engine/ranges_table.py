@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from finssim.engine.distributions import Distribution, Drawn, distribution_of, unknown
 from finssim.engine.measured import SENSORS
 from finssim.engine.ranges_file import AXES, MOST_WAVES, EachScales, Offsets, Ranges
 from finssim.physics.types import MAX_THRUSTERS
+from finssim.vehicles.terms import Term
 
-__all__ = ["ENTRIES", "INDEX", "TETHER", "WORLD", "Entry", "check_correlated", "drawn_entries", "varies"]
+__all__ = [
+    "ENTRIES", "INDEX", "TETHER", "WORLD", "WORLD_END", "Entry", "added_entry", "check_correlated", "drawn_entries",
+    "term_entries", "varies",
+]  # fmt: skip
 
 TURN = Distribution(uniform=(0.0, 6.2831853))
 ALWAYS_FIRST = 0.999
@@ -34,15 +39,18 @@ class Entry:
     """A direction or phase: always from the whole circle."""
     told: bool = True
     """Among the privileged numbers where it varies."""
+    stream: int = -1
+    """Of its random numbers, by which no other entry changes them."""
 
 
-def _table() -> Iterator[Entry]:
+def _table() -> Iterator[Entry | None]:
     yield from (Entry("mass"), Entry("volume"), Entry("inertia"))
     for center in ("center_of_gravity", "center_of_buoyancy"):
         yield from (Entry(f"{center}.{axis}", "m", 0.0) for axis in "xyz")
     for family in ("added_mass", "linear_damping", "quadratic_damping"):
         yield from (Entry(f"{family}.{axis}") for axis in ("all", *AXES))
-    yield from (Entry("surge_damping"), Entry("mesh_drag"), Entry("thrust.all"))
+    yield None  # its stream was another entry's
+    yield from (Entry("mesh_drag"), Entry("thrust.all"))
     for kind in ("thrust.each", "thrust.failure"):
         yield from (Entry(f"{kind}.{k}") for k in range(MAX_THRUSTERS))
     yield Entry("time_constant.all")
@@ -77,10 +85,35 @@ def _sensor_unit(name: str) -> str:
     )
 
 
-ENTRIES = tuple(_table())
+ENTRIES = [replace(entry, stream=i) for i, entry in enumerate(_table()) if entry is not None]
+"""All entries; those of a vehicle's terms join them when ranges first name the term."""
 INDEX = {entry.name: i for i, entry in enumerate(ENTRIES)}
 WORLD = next(i for i, entry in enumerate(ENTRIES) if entry.world)
-"""Entries from this one on are the world's."""
+"""Entries from this one to before `WORLD_END` are the world's."""
+WORLD_END = len(ENTRIES)
+
+
+def term_entries(term: Term) -> list[Entry]:
+    """Entries of a term: `lift.coefficient`, a factor on each parameter, and `lift.added_coefficient`, to be added.
+
+    Only parameters that are one number in a section of their own can be added to. The streams follow from the names.
+    """
+    scalars, out = term.scalars(), []
+    for name, path in term.parameters.items():
+        out.append(Entry(path))
+        if path in scalars and path != term.name:
+            out.append(Entry(added_entry(path), term.units[name], 0.0))
+    for entry in out:
+        if entry.name not in INDEX:
+            INDEX[entry.name] = len(ENTRIES)
+            ENTRIES.append(replace(entry, stream=(1 << 20) + zlib.crc32(entry.name.encode()) % (1 << 28)))
+    return out
+
+
+def added_entry(path: str) -> str:
+    """Name of the entry that is added to the parameter at a path."""
+    term, _, name = path.rpartition(".")
+    return f"{term}.added_{name}"
 
 
 def varies(distribution: Distribution, nominal: float) -> bool:
@@ -105,7 +138,8 @@ def drawn_entries(ranges: Ranges, thrusters: int = MAX_THRUSTERS) -> dict[str, D
 
 
 def _given(ranges: Ranges, thrusters: int) -> Iterator[tuple[str, Drawn | None]]:
-    for name in ("mass", "inertia", "surge_damping", "mesh_drag", "added_time_constant", "delay", "added_delay",
+    yield from ranges.terms.items()
+    for name in ("mass", "inertia", "mesh_drag", "added_time_constant", "delay", "added_delay",
                  "command_jitter", "slew", "dead_zone", "added_dead_zone", "current", "vertical_current"):  # fmt: skip
         yield name, getattr(ranges, name)
     yield "volume", None if ranges.volume == "with_mass" else ranges.volume

@@ -164,7 +164,7 @@ class Simulator:
             walls_present=self.surroundings[1] is not None,
             tether_present=self.surroundings[2] is not None,
             speed_lag=bool(self.plant.speed_lag.numpy().any()),
-            surge_coupled=bool(self.plant.Du.numpy().any()),
+            terms=self.plant.terms,
             funnel_present=self.dock is not None,
             lanes=self.in_lanes,
         )
@@ -176,6 +176,7 @@ class Simulator:
             self.command.array,
             *clocks,
             self.plant.array,
+            self.plant.extra,
             *around,
             self.control_step,
             self.substeps,
@@ -228,8 +229,9 @@ class Simulator:
     def compare_worlds(self) -> None:
         """Note whether all worlds have equal parameters, which are then read once; never if some are drawn."""
         if self.in_lanes:
-            rows = self.plant.array.numpy().view(np.uint8).reshape(self.worlds, -1)
-            self._shared.fill_(int(not self._drawn and bool((rows == rows[0]).all())))
+            arrays = [self.plant.array] + [self.plant.extra] * bool(self.plant.terms)
+            rows = [array.numpy().view(np.uint8).reshape(self.worlds, -1) for array in arrays]
+            self._shared.fill_(int(not self._drawn and all(bool((r == r[0]).all()) for r in rows)))
 
     def reset(self, mask: ArrayLike | None = None) -> None:
         """Stop the motors, empty the delay lines and set the clocks to zero; pose and velocity stay.

@@ -10,6 +10,7 @@ from finssim.engine.actuation import delayed_command, delivered_thrust, lag_targ
 from finssim.engine.lanes import (
     LANES,
     Loop,
+    NumberArray,
     StructArray,
     Trace,
     UniformStruct,
@@ -29,7 +30,7 @@ from finssim.engine.midpoint import (
 )
 from finssim.engine.state import HISTORY, State, VehicleState, is_finite, snapshot, vec13
 from finssim.physics.contact import PoolWalls, contact_wrench, walls_within
-from finssim.physics.damping import surge_coupled_wrench, twist_at, wrench_from
+from finssim.physics.damping import twist_at, wrench_from
 from finssim.physics.funnel import Funnel, funnel_within, funnel_wrench
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
 from finssim.physics.hydrodynamics.mesh import HullMesh, drag_slope
@@ -42,9 +43,11 @@ from finssim.physics.inertia import (
 from finssim.physics.kinematics import position_rate, quaternion_rate, rotate_by, up_in_body
 from finssim.physics.motors import admissible, first_order
 from finssim.physics.plant import VehicleCommand, VehicleParameters, mass_matrix
+from finssim.physics.terms.composed import composed, row_length
 from finssim.physics.tether import Tether, tether_wrench
 from finssim.physics.types import angular, join, linear, symmetric_times, vec6, vec8
 from finssim.physics.water import Flow, WaterArrays, flow_at
+from finssim.vehicles.terms import Term
 
 MODULE_OPTIONS = {
     "cpu_compiler_flags": "-march=native -ffp-contract=fast"
@@ -77,7 +80,7 @@ def physics_kernel(
     walls_present: bool = True,
     tether_present: bool = True,
     speed_lag: bool = True,
-    surge_coupled: bool = True,
+    terms: tuple[Term, ...] = (),
     funnel_present: bool = False,
     lanes: bool = False,
 ) -> wp.Kernel:
@@ -90,7 +93,7 @@ def physics_kernel(
         walls_present: Whether there is a pool to bump into.
         tether_present: Whether there is a tether.
         speed_lag: Whether some vehicle's motors lag in speed rather than in force.
-        surge_coupled: Whether some vehicle's damping is coupled to surge (Du is not zero).
+        terms: Those that some vehicle has, in the order of the rows of their parameters.
         funnel_present: Whether there is a dock to enter.
         lanes: Whether worlds go in blocks of `LANES`, on a processor; see `finssim.engine.lanes`.
 
@@ -99,6 +102,7 @@ def physics_kernel(
         number of the slice's worlds before its offset.
     """
     hydrodynamic_wrench = HYDRODYNAMICS[model]
+    term_wrench, term_slope = composed(terms, "wrench"), composed(terms, "slope")
     runge_kutta = integrator == "rk4"
     added_mass = model != "simplified"
     contacts = walls_present or funnel_present
@@ -113,6 +117,7 @@ def physics_kernel(
     @wp.func
     def motion_at(
         plant: wp.array2d(dtype=VehicleParameters),
+        extra: wp.array3d(dtype=float),
         hull: HullMesh,
         water: WaterArrays,
         tether: wp.array2d(dtype=Tether),
@@ -167,10 +172,11 @@ def physics_kernel(
                     wet.wet * plant[w, v].M_A, plant[w, v].r_b, water_b, wp.quat_rotate_inv(q, passing),
                     wp.quat_rotate_inv(q, flowing), angular(nu), wet.displaced,
                 )  # fmt: skip
-        if wp.static(surge_coupled):
+        if wp.static(term_wrench is not None):
             r_h = plant[w, v].r_h
             nu_h = twist_at(nu_r, r_h)
-            tau += wet.wet * wrench_from(surge_coupled_wrench(nu_h, plant[w, v].Du), r_h)
+            tau_h = term_wrench(extra, w, v, nu_h, up, -position[2], water.density)
+            tau += wet.wet * wrench_from(tau_h, r_h)
         if wp.static(tether_present):
             tau += tether_wrench(tether[w, v], water.density, position, q, nu, flow.velocity)
         tau -= coriolis_wrench(momentum, nu)
@@ -202,6 +208,10 @@ def physics_kernel(
                 out.relaxation = wp.cw_mul(share, wp.cw_mul(plant[w, v].relax, slope))
             else:
                 out.relaxation = wp.cw_mul(share, relaxation_of(plant, w, v, nu_r))
+                if wp.static(term_slope is not None):
+                    nu_m = twist_at(nu_r, plant[w, v].r_m)
+                    falls = term_slope(extra, w, v, nu_m, up, -position[2], water.density)
+                    out.relaxation += wp.cw_mul(share, wp.cw_mul(plant[w, v].relax, wp.max(falls, vec6())))
         return out
 
     @wp.func
@@ -261,6 +271,7 @@ def physics_kernel(
         command: wp.array2d(dtype=VehicleCommand),
         commands: wp.array3d(dtype=vec8),
         plant: wp.array2d(dtype=VehicleParameters),
+        extra: wp.array3d(dtype=float),
         hull: HullMesh,
         water: WaterArrays,
         walls: PoolWalls,
@@ -310,6 +321,7 @@ def physics_kernel(
             q1 = quaternion_rate(q, angular(nu))
             n1 = motion_at(
                 plant,
+                extra,
                 hull,
                 water,
                 tether,
@@ -334,7 +346,7 @@ def physics_kernel(
             if wp.static(contacts):
                 outer = other + contact_at(plant, walls, funnel, w, v, xm, qm, nu2).tau
             n2 = motion_at(
-                plant, hull, water, tether, w, v, xm, qm, nu2, nu2, thrust, pushed, outer, t + 0.5 * h,
+                plant, extra, hull, water, tether, w, v, xm, qm, nu2, nu2, thrust, pushed, outer, t + 0.5 * h,
                 elapsed + 0.5 * h, 0.0,
             ).nu_dot  # fmt: skip
             nu3 = nu + 0.5 * h * n2
@@ -345,7 +357,7 @@ def physics_kernel(
             if wp.static(contacts):
                 outer = other + contact_at(plant, walls, funnel, w, v, xn, qn, nu3).tau
             n3 = motion_at(
-                plant, hull, water, tether, w, v, xn, qn, nu3, nu3, thrust, pushed, outer, t + 0.5 * h,
+                plant, extra, hull, water, tether, w, v, xn, qn, nu3, nu3, thrust, pushed, outer, t + 0.5 * h,
                 elapsed + 0.5 * h, 0.0,
             ).nu_dot  # fmt: skip
             nu4 = nu + h * n3
@@ -357,6 +369,7 @@ def physics_kernel(
                 outer = other + contact_at(plant, walls, funnel, w, v, xe, qe, nu4).tau
             n4 = motion_at(
                 plant,
+                extra,
                 hull,
                 water,
                 tether,
@@ -402,7 +415,7 @@ def physics_kernel(
             x_middle = position + 0.5 * h * x_dot
             q_middle = q + 0.5 * h * quaternion_rate(q, angular(nu))
             motion = motion_at(
-                plant, hull, water, tether, w, v, x_middle, q_middle, nu_middle, nu, thrust, pushed, other,
+                plant, extra, hull, water, tether, w, v, x_middle, q_middle, nu_middle, nu, thrust, pushed, other,
                 t + 0.5 * h, elapsed + 0.5 * h, h,
             )  # fmt: skip
             nu_dot = relaxed(motion.nu_dot, guess, motion.relaxation, plant[w, v].r_m)
@@ -488,6 +501,7 @@ def physics_kernel(
         steps: wp.array(dtype=int),
         broken: wp.array(dtype=int),
         plant: wp.array2d(dtype=VehicleParameters),
+        extra: wp.array3d(dtype=float),
         hull: HullMesh,
         water: WaterArrays,
         walls: PoolWalls,
@@ -520,6 +534,7 @@ def physics_kernel(
                 command,
                 commands,
                 plant,
+                extra,
                 hull,
                 water,
                 walls,
@@ -546,6 +561,7 @@ def physics_kernel(
         broken: wp.array(dtype=int),
         frozen: wp.array(dtype=int),
         plant: wp.array2d(dtype=VehicleParameters),
+        extra: wp.array3d(dtype=float),
         hull: HullMesh,
         water: WaterArrays,
         walls: PoolWalls,
@@ -560,14 +576,14 @@ def physics_kernel(
         if frozen[w] != 0:
             return
         step_vehicle(
-            state, command, commands, history, steps, broken, plant, hull, water, walls, tether, funnel,
+            state, command, commands, history, steps, broken, plant, extra, hull, water, walls, tether, funnel,
             control_step, substeps, w, v,
         )  # fmt: skip
 
     if not lanes:
         return physics_step
 
-    block = lane_block(set_out, substep, arrive)
+    block = lane_block(set_out, substep, arrive, row_length(terms))
 
     @wp.kernel(enable_backward=False, module="unique", module_options=MODULE_OPTIONS)
     def physics_blocks(
@@ -579,6 +595,7 @@ def physics_kernel(
         broken: wp.array(dtype=int),
         frozen: wp.array(dtype=int),
         plant: wp.array2d(dtype=VehicleParameters),
+        extra: wp.array3d(dtype=float),
         hull: HullMesh,
         water: WaterArrays,
         walls: PoolWalls,
@@ -594,13 +611,13 @@ def physics_kernel(
         w = world_offset + wp.static(LANES) * i
         count = wp.min(wp.static(LANES), worlds - wp.static(LANES) * i)
         done = block(
-            state, command, commands, history, steps, frozen, plant, shared, water, walls, tether, control_step,
+            state, command, commands, history, steps, frozen, plant, extra, shared, water, walls, tether, control_step,
             substeps, w, v, count,
         )  # fmt: skip
         for k in range(count):
             if ((done >> k) & 1) == 0 and frozen[w + k] == 0:
                 step_vehicle(
-                    state, command, commands, history, steps, broken, plant, hull, water, walls, tether, funnel,
+                    state, command, commands, history, steps, broken, plant, extra, hull, water, walls, tether, funnel,
                     control_step, substeps, w + k, v,
                 )  # fmt: skip
 
@@ -613,7 +630,7 @@ WIDE = {"half_length": 1e3, "half_width": 1e3, "depth": 1e3}
 """Example of a pool, whose walls are far away."""
 
 
-def lane_block(set_out: Any, substep: Any, arrive: Any) -> Any:
+def lane_block(set_out: Any, substep: Any, arrive: Any, term_numbers: int) -> Any:
     """A native function that takes a block of worlds through a control step, traced from the functions for one.
 
     Worlds are left out whose episode has just begun, that are frozen, whose command is not finite, that are not wholly
@@ -623,6 +640,7 @@ def lane_block(set_out: Any, substep: Any, arrive: Any) -> Any:
     state = StructArray(trace, "state", VehicleState, SUBMERGED)
     command = StructArray(trace, "command", VehicleCommand, {})
     plant = StructArray(trace, "plant", VehicleParameters, {})
+    extra = NumberArray(trace, "extra", term_numbers)
     tether = StructArray(trace, "tether", Tether, {})
     commands, history = VectorArray(trace, "commands", vec8, 2), VectorArray(trace, "history", vec13, 0)
     commands.shape = (0, 0, trace.symbol("I", "slots", 4))
@@ -644,6 +662,7 @@ def lane_block(set_out: Any, substep: Any, arrive: Any) -> Any:
             command,
             commands,
             plant,
+            extra,
             None,
             water,
             walls,
@@ -669,6 +688,8 @@ const long row = shared.data[0] ? 0 : plant.strides[0];
 const At state_at = {{(char*)state.data + w * state.strides[0] + v * state.strides[1], state.strides[0], 0}};
 const At command_at = {{(char*)command.data + w * command.strides[0] + v * command.strides[1], command.strides[0], 0}};
 const At plant_at = {{(char*)plant.data + w * row + v * plant.strides[1], row, 0}};
+const long term_row = shared.data[0] ? 0 : extra.strides[0];
+const At extra_at = {{(char*)extra.data + w * term_row + v * extra.strides[1], term_row, 0}};
 const At tether_at = {{(char*)tether.data + w * tether.strides[0] + v * tether.strides[1], tether.strides[0], 0}};
 const At commands_at = {{
     (char*)commands.data + w * commands.strides[0] + v * commands.strides[1], commands.strides[0], commands.strides[2]
@@ -693,6 +714,7 @@ const F control = all(control_step), h = all(control_step / (float)substeps);
         steps: wp.array(dtype=int),
         frozen: wp.array(dtype=int),
         plant: wp.array2d(dtype=VehicleParameters),
+        extra: wp.array3d(dtype=float),
         shared: wp.array(dtype=int),
         water: WaterArrays,
         walls: PoolWalls,

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
+
 from finssim.engine.distributions import Distribution
 from finssim.engine.plant_arrays import NO_LIMIT, vehicle_parameters
 from finssim.engine.ranges_file import AXES, Ranges
 from finssim.engine.ranges_table import ENTRIES, INDEX, drawn_entries
 from finssim.vehicles import Vehicle
+from finssim.vehicles.terms import unit_of
 
 __all__ = ["Row", "rows_of"]
 
@@ -82,9 +85,13 @@ def _body(
             factors = [drawn[f"{family}.{name}"] for name in ("all", axis) if f"{family}.{name}" in drawn]
             if factors and matrix[i][i] != 0.0:
                 yield _scaled(f"{family}.{axis}", float(matrix[i][i]), force if i < 3 else moment, factors)
-    for name in ("surge_damping", "mesh_drag"):
-        if name in drawn:
-            yield _scaled(name, 1.0, "factor", [drawn[name]])
+    if "mesh_drag" in drawn:
+        yield _scaled("mesh_drag", 1.0, "factor", [drawn["mesh_drag"]])
+    for name in ranges.terms:
+        if name in drawn and ENTRIES[INDEX[name]].unit == "1":
+            one = np.ndim(p.get(name, np.zeros(1))) == 0
+            unit = unit_of(name) if one else "factor"
+            yield _scaled(name, float(p[name]) if one else 1.0, unit, [drawn[name]])
 
 
 def vehicle_matrix(vehicle: Vehicle, hydrodynamics: str, family: str) -> list[list[float]]:

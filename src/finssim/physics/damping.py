@@ -6,33 +6,20 @@ from finssim.physics.types import angular, join, linear, mat66, vec6
 
 
 @wp.func
-def damping_wrench(nu_r: vec6, D1: mat66, D2: mat66, Du: mat66) -> vec6:
+def damping_wrench(nu_r: vec6, D1: mat66, D2: mat66) -> vec6:
     """Damping wrench on a submerged body, about the point where the coefficients hold.
 
-    tau_D = -[D1 + D2 diag(|nu_r|) + Du |u_r|] nu_r                                  (paper, eq. 2)
+    tau_D = -[D1 + D2 diag(|nu_r|)] nu_r            (paper, eq. 2; its Du is `finssim.physics.terms.surge_damping`)
 
     Args:
         nu_r: Velocity of that point relative to the water, body frame [m/s, rad/s].
         D1: Linear damping, 6x6 [N s/m, N m s/rad].
         D2: Quadratic damping, 6x6 [N s²/m², N m s²/rad²].
-        Du: Surge-coupled damping, 6x6, units of D2.
 
     Returns:
         Wrench about the same point, body frame [N, N m].
     """
-    return uncoupled_damping_wrench(nu_r, D1, D2) + surge_coupled_wrench(nu_r, Du)
-
-
-@wp.func
-def uncoupled_damping_wrench(nu_r: vec6, D1: mat66, D2: mat66) -> vec6:
-    """`damping_wrench` of a vehicle without surge coupling (Du = 0), which most are: a matrix product less."""
     return -(D1 * nu_r + D2 * wp.cw_mul(wp.abs(nu_r), nu_r))
-
-
-@wp.func
-def surge_coupled_wrench(nu_r: vec6, Du: mat66) -> vec6:
-    """The part of `damping_wrench` that grows with the surge speed: -Du |u_r| nu_r."""
-    return -wp.abs(nu_r[0]) * (Du * nu_r)
 
 
 @wp.func

@@ -27,11 +27,10 @@ class VehicleParameters:
     relax: vec6  # relaxation of a substep per slope of the damping, kept by `refresh_plant`
     relax_1: vec6  # what linear damping adds to the relaxation of a substep, kept by `refresh_plant`
     relax_2: vec6  # what quadratic damping adds to it, per speed on the same axis [s/m, s/rad]
-    relax_v: vec6  # what damping away from the origin and coupled to surge adds, per linear speed [s/m]
+    relax_v: vec6  # what damping away from the origin adds, per linear speed [s/m]
     r_h: wp.vec3  # point where the damping coefficients hold, body frame [m]
     D1: mat66
     D2: mat66
-    Du: mat66
     form_drag: float
     skin_drag: float
     hull: int  # which hull mesh, for the mesh model
@@ -122,8 +121,7 @@ def refresh_plant(
     r = plant[w, v].r_h - p
     d1 = diagonal_at_origin(wp.get_diag(plant[w, v].D1), r)
     d2 = 2.0 * wp.get_diag(plant[w, v].D2)
-    dv = diagonal_at_origin(d2, r) - d2 + wp.get_diag(plant[w, v].Du)
-    dv[0] = dv[0] + plant[w, v].Du[0, 0]
+    dv = diagonal_at_origin(d2, r) - d2
     H = twist_shift(p)
     weight = substep * wp.static(RELAXATION) * wp.get_diag(H * M_inv * wp.transpose(H))
     none = vec6()

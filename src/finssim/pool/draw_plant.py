@@ -103,9 +103,9 @@ def _water(
     M_A = _congruent(hydro.added_mass, draw.around(half, 6))
     factor = draw.around(half, 6)
     D1, D2 = _congruent(hydro.linear_damping, factor), _congruent(hydro.quadratic_damping, factor)
-    if np.any(hydro.surge_damping):
+    if hydro.terms:
         raise PlantSpecError(
-            f"vehicle '{vehicle.name}' has surge_damping, which the pool's plants do not model"
+            f"vehicle '{vehicle.name}' has {', '.join(hydro.terms)}, which the pool's plants do not model"
         )
     drag = panel_drag(vehicle)
     hull = hull_share(vehicle, spread.hull_share, drag)

@@ -13,6 +13,7 @@ from finssim.engine import Pool, Simulator, Water, Wave
 from finssim.engine.plant_arrays import NO_LIMIT
 from finssim.physics.hydrostatics import submerged_fraction
 from finssim.physics.kinematics import up_in_body
+from finssim.physics.terms.composed import layout
 from finssim.physics.types import join, mat66, vec6, vec8
 from finssim.pool.current import Gyre, circulation_at, gyre
 from finssim.pool.losses import PropellerBank, delivered_thrust, propeller_bank
@@ -176,7 +177,8 @@ class Plant:
             threads=1,
             water_moves=bool(spec.circulation.eddies or any(spec.circulation.stream)),
         )
-        for name, value in _engine_fields(vehicle, spec).items():
+        none = {slot.path: 0.0 for slot in layout(simulator.plant.terms)}
+        for name, value in (_engine_fields(vehicle, spec) | none).items():
             view = simulator.plant.fields[name].numpy()
             view[...] = value
         simulator.place(position=position, quaternion=quaternion)
@@ -249,7 +251,6 @@ def _engine_fields(vehicle: Vehicle, spec: PlantSpec) -> dict[str, Any]:
         "M_A": spec.added_mass.about_origin(),
         "D1": 0.0,
         "D2": 0.0,
-        "Du": 0.0,
         "force_min": -1.0e6,
         "force_max": 1.0e6,
         "dead_minus": 0.0,

@@ -125,10 +125,8 @@ class DriveNumbers:
                 "vehicle"
             )
         hydro: Any = vehicle.hydrodynamics[sets[0]]
-        quadratic = np.diag(hydro.quadratic_damping).copy()
-        quadratic[0] += hydro.surge_damping[0, 0]
         columns = (
-            np.diag(hydro.linear_damping), quadratic, np.diag(vehicle.mass_matrix(sets[0])),
+            np.diag(hydro.linear_damping), hydro.axis_drag, np.diag(vehicle.mass_matrix(sets[0])),
             vehicle.wrench_limits, terminal_speeds(vehicle, sets[0]),
         )  # fmt: skip
         rows = (tuple(column[ROWS].tolist()) for column in columns)

@@ -95,18 +95,18 @@ def terminal_speed(d1: float, d2: float, tau: float) -> float:
 
 
 def terminal_speeds(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> Array:
-    """Steady speed on each axis alone at its symmetric wrench limit, from the diagonals of D1, D2 and Du.
+    """Steady speed on each axis alone at its symmetric wrench limit, from d1 and d2 of that axis and its terms.
 
     Returns:
         [m/s, rad/s], (6,)
     """
     chosen = _coefficients(vehicle, hydrodynamics)
-    quadratic = np.diag(chosen.quadratic_damping).copy()
-    quadratic[0] += chosen.surge_damping[0, 0]
     return np.array(
         [
             terminal_speed(*row)
-            for row in zip(np.diag(chosen.linear_damping), quadratic, vehicle.wrench_limits, strict=True)
+            for row in zip(
+                np.diag(chosen.linear_damping), chosen.axis_drag, vehicle.wrench_limits, strict=True
+            )
         ]
     )
 

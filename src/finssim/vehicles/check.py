@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from finssim.vehicles.capability import trim, wrench_capability
 from finssim.vehicles.errors import VehicleError
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
+from finssim.vehicles.terms import TERMS
 from finssim.vehicles.vehicle import AXES, Vehicle
 
 __all__ = ["Finding", "check_vehicle"]
@@ -66,7 +67,7 @@ def _damping(vehicle: Vehicle) -> Iterator[Finding]:
         if not isinstance(chosen, HydrodynamicSet):
             continue
         coupled = bool(np.any(chosen.quadratic_damping - np.diag(np.diag(chosen.quadratic_damping))))
-        parts = {"D1": chosen.linear_damping, "D2": chosen.quadratic_damping, "Du": chosen.surge_damping}
+        parts = {"D1": chosen.linear_damping, "D2": chosen.quadratic_damping}
         if coupled:
             del parts["D2"]
         smallest = {part: float(np.linalg.eigvalsh((D + D.T) / 2.0)[0]) for part, D in parts.items()}
@@ -81,6 +82,10 @@ def _damping(vehicle: Vehicle) -> Iterator[Finding]:
                 "of its diagonal, expected >= 0"
             )
         yield Finding(f"damping ({name})", passed, sentence)
+        for key, value in chosen.terms.items():
+            check = TERMS[key].check
+            if check is not None:
+                yield Finding(f"{key} ({name})", *check(value))
 
 
 def _least_power(D2: NDArray[np.float64], samples: int = 4000) -> float:

@@ -4,17 +4,32 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import Discriminator, Tag
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Discriminator, Tag, model_serializer, model_validator
 
-from finssim.vehicles.part import Matrix6, NonNegative, Part, Symmetric6, Vector3, zeros
+from finssim.vehicles.part import (
+    Matrix6,
+    NonNegative,
+    Part,
+    Symmetric6,
+    Vector3,
+    did_you_mean,
+    refuse_section,
+    zeros,
+)
+from finssim.vehicles.terms import SHIPPED, TERMS, find_term, term_names
 
 
 class HydrodynamicSet(Part):
-    """Coefficients of tau_D = -[D1 + D2 diag(|nu_r|) + Du |u_r|] nu_r and of the added mass  (paper, eq. 1-2).
+    """Coefficients of tau_D = -[D1 + D2 diag(|nu_r|)] nu_r and of the added mass (paper, eq. 1-2), and further terms.
 
     Body axes, order surge sway heave roll pitch yaw. Positive diagonal entries take energy out.
-    The file gives 6 diagonal entries or 6 rows of 6.
+    The file gives 6 diagonal entries or 6 rows of 6. Terms stand beside them, each under its key (see `Term`); a term
+    that the file does not have reads as what it says for that.
     """
+
+    model_config = ConfigDict(frozen=True, extra="allow", arbitrary_types_allowed=True)
 
     added_mass: Symmetric6 = zeros(6, 6)
     """M_A [kg, kg m, kg m²], (6, 6)."""
@@ -22,10 +37,59 @@ class HydrodynamicSet(Part):
     """D1 [N s/m, N s, N m s], (6, 6)."""
     quadratic_damping: Matrix6
     """D2 [N s²/m², ..., N m s²], (6, 6)."""
-    surge_damping: Matrix6 = zeros(6, 6)
-    """Du, multiplied by the surge speed |u_r|, (6, 6)."""
     reference_point: Vector3 = zeros(3)
     """Body point at which velocity and wrench of these coefficients are taken [m], (3,)."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys_only(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
+            return data
+        out = dict(data)
+        for key in [key for key in data if key not in cls.model_fields]:
+            term = find_term(str(key))
+            if term is None:
+                known = [*cls.model_fields, *term_names()]
+                raise refuse_section(
+                    f"unknown key '{key}'{did_you_mean(str(key), known)} known keys: {', '.join(known)}"
+                )
+            out[key] = term.read(data[key])
+        return out
+
+    @model_serializer(mode="wrap")
+    def _plain(self, handler: Any) -> dict[str, Any]:
+        own = {key: TERMS[key].plain(value) for key, value in self.terms.items()}
+        return {key: own.get(key, value) for key, value in handler(self).items()}
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return super().__getattr__(name)  # type: ignore[misc]
+        except AttributeError:
+            if name not in SHIPPED and name not in TERMS:
+                raise
+        return getattr(find_term(name), "absent", None)
+
+    @property
+    def terms(self) -> dict[str, Any]:
+        """Key -> value of the terms that the file has."""
+        return dict(sorted((self.model_extra or {}).items()))
+
+    @property
+    def term_parameters(self) -> dict[str, Any]:
+        """Path -> number or array of every parameter of its terms, such as `lift.coefficient`."""
+        given = self.terms.items()
+        return {path: x for name, value in given for path, x in TERMS[name].numbers(value).items()}
+
+    @property
+    def term_scalars(self) -> dict[str, tuple[float, float]]:
+        """Path -> least and greatest value of the parameters of its terms that are one number: fits may move these."""
+        return {path: ends for name in self.terms for path, ends in TERMS[name].scalars().items()}
+
+    @property
+    def axis_drag(self) -> NDArray[np.float64]:
+        """d2 of steady motion along each axis alone, where drag is d1 v + d2 v|v|, (6,)."""
+        shares = (TERMS[name].quadratic(value) for name, value in self.terms.items())
+        return np.asarray(sum(shares, start=np.diag(self.quadratic_damping)))
 
 
 class MeshSet(Part):

@@ -17,6 +17,7 @@ from finssim.vehicles.check import check_vehicle
 from finssim.vehicles.defaults import DEFAULTS
 from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
 from finssim.vehicles.loader import catalogue, load_vehicle
+from finssim.vehicles.terms import TERMS
 from finssim.vehicles.vehicle import AXES, ORIGINS, Vehicle
 
 if TYPE_CHECKING:
@@ -74,6 +75,8 @@ def print_vehicle(vehicle: Vehicle, console: Console, picture: Path | None = Non
     console.print(_body(vehicle))
     for name, chosen in vehicle.hydrodynamics.items():
         console.print(_hydrodynamics(vehicle, name, chosen))
+        if isinstance(chosen, HydrodynamicSet) and chosen.terms:
+            console.print(_terms(vehicle, name, chosen))
     console.print(_thrusters(vehicle))
     console.print(_performance(vehicle))
     console.print(_sources(vehicle))
@@ -140,7 +143,6 @@ def _hydrodynamics(vehicle: Vehicle, name: str, chosen: HydrodynamicSet | MeshSe
         ("M_A", "added_mass"),
         ("D1", "linear_damping"),
         ("D2", "quadratic_damping"),
-        ("Du", "surge_damping"),
     ):
         matrix = getattr(chosen, key)
         if not np.any(matrix):
@@ -151,6 +153,23 @@ def _hydrodynamics(vehicle: Vehicle, name: str, chosen: HydrodynamicSet | MeshSe
             label + (" (full)" if full else ""),
             *(f"{value:.6g}{mark}" for value, mark in zip(np.diag(matrix), marks, strict=True)),
         )
+    return table
+
+
+def _terms(vehicle: Vehicle, name: str, chosen: HydrodynamicSet) -> Table:
+    table = _table(f"Terms: {name}", "", "value", "unit")
+    for key, value in chosen.terms.items():
+        units = iter(TERMS[key].units.values())
+        for path, number in TERMS[key].numbers(value).items():
+            full = f"hydrodynamics.{name}.{path}"
+            rows = np.atleast_2d(number)
+            for i, row in enumerate(rows):
+                given = any(
+                    f"{full}.".startswith(f"{key}.") or key.startswith(f"{full}.")
+                    for key in vehicle.provenance
+                )
+                marks = _mark(vehicle, f"{full}.{i}" if len(rows) > 1 else full) if given else ""
+                table.add_row(path if i == 0 else "", _numbers(row) + marks, next(units) if i == 0 else "")
     return table
 
 

@@ -91,6 +91,9 @@ def range_factors(fit: Fit, vehicle: Vehicle) -> dict[str, Factor]:
             if matrix[i, i] != 0.0:  # a factor on nothing is nothing
                 path = f"hydrodynamics.calibrated.{family}.{i}.{i}"
                 factors[f"{family}.{axis}"] = _factor(path, fit, vehicle)
+    for path in chosen.term_scalars:
+        if chosen.term_parameters[path] != 0.0:
+            factors[path] = _factor(f"hydrodynamics.calibrated.{path}", fit, vehicle)
     excess = fit.estimates.get("buoyancy_excess")
     if excess is not None and excess.identifiable:
         low, high = ((vehicle.weight + x) / (vehicle.weight + excess.estimate) for x in excess.ci95)
@@ -154,7 +157,13 @@ def _text(fit: Fit, vehicle: Vehicle) -> str:
             axis: factors[f"{family}.{axis}"] for axis in AXES if f"{family}.{axis}" in factors
         }
         lines += _mapping(family, "axes", rows)
-    for key in ("volume", "time_constant", "delay"):
+    of_terms = [
+        path.split(".") for path in vehicle.hydrodynamic_set("calibrated").term_scalars if path in factors
+    ]
+    for term in dict.fromkeys(path[0] for path in of_terms if len(path) > 1):
+        own = {path[1]: factors[".".join(path)] for path in of_terms if path[0] == term}
+        lines += _mapping(term, None, own)
+    for key in ("volume", "time_constant", "delay", *(path[0] for path in of_terms if len(path) == 1)):
         if key in factors:
             lines.append(f"{key}: {factors[key].text()}  # {factors[key].why}")
     thrust = {key: factors[f"thrust.{key}"] for key in ("all", "each") if f"thrust.{key}" in factors}

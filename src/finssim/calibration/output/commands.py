@@ -121,7 +121,10 @@ def calibrate_hydrodynamics(
     """
     further = tuple(name for name in (word.strip() for word in estimate.split(",")) if name)
     if method == "regression":
-        for given, option in ((full, "--full"), (further, "--estimate"), (horizon is not None, "--horizon")):
+        from finssim.calibration.simulation.fit import ESTIMATE
+
+        words = [name for name in further if name in ESTIMATE]
+        for given, option in ((full, "--full"), (words, "--estimate"), (horizon is not None, "--horizon")):
             if given:
                 raise CalibrationError(
                     f"{option} {ONLY_SIMULATION}: a regression looks at one axis at a time"

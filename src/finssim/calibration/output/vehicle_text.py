@@ -11,6 +11,7 @@ from typing import Any
 
 from finssim.calibration.output.origins import Path, leaves
 from finssim.vehicles import Provenance
+from finssim.vehicles.terms import TERMS
 
 __all__ = ["vehicle_text"]
 
@@ -103,7 +104,7 @@ def _lines(
         for inner, value in node.items():
             yield from _lines(inner, value, (*path, str(inner)), common, origins, pad + "  ")
         return
-    unit = f"  # [{UNITS[path[-1]]}]" if path[-1] in UNITS else ""
+    unit = f"  # [{_unit(path)}]" if _unit(path) else ""
     if isinstance(node, list) and not _uniform(node, path, origins):
         yield head + unit
         for i, item in enumerate(node):
@@ -123,6 +124,12 @@ def _lines(
             yield f"{inner}  - {_flow(row, (*path, str(i)), common, origins)}"
     else:
         yield flow + unit
+
+
+def _unit(path: Path) -> str:
+    """Of the value at a path; empty where there is none to write."""
+    term = TERMS.get(path[2]) if path[0] == "hydrodynamics" and len(path) > 2 else None
+    return UNITS.get(path[-1], "") if term is None else term.units.get(path[-1], "")
 
 
 def _item(

@@ -173,6 +173,8 @@ def axis_data(
         rows=tuple(r for _, r, _ in out),
         kernels=tuple(k for _, _, k in out),
         tilted=tilted,
+        estimated=plants[0].estimated,
+        lowest=plants[0].lowest,
     ), said
 
 

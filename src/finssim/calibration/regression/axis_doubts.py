@@ -71,7 +71,7 @@ def damping_known(data: AxisData, chosen: Selection, before: tuple[float, float]
     dof = fit.covariance.dof[np.isin(np.flatnonzero(fit.terms), (D1, D2))]
     quantile = float(t.ppf(0.975, min(float(np.min(dof, initial=np.inf)), 1e6)))
     for speed in np.percentile(_moving(data, chosen), [50.0, 95.0]):
-        weights = np.zeros(len(TERMS))
+        weights = np.zeros(len(fit.terms))
         weights[[D1, D2]] = speed, speed**2
         force, w = float(weights @ fit.theta), weights[fit.terms]
         with np.errstate(invalid="ignore"):

@@ -22,7 +22,7 @@ __all__ = ["TERMS", "AxisData", "AxisFit", "fit_axis", "informative"]
 Array = NDArray[np.float64]
 
 TERMS = ("m_eff", "d1", "d2", "bias", "delay", "smoothing", "k")
-"""Names of the columns; see the module for `delay` [s] and `smoothing` [s²]."""
+"""Names of the first columns; see the module for `delay` [s] and `smoothing` [s²]."""
 
 FREE_ROUNDS = 6
 """After so many the variance of trial offsets stays, so that the rounds settle."""
@@ -49,6 +49,19 @@ class AxisData:
     inertia: float | None = None
     """Effective inertia where it is known [kg, kg m²]; fitted if None."""
 
+    estimated: tuple[str, ...] = ()
+    """Paths of the parameters of the vehicle's terms that are fitted too."""
+    lowest: tuple[float, ...] = ()
+    """Their bounds."""
+
+    @property
+    def terms(self) -> NDArray[np.bool_]:
+        """Which of `TERMS` and of `estimated` the rows can tell: a stiffness where there is one, terms that act."""
+        largest = np.max(
+            [np.abs(rows.X[:, len(TERMS) :]).max(axis=0, initial=0.0) for rows in self.rows], axis=0
+        )
+        return np.append([name != "k" or self.restoring for name in TERMS], largest > 0.0)
+
     @property
     def restoring(self) -> bool:
         """Roll and pitch have a stiffness."""
@@ -60,13 +73,13 @@ class AxisFit:
     """Result for one choice of terms."""
 
     terms: NDArray[np.bool_]
-    """Which of `TERMS` are fitted, (7,)."""
+    """Which of `TERMS`, and then of `AxisData.estimated`, are fitted, (7 + k,)."""
     theta: Array
-    """Zero where not fitted, but for a known inertia, (7,)."""
+    """Zero where not fitted, but for a known inertia, (7 + k,)."""
     free: Array
-    """The same without bounds, (7,)."""
+    """The same without bounds, (7 + k,)."""
     active: NDArray[np.bool_]
-    """Terms that a bound holds, (7,)."""
+    """Terms that a bound holds, (7 + k,)."""
     evidence: Evidence
     """Of the fitted terms."""
     covariance: Covariance
@@ -91,11 +104,10 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
 
     Args:
         data: The axis.
-        terms: Which of `TERMS` to fit, (7,); `k` only on roll and pitch.
+        terms: Which of `TERMS` and `data.estimated` to fit, (7 + k,); of `data.terms`.
         iterations: Rounds of instruments and weights.
     """
-    p = 7 if data.restoring else 6
-    kept = terms[:p]
+    p, kept = len(terms), terms
     X = np.concatenate([rows.X for rows in data.rows])
     known = np.zeros(p)
     if data.inertia is not None:
@@ -133,7 +145,7 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
         sums = moments(X[inside], Z[inside], y[inside], weight, group).of(kept)
     free = np.zeros(p)
     free[kept], N_g, scores, rss = solve(sums, ratio)
-    lower = np.where(np.isin(np.arange(p), (3, 4, 5)), -np.inf, 0.0)[kept]
+    lower = np.array([0.0, 0.0, 0.0, -np.inf, -np.inf, -np.inf, 0.0, *data.lowest])[kept]
     held, active_kept = bounded(N_g.sum(axis=0) + 1e-12 * np.eye(kept.sum()), free[kept], lower)
     theta, active = np.zeros(p), np.zeros(p, bool)
     theta[kept], active[kept] = held, active_kept
@@ -144,14 +156,14 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
         cut = moments(X[inside], Z[inside], y[inside], weight, blocks).of(kept)
         _, N_g, scores, _ = solve(cut)
         unit = "blocks"
-    names = tuple(name for name, on in zip(TERMS[:p], kept, strict=True) if on)
+    names = tuple(name for name, on in zip((*TERMS, *data.estimated), kept, strict=True) if on)
     found = evidence(names, N_g, scores, variance, unit)
     ends = np.cumsum([len(rows.y) for rows in data.rows])[:-1]
     return AxisFit(
-        terms=np.pad(kept, (0, 7 - p)),
-        theta=np.pad(theta + known, (0, 7 - p)),
-        free=np.pad(free + known, (0, 7 - p)),
-        active=np.pad(active, (0, 7 - p)),
+        terms=kept,
+        theta=theta + known,
+        free=free + known,
+        active=active,
         evidence=found,
         covariance=trial_covariance(found),
         offset_ratio=ratio,
@@ -197,6 +209,7 @@ def _simulate(data: AxisData, theta: Array, pieces: list[list[Piece]]) -> tuple[
     for found, own in zip(data.signals, pieces, strict=True):
         left = np.where(np.isfinite(found.left[:, data.axis]), found.left[:, data.axis], 0.0)
         wrench = np.interp(found.t - delay, found.t, left) - b * _offset(found, data.axis)
+        wrench = wrench + found.unit[:, data.axis] @ theta[len(TERMS) :]
         places.append((slice(len(runs), len(runs) + len(own)), own, len(found.t)))
         runs += [piece.run(wrench) for piece in own]
     lines = simulate_axis(np.array([m, max(d1, 0.0), max(d2, 0.0), k]), runs)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.engine.plant_arrays import twist_shift
+from finssim.physics.terms.composed import parameter_row, term_wrenches
 from finssim.vehicles import HydrodynamicSet, Vehicle
+from finssim.vehicles.terms import TERMS, Term
 
-__all__ = ["Matrices", "known_wrench", "matrices"]
+__all__ = ["Matrices", "known_wrench", "matrices", "unit_wrenches"]
 
 Array = NDArray[np.float64]
 
@@ -26,7 +30,16 @@ class Matrices:
     M_A: Array
     D1: Array
     D2: Array
-    Du: Array
+    terms: tuple[Term, ...] = ()
+    """Further terms of the wrench."""
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    """Of these, by path."""
+    estimated: tuple[str, ...] = ()
+    """Paths of the parameters among these that are fitted; zero in `parameters`."""
+    lowest: tuple[float, ...] = ()
+    """Bounds of these."""
+    density: float
+    """Of the water [kg/m³]."""
     excess: float
     """Buoyancy less weight, submerged [N]."""
     arm: Array
@@ -55,16 +68,23 @@ class Matrices:
         return ~(height > -self.half_height)
 
 
-def matrices(vehicle: Vehicle, density: float | None = None, hydrodynamics: str = "calibrated") -> Matrices:
+def matrices(
+    vehicle: Vehicle,
+    density: float | None = None,
+    hydrodynamics: str = "calibrated",
+    *,
+    estimate: Sequence[str] = (),
+) -> Matrices:
     """Of a vehicle file.
 
     Args:
         vehicle: The vehicle.
         density: Of the water [kg/m³]; the file's where not given.
         hydrodynamics: Which set.
+        estimate: Parameters of its terms that are to be fitted.
 
     Raises:
-        CalibrationError: The set has no coefficients to calibrate.
+        CalibrationError: The set has no coefficients to calibrate, or no such parameter.
     """
     chosen = vehicle.hydrodynamics.get(hydrodynamics)
     if not isinstance(chosen, HydrodynamicSet):
@@ -72,6 +92,12 @@ def matrices(vehicle: Vehicle, density: float | None = None, hydrodynamics: str 
             f"{vehicle.name}: no coefficients in hydrodynamics.{hydrodynamics}, expected a set with linear_damping and "
             "quadratic_damping: add one, zeros will do, for the fit to fill"
         )
+    for path in estimate:
+        if path not in chosen.term_scalars:
+            known = ", ".join(chosen.term_scalars) or "its vehicle file has no terms"
+            raise CalibrationError(
+                f"{vehicle.name}: cannot estimate '{path}' by regression; available: {known}"
+            )
     r = np.asarray(chosen.reference_point, float)
     H = twist_shift(r.tolist())
     back = np.linalg.inv(H)
@@ -83,7 +109,11 @@ def matrices(vehicle: Vehicle, density: float | None = None, hydrodynamics: str 
         M_A=np.array(chosen.added_mass, float),
         D1=np.array(chosen.linear_damping, float),
         D2=np.array(chosen.quadratic_damping, float),
-        Du=np.array(chosen.surge_damping, float),
+        terms=tuple(TERMS[name] for name in sorted(chosen.terms)),
+        parameters=chosen.term_parameters | dict.fromkeys(estimate, 0.0),
+        estimated=tuple(estimate),
+        lowest=tuple(chosen.term_scalars[path][0] for path in estimate),
+        density=vehicle.water.density if density is None else density,
         excess=buoyancy - vehicle.weight,
         arm=buoyancy * (body.center_of_buoyancy - r) - vehicle.weight * (body.center_of_gravity - r),
         centre_of_buoyancy=np.asarray(body.center_of_buoyancy, float),
@@ -91,16 +121,17 @@ def matrices(vehicle: Vehicle, density: float | None = None, hydrodynamics: str 
     )
 
 
-def known_wrench(nu: Array, up: Array, rate: float, plant: Matrices) -> Array:
+def known_wrench(nu: Array, up: Array, depth: Array, rate: float, plant: Matrices) -> Array:
     """What has to be taken off the applied wrench before an axis' own model is fitted.
 
-    C(nu) nu + offdiag(M) nu_dot + offdiag(D1) nu + offdiag(D2) |nu| nu + Du |u| nu - (hydrostatics that are not fitted)
+    C(nu) nu + offdiag(M) nu_dot + offdiag(D1) nu + offdiag(D2) |nu| nu - (terms and hydrostatics that are not fitted)
 
     Fitted, hence not taken off, are the buoyancy excess in heave and the restoring moments of roll and pitch.
 
     Args:
         nu: About the reference point, zero where unknown, (n, 6).
         up: World z in the body frame, (n, 3).
+        depth: Of the body origin [m], zero where unknown, (n,).
         rate: [Hz]
         plant: The vehicle.
 
@@ -117,7 +148,9 @@ def known_wrench(nu: Array, up: Array, rate: float, plant: Matrices) -> Array:
     if (M * off).any() and len(nu) > 1:
         known += np.gradient(smooth, 1.0 / rate, axis=0) @ (M * off).T
     known += smooth @ (plant.D1 * off).T + (np.abs(smooth) * smooth) @ (plant.D2 * off).T
-    known += np.abs(smooth[:, :1]) * (smooth @ plant.Du.T)
+    if plant.terms:
+        row = parameter_row(plant.terms, plant.parameters)
+        known -= term_wrenches(plant.terms, [row], smooth, up, depth, plant.density)[:, 0]
 
     known[:, :2] -= plant.excess * up[:, :2]
     x, y, _ = plant.arm
@@ -125,6 +158,31 @@ def known_wrench(nu: Array, up: Array, rate: float, plant: Matrices) -> Array:
     known[:, 4] += x * up[:, 2]
     known[:, 5] -= x * up[:, 1] - y * up[:, 0]
     return np.asarray(known)
+
+
+def unit_wrenches(nu: Array, up: Array, depth: Array, plant: Matrices) -> Array:
+    """What the estimated parameters of terms add to the wrench, each by its unit; arguments as for `known_wrench`.
+
+    Returns:
+        (n, 6, k) [N, N m by the units of the parameters]
+
+    Raises:
+        CalibrationError: The wrench is not linear in one of them.
+    """
+    if not plant.estimated:
+        return np.zeros((len(nu), 6, 0))
+    values = [{}, *({path: x} for x in (1.0, 2.0) for path in plant.estimated)]
+    rows = [parameter_row(plant.terms, {**plant.parameters, **own}) for own in values]
+    tau = term_wrenches(plant.terms, rows, _smooth(nu), up, depth, plant.density)
+    once, twice = np.split(tau[:, 1:] - tau[:, :1], 2, axis=1)
+    for j, path in enumerate(plant.estimated):
+        if np.abs(twice[:, j] - 2.0 * once[:, j]).max(initial=0.0) > 1e-3 * np.abs(once[:, j]).max(
+            initial=0.0
+        ):
+            raise CalibrationError(
+                f"the wrench is not proportional to {path}, as a regression needs it: give --method simulation"
+            )
+    return np.asarray(np.swapaxes(once, 1, 2))
 
 
 def _smooth(nu: Array) -> Array:

@@ -14,7 +14,13 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Correlation, Estimate, Fit
 from finssim.calibration.regression.axis_data import Prepared, axis_data, excited, later, prepare
 from finssim.calibration.regression.axis_doubts import LARGE_DELAY, late_velocity, quality, worthless
-from finssim.calibration.regression.axis_estimates import AxisResult, axis_result, outside, trim
+from finssim.calibration.regression.axis_estimates import (
+    AxisResult,
+    axis_result,
+    outside,
+    term_estimate,
+    trim,
+)
 from finssim.calibration.regression.axis_fit import TERMS, AxisData
 from finssim.calibration.regression.dive_and_coast import buoyancy_estimate
 from finssim.calibration.regression.plant_terms import Matrices, matrices
@@ -46,6 +52,7 @@ def regress(
     *,
     axes: Sequence[str] | None = None,
     damping: str = "auto",
+    estimate: Sequence[str] = (),
     known: Mapping[str, float] | None = None,
     seed: int = 0,
 ) -> Fit:
@@ -61,11 +68,14 @@ def regress(
         vehicle: Gives the rigid body, what is known of couplings, and where the numbers go.
         axes: Axes to fit; all that are excited if None.
         damping: `auto`, `linear`, `quadratic` or `both`.
+        estimate: Parameters of the vehicle's terms to fit too, such as `lift.coefficient`, in which their wrench is
+            linear; each from all axes on which it acts.
         known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²].
         seed: Kept with the fit; nothing here is random.
 
     Raises:
-        CalibrationError: No trial can be used, one is held out, an axis or damping is unknown, or two share a name.
+        CalibrationError: No trial can be used, one is held out, an axis, damping or parameter is unknown, or two share
+            a name.
     """
     wanted = _wanted(axes)
     if damping not in DAMPING:
@@ -73,7 +83,9 @@ def regress(
     require_fittable(trials)
     driven = [trial for trial in trials if not trial.header.passive]
     prepared, warnings = prepare(driven, vehicle)
-    chosen, plant, more = _fit_axes(prepared, vehicle, wanted, axes is not None, damping, known or {})
+    chosen, plant, more = _fit_axes(
+        prepared, vehicle, wanted, axes is not None, damping, known or {}, estimate
+    )
     warnings += more
     file = matrices(vehicle)
     estimates: dict[str, Estimate] = {}
@@ -90,13 +102,19 @@ def regress(
                 buoyancy = replace(buoyancy, identifiable=False, note=result.worthless)
             estimates[buoyancy.name] = buoyancy
             warnings += notes
+    told = {i: pair for i, pair in chosen.items() if not results[AXES[i]].worthless}
+    for path in estimate:
+        found, notes = term_estimate(path, told)
+        warnings += notes
+        if found is not None:
+            estimates[path] = found
+            changes |= {str(found.path): found.estimate} if found.identifiable else {}
     used = {s.name for data, _ in chosen.values() for s in data.signals}
     _hydrostatics(estimates, changes, vehicle, plant, warnings)
     figures = {axis: result.quality for axis, result in results.items()}
     curves = [curve for result in results.values() for curve in result.curves]
-    told = [axis for axis, result in results.items() if not result.worthless]
-    warnings += late_velocity(figures, explained=told)
-    quiet = _passive(trials, vehicle, [i for i in wanted if AXES[i] not in told], known or {})
+    warnings += late_velocity(figures, explained=[AXES[i] for i in told])
+    quiet = _passive(trials, vehicle, [i for i in wanted if i not in told], known or {})
     if quiet is not None:
         estimates, changes, figures = (
             estimates | quiet.estimates,
@@ -127,6 +145,7 @@ def regress(
             "damping": damping,
             "axes": [AXES[i] for i in chosen],
             **({"fix": {f"{axis}.m": m for axis, m in known.items()}} if known else {}),
+            **({"estimate": list(estimate)} if estimate else {}),
             "seed": seed,
         },
     )
@@ -144,10 +163,11 @@ def _fit_axes(
     asked: bool,
     damping: str,
     known: Mapping[str, float],
+    estimate: Sequence[str],
 ) -> tuple[dict[int, tuple[AxisData, Selection]], Matrices, list[str]]:
     """Data and model of every axis that can be fitted; couplings between axes use the estimates of the round before."""
-    plant, warnings = matrices(vehicle), list[str]()
-    waters = [matrices(vehicle, one.trial.header.water.density) for one in prepared]
+    plant, warnings = matrices(vehicle, estimate=estimate), list[str]()
+    waters = [matrices(vehicle, one.trial.header.water.density, estimate=estimate) for one in prepared]
     active = excited(prepared, vehicle) if prepared else np.zeros((0, 6), bool)
     fitted = {i for i in wanted if active[:, i].any()}
     chosen: dict[int, tuple[AxisData, Selection]] = {}
@@ -232,9 +252,9 @@ def _hydrostatics(
 def _correlation(chosen: dict[int, tuple[AxisData, Selection]]) -> tuple[Correlation | None, list[str]]:
     """Of all axes together, block by block, with a sentence for every trade-off."""
     names, blocks, sentences = list[str](), list[Array](), list[str]()
-    for i, (_, selection) in chosen.items():
-        fit = selection.fit
-        own = [f"{AXES[i]}.{name}" for name, on in zip(TERMS, fit.terms, strict=True) if on]
+    for i, (data, selection) in chosen.items():
+        fit, terms = selection.fit, (*TERMS, *data.estimated)
+        own = [f"{AXES[i]}.{name}" for name, on in zip(terms, fit.terms, strict=True) if on]
         found, said = degeneracy(own, fit.covariance.local, fit.free[fit.terms])
         names += own
         blocks.append(found.matrix)

@@ -5,10 +5,11 @@ vanishes at its ends, and integration by parts moves the derivative onto it (the
 both sides):
 
     ∫ phi tau = -m ∫ phi_dot nu + d1 ∫ phi nu + d2 ∫ phi |nu| nu + b ∫ phi (+ k ∫ phi sin eta)
-                + c1 ∫ phi tau_dot - c2 ∫ phi tau_dot_dot
+                + c1 ∫ phi tau_dot - c2 ∫ phi tau_dot_dot (- Σ θ_j ∫ phi tau_j)
 
 The last two allow for a motion that was recorded late by c1 [s] and smoothed by a filter of variance 2 c2 [s²]: to
-second order, that filter may act on tau instead. Equations hold about the reference point of the hydrodynamic
+second order, that filter may act on tau instead. tau_j are the wrenches of the vehicle's further terms for units of the
+parameters θ_j that are fitted. Equations hold about the reference point of the hydrodynamic
 coefficients; what the vehicle file knows (Coriolis terms, couplings off the diagonal, gravity and buoyancy but for the
 parts that are fitted) is moved to the left side.
 """
@@ -21,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.motion.signals import Motion
-from finssim.calibration.regression.plant_terms import Matrices, known_wrench
+from finssim.calibration.regression.plant_terms import Matrices, known_wrench, unit_wrenches
 from finssim.calibration.regression.robust import local_outliers
 
 __all__ = ["Kernel", "Rows", "Signals", "axis_rows", "kernel", "simulated_columns", "signals"]
@@ -95,6 +96,8 @@ class Signals:
     """Within the phases that are fitted, (n,)."""
     unknown: tuple[int, ...]
     """Axes whose velocity is unknown; their couplings are taken as zero."""
+    unit: Array
+    """Wrench of the vehicle's terms for a unit of each parameter that is fitted, (n, 6, k)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +106,8 @@ class Rows:
 
     name: str
     X: Array
-    """Columns nu_dot, nu, |nu| nu, 1, tau_dot, -tau_dot_dot and, on roll and pitch, sin eta, (n, 6 or 7)."""
+    """Columns nu_dot, nu, |nu| nu, 1, tau_dot, -tau_dot_dot, sin eta (zero but on roll and pitch), and -tau_j of the
+    parameters of terms, (n, 7 + k)."""
     y: Array
     """(n,)"""
     at: NDArray[np.int64]
@@ -147,9 +151,12 @@ def signals(
     shifted = filled @ matrices.H.T
     nu = np.where(known, shifted, np.nan)
     tau = motion.tau @ np.linalg.inv(matrices.H)  # wrench moves with the inverse transpose
-    left = tau - known_wrench(
-        np.where(np.isfinite(nu), nu, 0.0), np.where(np.isfinite(up), up, [0, 0, 1.0]), motion.rate, matrices
+    state = (
+        np.where(np.isfinite(nu), nu, 0.0),
+        np.where(np.isfinite(up), up, [0, 0, 1.0]),
+        np.nan_to_num(-motion.position[:, 2]),
     )
+    left = tau - known_wrench(*state, motion.rate, matrices)
     phase = motion.phase
     named = bool(np.isin(phase, ["excitation", "coast"]).any())
     return Signals(
@@ -163,6 +170,7 @@ def signals(
         usable=motion.valid & matrices.submerged(motion.position, up),
         wanted=np.isin(phase, ["excitation", "coast"]) if named else np.ones(n, bool),
         unknown=tuple(int(i) for i in np.flatnonzero(~known)),
+        unit=unit_wrenches(*state, matrices),
     )
 
 
@@ -194,8 +202,9 @@ def axis_rows(found: Signals, axis: int, kernels: Kernel) -> Rows | None:
         _, constant = _filtered(offset[cut, None], kernels)
         _, first = _filtered(left[cut, None], kernels, kernels.phi_dot)
         _, second = _filtered(left[cut, None], kernels, kernels.phi_dot_dot)
+        _, terms = _filtered(found.unit[cut, axis], kernels)
         moving = _columns(nu[cut], None if sine is None else sine[cut], kernels)
-        X.append(np.concatenate([moving[:, :3], constant, first, -second, moving[:, 3:]], axis=1))
+        X.append(np.concatenate([moving[:, :3], constant, first, -second, moving[:, 3:], -terms], axis=1))
         y.append(rhs[:, 0])
         at.append(begin + centre)
     return Rows(
@@ -214,17 +223,17 @@ def simulated_columns(nu: Array, sine: Array | None, rows: Rows, kernels: Kernel
     moving = np.concatenate(
         [_columns(nu[b:e], None if sine is None else sine[b:e], kernels) for b, e in rows.spans]
     )
-    return np.concatenate([moving[:, :3], rows.X[:, 3:6], moving[:, 3:]], axis=1)
+    return np.concatenate([moving[:, :3], rows.X[:, 3:6], moving[:, 3:], rows.X[:, 7:]], axis=1)
 
 
 def _columns(nu: Array, sine: Array | None, kernels: Kernel) -> Array:
-    """[nu_dot, nu, |nu| nu, sine] under phi, (rows, 3 or 4)."""
+    """[nu_dot, nu, |nu| nu, sine] under phi, (rows, 4)."""
     if len(kernels.short) > 1:
         weight = np.convolve(np.ones(len(nu)), kernels.short, "same")
         smooth = np.convolve(nu, kernels.short, "same") / weight
     else:
         smooth = nu
-    signals = [nu, np.abs(smooth) * smooth] + ([] if sine is None else [sine])
+    signals = [nu, np.abs(smooth) * smooth, np.zeros(len(nu)) if sine is None else sine]
     _, out = _filtered(np.stack(signals, axis=1), kernels)
     _, first = _filtered(nu[:, None], kernels, kernels.phi_dot)
     return np.concatenate([first, out], axis=1)

@@ -57,8 +57,7 @@ def select(data: AxisData, damping: str = "auto") -> Selection:
     """
     if damping not in DAMPING:
         raise CalibrationError(f"unknown damping '{damping}'; available: {', '.join(DAMPING)}")
-    terms = np.ones(len(TERMS), bool)
-    terms[TERMS.index("k")] = data.restoring
+    terms = data.terms
     if damping in ("linear", "quadratic"):
         terms[D2 if damping == "linear" else D1] = False
         smoothed = fit_axis(data, terms)
@@ -146,7 +145,7 @@ def _p_value(fit: AxisFit, term: int) -> float:
 
 def _interval(fit: AxisFit) -> Array:
     """About the free estimates, and where a bound moved them about the held ones too."""
-    out = np.full((len(TERMS), 2), np.nan)
+    out = np.full((len(fit.terms), 2), np.nan)
     free, held = (intervals(x[fit.terms], fit.covariance) for x in (fit.free, fit.theta))
     out[fit.terms, 0] = np.minimum(free[:, 0], held[:, 0])
     out[fit.terms, 1] = np.maximum(free[:, 1], held[:, 1])

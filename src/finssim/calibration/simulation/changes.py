@@ -83,6 +83,9 @@ def changes(
     for name, path in (("thrust_lag", "time_constant"), ("thrust_delay", "delay")):
         if name in found and found[name].identifiable:
             out[f"thrusters.*.{path}"] = max(found[name].estimate, 1e-4 if path == "time_constant" else 0.0)
+    for path in p.terms:
+        if found[path].identifiable:
+            out[f"{base}.{path}"] = found[path].estimate
     if "thrust_scale" in found and found["thrust_scale"].identifiable and scaled:
         scale = found["thrust_scale"].estimate
         for name, thruster in p.vehicle.thrusters.items():

@@ -12,6 +12,7 @@ from finssim.calibration.fit import Estimate
 from finssim.calibration.regression.axis_estimates import BIAS_NOTE, CERTAIN
 from finssim.calibration.simulation.evidence import Findings
 from finssim.calibration.simulation.parameters import Parameters
+from finssim.vehicles.terms import unit_of
 
 __all__ = ["Quantity", "estimates", "quantities"]
 
@@ -72,6 +73,7 @@ def quantities(p: Parameters, axes: Sequence[str]) -> list[Quantity]:
             "current.y",
         ):
             out.append(Quantity(c.name, c.unit, paths.get(c.name), c.name))
+    out += [Quantity(path, unit_of(path), f"{base}.{path}", path) for path in p.terms]
     if p.coupled:
         for name, matrix, i, j in p.coupled.entries():
             out.append(Quantity(name, _unit(matrix, i, j), f"{base}.{matrix}.{i}.{j}", "coupling"))

@@ -15,7 +15,7 @@ from finssim.calibration.simulation.segments import Streams, streams
 from finssim.calibration.simulation.stages import Stages
 from finssim.calibration.trials.fittable import require_axes, require_fittable
 from finssim.calibration.trials.trial import Trial
-from finssim.vehicles import AXES, Vehicle
+from finssim.vehicles import AXES, HydrodynamicSet, Vehicle
 
 __all__ = ["ESTIMATE", "fit_by_simulation"]
 
@@ -49,7 +49,8 @@ def fit_by_simulation(
         vehicle: Gives the rigid body, the motors and everything that is not fitted.
         axes: Axes to fit; those that the trials excite if None.
         full: Also couplings of these axes: symmetric added mass, full damping.
-        estimate: Words of `ESTIMATE`. Buoyancy comes with heave, stiffness with roll and pitch, a bias with the others.
+        estimate: Words of `ESTIMATE`, and parameters of the vehicle's terms, such as `lift.coefficient`. Buoyancy comes
+            with heave, stiffness with roll and pitch, a bias with the others.
         damping: `auto`, `linear`, `quadratic` or `both`.
         horizon: Length of the segments [s]; from the data if None.
         seed: Of the coarse search.
@@ -62,7 +63,7 @@ def fit_by_simulation(
     Raises:
         CalibrationError: No trial can be used, one is held out, or a word is unknown.
     """
-    _check(trials, axes, damping, estimate)
+    _check(trials, vehicle, axes, damping, estimate)
     prepared = [streams(trial, vehicle) for trial in trials]
     chosen, warnings = _axes(prepared, vehicle, axes)
     say = Clock(progress)
@@ -87,15 +88,24 @@ def fit_by_simulation(
 
 
 def _check(
-    trials: Sequence[Trial], axes: Sequence[str] | None, damping: str, estimate: Sequence[str]
+    trials: Sequence[Trial],
+    vehicle: Vehicle,
+    axes: Sequence[str] | None,
+    damping: str,
+    estimate: Sequence[str],
 ) -> None:
     require_fittable(trials)
     require_axes(axes)
     if damping not in DAMPING:
         raise CalibrationError(f"unknown damping '{damping}'; available: {', '.join(DAMPING)}")
+    chosen = vehicle.hydrodynamics.get("calibrated")
+    known = [*ESTIMATE, *(chosen.term_scalars if isinstance(chosen, HydrodynamicSet) else ())]
     for word in estimate:
-        if word not in ESTIMATE:
-            raise CalibrationError(f"cannot estimate '{word}'; available: {', '.join(ESTIMATE)}")
+        if word not in known:
+            raise CalibrationError(
+                f"cannot estimate '{word}'; available: {', '.join(known)}"
+                + ("; a term's parameter only where the vehicle file has the term" if "." in word else "")
+            )
 
 
 def _axes(

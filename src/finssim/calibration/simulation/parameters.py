@@ -12,18 +12,23 @@ from numpy.typing import NDArray
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.simulation.coupled import Coupled
 from finssim.engine.plant_arrays import twist_shift, vehicle_parameters
+from finssim.physics.terms.composed import parameter_row, term_wrenches
 from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
+from finssim.vehicles.terms import TERMS, unit_of
 
 __all__ = ["EXTRAS", "Coordinate", "Parameters", "Plants"]
 
 Array = NDArray[np.float64]
 
 EXTRAS = ("thrust_scale", "thrust_lag", "thrust_delay", "current", "buoyancy_excess", "k")
-"""What can be estimated besides the axes' own numbers."""
+"""What can be estimated besides the axes' own numbers and the parameters of the vehicle's terms."""
 
 MARGIN = 0.95
 """Part of the rigid-body inertia that a negative added mass may take away."""
+
+FELT, USUAL_SPEED = 0.02, 0.5
+"""Part of the weight, and speed on each axis [m/s, rad/s]."""
 
 LONGEST_DELAY = 1.0
 """[s]"""
@@ -61,6 +66,19 @@ class Plants:
     """[s], (W,)"""
 
 
+def term_coordinate(chosen: HydrodynamicSet, vehicle: Vehicle, path: str) -> Coordinate:
+    """A parameter of a term; a large change of it makes a force of `FELT` of the weight at `USUAL_SPEED`."""
+    terms = tuple(TERMS[name] for name in sorted(chosen.terms))
+    numbers = chosen.term_parameters
+    start = float(numbers[path])
+    rows = [parameter_row(terms, numbers | {path: x}) for x in (start, start + 1.0)]
+    nu = USUAL_SPEED * np.array([[1.0, 1.0, 1.0, 1.0, 1.0, 1.0]])
+    tau = term_wrenches(terms, rows, nu, [[0.0, 0.0, 1.0]], 1.0, vehicle.water.density)[0]
+    change = float(np.abs(tau[1] - tau[0]).max())
+    scale = max(abs(start), FELT * vehicle.weight / change if change > 0.0 else 1.0)
+    return Coordinate(path, unit_of(path), start, *chosen.term_scalars[path], scale)
+
+
 class Parameters:
     """The free numbers of a fit.
 
@@ -95,7 +113,7 @@ class Parameters:
             axes: Whose added mass and damping are free.
             damping: `linear`, `quadratic` or `both` by axis; what is left out is zero.
             full: Couple these axes: symmetric M_A, full D1 and D2.
-            extras: Of `EXTRAS`.
+            extras: Of `EXTRAS`, and parameters of the vehicle's terms, such as `lift.coefficient`.
             biases: Axes with a constant wrench b, about the set's reference point and on the side of the damping:
                 M nu_dot + D nu + b = tau.
             hydrodynamics: Which set of coefficients.
@@ -112,10 +130,11 @@ class Parameters:
             raise CalibrationError(
                 f"{vehicle.name}: hydrodynamics.{hydrodynamics} has no damping coefficients to fit: give another set"
             )
-        unknown = sorted(set(extras) - set(EXTRAS))
+        own = chosen.term_scalars
+        unknown = sorted(set(extras) - {*EXTRAS, *own})
         if unknown:
             raise CalibrationError(
-                f"cannot estimate '{unknown[0]}'; available: {', '.join(EXTRAS)} and the numbers of every axis"
+                f"cannot estimate '{unknown[0]}'; available: {', '.join([*EXTRAS, *own])} and the numbers of every axis"
             )
         self.vehicle, self.hydrodynamics, self.set = vehicle, hydrodynamics, chosen
         self.axes = tuple(a for a in AXES if a in axes)
@@ -123,6 +142,7 @@ class Parameters:
         self.unseen = tuple(a for a in self.imposed if a in unseen)
         self.index = np.array([AXES.index(a) for a in self.axes], int)
         self.damping, self.extras = damping, tuple(extras)
+        self.terms = tuple(path for path in own if path in extras)
         self.biases = tuple(a for a in AXES if a in biases)
         self.r_h = np.asarray(chosen.reference_point, float)
         self.H = twist_shift(self.r_h.tolist())
@@ -173,6 +193,7 @@ class Parameters:
         for extra in EXTRAS:
             if extra in self.extras:
                 out += table[extra]
+        out += [term_coordinate(self.set, w, path) for path in self.terms]
         for axis in self.biases:
             i = AXES.index(axis)
             size = 0.5 * float((self.M_RB + self.M_A)[i, i])
@@ -283,6 +304,8 @@ class Parameters:
             r_b = np.tile(np.asarray(body.center_of_buoyancy, float), (W, 1, 1))
             r_b[:, 0, 2] = self.buoyancy_height(self.value(x, "k"), volume)
             fields["r_b"] = r_b
+        for path in self.terms:
+            fields[path] = self.value(x, path)[:, None]
         if "thrust_scale" in self._at:
             fields["gain"] = np.repeat(self.value(x, "thrust_scale")[:, None, None], 8, axis=-1)
         bias = np.zeros((W, 1, 6))

@@ -27,7 +27,7 @@ from finssim.calibration.simulation.excited import (
     speeds,
 )
 from finssim.calibration.simulation.gauss_newton import Point, Solution, solve
-from finssim.calibration.simulation.parameters import EXTRAS, Parameters
+from finssim.calibration.simulation.parameters import Parameters
 from finssim.calibration.simulation.report import Clock, doubts, pictures, quality
 from finssim.calibration.simulation.segments import Segment, Streams, segments
 from finssim.calibration.simulation.shooting import Shooting
@@ -101,7 +101,7 @@ class Stages:
         self.shorter: dict[str, float] = {}
         self.used: list[Streams] = []
         self.segments: list[Segment] = []
-        self.extras = {word for word in estimate if word in EXTRAS}
+        self.extras = {word for word in estimate if word not in ("bias", "trial_bias")}
         if "heave" in axes:
             self.extras.add("buoyancy_excess")
         if {"roll", "pitch"} & set(axes):

@@ -4,7 +4,7 @@
 
 import warp as wp
 
-from finssim.physics.damping import twist_at, uncoupled_damping_wrench, wrench_from
+from finssim.physics.damping import damping_wrench, twist_at, wrench_from
 from finssim.physics.hydrodynamics.mesh import HullMesh
 from finssim.physics.hydrostatics import WaterWrench, hydrostatic_wrench, submerged_fraction, submersion_rate
 from finssim.physics.kinematics import point_velocity
@@ -60,7 +60,7 @@ def fossen_wrench(
         out.wet_rate = submersion_rate(height, plant[w, v].surface_half_height, climb)
     out.displaced = water.density * plant[w, v].volume * wet
     r_h = plant[w, v].r_h
-    tau_D = uncoupled_damping_wrench(twist_at(nu_r, r_h), plant[w, v].D1, plant[w, v].D2)
+    tau_D = damping_wrench(twist_at(nu_r, r_h), plant[w, v].D1, plant[w, v].D2)
     weight = plant[w, v].mass * water.gravity
     tau_H = hydrostatic_wrench(weight, out.displaced * water.gravity, plant[w, v].r_g, r_b, up)
     out.tau = tau_H + wet * wrench_from(tau_D, r_h)

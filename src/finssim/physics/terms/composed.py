@@ -1,0 +1,247 @@
+"""Adding terms, and the functions that evaluate all terms of a simulation, written from the terms that it has.
+
+A term's functions are called by the names of their arguments:
+
+    nu_r      velocity relative to the water at the reference point of the set, body frame [m/s, rad/s], vec6
+    up        world's z axis in the body frame, vec3
+    depth     of the body origin below the still surface [m]
+    density   of the water [kg/m³]
+
+and each of the term's parameters by its name: a float, vec3, vec6 or mat66. The engine takes a wrench in proportion to
+the part of the vehicle that is under water, and moves it from the reference point to the body origin.
+"""
+
+# mypy: disable-error-code="misc,no-any-return,no-untyped-call,no-untyped-def,untyped-decorator,valid-type"
+
+import hashlib
+import inspect
+import linecache
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, get_type_hints
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from finssim.physics.types import mat66, vec6
+from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
+from finssim.vehicles.terms import TERMS, Term
+
+__all__ = [
+    "Slot",
+    "TermError",
+    "add_term",
+    "composed",
+    "layout",
+    "parameter_row",
+    "row_length",
+    "term_wrenches",
+]
+
+STATE: dict[str, Any] = {"nu_r": vec6, "up": wp.vec3, "depth": float, "density": float}
+"""What a term's functions may take besides its parameters."""
+KINDS = {"float": float, "vec3": wp.vec3, "vec6": vec6, "mat66": mat66}
+"""What a parameter may be."""
+PIECE = 8
+"""A row of parameters is a multiple of so many numbers, which a processor reads at once."""
+
+
+class TermError(ValueError):
+    """A term that cannot be added."""
+
+
+def add_term(term: Term) -> Term:
+    """Make a term known: vehicle files may then have it, and simulations of vehicles that do evaluate it.
+
+    Args:
+        term: All of it; one file holds it.
+
+    Raises:
+        TermError: Its key is taken, its functions take what there is not, or a unit is missing.
+    """
+    if TERMS.get(term.name, term) is not term:
+        raise TermError(f"there is a term '{term.name}' already: give yours another name")
+    if term.name in {*HydrodynamicSet.model_fields, *MeshSet.model_fields} or not term.name.isidentifier():
+        raise TermError(f"a term cannot be named '{term.name}': give it a key that no hydrodynamic set has")
+    if set(term.units) != set(term.parameters):
+        raise TermError(
+            f"term '{term.name}' has units of {', '.join(term.units)}, expected of its parameters: "
+            f"{', '.join(term.parameters)}"
+        )
+    used = set()
+    for what, function in _functions(term).items():
+        for name, kind in _arguments(function).items():
+            expected = [STATE[name]] if name in STATE else list(KINDS.values())
+            if (name not in STATE and name not in term.parameters) or kind not in expected:
+                raise TermError(
+                    f"term '{term.name}': {what} takes '{name}: {getattr(kind, '__name__', kind)}', expected of: "
+                    f"{', '.join([*STATE, *term.parameters])}; parameters are {', '.join(KINDS)}"
+                )
+            used.add(name)
+    unused = [name for name in term.parameters if name not in used]
+    if unused:
+        raise TermError(f"term '{term.name}': no function takes the parameter '{unused[0]}'")
+    TERMS[term.name] = term
+    return term
+
+
+@cache  # not as a term is added: this starts Warp, which a vehicle file alone does not need
+def _require_zero(term: Term) -> None:
+    """Refuse a wrench of parameters that are zero: vehicles without a term are simulated so beside those with it."""
+    tau = term.wrench.func(**{name: _example(name, kind) for name, kind in _arguments(term.wrench).items()})
+    if any(float(x) != 0.0 for x in tau):
+        raise TermError(
+            f"term '{term.name}': its wrench is not zero where all its parameters are: make it so"
+        )
+
+
+def _functions(term: Term) -> dict[str, Any]:
+    return {what: f for what in ("wrench", "slope") if (f := getattr(term, what)) is not None}
+
+
+@cache
+def _arguments(function: Any) -> dict[str, Any]:
+    hints = get_type_hints(function.func)
+    return {name: hints.get(name) for name in inspect.signature(function.func).parameters}
+
+
+def _example(name: str, kind: Any) -> Any:
+    """A state in which forces act, and parameters that are zero."""
+    if name == "nu_r":
+        return vec6(0.7, -0.4, 0.5, 0.3, -0.6, 0.2)
+    if name == "up":
+        return wp.vec3(0.6, 0.0, 0.8)
+    return 3.0 if name in STATE else kind()
+
+
+@dataclass(frozen=True)
+class Slot:
+    """A parameter in a row of the array that holds those of all terms of a simulation."""
+
+    term: Term
+    name: str
+    path: str
+    kind: Any
+    first: int
+
+    @property
+    def size(self) -> int:
+        """Numbers in it."""
+        return 1 if self.kind is float else int(np.prod(self.kind._shape_))
+
+
+@cache
+def layout(terms: tuple[Term, ...]) -> tuple[Slot, ...]:
+    """Where the parameters of some terms stand in a row."""
+    slots, first = [], 0
+    for term in terms:
+        kinds = {name: kind for f in _functions(term).values() for name, kind in _arguments(f).items()}
+        for name, path in term.parameters.items():
+            slots.append(Slot(term, name, path, kinds[name], first))
+            first += slots[-1].size
+    return tuple(slots)
+
+
+def row_length(terms: tuple[Term, ...]) -> int:
+    """Numbers in a row, a multiple of `PIECE`."""
+    return PIECE * max(1, -(-sum(slot.size for slot in layout(terms)) // PIECE))
+
+
+def parameter_row(terms: tuple[Term, ...], numbers: Mapping[str, Any]) -> NDArray[np.float64]:
+    """The row of parameters by path, zero where one is not given, (`row_length`,)."""
+    row = np.zeros(row_length(terms))
+    for slot in layout(terms):
+        row[slot.first : slot.first + slot.size] = np.ravel(numbers.get(slot.path, 0.0))
+    return row
+
+
+@cache
+def composed(terms: tuple[Term, ...], what: str) -> Any:
+    """Sum of what the terms give, as a `wp.func` of (x, w, v, nu_r, up, depth, density) -> vec6.
+
+    Args:
+        terms: The terms, in the order of their rows.
+        what: `wrench` or `slope`.
+
+    Returns:
+        None where no term gives it. x holds the parameters, (worlds, vehicles, `row_length`).
+    """
+    space: dict[str, Any] = {"wp": wp, "vec6": vec6, "mat66": mat66, "vec3": wp.vec3}
+    calls = []
+    for term in terms:
+        _require_zero(term)
+        function = _functions(term).get(what)
+        if function is None:
+            continue
+        slots = {slot.name: slot for slot in layout(terms) if slot.term is term}
+        taken = [name if name in STATE else _read(slots[name]) for name in _arguments(function)]
+        space[f"t_{term.name}"] = function
+        calls.append(f"t_{term.name}({', '.join(taken)})")
+    if not calls:
+        return None
+    head = "x: wp.array3d(dtype=float), w: int, v: int, nu_r: vec6, up: wp.vec3, depth: float, density: float"
+    text = f"def added_{what}({head}):\n    return {' + '.join(calls)}\n"
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
+    place = f"<{what} of {', '.join(term.name for term in terms)}, {digest}>"
+    linecache.cache[place] = (len(text), None, text.splitlines(keepends=True), place)  # Warp reads the source
+    space["__name__"] = f"{__name__}_{digest}"
+    exec(compile(text, place, "exec"), space)
+    return wp.func(space[f"added_{what}"], module=wp.get_module(space["__name__"]))
+
+
+def _read(slot: Slot) -> str:
+    numbers = [f"x[w, v, {slot.first + i}]" for i in range(slot.size)]
+    kind = next(name for name, kind in KINDS.items() if kind is slot.kind)
+    return numbers[0] if kind == "float" else f"{kind}({', '.join(numbers)})"
+
+
+@cache
+def _sampler(terms: tuple[Term, ...]) -> wp.Kernel:
+    added_wrench = composed(terms, "wrench")
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def sample(
+        x: wp.array3d(dtype=float),
+        nu_r: wp.array(dtype=vec6),
+        up: wp.array(dtype=wp.vec3),
+        depth: wp.array(dtype=float),
+        density: float,
+        tau: wp.array2d(dtype=vec6),
+    ):
+        i, k = wp.tid()
+        tau[i, k] = added_wrench(x, k, 0, nu_r[i], up[i], depth[i], density)
+
+    return sample
+
+
+def term_wrenches(
+    terms: tuple[Term, ...], rows: ArrayLike, nu_r: ArrayLike, up: ArrayLike, depth: ArrayLike, density: float
+) -> NDArray[np.float64]:
+    """The wrench of terms in given motions, by the functions that simulations run.
+
+    Args:
+        terms: The terms.
+        rows: Their parameters, in several versions, (k, `row_length`).
+        nu_r: Relative to the water at the reference point, body frame [m/s, rad/s], (n, 6).
+        up: World z in the body frame, (n, 3).
+        depth: Of the body origin [m], (n,) or one number.
+        density: Of the water [kg/m³].
+
+    Returns:
+        About the reference point, body frame [N, N m], (n, k, 6).
+    """
+    n, k = len(np.asarray(nu_r)), len(np.asarray(rows))
+    x = np.ascontiguousarray(np.asarray(rows, np.float32)[:, None])
+    single = [
+        np.ascontiguousarray(np.broadcast_to(np.asarray(a, np.float32), shape))
+        for a, shape in ((nu_r, (n, 6)), (up, (n, 3)), (depth, (n,)))
+    ]
+    tau = np.zeros((n, k, 6), np.float32)
+    arrays: list[Any] = [
+        wp.array(a, dtype=kind, device="cpu", copy=False)
+        for a, kind in zip((x, *single, tau), (float, vec6, wp.vec3, float, vec6), strict=True)
+    ]
+    wp.launch(_sampler(terms), dim=(n, k), inputs=[*arrays[:4], float(density), arrays[4]], device="cpu")
+    return tau.astype(float)

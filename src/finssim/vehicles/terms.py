@@ -1,0 +1,129 @@
+"""Hydrodynamic terms: parts of the water's wrench beyond added mass and damping, each from one file.
+
+This layer knows a term by what a vehicle file says of it; `finssim.physics.terms` adds terms and evaluates them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, create_model
+
+from finssim.vehicles.part import Part
+
+__all__ = ["TERMS", "Term", "find_term", "term_names", "unit_of"]
+
+Array = NDArray[np.float64]
+
+SHIPPED = {"surge_damping": "finssim.physics.terms.surge_damping"}
+"""Key in a vehicle file -> the file of the term: a name and no import, for physics is a layer above."""
+
+GROUP = "finssim.terms"
+"""Entry points of installed packages that add terms: `lift = "my_package.lift"`."""
+
+TERMS: dict[str, Term] = {}
+"""Key in a hydrodynamic set -> the term, of those whose files were imported."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Term:
+    """A part of the wrench that water exerts on a vehicle, with everything that the package has to know of it.
+
+    Its parameters are numbers, vectors of 3 or 6, or 6x6 matrices. Where all of them are zero the wrench has to be
+    zero: so it is of vehicles that do not have the term, beside others that do.
+    """
+
+    name: str
+    """Its key in a hydrodynamic set of a vehicle file."""
+    schema: Any
+    """What stands under that key: a `Part` whose fields are the parameters, or the type of its only parameter."""
+    units: Mapping[str, str]
+    """Of each parameter by its name; an only parameter has the name of the term."""
+    wrench: Any
+    """`wp.func` -> vec6 [N, N m], body frame, about the reference point of the set; see `finssim.physics.terms`."""
+    slope: Any = None
+    """`wp.func` of the same arguments -> vec6: how fast the wrench falls with the velocity on each axis, 0 or more
+    [N s/m, N m s]. A stiff damping needs it, for the integrator takes that much implicitly; nu_r is here that of the
+    point where inertia is nearly diagonal."""
+    absent: Any = None
+    """Value of the key where the file does not have it."""
+    quadratic: Callable[[Any], Array] = field(default=lambda value: np.zeros(6))
+    """From what stands under the key to its share in the drag d2 v|v| of motion along each axis alone, (6,)."""
+    check: Callable[[Any], tuple[bool, str]] | None = None
+    """From what stands under the key to whether it makes sense, and a sentence that says so."""
+
+    @cached_property
+    def section(self) -> type[BaseModel]:
+        """A section of a vehicle file with this key alone: what pydantic checks and writes."""
+        fields: dict[str, Any] = {self.name: (self.schema, ...)}
+        return create_model(self.name, __base__=Part, **fields)
+
+    @cached_property
+    def parameters(self) -> dict[str, str]:
+        """Name of each parameter -> its path within a hydrodynamic set, `lift.coefficient`."""
+        if isinstance(self.schema, type) and issubclass(self.schema, Part):
+            return {name: f"{self.name}.{name}" for name in self.schema.model_fields}
+        return {self.name: self.name}
+
+    def read(self, value: Any) -> Any:
+        """Checked value of the key; pydantic's error names the key."""
+        return getattr(self.section.model_validate({self.name: value}), self.name)
+
+    def plain(self, value: Any) -> Any:
+        """The value as plain numbers, lists and dicts."""
+        return self.section.model_construct({self.name}, **{self.name: value}).model_dump(exclude_unset=True)[
+            self.name
+        ]
+
+    def numbers(self, value: Any) -> dict[str, Any]:
+        """Path of each parameter -> its number or array."""
+        return {
+            path: value if path == self.name else getattr(value, name)
+            for name, path in self.parameters.items()
+        }
+
+    def scalars(self) -> dict[str, tuple[float, float]]:
+        """Path -> lowest and highest value that the schema allows, of the parameters that are one number."""
+        if self.name in self.parameters:
+            fields = self.section.model_fields
+        else:
+            fields = self.schema.model_fields
+        out = {}
+        for name, path in self.parameters.items():
+            if fields[name].annotation is float:
+                bounds = {
+                    sign: getattr(m, sign)
+                    for m in fields[name].metadata
+                    for sign in ("gt", "ge", "lt", "le")
+                    if getattr(m, sign, None) is not None
+                }
+                low, high = bounds.get("ge", bounds.get("gt")), bounds.get("le", bounds.get("lt"))
+                out[path] = (-np.inf if low is None else low, np.inf if high is None else high)
+        return out
+
+
+def unit_of(path: str) -> str:
+    """Unit of a term's parameter, by its path within a hydrodynamic set."""
+    term, _, name = path.rpartition(".")
+    return TERMS[term or name].units[name]
+
+
+def term_names() -> list[str]:
+    """Keys of all terms that a vehicle file may have."""
+    return list(dict.fromkeys([*SHIPPED, *(point.name for point in entry_points(group=GROUP)), *TERMS]))
+
+
+def find_term(name: str) -> Term | None:
+    """The term of that key, whose file is imported now if it was not; None where there is none."""
+    if name not in TERMS:
+        place = SHIPPED.get(name) or next((p.value for p in entry_points(group=GROUP, name=name)), None)
+        if place is not None:
+            import_module(place)
+    return TERMS.get(name)

@@ -1,0 +1,380 @@
+"""A hydrodynamic term that the package does not know: one file with all of it, and one line."""
+# mypy: disable-error-code="valid-type,misc,index,no-any-return,no-untyped-def,untyped-decorator"
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import warp as wp
+
+from finssim.calibration.output.vehicle_file import write_vehicle
+from finssim.engine import Simulator
+from finssim.engine.ranges_file import RangesError, load_ranges
+from finssim.physics.terms import Term, add_term
+from finssim.physics.terms.composed import TermError, composed
+from finssim.physics.types import vec6
+from finssim.vehicles import VehicleError, check_vehicle, load_vehicle
+from finssim.vehicles.terms import TERMS
+from reference.draws import column, draw
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+spec = importlib.util.spec_from_file_location("own_term", EXAMPLES / "own_term.py")
+own_term = importlib.util.module_from_spec(spec)
+sys.modules["own_term"] = own_term
+spec.loader.exec_module(own_term)
+WING, Wing, wing_wrench = own_term.WING, own_term.Wing, own_term.wing_wrench
+
+FILE = """
+extends: bluerov2
+hydrodynamics:
+  calibrated:
+    wing:
+      origin: measured
+      source: tow tank
+      lift: 40.0
+      moment: {value: 1.5, origin: guessed}
+"""
+
+
+@pytest.fixture(autouse=True)
+def known():
+    """The one line; the next test may say it again."""
+    assert add_term(WING) is WING
+
+
+@pytest.fixture
+def winged(tmp_path):
+    """The catalogue's vehicle with a wing."""
+    (tmp_path / "mine.yaml").write_text(FILE, encoding="utf-8")
+    return load_vehicle(tmp_path / "mine.yaml")
+
+
+def bare(vehicle, **wing):
+    """A point of diagonal mass 20 kg and 1 kg m² in water that does nothing but what the wing does."""
+    zero = [0.0] * 6
+    base = "hydrodynamics.calibrated"
+    return vehicle.replace(
+        {
+            f"{base}.added_mass": zero, f"{base}.linear_damping": zero, f"{base}.quadratic_damping": zero,
+            f"{base}.wing": wing, f"{base}.reference_point": [0.0, 0.0, 0.0], "body.mass": 20.0,
+            "body.inertia": [1.0, 1.0, 1.0], "body.center_of_gravity": [0.0, 0.0, 0.0],
+            "body.center_of_buoyancy": [0.0, 0.0, 0.0], "body.displaced_volume": 20.0 / vehicle.water.density,
+        }
+    )  # fmt: skip
+
+
+def test_a_vehicle_file_may_have_it(winged, tmp_path):
+    """It is read with its origins, changed, written and read again; the vehicle of the catalogue has none."""
+    wing = winged.hydrodynamics["calibrated"].wing
+    assert (wing.lift, wing.moment) == (40.0, 1.5)
+    assert winged.origin_of("hydrodynamics.calibrated.wing.lift").source == "tow tank"
+    assert winged.origin_of("hydrodynamics.calibrated.wing.moment").origin == "guessed"
+    other = winged.replace({"hydrodynamics.calibrated.wing.lift": 30.0})
+    assert other.hydrodynamics["calibrated"].wing.lift == 30.0 and other.sha256 != winged.sha256
+    write_vehicle(other, tmp_path / "written.yaml")
+    again = load_vehicle(tmp_path / "written.yaml")
+    assert again.sha256 == other.sha256 and again.provenance == other.provenance
+    assert "lift: {value: 30.0" in (tmp_path / "written.yaml").read_text(encoding="utf-8")
+    plain = load_vehicle("bluerov2").hydrodynamics["calibrated"]
+    assert plain.wing is None and not plain.terms
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ("lift: -1.0", "bad.yaml: hydrodynamics.calibrated.wing: lift is -1.0, expected >= 0"),
+        ("lft: 1.0", "hydrodynamics.calibrated.wing: unknown key 'lft', did you mean 'lift'"),
+    ],
+)
+def test_its_mistakes_are_told_like_those_of_others(tmp_path, change, sentence):
+    """One sentence with the file and the key."""
+    (tmp_path / "bad.yaml").write_text(FILE.replace("lift: 40.0", change), encoding="utf-8")
+    with pytest.raises(VehicleError, match=sentence) as told:
+        load_vehicle(tmp_path / "bad.yaml")
+    assert len(str(told.value).splitlines()) == 1
+
+
+def test_show_lists_it_and_its_check_is_made(winged):
+    """`finssim vehicles show` has its numbers with their marks; a wing beyond its check is found."""
+    from io import StringIO
+
+    from rich.console import Console
+
+    from finssim.vehicles.show import print_vehicle
+
+    page = StringIO()
+    print_vehicle(winged, Console(file=page, width=120))
+    assert "wing.lift" in page.getvalue() and "1.5 ?" in page.getvalue() and "N s²/m²" in page.getvalue()
+    page = StringIO()
+    print_vehicle(
+        believed(3.0).replace({"hydrodynamics.calibrated.wing": {"lift": 7.0}}), Console(file=page, width=120)
+    )
+    assert "7 ?" in page.getvalue() and "wing.moment" in page.getvalue()
+    large = winged.replace({"hydrodynamics.calibrated.wing.lift": 900.0})
+    findings = {finding.name: finding for finding in check_vehicle(large)}
+    assert not findings["wing (calibrated)"].passed
+    assert "900" in findings["wing (calibrated)"].sentence
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("integrator", "worlds"), [("midpoint", 1), ("midpoint", 21), ("rk4", 5)])
+def test_the_simulator_feels_it(winged, integrator, worlds):
+    """m w' = -lift u w + m q u ..., I q' = -moment u q at constant u: q = q0 exp(-moment u t), w by quadrature.
+
+    u is held by giving surge no force: without pitch it stays. So q0 = 0 in one run, and w = w0 exp(-lift u t/m) with
+    u'= 0; and w0 = 0 with a small q0 in the other, where u and w change by the turning alone: |nu| stays.
+    """
+    u, t = 0.8, 2.0
+    vehicle = bare(winged, lift=15.0, moment=1.5)
+    sim = Simulator(vehicle, worlds=worlds, control_step=0.05, substeps=2, integrator=integrator, threads=1)
+    sim.place(position=(0.0, 0.0, -5.0), velocity=(u, 0.0, 0.1, 0.0, 0.0, 0.0))
+    for _ in range(round(t / 0.05)):
+        sim.step()
+    nu = sim.numpy("velocity")[:, 0]
+    np.testing.assert_allclose(nu[:, 0], u, rtol=1e-6)
+    np.testing.assert_allclose(nu[:, 2], 0.1 * np.exp(-15.0 * u * t / 20.0), rtol=2e-3)
+    sim.place(position=(0.0, 0.0, -5.0), velocity=(u, 0.0, 0.0, 0.0, 1e-3, 0.0))
+    for _ in range(round(t / 0.05)):
+        sim.step()
+    np.testing.assert_allclose(sim.numpy("velocity")[:, 0, 4], 1e-3 * np.exp(-1.5 * u * t), rtol=2e-3)
+
+
+@pytest.mark.slow
+def test_blocks_of_worlds_feel_it_as_single_worlds_do(monkeypatch, winged):
+    """The traced path of eight worlds against the kernel for one, each world with a wing of its own."""
+    runs = []
+    for lanes in (True, False):
+        monkeypatch.setattr(Simulator, "in_lanes", property(lambda self, lanes=lanes: lanes))
+        sim = Simulator(winged, worlds=19, threads=1)
+        sim.plant.fields["wing.lift"].assign(np.linspace(0.0, 80.0, 19, dtype=np.float32)[:, None])
+        sim.refresh()
+        sim.place(position=(0.0, 0.0, -5.0), velocity=(0.8, 0.1, 0.2, 0.0, 0.1, 0.0))
+        for _ in range(10):
+            sim.step()
+        runs.append(sim.numpy("velocity")[:, 0].copy())
+    assert np.all(np.diff(runs[0][:, 2]) < 0.0), "the larger the wing, the less heave is left"
+    np.testing.assert_allclose(runs[0], runs[1], rtol=0, atol=2e-6)
+
+
+@pytest.mark.slow
+def test_a_stiff_one_does_not_run_away(winged):
+    """Its slope is taken implicitly: 60 times what an explicit step could take, and w decays."""
+    vehicle = bare(winged, lift=20000.0, moment=0.0)
+    sim = Simulator(vehicle, control_step=0.1, substeps=2, threads=1)
+    sim.place(position=(0.0, 0.0, -5.0), velocity=(0.8, 0.0, 0.1, 0.0, 0.0, 0.0))
+    for _ in range(40):
+        sim.step()
+    assert abs(sim.numpy("velocity")[0, 0, 2]) < 1e-3
+
+
+@pytest.mark.slow
+def test_beside_vehicles_without_it(winged):
+    """Two vehicles of a world, one with a wing: the other moves bit for bit as alone among its kind."""
+    plain = load_vehicle("bluerov2")
+    both, alone = (Simulator(pair, threads=1) for pair in ([plain, winged], [plain, plain]))
+    for sim in (both, alone):
+        sim.place(position=[(0.0, 0.0, -5.0), (0.0, 3.0, -5.0)], velocity=(0.8, 0.0, 0.3, 0.0, 0.0, 0.0))
+        for _ in range(10):
+            sim.step()
+    one, other = both.numpy("velocity")[0], alone.numpy("velocity")[0]
+    np.testing.assert_allclose(one[0], other[0], rtol=1e-5, atol=1e-6)
+    assert abs(one[1, 2] - other[1, 2]) > 0.01
+
+
+RANGES = "wing: {lift: [0.5, 1.5], added_moment: [-1.0, 1.0]}\n"
+
+
+@pytest.mark.slow
+def test_its_parameters_are_drawn_by_name(winged, tmp_path):
+    """A factor on the file's lift and an addition to its moment; what is not named keeps its number."""
+    (tmp_path / "ranges.yaml").write_text(RANGES, encoding="utf-8")
+    ranges = load_ranges(tmp_path / "ranges.yaml")
+    simulator, draws = draw(ranges.model_dump(include={"terms"}), worlds=40, vehicles=winged)
+    assert set(draws.names) == {"wing.lift", "wing.added_moment"}
+    lift, moment = column(draws, "wing.lift"), column(draws, "wing.added_moment")
+    assert 0.5 <= lift.min() < 0.7 and 1.3 < lift.max() <= 1.5 and abs(np.corrcoef(lift, moment)[0, 1]) < 0.5
+    fields = simulator.plant.fields
+    np.testing.assert_allclose(fields["wing.lift"].numpy()[:, 0], 40.0 * lift, rtol=1e-6)
+    np.testing.assert_allclose(fields["wing.moment"].numpy()[:, 0], 1.5 + moment, rtol=1e-5)
+
+
+def test_ranges_of_a_record_read_back(tmp_path):
+    """What a training keeps of its ranges names the same entries again."""
+    from finssim.engine.ranges_file import Ranges
+
+    (tmp_path / "ranges.yaml").write_text(RANGES + "surge_damping: [0.9, 1.1]\n", encoding="utf-8")
+    kept = load_ranges(tmp_path / "ranges.yaml").model_dump(mode="json")
+    again = Ranges.model_validate(kept)
+    assert set(again.terms) == {"wing.lift", "wing.added_moment", "surge_damping"}
+    assert again.model_dump(mode="json") == kept
+    with pytest.raises(ValueError, match="wign"):
+        Ranges.model_validate({**kept, "terms": {"wign.lift": [0.5, 1.5]}})
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("wing: {lift: [1.5, 0.5]}", "wing.lift: is .1.5, 0.5., expected"),
+        ("wing: {lft: [0.5, 1.5]}", "wing: unknown entry 'wing.lft'; did you mean 'wing.lift'"),
+        ("wing: [0.5, 1.5]", "expected ranges of wing.lift"),
+        ("wign: {lift: [0.5, 1.5]}", "unknown entry 'wign'"),
+    ],
+)
+def test_ranges_that_cannot_be_are_refused(tmp_path, text, sentence):
+    (tmp_path / "ranges.yaml").write_text(text, encoding="utf-8")
+    with pytest.raises(RangesError, match=sentence):
+        load_ranges(tmp_path / "ranges.yaml")
+
+
+@wp.func
+def pushing(nu_r: vec6, lift: float, moment: float) -> vec6:
+    """A force without a cause."""
+    return vec6(1.0, lift, moment, 0.0, 0.0, 0.0)
+
+
+@wp.func
+def curious(nu_r: vec6, lift: float, moment: float, colour: float) -> vec6:
+    """Takes what there is not."""
+    return vec6(lift, moment, colour, 0.0, 0.0, 0.0)
+
+
+def test_a_term_that_cannot_be_is_refused():
+    """Another of that name, a key of the set's own, an unknown argument, a missing unit, a wrench of nothing."""
+    units, parts = WING.units, {"schema": Wing, "units": WING.units, "wrench": wing_wrench}
+    for term, sentence in (
+        (Term(name="wing", **parts), "there is a term 'wing' already"),
+        (Term(name="linear_damping", **parts), "cannot be named 'linear_damping'"),
+        (
+            Term(name="fin", schema=Wing, units=units, wrench=curious),
+            "takes 'colour: float', expected of: nu_r",
+        ),
+        (
+            Term(name="fin", schema=Wing, units={"lift": "N"}, wrench=wing_wrench),
+            "has units of lift, expected",
+        ),
+    ):
+        with pytest.raises(TermError, match=sentence):
+            add_term(term)
+    with pytest.raises(TermError, match="not zero where all its parameters are"):
+        composed((Term(name="fin", schema=Wing, units=units, wrench=pushing),), "wrench")
+
+
+@pytest.fixture(scope="module")
+def trials():
+    """A multisine on surge and heave together of the vehicle with the wing, with noise of its sensors."""
+    from finssim.calibration.excitation.programmes import programmes
+    from finssim.calibration.excitation.synthetic import simulate_programme
+
+    vehicle = load_vehicle("bluerov2").replace(
+        {"hydrodynamics.calibrated.wing": {"lift": 40.0, "moment": 1.5}}
+    )
+    return simulate_programme(programmes(("surge", "heave"), vehicle, kind="multisine"), vehicle, seed=3)
+
+
+def believed(lift):
+    """The vehicle as somebody has it who does not know the lift."""
+    return load_vehicle("bluerov2").replace({"hydrodynamics.calibrated.wing": {"lift": lift, "moment": 1.5}})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["regression", "simulation"])
+def test_a_calibration_estimates_its_parameter(trials, method, tmp_path):
+    """40 N s²/m² from trials of a vehicle whose file says 0: within the interval, which is narrower than a tenth."""
+    from finssim.calibration.output.calibrate import calibrated
+    from finssim.calibration.output.calibrated_ranges import write_ranges
+    from finssim.calibration.regression.regress import regress
+    from finssim.calibration.simulation.fit import fit_by_simulation
+
+    fit_by = regress if method == "regression" else fit_by_simulation
+    fit = fit_by(trials, believed(0.0), axes=("surge", "heave"), estimate=("wing.lift",))
+    found = fit.estimates["wing.lift"]
+    assert found.identifiable and found.unit == "N s²/m²"
+    assert found.ci95[0] <= 40.0 <= found.ci95[1] and np.ptp(found.ci95) < 4.0
+    vehicle = calibrated(fit)
+    assert vehicle.hydrodynamics["calibrated"].wing.lift == pytest.approx(found.estimate, rel=1e-6)
+    assert vehicle.origin_of("hydrodynamics.calibrated.wing.lift").origin == "measured"
+    write_vehicle(vehicle, tmp_path / "fitted.yaml")
+    assert load_vehicle(tmp_path / "fitted.yaml").sha256 == vehicle.sha256
+    write_ranges(fit, tmp_path / "ranges.yaml", vehicle)
+    assert set(load_ranges(tmp_path / "ranges.yaml").terms) == {"wing.lift", "wing.moment"}
+
+
+@pytest.mark.slow
+def test_a_known_wing_does_not_bias_what_is_fitted(trials):
+    """The damping of heave from trials with a wing: as the file has it where the file has the wing, not without."""
+    from finssim.calibration.regression.regress import regress
+
+    vehicle = believed(40.0)
+    chosen = vehicle.hydrodynamics["calibrated"]
+    drag = lambda fit: sum(fit.estimates[f"heave.d{i}"].estimate * 0.4**i for i in (1, 2))  # noqa: E731
+    true = chosen.linear_damping[2, 2] * 0.4 + chosen.quadratic_damping[2, 2] * 0.4**2
+    assert drag(regress(trials, vehicle, axes=("heave",))) == pytest.approx(true, rel=0.03)
+    assert drag(regress(trials, load_vehicle("bluerov2"), axes=("heave",))) > 1.2 * true
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["regression", "simulation"])
+def test_a_parameter_that_the_vehicle_does_not_have_is_refused(trials, method):
+    from finssim.calibration.errors import CalibrationError
+    from finssim.calibration.regression.regress import regress
+    from finssim.calibration.simulation.fit import fit_by_simulation
+
+    fit_by = regress if method == "regression" else fit_by_simulation
+    for vehicle, name in ((load_vehicle("bluerov2"), "wing.lift"), (believed(1.0), "wing.lft")):
+        with pytest.raises(CalibrationError, match=f"cannot estimate '{name}'"):
+            fit_by(trials, vehicle, axes=("heave",), estimate=(name,))
+
+
+def test_the_page_shows_the_example():
+    """Word for word, so that what is read is what runs."""
+    page = (EXAMPLES.parent / "docs" / "own_term.md").read_text(encoding="utf-8")
+    assert f"```py\n{(EXAMPLES / 'own_term.py').read_text(encoding='utf-8')}```" in page
+
+
+@pytest.mark.slow
+def test_the_example_runs():
+    """The wing takes heave out."""
+    run = subprocess.run(
+        [sys.executable, EXAMPLES / "own_term.py"], capture_output=True, text=True, check=True
+    )
+    without, with_wing = (
+        float(line.split()[-2]) for line in run.stdout.splitlines() if line.startswith("heave")
+    )
+    assert with_wing < 0.8 * without
+
+
+PACKAGE = """
+import warp as wp
+from finssim.physics.terms import Term, add_term
+from finssim.physics.types import vec6
+from finssim.vehicles.part import NonNegative
+
+@wp.func
+def fin_wrench(nu_r: vec6, fin_drag: float) -> vec6:
+    return vec6(0.0, -fin_drag * nu_r[1], 0.0, 0.0, 0.0, 0.0)
+
+add_term(Term(name="fin_drag", schema=NonNegative, units={"fin_drag": "N s/m"}, wrench=fin_wrench))
+"""
+
+
+def test_an_installed_package_brings_its_own(tmp_path, monkeypatch):
+    """A key that nobody imported is found by the entry point of a package: so commands know it too."""
+    (tmp_path / "finned_package.py").write_text(PACKAGE, encoding="utf-8")
+    about = tmp_path / "finned-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: finned\nVersion: 1.0\n", encoding="utf-8")
+    (about / "entry_points.txt").write_text("[finssim.terms]\nfin_drag = finned_package\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    try:
+        vehicle = load_vehicle("bluerov2").replace({"hydrodynamics.calibrated.fin_drag": 3.0})
+        assert vehicle.hydrodynamics["calibrated"].term_parameters == {"fin_drag": 3.0}
+        with pytest.raises(VehicleError, match="fin_drag is -3.0, expected >= 0"):
+            vehicle.replace({"hydrodynamics.calibrated.fin_drag": -3.0})
+        (tmp_path / "ranges.yaml").write_text("fin_drag: [0.5, 2.0]\n", encoding="utf-8")
+        assert load_ranges(tmp_path / "ranges.yaml").terms == {"fin_drag": (0.5, 2.0)}
+    finally:
+        TERMS.pop("fin_drag", None)
+        sys.modules.pop("finned_package", None)
