@@ -66,10 +66,6 @@ class Identification:
     steps: tuple[dict[str, float | str], ...] = ()
     """Terminal speeds and time constants beside those of a plant, of `excitation.terminal.compare_steps`."""
 
-    def with_steps(self, steps: Sequence[dict[str, float | str]]) -> Identification:
-        """The same with the comparison to a plant."""
-        return replace(self, steps=tuple(steps))
-
 
 def rough_vehicle(truth: Vehicle) -> Vehicle:
     """What one knows of a vehicle before any trial: weighed, measured out, thrusters from a bench.
