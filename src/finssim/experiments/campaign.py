@@ -10,9 +10,9 @@ import re
 import signal
 import threading
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from contextlib import closing
+from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ __all__ = [
     "Say",
     "Show",
     "choice",
+    "progress_bar",
     "run_experiment",
     "run_in_turn",
     "run_jobs",
@@ -36,8 +37,8 @@ __all__ = [
     "write_json",
 ]
 
-Say = Callable[[float, str], None]
-"""Told the share that is done and what comes next."""
+Say = Callable[..., None]
+"""Told the share that is done, and what comes next as text."""
 
 WATCH = 1.0
 """Time between two looks of a worker at its parent [s]."""
@@ -70,14 +71,8 @@ def run_experiment(
         What `work` returned.
     """
     start_warp()
-    screen = Console(stderr=True)
-    with Progress(console=screen, transient=True, disable=not bar or not screen.is_terminal) as progress:
-        task = progress.add_task(name, total=1.0)
-        result = work(
-            out=out,
-            say=lambda part, what: progress.update(task, completed=part, description=what),
-            **options,
-        )
+    with progress_bar(name, shown=bar) as say:
+        result = work(out=out, say=say, **options)
     if as_json:
         print(json.dumps(result, allow_nan=False))
         return result
@@ -85,6 +80,15 @@ def run_experiment(
     show(result, console)
     console.print(f"written: {out}", highlight=False, soft_wrap=True)
     return result
+
+
+@contextmanager
+def progress_bar(name: str, *, shown: bool = True) -> Iterator[Say]:
+    """A bar on standard error where that is a terminal; told the share that is done and, perhaps, what comes next."""
+    screen = Console(stderr=True)
+    with Progress(console=screen, transient=True, disable=not shown or not screen.is_terminal) as progress:
+        task = progress.add_task(name, total=1.0)
+        yield lambda part, what=name: progress.update(task, completed=part, description=what)
 
 
 def choice(known: Mapping[str, Any] | Sequence[str], name: str, kind: str, error: type[Exception]) -> None:

@@ -286,7 +286,7 @@ def table_of(result: Mapping[str, Any]) -> Shown:
 
 def print_comparison(result: Mapping[str, Any], console: Console) -> None:
     """Print it."""
-    print_shown(table_of(result), console)
+    print_shown(table_of(result), console, intervals=True)
 
 
 def _cell(figure: Mapping[str, Any]) -> str:

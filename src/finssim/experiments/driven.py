@@ -40,8 +40,14 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-TOPICS = ("thruster_cmd", "policy_info", "goal", "odom", "estimator_status", "thruster_state")
+TOPICS = ("thruster_cmd", "odom", "policy_info", "goal", "estimator_status", "thruster_state")
 """What a demonstration is made of; `events` are read where there are any."""
+REMEDY = "record a drive with --pool-file and pictures"
+LACKS = {
+    "thruster_cmd": f"nobody commanded: {REMEDY}",
+    "odom": f"it holds no estimate of where it was: {REMEDY}",
+}
+"""What a record without these says of a drive."""
 TELEOP = "finssim teleop"
 PERSON = "person"
 """Mode of a teleoperated vehicle in which its operator steers, and the one it begins in."""
@@ -137,15 +143,10 @@ def _check(record: Record, vehicle: Vehicle) -> None:
             f"{record.path}: is of the vehicle {about['vehicle']} {about['vehicle_sha256'][:12]}, expected "
             f"{vehicle.name} {vehicle.sha256[:12]}: name the file that was driven with --vehicle"
         )
-    for name, lacks in (
-        ("thruster_cmd", "nobody commanded"),
-        ("odom", "it holds no estimate of where it was"),
-    ):
-        if record.topic(name) not in record.topics:
-            raise DriveError(f"{record.path}: {lacks}: record a drive with --pool-file and pictures")
     for name in TOPICS:
         if record.topic(name) not in record.topics:
-            raise DriveError(f"{record.path}: has no topic {name}: not a record of finssim teleop or run")
+            lacks = f"has no topic {name}: not a record of finssim teleop or run"
+            raise DriveError(f"{record.path}: {LACKS.get(name, lacks)}")
 
 
 def _helm(steps: Array, told: list[tuple[float, Any]], teleop: bool) -> NDArray[np.bool_]:

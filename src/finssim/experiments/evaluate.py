@@ -12,12 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import Progress
 
 from finssim.control.guidance import Guide
 from finssim.control.trajectories import load_trajectory
 from finssim.control.trim import Trim
-from finssim.experiments.campaign import write_json
+from finssim.experiments.campaign import progress_bar, write_json
 from finssim.experiments.figures import (
     COLORS,
     clean,
@@ -207,6 +206,8 @@ def print_episodes(results: Sequence[Mapping[str, Any]], console: Console) -> No
     ]
     heads = ["measure", *(result["plant"]["name"] for result in results)]
     console.print(console_table(heads, rows, caption=EPISODES_CAPTION, caption_justify="left"))
+    for trial in (trial for result in results for trial in result["per_trial"] if trial.get("fault")):
+        console.print(f"{trial['record']}: {trial['fault']}", highlight=False, markup=False)
 
 
 def draw_episodes(evaluations: Sequence[Any], folder: Path, title: str) -> None:
@@ -427,9 +428,7 @@ def evaluate_controller(
     agent = agent_for(controller, body, the_task, Trim() if trim else None)
     if trim and not isinstance(agent, PolicyAgent):
         raise EvaluationError(f"'{controller}' has an integral of its own: trim a policy, or leave it out")
-    screen = Console(stderr=True)
-    with Progress(console=screen, transient=True, disable=not screen.is_terminal) as progress:
-        bar = progress.add_task(f"{trials} trials", total=1.0)
+    with progress_bar(f"{trials} trials") as show:
         done = form.run(
             agent,
             the_task,
@@ -439,7 +438,7 @@ def evaluate_controller(
             hydrodynamics=hydrodynamics,
             seed=seed,
             record=record,
-            show=lambda part: progress.update(bar, completed=part),
+            show=show,
             **guides,
         )
     result = {

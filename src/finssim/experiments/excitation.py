@@ -7,7 +7,6 @@ import math
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import Progress
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation.programmes import Programme, programmes
@@ -24,7 +22,7 @@ from finssim.calibration.importers.dispatch import read_trials
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import load_trial, load_trials, write_trial
 from finssim.control.guidance import Station
-from finssim.experiments.campaign import Job, Say, Show, run_jobs
+from finssim.experiments.campaign import Job, Say, Show, progress_bar, run_jobs
 from finssim.experiments.on_robot import (
     Attendant,
     OnRobot,
@@ -32,15 +30,13 @@ from finssim.experiments.on_robot import (
     RobotTrial,
     Session,
     check_starts,
-    play_trial,
     session,
 )
-from finssim.experiments.pool_trial import noise_seed, stand_in_pool
+from finssim.experiments.pool_trial import noise_seed, play_in_pool
 from finssim.files import atomic_directory, atomic_write
-from finssim.pool.draw_plant import draw_plant
+from finssim.pool import draw_plant
 from finssim.pool.plant_spec import Basin
 from finssim.quiet import start_warp
-from finssim.robot.lockstep import run_lockstep
 from finssim.robot.perception import Perception
 from finssim.robot.programme_pilot import ProgrammePilot
 from finssim.robot.recorder import Recorder
@@ -276,20 +272,13 @@ def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
     vehicle, standing = load_vehicle(run.vehicle), load_vehicle(run.pool_vehicle)
     place = place_of(run.programme, vehicle, _water_of(run))
     trial = programme_trial(run.programme, vehicle, place, hold=run.hold)
-    world, site = stand_in_pool(
-        standing, Station(place.position, place.yaw), plant=run.plant, severity=run.severity,
-        seed=noise_seed(run.seed, run.row, run.target),
-    )  # fmt: skip
     about = {**about_programme(run.programme, "virtual pool"), "seed": run.seed}
-    with Recorder(record, vehicle, about, pictures="none") as recorder, closing(world):
-        outcome = play_trial(
-            trial,
-            lambda runtime, **how: run_lockstep(runtime, world, **how),
-            vehicle,
-            site,
-            perception=Perception(vehicle, site, mode=ESTIMATOR),
-            recorder=recorder,
-        )
+    with Recorder(record, vehicle, about, pictures="none") as recorder:
+        outcome = play_in_pool(
+            trial, Station(place.position, place.yaw), vehicle, standing, recorder=recorder,
+            estimator={"mode": ESTIMATOR}, plant=run.plant, severity=run.severity,
+            seed=noise_seed(run.seed, run.row, run.target),
+        )  # fmt: skip
     t = outcome.runtime.t
     made = trial_of_record(record, run.target, run.row)
     write_trial(made, path, format="parquet")
@@ -396,16 +385,13 @@ def excite_in_pool(
     start_warp()
     body, pool_vehicle = load_vehicle(vehicle), pool_vehicle or vehicle
     played = programmes(axes, body, seed=seed, **plan)
-    screen = Console(stderr=True)
     with (
         atomic_directory(out, replaces=PLAN_FILE) as folder,
-        Progress(console=screen, transient=True, disable=not screen.is_terminal) as progress,
+        progress_bar("playing programmes") as say,
     ):
-        bar = progress.add_task("playing programmes", total=1.0)
         pool_trials(
             {"fit": played}, folder, vehicle=vehicle, pool_vehicle=pool_vehicle, plant=plant,
-            severity=severity, seed=seed, processes=processes,
-            say=lambda part, what: progress.update(bar, completed=part, description=what),
+            severity=severity, seed=seed, processes=processes, say=say,
         )  # fmt: skip
         for made in (folder / "fit").iterdir():
             made.rename(folder / made.name)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.pool.virtual_pool import VirtualPool
+from finssim.pool import VirtualPool
 from finssim.robot.link.decoder import MCU, Decoder
 from finssim.robot.link.frames import encode_telemetry
 from finssim.robot.messages import Delivery, Picture, Telemetry

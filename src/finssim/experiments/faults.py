@@ -27,7 +27,7 @@ from finssim.experiments.fault_scenarios import SCENARIOS, Bench, Course, Fault,
 from finssim.experiments.pool_trial import noise_seed, stand_in_pool
 from finssim.experiments.processes import Pair, ReliabilityError, await_flush, await_thrust, pair
 from finssim.experiments.tables import Shown, markdown_of, print_shown
-from finssim.pool.truth import read_truth
+from finssim.pool import read_truth
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.robot.bridge import Bridge

@@ -26,7 +26,7 @@ from finssim.localization.detection.families import bitmap
 from finssim.localization.detection.tags import corners
 from finssim.localization.pool import Pool
 from finssim.sensors.overhead_camera import Basin, OverheadCamera, Pose, Ripples, Scene, TagInScene
-from finssim.vehicles.equipment import Mount, Tags
+from finssim.vehicles import Mount, Tags
 
 __all__ = [
     "CONDITIONS",

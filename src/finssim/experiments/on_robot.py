@@ -35,9 +35,12 @@ __all__ = [
     "Attendant",
     "NEAR",
     "OnRobot",
+    "Outcome",
     "RobotError",
     "RobotTrial",
+    "Placing",
     "Session",
+    "Stages",
     "TURNED",
     "check_starts",
     "kept_folder",
@@ -130,7 +133,7 @@ def play_trial(
         recorder: Takes down the trial itself, not the way to its start.
         placing: How the vehicle gets to the start; None: it is there already, at rest, as in a pool that begins.
     """
-    stages = _Stages(trial, vehicle, recorder, placing)
+    stages = Stages(trial, vehicle, recorder, placing)
     if placing is None:
         runtime = Runtime(
             vehicle, site, trial.pilot, trial.guide, arm=True, perception=perception, recorder=recorder
@@ -145,19 +148,21 @@ def play_trial(
     return Outcome(trial, runtime, ended, stages.fault(runtime), stages.begun)
 
 
-class _Stages:
+class Stages:
     """Waits for the vehicle and its attendant, sees it to the start, hands over to the trial, and ends it."""
 
     def __init__(
         self, trial: RobotTrial, vehicle: Vehicle, recorder: Recorder | None, placing: Placing | None
     ) -> None:
-        self._trial, self._vehicle, self._recorder, self._placing = trial, vehicle, recorder, placing
-        self._stage: Callable[[Runtime, float], bool] = self._play if placing is None else self._wait
+        self._trial, self._vehicle, self._recorder = trial, vehicle, recorder
+        self._placed = placing is None
+        self._placing = placing or Placing(start=Station((0.0, 0.0, 0.0), 0.0))
+        self._stage: Callable[[Runtime, float], bool] = self._play if self._placed else self._wait
         self._since = math.nan
         """When the stage began [s]."""
         self._near_since: dict[tuple[float, ...], float] = {}
         self.ended: Ended | None = None
-        self.begun = placing is None
+        self.begun = self._placed
         self._reason = ""
 
     def look(self, runtime: Runtime) -> None:
@@ -189,16 +194,15 @@ class _Stages:
         return True
 
     def _keys(self) -> Sequence[str]:
-        attendant = self._placing and self._placing.attendant
-        return attendant.keys() if attendant else ()
+        return self._placing.attendant.keys() if self._placing.attendant else ()
 
     def _line(self, text: str) -> None:
-        if self._placing is not None and self._placing.attendant is not None:
+        if self._placing.attendant is not None:
             self._placing.attendant.line(text)
 
     def _wait(self, runtime: Runtime, now: float) -> bool:
         """Thrusters cannot turn: until the state is known and the attendant says go."""
-        assert self._placing is not None and runtime.reading is not None
+        assert runtime.reading is not None
         keys, reading = self._keys(), runtime.reading
         if now == self._since:
             return False  # what was pressed before anybody was asked means nothing
@@ -209,7 +213,7 @@ class _Stages:
         if not reading.ready:
             self._line(f"waiting for the vehicle: {reading.reason}")
             return False
-        there = self._there(reading, now)
+        there = self.there(reading, now)
         if self._placing.by_hand and not there:
             self._line(f"bring it to its start: {self._way(reading)}")
             return False
@@ -234,7 +238,7 @@ class _Stages:
             return self._end("fault")
         reading = runtime.reading
         self._line(f"on the way to its start: {self._way(reading)}; x: stop")
-        if self._there(reading, now):
+        if self.there(reading, now):
             self._begin(runtime, now)
         elif now - self._since > APPROACH:
             why = runtime.refusal or self._way(reading)
@@ -252,16 +256,15 @@ class _Stages:
             return self._end("fault")
         if self._trial.over(runtime):
             return self._end("over")
-        if self._placing is None:
+        if self._placed:
             return False  # the drive ends it
         t = 0.0 if math.isnan(runtime.t) else runtime.t
         self._line(f"{t:.0f} s of {self._trial.duration:.0f} s; x: stop")
         late = math.isnan(runtime.started) and now - self._since > GETTING_READY
         return (late or t > self._trial.duration + GETTING_READY) and self._end("not there")
 
-    def _there(self, reading: Reading, now: float) -> bool:
+    def there(self, reading: Reading, now: float) -> bool:
         """Whether the vehicle has been at its start, at rest, for long enough."""
-        assert self._placing is not None
         off = (
             float(np.abs(reading.position - self._placing.start.position).max()),
             abs(self._turn(reading)),
@@ -276,12 +279,10 @@ class _Stages:
         return False
 
     def _turn(self, reading: Reading) -> float:
-        assert self._placing is not None
         return float(wrap_angle(self._placing.start.yaw - quat_yaw(reading.quaternion)))
 
     def _way(self, reading: Reading) -> str:
         """What is left of the way."""
-        assert self._placing is not None
         x, y, z = self._placing.start.position - reading.position
         return f"({x:+.2f}, {y:+.2f}, {z:+.2f}) m and {math.degrees(self._turn(reading)):+.0f}° to go"
 

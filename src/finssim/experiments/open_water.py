@@ -16,11 +16,8 @@ from finssim.control.trajectories import Trajectory
 from finssim.experiments.campaign import Say, choice, write_json
 from finssim.experiments.tables import console_table
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
-from finssim.pool.draw_plant import draw_plant
-from finssim.pool.plant_spec import PlantSpec
+from finssim.pool import PlantSpec, VirtualPool, draw_plant, read_truth
 from finssim.pool.sites import positioning_of, site_of, vehicle_at
-from finssim.pool.truth import read_truth
-from finssim.pool.virtual_pool import VirtualPool
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.robot.lockstep import run_lockstep

@@ -10,10 +10,9 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from finssim.engine import Water
+from finssim.engine import Water, Wave
 from finssim.engine.randomize import Randomization
 from finssim.engine.ranges_file import Ranges, load_ranges
-from finssim.engine.surroundings import Wave
 from finssim.tasks import Environment, MeasurementNoise, Task
 from finssim.tasks.agents import Agent
 from finssim.tasks.make import observed

@@ -19,7 +19,6 @@ from rich.console import Console
 
 from finssim.control.controllers import CONTROLLERS
 from finssim.control.guidance import Guide, Station
-from finssim.control.policy import Policy
 from finssim.control.policy_description import DESCRIPTION_FILE, NETWORK_FILE
 from finssim.control.trajectories import load_trajectory
 from finssim.control.trim import Trim
@@ -30,6 +29,7 @@ from finssim.experiments.motion import PERIOD, Motion, localization_errors, meas
 from finssim.experiments.on_robot import (
     Attendant,
     OnRobot,
+    Outcome,
     RobotError,
     RobotTrial,
     Session,
@@ -43,11 +43,9 @@ from finssim.experiments.trials import DURATION, Trials
 from finssim.files import atomic_write
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.localization.pool import Pool
+from finssim.pool import Truth, VirtualPool, draw_plant, read_truth
 from finssim.pool.camera import PoolCamera
-from finssim.pool.draw_plant import draw_plant
 from finssim.pool.site import camera_of
-from finssim.pool.truth import Truth, read_truth
-from finssim.pool.virtual_pool import VirtualPool
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.robot.ablation import NoisyInput
@@ -55,7 +53,10 @@ from finssim.robot.goals import check_reachable
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import Pilot, make_pilot
+from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
+from finssim.tasks import task_named
+from finssim.tasks.agents import agent_for
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import room
 
@@ -65,6 +66,7 @@ __all__ = [
     "job_trial",
     "noise_seed",
     "play",
+    "play_in_pool",
     "pool_evaluation",
     "pool_jobs",
     "read_series",
@@ -169,6 +171,39 @@ def stand_in_pool(
     return pool, known_site
 
 
+def play_in_pool(
+    trial: RobotTrial,
+    start: Station,
+    vehicle: Vehicle,
+    standing: Vehicle,
+    *,
+    recorder: Recorder | None = None,
+    estimator: Mapping[str, Any],
+    **pool: Any,
+) -> Outcome:
+    """Play a trial by the robot's whole software in lock-step with a pool.
+
+    Args:
+        trial: What to do.
+        start: Where the vehicle is, at rest.
+        vehicle: As the robot knows it.
+        standing: Around which the pool's own is drawn.
+        recorder: Takes it down.
+        estimator: Options of `Perception`.
+        pool: As of `stand_in_pool`.
+    """
+    world, site = stand_in_pool(standing, start, **pool)
+    with closing(world):
+        return play_trial(
+            trial,
+            lambda runtime, **how: run_lockstep(runtime, world, **how),
+            vehicle,
+            site,
+            perception=Perception(vehicle, site, **estimator),
+            recorder=recorder,
+        )
+
+
 def job_trial(job: Job, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotTrial, Station]:
     """The trial of a job, which ends when its time is over, and where it starts.
 
@@ -235,17 +270,10 @@ def play(job: Job, path: Path) -> dict[str, Any]:
     trial, start = job_trial(job, vehicle, seed=seed)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "truth"
-        world, site = stand_in_pool(
-            standing, start, plant=job.plant, severity=job.severity, seed=seed, camera=job.camera, truth=file
-        )
-        with closing(world):
-            outcome = play_trial(
-                trial,
-                lambda runtime, **how: run_lockstep(runtime, world, **how),
-                vehicle,
-                site,
-                perception=Perception(vehicle, site, fusion=job.fusion),
-            )
+        outcome = play_in_pool(
+            trial, start, vehicle, standing, estimator={"fusion": job.fusion}, plant=job.plant,
+            severity=job.severity, seed=seed, camera=job.camera, truth=file,
+        )  # fmt: skip
         true = read_truth(file)
     assert isinstance(trial.watch, _Estimates)
     series = _series(true, outcome.runtime.started, trial.duration, np.array(trial.watch.rows))
@@ -409,6 +437,7 @@ def pool_evaluation(jobs: Sequence[Job], results: Sequence[Mapping[str, Any]], f
     """
     job, first = jobs[0], results[0]
     vehicle, standing = load_vehicle(job.vehicle), load_vehicle(job.pool_vehicle)
+    agent = agent_for(job.controller, vehicle, task_named("t1"))
     measures = [
         {"trial": i, "setpoint": job.target}
         | {key: value for key, value in result.items() if key not in ("job", "key", "provenance")}
@@ -418,7 +447,7 @@ def pool_evaluation(jobs: Sequence[Job], results: Sequence[Mapping[str, Any]], f
     if first.get("robot"):
         plant = {"name": "hardware", "title": f"robot {first['robot']}, by its own estimate"}
     result = {
-        "controller": _controller(job),
+        "controller": agent.describe() | {"name": job.row},
         "task": "t1",
         "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
         "hydrodynamics": "calibrated",
@@ -432,19 +461,3 @@ def pool_evaluation(jobs: Sequence[Job], results: Sequence[Mapping[str, Any]], f
     motions = [Motion(t=s["t"], position=s["position"], yaw=s["yaw"]) for s in series]
     goals = np.array([in_room(T1_SETPOINTS[job.target], standing) for job in jobs])
     return Evaluation(result, Trials(tuple(job.target for job in jobs), goals, *on_grid(motions, DURATION)))
-
-
-def _controller(job: Job) -> dict[str, Any]:
-    """The controller as evaluations describe it."""
-    if job.controller in CONTROLLERS:
-        return {"name": job.row, "kind": "pid", "action": "wrench6"}
-    d = Policy.load(job.controller).description
-    randomization = d.training.get("randomization")
-    return {
-        "name": job.row,
-        "kind": "policy",
-        "action": d.action["mode"],
-        "hydrodynamics": d.hydrodynamics,
-        "randomization": randomization["name"] if randomization else None,
-        "files": dict(d.files),
-    }

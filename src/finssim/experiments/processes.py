@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from finssim.pool.truth import TruthError, read_truth
+from finssim.pool import TruthError, read_truth
 
 __all__ = ["Pair", "Process", "ReliabilityError", "await_flush", "await_thrust", "pair"]
 

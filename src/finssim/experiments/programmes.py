@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from finssim.calibration.excitation.programmes import RATE, Programme, which_axes
 from finssim.control.allocator import Allocator
 from finssim.control.pole_placement import AxisModel, axis_model
-from finssim.pool.draw_plant import draw_plant
+from finssim.pool import PlantSpec, draw_plant
 from finssim.pool.plant import Plant
-from finssim.pool.plant_spec import Basin, PlantSpec
+from finssim.pool.plant_spec import Basin
 from finssim.pool.water_spec import BuoyancyDrift, Circulation
 from finssim.quiet import start_warp
 from finssim.vehicles import AXES, Vehicle, load_vehicle

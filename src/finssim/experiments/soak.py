@@ -16,7 +16,7 @@ from rich.console import Console
 
 from finssim.experiments.campaign import Say, write_json
 from finssim.experiments.pool_trial import stand_in_pool
-from finssim.pool.virtual_pool import VirtualPool
+from finssim.pool import VirtualPool
 from finssim.provenance import provenance
 from finssim.robot.goals import station_of
 from finssim.robot.lockstep import run_lockstep

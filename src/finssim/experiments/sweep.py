@@ -52,8 +52,8 @@ RETRIES = 3
 """How often a job is begun anew after its worker was lost."""
 SAME_FOR_ALL = ("task", "out", "seed", "console", "shown", "interrupted", "resume", "device", "vehicle")
 """Arguments of a training that a sweep sets itself."""
-FILES = ("randomize",)
-"""Settings that may name a file."""
+FILES = ("vehicle", "plants", "randomize")
+"""Keys whose values may name files."""
 
 
 class SweepError(ValueError):
@@ -165,40 +165,23 @@ def load_sweep(path: str | Path) -> Sweep:
         SweepError: It is not there, or something in it is not as expected; says where.
         PlantError: A plant that it names is not there, or wrong: told now, and not after the first training.
     """
-    data = read_mapping(Path(path), SweepError, such_as="task: t1")
+    data = _placed(read_mapping(Path(path), SweepError, such_as="task: t1"), Path(path).parent)
     try:
         sweep = Sweep.model_validate(data)
     except ValidationError as error:
         raise SweepError(f"{path}: {first_problem(error)}") from error
-    sweep = _with_paths(sweep, Path(path).parent)
     for name in sweep.evaluate.plants:
         load_plant(name)
     return sweep
 
 
-def _with_paths(sweep: Sweep, folder: Path) -> Sweep:
-    def placed(options: dict[str, Any]) -> dict[str, Any]:
-        return {name: _place(value, folder) if name in FILES else value for name, value in options.items()}
-
-    return sweep.model_copy(
-        update={
-            "vehicle": _place(sweep.vehicle, folder),
-            "train": placed(sweep.train),
-            "settings": {name: placed(options) for name, options in sweep.settings.items()},
-            "grid": {
-                name: [_place(value, folder) for value in values] if name in FILES else values
-                for name, values in sweep.grid.items()
-            },
-            "evaluate": sweep.evaluate.model_copy(
-                update={"plants": tuple(_place(name, folder) for name in sweep.evaluate.plants)}
-            ),
-        }
-    )
-
-
-def _place(value: Any, folder: Path) -> Any:
-    """A file beside the sweep file by its whole path; anything else as it is."""
-    beside = folder / value if isinstance(value, str) else None
+def _placed(value: Any, folder: Path, key: Any = "") -> Any:
+    """What a sweep file holds, with files beside it by their whole paths."""
+    if isinstance(value, dict):
+        return {name: _placed(one, folder, name) for name, one in value.items()}
+    if isinstance(value, list):
+        return [_placed(one, folder, key) for one in value]
+    beside = folder / value if isinstance(value, str) and key in FILES else None
     return str(beside.resolve()) if beside is not None and beside.is_file() else value
 
 

@@ -96,11 +96,12 @@ class Shown:
     sentences: Sequence[str] = ()
 
 
-def print_shown(shown: Shown, console: Console) -> None:
-    """On a screen; one that is narrow shows no intervals of the table."""
+def print_shown(shown: Shown, console: Console, *, intervals: bool = False) -> None:
+    """On a screen; one that is narrow shows no intervals of the table, unless they are asked for."""
     console.print(shown.headline or shown.title, highlight=False)
-    wide = console.width >= WIDE
-    rows = shown.rows if wide else [[re.sub(r" \[.+\]$", "", cell) for cell in row] for row in shown.rows]
+    rows = shown.rows
+    if not intervals and console.width < WIDE:
+        rows = [[re.sub(r" \[.+\]$", "", cell) for cell in row] for row in rows]
     console.print(console_table(shown.heads, rows))
     console.print(shown.note, highlight=False)
     for sentence in shown.sentences:

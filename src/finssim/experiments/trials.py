@@ -233,6 +233,8 @@ def _goals(guides: Sequence[Guide], t: float) -> Goal:
 
 EPISODES = 64
 """Unless told otherwise: an interval of a rate is then some ±0.12."""
+LABELS = ("trial", "record", "fault", "localization", "clock_offset_s")
+"""What a trial's row has besides its metrics."""
 
 
 class EpisodeError(ValueError):
@@ -307,7 +309,7 @@ def summarize_episodes(trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         `trials`, `valid` (episodes whose world did not break), `metrics` (name -> value, ci95) and `per_trial`.
     """
     metrics: dict[str, Any] = {}
-    for name in (name for name in trials[0] if name != "trial"):
+    for name in (name for name in trials[0] if name not in LABELS):
         values = [float(trial[name]) for trial in trials if trial[name] is not None]
         found = with_interval({i: [x] for i, x in enumerate(values)})
         metrics[name] = {"value": found and found.value, "ci95": found and [found.low, found.high]}
