@@ -51,6 +51,7 @@ __all__ = [
     "T2_COLUMNS",
     "Evaluation",
     "EvaluationError",
+    "TrackingRun",
     "by_setpoint",
     "by_trajectory",
     "cells",

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from finssim.control.trajectories import TRAJECTORIES, load_trajectory
-from finssim.experiments.evaluate import T1_COLUMNS, cells
+from finssim.experiments.evaluate import T1_COLUMNS, TrackingRun, cells, draw_tracking
 from finssim.experiments.figures import (
-    clean,
     draw_envelopes,
     error_envelope,
-    legend_below,
-    new_figure,
     save_figure,
 )
 from finssim.experiments.paper import PAPER_T2, T1_SETPOINTS, paper_row, paper_t2_row
@@ -198,34 +195,20 @@ def _draw_t1(by_row: Results, folder: Path) -> Path | None:
 
 
 def _draw_t2(by_row: Results, folder: Path) -> Path | None:
-    """From above, of each row and trajectory the trial with the median error; None if nothing was flown."""
-    flown = {name: [r for r in results if r["p95_m"] is not None] for name, results in by_row.items()}
-    flown = dict([(name, results) for name, results in flown.items() if results][:T2_DRAWN])
-    targets = list(dict.fromkeys(r["job"]["target"] for results in flown.values() for r in results))
-    if not targets:
+    """Of each row and trajectory the trial with the median error; None if nothing was flown."""
+    runs: dict[str, list[TrackingRun]] = {}
+    for name, results in by_row.items():
+        flown = sorted((r for r in results if r["p95_m"] is not None), key=lambda r: float(r["p95_m"]))
+        for target in dict.fromkeys(r["job"]["target"] for r in results):
+            of_target = [r for r in flown if r["job"]["target"] == target]
+            if of_target:
+                middle = of_target[len(of_target) // 2]
+                series = read_series(folder / "trials" / middle["key"])
+                guide = load_trajectory(target).scaled(middle.get("room", 1.0))
+                runs.setdefault(T2_ROWS[name].title, []).append((guide, series["t"], series["position"]))
+    if not runs:
         return None
-    columns = min(2, len(targets))
-    lines = -(-len(targets) // columns)
-    figure = new_figure(5.5 * columns, 3.4 * lines)
-    for k, target in enumerate(targets):
-        axes = figure.add_subplot(lines, columns, k + 1, aspect="equal")
-        _draw_paths(axes, target, flown, folder)
-    legend_below(figure, figure.axes[0], 3)
-    return save_figure(figure, folder / "t2_paths.png")
-
-
-def _draw_paths(axes: Any, target: str, flown: Mapping[str, Sequence[Any]], folder: Path) -> None:
-    played = next(r for results in flown.values() for r in results if r["job"]["target"] == target)
-    trajectory = load_trajectory(target).scaled(played.get("room", 1.0))
-    way = trajectory.at(np.linspace(0.0, trajectory.duration, 1000)).position
-    axes.plot(way[:, 0], way[:, 1], "k--", linewidth=1.2, label="reference")
-    for name, results in flown.items():
-        of_target = sorted((r for r in results if r["job"]["target"] == target), key=lambda r: r["p95_m"])
-        if of_target:
-            path = read_series(folder / "trials" / of_target[len(of_target) // 2]["key"])["position"]
-            axes.plot(path[:, 0], path[:, 1], linewidth=1.2, label=T2_ROWS[name].title)
-    axes.set(title=target, xlabel="x [m]", ylabel="y [m]")
-    clean(axes)
+    return save_figure(draw_tracking(dict(list(runs.items())[:T2_DRAWN])), folder / "t2_paths.png")
 
 
 def _paper_t1(row: str) -> dict[str, float]:
