@@ -116,10 +116,11 @@ def hydrodynamics(
     method: Annotated[
         str,
         typer.Option(
-            help="regression: each axis by its equation of motion; simulation: what simulates the trials best.",
+            help="regression: each axis by its equation of motion; simulation: what simulates the trials best; auto: "
+            "the regression, or the simulation where that replays the trials better.",
             metavar="METHOD",
         ),
-    ] = "regression",
+    ] = "auto",
     full: Annotated[
         bool, typer.Option("--full", help="Also couplings between axes (simulation method).")
     ] = False,
@@ -133,6 +134,13 @@ def hydrodynamics(
     damping: Annotated[
         str, typer.Option(help="Drag: linear, quadratic, both, or auto to choose.", metavar="KIND")
     ] = "auto",
+    fix: Annotated[
+        str,
+        typer.Option(
+            help="Inertias that are known, added mass included [kg, kg m²]: yaw.m=0.6,surge.m=24 (regression).",
+            metavar="AXIS.m=N",
+        ),
+    ] = "",
     horizon: Annotated[
         float | None,
         typer.Option(help="Longest stretch simulated without a restart [s] (simulation method)."),
@@ -163,6 +171,7 @@ def hydrodynamics(
         full=full,
         estimate=estimate,
         damping=damping,
+        fix=fix,
         horizon=horizon,
         out=out,
         report=report,

@@ -89,12 +89,12 @@ def test_an_estimate_with_one_is(telemetry):
 
 
 def test_the_stick_up_pushes_up_through_all_vertical_thrusters(telemetry):
-    """The pilot ascended once: the four vertical pulses of different directions become one and the same push."""
+    """The pilot ascended once: four vertical pulses of different directions become one push against the axes, up."""
     vertical = [telemetry.series(f"pwm_T{n}")[1] for n in (5, 6, 7, 8)]
     np.testing.assert_array_equal(vertical[0], vertical[3])
     np.testing.assert_array_equal(vertical[1], vertical[2])
     i = int(np.argmax(np.abs(vertical[0] - 1500.0)))
-    assert all(pulses[i] == 1700.0 for pulses in vertical)
+    assert all(pulses[i] == 1300.0 for pulses in vertical)
 
 
 def test_arming_splits_the_log():
@@ -164,7 +164,7 @@ def test_an_explicit_map_of_outputs_comes_first(tmp_path):
     (trial,) = read_trials([BIN], column_map=tmp_path / "map.yaml")
     (usual,) = read_trials([BIN], vehicle="bluerov2")
     np.testing.assert_array_equal(trial.channels["pwm_T2"], usual.channels["pwm_T1"])
-    np.testing.assert_array_equal(trial.channels["pwm_T3"], usual.channels["pwm_T3"])
+    np.testing.assert_array_equal(trial.channels["pwm_T3"], 3000.0 - usual.channels["pwm_T3"])
     (tmp_path / "map.yaml").write_text(text.replace("C1: T2", "C1: T9"))
     with pytest.raises(CalibrationError, match=r"ardusub.outputs.C1: bluerov2 has no thruster 'T9'"):
         read_trials([BIN], column_map=tmp_path / "map.yaml")

@@ -242,3 +242,32 @@ def test_a_wrench_that_jumps_between_exact_levels_was_held(rate):
     assert not read(lagged).held
     assert not read(noisy).held
     assert not read(steps, inputs_between="linear").held
+
+
+@pytest.mark.parametrize(
+    "after, last, ends, pushes",
+    [
+        (None, 1700.0, 4.0, None),
+        (None, 1500.0, 10.0, 0.0),
+        ("held", 1700.0, 10.0, 1.0),
+        ("zero", 1700.0, 10.0, 0.0),
+    ],
+)
+def test_inputs_have_an_end(after, last, ends, pushes):
+    """A stream of pulses that stops while the recording goes on: unknown from there, held or zero where the header says
+    so; a last pulse of no thrust is held."""
+    vehicle = load_vehicle("bluerov2")
+    t = np.arange(0.0, 10.0, 0.1)
+    pulses = np.where(t < 2.0, 1500.0, 1700.0)
+    pulses[t >= 3.5] = last
+    pulses[t >= 4.0] = np.nan
+    channels = {f"pwm_{name}": pulses for name in vehicle.thruster_names} | {"r": np.sin(t)}
+    found = drive(trial(channels, t, **({} if after is None else {"inputs_after": after})), vehicle)
+    assert found.spans[-1, 1] == pytest.approx(ends, abs=0.15)
+    assert (found.end is None) == (ends > 5.0)
+    tau = applied_wrench(found, vehicle, t)
+    assert np.isfinite(tau[t < 3.9]).all()
+    if pushes is None:
+        assert np.isnan(tau[t > 4.2]).all()
+    else:
+        assert (np.abs(tau[t > 4.5]).max() > 1.0) == bool(pushes)

@@ -6,11 +6,16 @@ import numpy as np
 
 from finssim.calibration.check.report import Finding
 from finssim.calibration.motion.accelerations import holds_gravity
-from finssim.calibration.motion.attitude_signal import AttitudeSignal, attitude_signal, up_in_body
-from finssim.calibration.motion.smoothing import smooth
+from finssim.calibration.motion.attitude_signal import (
+    AttitudeSignal,
+    attitude_samples,
+    attitude_signal,
+    up_in_body,
+)
+from finssim.calibration.motion.smoothing import longest_step, smooth
 from finssim.calibration.motion.synchronisation import Offset
 from finssim.calibration.trials.trial import Array, Trial
-from finssim.geometry.rotations import quat_rotate
+from finssim.geometry.rotations import quat_rotate, quat_to_euler
 from finssim.vehicles import Vehicle
 
 __all__ = ["frame_findings", "unit_findings"]
@@ -31,6 +36,12 @@ FASTEST_TURN = 15.0
 """No vehicle turns faster [rad/s]."""
 
 DEGREES = 57.3
+
+DRIFTS = 0.2
+"""Range of the heading less the integrated gyro and its constant error that is a drift [rad]."""
+
+GYRO_BIAS = 0.03
+"""Steady difference between heading and integrated gyro that no calibrated gyro has [rad/s]."""
 
 
 def unit_findings(trial: Trial) -> list[Finding]:
@@ -69,6 +80,7 @@ def frame_findings(trial: Trial, vehicle: Vehicle, offsets: dict[str, Offset]) -
     return [
         *_gravity(trial, vehicle.water.gravity, t, attitude),
         *_rates(trial, t, attitude),
+        *_heading(trial, by),
         *_vertical(trial, t, attitude),
         *_horizontal(trial, t, attitude),
     ]
@@ -173,6 +185,44 @@ def _rates(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
         elif correlation > WITH and 0.6 < ratio * DEGREES < 1.6:
             found.append(_degrees(angle, float(np.nanmax(np.abs(trial.channels.get(angle, x)))), "rad"))
     return found
+
+
+def _heading(trial: Trial, late: float) -> list[Finding]:
+    """The heading against the integrated gyro, psi_dot = (q sin(roll) + r cos(roll)) / cos(pitch)."""
+    t, r = trial.series("r")
+    at, q, given = attitude_samples(trial)
+    if len(t) < FEWEST or "yaw" not in given or len(at) < FEWEST:
+        return []
+    at, (roll, pitch, yaw) = at - late, quat_to_euler(q)
+    inside = (t >= at[0]) & (t <= at[-1])
+    if inside.sum() < FEWEST:
+        return []
+    t, r = t[inside], r[inside]
+    phi, theta = np.interp(t, at, roll), np.interp(t, at, pitch)
+    q_at = np.interp(t, *trial.series("q")) if trial.has("q") else np.zeros(len(t))
+    rate = (q_at * np.sin(phi) + r * np.cos(phi)) / np.maximum(np.cos(theta), 0.2)
+    # A gap of the gyro hides a turn: each stretch begins anew.
+    step = np.diff(t)
+    wide = step > longest_step(t)
+    turned = np.concatenate([[0.0], np.cumsum(np.where(wide, 0.0, 0.5 * (rate[1:] + rate[:-1]) * step))])
+    apart = np.interp(t, at, np.unwrap(yaw)) - turned
+    for edge in np.flatnonzero(wide):
+        apart[edge + 1 :] += apart[edge] - apart[edge + 1]
+    bias, _ = np.polyfit(t - t[0], apart, 1) if t[-1] - t[0] > 5.0 else (0.0, 0.0)
+    rest = apart - bias * (t - t[0])
+    noise = 1.4826 * float(np.median(np.abs(np.diff(apart)))) * 6.0
+    wander = float(np.ptp(rest)) - noise
+    if wander < DRIFTS and abs(bias) < GYRO_BIAS:
+        return []
+    drift = float(np.ptp(apart)) - noise
+    return [
+        Finding(
+            "care",
+            f"the heading drifts by {drift:.2g} rad against the integrated gyro: a compass disturbed by the motors, or "
+            "a gyro with a bias? Fits of yaw go by the gyro; velocities from x, y are turned by the heading, and are "
+            "wrong where it is",
+        )
+    ]
 
 
 def _vertical(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:

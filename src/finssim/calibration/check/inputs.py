@@ -26,6 +26,15 @@ def input_findings(trial: Trial, vehicle: Vehicle, inputs: Drive) -> list[Findin
             reason = "no pulse leaves the dead band of its speed controller"
         return [*found, Finding("refused", reason)]
     found += _wrench_beyond(vehicle, inputs) if not inputs.thrusters else _thrusters(trial, vehicle, inputs)
+    if inputs.end is not None:
+        rest = trial.t[-1] - inputs.end
+        found.append(
+            Finding(
+                "care",
+                f"the inputs end {rest:.3g} s before the recording, at {inputs.end - trial.t[0]:.4g} s: what follows "
+                "is left out; write 'inputs_after: zero' in trial.yaml if the thrusters stopped there, as on disarming",
+            )
+        )
     if inputs.source == "pwm" and not trial.has("voltage") and trial.header.voltage is None:
         found.append(
             Finding(

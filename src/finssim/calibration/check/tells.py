@@ -103,14 +103,10 @@ def _relative(axis: str) -> Told:
         return Told(can=True, why="passive: relative to the vehicle file's restoring moment")
     if axis == "heave":
         return Told(can=True, why="passive: relative to the vehicle file's buoyancy excess")
-    return Told(can=False, why="passive, and no force along this axis is known")
+    return Told(can=False, why="passive, and no force along this axis is known: d1/m_eff and d2/m_eff alone")
 
 
 def _damping(report: AxisReport, inputs: Drive) -> dict[str, Told]:
-    if inputs.source == "passive":
-        relative = _relative(report.axis)
-        if not relative.can:
-            return {"d1": relative, "d2": relative}
     decades = f"{report.decades:.1f} decades of speed up to {report.fastest:.2g}"
     if report.decades < SEPARATE:
         one = f"{decades}: only their sum at that speed; more levels or a coast would part them"

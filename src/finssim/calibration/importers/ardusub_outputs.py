@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -11,10 +11,16 @@ from finssim.geometry.frames import FROM_FOSSEN
 from finssim.vehicles import Vehicle
 from finssim.vehicles.part import did_you_mean
 
-__all__ = ["NEUTRAL", "FRAMES", "outputs_of"]
+__all__ = ["NEUTRAL", "FRAMES", "STICKS", "mixed_pulses", "outputs_of"]
 
 NEUTRAL = 1500.0
 """Pulse width of no thrust [µs]."""
+
+HALF_RANGE = 400.0
+"""Pulse width of full output, from neutral [µs]."""
+
+STICKS = ("stick_roll", "stick_pitch", "stick_yaw", "stick_throttle", "stick_forward", "stick_lateral")
+"""Demands in the order of the mixer's factors."""
 
 MOTOR_1 = 33
 """SERVOn_FUNCTION of the first motor."""
@@ -70,6 +76,37 @@ FRAMES: dict[int, tuple[str, list[list[float]]]] = {
 
 LEAST_LIKENESS = 1.4
 """Of a motor's factors to a thruster: 1 from the direction of the force and 1 from the signs of its moments at most."""
+
+
+def mixed_pulses(frame: str, demands: np.ndarray, directions: Sequence[int] = ()) -> np.ndarray:
+    """Pulse widths of ArduSub's motors 1, 2, ... for the demands of a pilot in manual mode.
+
+    VECTORED adds a motor's demands and clips them, and limits the forward demand of the rear pair (in the direction of
+    travel) to 1 - |throttle|; VECTORED_6DOF divides verticals and horizontals each by their largest sum above 1
+    (ArduPilot, AP_Motors6DOF::output_armed_stabilizing_vectored, _vectored_6dof).
+
+    Args:
+        frame: VECTORED or VECTORED_6DOF.
+        demands: Roll right, pitch up, yaw clockwise, throttle up, forward, lateral right in [-1, 1], (n, 6).
+        directions: MOT_n_DIRECTION of each motor; 1 where not given.
+
+    Returns:
+        [µs], (n, motors).
+    """
+    factors = np.array(next(rows for name, rows in FRAMES.values() if name == frame), dtype=float)
+    demands = np.clip(demands, -1.0, 1.0)
+    output = demands @ factors.T
+    if frame == "VECTORED":
+        forward = demands[:, 4]
+        limit = np.maximum(1.0 - np.abs(demands[:, 3]), 0.0)
+        rear = np.sign(factors[:, 4]) * np.sign(forward)[:, None] > 0.0
+        output += np.where(rear, (np.clip(forward, -limit, limit) - forward)[:, None] * factors[:, 4], 0.0)
+    else:
+        for group in (factors[:, 3] == 0.0, factors[:, 3] != 0.0):
+            output[:, group] /= np.maximum(np.abs(output[:, group]).max(axis=-1, keepdims=True), 1.0)
+    sign = np.ones(len(factors))
+    sign[: len(directions)] = directions
+    return np.asarray(NEUTRAL + HALF_RANGE * np.clip(sign * output, -1.0, 1.0))
 
 
 def outputs_of(

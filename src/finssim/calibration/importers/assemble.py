@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.importers.column_map import ColumnMap
+from finssim.calibration.importers.ardusub_outputs import FRAMES, NEUTRAL, STICKS, mixed_pulses, outputs_of
+from finssim.calibration.importers.column_map import ArduSubMap, ColumnMap
 from finssim.calibration.importers.source_map import Frame
 from finssim.calibration.importers.streams import Stream, Table
 from finssim.calibration.importers.units import GRAVITY
@@ -53,6 +54,10 @@ def trial_of(name: str, table: Table, header: Header, column_map: ColumnMap) -> 
         depth, note = _depth(name, channels.pop("pressure"), header, column_map)
         notes += note
         channels["depth"] = depth
+    if any(c in channels for c in STICKS):
+        pulses, note = _pulses(name, channels, header, column_map.ardusub)
+        channels = {c: v for c, v in channels.items() if c not in STICKS} | pulses
+        notes.append(note)
     notes += tidy_quaternions(channels)
     for column in [c for c, v in channels.items() if not np.isfinite(v).any()]:
         notes.append(f"{column} holds no finite number and is left out")
@@ -103,6 +108,41 @@ def _body_velocity(name: str, t: Array, channels: dict[str, Array]) -> dict[str,
         attitude = Slerp(times, Rotation.from_quat(q[known]))(t[usable]).as_quat()
         body[usable] = quat_inverse_rotate(attitude, velocity[usable])
     return dict(zip(NU[:3], body.T, strict=True))
+
+
+def _pulses(
+    name: str, channels: dict[str, Array], header: Header, asked: ArduSubMap
+) -> tuple[dict[str, Array], str]:
+    """Pulse widths of the vehicle's thrusters [µs] from the sticks, by ArduSub's mixer; and a note."""
+    if asked.frame is None or header.vehicle is None:
+        raise CalibrationError(
+            f"{name}: stick_* columns go through ArduSub's mixer: give its frame in the map, "
+            "'ardusub: {frame: VECTORED_6DOF}' or VECTORED, and the vehicle"
+        )
+    pulses = [c for c in channels if c.startswith("pwm_")]
+    if pulses:
+        raise CalibrationError(
+            f"{name}: expected stick_* or pwm_* columns, not both: {pulses[0]} is there as well"
+        )
+    given = [channels[c] for c in STICKS if c in channels]
+    known = np.all([np.isfinite(v) for v in given], axis=0)
+    demands = np.stack([channels.get(c, np.zeros(len(known))) for c in STICKS], axis=-1)
+    beyond = float(np.abs(demands[known]).max(initial=0.0))
+    if beyond > 1.01:
+        raise CalibrationError(
+            f"{name}: stick_* reach {beyond:g}, expected demands in [-1, 1]: "
+            "give scale and offset in the map, scale: 0.0025 and offset: -3.75 for channels of 1100 to 1900 µs"
+        )
+    vehicle = load_vehicle(header.vehicle)
+    config = next(number for number, (frame, _) in FRAMES.items() if frame == asked.frame)
+    directions = {f"MOT_{motor + 1}_DIRECTION": 1.0 for motor in range(len(FRAMES[config][1]))}
+    outputs, note = outputs_of(vehicle, {"FRAME_CONFIG": config, **directions}, asked.outputs)
+    mixed = mixed_pulses(asked.frame, asked.gain * demands, asked.motor_directions)
+    found = {}
+    for output, (thruster, sign) in outputs.items():
+        pulse = NEUTRAL + sign * (mixed[:, output - 1] - NEUTRAL)
+        found[f"pwm_{thruster}"] = np.where(known, pulse, np.nan)
+    return found, f"sticks went through the mixer of frame {asked.frame}, gain {asked.gain:g}: {note}"
 
 
 def _depth(name: str, pressure: Array, header: Header, column_map: ColumnMap) -> tuple[Array, list[str]]:

@@ -20,7 +20,7 @@ HEADER_KEYS = tuple(name for name in Header.model_fields if name != "convert")
 
 
 class ArduSubMap(Part):
-    """What is taken from an ArduSub log."""
+    """What is taken from an ArduSub log, and how its mixer turns sticks into pulses."""
 
     outputs: dict[str, str] = Field(default_factory=dict)
     """Output of the autopilot -> thruster, `{C1: T1, C2: -T2}`; a minus where longer pulses push backwards."""
@@ -31,6 +31,12 @@ class ArduSubMap(Part):
     """The pressure sensor in the water; the primary one where not given."""
     stamps: Literal["header", "received"] = "header"
     """Of a .tlog: the autopilot's own clock where a message has it, or the times at which messages were received."""
+    frame: Literal["VECTORED", "VECTORED_6DOF"] | None = None
+    """Of the mixer that `stick_*` columns went through."""
+    gain: float = Field(default=1.0, gt=0.0, le=1.0)
+    """Pilot gain (PilotGain, JS_GAIN_DEFAULT) of `stick_*` columns, where they are the joystick's, not scaled yet."""
+    motor_directions: tuple[Literal[1, -1], ...] = ()
+    """MOT_n_DIRECTION of motors 1, 2, ..., for `stick_*` columns; 1 where not given."""
 
 
 class SplitRule(Part):
@@ -80,8 +86,8 @@ class ColumnMap(Part):
     topics: dict[str, SourceMap] = Field(default_factory=dict)
     ardusub: ArduSubMap = Field(default_factory=ArduSubMap)
     split: SplitRule | None = None
-    surface_pressure: float | None = Field(default=None, gt=0.0)
-    """Absolute pressure at the surface, for `pressure` columns [Pa]."""
+    surface_pressure: float | None = Field(default=None, ge=0.0)
+    """Of the surface as the sensor reads it, for `pressure` columns [Pa]; 0 for a gauge."""
     header: dict[str, Any] = Field(default_factory=dict)
     """What `trial.yaml` of every trial says."""
     trials: dict[str, dict[str, Any]] = Field(default_factory=dict)

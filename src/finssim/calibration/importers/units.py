@@ -20,9 +20,15 @@ EXTRA_COLUMNS = {
     "vx": ("m/s", "velocity along world x"),
     "vy": ("m/s", "velocity along world y"),
     "vz": ("m/s", "velocity along world z"),
-    "pressure": ("Pa", "absolute pressure"),
+    "pressure": ("Pa", "absolute pressure, or above that of the surface with surface_pressure 0"),
+    "stick_roll": ("-", "ArduSub's demand of roll in [-1, 1], right side down"),
+    "stick_pitch": ("-", "of pitch, nose up"),
+    "stick_yaw": ("-", "of yaw, clockwise from above"),
+    "stick_throttle": ("-", "of throttle, up"),
+    "stick_forward": ("-", "of forward, ahead"),
+    "stick_lateral": ("-", "of lateral, right"),
 }
-"""Names that a map may give beside the canonical columns: they become u v w and depth in the trial."""
+"""Names that a map may give beside the canonical columns: they become u v w, depth and pulse widths in the trial."""
 
 _POUND_FORCE = 4.4482216152605
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -23,7 +24,6 @@ from finssim.vehicles import AXES, Vehicle, load_vehicle
 
 __all__ = ["calibrate_hydrodynamics", "calibrate_motor", "calibrate_thruster", "usable"]
 
-METHODS = ("regression", "simulation")
 ONLY_SIMULATION = "needs --method simulation"
 
 
@@ -83,10 +83,11 @@ def calibrate_hydrodynamics(
     vehicle: str,
     out: Path,
     axes: str | None = None,
-    method: str = "regression",
+    method: str = "auto",
     full: bool = False,
     estimate: str = "",
     damping: str = "auto",
+    fix: str = "",
     horizon: float | None = None,
     report: Path | None = None,
     ranges: Path | None = None,
@@ -100,10 +101,11 @@ def calibrate_hydrodynamics(
         vehicle: Name or file.
         out: Vehicle file to write.
         axes: Separated by commas; those that the trials excite if None.
-        method: `regression` or `simulation`.
+        method: `auto`, `regression` or `simulation`.
         full: Also couplings.
         estimate: Further parameters, separated by commas.
         damping: auto, linear, quadratic or both.
+        fix: Effective inertias M_RB + M_A that are known, `yaw.m=0.6,surge.m=24` [kg, kg m²].
         horizon: Longest stretch that is simulated without a restart [s].
         report: Directory of the report, or None.
         ranges: Ranges file for training, or None.
@@ -117,8 +119,6 @@ def calibrate_hydrodynamics(
         CalibrationError, VehicleError, OutputError: As they say; nothing is written then.
         KeyboardInterrupt: After Ctrl-C, when the best until then, if there is any, has been written.
     """
-    if method not in METHODS:
-        raise CalibrationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
     further = tuple(name for name in (word.strip() for word in estimate.split(",")) if name)
     if method == "regression":
         for given, option in ((full, "--full"), (further, "--estimate"), (horizon is not None, "--horizon")):
@@ -127,6 +127,7 @@ def calibrate_hydrodynamics(
                     f"{option} {ONLY_SIMULATION}: a regression looks at one axis at a time"
                 )
     chosen = _axes(axes)
+    known = _known(fix)
     places = _Places(out, report, ranges)
     command = _command(
         "hydrodynamics",
@@ -137,6 +138,7 @@ def calibrate_hydrodynamics(
         full=full,
         estimate=estimate or None,
         damping=damping,
+        fix=fix or None,
         horizon=horizon,
         out=out,
         report=report,
@@ -145,25 +147,22 @@ def calibrate_hydrodynamics(
     )
     body = load_vehicle(vehicle)
     used = _trials(trials)
-    if method == "regression":
-        from finssim.calibration.regression.regress import regress
+    from finssim.calibration.hydrodynamics import fit_hydrodynamics
 
-        fit = regress(used, body, axes=chosen, damping=damping, seed=seed)
-    else:
-        from finssim.calibration.simulation.fit import fit_by_simulation
-
-        with _progress() as progress:
-            fit = fit_by_simulation(
-                used,
-                body,
-                axes=chosen,
-                full=full,
-                estimate=further,
-                damping=damping,
-                horizon=horizon,
-                seed=seed,
-                progress=progress,
-            )
+    with _progress() as progress:
+        fit = fit_hydrodynamics(
+            used,
+            body,
+            axes=chosen,
+            method=method,
+            full=full,
+            estimate=further,
+            damping=damping,
+            known=known,
+            horizon=horizon,
+            seed=seed,
+            progress=progress,
+        )
     return _finish(fit, places, command, as_json)
 
 
@@ -222,6 +221,25 @@ def _axes(words: str | None) -> tuple[str, ...] | None:
         if name not in AXES:
             raise CalibrationError(f"unknown axis '{name}'; available: {', '.join(AXES)}")
     return tuple(axis for axis in AXES if axis in names)
+
+
+def _known(words: str) -> dict[str, float]:
+    """Axis -> effective inertia, of `yaw.m=0.6,surge.m=24`."""
+    found = {}
+    for word in filter(None, (part.strip() for part in words.split(","))):
+        name, _, value = word.partition("=")
+        axis, _, letter = name.strip().partition(".")
+        try:
+            size = float(value)
+        except ValueError:
+            size = math.nan
+        if axis not in AXES or letter not in ("m", "m_eff") or not (math.isfinite(size) and size > 0.0):
+            raise CalibrationError(
+                f"--fix is '{word}', expected AXIS.m=NUMBER with an axis of {', '.join(AXES)} and the mass with added "
+                "mass in kg, or the inertia with added inertia in kg m², as in yaw.m=0.6"
+            )
+        found[axis] = size
+    return found
 
 
 @contextmanager

@@ -51,12 +51,14 @@ def worthless(data: AxisData, figures: dict[str, float], chosen: Selection) -> s
     return ""
 
 
-def damping_known(data: AxisData, chosen: Selection) -> bool:
-    """Whether the drag is known to `USEFUL` at the speeds of the trials, at their median and near their top.
+def damping_known(data: AxisData, chosen: Selection, before: tuple[float, float]) -> bool:
+    """Whether the drag is known at the speeds of the trials, at their median and near their top: to `USEFUL`, or well
+    enough to exclude that of the vehicle file.
 
     Args:
         data: The trials.
         chosen: The model.
+        before: d1 and d2 of the file.
     """
     from scipy.stats import t
 
@@ -74,7 +76,11 @@ def damping_known(data: AxisData, chosen: Selection) -> bool:
         force, w = float(weights @ fit.theta), weights[fit.terms]
         with np.errstate(invalid="ignore"):
             std = np.sqrt(max(w @ covariance @ w for covariance in found))
-        if not (np.isfinite(std) and force > 0.0 and quantile * std < USEFUL * force):
+        if not (np.isfinite(std) and force > 0.0):
+            return False
+        close = quantile * std < USEFUL * force
+        excluded = abs(before[0] * speed + before[1] * speed**2 - force) > quantile * std
+        if not close and not excluded:
             return False
     return True
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -55,20 +56,23 @@ class AxisResult:
     """Why nothing that was found can be believed; empty where it can."""
 
 
-def axis_result(data: AxisData, chosen: Selection, plant: Matrices) -> AxisResult:
+def axis_result(data: AxisData, chosen: Selection, file: Matrices) -> AxisResult:
     """Estimates of an axis.
+
+    What the data know well is written, and so is what they know badly where the vehicle file's number lies outside the
+    interval: a wide interval is a better answer than a number that it excludes.
 
     Args:
         data: Its trials.
         chosen: The model and its intervals.
-        plant: For the rigid part of the inertia.
+        file: The vehicle as its file has it.
     """
     axis = AXES[data.axis]
     low, high = speed_range(data, chosen)
     speeds = f"speeds of {low:.2g}-{high:.2g} {'m/s' if data.axis < 3 else 'rad/s'}"
-    draft = _Draft(data=data, chosen=chosen)
+    draft = _Draft(data=data, chosen=chosen, file=file)
     draft.inertia()
-    draft.added_mass(float(plant.M_RB[data.axis, data.axis]))
+    draft.added_mass(float(file.M_RB[data.axis, data.axis]))
     draft.damping(speeds)
     if data.restoring:
         draft.add("k", K, "N m/rad", "body.center_of_buoyancy.2")
@@ -92,6 +96,7 @@ class _Draft:
 
     data: AxisData
     chosen: Selection
+    file: Matrices
     estimates: dict[str, Estimate] = field(default_factory=dict)
     changes: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
@@ -130,6 +135,17 @@ class _Draft:
 
     def inertia(self) -> None:
         """m_eff, and in its note a lag that may be part of it."""
+        if self.data.inertia is not None:
+            m, name = self.data.inertia, f"{self.axis}.m_eff"
+            self.estimates[name] = Estimate(
+                name=name,
+                estimate=m,
+                ci95=(m, m),
+                unit=self.unit("kg", "kg m²"),
+                identifiable=True,
+                note="given",
+            )
+            return
         whole = self.add("m_eff", M, self.unit("kg", "kg m²"))
         lag = self.data.shift + self.chosen.fit.theta[DELAY]
         if self.data.shift and not self.chosen.fit.active[M]:
@@ -142,7 +158,7 @@ class _Draft:
     def added_mass(self, rigid: float) -> None:
         """m_eff less the rigid part."""
         whole = self.estimates[f"{self.axis}.m_eff"]
-        value, ends = float(self.chosen.fit.theta[M] - rigid), self.chosen.interval[M] - rigid
+        value, ends = whole.estimate - rigid, np.array(whole.ci95) - rigid
         unit, path = whole.unit, self.path("added_mass")
         sure, note = whole.identifiable, f"with the file's rigid {rigid:.4g} {unit} as exact"
         if value <= 0.0:
@@ -156,7 +172,8 @@ class _Draft:
         elif ends[0] <= 0.0:
             sure, note = False, "not distinguishable from zero"
         half = 0.5 * (whole.ci95[1] - whole.ci95[0])
-        if value > 0.0 and half < USEFUL * whole.estimate:
+        before = float(self.file.M_A[self.data.axis, self.data.axis])
+        if value > 0.0 and (half < USEFUL * whole.estimate or outside(before, ends)):
             self.changes[path] = value
         name = f"{self.axis}.added_mass"
         self.estimates[name] = Estimate(
@@ -178,7 +195,8 @@ class _Draft:
                 )  # fmt: skip
             elif self.chosen.fit.terms[term]:
                 self.add(name, term, unit, self.path(family))
-        if damping_known(self.data, self.chosen):
+        i = self.data.axis
+        if damping_known(self.data, self.chosen, (float(self.file.D1[i, i]), float(self.file.D2[i, i]))):
             self.changes[self.path("linear_damping")] = max(float(theta[D1]), 0.0)
             self.changes[self.path("quadratic_damping")] = max(float(theta[D2]), 0.0)
         else:
@@ -199,6 +217,29 @@ class _Draft:
         }
         self.changes = {}
         self.warnings.append(f"{self.axis}: {reason}; the vehicle file keeps its numbers")
+
+
+def trim(found: Mapping[str, Estimate], buoyancy: float, centre: Sequence[float]) -> dict[str, float]:
+    """Where the centre of buoyancy sits for the constant moments of roll and pitch, as of a vehicle that lies tilted.
+
+    B r_b - W r_g = (b_pitch, -b_roll, k), of which the centre of gravity stays.
+
+    Args:
+        found: Estimates, `roll.bias` and `pitch.bias` among them.
+        buoyancy: B [N].
+        centre: r_b of the vehicle file [m].
+    """
+    out = {}
+    for name, i, sign in (("pitch.bias", 0, 1.0), ("roll.bias", 1, -1.0)):
+        bias = found.get(name)
+        if bias is not None and bias.identifiable and outside(0.0, bias.ci95):
+            out[f"body.center_of_buoyancy.{i}"] = float(centre[i]) + sign * bias.estimate / buoyancy
+    return out
+
+
+def outside(value: float, ends: Array | tuple[float, float]) -> bool:
+    """Whether a number lies outside an interval that has two ends."""
+    return bool(np.isfinite(ends).all() and not ends[0] <= value <= ends[1])
 
 
 def _curves(data: AxisData, chosen: Selection) -> list[Curve]:

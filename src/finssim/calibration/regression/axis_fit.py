@@ -46,6 +46,8 @@ class AxisData:
     """Share of the samples that were left out for their tilt."""
     shift: float = 0.0
     """Time by which the wrench was put later, beyond which `delay` is counted [s]."""
+    inertia: float | None = None
+    """Effective inertia where it is known [kg, kg m²]; fitted if None."""
 
     @property
     def restoring(self) -> bool:
@@ -60,7 +62,7 @@ class AxisFit:
     terms: NDArray[np.bool_]
     """Which of `TERMS` are fitted, (7,)."""
     theta: Array
-    """Zero where not fitted, (7,)."""
+    """Zero where not fitted, but for a known inertia, (7,)."""
     free: Array
     """The same without bounds, (7,)."""
     active: NDArray[np.bool_]
@@ -95,7 +97,11 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
     p = 7 if data.restoring else 6
     kept = terms[:p]
     X = np.concatenate([rows.X for rows in data.rows])
-    y = np.concatenate([rows.y for rows in data.rows])
+    known = np.zeros(p)
+    if data.inertia is not None:
+        kept = kept & (np.arange(p) != 0)
+        known[0] = data.inertia
+    y = np.concatenate([rows.y for rows in data.rows]) - X @ known
     used = [informative(rows, signals) for rows, signals in zip(data.rows, data.signals, strict=True)]
     trial = np.repeat(np.arange(len(data.rows)), [len(rows.y) for rows in data.rows])
     inside = np.concatenate(used)
@@ -117,7 +123,7 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
         )
         if round_ < FREE_ROUNDS:
             ratio = offset_ratio(sums, correlated) / correlated
-        runs = _simulate(data, theta, pieces)
+        runs = _simulate(data, theta + known, pieces)
         if runs is None:
             break
         Z, simulated, instrumental = runs[0], runs[1], True
@@ -143,14 +149,14 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
     ends = np.cumsum([len(rows.y) for rows in data.rows])[:-1]
     return AxisFit(
         terms=np.pad(kept, (0, 7 - p)),
-        theta=np.pad(theta, (0, 7 - p)),
-        free=np.pad(free, (0, 7 - p)),
+        theta=np.pad(theta + known, (0, 7 - p)),
+        free=np.pad(free + known, (0, 7 - p)),
         active=np.pad(active, (0, 7 - p)),
         evidence=found,
         covariance=trial_covariance(found),
         offset_ratio=ratio,
         independent=float(inside.sum()) / correlated,
-        fitted=tuple(np.split(X @ theta, ends)),
+        fitted=tuple(np.split(X @ (theta + known), ends)),
         used=tuple(used),
         simulated=tuple(simulated),
         instrumental=instrumental,

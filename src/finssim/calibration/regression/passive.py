@@ -1,12 +1,13 @@
-"""Trials with the thrusters off: free decay of roll and pitch, and buoyant rise.
+"""Trials with the thrusters off: free decay of roll and pitch, coasts of surge, sway and yaw, and buoyant rise.
 
-Without a known force a motion shows ratios only: k/m, d1/m, d2/m of a decay, (B - W)/m of a rise. Absolute values
-follow from one number of the vehicle file, which every estimate names.
+Without a known force a motion shows ratios only: k/m, d1/m, d2/m of a decay, d1/m, d2/m of a coast, (B - W)/m of a
+rise. Absolute values follow from one number that is given or the vehicle file's, which every estimate names.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.regression.buoyant_rise import Rise, buoyant_rise
+from finssim.calibration.regression.coast_down import COASTING, coast_of, coast_result
 from finssim.calibration.regression.decay_estimates import decay_result
 from finssim.calibration.regression.free_decay import BOTH, Decay, free_decay
 from finssim.calibration.regression.plant_terms import Matrices, matrices
@@ -30,14 +32,16 @@ def passive(
     *,
     axes: Sequence[str] | None = None,
     assume: Literal["restoring", "inertia"] = "restoring",
+    known: Mapping[str, float] | None = None,
 ) -> Fit:
     """What trials without thrust tell.
 
     Args:
         trials: Each with one release.
         vehicle: Gives the number that is taken as known.
-        axes: Of roll, pitch and heave; all if None.
+        axes: All if None.
         assume: `restoring`: the stiffness k = B z_b - W z_g of the file is right; `inertia`: its M_RB + M_A is.
+        known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²], for coasts.
 
     Raises:
         CalibrationError: No trial shows a decay or a rise.
@@ -46,9 +50,9 @@ def passive(
     estimates: dict[str, Estimate] = {}
     changes: dict[str, Any] = {}
     quality: dict[str, dict[str, float]] = {}
-    warnings, curves, used = list[str](), list[Curve](), set[str]()
+    warnings, missing, curves, used = list[str](), list[str](), list[Curve](), set[str]()
     for axis in ("roll", "pitch"):
-        decays = _decays(trials, axis, warnings) if axes is None or axis in axes else []
+        decays = _decays(trials, axis, missing) if axes is None or axis in axes else []
         if not decays:
             continue
         found = decay_result(axis, decays, plant, assume)
@@ -58,15 +62,33 @@ def passive(
         quality[axis] = _decay_quality(decays)
         curves += [_decay_curve(d) for d in decays]
         used |= {d.trial for d in decays}
-    rises = _rises(trials, warnings) if axes is None or "heave" in axes else []
+    rises = _each(trials, buoyant_rise, missing) if axes is None or "heave" in axes else []
     if rises:
         risen = _rise_estimates(rises, plant)
         estimates |= risen
         warnings += _contradictions(risen, plant)
         curves += [_rise_curve(rise) for rise in rises]
         used |= {rise.trial for rise in rises}
+    for axis in COASTING:
+        wanted = axes is None or axis in axes
+        coasts = _each(trials, partial(coast_of, axis=axis, vehicle=vehicle), missing) if wanted else []
+        if coasts:
+            coasted = coast_result(axis, coasts, vehicle, plant, known or {})
+            estimates |= {e.name: e for e in coasted.estimates}
+            changes |= coasted.changes
+            quality[axis] = coasted.quality
+            curves += coasted.curves
+            used |= {coast.trial for coast in coasts}
     if not estimates:
-        raise CalibrationError(f"no trial shows a free decay or a rise: {'; '.join(warnings)}")
+        reasons = "; ".join(sentence for sentence in missing if sentence.startswith(f"{trials[0].name}: "))
+        others = f"; and {len(trials) - 1} trials more" if len(trials) > 1 else ""
+        raise CalibrationError(
+            f"no trial shows a free decay, a coast or a rise: {reasons or 'none was given'}{others}"
+        )
+    # That a trial shows one motion and not the others is no news.
+    warnings += [
+        sentence for sentence in missing if not sentence.startswith(tuple(f"{name}: " for name in used))
+    ]
     return Fit(
         kind="hydrodynamics",
         method="passive",
@@ -81,17 +103,12 @@ def passive(
     )
 
 
-def _decays(trials: Sequence[Trial], axis: str, warnings: list[str]) -> list[Decay]:
-    """Those of one axis, all with the same kind of damping; why a trial shows none becomes a warning."""
-    decays, swinging = [], []
-    for trial in trials:
-        try:
-            decays.append(free_decay(trial, axis))
-            swinging.append(trial)
-        except CalibrationError as error:
-            warnings.append(str(error))
+def _decays(trials: Sequence[Trial], axis: str, missing: list[str]) -> list[Decay]:
+    """Those of one axis, all with the same kind of damping."""
+    decays: list[Decay] = _each(trials, partial(free_decay, axis=axis), missing)
     if len({d.terms for d in decays}) > 1:  # one vehicle, one kind of damping
-        decays = [free_decay(trial, axis, terms=BOTH) for trial in swinging]
+        swinging = {d.trial for d in decays}
+        decays = [free_decay(trial, axis, terms=BOTH) for trial in trials if trial.name in swinging]
     return decays
 
 
@@ -103,15 +120,15 @@ def _decay_quality(decays: Sequence[Decay]) -> dict[str, float]:
     }
 
 
-def _rises(trials: Sequence[Trial], warnings: list[str]) -> list[Rise]:
-    """Why a trial shows none becomes a warning."""
-    rises = []
+def _each(trials: Sequence[Trial], find: Callable[[Trial], Any], missing: list[str]) -> list[Any]:
+    """What is found in each trial; why one shows nothing goes to `missing`."""
+    found = []
     for trial in trials:
         try:
-            rises.append(buoyant_rise(trial))
+            found.append(find(trial))
         except CalibrationError as error:
-            warnings.append(str(error))
-    return rises
+            missing.append(str(error))
+    return found
 
 
 def _rise_estimates(rises: list[Rise], plant: Matrices) -> dict[str, Estimate]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Correlation, Estimate, Fit
 from finssim.calibration.regression.axis_data import Prepared, axis_data, excited, later, prepare
 from finssim.calibration.regression.axis_doubts import LARGE_DELAY, late_velocity, quality, worthless
-from finssim.calibration.regression.axis_estimates import AxisResult, axis_result
+from finssim.calibration.regression.axis_estimates import AxisResult, axis_result, outside, trim
 from finssim.calibration.regression.axis_fit import TERMS, AxisData
 from finssim.calibration.regression.dive_and_coast import buoyancy_estimate
 from finssim.calibration.regression.plant_terms import Matrices, matrices
@@ -46,6 +46,7 @@ def regress(
     *,
     axes: Sequence[str] | None = None,
     damping: str = "auto",
+    known: Mapping[str, float] | None = None,
     seed: int = 0,
 ) -> Fit:
     """Effective mass, damping, bias and, in roll and pitch, stiffness of every axis that the trials excite.
@@ -60,6 +61,7 @@ def regress(
         vehicle: Gives the rigid body, what is known of couplings, and where the numbers go.
         axes: Axes to fit; all that are excited if None.
         damping: `auto`, `linear`, `quadratic` or `both`.
+        known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²].
         seed: Kept with the fit; nothing here is random.
 
     Raises:
@@ -71,13 +73,14 @@ def regress(
     require_fittable(trials)
     driven = [trial for trial in trials if not trial.header.passive]
     prepared, warnings = prepare(driven, vehicle)
-    chosen, plant, more = _fit_axes(prepared, vehicle, wanted, axes is not None, damping)
+    chosen, plant, more = _fit_axes(prepared, vehicle, wanted, axes is not None, damping, known or {})
     warnings += more
+    file = matrices(vehicle)
     estimates: dict[str, Estimate] = {}
     changes: dict[str, Any] = {}
     results: dict[str, AxisResult] = {}
     for i, (data, selection) in chosen.items():
-        results[AXES[i]] = result = axis_result(data, selection, plant)
+        results[AXES[i]] = result = axis_result(data, selection, file)
         estimates |= result.estimates
         changes |= result.changes
         warnings += result.warnings
@@ -93,7 +96,7 @@ def regress(
     curves = [curve for result in results.values() for curve in result.curves]
     told = [axis for axis, result in results.items() if not result.worthless]
     warnings += late_velocity(figures, explained=told)
-    quiet = _passive(trials, vehicle, [i for i in wanted if AXES[i] not in told])
+    quiet = _passive(trials, vehicle, [i for i in wanted if AXES[i] not in told], known or {})
     if quiet is not None:
         estimates, changes, figures = (
             estimates | quiet.estimates,
@@ -120,7 +123,12 @@ def regress(
         warnings=tuple(dict.fromkeys([*warnings, *sentences])),
         curves=tuple(curves),
         trials={trial.name: trial.sha256 for trial in trials if trial.name in used},
-        settings={"damping": damping, "axes": [AXES[i] for i in chosen], "seed": seed},
+        settings={
+            "damping": damping,
+            "axes": [AXES[i] for i in chosen],
+            **({"fix": {f"{axis}.m": m for axis, m in known.items()}} if known else {}),
+            "seed": seed,
+        },
     )
 
 
@@ -130,7 +138,12 @@ def _wanted(axes: Sequence[str] | None) -> list[int]:
 
 
 def _fit_axes(
-    prepared: list[Prepared], vehicle: Vehicle, wanted: list[int], asked: bool, damping: str
+    prepared: list[Prepared],
+    vehicle: Vehicle,
+    wanted: list[int],
+    asked: bool,
+    damping: str,
+    known: Mapping[str, float],
 ) -> tuple[dict[int, tuple[AxisData, Selection]], Matrices, list[str]]:
     """Data and model of every axis that can be fitted; couplings between axes use the estimates of the round before."""
     plant, warnings = matrices(vehicle), list[str]()
@@ -152,6 +165,7 @@ def _fit_axes(
                 if asked and not len(those):
                     warnings.append(f"{AXES[i]}: no trial excites it; the vehicle file keeps its numbers")
                 continue
+            data = replace(data, inertia=known.get(AXES[i]))
             if i in former and former[i][0].shift:
                 data = later(data, former[i][0].shift)
             if round_ and i in former and _same(former[i][0], data):
@@ -195,8 +209,11 @@ def _hydrostatics(
     if excess is not None and excess.identifiable:
         volume = (vehicle.weight + excess.estimate) / (vehicle.water.density * vehicle.water.gravity)
         changes["body.displaced_volume"] = float(volume)
+    buoyancy = vehicle.water.density * vehicle.water.gravity * volume
+    changes |= trim(estimates, buoyancy, vehicle.body.center_of_buoyancy)
     found = [estimates[name] for name in ("roll.k", "pitch.k") if name in estimates]
-    found = [e for e in found if e.identifiable]
+    stiffness = float(matrices(vehicle).arm[2])
+    found = [e for e in found if e.identifiable or (e.estimate > 0.0 and outside(stiffness, e.ci95))]
     if not found:
         return
     half = np.array([0.5 * (e.ci95[1] - e.ci95[0]) for e in found])
@@ -207,7 +224,6 @@ def _hydrostatics(
             "of the centre of buoyancy cannot give; their weighted mean was taken"
         )
     k = float(np.sum(value / half**2) / np.sum(1.0 / half**2))
-    buoyancy = vehicle.water.density * vehicle.water.gravity * volume
     reference = float(vehicle.hydrodynamic_set("calibrated").reference_point[2])
     gravity_part = vehicle.weight * (float(vehicle.body.center_of_gravity[2]) - reference)
     changes["body.center_of_buoyancy.2"] = reference + (k + gravity_part) / buoyancy
@@ -230,12 +246,13 @@ def _correlation(chosen: dict[int, tuple[AxisData, Selection]]) -> tuple[Correla
     return Correlation(names=tuple(names), matrix=block_diag(*blocks)), sentences
 
 
-def _passive(trials: Sequence[Trial], vehicle: Vehicle, wanted: list[int]) -> Fit | None:
-    """What trials without thrust tell of roll, pitch and heave where no driven trial did; None without such trials."""
+def _passive(
+    trials: Sequence[Trial], vehicle: Vehicle, wanted: list[int], known: Mapping[str, float]
+) -> Fit | None:
+    """What trials without thrust show of axes that no driven trial did; None without such trials."""
     quiet = [trial for trial in trials if trial.header.passive]
-    axes = [AXES[i] for i in wanted if i in (2, 3, 4)]
-    if not quiet or not axes:
+    if not quiet or not wanted:
         return None
     from finssim.calibration.regression.passive import passive
 
-    return passive(quiet, vehicle, axes=axes)
+    return passive(quiet, vehicle, axes=[AXES[i] for i in wanted], known=known)

@@ -106,6 +106,7 @@ def _trial(replay: Replay, i: int, pair: Pair) -> dict[str, Any]:
                 "nrmse_unsmoothed": {
                     a: score(pair, model, pair.response(a), raw=True).value for a in pair.axes
                 },
+                "late_s": pair.late.get(model, 0.0),
                 "why": {a: s.why for a, s in replay.scores[model][i].items() if s.why},
                 "phases": {
                     a: {p: phase_score(pair, model, pair.response(a), p).value for p in PHASES}

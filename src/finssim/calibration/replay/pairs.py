@@ -67,6 +67,9 @@ class Pair:
     """Which uninterrupted replay a sample belongs to, -1 for none, (n,); None for a single one."""
     diverged: dict[str, float] = field(default_factory=dict)
     """Model -> time when its simulation stopped being finite [s]; only where it did."""
+    late: dict[str, float] = field(default_factory=dict)
+    """Model -> by how much the recorded motion lags the recorded commands beyond the model's motors [s], for which the
+    comparison allows; only where it shows."""
     in_sample: bool = False
     """Whether the vehicle was fitted on this very trial."""
     notes: tuple[str, ...] = ()

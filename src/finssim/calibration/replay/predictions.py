@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,9 @@ def replay_predictions(
     cut: list[Segment] = []
     for i, trial in enumerate(trials):
         s = streams(trial, vehicle)
+        late = next(iter(pairs[i].late.values()), 0.0)
+        if late:
+            s = replace(s, drive=replace(s.drive, t=s.drive.t + late, spans=s.drive.spans + late))
         for k in range(STAGGER):
             start = k * horizon / STAGGER
             parts = int((trial.duration - start) / horizon)

@@ -147,6 +147,11 @@ def _remarks(replay: Replay) -> list[str]:
                 said.append(f"{axis}: the velocity was not measured but {source}")
         if not scores:
             said.append("no axis is excited and measured")
+        for model, late in pair.late.items():
+            said.append(
+                f"{_label(model)}: the motion {'lags' if late > 0.0 else 'leads'} the recorded commands by "
+                f"{abs(late):.2f} s, which the comparison allows for: two clocks"
+            )
         for sentence in said:
             found.setdefault(sentence, []).append(pair.name)
     out = [*replay.left_out]

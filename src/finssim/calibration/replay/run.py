@@ -27,6 +27,12 @@ RATE = 50.0
 STEP = 0.02
 """Of the simulation; integrated by RK4 [s]."""
 
+LATEST, LEAST_LATE = 0.25, 0.02
+"""Largest and smallest offset between the clocks of commands and motion that a comparison allows for [s]."""
+
+SURE = 0.8
+"""Factor on the squared error that an offset has to reach to be believed."""
+
 
 def check_models(vehicle: Vehicle, models: Sequence[str]) -> tuple[str, ...]:
     """The models, each once.
@@ -166,12 +172,11 @@ def _add(
 ) -> None:
     """Write what a model made of a trial's segments into its pair."""
     n = len(pair.t)
-    values = {name: np.full(n, np.nan) for name in (*NU, "roll", "pitch", "depth")}
     applied = np.full((n, 6), np.nan)
+    pieces = []
     for number, (segment, k) in enumerate(zip(own, which, strict=True)):
         since = pair.t + pair.t0 - segment.t0
         inside = (since >= -1e-9) & (since <= segment.duration + 1e-9)
-        at = since[inside]
         assert pair.segment is not None
         pair.segment[inside] = number
         rows = slice(0, segment.steps + 1)
@@ -179,15 +184,51 @@ def _add(
         if not response.finite[0, k]:
             whole = np.isfinite(response.nu[rows, 0, k]).all(axis=1)
             pair.diverged.setdefault(model, float(segment.t0 - pair.t0 + t[int(np.argmin(whole))]))
-        for name, x in _responses(segment, response, rows, k).items():
-            values[name][inside] = np.interp(at, t, x)
+        pieces.append((inside, since[inside], t, _responses(segment, response, rows, k)))
         if not segment.commanded:
             force = np.concatenate([segment.before[-1:], segment.force])
             tau = _shifted(force @ segment.B.T, vehicle.wrench_reference)
-            applied[inside] = np.stack([np.interp(at, t, x) for x in tau.T], axis=-1)
-    pair.simulated[model] = values
+            applied[inside] = np.stack([np.interp(since[inside], t, x) for x in tau.T], axis=-1)
+
+    def at(late: float) -> dict[str, Array]:
+        values = {name: np.full(n, np.nan) for name in (*NU, "roll", "pitch", "depth")}
+        for inside, since, t, found in pieces:
+            for name, x in found.items():
+                values[name][inside] = np.interp(since - late, t, x)
+        return values
+
+    late = (
+        _late(pair, at) if all(segment.commanded for segment in own) and model not in pair.diverged else 0.0
+    )
+    if late:
+        pair.late[model] = late
+    pair.simulated[model] = at(late)
     if np.isfinite(applied).any():
         pair.applied[model] = applied
+
+
+def _late(pair: Pair, at: Callable[[float], dict[str, Array]]) -> float:
+    """The lag of a log's motion behind its commands that fits best [s]; 0 where it does not show.
+
+    Commands and motion are often recorded by two computers, and a fit allows for their clocks as well.
+    """
+    scored = pair.scored()
+    names = [pair.response(axis) for axis in pair.axes if pair.response(axis) in pair.measured]
+
+    def cost(late: float) -> float:
+        values, total = at(late), 0.0
+        for name in names:
+            error = (values[name] - pair.measured[name])[scored]
+            error = error[np.isfinite(error)]
+            spread = float(np.nanvar(pair.measured[name][scored]))
+            total += float(np.mean(error**2)) / max(spread, 1e-12) if len(error) else 0.0
+        return total
+
+    offsets = np.arange(-LATEST, LATEST + 1e-9, 0.01)
+    costs = [cost(float(offset)) for offset in offsets]
+    best = int(np.argmin(costs))
+    shows = 0 < best < len(offsets) - 1 and abs(offsets[best]) >= LEAST_LATE
+    return float(offsets[best]) if shows and costs[best] < SURE * cost(0.0) else 0.0
 
 
 def _responses(segment: Segment, response: Response, rows: slice, k: int) -> dict[str, Array]:

@@ -12,7 +12,7 @@ from finssim.calibration.simulation.gauss_newton import Solution
 from finssim.calibration.simulation.shooting import Shooting
 from finssim.calibration.uncertainty import Covariance, Evidence, intervals, trial_covariance
 
-__all__ = ["Findings", "evidence_of", "findings"]
+__all__ = ["FEWEST_TRIALS", "Findings", "evidence_of", "findings"]
 
 Array = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ def findings(problem: Shooting, solution: Solution) -> Findings:
 
 
 def evidence_of(problem: Shooting, solution: Solution) -> Evidence:
-    """Normal matrices and scores by trial, or by blocks of rows where there are fewer than `FEWEST_TRIALS`."""
+    """Normal matrices and scores by trial, or by blocks of rows where fewer than `FEWEST_TRIALS` excite an axis."""
     linear, std, point = solution.linear, solution.std, solution.point
     blocks = collect(linear, std, problem.edges, point.z, problem.prior_std)
     weight = huber(linear.residual / std)[1] / std**2
@@ -70,7 +70,7 @@ def evidence_of(problem: Shooting, solution: Solution) -> Evidence:
     if b:
         slopes = _without_biases(slopes, weight, trial, P, (G, b))
     unit, group = "trials", trial
-    if len(np.unique(trial)) < FEWEST_TRIALS:
+    if problem.few or len(np.unique(trial)) < FEWEST_TRIALS:
         unit, group = "blocks", _blocks(problem, trial)
     labels, group = np.unique(group, return_inverse=True)
     order = np.argsort(group, kind="stable")

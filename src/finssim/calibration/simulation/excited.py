@@ -37,6 +37,9 @@ SEEN = 0.9
 PUSH = 0.03
 """Range of a wrench, as part of the vehicle's limit, below which an axis is not driven."""
 
+SWING = 0.2
+"""Range of the rate of roll or pitch that tells of it though no thruster is meant for it [rad/s]."""
+
 ANSWER = (0.02, 0.02, 0.02, 0.04, 0.04, 0.04)
 """Range of a velocity below which an axis does not answer [m/s, rad/s]."""
 
@@ -100,7 +103,9 @@ def _moved(s: Streams, vehicle: Vehicle) -> set[str]:
         noise = s.motion.noise_std[i]
         answers = _range(nu) > max(ANSWER[i], 4.0 * noise if np.isfinite(noise) else 0.0)
         pushed = limits[i] > 0.0 and _range(tau[:, i]) > PUSH * limits[i]
-        if answers and (pushed or s.drive.source == "passive"):
+        # Weight rights roll and pitch again: a swing tells of them whatever began it.
+        swings = i in (3, 4) and _range(nu) > max(SWING, 10.0 * np.nan_to_num(noise))
+        if answers and (pushed or swings or s.drive.source == "passive"):
             out.add(axis)
     return out
 

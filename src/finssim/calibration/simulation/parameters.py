@@ -71,6 +71,7 @@ class Parameters:
 
     Attributes:
         coordinates: In the order of a vector.
+        expected: The vehicle file's numbers, (P,).
     """
 
     def __init__(
@@ -85,6 +86,7 @@ class Parameters:
         hydrodynamics: str = "calibrated",
         start: Mapping[str, float] | None = None,
         imposed: Sequence[str] = (),
+        unseen: Sequence[str] = (),
     ) -> None:
         """Choose what is free.
 
@@ -100,6 +102,7 @@ class Parameters:
             start: Coordinate -> where it starts, in place of the vehicle file's number.
             imposed: Axes that are not fitted: their added mass alone is free, for its momentum turns and pushes the
                 others. Their coordinates come last.
+            unseen: Those of `imposed` that no trial measured, and that therefore are simulated: their drag is free too.
 
         Raises:
             CalibrationError: the set holds no coefficients, or an extra is not known.
@@ -117,6 +120,7 @@ class Parameters:
         self.vehicle, self.hydrodynamics, self.set = vehicle, hydrodynamics, chosen
         self.axes = tuple(a for a in AXES if a in axes)
         self.imposed = tuple(a for a in AXES if a in imposed)
+        self.unseen = tuple(a for a in self.imposed if a in unseen)
         self.index = np.array([AXES.index(a) for a in self.axes], int)
         self.damping, self.extras = damping, tuple(extras)
         self.biases = tuple(a for a in AXES if a in biases)
@@ -139,6 +143,7 @@ class Parameters:
             np.array([getattr(c, name) for c in self.coordinates], float)
             for name in ("start", "low", "high", "scale")
         )
+        self.expected = np.clip(self.start, self.low, self.high)
         self._at = {name: i for i, name in enumerate(self.names)}
         for name, value in (start or {}).items():
             if name in self._at:
@@ -178,7 +183,18 @@ class Parameters:
             out.append(
                 Coordinate(f"{axis}.added_mass", "kg" if i < 3 else "kg m²", own, min(own, 0.0), inf, m)
             )
+        for axis in self.unseen:
+            i = AXES.index(axis)
+            m = float((self.M_RB + self.M_A)[i, i])
+            for name, matrix, size in (("d1", self.D1, m), ("d2", self.D2, 3.0 * m)):
+                unit = ("N s/m", "N s²/m²")[name == "d2"] if i < 3 else ("N m s", "N m s²")[name == "d2"]
+                out.append(Coordinate(f"{axis}.{name}", unit, float(matrix[i, i]), 0.0, inf, size))
         return out
+
+    @property
+    def nuisances(self) -> int:
+        """How many coordinates, the last ones, are there for the sake of the others."""
+        return len(self.imposed) + 2 * len(self.unseen)
 
     def mass_floor(self) -> Array:
         """Lowest added mass of each free axis, (n,): M stays positive definite with all of them there.
@@ -226,6 +242,9 @@ class Parameters:
         for axis in self.imposed:
             i = AXES.index(axis)
             M_A[:, i, i] = self.value(x, f"{axis}.added_mass")
+        for axis in self.unseen:
+            i = AXES.index(axis)
+            D1[:, i, i], D2[:, i, i] = self.value(x, f"{axis}.d1"), self.value(x, f"{axis}.d2")
         if self.coupled:
             self.coupled.write(x, M_A, D1, D2)
             return M_A, D1, D2

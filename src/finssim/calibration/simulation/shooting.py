@@ -31,6 +31,9 @@ GRAIN = 0.004
 COARSE = 0.05
 """Of a channel's range: residuals of that size are small while the parameters are still far off."""
 
+VAGUE = 8.0
+"""What is known of a fitted number beforehand: the file's within so many times its scale."""
+
 EXACT_CLOCK = 1e-3
 """How far the stream that serves as the clock may lag [s]."""
 
@@ -53,6 +56,7 @@ class Shooting:
         *,
         trial_biases: Sequence[str] = (),
         lagged: NDArray[np.bool_] | None = None,
+        few: bool = False,
     ) -> None:
         """Set up.
 
@@ -62,6 +66,7 @@ class Shooting:
             channels: Measured columns to compare.
             trial_biases: Axes whose constant wrench is free in every trial.
             lagged: Which segments' inputs an estimated lag or delay acts on, (S,); the commanded ones if None.
+            few: Whether some axis is excited by too few trials to show how trials differ.
         """
         self.segments, self.parameters = tuple(segments), parameters
         self.measured = Residuals(segments, channels)
@@ -75,16 +80,19 @@ class Shooting:
         )
         self.edges = self.measured.edges
         self.groups = np.array([s.index for s in segments])
-        self.judged = len(parameters.names) - len(parameters.imposed)
+        self.few = few
+        self.judged = len(parameters.names) - parameters.nuisances
         self.errors = SensorErrors(self.measured)
         far = np.full(len(self.errors.streams), LATEST)
         self.low, self.high = np.append(parameters.low, -far), np.append(parameters.high, far)
-        # Imposed axes have the file's inertia within a factor; streams tell the same time to hundredths of a second.
-        self.prior_mean = np.append(np.zeros(len(parameters.low)), 0.0 * far)
-        rows = [AXES.index(a) for a in parameters.imposed]
-        self.prior_mean[self.judged : len(parameters.low)] = np.diag(parameters.M_A)[rows]
+        # Imposed axes have the file's inertia within a factor, the others within an order of magnitude: far from a
+        # solution, over short segments, nothing else keeps them from infinity. Streams tell the same time to hundredths
+        # of a second.
+        self.prior_mean = np.append(parameters.expected, 0.0 * far)
         imposed = np.arange(len(parameters.low)) >= self.judged
-        known = np.where(imposed, 1.0 / parameters.scale**2, 0.0)
+        wide = [VAGUE * (name != "thrust_scale" and not parameters.coupled) for name in parameters.names]
+        size = np.where(imposed, 1.0, np.array(wide, float)) * parameters.scale
+        known = np.where(size > 0.0, 1.0 / np.maximum(size, 1e-300) ** 2, 0.0)
         self.prior_precision = np.append(known, 0.0 * far + LATE_STD**-2.0)
         if "thrust_delay" in parameters.names:
             # A common lag of all streams is a delay of the thrust: the first stream is the clock then.

@@ -16,8 +16,16 @@ from finssim.calibration.simulation.bordered import huber
 from finssim.calibration.simulation.changes import changes
 from finssim.calibration.simulation.coarse_search import coarse_search
 from finssim.calibration.simulation.estimates import estimates
-from finssim.calibration.simulation.evidence import Findings, findings
-from finssim.calibration.simulation.excited import TELL, compared, horizon, sampling, speeds
+from finssim.calibration.simulation.evidence import FEWEST_TRIALS, Findings, findings
+from finssim.calibration.simulation.excited import (
+    TELL,
+    compared,
+    excites,
+    horizon,
+    observable,
+    sampling,
+    speeds,
+)
 from finssim.calibration.simulation.gauss_newton import Point, Solution, solve
 from finssim.calibration.simulation.parameters import EXTRAS, Parameters
 from finssim.calibration.simulation.report import Clock, doubts, pictures, quality
@@ -83,8 +91,11 @@ class Stages:
         self.prepared, self.vehicle, self.axes, self.seed, self.say = prepared, vehicle, axes, seed, say
         self.base = vehicle.replace(start.changes) if start is not None and start.changes else vehicle
         self.given = length
+        self.excites = [excites(s, vehicle) for s in prepared]
         # The added mass of axes that are not fitted pushes and turns the others; roll's and pitch's hardly does.
         self.imposed = tuple(a for a in ("surge", "sway", "heave", "yaw") if a not in axes)
+        measured = observable(prepared)
+        self.unseen = tuple(a for a in self.imposed if a not in measured)
         apart = [float(np.median(np.diff(s.drive.t))) for s in prepared if not s.drive.held]
         self.own_error = OWN_ERROR + BETWEEN * max([0.0, *(dt - STEP for dt in apart)])
         self.shorter: dict[str, float] = {}
@@ -204,6 +215,7 @@ class Stages:
             biases=self.biases,
             start=start,
             imposed=() if full else self.imposed,
+            unseen=() if full else self.unseen,
         )
         return Shooting(
             self.segments,
@@ -211,6 +223,7 @@ class Stages:
             sorted({c for s in self.segments for c in s.measured}),
             trial_biases=self.trial_biases,
             lagged=self.lagged,
+            few=min(sum(axis in one for one in self.excites) for axis in self.axes) < FEWEST_TRIALS,
         )
 
     def _rough(self, problem: Shooting, point: Point) -> Point:

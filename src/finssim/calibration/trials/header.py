@@ -63,6 +63,9 @@ class Header(_Section):
     inputs_between: Literal["held", "linear"] | None = None
     """What inputs did between two samples. `None`: what was asked for is held, and so is what keeps exact levels and
     jumps from row to row; anything else that acted goes in a straight line."""
+    inputs_after: Literal["held", "zero", "unknown"] | None = None
+    """What acts after an input stream that ends before the recording does. `None`: a last command of no thrust is held,
+    any other is unknown from one sample later on."""
     passive: bool = False
     """Thrusters off: no input columns are needed."""
     wrench_at: Point | Literal["center_of_gravity", "origin"] | None = None

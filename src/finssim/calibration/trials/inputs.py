@@ -50,6 +50,8 @@ class Drive:
     """Beginnings and ends of the stretches in which the inputs are known [s], (s, 2)."""
     source: str
     """`rpm`, `force`, `tau`, `pwm`, `command`, or `passive`."""
+    end: float | None = None
+    """From here on the recording goes on and the inputs are unknown [s]; None where they last as long."""
     notes: tuple[str, ...] = ()
     """What was assumed, one sentence each."""
 
@@ -78,6 +80,10 @@ def drive(trial: Trial, vehicle: Vehicle) -> Drive:
     commanded, held, stepped = _between(trial, kind, columns)
     t, values = _together(trial, columns, held)
     force, B, names = _channels(trial, vehicle, kind, columns, t, values)
+    end = _end(trial, t, force) if held else None
+    zero_after = end is not None and trial.header.inputs_after == "zero"
+    if end is not None and zero_after:
+        t, force, end = np.append(t, end), np.concatenate([force, np.zeros_like(force[:1])]), None
     if len(names) > MAX_THRUSTERS:
         if commanded:
             raise CalibrationError(
@@ -93,9 +99,11 @@ def drive(trial: Trial, vehicle: Vehicle) -> Drive:
         commanded=commanded,
         thrusters=names is not TAU,
         held=held,
-        spans=_held_spans(t, trial.t) if held else _spans(t),
+        spans=_held_spans(t, trial.t, end) if held else _spans(t),
+        end=end,
         source=kind.rstrip("_"),
-        notes=_notes(kind, present, stepped),
+        notes=_notes(kind, present, stepped)
+        + (("the inputs end before the recording: none from there on",) if zero_after else ()),
     )
 
 
@@ -192,9 +200,21 @@ def _spans(t: Array) -> Array:
     return np.stack([t[np.concatenate([[True], wide])], t[np.concatenate([wide, [True]])]], axis=-1)
 
 
-def _held_spans(t: Array, recording: Array) -> Array:
-    """A command holds until the next, but not through a gap of the whole recording, where nobody knows of commands."""
-    return _spans(recording[recording >= t[0]])
+def _held_spans(t: Array, recording: Array, end: float | None) -> Array:
+    """A command holds until the next, but not through a gap of the whole recording, nor beyond its stream's end."""
+    inside = recording[(recording >= t[0]) & (recording <= (np.inf if end is None else end))]
+    return _spans(inside)
+
+
+def _end(trial: Trial, t: Array, force: Array) -> float | None:
+    """When a stream of commands ended well before the recording did, with thrust still asked for [s]; else None."""
+    after = trial.header.inputs_after
+    steps = np.diff(t)
+    longest = max(widest_step(t), 1.5 * float(steps.max()))
+    early = float(trial.t[-1] - t[-1]) > longest and after != "held"
+    if not early or (after is None and not np.any(force[-1])):
+        return None
+    return float(t[-1] + np.median(steps))
 
 
 def _keeps_levels(trial: Trial, columns: list[str]) -> bool:

@@ -1,0 +1,190 @@
+"""Calibration of drawn plants from logs as people have them: is it better than the catalogue's file, and honest?
+
+    python benchmarks/calibration_draws.py [--draws 50] [--method auto] [--first 0] [--json FILE]
+
+Every draw is a BlueROV2 Heavy with coefficients of its own, driven by sticks, one axis a trial, recorded at 5 Hz:
+pulses without a battery voltage (thrust 0.65 to 1.1 of the table's), motion that leads or lags the pulses by up to
+0.1 s, a tether that pulls with up to 2 N, a stiffness that the file does not know, and in every second draw no roll or
+pitch. Fitted on the lowest level, compared on two higher ones; intervals against the truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from finssim.calibration.excitation.measurement import NoiseProfile
+from finssim.calibration.excitation.programmes import Programme
+from finssim.calibration.excitation.recording import record
+from finssim.calibration.excitation.synthetic import trials_of
+from finssim.calibration.hydrodynamics import fit_hydrodynamics
+from finssim.calibration.output.calibrate import calibrated
+from finssim.calibration.replay.replay import replay
+from finssim.calibration.trials.trial import Trial
+from finssim.vehicles import AXES, Vehicle, load_vehicle
+
+FITTED = ("surge", "sway", "heave", "yaw")
+LEVELS = (0.15, 0.25, 0.4)
+"""Of the vehicle's wrench limits; the first is fitted."""
+RATE, SECONDS = 50.0, 26.0
+NOISE = NoiseProfile(
+    velocity_std=0.01, gyro_std=0.01, attitude_std=0.003, yaw_std=0.003, position_std=0.003, depth_std=0.01
+)
+SET = "hydrodynamics.calibrated"
+
+
+def drawn(vehicle: Vehicle, rng: np.random.Generator) -> tuple[Vehicle, float, np.ndarray]:
+    """A plant, its thrust over the file's, and the tether's force on it."""
+    chosen = vehicle.hydrodynamics["calibrated"]
+    size = lambda std: np.exp(std * rng.standard_normal(6))  # noqa: E731
+    mass = np.diag(chosen.added_mass) * size(0.35)
+    # The file says zero of some dampings; every real axis has some of both.
+    typical = np.array([20.0, 25.0, 30.0, 0.3, 0.5, 0.3])
+    linear = 0.4 * typical * size(0.6)
+    quadratic = np.diag(chosen.quadratic_damping) * size(0.4)
+    height = float(rng.uniform(0.01, 0.05))
+    plant = vehicle.replace(
+        {
+            f"{SET}.added_mass": mass.tolist(),
+            f"{SET}.linear_damping": linear.tolist(),
+            f"{SET}.quadratic_damping": quadratic.tolist(),
+            "body.center_of_buoyancy": [0.0, 0.0, height],
+            "body.displaced_volume": float(0.0135 * (1.0 + rng.uniform(0.0, 0.01))),
+        }
+    )
+    tether = np.zeros(6)
+    tether[:3] = rng.uniform(-1.0, 1.0, 3) * rng.uniform(0.0, 2.0)
+    return plant, float(rng.uniform(0.65, 1.1)), tether
+
+
+def sticks(axis: str, level: float, vehicle: Vehicle, rng: np.random.Generator, name: str) -> Programme:
+    """Steps of random length and height to both sides, with a pause here and there."""
+    n = round(SECONDS * RATE)
+    tau, t = np.zeros((n, 6)), 0.0
+    i = AXES.index(axis)
+    t += rng.uniform(0.8, 1.5)
+    while t < SECONDS - 2.0:
+        length = rng.uniform(1.0, 4.0)
+        height = 0.0 if rng.random() < 0.15 else rng.choice([-1.0, 1.0]) * rng.uniform(0.6, 1.0)
+        tau[round(t * RATE) : round((t + length) * RATE), i] = height * level * vehicle.wrench_limits[i]
+        t += length
+    return Programme(name=name, axes=(axis,), rate=RATE, tau_desired=tau, phase=np.full(n, ""))
+
+
+def logged(trial: Trial, lead: float, tilt: bool) -> Trial:
+    """At 5 Hz, the motion on a clock of its own, without the header's help."""
+    every, shift = 10, round(lead * RATE)
+    rows = np.arange(10, len(trial.t) - 10, every)
+    names = ["u", "v", "w", "p", "q", "r", "x", "y", "z"]
+    names += ["qx", "qy", "qz", "qw"] if tilt else []
+    channels = {c: v[rows].copy() for c, v in trial.channels.items() if c.startswith("pwm_")}
+    channels |= {c: trial.channels[c][rows + shift].copy() for c in names}
+    header = trial.header.model_copy(update={"axis": (), "description": "", "acceleration": "auto"})
+    return replace(trial, t=trial.t[rows] - trial.t[rows[0]], channels=channels, phase=None, header=header)
+
+
+def draw(seed: int, method: str) -> dict[str, object]:
+    """One plant: scores of both files by axis, and each interval with its truth."""
+    rng = np.random.default_rng([7, seed])
+    vehicle = load_vehicle("bluerov2_heavy")
+    plant, scale, tether = drawn(vehicle, rng)
+    lead = float(rng.uniform(-0.1, 0.1))
+    programmes = [
+        sticks(axis, level, vehicle, rng, f"{axis}_{round(100 * level):03d}")
+        for axis in FITTED
+        for level in LEVELS
+    ]
+    recording = record(programmes, plant, seed=seed, plant={"gain": scale}, disturbance=tether)
+    trials = trials_of(
+        recording, programmes, plant, noise=NOISE, seed=seed, rate=RATE, inputs=("pwm",),
+        columns=("u", "v", "w", "p", "q", "r", "x", "y", "z", "qx", "qy", "qz", "qw"),
+    )  # fmt: skip
+    trials = [logged(trial, lead, tilt=seed % 2 == 0) for trial in trials]
+    low = f"_{round(100 * LEVELS[0]):03d}"
+    fit = fit_hydrodynamics([t for t in trials if t.name.endswith(low)], vehicle, method=method)
+    after = calibrated(fit)
+    held = [t for t in trials if not t.name.endswith(low)]
+    scores = {name: _by_axis(body, held) for name, body in (("file", vehicle), ("calibrated", after))}
+    chosen = plant.hydrodynamics["calibrated"]
+    truth: dict[str, float] = {"thrust_scale": scale}
+    rigid = np.diag(plant.rigid_body_mass_matrix())
+    for axis in FITTED:
+        i = AXES.index(axis)
+        truth |= {
+            f"{axis}.m_eff": float(rigid[i] + chosen.added_mass[i, i]),
+            f"{axis}.d1": float(chosen.linear_damping[i, i]),
+            f"{axis}.d2": float(chosen.quadratic_damping[i, i]),
+        }
+    truth["buoyancy_excess"] = plant.buoyancy - plant.weight + float(tether[2])
+    found = {
+        name: [fit.estimates[name].estimate, *fit.estimates[name].ci95, value]
+        for name, value in truth.items()
+        if name in fit.estimates
+    }
+    return {"seed": seed, "method": fit.method, "scores": scores, "estimates": found}
+
+
+def _by_axis(vehicle: Vehicle, trials: list[Trial]) -> dict[str, float]:
+    values: dict[str, list[float]] = {}
+    for row in replay(trials, vehicle).scores["calibrated"]:
+        for axis, score in row.items():
+            if axis in FITTED and score.value is not None:
+                values.setdefault(axis, []).append(score.value)
+    return {axis: float(np.median(found)) for axis, found in values.items()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--draws", type=int, default=50)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--method", default="auto")
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    rows: list[dict[str, object]] = []
+    for seed in range(args.first, args.first + args.draws):
+        rows.append(draw(seed, args.method))
+        scores = rows[-1]["scores"]
+        assert isinstance(scores, dict)
+        print(
+            seed,
+            rows[-1]["method"],
+            {a: f"{scores['calibrated'][a]:.3f} < {v:.3f}" for a, v in scores["file"].items()},
+            flush=True,
+        )
+        if args.json:
+            args.json.write_text(json.dumps(rows))
+    report(rows)
+
+
+def report(rows: list[dict]) -> None:
+    """Draws that are better on every axis, and how often intervals hold the truth."""
+    better = sum(
+        all(r["scores"]["calibrated"].get(a, math.inf) < v for a, v in r["scores"]["file"].items())
+        for r in rows
+    )
+    print(f"better than the file on every fitted axis: {better} of {len(rows)} draws")
+    for axis in FITTED:
+        a, b = ([r["scores"][w].get(axis, math.nan) for r in rows] for w in ("calibrated", "file"))
+        print(f"  {axis:6s} NRMSE, median: calibrated {np.nanmedian(a):.3f}, file {np.nanmedian(b):.3f}")
+    names = sorted({name for r in rows for name in r["estimates"]})
+    inside = []
+    for name in names:
+        e = np.array([r["estimates"][name] for r in rows if name in r["estimates"]])
+        known = np.isfinite(e).all(axis=1)
+        e = e[known]
+        held = (e[:, 1] <= e[:, 3]) & (e[:, 3] <= e[:, 2])
+        inside += held.tolist()
+        ratio = np.median(e[:, 0] / e[:, 3])
+        print(f"  {name:18s} holds the truth in {held.mean():6.1%} of {len(e)}, estimate / truth {ratio:.2f}")
+    print(f"all intervals together: {np.mean(inside):.1%}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,290 @@
+"""The hydrodynamics of a vehicle from its trials: which method, what scale of thrust, and whether it helps.
+
+Two methods share trials, damping models and reports: the regression of each axis (`regression.regress`), and
+simulation error over all of them (`simulation.fit`). `auto` begins with the first, and takes the second where that
+replays the trials better.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from finssim.calibration.errors import CalibrationError
+from finssim.calibration.fit import Estimate, Fit
+from finssim.calibration.output.calibrate import SCALED, calibrated
+from finssim.calibration.regression.axis_estimates import CERTAIN
+from finssim.calibration.regression.plant_terms import matrices
+from finssim.calibration.regression.regress import regress
+from finssim.calibration.trials.inputs import drive
+from finssim.calibration.trials.trial import Trial
+from finssim.vehicles import AXES, Vehicle
+
+__all__ = ["METHODS", "fit_hydrodynamics"]
+
+METHODS = ("auto", "regression", "simulation")
+
+ENOUGH = 0.10
+"""NRMSE of the replay of every fitted axis up to which a regression is not tried to be bettered."""
+
+WORSE = 1.05
+"""Factor on the vehicle file's NRMSE above which the fit replays an axis worse than the file."""
+
+LIKELY_SCALE, SCALE_STD = 0.9, 0.25
+"""Thrust of a battery on its way from full to empty, to that at the voltage of the thruster's table, and the standard
+deviation of its logarithm: thrust goes with the square of a voltage of 3.3 to 4.2 V a cell."""
+
+ADDED_MASS_STD = 0.7
+"""Of the logarithm of a catalogue's added mass, a factor of two: published sets of one vehicle differ by as much."""
+
+INERTIA_STD = 0.5
+"""Of the logarithm of a catalogue's effective moment of inertia."""
+
+GIVEN_STD = 0.03
+"""Of the logarithm of an inertia that is given."""
+
+MULTIPLIED = ("m_eff", "added_mass", "d1", "d2", "bias", "k")
+"""Estimates of an axis that a thrust scale multiplies."""
+
+Progress = Callable[[float, str], None]
+
+
+def fit_hydrodynamics(
+    trials: Sequence[Trial],
+    vehicle: Vehicle,
+    *,
+    axes: Sequence[str] | None = None,
+    method: str = "auto",
+    full: bool = False,
+    estimate: Sequence[str] = (),
+    damping: str = "auto",
+    known: Mapping[str, float] | None = None,
+    horizon: float | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Fit:
+    """Fit added mass, damping, buoyancy and stiffness.
+
+    Where every driven trial is of pulse widths without a battery voltage, nobody knows the thrust: its scale is then
+    estimated from what voltages a battery has and what added mass the vehicle file expects, goes to the file with the
+    rest, and its uncertainty is in every interval.
+
+    Args:
+        trials: None of them held out.
+        vehicle: Gives the rigid body, the motors and what is not fitted.
+        axes: Axes to fit; those that the trials excite if None.
+        method: One of `METHODS`.
+        full: Also couplings; simulation only.
+        estimate: Further parameters; simulation only.
+        damping: `auto`, `linear`, `quadratic` or `both`.
+        known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²]; regression only.
+        horizon: Longest stretch that is simulated without a restart [s]; simulation only.
+        seed: Of everything random.
+        progress: Called with the part done and a few words.
+
+    Raises:
+        CalibrationError: No trial can be used, or an option is not the method's.
+    """
+    known = dict(known or {})
+    only_simulation = {
+        "couplings": full,
+        "further estimates": bool(estimate),
+        "a horizon": horizon is not None,
+    }
+    asked = [name for name, given in only_simulation.items() if given]
+    if method not in METHODS:
+        raise CalibrationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
+    if asked and (method == "regression" or known):
+        raise CalibrationError(
+            f"{asked[0]}: expected the simulation method: a regression looks at one axis at a time"
+        )
+    if known and method == "simulation":
+        raise CalibrationError("known inertias need the regression: the simulation method fits every inertia")
+
+    def regression(body: Vehicle) -> Fit:
+        return regress(trials, body, axes=axes, damping=damping, known=known, seed=seed)
+
+    def simulation(body: Vehicle) -> Fit:
+        from finssim.calibration.simulation.fit import fit_by_simulation
+
+        return fit_by_simulation(
+            trials, body, axes=axes, full=full, estimate=estimate, damping=damping, horizon=horizon, seed=seed,
+            progress=progress,
+        )  # fmt: skip
+
+    scale, std = 1.0, 0.0
+    if "thrust_scale" not in estimate and _unknown_voltage(trials, vehicle):
+        scale, std = _thrust_scale(_or_none(regression, vehicle), vehicle, known)
+    body = vehicle.replace(_scaled(vehicle, scale)) if std else vehicle
+    driven = [trial for trial in trials if not trial.header.passive]
+    if method == "simulation" or asked:
+        fit = simulation(body)
+    elif method == "regression" or known or not driven:
+        fit = regression(body)
+    else:
+        fit = _better(regression, simulation, body, trials)
+    if std:
+        fit = _with_scale(fit, vehicle, scale, std)
+    return replace(fit, warnings=(*fit.warnings, *_worse(fit, trials)))
+
+
+def _or_none(fit: Callable[[Vehicle], Fit], vehicle: Vehicle) -> Fit | None:
+    try:
+        return fit(vehicle)
+    except CalibrationError:
+        return None
+
+
+def _better(
+    regression: Callable[[Vehicle], Fit],
+    simulation: Callable[[Vehicle], Fit],
+    body: Vehicle,
+    trials: Sequence[Trial],
+) -> Fit:
+    """The regression where it replays every axis well and better than the file; else whichever replays better."""
+    first = _or_none(regression, body)
+    if first is None:
+        return simulation(body)
+    before, after = _scores(body, trials), _scores(calibrated(first), trials)
+    if after and all(
+        value <= ENOUGH and value <= before.get(axis, math.inf) for axis, value in after.items()
+    ):
+        return first
+    second = _or_none(simulation, body)
+    if second is None:
+        return first
+    other = _scores(calibrated(second), trials)
+    means = [_mean(scores, {*after, *other}) for scores in (after, other)]
+    return second if means[1] < means[0] else first
+
+
+def _mean(scores: Mapping[str, float], axes: set[str]) -> float:
+    """Over the axes; an axis without a score, or one that is further off than no model, counts 1."""
+    return float(np.mean([min(scores.get(axis, 1.0), 1.0) for axis in axes])) if axes else 1.0
+
+
+def _scores(vehicle: Vehicle, trials: Sequence[Trial]) -> dict[str, float]:
+    """NRMSE of the replay by axis, the median over the trials; none where nothing can be replayed."""
+    from finssim.calibration.replay.replay import replay
+
+    try:
+        rows = replay(trials, vehicle).scores["calibrated"]
+    except CalibrationError:
+        return {}
+    values: dict[str, list[float]] = {}
+    for row in rows:
+        for axis, score in row.items():
+            if score.value is not None:
+                values.setdefault(str(axis), []).append(
+                    score.value if math.isfinite(score.value) else math.inf
+                )
+    return {axis: float(np.median(found)) for axis, found in values.items()}
+
+
+def _worse(fit: Fit, trials: Sequence[Trial]) -> list[str]:
+    """A sentence for each axis that the calibrated vehicle replays worse than the file it came from."""
+    if not fit.changes:
+        return []
+    before, after = _scores(fit.vehicle, trials), _scores(calibrated(fit), trials)
+    return [
+        f"{axis}: the calibrated vehicle replays these trials worse (NRMSE {value:.2f}) than the vehicle file does "
+        f"({before[axis]:.2f}): do not use it for this axis; try --method "
+        f"{'simulation' if fit.method == 'regression' else 'regression'}, or trials that move it alone"
+        for axis, value in after.items()
+        if axis in before and value > WORSE * before[axis] + 0.01
+    ]
+
+
+# -- the scale of thrust --------------------------------------------------------------------------------------------
+
+
+def _unknown_voltage(trials: Sequence[Trial], vehicle: Vehicle) -> bool:
+    """Whether all that is known of the thrust is pulse widths, and the battery's voltage is not."""
+    driven = [trial for trial in trials if not trial.header.passive]
+    try:
+        sources = {drive(trial, vehicle).source for trial in driven}
+    except CalibrationError:
+        return False
+    silent = all(trial.header.voltage is None and not trial.has("voltage") for trial in driven)
+    return sources == {"pwm"} and silent
+
+
+def _scaled(vehicle: Vehicle, scale: float) -> dict[str, Any]:
+    """Changes of the vehicle file that multiply every thrust."""
+    return {
+        f"thrusters.{name}.{key}": scale * float(getattr(thruster, key))
+        for name, thruster in vehicle.thrusters.items()
+        for key in SCALED
+    }
+
+
+def _thrust_scale(fit: Fit | None, vehicle: Vehicle, known: Mapping[str, float]) -> tuple[float, float]:
+    """Thrust over that of the file, and the standard deviation of its logarithm.
+
+    Motion shows inertia over thrust; the vehicle file expects an inertia, and batteries have a voltage:
+    ln s is the mean of ln(m_file / m_fit) over the axes and of ln `LIKELY_SCALE`, weighted by their certainty.
+    """
+    plant = matrices(vehicle)
+    said, weight = [math.log(LIKELY_SCALE)], [SCALE_STD**-2]
+    for i, axis in enumerate(AXES):
+        found = fit.estimates.get(f"{axis}.m_eff") if fit is not None else None
+        if found is None or not found.estimate > 0.0 or axis in ("roll", "pitch"):
+            continue  # a stiffness that nobody knows goes with the inertia of roll and pitch
+        expected = float(plant.M_RB[i, i] + plant.M_A[i, i])
+        std = INERTIA_STD if i > 2 else ADDED_MASS_STD * float(plant.M_A[i, i]) / expected
+        value = found.estimate
+        half = 0.5 * (found.ci95[1] - found.ci95[0]) / value
+        if axis in known:
+            continue
+        if math.isfinite(half) and half < 0.5:
+            said.append(math.log(expected / value))
+            weight.append(1.0 / (std**2 + (0.5 * half) ** 2 + 1e-4))
+    total = sum(weight)
+    return math.exp(sum(w * x for w, x in zip(weight, said, strict=True)) / total), total**-0.5
+
+
+def _with_scale(fit: Fit, vehicle: Vehicle, scale: float, std: float) -> Fit:
+    """The fit with the scale among its estimates and in its intervals."""
+    low, high = math.exp(-1.96 * std), math.exp(1.96 * std)
+    fitted = fit.settings.get("axes", ())
+    found = dict(fit.estimates)
+    for name, e in fit.estimates.items():
+        axis, _, kind = name.partition(".")
+        if name == "buoyancy_excess" or (axis in fitted and kind in MULTIPLIED):
+            rigid = found[f"{axis}.m_eff"].estimate - e.estimate if kind == "added_mass" else 0.0
+            found[name] = _widened(e, rigid, low, high)
+    found["thrust_scale"] = Estimate(
+        name="thrust_scale", estimate=scale, ci95=(scale * low, scale * high), unit="-", identifiable=False,
+        note="no battery voltage: from what batteries have and the added mass that the vehicle file expects; it is in "
+        "every interval",
+    )  # fmt: skip
+    warning = (
+        f"no trial has a battery voltage, so that the thrust is known to {100.0 * (high - 1.0):.0f} % at best, and "
+        "masses and drag with it: give a column 'voltage', or 'voltage:' in trial.yaml or in the map"
+    )
+    return replace(
+        fit,
+        vehicle=vehicle,
+        estimates=found,
+        changes={**_scaled(vehicle, scale), **fit.changes},
+        warnings=(warning, *fit.warnings),
+    )
+
+
+def _widened(e: Estimate, rigid: float, low: float, high: float) -> Estimate:
+    """An estimate whose interval also holds a factor between `low` and `high` on estimate + rigid."""
+    whole, (a, b) = e.estimate + rigid, e.ci95
+    if not (math.isfinite(a) and math.isfinite(b)):
+        return e
+    down, up = (1.0 - low, high - 1.0) if whole >= 0.0 else (high - 1.0, 1.0 - low)
+    a = whole - math.hypot(e.estimate - a, down * abs(whole)) - rigid
+    b = whole + math.hypot(b - e.estimate, up * abs(whole)) - rigid
+    kind = e.name.partition(".")[2]
+    if kind in ("d1", "d2", "k"):
+        a = max(a, 0.0)
+    sure = e.identifiable and (kind in ("bias", "") or 0.5 * (b - a) <= CERTAIN * abs(e.estimate))
+    return replace(e, ci95=(a, b), identifiable=sure)

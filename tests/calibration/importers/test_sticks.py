@@ -1,0 +1,100 @@
+"""A pilot's sticks through ArduSub's mixer: pulses that push the vehicle where the pilot pointed."""
+
+import numpy as np
+import pytest
+
+from finssim.calibration.errors import CalibrationError
+from finssim.calibration.importers.ardusub_outputs import STICKS, mixed_pulses
+from finssim.calibration.importers.dispatch import read_trials
+from finssim.calibration.trials.inputs import drive
+from finssim.vehicles import load_vehicle
+
+FRAMES = {"VECTORED": "bluerov2", "VECTORED_6DOF": "bluerov2_heavy"}
+PUSHES = {
+    "stick_forward": (0, 1.0),
+    "stick_lateral": (1, -1.0),
+    "stick_throttle": (2, 1.0),
+    "stick_roll": (3, 1.0),
+    "stick_pitch": (4, -1.0),
+    "stick_yaw": (5, -1.0),
+}
+"""Stick -> axis of forward-left-up and its sign: right is -y, nose up is -pitch, clockwise from above is -yaw."""
+
+
+def demand(**sticks):
+    return np.array([[sticks.get(name.removeprefix("stick_"), 0.0) for name in STICKS]])
+
+
+def trial(tmp_path, text, **columns):
+    """A log of sticks under a map."""
+    n = 20
+    rows = [",".join(["t", *columns])] + [
+        ",".join(str(v) for v in [0.1 * k, *columns.values()]) for k in range(n)
+    ]
+    (tmp_path / "log.csv").write_text("\n".join(rows))
+    (tmp_path / "map.yaml").write_text(
+        text + "time: t\ncolumns: {" + ", ".join(f"{c}: {c}" for c in columns) + "}\n"
+    )
+    (found,) = read_trials([tmp_path / "log.csv"], column_map=tmp_path / "map.yaml")
+    return found
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize("stick", PUSHES)
+def test_each_stick_pushes_its_way(tmp_path, frame, stick):
+    """Through the mixer, the vehicle file's thrusters and its speed controllers."""
+    if (frame, stick) == ("VECTORED", "stick_pitch"):
+        pytest.skip("six thrusters do not pitch")
+    vehicle = load_vehicle(FRAMES[frame])
+    found = drive(
+        trial(tmp_path, f"vehicle: {vehicle.name}\nardusub: {{frame: {frame}}}\n", **{stick: 0.5}), vehicle
+    )
+    tau = vehicle.control_matrix @ found.force[-1]
+    axis, sign = PUSHES[stick]
+    assert sign * tau[axis] > (5.0 if axis < 3 else 0.5)
+    if axis < 3:
+        assert np.abs(np.delete(tau[:3], axis)).max() < 0.1 * abs(tau[axis])
+
+
+def test_the_vectored_frame_gives_way_to_the_throttle():
+    """The pair that is the rear in the direction of travel has no more forward demand than 1 - |throttle|."""
+    out = (mixed_pulses("VECTORED", demand(forward=1.0, throttle=0.75)) - 1500.0)[0] / 400.0
+    np.testing.assert_allclose(out[:4], [-1.0, -1.0, 0.25, 0.25])
+    out = (mixed_pulses("VECTORED", demand(forward=-1.0, throttle=0.75)) - 1500.0)[0] / 400.0
+    np.testing.assert_allclose(out[:4], [0.25, 0.25, -1.0, -1.0])
+    np.testing.assert_allclose(
+        (mixed_pulses("VECTORED", demand(forward=1.0, yaw=1.0))[0, :4] - 1500.0) / 400.0, [0, -1, 0, 1]
+    )
+
+
+def test_the_frame_of_six_axes_keeps_directions():
+    """Horizontals and verticals are scaled down apart, so that full ahead and full right is still diagonal."""
+    out = (mixed_pulses("VECTORED_6DOF", demand(forward=1.0, lateral=1.0, throttle=0.3)) - 1500.0)[0] / 400.0
+    np.testing.assert_allclose(out, [0.0, -1.0, 1.0, 0.0, -0.3, -0.3, -0.3, -0.3])
+
+
+def test_directions_and_gain():
+    """MOT_n_DIRECTION turns a motor's pulses; the pilot gain scales the sticks before the mixer."""
+    turned = mixed_pulses("VECTORED", demand(throttle=0.5), directions=[1, 1, 1, 1, -1, 1])[0]
+    np.testing.assert_allclose(turned[4:], [1700.0, 1300.0])
+
+
+@pytest.mark.parametrize(
+    "text, columns, said",
+    [
+        ("vehicle: bluerov2\n", {"stick_yaw": 0.1}, "frame"),
+        ("vehicle: bluerov2\nardusub: {frame: VECTORED}\n", {"stick_yaw": 1600}, "scale and offset"),
+        ("vehicle: bluerov2\nardusub: {frame: VECTORED}\n", {"stick_yaw": 0.1, "pwm_T1": 1500}, "not both"),
+        ("vehicle: bluerov2_heavy\nardusub: {frame: VECTORED}\n", {"stick_yaw": 0.1}, "6 motors"),
+    ],
+)
+def test_what_cannot_be_mixed_is_refused(tmp_path, text, columns, said):
+    """One sentence with what to give."""
+    with pytest.raises(CalibrationError, match=said):
+        trial(tmp_path, text, **columns)
+
+
+def test_gauge_pressure_has_its_zero_at_the_surface(tmp_path):
+    """surface_pressure: 0."""
+    found = trial(tmp_path, "vehicle: bluerov2\nsurface_pressure: 0\n", pressure=9810.0)
+    np.testing.assert_allclose(found.series("depth")[1], 1.0, rtol=1e-6)

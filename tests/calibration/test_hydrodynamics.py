@@ -1,0 +1,132 @@
+"""From logs as people have them to a vehicle file that replays other trials better than the catalogue's."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from finssim.calibration.check.check import check_trials
+from finssim.calibration.errors import CalibrationError
+from finssim.calibration.hydrodynamics import LIKELY_SCALE, fit_hydrodynamics
+from finssim.calibration.importers.dispatch import read_trials
+from finssim.calibration.output.calibrate import calibrated
+from finssim.calibration.replay.replay import replay
+from finssim.vehicles import load_vehicle
+
+DATA = Path(__file__).parents[1] / "data" / "standins"
+DOCS = Path(__file__).parents[2] / "docs" / "importing.md"
+
+
+def read(pattern, name, folder, tmp):
+    """Trials of a set by the map that the page on importing prints under this name."""
+    block = DOCS.read_text(encoding="utf-8").split(f"# {name}\n", 1)[1].split("```", 1)[0]
+    (tmp / name).write_text(block)
+    files = sorted(path for p in pattern for path in (DATA / folder).glob(p))
+    return read_trials(files, column_map=tmp / name)
+
+
+def scores(vehicle, trials, **options):
+    """NRMSE by axis, the median over the trials."""
+    return replay(trials, vehicle, **options).aggregate("calibrated").by_axis
+
+
+@pytest.fixture(scope="module")
+def joystick(tmp_path_factory):
+    """Trials to fit, trials to replay."""
+    tmp = tmp_path_factory.mktemp("map")
+    held = [f"*_{level}.csv" for level in ("040", "060")]
+    return read(["*_025.csv"], "joystick.yaml", "joystick_mocap", tmp), read(
+        held, "joystick.yaml", "joystick_mocap", tmp
+    )
+
+
+def test_sticks_and_motion_capture_at_5_hz(joystick):
+    """Fitted at a quarter of the sticks' range, replayed at twice that: below 0.1, and better than the catalogue."""
+    fitted, held = joystick
+    vehicle = load_vehicle("bluerov2_heavy")
+    fit = fit_hydrodynamics(fitted, vehicle, method="regression")
+    found, before = scores(calibrated(fit), held), scores(vehicle, held)
+    assert max(found[axis] for axis in ("surge", "sway", "yaw", "heave")) < 0.10, found
+    assert all(found[axis] < 0.8 * before[axis] for axis in found), (found, before)
+    scale = fit.estimates["thrust_scale"]
+    assert scale.ci95[0] < scale.estimate < scale.ci95[1] and scale.ci95[1] > 1.5 * scale.ci95[0]
+    mass = fit.estimates["surge.m_eff"]
+    assert mass.ci95[1] - mass.ci95[0] > 0.4 * mass.estimate and not mass.identifiable
+    assert any("battery voltage" in sentence for sentence in fit.warnings)
+
+
+def test_a_known_voltage_leaves_the_thrust_alone(joystick):
+    """With the voltage in the header no scale is estimated, and the masses are surer."""
+    fitted, _ = joystick
+    vehicle = load_vehicle("bluerov2_heavy")
+    told = [replace(t, header=t.header.model_copy(update={"voltage": 15.0})) for t in fitted]
+    fit = fit_hydrodynamics(told, vehicle, method="regression", axes=["yaw"])
+    assert "thrust_scale" not in fit.estimates
+    assert fit.estimates["yaw.m_eff"].identifiable
+
+
+@pytest.mark.slow
+def test_pulses_and_an_imu_without_any_velocity(tmp_path):
+    """Roll, pitch, yaw three seconds ahead and a yaw trial of a higher level, from gyro, attitude and depth alone."""
+    vehicle = load_vehicle("bluerov2")
+    fitted = read(["yaw_020*", "yaw_035*", "mixed_035*", "heave_050*"], "pulses.yaml", "pulses_imu", tmp_path)
+    held = read(["yaw_050*", "mixed_050*"], "pulses.yaml", "pulses_imu", tmp_path)
+    reports = check_trials(fitted, vehicle)
+    for report in reports:
+        said = " ".join(finding.text for finding in report.findings)
+        assert "drifts by" in said and "inputs end" in said, said
+    fit = fit_hydrodynamics(fitted, vehicle)
+    assert fit.method == "simulation"
+    result = replay(held, calibrated(fit), horizon=3.0)
+    ahead = {axis: result.ahead[axis]["calibrated"].nrmse[-1] for axis in ("roll", "pitch", "yaw")}
+    assert max(ahead.values()) < 0.15, ahead
+    (yaw,) = (
+        s["yaw"].value
+        for p, s in zip(result.pairs, result.scores["calibrated"], strict=True)
+        if p.name == "yaw_050"
+    )
+    assert yaw < 0.10
+
+
+def test_a_heading_that_decays(tmp_path):
+    """Spun by hand and weighed by nobody: quadratic drag over inertia, with an interval; an inertia scales it."""
+    vehicle = load_vehicle("bluerov2")
+    trials = read(["*.csv"], "decay.yaml", "yaw_decay", tmp_path)
+    fit = fit_hydrodynamics(trials, vehicle)
+    ratio = fit.estimates["yaw.d2/m_eff"]
+    assert ratio.estimate == pytest.approx(0.775, rel=0.02) and ratio.identifiable
+    assert ratio.ci95[1] - ratio.ci95[0] < 0.05 * ratio.estimate
+    assert fit.quality["yaw"]["rmse_quadratic"] < 0.2 * fit.quality["yaw"]["rmse_linear"]
+    assert scores(calibrated(fit), trials)["yaw"] < 0.02
+    known = fit_hydrodynamics(trials, vehicle, known={"yaw": 0.5})
+    assert known.estimates["yaw.d2"].estimate == pytest.approx(0.5 * ratio.estimate)
+    assert calibrated(known).mass_matrix()[5, 5] == pytest.approx(0.5, rel=1e-6)
+
+
+def test_options_belong_to_their_method(joystick):
+    """What a method cannot do is refused before anything is fitted."""
+    fitted, _ = joystick
+    vehicle = load_vehicle("bluerov2_heavy")
+    for options in (
+        {"method": "regression", "full": True},
+        {"method": "simulation", "known": {"yaw": 1.0}},
+        {"method": "x"},
+    ):
+        with pytest.raises(CalibrationError):
+            fit_hydrodynamics(fitted, vehicle, **options)
+
+
+def test_without_any_motion_a_battery_decides_the_scale(joystick):
+    """Where no inertia is found, the scale is what batteries have."""
+    fitted, _ = joystick
+    still = [
+        replace(
+            t, channels={c: v for c, v in t.channels.items() if c.startswith("pwm_") or c in ("r", "yaw")}
+        )
+        for t in fitted
+        if t.name.startswith("yaw")
+    ]
+    fit = fit_hydrodynamics(still, load_vehicle("bluerov2_heavy"), method="regression", known={"yaw": 0.6})
+    assert fit.estimates["thrust_scale"].estimate == pytest.approx(LIKELY_SCALE, rel=0.3)
+    assert np.isfinite(fit.estimates["thrust_scale"].ci95).all()
