@@ -20,7 +20,7 @@ from finssim.files import atomic_write
 from finssim.page import html_page, html_picture, html_table
 from finssim.provenance import provenance
 
-__all__ = ["ablation", "ablation_tables", "everything", "print_ablation", "print_everything"]
+__all__ = ["ablation", "everything", "print_ablation", "print_everything"]
 
 SPECS: Mapping[str, Spec] = {"t1": T1, "t2": T2}
 """The experiments that an ablation is made of, in its order."""

@@ -25,7 +25,6 @@ from finssim.quiet import start_warp
 
 __all__ = [
     "Job",
-    "Play",
     "Say",
     "Show",
     "choice",

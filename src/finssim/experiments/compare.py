@@ -33,18 +33,7 @@ from finssim.provenance import provenance
 from finssim.tasks import TASKS
 from finssim.vehicles import load_vehicle
 
-__all__ = [
-    "MEASURES",
-    "CompareError",
-    "compare",
-    "comparison",
-    "curve_of",
-    "groups_of",
-    "measures_of",
-    "print_comparison",
-    "scores_of",
-    "table_of",
-]
+__all__ = ["CompareError", "MEASURES", "compare", "print_comparison"]
 
 CURVES_FILE = "curves.csv"
 SEED_AT_END = re.compile(r"[-_]?(?:seed|s)?[-_]?\d+$")

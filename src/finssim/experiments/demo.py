@@ -44,7 +44,7 @@ from finssim.pool import draw_plant
 from finssim.quiet import start_warp
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
-__all__ = ["FULL", "Scope", "demo"]
+__all__ = ["demo"]
 
 PLANT_FILE = "pool.yaml"
 """The plant, for `finssim pool --plant`."""

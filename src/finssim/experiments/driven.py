@@ -25,18 +25,7 @@ from finssim.robot.record_reader import Record, open_record
 from finssim.tasks.observer import Observer
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = [
-    "Drive",
-    "DriveError",
-    "SAME_GOAL",
-    "actions_of",
-    "collect_records",
-    "episodes_of",
-    "indices_of",
-    "read_drive",
-    "station_at",
-    "trajectory_of",
-]
+__all__ = ["Drive", "DriveError", "SAME_GOAL", "collect_records", "read_drive", "station_at", "trajectory_of"]
 
 Array = NDArray[np.float64]
 

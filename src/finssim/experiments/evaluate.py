@@ -47,21 +47,16 @@ from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = [
     "CAPTION",
-    "T1_COLUMNS",
-    "T2_COLUMNS",
     "Evaluation",
     "EvaluationError",
+    "T1_COLUMNS",
     "TrackingRun",
     "by_setpoint",
-    "by_trajectory",
     "cells",
     "draw_tracking",
     "evaluate",
     "evaluate_controller",
     "print_comparison",
-    "print_episodes",
-    "print_results",
-    "print_tracking",
 ]
 
 Array = NDArray[np.float64]

@@ -44,17 +44,7 @@ from finssim.robot.runtime import Runtime
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.defaults import room
 
-__all__ = [
-    "PoolRun",
-    "STOPPING",
-    "box_of",
-    "excite_in_pool",
-    "excite_on_robot",
-    "place_of",
-    "play_programme",
-    "pool_trials",
-    "trials_on_robot",
-]
+__all__ = ["excite_in_pool", "excite_on_robot", "pool_trials", "trials_on_robot"]
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Lower and upper corner of the water that a vehicle may be in, world frame [m]."""

@@ -41,19 +41,7 @@ from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import load_vehicle
 
-__all__ = [
-    "STOP_WITHIN",
-    "FaultJob",
-    "faults_experiment",
-    "faults_table",
-    "inset",
-    "measured",
-    "passed",
-    "play",
-    "play_kill",
-    "print_faults",
-    "row_ok",
-]
+__all__ = ["faults_experiment", "print_faults"]
 
 Array = NDArray[np.float64]
 

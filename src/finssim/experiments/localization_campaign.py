@@ -32,9 +32,6 @@ __all__ = [
     "CONDITIONS",
     "Calibrated",
     "Campaign",
-    "Conditions",
-    "IMAGES",
-    "LOCATIONS",
     "Picture",
     "REACH",
     "RENDERERS",
@@ -44,7 +41,6 @@ __all__ = [
     "draw_campaign",
     "lifted",
     "pictures",
-    "published_pool",
     "write_survey",
 ]
 

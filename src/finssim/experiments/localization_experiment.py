@@ -41,19 +41,7 @@ from finssim.localization.pool import Pool, write_pool
 from finssim.localization.poses.methods import METHODS, Constraints
 from finssim.provenance import provenance
 
-__all__ = [
-    "METHODS_SHOWN",
-    "PAPER_TABLE_2",
-    "RESULT_FILE",
-    "Scores",
-    "localization_experiment",
-    "locate",
-    "markdown",
-    "pooled",
-    "print_table",
-    "sensitivity",
-    "tables_of",
-]
+__all__ = ["RESULT_FILE", "localization_experiment", "print_table", "tables_of"]
 
 Array = NDArray[np.float64]
 

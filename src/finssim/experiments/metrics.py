@@ -24,13 +24,11 @@ from finssim.geometry.rotations import quat_rotate
 __all__ = [
     "ERRORS",
     "EVALUATION_WINDOW",
-    "MEASURES",
     "POSITION_TOLERANCE",
     "YAW_TOLERANCE",
     "measure_tracking",
     "measure_trial",
     "pose_error",
-    "projected_times",
     "resample",
     "summarize",
     "summarize_tracking",

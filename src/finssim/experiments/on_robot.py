@@ -33,15 +33,11 @@ from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = [
     "Attendant",
-    "NEAR",
     "OnRobot",
     "Outcome",
     "RobotError",
     "RobotTrial",
-    "Placing",
     "Session",
-    "Stages",
-    "TURNED",
     "check_starts",
     "kept_folder",
     "session",

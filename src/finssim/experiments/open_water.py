@@ -27,7 +27,7 @@ from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["open_water", "print_open_water", "swim", "way_of"]
+__all__ = ["open_water", "print_open_water"]
 
 Array = npt.NDArray[np.float64]
 

@@ -12,17 +12,7 @@ from numpy.typing import NDArray
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import room
 
-__all__ = [
-    "PAPER_T1",
-    "PAPER_T2",
-    "T1_PUBLISHED",
-    "T1_SETPOINTS",
-    "T1_START",
-    "from_published",
-    "in_room",
-    "paper_row",
-    "paper_t2_row",
-]
+__all__ = ["PAPER_T2", "T1_SETPOINTS", "T1_START", "in_room", "paper_row", "paper_t2_row"]
 
 T1_PUBLISHED = MappingProxyType(
     {

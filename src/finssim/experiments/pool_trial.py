@@ -63,7 +63,6 @@ from finssim.vehicles.defaults import room
 __all__ = [
     "HARDWARE",
     "Job",
-    "job_trial",
     "noise_seed",
     "play",
     "play_in_pool",
@@ -72,7 +71,6 @@ __all__ = [
     "read_series",
     "run_on_robot",
     "stand_in_pool",
-    "write_series",
 ]
 
 Array = NDArray[np.float64]

@@ -21,7 +21,7 @@ from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.capability import level_speed, terminal_speed
 from finssim.vehicles.defaults import room
 
-__all__ = ["PERIODS", "SHARE", "STEADY", "compare_steps", "matched", "shuttles", "step_responses", "trimmed"]
+__all__ = ["compare_steps", "matched", "shuttles", "trimmed"]
 
 SHARE = 0.9
 """Largest level, part of the wrench limit: the rest is for the controller that holds the other axes."""

@@ -28,7 +28,7 @@ from finssim.files import atomic_directory
 from finssim.provenance import provenance
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
-__all__ = ["STEPS", "randomize_show", "rows_of", "step_responses"]
+__all__ = ["randomize_show"]
 
 FAMILIES = {
     "added_mass": ("M_A", "kg", "kg m²"),

@@ -31,17 +31,7 @@ from finssim.quiet import start_warp
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.vehicle import Axis
 
-__all__ = [
-    "MODELS",
-    "PAPER_TABLE_3",
-    "RESULT_FILE",
-    "experiment_seed",
-    "markdown",
-    "pooled",
-    "print_table",
-    "replay_experiment",
-    "tables_of",
-]
+__all__ = ["RESULT_FILE", "print_table", "replay_experiment", "tables_of"]
 
 RESULT_FILE = "replay_experiment.json"
 

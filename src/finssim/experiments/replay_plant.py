@@ -22,7 +22,7 @@ from finssim.pool.coupled import CoupledMatrix, Section, Three
 from finssim.vehicles import Vehicle
 from finssim.yaml_file import first_problem, read_mapping
 
-__all__ = ["PLANT_FILE", "ReplayPlant", "load_replay_plant"]
+__all__ = ["ReplayPlant", "load_replay_plant"]
 
 Array = NDArray[np.float64]
 

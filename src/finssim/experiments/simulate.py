@@ -22,7 +22,7 @@ from finssim.geometry.rotations import quat_to_euler
 from finssim.provenance import provenance
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
-__all__ = ["CommandError", "parse_wrench", "simulate"]
+__all__ = ["CommandError", "simulate"]
 
 UNITS = ("N", "N", "N", "N m", "N m", "N m")
 

@@ -24,7 +24,7 @@ from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import load_vehicle
 
-__all__ = ["memory_mib", "print_soak", "soak", "verdict"]
+__all__ = ["print_soak", "soak"]
 
 Array = NDArray[np.float64]
 

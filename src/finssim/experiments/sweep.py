@@ -42,7 +42,7 @@ from finssim.provenance import provenance
 from finssim.tasks import TASKS
 from finssim.yaml_file import first_problem, read_mapping
 
-__all__ = ["SweepError", "load_sweep", "sweep"]
+__all__ = ["SweepError", "sweep"]
 
 RESULT_FILE = "sweep.json"
 ROW_FILE = "sweep-row.json"

@@ -22,7 +22,7 @@ from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import load_vehicle
 
-__all__ = ["lockstep_speed", "print_timing", "timing"]
+__all__ = ["print_timing", "timing"]
 
 CAMERAS = ("pictures", "corners")
 STATION = "0,0,-0.5,0"

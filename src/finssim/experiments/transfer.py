@@ -23,19 +23,7 @@ from finssim.learning.train import train
 from finssim.provenance import provenance
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = [
-    "INTERVALS",
-    "MEASURES",
-    "Row",
-    "Spec",
-    "Training",
-    "finished",
-    "row_figures",
-    "run",
-    "sentence",
-    "trained",
-    "transfer_experiment",
-]
+__all__ = ["INTERVALS", "MEASURES", "Row", "Spec", "Training", "finished", "run", "transfer_experiment"]
 
 Results = Mapping[str, Sequence[Mapping[str, Any]]]
 """Row -> results of its trials."""

@@ -18,7 +18,7 @@ from finssim.experiments.tables import console_table
 from finssim.provenance import provenance
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
-__all__ = ["Response", "ValidationError", "published", "simulate_responses", "validate"]
+__all__ = ["ValidationError", "validate"]
 
 PUBLISHED = Path(__file__).parent / "published"
 DURATION = 6.0
