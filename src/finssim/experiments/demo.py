@@ -82,7 +82,7 @@ class Scope:
     def of(self, vehicle: Vehicle) -> Scope:
         """The same for a vehicle: levels that move it as FinsROV's move FinsROV, on the axes that it controls.
 
-        See `excitation.levels.matched`.
+        See `programmes.matched`.
         """
         return replace(
             self,

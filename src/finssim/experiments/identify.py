@@ -54,7 +54,7 @@ class Identification:
     warnings: tuple[str, ...]
     seconds: float
     steps: tuple[dict[str, float | str], ...] = ()
-    """Terminal speeds and time constants beside those of a plant, of `excitation.terminal.compare_steps`."""
+    """Terminal speeds and time constants beside those of a plant, of `programmes.compare_steps`."""
 
 
 def rough_vehicle(truth: Vehicle) -> Vehicle:
