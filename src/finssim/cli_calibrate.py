@@ -241,7 +241,9 @@ def _experiment_replay(
 
     Example: finssim experiment replay --seeds 3 --out experiment
     """
-    start_warp()
-    from finssim.experiments.replay_experiment import run
+    from finssim.experiments.campaign import run_experiment
+    from finssim.experiments.replay_experiment import print_table, replay_experiment
 
-    run(seeds=seeds, out=out, seed=seed, as_json=as_json)
+    run_experiment(
+        "experiment replay", replay_experiment, print_table, out=out, seeds=seeds, seed=seed, as_json=as_json
+    )

@@ -24,7 +24,7 @@ from finssim.cli_options import (
 from finssim.cli_robot import robot_or_none
 
 if TYPE_CHECKING:
-    from finssim.experiments.on_robot.session import OnRobot
+    from finssim.experiments.on_robot import OnRobot
 
 __all__ = ["ablation", "everything", "faults", "open_water", "soak", "stack", "t1", "t2", "timing"]
 
@@ -110,8 +110,8 @@ def t1(
 
     Example: finssim experiment t1 --rows pid --seeds 1 --robot serial:/dev/ttyUSB0 --pool-file p.yaml --arm --out hw
     """
-    from finssim.experiments.transfer.experiment import run
-    from finssim.experiments.transfer.t1 import T1
+    from finssim.experiments.transfer import run
+    from finssim.experiments.transfer_tables import T1
 
     options = _options(
         rows, setpoints, plants=plants, seeds=seeds, seed=seed, severity=severity, camera=camera
@@ -151,8 +151,8 @@ def t2(
 
     Example: finssim experiment t2 --rows calibrated-dr,pid --trajectories lemniscate --seeds 1 --out t2
     """
-    from finssim.experiments.transfer.experiment import run
-    from finssim.experiments.transfer.t2 import T2
+    from finssim.experiments.transfer import run
+    from finssim.experiments.transfer_tables import T2
 
     options = _options(
         rows, trajectories, plants=plants, seeds=seeds, seed=seed, severity=severity, camera=camera
@@ -180,10 +180,13 @@ def ablation(
 
     Example: finssim experiment ablation --seeds 3 --out ablation
     """
-    from finssim.experiments.transfer.ablation import run
+    from finssim.experiments.ablation import ablation as work
+    from finssim.experiments.ablation import print_ablation
+    from finssim.experiments.campaign import run_experiment
 
-    run(
-        out=out, plants=plants, seeds=seeds, seed=seed, severity=severity, camera=camera, vehicle=vehicle,
+    run_experiment(
+        "experiment ablation", work, print_ablation, out=out,
+        plants=plants, seeds=seeds, seed=seed, severity=severity, camera=camera, vehicle=vehicle,
         steps=steps, processes=processes, as_json=as_json,
     )  # fmt: skip
 
@@ -206,10 +209,13 @@ def open_water(
 
     Example: finssim experiment open-water --seeds 1 --out drift
     """
-    from finssim.experiments.open_water import run
+    from finssim.experiments.campaign import run_experiment
+    from finssim.experiments.open_water import open_water as work
+    from finssim.experiments.open_water import print_open_water
 
-    run(
-        out=out, vehicle=vehicle, minutes=minutes, speed=speed, shape=way, positioning=positioning, seeds=seeds,
+    run_experiment(
+        "experiment open-water", work, print_open_water, out=out,
+        vehicle=vehicle, minutes=minutes, speed=speed, shape=way, positioning=positioning, seeds=seeds,
         seed=seed, severity=severity, as_json=as_json,
     )  # fmt: skip
 
@@ -229,10 +235,13 @@ def everything(
 
     Example: finssim experiment all --seeds 1 --plants 1 --out everything
     """
-    from finssim.experiments.transfer.everything import run
+    from finssim.experiments.ablation import everything as work
+    from finssim.experiments.ablation import print_everything
+    from finssim.experiments.campaign import run_experiment
 
-    run(
-        out=out, plants=plants, seeds=seeds, seed=seed, severity=severity, camera=camera, steps=steps,
+    run_experiment(
+        "experiment all", work, print_everything, out=out,
+        plants=plants, seeds=seeds, seed=seed, severity=severity, camera=camera, steps=steps,
         processes=processes, as_json=as_json,
     )  # fmt: skip
 
@@ -257,11 +266,13 @@ def faults(
 
     Example: finssim experiment faults --scenarios link-cut,blind-3 --out faults
     """
-    from finssim.experiments.reliability.faults import run
+    from finssim.experiments.campaign import run_experiment
+    from finssim.experiments.faults import faults_experiment, print_faults
 
     chosen = None if scenarios is None else tuple(scenarios.split(","))
-    result = run(
-        out=out, seeds=seeds, seed=seed, scenarios=chosen, severity=severity, vehicle=vehicle,
+    result = run_experiment(
+        "experiment faults", faults_experiment, print_faults, out=out,
+        seeds=seeds, seed=seed, scenarios=chosen, severity=severity, vehicle=vehicle,
         processes=processes, as_json=as_json,
     )  # fmt: skip
     if not result["ok"]:
@@ -282,9 +293,14 @@ def soak(
 
     Example: finssim experiment soak --hours 20 --out soak
     """
-    from finssim.experiments.reliability.soak import run
+    from finssim.experiments.campaign import run_experiment
+    from finssim.experiments.soak import print_soak
+    from finssim.experiments.soak import soak as work
 
-    result = run(out=out, hours=hours, seed=seed, severity=severity, vehicle=vehicle, as_json=as_json)
+    result = run_experiment(
+        "experiment soak", work, print_soak, out=out, hours=hours, seed=seed, severity=severity, vehicle=vehicle,
+        as_json=as_json,
+    )  # fmt: skip
     if result["verdict"] == "grows" or result["faults"]:
         raise typer.Exit(3)
 
@@ -304,9 +320,14 @@ def timing(
 
     Example: finssim experiment timing --minutes 10 --out timing
     """
-    from finssim.experiments.reliability.timing import run
+    from finssim.experiments.campaign import run_experiment
+    from finssim.experiments.timing import print_timing
+    from finssim.experiments.timing import timing as work
 
-    run(out=out, minutes=minutes, camera=camera, policy=policy, seed=seed, vehicle=vehicle, as_json=as_json)
+    run_experiment(
+        "experiment timing", work, print_timing, out=out, minutes=minutes, camera=camera, policy=policy, seed=seed,
+        vehicle=vehicle, as_json=as_json,
+    )  # fmt: skip
 
 
 def stack(

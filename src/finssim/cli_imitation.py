@@ -69,7 +69,7 @@ def collect(
     if not records and (len(experts) > 1 or episodes is None or goal is not None):
         raise typer.BadParameter("give one expert and --episodes, and no --goal, which is of records")
     if records:
-        from finssim.experiments.driven.command import collect_records
+        from finssim.experiments.driven import collect_records
 
         told = collect_records(records, task, out=out, vehicle=vehicle, action=action, goal=goal)
     else:

@@ -10,7 +10,7 @@ import typer
 from finssim.cli_options import Arm, Bind, Json, Lockstep, Pictures, Vehicle
 
 if TYPE_CHECKING:
-    from finssim.experiments.on_robot.session import OnRobot
+    from finssim.experiments.on_robot import OnRobot
 
 __all__ = ["robot_or_none", "run"]
 
@@ -164,7 +164,7 @@ def robot_or_none(
         return None
     if pool_file is None:
         raise typer.BadParameter("a robot knows where it is by its pool file: give --pool-file")
-    from finssim.experiments.on_robot.session import OnRobot
+    from finssim.experiments.on_robot import OnRobot
     from finssim.robot.wiring import Wiring
 
     return OnRobot(

@@ -43,10 +43,13 @@ def compare(
     Example: finssim compare runs/hold-seed1 runs/hold-seed2 runs/hold-seed3 sac=runs/sac-1 --out compared
     """
     start_warp()
-    from finssim.experiments.compare.command import compare as run
+    from finssim.experiments.campaign import run_experiment
+    from finssim.experiments.compare import compare as work
+    from finssim.experiments.compare import print_comparison
 
-    run(
-        runs, out=out, vehicle=vehicle, plant=plant, trials=trials, measures=measure or (), seed=seed,
+    run_experiment(
+        "comparing", work, print_comparison, runs=runs, out=out,
+        vehicle=vehicle, plant=plant, trials=trials, measures=measure or (), seed=seed,
         as_json=as_json,
     )  # fmt: skip
 
@@ -77,7 +80,7 @@ def sweep(
 
     Example: finssim sweep sweep.yaml --out swept
     """
-    from finssim.experiments.sweep.command import sweep as run
+    from finssim.experiments.sweep import sweep as run
 
     if not run(file, out=out, address=address, processes=processes, as_json=as_json)["ok"]:
         raise typer.Exit(3)

@@ -211,7 +211,7 @@ def excite(
         unattended=unattended,
     )  # fmt: skip
     if where is not None:
-        from finssim.experiments.excitation.command import excite_on_robot
+        from finssim.experiments.excitation import excite_on_robot
 
         made = excite_on_robot(axes, vehicle=vehicle, out=out, robot=where, seed=seed, room=room, **plan)
         _print_folders(made, as_json)
@@ -221,7 +221,7 @@ def excite(
             raise typer.BadParameter(
                 "--pool goes with neither --simulate nor --room: a pool has its own room"
             )
-        from finssim.experiments.excitation.command import excite_in_pool
+        from finssim.experiments.excitation import excite_in_pool
 
         made = excite_in_pool(
             axes,

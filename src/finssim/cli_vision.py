@@ -273,6 +273,10 @@ def experiment_localization(
 
     Example: finssim experiment localization --seeds 3 --out localization
     """
-    from finssim.experiments.localization_experiment import run
+    from finssim.experiments.campaign import run_experiment
+    from finssim.experiments.localization_experiment import localization_experiment, print_table
 
-    run(renderer=renderer, seeds=seeds, out=out, seed=seed, as_json=as_json)
+    run_experiment(
+        "experiment localization", localization_experiment, print_table, out=out, renderer=renderer, seeds=seeds,
+        seed=seed, as_json=as_json,
+    )  # fmt: skip

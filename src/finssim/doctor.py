@@ -52,7 +52,7 @@ EXTRAS = {
     ),
     "sb3-contrib": Extra({"sb3-contrib": "sb3_contrib"}, "learn with recurrent PPO of SB3-Contrib"),
     "imitation": Extra({"minari": "minari"}, "collect demonstrations and learn from them"),
-    "sweep": Extra({"ray": "ray"}, "train over seeds and settings on many processors or machines"),
+    "sweep": Extra({"ray": "ray"}, "train over seeds and settings on many machines"),
     "logs": Extra(
         {
             "matplotlib": "matplotlib",

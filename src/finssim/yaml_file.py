@@ -78,3 +78,14 @@ def read_mapping(
         found = "nothing" if tree is None else f"a {type(tree).__name__}"
         raise refuse(f"{name}: expected keys such as '{such_as}', found {found}")
     return tree
+
+
+def first_problem(error: Any) -> str:
+    """What Pydantic found wrong first in data from a file, as `where: what`.
+
+    Args:
+        error: A `pydantic.ValidationError`.
+    """
+    problem = error.errors()[0]
+    where, what = ".".join(map(str, problem["loc"])), str(problem["msg"]).removeprefix("Value error, ")
+    return f"{where}: {what}" if where else what

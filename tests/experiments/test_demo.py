@@ -14,8 +14,8 @@ from finssim.control.policy import Policy
 from finssim.experiments import demo as demo_module
 from finssim.experiments.demo import FULL, Scope, demo
 from finssim.experiments.identify import identify
-from finssim.experiments.setpoints import T1_SETPOINTS
-from finssim.experiments.transfer.series import read_series
+from finssim.experiments.paper import T1_SETPOINTS
+from finssim.experiments.pool_trial import read_series
 from finssim.files import OutputError
 from finssim.learning.training_loop import Loop
 from finssim.pool import load_plant_spec

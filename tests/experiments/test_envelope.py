@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from finssim.experiments.envelope import draw_envelopes, error_envelope, save_envelopes
+from finssim.experiments.figures import draw_envelopes, error_envelope, save_figure
 from finssim.files import OutputError
 
 GOAL = np.array([1.0, 0.3, -0.5, math.pi])
@@ -54,11 +54,15 @@ def test_the_figure_draws_each_median_and_both_limits(tmp_path):
         assert len(medians) == 2
         assert any(np.allclose(line.get_ydata(), limit) for line in axes.lines)
     np.testing.assert_allclose(above.lines[0].get_ydata(), 0.3)
-    assert save_envelopes(envelopes, tmp_path / "envelope.png").read_bytes().startswith(b"\x89PNG")
+    assert (
+        save_figure(draw_envelopes(envelopes), tmp_path / "envelope.png").read_bytes().startswith(b"\x89PNG")
+    )
 
 
 def test_a_figure_that_cannot_be_written_says_so(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="write elsewhere"):
-        save_envelopes({"pid": error_envelope([at_distance(0.1)])}, tmp_path / "file" / "envelope.png")
+        save_figure(
+            draw_envelopes({"pid": error_envelope([at_distance(0.1)])}), tmp_path / "file" / "envelope.png"
+        )
     assert [path.name for path in tmp_path.iterdir()] == ["file"]

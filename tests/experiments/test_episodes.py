@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from finssim.experiments.episodes import EpisodeError, run_episodes, summarize_episodes
 from finssim.experiments.evaluate import evaluate
 from finssim.experiments.plants import load_plant
+from finssim.experiments.trials import EpisodeError, run_episodes, summarize_episodes
 from finssim.tasks import TASKS, Environment, task_named
 from finssim.tasks.actions import action_size
 from finssim.tasks.agents import agent_for

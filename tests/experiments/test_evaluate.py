@@ -15,9 +15,8 @@ from finssim.control.policy_description import PolicyDescription, PolicyError, V
 from finssim.engine import read_run
 from finssim.experiments import trials as trials_module
 from finssim.experiments.evaluate import EvaluationError, evaluate, evaluate_controller
-from finssim.experiments.paper_results import PAPER_T1
+from finssim.experiments.paper import PAPER_T1, T1_SETPOINTS, T1_START
 from finssim.experiments.plants import Plant, PlantError, available_plants, load_plant
-from finssim.experiments.setpoints import T1_SETPOINTS, T1_START
 from finssim.experiments.trials import run_trials
 from finssim.files import OutputError
 from finssim.learning.export import export_policy

@@ -6,19 +6,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.experiments import localization_pictures
-from finssim.experiments.localization_calibration import calibrate
 from finssim.experiments.localization_campaign import (
     CONDITIONS,
     IMAGES,
     LOCATIONS,
     REACH,
     Conditions,
+    calibrate,
     draw_campaign,
     lifted,
+    pictures,
     published_pool,
+    scene_of,
 )
-from finssim.experiments.localization_pictures import pictures
 from finssim.geometry.rotations import matrix_to_quat, quat_to_euler
 
 SMALL = {"locations": (6, 4), "images": 48}
@@ -128,7 +128,7 @@ def test_each_condition_alone_does_what_it_says(name):
     assert (campaign.lens != true.camera.lens) == (name == "lens")
     assert (campaign.water_read != 1.0) == (name == "tape")
     assert np.allclose(campaign.truth.interface.normal, [0, 0, 1], atol=1e-12) == (name != "level")
-    assert (localization_pictures.scene_of(campaign).ripples is None) == (name != "ripples")
+    assert (scene_of(campaign).ripples is None) == (name != "ripples")
 
 
 def test_quiet_conditions_have_no_error_but_that_of_the_pictures():

@@ -10,10 +10,9 @@ import pytest
 from finssim import boundary
 from finssim.cli import app
 from finssim.experiments import localization_experiment as module
-from finssim.experiments import localization_scores
-from finssim.experiments.localization_campaign import CONDITIONS
+from finssim.experiments import statistics
+from finssim.experiments.localization_campaign import CONDITIONS, Picture
 from finssim.experiments.localization_experiment import METHODS_SHOWN, PAPER_TABLE_2, localization_experiment
-from finssim.experiments.localization_pictures import Picture
 from finssim.files import OutputError
 from finssim.localization.camera_file import load_camera
 from finssim.localization.detection.detections import read_detections
@@ -32,7 +31,7 @@ FILES = {
 def quick():
     """Intervals from fewer resamples."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(localization_scores, "RESAMPLES", 200)
+        patch.setattr(statistics, "RESAMPLES", 200)
         yield
 
 
@@ -41,7 +40,7 @@ def done(tmp_path_factory):
     """One seed of 20 places and 40 pictures, with our renderer; its progress."""
     out, said = tmp_path_factory.mktemp("experiment") / "localization", []
     result = localization_experiment(
-        out=out, seeds=1, seed=1, locations=(5, 4), images=40, progress=lambda *what: said.append(what)
+        out=out, seeds=1, seed=1, locations=(5, 4), images=40, say=lambda *what: said.append(what)
     )
     return out, result, said
 
@@ -181,7 +180,7 @@ def test_an_interruption_keeps_what_is_finished(tmp_path, words):
     """Whole seeds, the first as far as it came; the page says that it was interrupted, and links what is there."""
     out = tmp_path / "out"
     given = {"renderer": "geometry", "seeds": 3, "seed": 1, **TINY}
-    result = localization_experiment(out=out, progress=interrupting(words), **given)
+    result = localization_experiment(out=out, say=interrupting(words), **given)
     assert result["interrupted"] and result["seeds"] == INTERRUPTED[words] and result["seeds_asked_for"] == 3
     visits = {m["refractive"]["visits"] for m in result["results"].values()}
     assert visits <= {5, 6}  # of one seed each; a lifted tag may leave the picture
@@ -194,7 +193,7 @@ def test_an_interruption_keeps_what_is_finished(tmp_path, words):
 def test_an_interruption_before_anything_is_finished_leaves_nothing(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         localization_experiment(
-            out=tmp_path / "out", progress=interrupting("seed 1, published conditions"), seeds=1, **TINY
+            out=tmp_path / "out", say=interrupting("seed 1, published conditions"), seeds=1, **TINY
         )
     assert list(tmp_path.iterdir()) == []
 
@@ -232,7 +231,7 @@ def test_what_cannot_be_run_is_refused(tmp_path, options, words):
 def test_somebodys_folder_is_refused_before_the_work(tmp_path):
     (tmp_path / "thesis.tex").touch()
     with pytest.raises(OutputError, match="already holds files"):
-        localization_experiment(out=tmp_path, progress=interrupting("seed 1, published conditions"))
+        localization_experiment(out=tmp_path, say=interrupting("seed 1, published conditions"))
 
 
 def finssim(*words):

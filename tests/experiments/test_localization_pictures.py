@@ -5,9 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.experiments import localization_pictures as module
-from finssim.experiments.localization_campaign import CONDITIONS, TAG, draw_campaign, lifted
-from finssim.experiments.localization_pictures import RENDERERS, pictures
+from finssim.experiments import localization_campaign as module
+from finssim.experiments.localization_campaign import (
+    CONDITIONS,
+    RENDERERS,
+    TAG,
+    draw_campaign,
+    lifted,
+    pictures,
+)
 from finssim.geometry.optics import project
 from finssim.localization.detection.tags import corners
 

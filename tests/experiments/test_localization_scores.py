@@ -8,14 +8,13 @@ from functools import partial
 import numpy as np
 import pytest
 
-from finssim.experiments import localization_pictures, localization_scores
-from finssim.experiments.localization_campaign import CONDITIONS, draw_campaign
-from finssim.experiments.localization_pictures import pictures
-from finssim.experiments.localization_scores import Scores, pooled
+from finssim.experiments import localization_campaign, localization_experiment
+from finssim.experiments.localization_campaign import CONDITIONS, draw_campaign, pictures
+from finssim.experiments.localization_experiment import Scores, pooled
 
 PIXEL_STD = 0.2
-locate = partial(localization_scores.locate, pixel_std=PIXEL_STD)
-sensitivity = partial(localization_scores.sensitivity, pixel_std=PIXEL_STD)
+locate = partial(localization_experiment.locate, pixel_std=PIXEL_STD)
+sensitivity = partial(localization_experiment.sensitivity, pixel_std=PIXEL_STD)
 SMALL = {"locations": (6, 4), "images": 48}
 
 
@@ -35,7 +34,7 @@ def published():
 def exact():
     """No error at all."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(localization_pictures, "CORNER_NOISE", 0.0)
+        patch.setattr(localization_campaign, "CORNER_NOISE", 0.0)
         return seen_by_geometry("quiet")
 
 

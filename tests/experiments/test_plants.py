@@ -9,10 +9,8 @@ from finssim.control.trajectories import load_trajectory
 from finssim.engine import read_run
 from finssim.engine.ranges_file import load_ranges
 from finssim.experiments import trials as trials_module
-from finssim.experiments.episodes import run_episodes
 from finssim.experiments.plants import Plant, PlantError, available_plants, load_plant
-from finssim.experiments.t2_trials import run_tracking
-from finssim.experiments.trials import run_trials
+from finssim.experiments.trials import run_episodes, run_tracking, run_trials
 from finssim.tasks import Environment, EnvironmentSetupError, MeasurementNoise, Sensing, task_named
 from finssim.tasks.actions import action_size
 from finssim.tasks.agents import agent_for

@@ -12,8 +12,7 @@ from finssim import boundary
 from finssim.cli import app
 from finssim.engine.randomize import Randomization
 from finssim.engine.ranges_file import Ranges, available, load_ranges
-from finssim.experiments.randomize_rows import rows_of
-from finssim.experiments.randomize_show import STEPS, step_responses
+from finssim.experiments.randomize_show import STEPS, rows_of, step_responses
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")

@@ -11,8 +11,8 @@ from finssim.control.guidance import Station
 from finssim.control.trajectories import load_trajectory
 from finssim.experiments.evaluate import evaluate
 from finssim.experiments.metrics import measure_trial
+from finssim.experiments.paper import T1_SETPOINTS
 from finssim.experiments.recorded import RecordedError, read_record
-from finssim.experiments.setpoints import T1_SETPOINTS
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.pool import draw_plant
 from finssim.pool.camera import PoolCamera

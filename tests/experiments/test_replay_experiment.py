@@ -11,8 +11,15 @@ import pytest
 from rich.console import Console
 
 from finssim.experiments import replay_experiment as module
-from finssim.experiments.replay_experiment import MODELS, PAPER_TABLE_3, pooled, replay_experiment
-from finssim.experiments.replay_table import markdown, print_table, tables_of
+from finssim.experiments.replay_experiment import (
+    MODELS,
+    PAPER_TABLE_3,
+    markdown,
+    pooled,
+    print_table,
+    replay_experiment,
+    tables_of,
+)
 from finssim.vehicles import load_vehicle
 
 pytestmark = pytest.mark.slow

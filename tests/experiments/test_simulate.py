@@ -8,8 +8,7 @@ import pandas as pd
 import pytest
 
 from finssim.engine import SimulatorError
-from finssim.experiments.simulate import simulate
-from finssim.experiments.wrench_words import CommandError
+from finssim.experiments.simulate import CommandError, simulate
 from finssim.files import OutputError
 from finssim.vehicles import VehicleError, load_vehicle
 

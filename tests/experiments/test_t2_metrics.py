@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from finssim.control.trajectories import TRAJECTORIES
-from finssim.experiments.t2_metrics import MEASURES, measure_tracking, projected_times, summarize_tracking
+from finssim.experiments.metrics import MEASURES, measure_tracking, projected_times, summarize_tracking
 from finssim.geometry.rotations import quat_from_euler
 
 ELLIPSE, EIGHT = TRAJECTORIES["ellipse"], TRAJECTORIES["lemniscate"]

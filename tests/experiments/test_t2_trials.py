@@ -14,13 +14,17 @@ from finssim.control.modes import action_mode
 from finssim.control.pid_paper import PAPER_PROFILE, TRAJECTORY_PROFILE
 from finssim.control.policy_description import PolicyDescription, VehicleIdentity
 from finssim.control.trajectories import TRAJECTORIES
-from finssim.experiments.evaluate import EvaluationError, evaluate, evaluate_controller
-from finssim.experiments.paper_results import PAPER_T2, paper_t2_row
+from finssim.experiments.evaluate import (
+    EvaluationError,
+    by_trajectory,
+    draw_tracking,
+    evaluate,
+    evaluate_controller,
+)
+from finssim.experiments.metrics import MEASURES
+from finssim.experiments.paper import PAPER_T2, paper_t2_row
 from finssim.experiments.plants import load_plant
-from finssim.experiments.t2_figure import draw_tracking
-from finssim.experiments.t2_metrics import MEASURES
-from finssim.experiments.t2_table import by_trajectory
-from finssim.experiments.t2_trials import T2_TRAJECTORIES, run_tracking
+from finssim.experiments.trials import T2_TRAJECTORIES, run_tracking
 from finssim.learning.export import export_policy
 from finssim.tasks import TrajectoryTracking
 from finssim.tasks.agents import agent_for
@@ -64,14 +68,14 @@ def test_a_directory_holds_result_figure_and_states(nominal):
 
 
 def test_the_table_has_a_row_per_trajectory_and_the_papers(nominal, capsys):
-    from finssim.experiments.t2_table import print_tracking, print_tracking_plants
+    from finssim.experiments.evaluate import print_tracking
 
     result = nominal[1].result
-    print_tracking(result, Console(width=80))
+    print_tracking([result], Console(width=80))
     out = capsys.readouterr().out
     assert all(f"{name} " in out and f"paper, {name}" in out for name in T2_TRAJECTORIES)
     assert "0.182" in out and "…" not in out
-    print_tracking_plants([result, result], Console(width=80))
+    print_tracking([result, result], Console(width=80))
     assert "nominal, ellipse" in capsys.readouterr().out
 
 

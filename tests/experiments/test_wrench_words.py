@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from finssim.experiments.wrench_words import CommandError, parse_wrench
+from finssim.experiments.simulate import CommandError, parse_wrench
 from finssim.vehicles import AXES
 
 numbers = st.floats(allow_nan=False, allow_infinity=False)

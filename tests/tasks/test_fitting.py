@@ -11,7 +11,7 @@ from finssim.control.modes import mode_from_dict
 from finssim.control.pole_placement import axis_model
 from finssim.control.policy import Policy
 from finssim.engine import Pool
-from finssim.experiments.setpoints import T1_SETPOINTS, in_room
+from finssim.experiments.paper import T1_SETPOINTS, in_room
 from finssim.learning.train import train
 from finssim.tasks import EnvironmentSetupError
 from finssim.tasks.catalogue import TASKS

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import shutil
 import sys
 import time
@@ -19,33 +21,36 @@ from finssim.calibration.excitation.programmes import Programme, programmes
 from finssim.calibration.trials.trial import Trial
 from finssim.control.policy import Policy
 from finssim.control.policy_description import DESCRIPTION_FILE
-from finssim.experiments.camera_view import camera_view
-from finssim.experiments.demo_files import PLANT_FILE, TRIALS_FOLDER, command_lines, write_demo
-from finssim.experiments.evaluate import Evaluation
-from finssim.experiments.excitation.command import trials_on_robot
-from finssim.experiments.excitation.levels import matched, trimmed
-from finssim.experiments.excitation.pool_trials import pool_trials
-from finssim.experiments.excitation.shuttle import shuttles
-from finssim.experiments.excitation.terminal import compare_steps
-from finssim.experiments.identify import HELD_OUT, Identification, Record, identify, vehicle_files
-from finssim.experiments.on_robot.play import Attendant
-from finssim.experiments.on_robot.session import OnRobot, kept_folder
-from finssim.experiments.pool_evaluation import pool_evaluation, pool_jobs
-from finssim.experiments.results_table import print_comparison
-from finssim.experiments.running import Say
-from finssim.experiments.setpoints import T1_SETPOINTS
-from finssim.experiments.transfer.campaign import Show, run_jobs
-from finssim.experiments.transfer.job import Job
-from finssim.experiments.transfer.policies import finished
-from finssim.experiments.transfer.pool_trial import play
-from finssim.experiments.transfer.robot_trial import HARDWARE, run_on_robot
+from finssim.experiments.campaign import Say, run_jobs, write_json
+from finssim.experiments.demo_report import camera_view, report_html
+from finssim.experiments.evaluate import Evaluation, print_comparison
+from finssim.experiments.excitation import pool_trials, trials_on_robot
+from finssim.experiments.identify import (
+    HELD_OUT,
+    TRIALS,
+    Identification,
+    commands,
+    identify,
+    vehicle_files,
+)
+from finssim.experiments.on_robot import Attendant, OnRobot, kept_folder
+from finssim.experiments.paper import T1_SETPOINTS
+from finssim.experiments.pool_trial import HARDWARE, Job, play, pool_evaluation, pool_jobs, run_on_robot
+from finssim.experiments.programmes import compare_steps, matched, shuttles, trimmed
+from finssim.experiments.transfer import finished
 from finssim.files import atomic_directory
 from finssim.learning.train import train
 from finssim.pool import draw_plant
 from finssim.quiet import start_warp
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
-__all__ = ["FULL", "Scope", "demo"]
+__all__ = ["demo"]
+
+PLANT_FILE = "pool.yaml"
+"""The plant, for `finssim pool --plant`."""
+TRIALS_FOLDER = "deployed"
+"""A result and a series for every trial of a controller."""
+
 
 REPORT_FILE = "report.html"
 SEED = 1
@@ -77,7 +82,7 @@ class Scope:
     def of(self, vehicle: Vehicle) -> Scope:
         """The same for a vehicle: levels that move it as FinsROV's move FinsROV, on the axes that it controls.
 
-        See `excitation.levels.matched`.
+        See `programmes.matched`.
         """
         return replace(
             self,
@@ -167,8 +172,7 @@ def demo(
         }
         with _rescued(policy, rescue, console):
             evaluations, picture = _deployed(folder, policy, seed, scope, place)
-            commands = command_lines(out, vehicle, PLANT, SEVERITY, RANGES, training, robot)
-            write_demo(folder, found, evaluations, policy, training, commands, picture)
+            _write(folder, found, evaluations, training, _commands(out, place, training), picture)
     print_comparison([e.result for e in evaluations if e.result["camera"] != "pictures"], Console())
     report = Path(out) / REPORT_FILE
     print(f"report: {report}")
@@ -192,12 +196,17 @@ class _Place:
 def _identified(folder: Path, out: Path, seed: int, scope: Scope, place: _Place) -> Identification:
     """Trials, the vehicle they tell of, and in a pool how its speeds compare with the plant's."""
     standing, console = load_vehicle(place.vehicle), place.console
+    plans = _plans(standing, scope)
     if place.robot is not None:
+        robot = place.robot
         console.print("recording trials on the robot", highlight=False)
-        found = identify(
-            folder, place.vehicle, seed=seed, shown=out, record=_robot_recorder(standing, scope, place)
-        )
-        return _told(found, console)
+
+        def record(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
+            return trials_on_robot(
+                plans, folder, load_vehicle(rough), robot, attendant=place.attendant, console=console
+            )
+
+        return _told(identify(folder, place.vehicle, seed=seed, shown=out, record=record), console)
     spec = draw_plant(standing, PLANT, SEVERITY)
     spec.write(folder / PLANT_FILE)
     console.print("recording trials in the virtual pool", highlight=False)
@@ -209,59 +218,34 @@ def _identified(folder: Path, out: Path, seed: int, scope: Scope, place: _Place)
 
         def show(run: Any, result: Mapping[str, Any]) -> None:
             unit = "m/s" if run.programme.axes[0] in AXES[:3] else "rad/s"
-            if result["fault"]:
-                console.print(f"  {run.target}: left out: {result['fault']}", highlight=False)
-                return
-            told = f"  {run.target}: up to {result['fastest']:.2f} {unit} in {result['duration']:.0f} s"
-            console.print(told, highlight=False)
+            text = f"up to {result['fastest']:.2f} {unit} in {result['duration']:.0f} s"
+            text = f"left out: {result['fault']}" if result["fault"] else text
+            console.print(f"  {run.target}: {text}", highlight=False)
 
-        record = _recorder(place.vehicle, standing, scope, place.processes, say, show)
-        found = identify(folder, place.vehicle, seed=seed, shown=out, record=record)
+        def simulated(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
+            return pool_trials(
+                plans, folder, vehicle=str(rough), pool_vehicle=place.vehicle, plant=PLANT, severity=SEVERITY,
+                seed=seed, leave_out=True, processes=place.processes, say=say, show=show,
+            )  # fmt: skip
+
+        found = identify(folder, place.vehicle, seed=seed, shown=out, record=simulated)
         linear = {axis: levels for axis, levels in scope.levels.items() if axis not in ("roll", "pitch")}
-        found = found.with_steps(compare_steps(found.vehicle, standing, spec, linear))
+        found = replace(found, steps=tuple(compare_steps(found.vehicle, standing, spec, linear)))
     return _told(found, console)
 
 
 def _told(found: Identification, console: Console) -> Identification:
     """Say what was identified."""
-    speeds = f", terminal speeds within {100.0 * _farthest(found):.0f} % of the pool's own vehicle"
-    told = sum(e.identifiable for e in found.fit.estimates.values())
+    off = [abs(float(s["model_speed"]) / float(s["plant_speed"]) - 1.0) for s in found.steps]
+    speeds = f", terminal speeds within {100.0 * max(off):.0f} % of the pool's own vehicle" if off else ""
+    identifiable = sum(e.identifiable for e in found.fit.estimates.values())
     console.print(
-        f"identified from {len(found.fit.trials)} trials in {found.seconds:.0f} s: {told} of "
+        f"identified from {len(found.fit.trials)} trials in {found.seconds:.0f} s: {identifiable} of "
         f"{len(found.fit.estimates)} parameters told, NRMSE on {len(found.replay.pairs)} other trials "
-        f"{found.replay.aggregate('calibrated').value:.3f}{speeds if found.steps else ''}",
+        f"{found.replay.aggregate('calibrated').value:.3f}{speeds}",
         highlight=False,
     )
     return found
-
-
-def _farthest(found: Identification) -> float:
-    """Largest error of an identified terminal speed, part of the plant's."""
-    far = (abs(float(s["model_speed"]) / float(s["plant_speed"]) - 1.0) for s in found.steps)
-    return max(far, default=0.0)
-
-
-def _recorder(
-    name: str, standing: Vehicle, scope: Scope, processes: int | None, say: Say, show: Show
-) -> Record:
-    """Trials of the virtual pool."""
-
-    def record(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
-        return pool_trials(
-            _plans(standing, scope),
-            folder,
-            vehicle=str(rough),
-            pool_vehicle=name,
-            plant=PLANT,
-            severity=SEVERITY,
-            seed=seed,
-            leave_out=True,
-            processes=processes,
-            say=say,
-            show=show,
-        )
-
-    return record
 
 
 def _plans(standing: Vehicle, scope: Scope) -> dict[str, list[Programme]]:
@@ -272,22 +256,6 @@ def _plans(standing: Vehicle, scope: Scope) -> dict[str, list[Programme]]:
     }
     plans["fit"] += shuttles(scope.shuttles, standing) if scope.shuttles else []
     return {role: [trimmed(programme, standing) for programme in plan] for role, plan in plans.items()}
-
-
-def _robot_recorder(standing: Vehicle, scope: Scope, place: _Place) -> Record:
-    """Trials of a robot, those of an earlier call among them."""
-
-    def record(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
-        return trials_on_robot(
-            _plans(standing, scope),
-            folder,
-            load_vehicle(rough),
-            place.robot,  # type: ignore[arg-type]
-            attendant=place.attendant,
-            console=place.console,
-        )
-
-    return record
 
 
 def _deployed(
@@ -339,6 +307,55 @@ def _by_row(jobs: Sequence[Job], results: Sequence[dict[str, Any]], place: Path)
     rows = sorted({job.row for job in jobs}, key=lambda row: [*CONTROLLERS, row].index(row))
     chosen = [[i for i, job in enumerate(jobs) if job.row == row] for row in rows]
     return [pool_evaluation([jobs[i] for i in those], [results[i] for i in those], place) for those in chosen]
+
+
+def _write(
+    folder: Path,
+    found: Identification,
+    evaluations: Sequence[Evaluation],
+    training: Mapping[str, Any],
+    commands: Sequence[str],
+    picture: bytes | None,
+) -> None:
+    """Write NAME.json of every controller, `steps.json`, `camera.png` and `report.html`."""
+    for evaluation in evaluations:
+        write_json(folder / f"{evaluation.result['controller']['name']}.json", evaluation.result)
+    (folder / "steps.json").write_text(json.dumps(found.steps, indent=2) + "\n", encoding="utf-8")
+    if picture is not None:
+        (folder / "camera.png").write_bytes(picture)
+    with (folder / "policy" / "curves.csv").open(encoding="utf-8", newline="") as file:
+        curves = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+    html = report_html(evaluations, curves, training, commands, found, picture)
+    (folder / REPORT_FILE).write_text(html, encoding="utf-8")
+
+
+def _commands(out: Path, place: _Place, training: Mapping[str, Any]) -> list[str]:
+    """Command lines that repeat the demonstration's steps by hand."""
+    name = load_vehicle(place.vehicle).name
+    rough, identified = (out / file for file in vehicle_files(name))
+    seed, steps = training["seed"], training["steps"]
+    goal = f"finssim run --policy policy --vehicle {identified} --goal 1,0.3,-0.5,90"
+    excite = f"finssim excite all --vehicle {rough}"
+    middle = [
+        *commands(out, name, seed),
+        f"finssim train t1 --vehicle {identified} --randomize {RANGES} --seed {seed} --steps {steps} --out policy",
+    ]
+    if place.robot is not None:
+        robot = f"{place.robot.options} --arm"
+        return [
+            f"{excite} {robot} --coast {COAST:g} --out more-trials",
+            *middle,
+            f"{goal} {robot} --record run.mcap",
+            f"finssim evaluate run.mcap --task t1 --vehicle {identified}",
+        ]
+    return [
+        f"finssim trials import {out / TRIALS / 'fit' / 'records'}/*.mcap --split phase --out trials",
+        f"{excite} --pool {PLANT} --severity {SEVERITY} --pool-vehicle {place.vehicle} --coast {COAST:g} "
+        "--out more-trials",
+        *middle,
+        f"finssim pool --vehicle {place.vehicle} --plant {out / PLANT_FILE} --pool-file site.yaml --truth truth.fst",
+        f"{goal} --robot pool --pool-file site.yaml --arm",
+    ]
 
 
 @contextmanager

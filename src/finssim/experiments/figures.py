@@ -1,89 +1,179 @@
-"""Pictures of a training and of its trials: the training curve, and the paths seen from above."""
+"""Figures of one style, and the one that several experiments draw: errors of controllers against time."""
 
 from __future__ import annotations
 
+import io
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from numpy.typing import ArrayLike, NDArray
 
-from finssim.engine import Pool
-from finssim.experiments.trials import Trials
+from finssim.experiments.metrics import (
+    EVALUATION_WINDOW,
+    POSITION_TOLERANCE,
+    YAW_TOLERANCE,
+    pose_error,
+    resample,
+)
+from finssim.files import atomic_write
 
-__all__ = ["draw_paths", "draw_training_curve"]
+__all__ = [
+    "COLORS",
+    "clean",
+    "draw_envelopes",
+    "error_envelope",
+    "legend_below",
+    "new_figure",
+    "png",
+    "save_figure",
+]
 
-BLUE, ORANGE, GRAY = "#0072B2", "#D55E00", "0.6"
-ARROW = 0.18
-"""Length of an arrow that shows a heading [m]."""
+Array = NDArray[np.float64]
+
+QUARTILES = (0.25, 0.5, 0.75)
+
+LONGEST_OF_THREE = 28
+"""Letters of a label; where one is longer, the legend has two columns."""
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Okabe and Ito's palette: tells controllers apart for the colour-blind too."""
+DPI = 130
 
 
-def draw_training_curve(curves: Sequence[Mapping[str, Any]]) -> Figure:
-    """Mean return and share of episodes held, against control steps and wall time.
+def new_figure(width: float, height: float, title: str = "", layout: Any = "constrained") -> Any:
+    """An empty Matplotlib figure [inch], which is imported here, as it is slow to."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout=layout)
+    FigureCanvasAgg(figure)
+    if title:
+        figure.suptitle(title, fontsize=11)
+    return figure
+
+
+def clean(*panels: Any) -> None:
+    """Two spines, small ticks and a light grid."""
+    for axes in panels:
+        axes.tick_params(labelsize=8)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(True, which="major", color="0.87", linewidth=0.6)
+        axes.set_axisbelow(True)
+
+
+def legend_below(figure: Any, axes: Any, columns: int) -> None:
+    """What is labelled in one of the panels, below them all."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
+
+
+def save_figure(figure: Any, path: Path) -> Path:
+    """Write it, whole or not at all; the suffix of the path chooses the format.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=DPI)
+    return path
+
+
+def png(figure: Any) -> bytes:
+    """The same for a report."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI)
+    return buffer.getvalue()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Envelope:
+    """Lower quartile, median and upper quartile over the trials of one controller, at each time."""
+
+    t: Array
+    """Time since the start of the hold [s], shape (G,)."""
+    position: Array
+    """Distance to the goal [m], shape (3, G)."""
+    yaw: Array
+    """Magnitude of the yaw error [rad], shape (3, G)."""
+    trials: int
+
+
+def error_envelope(trials: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]]) -> Envelope:
+    """Pointwise quartiles of the errors of one controller's trials, on the 10 Hz evaluation grid.
 
     Args:
-        curves: Rows of `curves.csv`: steps, seconds, mean_return, held.
+        trials: For each trial, what `measure_trial` takes: t [s], position [m], yaw [rad], goal [m, rad], world frame.
+
+    Returns:
+        The envelope, as long as the shortest grid; NaN where more than half of the trials have no value.
+
+    Raises:
+        ValueError: There is no trial.
     """
-    figure = Figure(figsize=(7.2, 3.0), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots()
-    # Episodes last as long as several updates: before the first ends there is no return to show.
-    rows = [row for row in curves if row["mean_length"] > 0.0]
-    steps = np.array([row["steps"] for row in rows]) / 1e6
-    axes.plot(steps, [row["mean_return"] for row in rows], color=BLUE, linewidth=1.6)
-    axes.set_xlabel("control steps, all worlds [million]")
-    axes.set_ylabel("mean return of an episode", color=BLUE)
-    axes.grid(True, color="0.85", linewidth=0.6)
-    share = axes.twinx()
-    share.plot(steps, [100.0 * row["held"] for row in rows], color=ORANGE, linewidth=1.6)
-    share.set_ylabel("episodes held [%]", color=ORANGE)
-    share.set_ylim(-3.0, 103.0)
-    for side in (axes, share):
-        side.spines[["top"]].set_visible(False)
-    if rows:
-        last = rows[-1]
-        axes.set_title(f"{last['steps'] / 1e6:.1f} million steps in {last['seconds']:.0f} s", fontsize=10)
+    if not trials:
+        raise ValueError("an envelope needs at least one trial")
+    grids, distances, turns = [], [], []
+    for t, position, yaw, goal in trials:
+        grid, position, yaw = resample(t, position, yaw)
+        error, yaw_error = pose_error(position, yaw, np.asarray(goal, dtype=np.float64))
+        grids.append(grid)
+        distances.append(np.linalg.norm(error, axis=-1))
+        turns.append(np.abs(yaw_error))
+    length = min(map(len, grids))
+    position, yaw = (_quartiles(np.stack([x[:length] for x in each])) for each in (distances, turns))
+    return Envelope(t=grids[0][:length], position=position, yaw=yaw, trials=len(trials))
+
+
+def draw_envelopes(envelopes: Mapping[str, Envelope], title: str = "") -> Any:
+    """The figure: position error above, yaw error below, a colour for each controller.
+
+    The success limits are drawn dashed and the evaluation window is gray. Scales are logarithmic, since errors fall
+    from metres to millimetres, and start at 1 mm and 0.01 deg, where smaller errors leave the figure.
+
+    Args:
+        envelopes: Legend label -> envelope.
+        title: Written above, or left out when empty.
+    """
+    figure = new_figure(7.2, 5.6, title)
+    above, below = figure.subplots(2, 1, sharex=True)
+    clean(above, below)
+    for i, (label, envelope) in enumerate(envelopes.items()):
+        label = f"{label} ({envelope.trials} trial{'s' if envelope.trials != 1 else ''})"
+        for axes, (low, median, high) in ((above, envelope.position), (below, np.degrees(envelope.yaw))):
+            color = COLORS[i % len(COLORS)]
+            axes.fill_between(envelope.t, low, high, color=color, alpha=0.2, linewidth=0.0)
+            axes.plot(envelope.t, median, color=color, linewidth=1.6, label=label)
+    _scale(above, 1e-3, POSITION_TOLERANCE, f"success: {POSITION_TOLERANCE:.2f} m on each axis")
+    _scale(below, 1e-2, math.degrees(YAW_TOLERANCE), f"success: {math.degrees(YAW_TOLERANCE):.0f}°")
+    above.set_ylabel("position error [m]")
+    end = max((float(e.t[-1]) for e in envelopes.values()), default=EVALUATION_WINDOW[1])
+    below.set(ylabel="yaw error [°]", xlabel="time since the start of the hold [s]", xlim=(0.0, end))
+    labels = above.get_legend_handles_labels()[1]
+    legend_below(figure, above, 3 if max(map(len, labels), default=0) <= LONGEST_OF_THREE else 2)
     return figure
 
 
-def draw_paths(trials: Trials, title: str = "", pool: Pool | None = None) -> Figure:
-    """The paths of all trials from above and from the side, in the pool; start and goals with their headings."""
-    pool = pool or Pool()
-    figure = Figure(figsize=(7.2, 6.0), layout="compressed")
-    FigureCanvasAgg(figure)
-    above, side = figure.subplots(2, 1, sharex=True, height_ratios=(pool.width, pool.depth))
-    for axes, (vertical, low, height) in zip(
-        (above, side), ((1, -pool.width / 2, pool.width), (2, -pool.depth, pool.depth)), strict=True
-    ):
-        frame = Rectangle((-pool.length / 2, low), pool.length, height, facecolor="#eaf3f8", edgecolor=GRAY)
-        axes.add_patch(frame)
-        for i in range(len(trials.setpoints)):
-            path = trials.position[:, i]
-            axes.plot(path[:, 0], path[:, vertical], color=BLUE, linewidth=1.2)
-        axes.plot(
-            trials.goals[:, 0], trials.goals[:, vertical], "o", mfc="none", mec=ORANGE, ms=9, label="goal"
-        )
-        axes.plot(*trials.position[0, 0, [0, vertical]], "s", color="0.2", ms=5, label="start")
-        axes.set_aspect("equal")
-        axes.set_xlim(-pool.length / 2 - 0.05, pool.length / 2 + 0.05)
-        axes.set_ylim(low - 0.05, low + height + 0.05)
-        axes.spines[["top", "right"]].set_visible(False)
-    _headings(above, trials)
-    above.set_ylabel("y, left [m]")
-    side.set_ylabel("z, up [m]")
-    side.set_xlabel("x, forward [m]")
-    figure.legend(
-        *above.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=9
+def _quartiles(x: Array) -> Array:
+    """Quartiles over the first axis among the values there are; NaN where fewer than half are there."""
+    enough = np.mean(np.isfinite(x), axis=0) >= 0.5
+    quartiles = np.full((len(QUARTILES), x.shape[1]), np.nan)
+    quartiles[:, enough] = np.nanquantile(x[:, enough], QUARTILES, axis=0)
+    return quartiles
+
+
+def _scale(axes: Any, bottom: float, limit: float, label: str) -> None:
+    """Logarithmic from `bottom` to what is drawn, with the success limit in sight."""
+    top = max((float(np.nanmax(line.get_ydata(), initial=limit)) for line in axes.lines), default=limit)
+    axes.set_ylim(bottom, 2.0 * top)
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.axvspan(*EVALUATION_WINDOW, color="0.92", zorder=0)
+    axes.axhline(limit, color="0.3", linestyle="--", linewidth=1.0)
+    note = axes.annotate(
+        label, (1.0, limit), xycoords=("axes fraction", "data"), xytext=(-4, 4), textcoords="offset points"
     )
-    if title:
-        figure.suptitle(title, fontsize=10)
-    return figure
-
-
-def _headings(axes: Axes, trials: Trials) -> None:
-    for x, y, _, yaw in trials.goals:
-        tip = (x + ARROW * np.cos(yaw), y + ARROW * np.sin(yaw))
-        axes.annotate("", tip, (x, y), arrowprops={"arrowstyle": "->", "color": ORANGE})
+    note.set(ha="right", fontsize=8, color="0.2")
+    note.set_bbox({"facecolor": "white", "alpha": 0.7, "linewidth": 0.0, "pad": 1.0})

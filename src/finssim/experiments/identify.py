@@ -5,11 +5,11 @@ from __future__ import annotations
 import io
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from finssim.calibration.excitation.programmes import Programme, programmes
+from finssim.calibration.excitation.programmes import programmes
 from finssim.calibration.excitation.synthetic import simulate_programme
 from finssim.calibration.fit import Fit
 from finssim.calibration.output.calibrate import calibrated, doubts
@@ -24,17 +24,7 @@ from finssim.quiet import start_warp
 from finssim.vehicles import Provenance, Vehicle, load_vehicle
 from finssim.vehicles.defaults import room
 
-__all__ = [
-    "HELD_OUT",
-    "TRIALS",
-    "Identification",
-    "Record",
-    "commands",
-    "identify",
-    "rough_vehicle",
-    "simulated_trials",
-    "vehicle_files",
-]
+__all__ = ["HELD_OUT", "Identification", "TRIALS", "commands", "identify", "vehicle_files"]
 
 TRIALS = "trials"
 SET = "hydrodynamics.calibrated"
@@ -64,11 +54,7 @@ class Identification:
     warnings: tuple[str, ...]
     seconds: float
     steps: tuple[dict[str, float | str], ...] = ()
-    """Terminal speeds and time constants beside those of a plant, of `excitation.terminal.compare_steps`."""
-
-    def with_steps(self, steps: Sequence[dict[str, float | str]]) -> Identification:
-        """The same with the comparison to a plant."""
-        return replace(self, steps=tuple(steps))
+    """Terminal speeds and time constants beside those of a plant, of `programmes.compare_steps`."""
 
 
 def rough_vehicle(truth: Vehicle) -> Vehicle:
@@ -174,26 +160,16 @@ def simulated_trials(truth: Vehicle) -> Record:
             "fit": programmes("all", truth, coast=COAST),
             "held-out": programmes(tuple(HELD_OUT), truth, levels=HELD_OUT, coast=COAST),
         }
-        recorded = _simulated(plans, truth, seed)
-        for role, trials in recorded.items():
-            for trial in trials:
-                write_trial(trial, folder / role / trial.name, format="parquet")
+        trials = iter(simulate_programme(sum(plans.values(), []), truth, noise="sensors", seed=seed))
+        recorded: dict[str, list[Trial]] = {role: [] for role in plans}
+        for role, plan in plans.items():
+            for _, trial in zip(plan, trials, strict=False):
+                meant = replace(trial, header=trial.header.model_copy(update={"role": role}))
+                write_trial(meant, folder / role / meant.name, format="parquet")
+                recorded[role].append(meant)
         return recorded
 
     return record
-
-
-def _simulated(plans: Mapping[str, Sequence[Programme]], truth: Vehicle, seed: int) -> dict[str, list[Trial]]:
-    """Each trial's header says what it is for."""
-    every = [programme for plan in plans.values() for programme in plan]
-    trials = iter(simulate_programme(every, truth, noise="sensors", seed=seed))
-    return {
-        role: [
-            replace(trial, header=trial.header.model_copy(update={"role": role}))
-            for _, trial in zip(plan, trials, strict=False)
-        ]
-        for role, plan in plans.items()
-    }
 
 
 def _write_replay(scored: Replay, folder: Path) -> bytes:

@@ -2,25 +2,50 @@
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 
-from finssim.experiments.localization_calibration import Calibrated, calibrate
-from finssim.experiments.localization_campaign import CONDITIONS, Campaign, draw_campaign, lifted
-from finssim.experiments.localization_pictures import RENDERERS, Picture, pictures
-from finssim.experiments.localization_scores import Scores, locate, pooled, rmse_cm, sensitivity
-from finssim.experiments.localization_table import RESULT_FILE, print_table, write_results
-from finssim.experiments.running import Say, run_experiment
+from finssim.experiments.campaign import Say, choice, write_json
+from finssim.experiments.figures import COLORS, clean, legend_below, new_figure, save_figure
+from finssim.experiments.localization_campaign import (
+    CONDITIONS,
+    REACH,
+    RENDERERS,
+    TAG,
+    Calibrated,
+    Campaign,
+    Picture,
+    Visit,
+    calibrate,
+    draw_campaign,
+    lifted,
+    pictures,
+    write_survey,
+)
+from finssim.experiments.statistics import bootstrap
+from finssim.experiments.tables import console_table, markdown_table
 from finssim.files import atomic_directory, refuse_unwritable
+from finssim.localization.camera_file import write_camera
+from finssim.localization.detection.detections import write_detections
+from finssim.localization.detection.tags import tag_corners_b
+from finssim.localization.pool import Pool, write_pool
+from finssim.localization.poses.methods import METHODS, Constraints
 from finssim.provenance import provenance
 
-__all__ = ["METHODS_SHOWN", "PAPER_TABLE_2", "SeedResult", "localization_experiment", "run"]
+__all__ = ["RESULT_FILE", "localization_experiment", "print_table", "tables_of"]
+
+Array = NDArray[np.float64]
+
+RESULT_FILE = "localization.json"
 
 PAPER_TABLE_2 = MappingProxyType({"pinhole": (5.74, 11.41), "refractive": (0.73, 1.45)})
 """Method -> RMSE and 95th percentile in the paper [cm]: its camera over its pool, calibrated on the same places."""
@@ -43,6 +68,310 @@ LIFT = 0.4
 RIPPLES = (0.0, 0.005, 0.01, 0.02, 0.04)
 RIPPLE_VISITS = 40
 RIPPLE_IMAGES = 4
+DEPTHS = (-0.05, -0.02, -0.01, 0.0, 0.01, 0.02, 0.05)
+TILTS = tuple(np.radians([0.0, 0.1, 0.2, 0.5, 1.0]).tolist())
+INDICES = (-0.02, -0.01, -0.005, 0.0, 0.005, 0.01, 0.02)
+Z_STD = 0.01
+TILT_STD = float(np.radians(0.5))
+TAGS_B = tag_corners_b(TAG)
+
+NOTE = (
+    "ours: a virtual pool of the published geometry, calibrated on half of the places, measured at the others. paper: "
+    "its camera over its pool, calibrated and measured on the same places, with the depth known. These are different "
+    "experiments and stand side by side for orientation."
+)
+WORDS = {
+    "published": "every error",
+    "flat": "no ripples",
+    "quiet": "noise of the pictures alone",
+    "lifted": "every error, and the tag higher than the calibration saw it",
+    "refractive": "refractive",
+    "refractive-weighted": "refractive, weighted",
+    "refractive-6dof": "refractive, 6 DOF",
+    "pinhole-depth": "pinhole with depth",
+    "pinhole": "pinhole PnP",
+    "pinhole, refractive pose": "pinhole PnP, as paper",
+}
+HEADS = ["", "RMSE [cm]", "95 % of it", "P95 [cm]", "95 % of it", "located"]
+CALIBRATION = {
+    "seed": ("seed", ""),
+    "camera_height_mm": ("camera height [mm]", ".2f"),
+    "water_height_mm": ("water [mm]", ".2f"),
+    "camera_over_water_mm": ("camera over water [mm]", ".2f"),
+    "tilt_deg": ("tilt [°]", ".3f"),
+    "index": ("index", "+.4f"),
+}
+"""What a calibration got wrong: key -> heading and format."""
+SENSITIVITIES = {
+    "depth_cm": "error of depth [cm]",
+    "tilt_deg": "tilt of the water that is not known [°]",
+    "index": "error of the water's index",
+    "ripples": "rms slope of ripples",
+}
+
+
+@dataclass(frozen=True)
+class Scores:
+    """One method on one campaign's held-out visits."""
+
+    visits: NDArray[np.intp]
+    """Those that were located at least once, (n,)."""
+    surveyed: Array
+    """Mean estimate minus surveyed place, x and y [m], (n, 2)."""
+    true: Array
+    """Mean estimate minus true place [m], (n, 2)."""
+    pictures: int
+    located: int
+    reasons: Mapping[str, int]
+    """Why pictures gave no position, with how many."""
+
+    @property
+    def rmse(self) -> float:
+        """Horizontal error against the surveyed places [m]; NaN where nothing was located."""
+        return float(np.sqrt(np.mean(np.sum(self.surveyed**2, 1)))) if len(self.visits) else math.nan
+
+
+def locate(
+    campaign: Campaign,
+    seen: Sequence[Picture],
+    pool: Pool,
+    method: str,
+    *,
+    pixel_std: float,
+    depth_offset: float = 0.0,
+) -> Scores:
+    """Locate the tag in every picture of the held-out visits and average over each visit.
+
+    Args:
+        campaign: What lay where.
+        seen: Its pictures.
+        pool: As calibrated.
+        method: Key of `finssim.localization.poses.methods.METHODS`.
+        pixel_std: Standard deviation of a corner, as the calibration found it [px].
+        depth_offset: Added to the depth reading [m].
+    """
+    found: dict[int, list[tuple[float, float]]] = {}
+    reasons = Counter[str]()
+    pictures = 0
+    for picture in seen:
+        if campaign.calibrates[picture.visit]:
+            continue
+        pictures += 1
+        visit = campaign.visits[picture.visit]
+        place, reason = _place(picture, visit, pool, method, pixel_std, depth_offset)
+        if place is None:
+            reasons[reason.partition(":")[0]] += 1
+        else:
+            found.setdefault(picture.visit, []).append(place)
+    index = np.array(sorted(found), np.intp)
+    means = np.array([np.mean(found[k], axis=0) for k in index]).reshape(-1, 2)
+    surveyed = np.array([campaign.visits[k].nominal[:2] for k in index]).reshape(-1, 2)
+    true = np.array([campaign.visits[k].position[:2] for k in index]).reshape(-1, 2)
+    located = sum(map(len, found.values()))
+    return Scores(index, means - surveyed, means - true, pictures, located, reasons)
+
+
+def _place(
+    picture: Picture, visit: Visit, pool: Pool, method: str, pixel_std: float, depth_offset: float
+) -> tuple[tuple[float, float] | None, str]:
+    if picture.detection is None:
+        return None, "tag not detected"
+    water = pool.interface  # depth is measured along its normal, which is up
+    given = Constraints(
+        z_b=-water.offset - visit.depth_read - depth_offset,
+        z_std=Z_STD,
+        roll=visit.roll_read,
+        pitch=visit.pitch_read,
+        tilt_std=TILT_STD,
+        up=tuple(water.normal.tolist()),
+    )
+    measured = METHODS[method]((picture.detection,), pool, TAGS_B, given, pixel_std)
+    return ((measured.x, measured.y), "") if measured.ok else (None, measured.reason)
+
+
+def pooled(scores: Sequence[Scores]) -> dict[str, Any]:
+    """RMSE and 95th percentile over all seeds, with intervals from a bootstrap of seeds, then of visits.
+
+    Args:
+        scores: One for each seed.
+
+    Returns:
+        Centimetres, as the paper's table has them; None where nothing was located.
+    """
+    scored = [s for s in scores if len(s.visits)]
+    errors = [np.linalg.norm(100.0 * s.surveyed, axis=1) for s in scored]
+    true = [np.linalg.norm(100.0 * s.true, axis=1) for s in scored]
+
+    def redraw(random: np.random.Generator) -> tuple[float, float]:
+        chosen = random.integers(len(errors), size=len(errors))
+        return _figures([random.choice(errors[k], len(errors[k])) for k in chosen])
+
+    figures: Any = np.full((4, 2), None)
+    if scored:
+        figures = np.array([_figures(errors), *bootstrap(redraw), _figures(true)])
+    (rmse, p95), low, high, (true_rmse, true_p95) = figures.tolist()
+    return {
+        "rmse_cm": rmse,
+        "rmse_ci95_cm": [low[0], high[0]],
+        "p95_cm": p95,
+        "p95_ci95_cm": [low[1], high[1]],
+        "rmse_to_truth_cm": true_rmse,
+        "p95_to_truth_cm": true_p95,
+        "visits": sum(len(e) for e in errors),
+        "pictures": sum(s.pictures for s in scores),
+        "located": sum(s.located for s in scores),
+        "reasons": dict(sum((Counter(s.reasons) for s in scores), Counter())),
+    }
+
+
+def _figures(errors: Sequence[Array]) -> tuple[float, float]:
+    x = np.concatenate(errors)
+    return float(np.sqrt(np.mean(x**2))), float(np.percentile(x, 95))
+
+
+def rmse_cm(scores: Scores) -> float | None:
+    """Horizontal error against the surveyed places [cm]; None where nothing was located."""
+    return 100.0 * scores.rmse if len(scores.visits) else None
+
+
+def sensitivity(
+    campaign: Campaign, seen: Sequence[Picture], pool: Pool, pixel_std: float
+) -> dict[str, list[list[float | None]]]:
+    """RMSE of the refractive method with one thing wrong on purpose.
+
+    Returns:
+        `depth_cm`, `tilt_deg` and `index` -> pairs of the error put in and the RMSE [cm] that comes out, None where
+        nothing was located.
+    """
+
+    def rmse(changed: Pool, depth_offset: float = 0.0) -> float | None:
+        given = {"pixel_std": pixel_std, "depth_offset": depth_offset}
+        return rmse_cm(locate(campaign, seen, changed, "refractive", **given))
+
+    water = pool.interface
+    return {
+        "depth_cm": [[100.0 * d, rmse(pool, d)] for d in DEPTHS],
+        "tilt_deg": [[float(np.degrees(t)), rmse(replace(pool, interface=_leaning(pool, t)))] for t in TILTS],
+        "index": [
+            [i, rmse(replace(pool, interface=replace(water, index_far=water.index_far + i)))] for i in INDICES
+        ],
+    }
+
+
+def _leaning(pool: Pool, angle: float) -> Any:
+    """The water tilted about the point below the camera, which keeps its height."""
+    x, y = pool.camera.position[:2]
+    height = float(pool.interface.height(x, y))
+    leaning = pool.interface.tilted(angle, 0.0)
+    return replace(leaning, offset=-float(leaning.normal @ [x, y, height]))
+
+
+def _draw_error_map(campaign: Campaign, pinhole: Scores, refractive: Scores, path: Path) -> None:
+    """Arrows from every held-out place to where each method puts it, longer than true as the titles say."""
+    places = np.array([visit.nominal[:2] for visit in campaign.visits])
+    figure = new_figure(12.0, 4.2)
+    panels = (("pinhole PnP", pinhole, 3.0, COLORS[1]), ("refractive", refractive, 10.0, COLORS[0]))
+    for axes, (title, scores, scale, color) in zip(figure.subplots(1, 2, sharey=True), panels, strict=True):
+        clean(axes)
+        axes.plot(*places[campaign.calibrates].T, "+", color="0.7", markersize=5, label="calibrated here")
+        at, arrows = places[scores.visits], scale * scores.surveyed
+        axes.plot(*at.T, ".", color="0.1", markersize=3, label="held out")
+        axes.quiver(*at.T, *arrows.T, angles="xy", scale_units="xy", scale=1.0, width=0.003, color=color)
+        axes.set_title(f"{title}: RMSE {100.0 * scores.rmse:.2f} cm, arrows {scale:.0f} times as long")
+        axes.set(aspect="equal", xlabel="x [m]", xlim=(-REACH[0] - 0.3, REACH[0] + 0.3))
+    figure.axes[0].set_ylabel("y [m]")
+    legend_below(figure, figure.axes[0], 2)
+    save_figure(figure, path)
+
+
+def _draw_sensitivity(swept: Mapping[str, Any], path: Path) -> None:
+    """RMSE [cm] against an error put in on purpose."""
+    names = [name for name in SENSITIVITIES if name in swept]
+    figure = new_figure(3.1 * len(names), 3.0)
+    panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
+    for axes, name in zip(panels, names, strict=True):
+        axes.plot(*np.array(swept[name], float).T, "o-", color=COLORS[0], markersize=4)
+        axes.set(xlabel=SENSITIVITIES[name], ylim=(0.0, None))
+        clean(axes)
+    panels[0].set_ylabel("RMSE [cm]")
+    save_figure(figure, path)
+
+
+def tables_of(result: Mapping[str, Any]) -> dict[str, tuple[list[str], list[list[str]]]]:
+    """Words about conditions -> heads and rows of the table; the last is the paper's."""
+    tables = {
+        f"ours, {name} conditions: {WORDS[name]}": [
+            [
+                WORDS[method],
+                *(_text(m["rmse_cm"], m["rmse_ci95_cm"])),
+                *(_text(m["p95_cm"], m["p95_ci95_cm"])),
+                f"{m['located']}/{m['pictures']}",
+            ]
+            for method, m in methods.items()
+        ]
+        for name, methods in result["results"].items()
+    }
+    tables["the paper: its camera over its pool"] = [
+        [f"paper, {WORDS[m]}", f"{p['rmse_cm']:.2f}", "", f"{p['p95_cm']:.2f}", "", ""]
+        for m, p in result["paper"].items()
+    ]
+    return {words: (HEADS, rows) for words, rows in tables.items()}
+
+
+def _text(value: float | None, interval: Sequence[float | None]) -> tuple[str, str]:
+    """A figure, and its interval."""
+    low, high = interval
+    bounds = "" if low is None or high is None else f"[{low:.2f}, {high:.2f}]"
+    return "none" if value is None else f"{value:.2f}", bounds
+
+
+def print_table(result: Mapping[str, Any], console: Console) -> None:
+    """Print the tables, ours by conditions, then the paper's."""
+    console.print(_headline(result), highlight=False)
+    for words, (heads, rows) in tables_of(result).items():
+        console.print(console_table(heads, rows, title=words, title_style="bold"))
+    console.print(_gain(result), highlight=False)
+    console.print(NOTE, highlight=False)
+
+
+def markdown(result: Mapping[str, Any]) -> str:
+    """`localization.md`."""
+    parts = ["# Horizontal localization through water", _headline(result), _gain(result)]
+    for words, table in tables_of(result).items():
+        parts += [f"## {words[0].upper()}{words[1:]}", markdown_table(*table)]
+    parts += [NOTE, "![Error map](error_map.png)"]
+    if result["sensitivity"]:  # an interruption may come before it
+        parts.append("![Sensitivity](sensitivity.png)")
+    heads = [heading for heading, _ in CALIBRATION.values()]
+    rows = [[format(c[key], form) for key, (_, form) in CALIBRATION.items()] for c in result["calibration"]]
+    origin = result["provenance"]
+    parts += ["## What the calibrations got wrong", markdown_table(heads, rows, left=())]
+    parts.append(f"FinsSim {origin['finssim']}, revision {origin['revision']}, seeds {result['seeds']}.")
+    return "\n\n".join(parts) + "\n"
+
+
+def _headline(result: Mapping[str, Any]) -> str:
+    short = f" (interrupted, {result['seeds_asked_for']} asked for)" if result["interrupted"] else ""
+    return (
+        f"{len(result['seeds'])} seeds{short}, each {result['pictures_per_seed']} pictures at"
+        f" {result['places']} places,"
+        f" renderer {result['renderer']}"
+    )
+
+
+def _gain(result: Mapping[str, Any]) -> str:
+    rivals = {
+        "pinhole": "pinhole PnP calibrated on the same half",
+        "pinhole, refractive pose": "pinhole PnP with the camera pose of the refractive calibration, as the paper's",
+    }
+    sentences = []
+    for rival, words in rivals.items():
+        m = result["results"]["published"]
+        if not (m["refractive"]["located"] and m[rival]["located"]):
+            continue
+        less = [100.0 * (1.0 - m["refractive"][key] / m[rival][key]) for key in ("rmse_cm", "p95_cm")]
+        sentences.append(f"Refractive below {words}: RMSE {less[0]:.1f} %, P95 {less[1]:.1f} %.")
+    return " ".join(sentences)
 
 
 @dataclass(frozen=True)
@@ -56,27 +385,16 @@ class SeedResult:
     """By method."""
 
 
-def run(
-    *,
-    renderer: str = "own",
-    seeds: int = 3,
-    out: Path,
-    seed: int = 1,
-    as_json: bool = False,
-    console: Console | None = None,
-) -> dict[str, Any]:
-    """Run the experiment with a progress bar, print the table (or one JSON object) and write the directory.
+@dataclass
+class _Drawn:
+    """What is done so far."""
 
-    Arguments as for `localization_experiment`; console is where the table goes, standard output if None.
-    """
-    return run_experiment(
-        "localization experiment",
-        lambda say: localization_experiment(renderer=renderer, seeds=seeds, out=out, seed=seed, progress=say),
-        print_table,
-        out=out,
-        as_json=as_json,
-        console=console,
-    )
+    done: Mapping[str, list[SeedResult]] = field(default_factory=lambda: {name: [] for name in CONDITIONS})
+    """By conditions."""
+    higher: list[dict[str, Scores]] = field(default_factory=list)
+    """The tag lifted, by seed and method."""
+    swept: dict[str, Any] = field(default_factory=dict)
+    interrupted: bool = False
 
 
 def localization_experiment(
@@ -85,9 +403,8 @@ def localization_experiment(
     seeds: int = 3,
     out: Path,
     seed: int = 1,
-    locations: tuple[int, int] | None = None,
-    images: int | None = None,
-    progress: Say | None = None,
+    say: Say = lambda part, what: None,
+    **size: Any,
 ) -> dict[str, Any]:
     """Draw the published test, calibrate on one half of its places, locate the tag at the other half.
 
@@ -99,9 +416,8 @@ def localization_experiment(
         seeds: How many drawings.
         out: Directory for `localization.json`, `.md`, figures, and of the first seed survey, detections and pool files.
         seed: The first.
-        locations: Places along and across the pool; the published 170 if None.
-        images: Pictures in all; the published 720 if None.
-        progress: Told the share that is done and what comes next.
+        say: Told the share that is done and what comes next.
+        size: Of `draw_campaign`: locations (places along and across the pool) and images; as published if not given.
 
     Returns:
         What `localization.json` holds.
@@ -111,77 +427,74 @@ def localization_experiment(
     """
     if seeds < 1:
         raise ValueError(f"seeds is {seeds}, expected at least 1")
-    if renderer not in RENDERERS:
-        raise ValueError(f"unknown renderer '{renderer}'; available: {', '.join(RENDERERS)}")
+    choice(RENDERERS, renderer, "renderer", ValueError)
     refuse_unwritable(atomic_directory(out, replaces=RESULT_FILE))
-    size: dict[str, Any] = {}
-    if locations is not None:
-        size["locations"] = locations
-    if images is not None:
-        size["images"] = images
-    found = _drawn(seeds, seed, renderer, size, progress or (lambda part, what: None))
-    first = found.done["published"][0]
+    drawn = _draw_all(seeds, seed, renderer, size, say)
+    runs = drawn.done["published"]
+    first = runs[0]
+    scores = {name: [one.scores for one in each] for name, each in drawn.done.items()}
     result = {
         "experiment": "localization",
         "renderer": renderer,
-        "seeds": [one.campaign.seed for one in found.done["published"]],
+        "seeds": [one.campaign.seed for one in runs],
         "seeds_asked_for": seeds,
-        "interrupted": found.interrupted,
+        "interrupted": drawn.interrupted,
         "places": len(first.campaign.visits),
         "pictures_per_seed": sum(visit.images for visit in first.campaign.visits),
         "conditions": {name: vars(CONDITIONS[name]) for name in CONDITIONS},
-        "results": found.results(),
+        "results": {
+            name: {method: pooled([one[method] for one in each]) for method in METHODS_SHOWN}
+            for name, each in (scores | {"lifted": drawn.higher}).items()
+            if each
+        },
         "lift_m": LIFT,
-        "pixel_std_px": [one.found.pixel_std for one in found.done["published"]],
-        "calibration": [_errors(one) for one in found.done["published"]],
-        "sensitivity": found.swept,
+        "pixel_std_px": [one.found.pixel_std for one in runs],
+        "calibration": [_errors(one) for one in runs],
+        "sensitivity": drawn.swept,
         "paper": {m: {"rmse_cm": r, "p95_cm": p} for m, (r, p) in PAPER_TABLE_2.items()},
         "provenance": provenance(),
     }
-    write_results(result, out, first.campaign, first.found, first.scores)
+    _write(result, out, first)
     return result
 
 
-@dataclass(frozen=True)
-class _Findings:
-    done: Mapping[str, list[SeedResult]]
-    """By conditions."""
-    higher: list[dict[str, Scores]]
-    """The tag lifted, by seed and method."""
-    swept: Mapping[str, Any]
-    interrupted: bool
-
-    def results(self) -> dict[str, Any]:
-        """Conditions -> method -> figures over all seeds."""
-        scores = {name: [one.scores for one in runs] for name, runs in self.done.items()}
-        return {
-            name: {method: pooled([one[method] for one in runs]) for method in METHODS_SHOWN}
-            for name, runs in (scores | {"lifted": self.higher}).items()
-            if runs
-        }
+def _write(result: Mapping[str, Any], out: Path, first: SeedResult) -> None:
+    """Write the directory: result, page, figures, and what a user needs to do the first seed by hand."""
+    with atomic_directory(out, replaces=RESULT_FILE) as folder:
+        scores, found = first.scores, first.found
+        _draw_error_map(first.campaign, scores["pinhole"], scores["refractive"], folder / "error_map.png")
+        if result["sensitivity"]:
+            _draw_sensitivity(result["sensitivity"], folder / "sensitivity.png")
+        write_camera(folder / "camera.yaml", first.campaign.lens, {})
+        write_pool(found.refractive, folder / "pool.yaml")
+        write_pool(found.pinhole, folder / "pool_pinhole.yaml")
+        write_detections(found.frames, folder / "detections.csv")
+        write_survey(found.survey, folder / "survey.csv")
+        write_json(folder / RESULT_FILE, result, markdown(result))
 
 
-def _drawn(seeds: int, seed: int, renderer: str, size: Mapping[str, Any], say: Say) -> _Findings:
+def _draw_all(seeds: int, seed: int, renderer: str, size: Mapping[str, Any], say: Say) -> _Drawn:
     """All seeds, or after Ctrl-C those that are finished, of the first what there is."""
-    done: dict[str, list[SeedResult]] = {name: [] for name in CONDITIONS}
-    higher: list[dict[str, Scores]] = []
-    swept: dict[str, Any] = {}
+    drawn = _Drawn()
+    published = drawn.done["published"]
     try:
         for k in range(seeds):
             for j, name in enumerate(CONDITIONS):
                 say((k + j / len(CONDITIONS)) / seeds, f"seed {seed + k}, {name} conditions")
-                done[name].append(_one(name, seed + k, renderer, size))
+                drawn.done[name].append(_one(name, seed + k, renderer, size))
             say((k + 0.8) / seeds, f"seed {seed + k}, another depth")
-            higher.append(_lifted(done["published"][k], renderer))
-            if not swept:
+            campaign = lifted(published[k].campaign, LIFT)  # the same calibration, the tag at another depth
+            drawn.higher.append(_scored(campaign, list(pictures(campaign, renderer)), published[k].found))
+            if not drawn.swept:
                 say((k + 0.9) / seeds, "sensitivity")
-                swept = _swept(done["published"][0], renderer, size)
+                drawn.swept.update(_swept(published[0], renderer))
     except KeyboardInterrupt:
-        if not done["published"]:
+        if not published:
             raise
-        finished = max(len(higher), 1)
-        return _Findings({name: runs[:finished] for name, runs in done.items()}, higher, swept, True)
-    return _Findings(done, higher, swept, False)
+        drawn.interrupted = True
+        for runs in drawn.done.values():
+            del runs[max(len(drawn.higher), 1) :]
+    return drawn
 
 
 def _one(name: str, seed: int, renderer: str, size: Mapping[str, Any]) -> SeedResult:
@@ -199,13 +512,7 @@ def _scored(campaign: Campaign, seen: Sequence[Picture], found: Calibrated) -> d
     }
 
 
-def _lifted(one: SeedResult, renderer: str) -> dict[str, Scores]:
-    """The same calibration, the tag at another depth."""
-    campaign = lifted(one.campaign, LIFT)
-    return _scored(campaign, list(pictures(campaign, renderer)), one.found)
-
-
-def _swept(one: SeedResult, renderer: str, size: Mapping[str, Any]) -> dict[str, Any]:
+def _swept(one: SeedResult, renderer: str) -> dict[str, Any]:
     """Sensitivities: to depth, tilt and index on the same pictures, to ripples on new ones."""
     swept: dict[str, Any] = dict(
         sensitivity(one.campaign, one.seen, one.found.refractive, one.found.pixel_std)

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.control.guidance import Guide
-from finssim.experiments.metrics import measure_trial
-from finssim.experiments.t2_metrics import ERRORS, measure_tracking
+from finssim.experiments.metrics import ERRORS, measure_tracking, measure_trial
 
 __all__ = ["PERIOD", "Motion", "localization_errors", "measure", "on_grid"]
 

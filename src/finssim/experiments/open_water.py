@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import tempfile
 from collections.abc import Mapping
@@ -12,17 +11,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
-from rich.table import Table
 
 from finssim.control.trajectories import Trajectory
-from finssim.experiments.running import Say, run_experiment
-from finssim.files import atomic_write
+from finssim.experiments.campaign import Say, choice, write_json
+from finssim.experiments.tables import console_table
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
-from finssim.pool.draw_plant import draw_plant
-from finssim.pool.plant_spec import PlantSpec
+from finssim.pool import PlantSpec, VirtualPool, draw_plant, read_truth
 from finssim.pool.sites import positioning_of, site_of, vehicle_at
-from finssim.pool.truth import read_truth
-from finssim.pool.virtual_pool import VirtualPool
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.robot.lockstep import run_lockstep
@@ -32,7 +27,7 @@ from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["WAYS", "open_water", "run", "swim", "way_of"]
+__all__ = ["open_water", "print_open_water"]
 
 Array = npt.NDArray[np.float64]
 
@@ -62,8 +57,7 @@ def way_of(shape: str, duration: float, speed: float) -> Trajectory:
     Raises:
         ValueError: There is no such shape.
     """
-    if shape not in WAYS:
-        raise ValueError(f"unknown way '{shape}'; available: {', '.join(WAYS)}")
+    choice(WAYS, shape, "way", ValueError)
     corners = [[0.0, 0.0], [speed * duration, 0.0]]
     if shape == "square":
         around = [[SIDE, 0.0], [SIDE, SIDE], [0.0, SIDE], [0.0, 0.0]]
@@ -225,33 +219,19 @@ def open_water(
         "trials": trials,
         "provenance": provenance(),
     }
-    with atomic_write(Path(out) / "open_water.json") as temporary:
-        temporary.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_json(Path(out) / "open_water.json", result)
     return result
 
 
-def run(
-    *, out: Path, as_json: bool = False, console: Console | None = None, **options: Any
-) -> dict[str, Any]:
-    """As `open_water`, with a progress bar and a table."""
-    return run_experiment(
-        "experiment open-water",
-        lambda say: open_water(out=out, say=say, **options),
-        _print,
-        out=out,
-        as_json=as_json,
-        console=console,
-    )
-
-
-def _print(result: Mapping[str, Any], console: Console) -> None:
+def print_open_water(result: Mapping[str, Any], console: Console) -> None:
+    """Print a row for each way."""
     title = f"{result['vehicle']['name']}, {result['shape']}, positioning {result['positioning']}"
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
-    for name in ("seed", "way [m]", "drift [m]", "drift [%]", "std [m]", "NEES", "inside", "off way [m]", ""):
-        table.add_column(name, justify="right")
-    for t in result["trials"]:
-        table.add_row(
+    heads = ("seed", "way [m]", "drift [m]", "drift [%]", "std [m]", "NEES", "inside", "off way [m]", "")
+    rows = [
+        [
             str(t["seed"]), f"{t['way_m']:.1f}", f"{t['drift_m']:.2f}", f"{100.0 * t['drift_m'] / t['way_m']:.2f}",
             f"{t['std_m']:.2f}", f"{t['nees']:.2f}", f"{100.0 * t['inside']:.0f} %", f"{t['off_m']:.2f}", t["fault"],
-        )  # fmt: skip
-    console.print(table)
+        ]
+        for t in result["trials"]
+    ]  # fmt: skip
+    console.print(console_table(heads, rows, left=(), title=title))

@@ -10,18 +10,17 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from finssim.engine import Water
+from finssim.engine import Water, Wave
 from finssim.engine.randomize import Randomization
 from finssim.engine.ranges_file import Ranges, load_ranges
-from finssim.engine.surroundings import Wave
 from finssim.tasks import Environment, MeasurementNoise, Task
 from finssim.tasks.agents import Agent
 from finssim.tasks.make import observed
 from finssim.tasks.sensing import seen_with
 from finssim.vehicles import Vehicle
-from finssim.yaml_file import read_mapping
+from finssim.yaml_file import first_problem, read_mapping
 
-__all__ = ["Plant", "PlantError", "available_plants", "load_plant"]
+__all__ = ["Plant", "PlantError", "load_plant"]
 
 SHIPPED = Path(__file__).parent / "plants"
 
@@ -127,7 +126,7 @@ class Plant(BaseModel):
         }
 
     def environment(
-        self, agent: Agent, task: Task, vehicle: Vehicle, *, hydrodynamics: str, **options: Any
+        self, agent: Agent, task: Task, vehicle: Vehicle, *, hydrodynamics: str = "calibrated", **options: Any
     ) -> Environment:
         """Worlds in which an agent acts in this plant.
 
@@ -173,9 +172,7 @@ def load_plant(name_or_path: str | Path) -> Plant:
     try:
         return Plant.model_validate({"name": path.stem, **data})
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(x) for x in first["loc"])
-        raise PlantError(f"{path}: {where}: {first['msg'].removeprefix('Value error, ')}") from None
+        raise PlantError(f"{path}: {first_problem(error)}") from None
 
 
 def _water(value: Mapping[str, Any]) -> Water:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +13,167 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from finssim.control.allocator import Allocator
 from finssim.engine import Simulator, Water
+from finssim.engine.distributions import Distribution
+from finssim.engine.plant_arrays import NO_LIMIT, vehicle_parameters
 from finssim.engine.randomize import Randomization
-from finssim.experiments.randomize_figure import draw_spread
-from finssim.experiments.randomize_rows import Row, rows_of
+from finssim.engine.ranges_file import Ranges
+from finssim.engine.ranges_table import ENTRIES, INDEX, drawn_entries
+from finssim.experiments.campaign import write_json
+from finssim.experiments.figures import COLORS, clean, legend_below, new_figure, save_figure
+from finssim.experiments.tables import console_table
 from finssim.files import atomic_directory
 from finssim.provenance import provenance
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
-__all__ = ["ShowError", "randomize_show", "step_responses"]
+__all__ = ["randomize_show"]
+
+FAMILIES = {
+    "added_mass": ("M_A", "kg", "kg m²"),
+    "linear_damping": ("D1", "N s/m", "N m s"),
+    "quadratic_damping": ("D2", "N s²/m²", "N m s²"),
+}
+"""Family -> field of the parameters, unit of the first three axes, unit of the last three."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One number of the vehicle, the water or the sensors."""
+
+    entry: str
+    nominal: float | None
+    """As the file has it, or where nothing is drawn; None where that has no such number."""
+    low: float
+    high: float
+    unit: str
+    drawn: str
+    """How, in words."""
+
+
+def rows_of(ranges: Ranges, vehicle: Vehicle, hydrodynamics: str = "calibrated") -> list[Row]:
+    """Everything that a ranges file draws for a vehicle, in SI.
+
+    Args:
+        ranges: The ranges.
+        vehicle: The vehicle.
+        hydrodynamics: Whose coefficients.
+
+    Raises:
+        SimulatorError: The vehicle has no such hydrodynamics.
+    """
+    drawn = drawn_entries(ranges, thrusters=1)  # every thruster is drawn alike: one stands for all
+    p, name = vehicle_parameters(vehicle, hydrodynamics), vehicle.thruster_names[0]
+    # Added mass as the file has it, about the point where its coefficients hold.
+    matrices = p | {"M_A": vehicle.hydrodynamics[hydrodynamics].added_mass}
+
+    def scaled(entry: str, nominal: Any, unit: str, *keys: str) -> list[Row]:
+        factors = [drawn[key] for key in keys if key in drawn]
+        return [_scaled(entry, float(nominal), unit, factors)] if factors else []
+
+    rows = [
+        *scaled("mass", p["mass"], "kg", "mass"),
+        *scaled("volume", p["volume"], "m³", "mass" if ranges.volume == "with_mass" else "volume"),
+    ]
+    for i, axis in enumerate(AXES[3:]):
+        rows += scaled(f"inertia.{axis}", vehicle.body.inertia[i][i], "kg m²", "inertia")
+    for center, field in (("center_of_gravity", "r_g"), ("center_of_buoyancy", "r_b")):
+        for i, letter in enumerate("xyz"):
+            if (entry := f"{center}.{letter}") in drawn:
+                rows.append(_shifted(entry, float(p[field][i]), "m", drawn[entry]))
+    for family, (field, *units) in FAMILIES.items():
+        for i, axis in enumerate(AXES):
+            nominal = matrices[field][i][i]
+            if nominal != 0.0:
+                keys = f"{family}.all", f"{family}.{axis}"
+                rows += scaled(f"{family}.{axis}", nominal, units[i // 3], *keys)
+    for factor in ("surge_damping", "mesh_drag"):
+        rows += scaled(factor, 1.0, "factor", factor)
+    rows += scaled(f"thrust ({name})", p["force_max"][0], "N", "thrust.all", "thrust.each.0")
+    rows += scaled("thrust.failure, of each", 1.0, "factor", "thrust.failure.0")
+    lag = ("time_constant.all", "time_constant.each.0")
+    rows += scaled(f"time_constant ({name})", p["time_constant"][0], "s", *lag)
+    rows += scaled("delay", p["delay"], "s", "delay")
+    if p["slew"][0] < NO_LIMIT:
+        rows += scaled(f"slew ({name})", p["slew"][0], "rad/s²" if p["speed_lag"] else "N/s", "slew")
+    rows += scaled(f"dead_zone ({name})", p["dead_plus"][0], "N", "dead_zone")
+    return [*rows, *_others(drawn)]
+
+
+def _scaled(entry: str, nominal: float, unit: str, factors: list[Distribution]) -> Row:
+    low, high = nominal, nominal
+    for factor in factors:
+        ends = factor.bounds()
+        if factor.probability < 1.0:
+            ends = min(ends[0], 1.0), max(ends[1], 1.0)
+        low, high = low * ends[0], high * ends[1]
+    return Row(entry, nominal, min(low, high), max(low, high), unit, " × ".join(f.text() for f in factors))
+
+
+def _shifted(entry: str, nominal: float, unit: str, drawn: Distribution) -> Row:
+    low, high = drawn.bounds()
+    if drawn.probability < 1.0:
+        low, high = min(low, 0.0), max(high, 0.0)
+    return Row(entry, nominal, nominal + low, nominal + high, unit, drawn.text())
+
+
+def _others(drawn: dict[str, Distribution]) -> Iterator[Row]:
+    """Entries in a unit of their own."""
+    for name, distribution in drawn.items():
+        entry = ENTRIES[INDEX[name]]
+        counted = entry.name == "waves.count"
+        if entry.angle or (
+            entry.unit == "1" and not name.startswith(("tether.", "sensors.")) and not counted
+        ):
+            continue
+        if name.startswith(("center_of", "waves.")) and not name.startswith("waves.0.") and not counted:
+            continue
+        low, high = distribution.bounds()
+        drawn_as = distribution.text()
+        if counted:
+            low, high, drawn_as = float(int(low)), float(int(high)), "whole numbers"
+        unit = "" if entry.unit == "1" else entry.unit
+        absent = name.startswith(("waves.", "tether.", "current_drift.time"))
+        nominal = None if absent else entry.nominal
+        yield Row(name.replace("waves.0.", "waves."), nominal, low, high, unit, drawn_as)
+
+
+Array = NDArray[np.float64]
+
+LABELS = {
+    "surge": "surge speed [m/s]",
+    "sway": "sway speed [m/s]",
+    "heave": "heave speed, down [m/s]",
+    "yaw": "yaw rate [rad/s]",
+}
+
+
+def draw_spread(t: Array, drawn: Mapping[str, Array], nominal: Mapping[str, Array], title: str) -> Any:
+    """A panel for each axis: 5 to 95 % and the middle half of the drawn vehicles, some of them, and the file's own.
+
+    Args:
+        t: Times [s], (T,).
+        drawn: Axis -> speeds of the drawn vehicles, (n, T).
+        nominal: Axis -> speed of the vehicle of the file, (T,).
+        title: Written above.
+    """
+    figure = new_figure(8.4, 6.0, title)
+    for axes, (axis, speeds) in zip(figure.subplots(2, 2, sharex=True).flat, drawn.items(), strict=True):
+        clean(axes)
+        band = np.percentile(speeds, BAND, axis=0)
+        axes.fill_between(t, band[0], band[4], color=COLORS[0], alpha=0.18, linewidth=0.0, label="5 to 95 %")
+        axes.fill_between(t, band[1], band[3], color=COLORS[0], alpha=0.30, linewidth=0.0, label="25 to 75 %")
+        for k, line in enumerate(speeds[:12]):
+            axes.plot(t, line, color=COLORS[0], linewidth=0.5, alpha=0.6, label=None if k else "some of them")
+        axes.plot(t, nominal[axis], color="0.1", linewidth=1.8, label="as the file has it")
+        axes.set(ylabel=LABELS[axis], xlim=(0.0, float(t[-1])))
+    for axes in figure.axes[2:]:
+        axes.set_xlabel("time since the step [s]")
+    figure.align_ylabels()
+    legend_below(figure, figure.axes[0], 4)
+    return figure
+
 
 CONTROL_STEP = 0.1
 DURATION = 8.0
@@ -93,13 +241,14 @@ def randomize_show(
             "speeds": {axis: _speeds(drawn[axis], nominal[axis][0]) for axis in STEPS},
             "provenance": provenance(),
         }
-        (place / RECORD).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-        _write_rows(place / "entries.csv", rows)
+        write_json(place / RECORD, record)
+        with (place / "entries.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, [field.name for field in fields(Row)])
+            writer.writeheader()
+            writer.writerows(record["entries"])
         title = f"{randomization.ranges.name} on {chosen.name}: half the wrench limit on one axis, {samples} draws"
-        bands = {axis: np.percentile(drawn[axis], BAND, axis=0) for axis in STEPS}
-        lines = {axis: drawn[axis][:12] for axis in STEPS}
-        figure = draw_spread(t, bands, lines, {axis: nominal[axis][0] for axis in STEPS}, title)
-        figure.savefig(place / "spread.png", dpi=150)
+        own = {axis: nominal[axis][0] for axis in STEPS}
+        save_figure(draw_spread(t, drawn, own, title), place / "spread.png")
     if as_json:
         print(json.dumps(record))
     else:
@@ -109,7 +258,7 @@ def randomize_show(
 
 def step_responses(
     vehicle: Vehicle, randomization: Randomization | None, hydrodynamics: str, samples: int, seed: int
-) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
+) -> tuple[Array, dict[str, Array]]:
     """Speed along the axis that is pushed, from rest, in deep open water.
 
     Args:
@@ -160,39 +309,35 @@ def step_responses(
     return CONTROL_STEP * np.arange(count + 1), speeds
 
 
-def _speeds(drawn: NDArray[np.float64], nominal: NDArray[np.float64]) -> dict[str, float]:
+def _speeds(drawn: Array, nominal: Array) -> dict[str, float]:
     """Speed at the end: of the vehicle itself, and percentiles over those that were drawn."""
-    found = {f"p{p:g}": float(x) for p, x in zip(BAND, np.percentile(drawn[:, -1], BAND), strict=True)}
-    return {"nominal": float(nominal[-1]), **found}
-
-
-def _write_rows(path: Path, rows: Sequence[Row]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(asdict(rows[0])) if rows else ["entry"])
-        writer.writeheader()
-        writer.writerows(asdict(row) for row in rows)
+    bounds = np.percentile(drawn[:, -1], BAND).tolist()
+    return {"nominal": float(nominal[-1])} | {f"p{p:g}": x for p, x in zip(BAND, bounds, strict=True)}
 
 
 def _print(record: Mapping[str, Any], rows: Sequence[Row], out: Path) -> None:
     console = Console()
-    table = Table(
-        box=None, pad_edge=False, title=f"{record['ranges']['name']} on {record['vehicle']['name']}"
-    )
-    for heading in ("entry", "file", "low", "high", "unit", "drawn as"):
-        right = heading in ("file", "low", "high")
-        table.add_column(heading, justify="right" if right else "left", no_wrap=heading == "entry")
-    for row in rows:
-        numbers = ("–" if x is None else f"{x:.4g}" for x in (row.nominal, row.low, row.high))
-        table.add_row(row.entry, *numbers, escape(row.unit), escape(row.drawn))
-    console.print(table)
-    console.print()
-    speeds = Table(box=None, pad_edge=False, title=f"speed after {DURATION:g} s at half the wrench limit")
-    for heading in ("axis", "file", "5 %", "median", "95 %", "unit"):
-        speeds.add_column(heading, justify="left" if heading in ("axis", "unit") else "right")
-    for axis, found in record["speeds"].items():
-        numbers = (f"{found[key]:.3f}" for key in ("nominal", "p5", "p50", "p95"))
-        speeds.add_row(
-            "heave, down" if axis == "heave" else axis, *numbers, "rad/s" if axis == "yaw" else "m/s"
-        )
-    console.print(speeds)
+    cells = [
+        [
+            row.entry,
+            *("–" if x is None else f"{x:.4g}" for x in (row.nominal, row.low, row.high)),
+            row.unit,
+            row.drawn,
+        ]
+        for row in rows
+    ]
+    heads = ("entry", "file", "low", "high", "unit", "drawn as")
+    title = f"{record['ranges']['name']} on {record['vehicle']['name']}"
+    console.print(console_table(heads, cells, left=(0, 4, 5), title=title))
+    cells = [
+        [
+            "heave, down" if axis == "heave" else axis,
+            *(f"{speeds[key]:.3f}" for key in ("nominal", "p5", "p50", "p95")),
+            "rad/s" if axis == "yaw" else "m/s",
+        ]
+        for axis, speeds in record["speeds"].items()
+    ]
+    heads = ("axis", "file", "5 %", "median", "95 %", "unit")
+    title = f"speed after {DURATION:g} s at half the wrench limit"
+    console.print(console_table(heads, cells, left=(0, 5), title=title))
     console.print(f"written: {out}", highlight=False, markup=False, soft_wrap=True)

@@ -16,12 +16,10 @@ from numpy.typing import NDArray
 from finssim.calibration.trials.table_file import read_table
 from finssim.control.guidance import Guide
 from finssim.control.trajectories import load_trajectory
-from finssim.experiments.driven.drive import Drive, read_drive
-from finssim.experiments.driven.episodes import SAME_GOAL, station_at, trajectory_of
+from finssim.experiments.driven import SAME_GOAL, Drive, read_drive, station_at, trajectory_of
 from finssim.experiments.motion import Motion, localization_errors, measure, on_grid
-from finssim.experiments.setpoints import T1_SETPOINTS, in_room
-from finssim.experiments.t2_trials import TrackingTrials
-from finssim.experiments.trials import DURATION, Trials
+from finssim.experiments.paper import T1_SETPOINTS, in_room
+from finssim.experiments.trials import DURATION, TrackingTrials, Trials
 from finssim.geometry.rotations import quat_yaw
 from finssim.pool.truth import read_truth
 from finssim.robot.record_reader import open_record

@@ -15,19 +15,90 @@ from rich.console import Console
 from finssim.calibration.excitation.programmes import programmes
 from finssim.calibration.fit import Fit
 from finssim.calibration.output.calibrate import calibrated
+from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.calibration.regression.regress import regress
-from finssim.calibration.replay.metrics import RESAMPLES, SEED
+from finssim.calibration.replay.as_json import DEFINITION
+from finssim.calibration.replay.figure import MODEL_LABELS, draw_response_envelopes
 from finssim.calibration.replay.replay import Replay, replay
+from finssim.experiments.campaign import Say, write_json
+from finssim.experiments.figures import save_figure
 from finssim.experiments.replay_plant import ReplayPlant, load_replay_plant
-from finssim.experiments.replay_table import RESULT_FILE, print_table, write_results
-from finssim.experiments.running import Say, run_experiment
+from finssim.experiments.statistics import RESAMPLES, SEED, bootstrap
+from finssim.experiments.tables import console_table, markdown_table
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.vehicle import Axis
 
-__all__ = ["AXES", "MODELS", "PAPER_TABLE_3", "experiment_seed", "pooled", "replay_experiment", "run"]
+__all__ = ["RESULT_FILE", "print_table", "replay_experiment", "tables_of"]
+
+RESULT_FILE = "replay_experiment.json"
+
+NOTE = (
+    "ours: held-out trials of a virtual plant outside all three model classes. paper: Unity replaying trials of the "
+    "real FinsROV in its pool. These are different experiments and stand side by side for orientation."
+)
+LEVELS = {
+    "same_levels": "held-out repeats of the fitted levels",
+    "other_levels": "the validation sweeps, levels that no fit has seen",
+}
+
+
+def tables_of(result: Mapping[str, Any]) -> dict[str, tuple[list[str], list[list[str]]]]:
+    """Words about a table -> its head and rows: ours by set of levels, then the paper's."""
+    axes = list(next(iter(result["same_levels"]["models"].values()))["by_axis"])
+    out = {}
+    for key, words in LEVELS.items():
+        rows = []
+        for model, m in result[key]["models"].items():
+            values = [f"{m['by_axis'][a]:.3f}" if a in m["by_axis"] else "–" for a in axes]
+            rows.append([f"ours, {MODEL_LABELS[model]}", f"{m['aggregate']:.3f}", _range(m["ci95"]), *values])
+        out[words] = (["", "NRMSE", "95 % interval", *axes], rows)
+    theirs = [
+        [f"paper, {MODEL_LABELS[model]}", f"{p['aggregate']:.3f}", _range(p["ci95"])]
+        for model, p in result["paper"].items()
+    ]
+    return {**out, "the paper: its vehicle in its pool": (["", "NRMSE", "95 % interval"], theirs)}
+
+
+def print_table(result: Mapping[str, Any], console: Console) -> None:
+    """Print the tables, ours by set of levels, then the paper's."""
+    console.print(_headline(result), highlight=False)
+    for words, (heads, rows) in tables_of(result).items():
+        console.print(console_table(heads, rows, title=words, title_style="bold"))
+    console.print(NOTE, highlight=False)
+
+
+def markdown(result: Mapping[str, Any]) -> str:
+    """`replay_experiment.md`."""
+    parts = ["# Replay error of three hydrodynamic models", _headline(result)]
+    for words, (heads, rows) in tables_of(result).items():
+        parts += [f"## {words[0].upper()}{words[1:]}", markdown_table(heads, rows)]
+    hashes = ", ".join(fit["vehicle_sha256"][:12] for fit in result["fits"])
+    origin = result["provenance"]
+    about = (
+        f"Vehicle file {result['vehicle']['name']} {result['vehicle']['sha256'][:12]}; calibrated vehicles {hashes}; "
+        f"seeds {', '.join(map(str, result['seeds']))}; FinsSim {origin['finssim']}, revision {origin['revision']}."
+    )
+    parts += [NOTE, "![Response envelopes](envelope.png)", DEFINITION, about]
+    return "\n\n".join(parts) + "\n"
+
+
+def _headline(result: Mapping[str, Any]) -> str:
+    counts = result["trials_per_seed"]
+    seeds = len(result["seeds"])
+    note = f" (interrupted: {result['seeds_asked_for']} were asked for)" if result["interrupted"] else ""
+    who = f"{result['vehicle']['name']}, {seeds} seed{'s' if seeds != 1 else ''}{note}"
+    return (
+        f"{who}: fitted on {counts['fitted']} trials each, replayed on {counts['same_levels']} others of the same "
+        f"levels and {counts['other_levels']} of other levels"
+    )
+
+
+def _range(ci95: Sequence[float]) -> str:
+    return f"[{ci95[0]:.3f}, {ci95[1]:.3f}]"
+
 
 AXES: tuple[Axis, ...] = ("surge", "sway", "heave", "yaw")
 MODELS = ("calibrated", "mesh", "simplified")
@@ -58,29 +129,6 @@ class SeedResult:
     """The published validation sweeps, of levels that no fit has seen."""
 
 
-def run(
-    *,
-    seeds: int = 3,
-    out: Path,
-    seed: int = 1,
-    as_json: bool = False,
-    vehicle: str = "finsrov",
-    console: Console | None = None,
-) -> dict[str, Any]:
-    """Run the experiment with a progress bar, print the table (or one JSON object) and write the directory.
-
-    Arguments as for `replay_experiment`; console is where the table goes, standard output if None.
-    """
-    return run_experiment(
-        "replay experiment",
-        lambda say: replay_experiment(seeds=seeds, out=out, seed=seed, vehicle=vehicle, progress=say),
-        print_table,
-        out=out,
-        as_json=as_json,
-        console=console,
-    )
-
-
 def replay_experiment(
     *,
     seeds: int,
@@ -90,7 +138,7 @@ def replay_experiment(
     plant: ReplayPlant | None = None,
     repeats: int = REPEATS,
     axes: Sequence[str] = AXES,
-    progress: Say | None = None,
+    say: Say = lambda part, what: None,
 ) -> dict[str, Any]:
     """Trials from the hidden plant, identification on half of them, three models replayed on the other half.
 
@@ -105,7 +153,7 @@ def replay_experiment(
         plant: The hidden plant; the shipped one if None.
         repeats: Of every level and direction, an even number.
         axes: Which are excited, fitted and replayed.
-        progress: Told the share that is done and what comes next.
+        say: Told the share that is done and what comes next.
 
     Returns:
         What `replay_experiment.json` holds.
@@ -124,8 +172,12 @@ def replay_experiment(
     interrupted = False
     try:
         for k in range(seeds):
-            say = _part(progress, k, seeds)
-            done.append(experiment_seed(body, water, seed + k, repeats, axes, say))
+            done.append(
+                experiment_seed(
+                    body, water, seed + k, repeats, axes,
+                    lambda part, what, k=k: say((k + part) / seeds, f"seed {k + 1} of {seeds}: {what}"),
+                )
+            )  # fmt: skip
     except KeyboardInterrupt:
         if not done:
             raise
@@ -149,9 +201,13 @@ def replay_experiment(
         "bootstrap": {"resamples": RESAMPLES, "seed": SEED, "unit": "seed, then trial"},
         "provenance": provenance(),
     }
-    write_results(
-        result, out, [p for one in done for p in one.same_levels.pairs], [one.vehicle for one in done]
-    )
+    with atomic_directory(out, replaces=RESULT_FILE) as folder:
+        pairs = [pair for one in done for pair in one.same_levels.pairs]
+        save_figure(draw_response_envelopes(pairs), folder / "envelope.png")
+        (folder / "vehicles").mkdir()
+        for one in done:
+            write_vehicle(one.vehicle, folder / "vehicles" / f"seed_{one.seed}.yaml")
+        write_json(folder / RESULT_FILE, result, markdown(result))
     return result
 
 
@@ -189,11 +245,17 @@ def pooled(replays: Sequence[Replay]) -> dict[str, Any]:
     models: dict[str, Any] = {}
     for model in replays[0].models:
         by_seed = [_values(one, model) for one in replays]
-        axes = [axis for axis in AXES if any(len(v.get(axis, ())) for v in by_seed)]
+        axes = [axis for axis in AXES if any(axis in values for values in by_seed)]
         by_axis = {a: float(np.median(np.concatenate([v[a] for v in by_seed]))) for a in axes}
+
+        def redraw(random: np.random.Generator, by_seed: Any = by_seed, axes: Any = axes) -> float:
+            drawn = [by_seed[s] for s in random.integers(len(by_seed), size=len(by_seed))]
+            each = (np.concatenate([random.choice(v[a], len(v[a])) for v in drawn]) for a in axes)
+            return float(np.mean([np.median(values) for values in each]))
+
         models[model] = {
             "aggregate": float(np.mean(list(by_axis.values()))),
-            "ci95": _interval(by_seed, axes),
+            "ci95": bootstrap(redraw).tolist(),
             "by_axis": by_axis,
             "aggregate_mean": float(np.mean([np.concatenate([v[a] for v in by_seed]).mean() for a in axes])),
             "per_seed": [one.aggregate(model).value for one in replays],
@@ -205,25 +267,12 @@ def pooled(replays: Sequence[Replay]) -> dict[str, Any]:
 
 def _values(one: Replay, model: str) -> dict[str, NDArray[np.float64]]:
     """NRMSE of every trial by axis."""
-    out: dict[str, list[float]] = {}
+    values: dict[str, list[float]] = {}
     for scores in one.scores[model]:
         for axis, s in scores.items():
             if s.value is not None:
-                out.setdefault(axis, []).append(s.value)
-    return {axis: np.array(values) for axis, values in out.items()}
-
-
-def _interval(by_seed: Sequence[Mapping[str, NDArray[np.float64]]], axes: Sequence[str]) -> list[float]:
-    random = np.random.default_rng(SEED)
-    replicates = np.empty(RESAMPLES)
-    for k in range(RESAMPLES):
-        drawn = random.integers(len(by_seed), size=len(by_seed))
-        medians = [
-            np.median(np.concatenate([random.choice(by_seed[s][a], len(by_seed[s][a])) for s in drawn]))
-            for a in axes
-        ]
-        replicates[k] = np.mean(medians)
-    return [float(x) for x in np.percentile(replicates, (2.5, 97.5))]
+                values.setdefault(axis, []).append(s.value)
+    return {axis: np.array(each) for axis, each in values.items()}
 
 
 def _fit(one: SeedResult) -> dict[str, Any]:
@@ -236,13 +285,3 @@ def _fit(one: SeedResult) -> dict[str, Any]:
         "trials": dict(one.fit.trials),
         "held_out": {p.name: p.sha256 for p in one.same_levels.pairs},
     }
-
-
-def _part(progress: Say | None, k: int, seeds: int) -> Say:
-    """Progress of one of several seeds."""
-
-    def say(part: float, what: str) -> None:
-        if progress is not None:
-            progress((k + part) / seeds, f"seed {k + 1} of {seeds}: {what}")
-
-    return say

@@ -20,9 +20,9 @@ from finssim.engine import Simulator, TetherLine
 from finssim.experiments.plants import PlantError
 from finssim.pool.coupled import CoupledMatrix, Section, Three
 from finssim.vehicles import Vehicle
-from finssim.yaml_file import read_mapping
+from finssim.yaml_file import first_problem, read_mapping
 
-__all__ = ["PLANT_FILE", "ReplayPlant", "load_replay_plant"]
+__all__ = ["ReplayPlant", "load_replay_plant"]
 
 Array = NDArray[np.float64]
 
@@ -144,6 +144,4 @@ def load_replay_plant(path: Path = PLANT_FILE) -> ReplayPlant:
     try:
         return ReplayPlant.model_validate(data)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(x) for x in first["loc"])
-        raise PlantError(f"{path}: {where}: {first['msg'].removeprefix('Value error, ')}") from None
+        raise PlantError(f"{path}: {first_problem(error)}") from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import difflib
 import json
 import math
 from pathlib import Path
@@ -11,19 +12,65 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from finssim.control.allocator import Allocator
 from finssim.engine import Simulator
 from finssim.engine.recorder import STATE_COLUMNS
-from finssim.experiments.wrench_words import CommandError, parse_wrench
+from finssim.experiments.tables import console_table
 from finssim.files import atomic_write
 from finssim.geometry.rotations import quat_to_euler
 from finssim.provenance import provenance
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
-__all__ = ["simulate"]
+__all__ = ["CommandError", "simulate"]
+
+UNITS = ("N", "N", "N", "N m", "N m", "N m")
+
+
+class CommandError(ValueError):
+    """The words of a command line do not describe a wrench or a run; the message says which and what to write."""
+
+
+def parse_wrench(text: str) -> NDArray[np.float64]:
+    """Wrench from words such as "surge=10 yaw=-1".
+
+    Args:
+        text: `axis=number` separated by spaces or commas; axes left out are 0.
+
+    Returns:
+        Wrench, body frame, order surge sway heave roll pitch yaw [N, N m], (6,).
+
+    Raises:
+        CommandError: An axis is unknown or given twice, or a number is missing or not finite.
+    """
+    tau = np.zeros(6)
+    seen: set[str] = set()
+    words = text.replace(",", " ").split()
+    if not words:
+        raise CommandError('command is empty: give axis=number, such as "surge=10 yaw=1" [N, N m]')
+    for word in words:
+        axis, _, number = word.partition("=")
+        if axis not in AXES:
+            close = difflib.get_close_matches(axis, AXES, n=1)
+            hint = f"; did you mean '{close[0]}'?" if close else ""
+            raise CommandError(f"command: unknown axis '{axis}'; available: {', '.join(AXES)}{hint}")
+        if axis in seen:
+            raise CommandError(f"command: '{axis}' is given twice")
+        seen.add(axis)
+        tau[AXES.index(axis)] = _finite(axis, number)
+    return tau
+
+
+def _finite(axis: str, number: str) -> float:
+    unit = UNITS[AXES.index(axis)]
+    try:
+        value = float(number)
+    except ValueError:
+        raise CommandError(f"command: {axis} is '{number}', expected a number: {axis}=1.5 [{unit}]") from None
+    if not math.isfinite(value):
+        raise CommandError(f"command: {axis} is {value}, expected a finite number [{unit}]")
+    return value
+
 
 CONTROL_STEP = 0.1
 """Time between two rows [s]."""
@@ -116,16 +163,13 @@ def _write_table(path: Path, vehicle: Vehicle, rows: NDArray[np.float64]) -> Non
 def _print(
     vehicle: Vehicle, tau: NDArray[Any], achieved: NDArray[Any], last: NDArray[Any], out: Path
 ) -> None:
-    console = Console()
     angles_deg = np.degrees(quat_to_euler(last[4:8]))
-    table = Table(box=None, pad_edge=False, title=f"{vehicle.name} after {last[0]:g} s", title_justify="left")
-    for heading in ("", *AXES):
-        table.add_column(heading, justify="right")
-    units = escape("[N, N m]")
-    table.add_row(f"wrench asked {units}", *(f"{x:.4g}" for x in tau))
-    table.add_row(f"wrench given {units}", *(f"{x:.4g}" for x in achieved.round(4) + 0.0))
-    table.add_row("velocity " + escape("[m/s, rad/s]"), *(f"{x:.3f}" for x in last[8:14]))
-    place = [*(f"{x:.2f}" for x in last[1:4]), *(f"{x:.1f}" for x in angles_deg)]
-    table.add_row("place " + escape("[m, deg]"), *place)
-    console.print(table)
+    rows = [
+        ["wrench asked [N, N m]", *(f"{x:.4g}" for x in tau)],
+        ["wrench given [N, N m]", *(f"{x:.4g}" for x in achieved.round(4) + 0.0)],
+        ["velocity [m/s, rad/s]", *(f"{x:.3f}" for x in last[8:14])],
+        ["place [m, deg]", *(f"{x:.2f}" for x in last[1:4]), *(f"{x:.1f}" for x in angles_deg)],
+    ]
+    console, title = Console(), f"{vehicle.name} after {last[0]:g} s"
+    console.print(console_table(["", *AXES], rows, left=(), title=title))
     console.print(f"written: {out} and {out}.json", highlight=False, markup=False)

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from finssim.control.guidance import Guide
 from finssim.control.trajectories import TRAJECTORIES
-from finssim.experiments.episodes import summarize_episodes
+from finssim.experiments.trials import summarize_episodes
 from finssim.files import atomic_write
 from finssim.pool.camera import PoolCamera
 from finssim.pool.draw_plant import draw_plant

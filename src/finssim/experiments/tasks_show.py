@@ -6,11 +6,10 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich import box
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
+from finssim.experiments.tables import console_table
 from finssim.tasks import TASKS
 from finssim.tasks.describe import describe_task
 
@@ -23,14 +22,15 @@ def tasks_list(*, as_json: bool = False, console: Console | None = None) -> None
     if as_json:
         print(json.dumps(found, allow_nan=False))
         return
-    table = _table("task", "agents", "sees", "does", "every [s]", "for [s]", "baseline", "what is to be done")
-    for name, told in found.items():
-        table.add_row(
-            *(name, str(len(told["agents"])), str(told["observation"]["size"])),
-            *(str(told["action"]["size"]), f"{told['period_s']:g}"),
-            *(f"{told['time_limit_s']:g}", ", ".join(told["baselines"]), Text(told["title"])),
-        )
-    (console or Console()).print(table)
+    rows = [
+        [
+            name, str(len(told["agents"])), str(told["observation"]["size"]), str(told["action"]["size"]),
+            f"{told['period_s']:g}", f"{told['time_limit_s']:g}", ", ".join(told["baselines"]), told["title"],
+        ]
+        for name, told in found.items()
+    ]  # fmt: skip
+    heads = ("task", "agents", "sees", "does", "every [s]", "for [s]", "baseline", "what is to be done")
+    (console or Console()).print(console_table(heads, rows, left=(0, 6, 7), whole=(0, 6)))
 
 
 def tasks_show(
@@ -60,19 +60,44 @@ def tasks_show(
     console = console or Console()
     for line in _head(told):
         console.print(Text(line))
-    for title, table in (
-        ("Observation, of one agent", _observation(told)),
-        ("Action, from -1 to 1", _action(told)),
-        ("Reward, in every step", _terms(told["reward"]["terms"], "weight")),
-        ("Ends", _terms(told["ends"], "reward")),
-        ("Counted", _terms(told["totals"])),
-        ("Settings", _settings(told)),
+    parts = [
+        [
+            f"{one['first']}–{one['first'] + one['size'] - 1}" if one["size"] > 1 else str(one["first"]),
+            one["name"],
+            "" if one["unit"] == "1" else f"[{one['unit']}]",
+            "" if one["scale"] == 1.0 else f"{one['scale']:g}",
+            "" if one["clip"] is None else f"±{one['clip']:g}",
+        ]
+        for one in told["observation"]["parts"]
+    ]
+    action = [
+        [one["name"], f"{one['low']:.4g}", f"{one['high']:.4g}", f"[{one['unit']}]"]
+        for one in told["action"]["components"]
+    ]
+    settings = [[one["name"], _value(one["value"]), one["told"]] for one in told["settings"]]
+    rewards, ends = told["reward"]["terms"], told["ends"]
+    for title, heads, rows, left in (
+        (
+            "Observation, of one agent",
+            ("index", "quantity", "unit", "divided by", "limited to"),
+            parts,
+            (0, 1, 2),
+        ),
+        ("Action, from -1 to 1", ("component", "at -1", "at 1", "unit"), action, (0, 3)),
+        ("Reward, in every step", ("name", "weight", "term"), _terms(rewards, "weight"), (0, 2)),
+        ("Ends", ("name", "reward", "term"), _terms(ends, "reward"), (0, 2)),
+        ("Counted", ("name", "term"), [[one["name"], one["told"]] for one in told["totals"]], (0, 1)),
+        ("Settings", ("name", "value", "meaning"), settings, (0, 1, 2)),
     ):
-        if table.row_count:
+        if rows:
             console.print(Text(f"\n{title}", style="bold"))
-            console.print(table)
+            console.print(console_table(heads, rows, left=left))
         if title.startswith("Reward") and told["reward"]["told"]:
             console.print(Text(told["reward"]["told"]))
+
+
+def _terms(terms: Sequence[Mapping[str, Any]], number: str) -> list[list[str]]:
+    return [[one["name"], f"{one[number]:g}", one["told"]] for one in terms]
 
 
 def _head(told: Mapping[str, Any]) -> list[str]:
@@ -95,41 +120,6 @@ def _head(told: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _observation(told: Mapping[str, Any]) -> Table:
-    table = _table("index", "quantity", "unit", "divided by", "limited to")
-    for part in told["observation"]["parts"]:
-        first, last = part["first"], part["first"] + part["size"] - 1
-        table.add_row(
-            str(first) if first == last else f"{first}–{last}",
-            Text(part["name"]),
-            Text("" if part["unit"] == "1" else f"[{part['unit']}]"),
-            "" if part["scale"] == 1.0 else f"{part['scale']:g}",
-            "" if part["clip"] is None else f"±{part['clip']:g}",
-        )
-    return table
-
-
-def _action(told: Mapping[str, Any]) -> Table:
-    table = _table("component", "at -1", "at 1", "unit")
-    for one in told["action"]["components"]:
-        table.add_row(Text(one["name"]), f"{one['low']:.4g}", f"{one['high']:.4g}", Text(f"[{one['unit']}]"))
-    return table
-
-
-def _terms(terms: Sequence[Mapping[str, Any]], number: str | None = None) -> Table:
-    table = _table("name", *([number] if number else []), "term")
-    for one in terms:
-        table.add_row(Text(one["name"]), *([f"{one[number]:g}"] if number else []), Text(one["told"]))
-    return table
-
-
-def _settings(told: Mapping[str, Any]) -> Table:
-    table = _table("name", "value", "meaning")
-    for one in told["settings"]:
-        table.add_row(one["name"], Text(_value(one["value"])), Text(one["told"]))
-    return table
-
-
 def _value(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
@@ -142,28 +132,3 @@ def _value(value: Any) -> str:
 
 def _words(values: Mapping[str, Any]) -> str:
     return ", ".join(f"{name} {_value(value)}" for name, value in values.items())
-
-
-def _table(*heads: str) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    numbers = (
-        "agents",
-        "sees",
-        "does",
-        "every [s]",
-        "for [s]",
-        "divided by",
-        "limited to",
-        "at -1",
-        "at 1",
-        "weight",
-        "reward",
-    )
-    for head in heads:
-        table.add_column(
-            Text(head),
-            justify="right" if head in numbers else "left",
-            overflow="fold",
-            no_wrap=head in ("task", "baseline", *numbers),
-        )
-    return table

@@ -11,14 +11,14 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.table import Table
 
 from finssim.control.allocator import Allocator
 from finssim.engine import Simulator
+from finssim.experiments.tables import console_table
 from finssim.provenance import provenance
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
-__all__ = ["Response", "ValidationError", "published", "simulate_responses", "validate"]
+__all__ = ["ValidationError", "validate"]
 
 PUBLISHED = Path(__file__).parent / "published"
 DURATION = 6.0
@@ -145,18 +145,17 @@ def validate(name: str, as_json: bool = False, hydrodynamics: str = "calibrated"
             json.dumps({**about, "source": source, "responses": rows, "provenance": provenance()}, indent=2)
         )
         return
-    console = Console()
-    table = Table(title=f"{vehicle.name}, {hydrodynamics}: steady speeds", box=None, pad_edge=False)
-    for heading in ("command", "applied", "simulated", "measured in the pool", "difference", ""):
-        table.add_column(heading, justify="left" if heading in ("command", "") else "right")
+    rows = []
     for r in responses:
         unit, speed = ("N m", "rad/s") if r.axis in AXES[3:] else ("N", "m/s")
         low, high = r.measured
         measured = f"{low:.3f}" if low == high else f"{low:.3f} to {high:.3f}"
-        verdict = "agrees" if r.agrees else "DISAGREES"
         numbers = (f"{r.applied:.2f} {unit}", f"{abs(r.simulated):.3f} {speed}", f"{measured} {speed}")
-        table.add_row(r.name, *numbers, f"{100.0 * r.difference:+.0f} %", verdict)
-    console.print(table)
+        verdict = "agrees" if r.agrees else "DISAGREES"
+        rows.append([r.name, *numbers, f"{100.0 * r.difference:+.0f} %", verdict])
+    console, title = Console(), f"{vehicle.name}, {hydrodynamics}: steady speeds"
+    heads = ("command", "applied", "simulated", "measured in the pool", "difference", "")
+    console.print(console_table(heads, rows, left=(0, 5), title=title))
     for r in responses:
         if r.why and not r.agrees:
             console.print(f"{r.name}: {r.why}", markup=False, highlight=False)

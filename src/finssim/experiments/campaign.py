@@ -1,0 +1,257 @@
+"""Experiments as campaigns: a bar while they work, trials over several processes that a later call goes on with."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+import re
+import signal
+import threading
+import time
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from contextlib import closing, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import Progress
+
+from finssim.files import atomic_write
+from finssim.quiet import start_warp
+
+__all__ = [
+    "Job",
+    "Say",
+    "Show",
+    "choice",
+    "progress_bar",
+    "run_experiment",
+    "run_in_turn",
+    "run_jobs",
+    "spread",
+    "write_json",
+]
+
+Say = Callable[..., None]
+"""Told the share that is done, and what comes next as text."""
+
+WATCH = 1.0
+"""Time between two looks of a worker at its parent [s]."""
+
+
+def run_experiment(
+    name: str,
+    work: Callable[..., dict[str, Any]],
+    show: Callable[[Mapping[str, Any], Console], None],
+    *,
+    out: Path,
+    as_json: bool = False,
+    console: Console | None = None,
+    bar: bool = True,
+    **options: Any,
+) -> dict[str, Any]:
+    """Run an experiment with a progress bar on standard error and print what came out.
+
+    Args:
+        name: What the bar is called.
+        work: The experiment, which writes its directory itself; called with `out`, `say` and the options.
+        show: Prints its table.
+        out: The directory.
+        as_json: Print one JSON object in place of the table.
+        console: Where the table goes; standard output if None.
+        bar: Show it; False where the work has a line of its own on the screen.
+        options: Of the work.
+
+    Returns:
+        What `work` returned.
+    """
+    start_warp()
+    with progress_bar(name, shown=bar) as say:
+        result = work(out=out, say=say, **options)
+    if as_json:
+        print(json.dumps(result, allow_nan=False))
+        return result
+    console = console or Console()
+    show(result, console)
+    console.print(f"written: {out}", highlight=False, soft_wrap=True)
+    return result
+
+
+@contextmanager
+def progress_bar(name: str, *, shown: bool = True) -> Iterator[Say]:
+    """A bar on standard error where that is a terminal; told the share that is done and, perhaps, what comes next."""
+    screen = Console(stderr=True)
+    with Progress(console=screen, transient=True, disable=not shown or not screen.is_terminal) as progress:
+        task = progress.add_task(name, total=1.0)
+        yield lambda part, what=name: progress.update(task, completed=part, description=what)
+
+
+def choice(known: Mapping[str, Any] | Sequence[str], name: str, kind: str, error: type[Exception]) -> None:
+    """Refuse a name that is not known, in a sentence with those that are."""
+    if name not in known:
+        raise error(f"unknown {kind} '{name}'; available: {', '.join(known)}")
+
+
+def write_json(path: Path, result: Mapping[str, Any], page: str | None = None) -> None:
+    """Write a result, and beside it, ending in .md, the page that a person reads."""
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    if page is not None:
+        with atomic_write(path.with_suffix(".md")) as temporary:
+            temporary.write_text(page, encoding="utf-8")
+
+
+class Job:
+    """One trial as plain data: equal jobs give equal results, and a result is kept under its key."""
+
+    row: str
+    """Of the table."""
+    target: str
+    """What is to be done."""
+    plant: int
+    seed: int
+
+    def described(self) -> dict[str, Any]:
+        """Everything that decides the result, with the contents of files in place of their names."""
+        raise NotImplementedError
+
+    def key(self) -> str:
+        """File name of its result: readable first, then a digest of everything that decides it."""
+        digest = hashlib.sha256(json.dumps(self.described(), sort_keys=True).encode()).hexdigest()[:10]
+        name = re.sub(r"[^A-Za-z0-9.+-]+", "_", f"{self.row}_{self.target}")
+        return f"{name}_plant{self.plant}_seed{self.seed}_{digest}"
+
+
+Play = Callable[[Any, Path], dict[str, Any]]
+"""Plays a job, leaves its series in files that begin with the given path, and returns its result as plain data."""
+Show = Callable[[Any, Mapping[str, Any]], None]
+"""Given a job that has been played, and its result."""
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    folder: Path,
+    play: Play,
+    *,
+    processes: int | None = None,
+    say: Say = lambda part, what: None,
+    show: Show = lambda job, result: None,
+) -> list[dict[str, Any]]:
+    """Play what has no result yet; after Ctrl-C or a kill the next call goes on where this one was.
+
+    Args:
+        jobs: Trials; equal ones are played once.
+        folder: Takes KEY.json of each, made if missing.
+        play: A function of a module, as it is called in other processes.
+        processes: As many as there are processors if None.
+        say: Told the share that is done and what is left.
+        show: Given each trial that is played now and its result, as soon as there is one.
+
+    Returns:
+        The results in the order of the jobs, each with its `job` and `key`.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    files = {job.key(): folder / f"{job.key()}.json" for job in jobs}
+    missing = {job.key(): job for job in jobs if not files[job.key()].is_file()}
+    with closing(
+        spread(partial(_play_one, folder=folder, play=play), list(missing.values()), processes)
+    ) as played:
+        for left, (job, future) in zip(reversed(range(len(missing))), played, strict=True):
+            show(job, future.result())
+            say(1.0 - left / len(files), f"{left} trials left")
+    return [json.loads(files[job.key()].read_text(encoding="utf-8")) for job in jobs]
+
+
+def run_in_turn(
+    jobs: Sequence[Job],
+    folder: Path,
+    play: Callable[[Any, Path], dict[str, Any] | None],
+    *,
+    show: Show = lambda job, result: None,
+) -> list[dict[str, Any]]:
+    """The same in this process, one after the other, for what there is only one of.
+
+    Args:
+        jobs: Trials; equal ones are played once, and those without a result are left out.
+        folder: Takes KEY.json of each, made if missing.
+        play: Its result; None: there is none yet, and the next call tries again.
+        show: Given each trial that is played now and its result.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    results = []
+    for job in {job.key(): job for job in jobs}.values():
+        file = folder / f"{job.key()}.json"
+        if not file.is_file():
+            result = play(job, folder / job.key())
+            if result is None:
+                continue
+            show(job, _write(job, folder, result))
+        results.append(json.loads(file.read_text(encoding="utf-8")))
+    return results
+
+
+def spread(
+    work: Callable[[Any], Any], items: Sequence[Any], processes: int | None = None
+) -> Generator[tuple[Any, Future[Any]], None, None]:
+    """Work on items in processes of their own, as many at once as there are processors if None.
+
+    Args:
+        work: A function of a module, as it is called in other processes.
+        items: What it is called with, each by itself.
+        processes: At once.
+
+    Yields:
+        An item and its outcome, as each ends. Whoever stops iterating, by Ctrl-C or by closing this, ends them all.
+    """
+    if not items:
+        return
+    # A fork would copy the threads of Warp and torch half-alive.
+    executor = ProcessPoolExecutor(
+        min(processes or os.cpu_count() or 1, len(items)),
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_prepare,
+        initargs=(os.getpid(),),
+    )
+    try:
+        futures = {executor.submit(work, item): item for item in items}
+        for future in as_completed(futures):
+            yield futures[future], future
+    except BaseException:
+        # End without waiting for what nobody will read.
+        workers = list((executor._processes or {}).values())
+        executor.shutdown(wait=False, cancel_futures=True)
+        for worker in workers:
+            worker.terminate()
+        raise
+    executor.shutdown()
+
+
+def _prepare(parent: int) -> None:
+    """Of a worker: one thread, since there are as many workers as processors; no life without its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears Ctrl-C and ends its workers
+    os.environ["OMP_NUM_THREADS"] = "1"
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    """End this process when its parent has gone, however that ended."""
+    while os.getppid() == parent:
+        time.sleep(WATCH)
+    os._exit(1)
+
+
+def _play_one(job: Job, folder: Path, play: Play) -> dict[str, Any]:
+    return _write(job, folder, play(job, folder / job.key()))
+
+
+def _write(job: Job, folder: Path, played: Mapping[str, Any]) -> dict[str, Any]:
+    """Write KEY.json of a result, with its job."""
+    result = {
+        "key": job.key(), "job": {**job.described(), "row": job.row, "target": job.target}, **played
+    }  # fmt: skip
+    write_json(folder / f"{job.key()}.json", result)
+    return result

@@ -1,0 +1,525 @@
+"""`finssim compare`: a figure and a table of trainings over seeds."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from finssim.control.policy import Policy
+from finssim.control.policy_description import PolicyDescription
+from finssim.experiments.campaign import Say, write_json
+from finssim.experiments.evaluate import evaluate_controller
+from finssim.experiments.figures import COLORS, clean, new_figure, save_figure
+from finssim.experiments.plants import Plant, load_plant
+from finssim.experiments.statistics import (
+    better,
+    interquartile_mean,
+    probability_of_improvement,
+    with_bootstrap,
+)
+from finssim.experiments.tables import Shown, markdown_of, print_shown
+from finssim.provenance import provenance
+from finssim.tasks import TASKS
+from finssim.vehicles import load_vehicle
+
+__all__ = ["CompareError", "MEASURES", "compare", "print_comparison"]
+
+CURVES_FILE = "curves.csv"
+SEED_AT_END = re.compile(r"[-_]?(?:seed|s)?[-_]?\d+$")
+NOT_SETTINGS = ("steps_done", "complete", "seconds", "resumed")
+"""Of a training's record: what tells how it went."""
+
+
+class CompareError(ValueError):
+    """Trainings that cannot be compared."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training."""
+
+    place: Path
+    description: PolicyDescription
+    curves: dict[str, NDArray[np.float64]]
+    """Columns of `curves.csv`; empty if it has none."""
+
+    @property
+    def seed(self) -> int:
+        """Of the training."""
+        return self.description.seed
+
+    @property
+    def seconds(self) -> float | None:
+        """How long it trained [s]."""
+        column = self.curves.get("seconds")
+        return None if column is None or not len(column) else float(column[-1])
+
+
+@dataclass(frozen=True)
+class Group:
+    """Trainings with equal settings and different seeds."""
+
+    name: str
+    runs: tuple[Run, ...]
+
+
+def groups_of(words: Sequence[str]) -> list[Group]:
+    """Load runs and put them together.
+
+    Args:
+        words: Policy directories, each `DIR` or `NAME=DIR`; without a name, that of the folder less a number at its end
+            (`hold-seed3` belongs to `hold`).
+
+    Raises:
+        CompareError: Two runs of a name differ in more than the seed, or have one seed; no run is given, or they do
+            different tasks.
+        PolicyError: A directory is no policy.
+    """
+    if not words:
+        raise CompareError("no run is given: name policy directories, each DIR or NAME=DIR")
+    named: dict[str, list[Run]] = {}
+    for word in words:
+        name, given, place = word.rpartition("=")
+        folder = Path(place)
+        if not given:
+            name = SEED_AT_END.sub("", folder.resolve().name) or folder.resolve().name
+        named.setdefault(name, []).append(_load(folder))
+    tasks = {run.description.task for runs in named.values() for run in runs}
+    if len(tasks) > 1:
+        raise CompareError(f"runs were trained for {', '.join(sorted(tasks))}: compare those of one task")
+    if not tasks <= TASKS.keys():
+        # FILE.py:CLASS in somebody's policy.yaml would be code to run.
+        raise CompareError(
+            f"runs were trained for {tasks.pop()!r}, expected one of {', '.join(TASKS)}: policies of other tasks "
+            "are evaluated one by one, with finssim evaluate --task FILE.py:CLASS"
+        )
+    for name, runs in named.items():
+        _check(name, runs)
+    return [Group(name, tuple(sorted(runs, key=lambda run: run.seed))) for name, runs in named.items()]
+
+
+def _load(folder: Path) -> Run:
+    return Run(folder, Policy.load(folder).description, _curves(folder / CURVES_FILE))
+
+
+def _curves(path: Path) -> dict[str, NDArray[np.float64]]:
+    if not path.is_file():
+        return {}
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    names = rows[0] if rows else ()
+    try:
+        return {name: np.array([float(row[name] or "nan") for row in rows]) for name in names}
+    except (TypeError, ValueError) as error:
+        raise CompareError(
+            f"{path}: a cell is no number ({error}): expected the curves of a training"
+        ) from error
+
+
+def _check(name: str, runs: Sequence[Run]) -> None:
+    first = runs[0]
+    for run in runs[1:]:
+        different = _difference(first.description, run.description)
+        if different:
+            raise CompareError(
+                f"{first.place} and {run.place} are both '{name}', but differ in {different}: "
+                "name them apart with NAME=DIR"
+            )
+    seeds = [run.seed for run in runs]
+    for seed in seeds:
+        if seeds.count(seed) > 1:
+            raise CompareError(f"'{name}' has two runs with seed {seed}: give each training once")
+
+
+def _difference(a: PolicyDescription, b: PolicyDescription) -> str:
+    """The first setting in which two trainings differ; empty if none."""
+    left, right = (_settings(description) for description in (a, b))
+    for key in {**left, **right}:
+        if left.get(key) != right.get(key):
+            return key
+    return ""
+
+
+def _settings(description: PolicyDescription) -> dict[str, Any]:
+    training = {k: v for k, v in description.training.items() if k not in NOT_SETTINGS}
+    return {
+        "task": description.task,
+        "action": description.action,
+        "vehicle": description.vehicle.sha256,
+        "hydrodynamics": description.hydrodynamics,
+        **training,
+    }
+
+
+MEASURES: dict[str, tuple[str, ...]] = {
+    "t1": ("success", "e_p_m", "e_psi_deg", "t_s_s"),
+    "t2": ("horizontal_rmse_m", "vertical_rmse_m", "p95_m"),
+}
+"""What is compared unless told otherwise; of other tasks success and return."""
+MORE_IS_BETTER = ("success", "complete", "completion", "return", "held", "captured", "capture")
+STRATA = ("setpoint", "trajectory")
+"""Keys of a trial that tell trials of different difficulty apart."""
+
+
+def less_is_better(measure: str) -> bool:
+    """Whether a measure is an error, a time or an effort."""
+    return measure not in MORE_IS_BETTER
+
+
+def measures_of(task: str, trials: Sequence[Mapping[str, Any]], asked: Sequence[str] = ()) -> tuple[str, ...]:
+    """The measures to compare.
+
+    Raises:
+        CompareError: One that is asked for is not measured.
+    """
+    have = [key for key, value in trials[0].items() if isinstance(value, bool | int | float) or value is None]
+    for name in asked:
+        if name not in have:
+            raise CompareError(f"no measure '{name}' of task '{task}'; available: {', '.join(have)}")
+    preferred = MEASURES.get(task, ("success", "return"))
+    return tuple(asked) or tuple(name for name in preferred if name in have) or tuple(have[:1])
+
+
+def evaluated(
+    groups: Sequence[Group], folder: Path, plant: Plant, say: Say, **options: Any
+) -> dict[tuple[str, int], list[dict[str, Any]]]:
+    """The trials of every run by (group, seed); what is in the folder already is not evaluated again."""
+    trials: dict[tuple[str, int], list[dict[str, Any]]] = {}
+    count = sum(len(group.runs) for group in groups)
+    for group in groups:
+        for run in group.runs:
+            say(len(trials) / count, f"evaluating {group.name}, seed {run.seed}")
+            trials[group.name, run.seed] = _trials(run, folder, plant, **options)
+    return trials
+
+
+def _trials(run: Run, folder: Path, plant: Plant, *, vehicle: str, **options: Any) -> list[dict[str, Any]]:
+    about = {
+        "files": run.description.files,
+        "vehicle": load_vehicle(vehicle).sha256,
+        "plant": plant.model_dump(mode="json"),
+        **options,
+    }
+    path = folder / f"{run.place.resolve().name}-{run.description.files['policy.onnx'][:10]}.json"
+    if path.is_file():
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        if kept["about"] == about:
+            return list(kept["result"]["per_trial"])
+    task = run.description.task
+    result = evaluate_controller(run.place, plant, task=task, vehicle=vehicle, **options).result
+    write_json(path, {"about": about, "result": result})
+    return list(result["per_trial"])
+
+
+def scores_of(runs: Sequence[Sequence[Mapping[str, Any]]], measure: str) -> NDArray[np.float64]:
+    """Scores (runs, strata): the mean over a run's trials of a stratum; a trial without a value is infinitely bad."""
+    worst = math.inf if less_is_better(measure) else -math.inf
+    rows = []
+    for trials in runs:
+        strata: dict[str, list[float]] = {}
+        for trial in trials:
+            stratum = next((str(trial[key]) for key in STRATA if key in trial), "all")
+            value = trial[measure]
+            strata.setdefault(stratum, []).append(worst if value is None else float(value))
+        rows.append([float(np.mean(values)) for values in strata.values()])
+    return np.array(rows, dtype=float)
+
+
+NOTE = (
+    "interquartile mean over seeds and targets; in brackets 95 % of a bootstrap over the seeds, stratified by target. "
+    "With fewer than five seeds an interval is too narrow; with fewer than three nobody is called better."
+)
+VERDICTS = {
+    "better": "{a} is better than {b} in {measure}",
+    "worse": "{b} is better than {a} in {measure}",
+    "open": "{a} and {b} are not told apart in {measure}",
+}
+
+
+def table_of(result: Mapping[str, Any]) -> Shown:
+    """A row for each group, and what the intervals support of each pair and leave open."""
+    rows = [
+        [
+            name,
+            str(len(group["seeds"])),
+            "–" if group["steps"] is None else f"{group['steps']:,}",
+            "–" if group["seconds"] is None else f"{group['seconds']:.0f}",
+            *(_cell(group["measures"][measure]) for measure in result["measures"]),
+        ]
+        for name, group in result["groups"].items()
+    ]
+    sentences = []
+    for pair in result["pairs"]:
+        low, high = pair["ci95"]
+        chance = f"chance that {pair['a']} is better: {pair['probability']:.2f} [{low:.2f}, {high:.2f}]"
+        sentences.append(f"{VERDICTS[pair['verdict']].format(**pair)} ({chance})")
+    return Shown(
+        title=f"{result['task']}, plant {result['plant']}",
+        heads=["", "seeds", "steps", "time [s]", *result["measures"]],
+        rows=rows,
+        note=NOTE,
+        sentences=sentences,
+    )
+
+
+def print_comparison(result: Mapping[str, Any], console: Console) -> None:
+    """Print it."""
+    print_shown(table_of(result), console, intervals=True)
+
+
+def _cell(figure: Mapping[str, Any]) -> str:
+    bounds = ", ".join("–" if x is None else f"{x:.4g}" for x in figure["ci95"])
+    value = "not reached" if figure["value"] is None else f"{figure['value']:.4g}"
+    return f"{value} [{bounds}]"
+
+
+CURVES = {
+    "evaluation_success": "success, evaluated",
+    "evaluation_return": "return, evaluated",
+    "held": "share that held at the end",
+    "mean_return": "return in training",
+}
+"""Columns of a training's curves and what they are; the first two that every run has are drawn."""
+TITLES = {
+    "e_p_m": "position error [m]",
+    "e_psi_deg": "heading error [°]",
+    "t_s_s": "settling time [s]",
+    "horizontal_rmse_m": "horizontal error, rms [m]",
+    "vertical_rmse_m": "vertical error, rms [m]",
+    "p95_m": "95th percentile of the error [m]",
+}
+"""What measures are; others are called by their names."""
+DARK = 0.3
+"""A chance so far from a half stands on a dark square."""
+POINTS = 60
+"""Of a curve."""
+CURVE_RESAMPLES = 200
+
+
+def draw_comparison(groups: Sequence[Group], result: Mapping[str, Any], path: Path) -> None:
+    """Write the figure."""
+    runs = [run for group in groups for run in group.runs]
+    curves = [name for name in CURVES if all(_drawable(run, name) for run in runs)][:2]
+    measures, pairs = list(result["measures"]), len(groups) > 1
+    height = 0.42 * len(groups) + 0.9
+    columns = max(len(measures), len(curves) + pairs)
+    figure = new_figure(2.4 + 2.6 * columns, height + 3.4)
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(height, 3.4))[:, 0]
+    above.suptitle("interquartile means, with 95 % intervals over the seeds", fontsize=9)
+    for k, axes in enumerate(_row(above, len(measures))):
+        _intervals(axes, groups, result, measures[k], labels=k == 0)
+    panels = _row(below, len(curves) + pairs)
+    for k, name in enumerate(curves):
+        _draw_curves(panels[k], groups, name, legend=k == 0)
+    if pairs:
+        _matrix(panels[-1], groups, result, measures[0])
+    save_figure(figure, path)
+
+
+def _row(figure: Any, n: int) -> list[Any]:
+    return list(figure.subplots(1, n, squeeze=False)[0]) if n else []
+
+
+def _intervals(
+    axes: Any, groups: Sequence[Group], result: Mapping[str, Any], name: str, *, labels: bool
+) -> None:
+    for i, group in enumerate(groups):
+        found = result["groups"][group.name]["measures"][name]
+        y, color = len(groups) - 1 - i, COLORS[i % len(COLORS)]
+        low, high = found["ci95"]
+        if found["value"] is None:
+            axes.annotate(
+                "not reached",
+                (0.04, y),
+                xycoords=("axes fraction", "data"),
+                fontsize=8,
+                color=color,
+                va="center",
+            )
+            continue
+        if low is not None and high is not None:
+            axes.barh(y, high - low, left=low, height=0.5, color=color, alpha=0.35)
+        axes.plot([found["value"]] * 2, [y - 0.25, y + 0.25], color=color, linewidth=2.5)
+    axes.set_yticks(range(len(groups)), [g.name for g in reversed(groups)] if labels else [""] * len(groups))
+    axes.set_ylim(-0.6, len(groups) - 0.4)
+    axes.use_sticky_edges = False  # an interval that ends at the least value is not to lie on the axis
+    axes.margins(x=0.08)
+    if name == "success":
+        axes.set_xlim(-0.04, 1.04)
+    axes.set_title(TITLES.get(name, name), fontsize=10)
+    axes.set_xlabel("less is better" if result["measures"][name] else "more is better", fontsize=8)
+    clean(axes)
+
+
+def _drawable(run: Run, name: str) -> bool:
+    return bool(np.isfinite(run.curves.get(name, np.empty(0))).any())
+
+
+def curve_of(group: Group, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Steps (n,) as far as every run of a group came, and low, middle and high of a column there, (3, n).
+
+    The middle is the interquartile mean over the runs, low and high are where a bootstrap over them puts it.
+    """
+    last = min(float(run.curves["steps"][-1]) for run in group.runs)
+    steps = np.linspace(last / POINTS, last, POINTS)
+    rows = np.array([_at(steps, run, name) for run in group.runs])
+    band = np.empty((3, POINTS))
+    for k in range(POINTS):
+        found = with_bootstrap([rows[:, k : k + 1]], interquartile_mean, CURVE_RESAMPLES)
+        band[:, k] = found.low, found.value, found.high
+    return steps, band
+
+
+def _at(steps: NDArray[np.float64], run: Run, name: str) -> NDArray[np.float64]:
+    """A column between its rows; one without a number, as before the first episode ended, is left out."""
+    known = np.isfinite(run.curves[name])
+    return np.interp(steps, run.curves["steps"][known], run.curves[name][known])
+
+
+def _draw_curves(axes: Any, groups: Sequence[Group], name: str, *, legend: bool) -> None:
+    for i, group in enumerate(groups):
+        steps, (low, middle, high) = curve_of(group, name)
+        color = COLORS[i % len(COLORS)]
+        axes.fill_between(steps / 1e6, low, high, color=color, alpha=0.2, linewidth=0.0)
+        axes.plot(steps / 1e6, middle, color=color, label=group.name)
+    axes.set_xlabel("control steps [million]", fontsize=8)
+    axes.set_title(CURVES[name], fontsize=10)
+    if legend:
+        axes.legend(frameon=False, fontsize=8)
+    clean(axes)
+
+
+def _matrix(axes: Any, groups: Sequence[Group], result: Mapping[str, Any], name: str) -> None:
+    n = len(groups)
+    table = np.full((n, n), np.nan)
+    for pair in result["pairs"]:
+        if pair["measure"] == name:
+            i, j = (next(k for k, g in enumerate(groups) if g.name == pair[side]) for side in ("a", "b"))
+            table[i, j], table[j, i] = pair["probability"], 1.0 - pair["probability"]
+    axes.imshow(table, vmin=0.0, vmax=1.0, cmap="PuOr")
+    for (i, j), value in np.ndenumerate(table):
+        if np.isfinite(value):
+            color = "white" if abs(value - 0.5) > DARK else "black"
+            axes.annotate(f"{value:.2f}", (j, i), ha="center", va="center", fontsize=9, color=color)
+    axes.set_xticks(
+        range(n), [g.name for g in groups], fontsize=8, rotation=30, ha="right", rotation_mode="anchor"
+    )
+    axes.set_yticks(range(n), [g.name for g in groups], fontsize=8)
+    axes.set_title(f"chance that the row is better:\n{TITLES.get(name, name)}", fontsize=10)
+
+
+RESULT_FILE = "compare.json"
+FEWEST = 3
+"""Seeds of each side, below which nothing is said: drawn from two, an interval hardly has a width."""
+
+
+def compare(
+    *,
+    runs: Sequence[str],
+    out: Path,
+    vehicle: str = "finsrov",
+    plant: str = "nominal",
+    trials: int | None = None,
+    measures: Sequence[str] = (),
+    seed: int = 42,
+    say: Say = lambda part, what: None,
+) -> dict[str, Any]:
+    """Evaluate every run on the same trials, and write `compare.json`, `compare.md` and `compare.png`.
+
+    Args:
+        runs: Policy directories, each DIR or NAME=DIR; those of one name differ in the seed alone.
+        out: Directory; evaluations that are there already are not made again.
+        vehicle: Name or file that all are evaluated with.
+        plant: Name or file.
+        trials: Of each run; the task's own number if None.
+        measures: Which to compare; the task's own if none.
+        seed: Of what the plant draws.
+        say: Told the share that is done and what comes next.
+
+    Raises:
+        CompareError, EvaluationError, PolicyError, PlantError, VehicleError, OutputError: As they say.
+    """
+    groups = groups_of(runs)
+    scored = evaluated(
+        groups, out / "evaluations", load_plant(plant), say, vehicle=vehicle, trials=trials, seed=seed
+    )
+    result = {
+        **comparison(groups, scored, measures),
+        "vehicle": vehicle,
+        "plant": plant,
+        "seed": seed,
+        "provenance": provenance(),
+    }
+    draw_comparison(groups, result, out / "compare.png")
+    write_json(out / RESULT_FILE, result, markdown_of(table_of(result)))
+    return result
+
+
+def comparison(
+    groups: Sequence[Group],
+    found: Mapping[tuple[str, int], Sequence[Mapping[str, Any]]],
+    asked: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Interquartile means over seeds and targets with intervals, and for each pair how likely one beats the other.
+
+    Args:
+        groups: Who is compared.
+        found: Trials by (group, seed).
+        asked: Measures; the task's own if none.
+
+    Returns:
+        `task`, `measures` (name -> whether less is better), `groups` (name -> runs, seeds, steps, seconds, measures)
+        and `pairs` (a, b, measure, probability that a is better, ci95, verdict: better, worse or open).
+    """
+    task = groups[0].runs[0].description.task
+    names = measures_of(task, next(iter(found.values())), asked)
+    scores = {
+        (group.name, name): scores_of([found[group.name, run.seed] for run in group.runs], name)
+        for group in groups
+        for name in names
+    }
+    rows: dict[str, Any] = {}
+    for group in groups:
+        seconds = [run.seconds for run in group.runs if run.seconds is not None]
+        rows[group.name] = {
+            "runs": [str(run.place) for run in group.runs],
+            "seeds": [run.seed for run in group.runs],
+            "steps": group.runs[0].description.training.get("steps"),
+            "seconds": sum(seconds) / len(seconds) if seconds else None,
+            "measures": {
+                name: with_bootstrap([scores[group.name, name]], interquartile_mean).as_json()
+                for name in names
+            },
+        }
+    pairs = [_pair(a.name, b.name, name, scores) for a, b in combinations(groups, 2) for name in names]
+    return {
+        "task": task,
+        "measures": {name: less_is_better(name) for name in names},
+        "groups": rows,
+        "pairs": pairs,
+    }
+
+
+def _pair(a: str, b: str, measure: str, scores: Mapping[tuple[str, str], Any]) -> dict[str, Any]:
+    less = less_is_better(measure)
+    found = with_bootstrap(
+        [scores[a, measure], scores[b, measure]],
+        lambda x, y: probability_of_improvement(x, y, less),
+    )
+    enough = min(len(scores[name, measure]) for name in (a, b)) >= FEWEST
+    verdict = {True: "better", False: "worse", None: "open"}[better(found) if enough else None]
+    return {
+        "a": a, "b": b, "measure": measure, "probability": found.value, "ci95": [found.low, found.high],
+        "verdict": verdict,
+    }  # fmt: skip

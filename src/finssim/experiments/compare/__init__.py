@@ -1,1 +1,0 @@
-"""`finssim compare`: what trainings over seeds are worth, beside each other."""

@@ -1,0 +1,471 @@
+"""`finssim collect RECORD.mcap`: a data set of what was done with a vehicle, instead of in the simulator."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from finssim.control.guidance import Guide, Station
+from finssim.control.modes import AXES, Thruster8, Wrench6, action_mode
+from finssim.control.trajectories import PUBLISHED_NAMES, TRAJECTORIES, load_trajectory
+from finssim.geometry.rotations import quat_yaw
+from finssim.learning.demonstrations import Episode, save
+from finssim.provenance import provenance
+from finssim.robot.goals import station_of
+from finssim.robot.record_messages import STATES
+from finssim.robot.record_reader import Record, open_record
+from finssim.tasks.observer import Observer
+from finssim.vehicles import Vehicle, load_vehicle
+
+__all__ = ["Drive", "DriveError", "SAME_GOAL", "collect_records", "read_drive", "station_at", "trajectory_of"]
+
+Array = NDArray[np.float64]
+
+TOPICS = ("thruster_cmd", "odom", "policy_info", "goal", "estimator_status", "thruster_state")
+"""What a demonstration is made of; `events` are read where there are any."""
+REMEDY = "record a drive with --pool-file and pictures"
+LACKS = {
+    "thruster_cmd": f"nobody commanded: {REMEDY}",
+    "odom": f"it holds no estimate of where it was: {REMEDY}",
+}
+"""What a record without these says of a drive."""
+TELEOP = "finssim teleop"
+PERSON = "person"
+"""Mode of a teleoperated vehicle in which its operator steers, and the one it begins in."""
+NO_GOAL = (0.0, 0.0, 0.0, 0.0)
+"""Stands in the record of a drive by hand without a goal."""
+
+
+class DriveError(ValueError):
+    """A record that cannot be made into demonstrations."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """The N decisions of a record at which there was an estimate, in their order."""
+
+    path: Path
+    driver: str
+    """teleop, or the pilot's name."""
+    period: float
+    """Of the decisions [s]."""
+    time: Array
+    """Robot's clock [s], (N,)."""
+    since: Array
+    """Time since the guide's start [s], (N,); NaN where the record does not tell it."""
+    guide: str
+    """Name of the station or trajectory; empty where the record does not tell it."""
+    position: Array
+    """Estimate of the body origin, world frame [m], (N, 3)."""
+    quaternion: Array
+    """Estimate of body to world, xyzw, (N, 4)."""
+    nu: Array
+    """Estimate of the velocity, body frame [m/s, rad/s], (N, 6)."""
+    goal: Array
+    """Where the vehicle should be: x, y, z [m], yaw [rad], world frame, (N, 4)."""
+    force: Array
+    """Thrusts that were asked for, canonical order [N], (N, n)."""
+    stretch: NDArray[np.int64]
+    """Number of the stretch a decision belongs to, (N,): all through it the robot was armed, the estimate ready and
+    the driver at the helm. Negative: in none."""
+
+    @property
+    def has_goal(self) -> bool:
+        """Whether anybody said where to."""
+        return self.driver != "teleop" or bool(np.any(self.goal != NO_GOAL))
+
+
+def read_drive(path: Path, vehicle: Vehicle) -> Drive:
+    """Read a record of `finssim teleop` or `finssim run`; one that was cut is read up to the cut.
+
+    Args:
+        path: MCAP file.
+        vehicle: It must be the very one that was driven.
+
+    Raises:
+        RecordError: Not a record.
+        DriveError: Of another vehicle, without an estimate, or nobody commanded.
+    """
+    with open_record(path) as record:
+        _check(record, vehicle)
+        teleop = record.metadata.get("command") == TELEOP
+        columns = {name: {e.time: e.message for e in record.messages((name,))} for name in TOPICS}
+        told = [
+            (e.time, json.loads(e.message.data))
+            for e in (record.messages(("events",)) if record.topic("events") in record.topics else ())
+        ]
+    steps = np.array(sorted(columns["thruster_state"]))
+    numbers = dict(zip(steps.tolist(), _stretches(steps, columns, _helm(steps, told, teleop)), strict=True))
+    whole = [t for t in sorted(columns["thruster_cmd"]) if all(t in columns[name] for name in TOPICS)]
+    if not whole:
+        raise DriveError(f"{path}: no decision at which there was an estimate: nothing to learn from")
+    rows = [{name: columns[name][t] for name in TOPICS} for t in whole]
+    stretch = np.array([numbers[t] for t in whole])
+    first = rows[int(np.argmax(stretch >= 0))]["policy_info"]
+    began, guide = _start(told)
+    return Drive(
+        path=path,
+        driver="teleop" if teleop else str(first.pilot),
+        period=float(first.period),
+        time=np.array(whole),
+        since=np.array(whole) - began,
+        guide=guide,
+        stretch=stretch,
+        **_numbers(rows),
+    )
+
+
+def _check(record: Record, vehicle: Vehicle) -> None:
+    about = record.metadata
+    if "vehicle_sha256" not in about:
+        raise DriveError(f"{record.path}: does not say of which vehicle it is: not a record of FinsSim")
+    if about["vehicle_sha256"] != vehicle.sha256:
+        raise DriveError(
+            f"{record.path}: is of the vehicle {about['vehicle']} {about['vehicle_sha256'][:12]}, expected "
+            f"{vehicle.name} {vehicle.sha256[:12]}: name the file that was driven with --vehicle"
+        )
+    for name in TOPICS:
+        if record.topic(name) not in record.topics:
+            lacks = f"has no topic {name}: not a record of finssim teleop or run"
+            raise DriveError(f"{record.path}: {LACKS.get(name, lacks)}")
+
+
+def _helm(steps: Array, told: list[tuple[float, Any]], teleop: bool) -> NDArray[np.bool_]:
+    """Whether the one who is to be learnt from steers at each step: of a drive by hand the person."""
+    if not teleop:
+        return np.ones(len(steps), dtype=np.bool_)
+    changes = [(t, event["text"] == PERSON) for t, event in told if event.get("kind") == "mode"]
+    times = np.array([-math.inf, *(t for t, _ in changes)])
+    # A press changes who decides from the next step on.
+    index = np.searchsorted(times, steps, side="left") - 1
+    return np.array([True, *(person for _, person in changes)])[np.maximum(index, 0)]
+
+
+def _stretches(
+    steps: Array, columns: Mapping[str, Mapping[float, Any]], helm: NDArray[np.bool_]
+) -> list[int]:
+    """Number of each step's stretch, which every step that may not be learnt from ends; negative there."""
+    states, ready, known = columns["thruster_state"], columns["estimator_status"], columns["odom"]
+    armed = STATES.index("armed")
+    fit = helm & np.array(
+        [
+            states[t].state == armed and t in known and t in ready and bool(ready[t].ready)
+            for t in steps.tolist()
+        ],
+        dtype=np.bool_,
+    )
+    return [int(n) for n in np.where(fit, np.cumsum(~fit), -1)]
+
+
+def _start(told: list[tuple[float, Any]]) -> tuple[float, str]:
+    """When the guide's time began, and the guide's name."""
+    return next(
+        ((t, str(event["text"])) for t, event in told if event.get("kind") == "trial_start"), (math.nan, "")
+    )
+
+
+def _numbers(rows: list[dict[str, Any]]) -> dict[str, Array]:
+    poses = [row["odom"].pose.pose for row in rows]
+    twists = [row["odom"].twist.twist for row in rows]
+    goals = [row["goal"].pose for row in rows]
+    # The goal is level: its quaternion turns about z alone.
+    yaw = [2.0 * math.atan2(g.orientation.z, g.orientation.w) for g in goals]
+    return {
+        "position": np.array([_xyz(p.position) for p in poses]),
+        "quaternion": np.array([(*_xyz(p.orientation), p.orientation.w) for p in poses]),
+        "nu": np.array([(*_xyz(t.linear), *_xyz(t.angular)) for t in twists]),
+        "goal": np.array([(*_xyz(g.position), a) for g, a in zip(goals, yaw, strict=True)]),
+        "force": np.array([row["thruster_cmd"].force for row in rows], dtype=float),
+    }
+
+
+def _xyz(v: Any) -> tuple[float, float, float]:
+    return float(v.x), float(v.y), float(v.z)
+
+
+NEAR_WRENCH = 0.05
+"""A wrench counts as said by an action if it is off by less, per axis, in parts of the wrench limits."""
+FEW = 0.05
+"""Part of the decisions that may be off by more: those at the limits of the thrusters."""
+
+
+def actions_of(force: ArrayLike, mode: Thruster8 | Wrench6, vehicle: Vehicle) -> NDArray[np.float32]:
+    """Actions that ask for what was commanded, in [-1, 1], (N, size).
+
+    Args:
+        force: Commanded thrusts, canonical order [N], (N, n).
+        mode: Action mode of that vehicle.
+        vehicle: Its control matrix makes a wrench of thrusts.
+
+    Raises:
+        DriveError: More than a few of the commands are none that the mode can ask for.
+    """
+    f = np.asarray(force, float)
+    if isinstance(mode, Thruster8):
+        full = np.where(f >= 0.0, np.asarray(mode.upper), -np.asarray(mode.lower)) * np.asarray(mode.scale)
+        wanted = f
+    else:
+        full = (np.asarray(mode.limits) * np.asarray(mode.scale))[list(mode.axes)]
+        wanted = (f @ vehicle.control_matrix.T)[:, list(mode.axes)]
+    action = np.divide(
+        wanted, full, out=np.zeros_like(wanted), where=np.broadcast_to(full, wanted.shape) > 0.0
+    )
+    action = np.clip(action, -1.0, 1.0)
+    _check_actions(action, f, mode, vehicle)
+    return action.astype(np.float32)
+
+
+def _check_actions(action: Array, force: Array, mode: Thruster8 | Wrench6, vehicle: Vehicle) -> None:
+    """Compare the wrench that the actions would give with the one that was commanded."""
+    limits = np.asarray(vehicle.wrench_limits, float)
+    off = np.abs((mode.to_thrusters(action) - force) @ vehicle.control_matrix.T)
+    off = np.divide(off, limits, out=np.zeros_like(off), where=limits > 0.0)
+    wrong = float(np.mean(off.max(axis=1) > NEAR_WRENCH))
+    if wrong > FEW:
+        worst = int(np.argmax(off.max(axis=0)))
+        raise DriveError(
+            f"{mode.name} cannot ask for what was commanded in {100.0 * wrong:.0f} % of the decisions ({AXES[worst]} "
+            f"is off by up to {off[:, worst].max():.2f} of its limit): give another --action"
+        )
+
+
+Indices = NDArray[np.int64]
+
+END = "end"
+"""In place of a goal: where a stretch ended."""
+NEAR = 0.25
+"""A decision may lie so far from the task's grid of times, in parts of its period."""
+SAME_GOAL = 1.0e-3
+"""Recorded goals that differ by no more are one, or lie on the trajectory [m, rad]."""
+
+
+class _Seen(NamedTuple):
+    """The estimate at one decision."""
+
+    position: Array
+    quaternion: Array
+    nu: Array
+
+
+def episodes_of(
+    drive: Drive, observer: Observer, mode: Thruster8 | Wrench6, vehicle: Vehicle, *,
+    goal: Station | str | None = None,
+) -> list[Episode]:  # fmt: skip
+    """Demonstrations of a drive; none where it has no stretch of two decisions.
+
+    Rewards are not known: they are NaN. An episode is never `terminated`; its measures are its `length` in steps and
+    `began`, the robot's time of its first decision [s].
+
+    Args:
+        drive: What was done.
+        observer: How the task is observed.
+        mode: In which it is acted.
+        vehicle: Which was driven.
+        goal: In place of the recorded one: a station, or `END`; of a task that follows a trajectory its name or file.
+
+    Raises:
+        DriveError: Decisions further apart than the task's, no goal, or commands that the mode cannot ask for.
+    """
+    task, period = observer.task, observer.task.control_step
+    if drive.period > period * (1.0 + 1e-6):
+        raise DriveError(
+            f"{drive.path}: {drive.driver} decided every {drive.period:g} s, expected at most {period:g} s, the period "
+            f"of {task.name}: it cannot be taken for a controller of that task"
+        )
+    guide_of = _guides(drive, vehicle, task.moving, goal)
+    stretches = indices_of(drive, period, split_goals=not task.moving and goal is None)
+    if not stretches:
+        return []
+    try:
+        actions = actions_of(drive.force[np.concatenate(stretches)], mode, vehicle)
+    except DriveError as error:
+        raise DriveError(f"{drive.path}: {error}") from None
+    found, first = [], 0
+    for rows in stretches:
+        guide = guide_of(rows)
+        observer.restart()
+        seen = [_Seen(drive.position[i], drive.quaternion[i], drive.nu[i]) for i in rows]
+        times = np.nan_to_num(drive.since[rows])
+        observation = [observer.observe(s, guide, float(t)) for s, t in zip(seen, times, strict=True)]
+        found.append(
+            Episode(
+                observation=np.array(observation, dtype=np.float32),
+                action=actions[first : first + len(rows) - 1],
+                reward=np.full(len(rows) - 1, np.nan, dtype=np.float32),
+                terminated=False,
+                metrics={"length": float(len(rows) - 1), "began": float(drive.time[rows[0]])},
+            )
+        )
+        first += len(rows)
+    return found
+
+
+def indices_of(drive: Drive, period: float, *, split_goals: bool) -> list[Indices]:
+    """Decisions, one a period, of each stretch that has at least two.
+
+    Args:
+        drive: What was done.
+        period: [s]
+        split_goals: Whether another goal begins another stretch.
+    """
+    number = drive.stretch
+    changed = np.diff(number) != 0
+    if split_goals:
+        changed = changed | (np.abs(np.diff(drive.goal, axis=0)) > SAME_GOAL).any(axis=1)
+    runs = np.split(np.arange(len(number)), np.flatnonzero(changed) + 1)
+    pieces = [piece for run in runs if number[run[0]] >= 0 for piece in _on_grid(run, drive.time, period)]
+    return [piece for piece in pieces if len(piece) >= 2]
+
+
+def _on_grid(run: Indices, time: Array, period: float) -> list[Indices]:
+    """The decisions nearest to a grid of times that begins with the first; a new grid after every gap."""
+    t = time[run]
+    pieces, piece = [], [0]
+    while (wanted := t[piece[0]] + len(piece) * period) <= t[-1] + 1e-6:
+        after = int(np.searchsorted(t, wanted))
+        near = max(after - 1, 0) if after == len(t) or wanted - t[after - 1] < t[after] - wanted else after
+        if abs(t[near] - wanted) <= NEAR * period:
+            piece.append(near)
+        else:
+            pieces.append(piece)
+            piece = [after]
+    return [run[p] for p in (*pieces, piece)]
+
+
+def _guides(
+    drive: Drive, vehicle: Vehicle, moving: bool, goal: Station | str | None
+) -> Callable[[Indices], Guide]:
+    """What tells a stretch's guide from the indices of its decisions."""
+    if moving:
+        trajectory = trajectory_of(drive, vehicle, None if goal is None else str(goal))
+        return lambda rows: trajectory
+    if isinstance(goal, Station):
+        return lambda rows: goal
+    if goal == END:
+        return lambda rows: _ended(drive, rows)
+    if not drive.has_goal:
+        raise DriveError(
+            f"{drive.path}: was driven by hand to no goal: give --goal x,y,z,yaw_deg, where to, or --goal {END}: where "
+            "each stretch ended"
+        )
+    return lambda rows: station_at(drive.goal[rows[0]])
+
+
+def station_at(goal: Sequence[float] | Array) -> Station:
+    """The station of a goal: x, y, z [m], yaw [rad], world frame, (4,)."""
+    x, y, z, yaw = map(float, goal)
+    return Station((x, y, z), yaw)
+
+
+def _ended(drive: Drive, rows: Indices) -> Station:
+    return station_at((*drive.position[rows[-1]], float(quat_yaw(drive.quaternion[rows[-1]]))))
+
+
+def _recorded_name(drive: Drive) -> str:
+    """Name of the trajectory that the record says was followed: one of ours, since what a record names is no path."""
+    if drive.guide not in (*TRAJECTORIES, *PUBLISHED_NAMES):
+        raise DriveError(
+            f"{drive.path}: followed '{drive.guide}', which is none of {', '.join(TRAJECTORIES)}: give --goal, the "
+            "name or the file of what was followed"
+        )
+    return drive.guide
+
+
+def trajectory_of(drive: Drive, vehicle: Vehicle, name: str | None = None) -> Guide:
+    """The trajectory that was followed, checked against the recorded goals.
+
+    Args:
+        drive: What was done.
+        vehicle: Which followed it: a published trajectory is as large as its room.
+        name: Name or file; the recorded name if None.
+
+    Raises:
+        DriveError: The record does not tell, or its goals are not on the trajectory.
+    """
+    name = name or _recorded_name(drive)
+    if np.isnan(drive.since).any():
+        raise DriveError(f"{drive.path}: does not say when its trajectory began: not a record of finssim run")
+    guide = load_trajectory(name, vehicle=vehicle)
+    off = float(np.linalg.norm(guide.at(drive.since).position - drive.goal[:, :3], axis=1).max())
+    if off > SAME_GOAL:
+        raise DriveError(
+            f"{drive.path}: its goals are up to {off:.3g} m off the trajectory '{name}': give --goal, the name or the "
+            "file of what was followed"
+        )
+    return guide
+
+
+def collect_records(
+    records: Sequence[Path],
+    task: str,
+    *,
+    out: Path,
+    vehicle: str = "finsrov",
+    action: str | None = None,
+    goal: str | None = None,
+) -> dict[str, Any]:
+    """Make demonstrations of records and write them.
+
+    Args:
+        records: MCAP files of `finssim teleop` or `finssim run`.
+        task: Its name, or FILE.py:CLASS of one's own.
+        out: Folder of the data set; an earlier one there is replaced.
+        vehicle: Name or file; the very one that was driven.
+        action: Mode; the task's own if None.
+        goal: Where the vehicle should have been, in place of what was recorded: "x,y,z,yaw_deg" or a file, "end" (where
+            each stretch ended); of t2 the trajectory, by name or file.
+
+    Returns:
+        What the data set says of itself, with `episodes` and `steps`.
+
+    Raises:
+        DriveError: A record does not fit, or nothing in it can be learnt from.
+        RecordError, ControlError, GoalError, VehicleError, OutputError: As they say.
+    """
+    body = load_vehicle(vehicle)
+    watch = Observer(task, body)
+    the_task = watch.task
+    mode = action_mode(action or the_task.action, body)
+    to = station_of(goal) if goal is not None and not the_task.moving and goal != END else goal
+    found, sources = [], []
+    for path in records:
+        drive = read_drive(path, body)
+        episodes = episodes_of(drive, watch, mode, body, goal=to)
+        found += episodes
+        steps = sum(len(e.action) for e in episodes)
+        sources.append(
+            {
+                "file": path.name,
+                "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+                "driver": drive.driver,
+                "episodes": len(episodes),
+                "steps": steps,
+            }  # fmt: skip
+        )
+    if not found:
+        names = ", ".join(str(path) for path in records)
+        raise DriveError(
+            f"{names}: nowhere was the robot armed, its estimate ready and its driver at the helm for two decisions "
+            f"{the_task.control_step:g} s apart towards one goal: nothing to learn from"
+        )
+    described = {
+        "task": the_task.name,
+        "expert": " and ".join(dict.fromkeys(str(source["driver"]) for source in sources)),
+        "observation": the_task.schema.model_dump(mode="json"),
+        "action": mode.describe(),
+        "vehicle": {"name": body.name, "sha256": body.sha256},
+        "observe": "record",
+        "goal": goal,
+        "records": sources,
+        "provenance": provenance(),
+    }
+    save(out, found, described)
+    return {**described, "episodes": len(found), "steps": sum(len(e.action) for e in found)}

@@ -1,0 +1,532 @@
+"""`finssim excite --pool` and `--robot`: programmes played by the robot's whole software, and the trials they make."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from rich.console import Console
+
+from finssim.calibration.errors import CalibrationError
+from finssim.calibration.excitation.programmes import Programme, programmes
+from finssim.calibration.importers.dispatch import read_trials
+from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial_files import load_trial, load_trials, write_trial
+from finssim.control.guidance import Station
+from finssim.experiments.campaign import Job, Say, Show, progress_bar, run_jobs
+from finssim.experiments.on_robot import (
+    Attendant,
+    OnRobot,
+    RobotError,
+    RobotTrial,
+    Session,
+    check_starts,
+    session,
+)
+from finssim.experiments.pool_trial import noise_seed, play_in_pool
+from finssim.files import atomic_directory, atomic_write
+from finssim.pool import draw_plant
+from finssim.pool.plant_spec import Basin
+from finssim.quiet import start_warp
+from finssim.robot.perception import Perception
+from finssim.robot.programme_pilot import ProgrammePilot
+from finssim.robot.recorder import Recorder
+from finssim.robot.runtime import Runtime
+from finssim.vehicles import AXES, Vehicle, load_vehicle
+from finssim.vehicles.defaults import room
+
+__all__ = ["excite_in_pool", "excite_on_robot", "pool_trials", "trials_on_robot"]
+
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Lower and upper corner of the water that a vehicle may be in, world frame [m]."""
+
+Array = NDArray[np.float64]
+
+WALL, SURFACE, FLOOR = 0.35, 0.15, 0.12
+"""Water kept between the vehicle's envelope and these at the ends of a run [m]; these three grow with `room`."""
+STOPPING = {"surge": 0.35, "sway": 0.3, "heave": 0.06}
+"""Of the way, kept for the coast after an excitation [m]."""
+LEAST_ROOM = 0.15
+"""Way on which nothing can be learnt [m]."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a programme begins."""
+
+    position: tuple[float, float, float]
+    """Body origin, world frame [m]."""
+    yaw: float
+    """[rad]"""
+    room: float | None
+    """Way after which the excitation ends [m]; None where it goes nowhere."""
+
+
+def box_of(where: Basin | Vehicle) -> Box:
+    """The water of a basin, or the workspace of a vehicle, which is taken for walls."""
+    if isinstance(where, Basin):
+        half = 0.5 * where.length, 0.5 * where.width
+        return (-half[0], -half[1], -where.depth), (*half, 0.0)
+    lower, upper = where.safety.workspace_lower, where.safety.workspace_upper
+    return tuple(map(float, lower)), tuple(map(float, upper))  # type: ignore[return-value]
+
+
+def place_of(programme: Programme, vehicle: Vehicle, box: Box) -> Place:
+    """The start of a programme: its way then lies in the middle of the water, surge and sway along x.
+
+    One that goes both ways begins in the middle itself, and has half of the way to either side.
+
+    Args:
+        programme: On one axis; several at once begin in the middle.
+        vehicle: Whose envelope keeps off the walls.
+        box: The water.
+
+    Raises:
+        CalibrationError: The water has no room for it.
+    """
+    (x0, y0, z0), (x1, y1, z1) = box
+    length, width, height = vehicle.body.size
+    scale = room(vehicle.body.size)
+    top, bottom = z1 - 0.5 * height - scale * SURFACE, z0 + 0.5 * height + scale * FLOOR
+    x, y, z = 0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.5 * (top + bottom)
+    if len(programme.axes) != 1 or programme.axes[0] in ("roll", "pitch", "yaw"):
+        return Place((x, y, z), 0.0, 0.5 * (y1 - y0) - 0.5 * math.hypot(length, width))
+    axis = programme.axes[0]
+    sign = _sign(programme)
+    if axis == "heave":
+        way = top - bottom
+        start = Place(
+            (x, y, z - 0.5 * sign * way), 0.0, way * (1.0 if sign else 0.5) - scale * STOPPING[axis]
+        )
+    else:
+        half = 0.5 * (x1 - x0) - 0.5 * (length if axis == "surge" else width) - scale * WALL
+        # Heading along x for surge; across it for sway, so that its left is where x falls.
+        ahead = 1.0 if axis == "surge" else -1.0
+        yaw = 0.0 if axis == "surge" else 0.5 * math.pi
+        start = Place(
+            (x - sign * ahead * half, y, z), yaw, half * (2.0 if sign else 1.0) - scale * STOPPING[axis]
+        )
+    if start.room is None or not start.room >= LEAST_ROOM:
+        raise CalibrationError(
+            f"{programme.name}: the pool leaves {start.room or 0.0:.2f} m to go along {axis}, expected {LEAST_ROOM} m "
+            "or more: use a larger pool"
+        )
+    return start
+
+
+def _sign(programme: Programme) -> float:
+    """Direction in which a programme goes along its only axis; 0 where it goes both ways."""
+    column = programme.tau_desired[:, AXES.index(programme.axes[0])]
+    return float(column.max() > 0.0) - float(column.min() < 0.0)
+
+
+ESTIMATOR = "error-state"
+"""Mode of the estimator: it predicts with the accelerometer, so that its velocity does not lag behind the motion."""
+
+
+def programme_trial(
+    programme: Programme, vehicle: Vehicle, place: Place, *, hold: str | None = "pid"
+) -> RobotTrial:
+    """The trial that plays a programme, and ends with it; its record has the phases.
+
+    Args:
+        programme: What to play.
+        vehicle: As the robot knows it.
+        place: Where it begins, and how far it may go.
+        hold: PID that keeps the other axes; None leaves them alone.
+    """
+    pilot = ProgrammePilot(
+        programme.tau_desired,
+        programme.phase,
+        programme.rate,
+        programme.axes,
+        vehicle,
+        room=place.room,
+        ascent_speed=programme.ascent_speed,
+        ascent_time=programme.ascent_time,
+        hold=hold,
+    )
+    return RobotTrial(
+        name=programme.name,
+        pilot=pilot,
+        guide=Station(place.position, place.yaw, name=programme.name),
+        duration=programme.duration,
+        over=lambda runtime: pilot.finished,
+        watch=_Phases(pilot, AXES.index(programme.axes[0])),
+    )
+
+
+class _Phases:
+    """Tells the record when the programme's phase changes, and remembers how fast the vehicle was."""
+
+    def __init__(self, pilot: ProgrammePilot, axis: int) -> None:
+        self._pilot, self._axis, self._said, self.fastest = pilot, axis, "", 0.0
+
+    def __call__(self, runtime: Runtime) -> None:
+        if self._said and runtime.reading is not None:
+            self.fastest = max(self.fastest, abs(float(runtime.reading.nu[self._axis])))
+        if self._pilot.phase != self._said and runtime.reading is not None and runtime.recorder is not None:
+            self._said = self._pilot.phase
+            runtime.recorder.event(runtime.reading.time, "phase", self._said)
+
+
+def fastest(trial: RobotTrial) -> float:
+    """Highest speed along the first axis of a programme that was played, as the robot knows it [m/s, rad/s]."""
+    return trial.watch.fastest if isinstance(trial.watch, _Phases) else 0.0
+
+
+def about_programme(programme: Programme, where: str) -> dict[str, Any]:
+    """What a record says of the trial that it makes."""
+    return {"trial": {"axis": list(programme.axes), "description": f"{where}: {programme.name}"}}
+
+
+def trial_of_record(record: Path, name: str, role: str) -> Trial:
+    """The trial of a record, from where its programme began.
+
+    Args:
+        record: MCAP of one programme.
+        name: Of the trial.
+        role: fit or held-out.
+    """
+    trial = read_trials([record], split="phase")[0]
+    return replace(trial, name=name, header=trial.header.model_copy(update={"role": role}))
+
+
+RECORDS = "records"
+"""Folder of the MCAPs beside the trials."""
+PLAN_FILE = "programmes.yaml"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoolRun(Job):
+    """A programme, who plays it and where; equal ones give equal trials."""
+
+    row: str
+    """fit or held-out."""
+    programme: Programme
+    vehicle: str
+    """Name or file of the vehicle as the robot knows it."""
+    pool_vehicle: str
+    """Name or file of the vehicle around which the pool's own is drawn."""
+    plant: int = 1
+    """Seed of the pool."""
+    severity: str = "realistic"
+    """nominal, realistic or hard."""
+    seed: int = 1
+    """Of noise; programmes of different names never share it."""
+    hold: str | None = "pid"
+    """PID that keeps the other axes."""
+
+    @property
+    def target(self) -> str:  # type: ignore[override]
+        """What is to be done."""
+        return self.programme.name
+
+    def described(self) -> dict[str, Any]:
+        """Everything that decides the trial, as plain data."""
+        vehicles = {name: load_vehicle(getattr(self, name)).sha256 for name in ("vehicle", "pool_vehicle")}
+        programme = {"name": self.target, "sha256": _digest([self.programme])}
+        return {**asdict(self), **vehicles, "programme": programme}
+
+
+def _digest(plan: Sequence[Programme]) -> str:
+    """Of what programmes ask for, and when."""
+    parts = (p.tau_desired.tobytes() + "".join(p.phase).encode() for p in plan)
+    return hashlib.sha256(b"".join(parts)).hexdigest()
+
+
+def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
+    """Play a programme in its pool.
+
+    Args:
+        run: What, who and where.
+        path: PATH.mcap takes the record, PATH (a folder) the trial.
+
+    Returns:
+        `fault` (why the bridge ended it early, or empty), `duration` [s], `fastest` (the highest speed along the
+        programme's first axis, as the robot estimates it [m/s, rad/s]) and the `notes` of the import.
+    """
+    start_warp()
+    path.mkdir(parents=True, exist_ok=True)
+    record = path.with_name(f"{path.name}.mcap")
+    record.unlink(missing_ok=True)
+    vehicle, standing = load_vehicle(run.vehicle), load_vehicle(run.pool_vehicle)
+    place = place_of(run.programme, vehicle, _water_of(run))
+    trial = programme_trial(run.programme, vehicle, place, hold=run.hold)
+    about = {**about_programme(run.programme, "virtual pool"), "seed": run.seed}
+    with Recorder(record, vehicle, about, pictures="none") as recorder:
+        outcome = play_in_pool(
+            trial, Station(place.position, place.yaw), vehicle, standing, recorder=recorder,
+            estimator={"mode": ESTIMATOR}, plant=run.plant, severity=run.severity,
+            seed=noise_seed(run.seed, run.row, run.target),
+        )  # fmt: skip
+    t = outcome.runtime.t
+    made = trial_of_record(record, run.target, run.row)
+    write_trial(made, path, format="parquet")
+    return {
+        "fault": outcome.fault,
+        "duration": 0.0 if math.isnan(t) else t,
+        "fastest": fastest(trial),
+        "notes": list(made.notes),
+    }
+
+
+def _water_of(run: PoolRun) -> Box:
+    return box_of(draw_plant(load_vehicle(run.pool_vehicle), run.plant, run.severity).basin)  # type: ignore[arg-type]
+
+
+def pool_trials(
+    plans: Mapping[str, Sequence[Programme]],
+    folder: Path,
+    *,
+    leave_out: bool = False,
+    processes: int | None = None,
+    say: Say = lambda part, what: None,
+    show: Show = lambda job, result: None,
+    **settings: Any,
+) -> dict[str, list[Trial]]:
+    """Play programmes in a pool; the robot's whole software does, at the start that `place_of` gives each.
+
+    Args:
+        plans: Role of the trials (fit, held-out) -> programmes.
+        folder: Takes ROLE/NAME, the trials, and ROLE/records/NAME.mcap.
+        leave_out: Leave out the trials that the bridge stopped, instead of refusing all; `show` is given their fault.
+        processes: As many as there are processors if None.
+        say: Told the share that is done and what is left.
+        show: Given each run and its result, of `play_programme`, as soon as there is one.
+        settings: Of every `PoolRun`.
+
+    Returns:
+        The trials by role, in the order of the programmes; a trial is complete.
+
+    Raises:
+        CalibrationError: A programme that the pool has no room for, or that the bridge stopped.
+        PlantSpecError: A vehicle that cannot be put into a pool.
+    """
+    runs = [
+        PoolRun(row=role, programme=programme, **settings)
+        for role, plan in plans.items()
+        for programme in plan
+    ]
+    body, box = load_vehicle(runs[0].vehicle), _water_of(runs[0])
+    for run in runs:  # what cannot be is refused before anything is played
+        place_of(run.programme, body, box)
+    trials: dict[str, list[Trial]] = {role: [] for role in plans}
+    with tempfile.TemporaryDirectory() as scratch:
+        results = run_jobs(runs, Path(scratch), play_programme, processes=processes, say=say, show=show)
+        for run, result in zip(runs, results, strict=True):
+            if result["fault"] and leave_out:
+                continue
+            if result["fault"]:
+                raise CalibrationError(
+                    f"{run.target} in the virtual pool: {result['fault']}: give lower levels, or fewer axes at once"
+                )
+            made, role = Path(scratch) / run.key(), folder / run.row
+            (role / RECORDS).mkdir(parents=True, exist_ok=True)
+            shutil.move(made, role / run.target)
+            shutil.move(made.with_name(f"{made.name}.mcap"), role / RECORDS / f"{run.target}.mcap")
+            trials[run.row].append(load_trial(role / run.target))
+    for name, made_of in trials.items():
+        if not made_of:
+            raise CalibrationError(
+                f"the bridge stopped every {name} trial in the virtual pool: {results[0]['fault']}: give lower levels"
+            )
+    return trials
+
+
+def excite_in_pool(
+    axes: str,
+    *,
+    vehicle: str,
+    out: Path,
+    plant: int,
+    pool_vehicle: str | None = None,
+    severity: str = "realistic",
+    seed: int = 0,
+    processes: int | None = None,
+    **plan: Any,
+) -> list[Path]:
+    """Play programmes in a virtual pool, each from its start at rest, over several processes.
+
+    Args:
+        axes: As for `programmes`; so are seed and plan (kind, levels, repeats, coast, duration).
+        vehicle: Name or file of the vehicle as the robot knows it.
+        out: Folder to make: a trial for each programme, `records/NAME.mcap`, and `programmes.yaml`.
+        plant: Seed of the pool.
+        pool_vehicle: Name or file of the vehicle around which the pool's own is drawn; `vehicle` if None.
+        severity: nominal, realistic or hard.
+        processes: As many as there are processors if None.
+
+    Returns:
+        The folders of the trials.
+
+    Raises:
+        CalibrationError, PlantSpecError, VehicleError, OutputError: As they say.
+    """
+    start_warp()
+    body, pool_vehicle = load_vehicle(vehicle), pool_vehicle or vehicle
+    played = programmes(axes, body, seed=seed, **plan)
+    with (
+        atomic_directory(out, replaces=PLAN_FILE) as folder,
+        progress_bar("playing programmes") as say,
+    ):
+        pool_trials(
+            {"fit": played}, folder, vehicle=vehicle, pool_vehicle=pool_vehicle, plant=plant,
+            severity=severity, seed=seed, processes=processes, say=say,
+        )  # fmt: skip
+        for made in (folder / "fit").iterdir():
+            made.rename(folder / made.name)
+        (folder / "fit").rmdir()
+        pool = {"vehicle": load_vehicle(pool_vehicle).name, "plant": plant, "severity": severity}
+        (folder / PLAN_FILE).write_text(_about(body, played, seed, plan, {"pool": pool}), encoding="utf-8")
+    return [Path(out) / programme.name for programme in played]
+
+
+def excite_on_robot(
+    axes: str,
+    *,
+    vehicle: str,
+    out: Path,
+    robot: OnRobot,
+    seed: int = 0,
+    attendant: Attendant | None = None,
+    console: Console | None = None,
+    **plan: Any,
+) -> list[Path]:
+    """Play programmes on a robot, one after the other; what lies in the folder is not played again.
+
+    Args:
+        axes: As for `programmes`; so are seed and plan (kind, levels, repeats, coast, duration).
+        vehicle: Name or file of the vehicle; its workspace is where programmes go to and fro.
+        out: Takes a trial for each programme, `records/NAME.mcap`, and `programmes.yaml`.
+        robot: Which, and how.
+        attendant: Instead of the terminal's keyboard.
+        console: Where it is told how it stands; standard error if None.
+
+    Returns:
+        The folders of the trials, without those that were skipped.
+
+    Raises:
+        RobotError: It may not be armed, stopped with nobody there to help, or the folder is of another plan.
+        KeyboardInterrupt: Ctrl-C; the same command goes on.
+        CalibrationError, GoalError, LinkError, VehicleError, OutputError: As they say.
+    """
+    start_warp()
+    body = load_vehicle(vehicle)
+    played = programmes(axes, body, seed=seed, **plan)
+    _take_folder(Path(out), _about(body, played, seed, plan, {"robot": True}))
+    with session(robot, body, attendant=attendant, console=console) as opened:
+        return robot_trials(played, Path(out), opened)
+
+
+def robot_trials(
+    plan: Sequence[Programme], folder: Path, opened: Session, *, role: str = "fit"
+) -> list[Path]:
+    """Play on an open robot what has no trial in a folder yet; returns the folders of the trials.
+
+    Args:
+        plan: Programmes.
+        folder: Takes NAME, the trials, and records/NAME.mcap.
+        opened: The robot.
+        role: Of the trials: fit or held-out.
+
+    Raises:
+        As `excite_on_robot`.
+    """
+    vehicle = opened.vehicle
+    places = {programme.name: place_of(programme, vehicle, box_of(vehicle)) for programme in plan}
+    starts = {name: Station(place.position, place.yaw) for name, place in places.items()}
+    check_starts(starts, vehicle)
+    made = []
+    for programme in plan:
+        name = programme.name
+        record = folder / RECORDS / f"{name}.mcap"
+        if not record.is_file():
+            outcome = opened.trial(
+                lambda programme=programme: programme_trial(programme, vehicle, places[programme.name]),
+                starts[name],
+                record,
+                counts=False,
+                exact=False,
+                perception=lambda: Perception(vehicle, opened.site, mode=ESTIMATOR),
+                about={"command": "finssim excite", **about_programme(programme, opened.robot.title)},
+            )
+            if outcome is None:
+                continue
+            unit = "m/s" if programme.axes[0] in AXES[:3] else "rad/s"
+            opened.say(f"  up to {fastest(outcome.trial):.2f} {unit} in {outcome.runtime.t:.0f} s")
+        if not (folder / name).is_dir():
+            write_trial(trial_of_record(record, name, role), folder / name, format="parquet")
+        made.append(folder / name)
+    return made
+
+
+def trials_on_robot(
+    plans: Mapping[str, Sequence[Programme]],
+    folder: Path,
+    vehicle: Vehicle,
+    robot: OnRobot,
+    *,
+    attendant: Attendant | None = None,
+    console: Console | None = None,
+) -> dict[str, list[Trial]]:
+    """What `pool_trials` does in a pool, on a robot: the trials by role, without those that were skipped.
+
+    Args:
+        plans: Role of the trials (fit, held-out) -> programmes.
+        folder: Takes ROLE/NAME and ROLE/records/NAME.mcap; what is there is not played again.
+        vehicle: As the robot knows it.
+        robot: Which, and how; not opened where nothing is left to play.
+        attendant: Instead of the terminal's keyboard.
+        console: Where it is told how it stands; standard error if None.
+
+    Raises:
+        As `excite_on_robot`; CalibrationError too where every programme of a role was skipped.
+    """
+    folders = {role: [folder / role / programme.name for programme in plan] for role, plan in plans.items()}
+    if not all(path.is_dir() for paths in folders.values() for path in paths):
+        with session(robot, vehicle, attendant=attendant, console=console) as opened:
+            for role, plan in plans.items():
+                robot_trials(plan, folder / role, opened, role=role)
+    return {role: load_trials([path for path in paths if path.is_dir()]) for role, paths in folders.items()}
+
+
+def _about(
+    vehicle: Vehicle,
+    played: Sequence[Programme],
+    seed: int,
+    plan: Mapping[str, Any],
+    where: Mapping[str, Any],
+) -> str:
+    """What the folder is of."""
+    about = {
+        "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
+        "kind": plan.get("kind", "published"),
+        **where,
+        "seed": seed,
+        "programmes": [programme.name for programme in played],
+        "sha256": _digest(played),
+    }
+    return yaml.safe_dump(about, sort_keys=False)
+
+
+def _take_folder(out: Path, about: str) -> None:
+    """Begin a folder, or go on in one that is of the very same plan."""
+    file = out / PLAN_FILE
+    if not out.exists() or not any(out.iterdir()):
+        with atomic_write(file) as temporary:
+            temporary.write_text(about, encoding="utf-8")
+    elif not file.is_file() or file.read_text(encoding="utf-8") != about:
+        raise RobotError(
+            f"{out}: holds other files than trials of these programmes of this vehicle: give a new --out, or the same "
+            "axes, levels, seed and vehicle to go on with them"
+        )

@@ -1,0 +1,586 @@
+"""`finssim experiment faults`: break one thing after another while a vehicle drives, and see what it does.
+
+Faults of the wire are played in lock-step with a hand on it, those of a whole process in real time, by kill -9.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import socket
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from finssim.experiments.campaign import Job, Say, choice, run_in_turn, run_jobs, write_json
+from finssim.experiments.fault_scenarios import SCENARIOS, Bench, Course, Fault, FaultyWire
+from finssim.experiments.pool_trial import noise_seed, stand_in_pool
+from finssim.experiments.processes import Pair, ReliabilityError, await_flush, await_thrust, pair
+from finssim.experiments.tables import Shown, markdown_of, print_shown
+from finssim.pool import read_truth
+from finssim.provenance import provenance
+from finssim.quiet import start_warp
+from finssim.robot.bridge import Bridge
+from finssim.robot.bridge_settings import BridgeSettings
+from finssim.robot.goals import station_of
+from finssim.robot.link.decoder import MCU, Decoder
+from finssim.robot.lockstep import run_lockstep
+from finssim.robot.pilots import make_pilot
+from finssim.robot.record_reader import open_record
+from finssim.robot.recorder import Recorder
+from finssim.robot.runtime import Runtime
+from finssim.vehicles import load_vehicle
+
+__all__ = ["faults_experiment", "print_faults"]
+
+Array = NDArray[np.float64]
+
+RATE = 60.0
+"""Of the robot's loop [Hz]."""
+MOTIONS = {
+    "station": ("0,0,-0.5,0", "0,0,-0.5,0", 8.0, 4.0),
+    "moving": ("-1.2,-0.3,-0.5,0", "1.2,0.3,-0.5,60", 3.0, 1.5),
+}
+"""Name -> start, goal, how long after arming the fault comes, and after the first thrust the kill [s]."""
+WATCHED = 10.0
+"""How long the vehicle is watched after a fault that stays, and at least after one that passes [s]."""
+AFTERWARDS = 4.0
+"""How long after a fault that has passed [s]."""
+LONGEST = 70.0
+"""Time until the estimator knows where the vehicle is, with the longest fault [s]."""
+ATTEMPTS = 3
+WATCHED_ALIVE = 8.0
+"""How long the one that lives on is watched after a kill [s]."""
+KILL_WEIGHT = 5.0
+"""Trials in lock-step that take as long as one in real time."""
+STILL = 0.05
+"""Thrust below which a thruster counts as stopped [N]."""
+QUIET = 1.0
+"""Thrusters have stopped if none pushed for the last so much of the fault [s]; less is a pause between two pulses."""
+STOP_WITHIN = 0.5
+"""Thrusters shall be at zero so soon after a fault, or the vehicle shall stay inside the workspace [s]."""
+LONGEST_LOSS = 1.0
+"""The most that a record may lack at its end [s]."""
+INSET = np.array([0.4, 0.4, 0.2])
+"""The workspace of these trials is so much smaller than the vehicle file's on every side [m]: that of the pool's walls
+could not be left by a vehicle that does everything wrong."""
+
+
+def inset(lower: Any, upper: Any) -> tuple[Array, Array]:
+    """Lower and upper corner of the workspace in which faults are tried, world frame [m], each (3,)."""
+    return np.asarray(lower, float) + INSET, np.asarray(upper, float) - INSET
+
+
+def measured(course: Course, began: float, ended: float, box: tuple[Array, Array] | None) -> dict[str, Any]:
+    """Measures of a course.
+
+    Args:
+        course: The truth, to the end of the trial.
+        began: When the fault began, pool's clock [s].
+        ended: When it ended, or the trial [s].
+        box: Lower and upper corner of the workspace; None: where the vehicle is does not count.
+
+    Returns:
+        `thrust_gone_s`, `frames_off_s`: from the fault to the last thrust, and to the last frame that enables motors;
+        None where they did not end. `margin_m`: least distance to the workspace's faces after the fault, negative
+        outside. `speed_m_s` and `thrust_n` (sum of magnitudes, mean over a second) before it.
+    """
+    t, fault = course.time, (course.time >= began) & (course.time <= ended)
+    pushes = np.abs(course.thrust).max(axis=1) > STILL
+    before = (t >= began - 1.0) & (t <= began)
+    after = course.position[t >= began]
+    margin = None if box is None else float(np.min([after - box[0], box[1] - after]))
+    travelled = np.linalg.norm(np.diff(course.position[before], axis=0), axis=1).sum()
+    return {
+        "thrust_gone_s": _last_activity(t[fault], pushes[fault], began),
+        "frames_off_s": _last_activity(t[fault], course.enabled[fault] > 0.0, began),
+        "margin_m": margin,
+        "speed_m_s": float(travelled / max(np.ptp(t[before]), 1e-9)),
+        "thrust_n": float(np.abs(course.thrust[before]).sum(axis=1).mean()),
+    }
+
+
+def passed(result: Mapping[str, Any]) -> bool:
+    """Whether a trial fulfils the contract: stopped in time or inside, nothing raised, the record readable."""
+    gone, margin = result["thrust_gone_s"], result["margin_m"]
+    stopped = gone is not None and gone <= STOP_WITHIN
+    inside = margin is not None and margin >= 0.0
+    lost = result["record_lost_s"]
+    recorded = not result["record_problem"] and lost is not None and lost <= LONGEST_LOSS
+    return bool((stopped or inside) and not result["raised"] and recorded)
+
+
+def _last_activity(time: Array, active: NDArray[np.bool_], began: float) -> float | None:
+    """When the last activity ended, counted from `began` [s]; None if it had not ended for `QUIET`."""
+    last = float(time[active][-1]) if active.any() else began
+    return None if time[-1] - last < QUIET else last - began
+
+
+@dataclass(frozen=True, kw_only=True)
+class FaultJob(Job):
+    """A fault, in what motion, in which pool."""
+
+    scenario: str
+    """Of the catalogue."""
+    variant: str = ""
+    motion: str = "station"
+    """What the vehicle does: station or moving."""
+    plant: int = 1
+    """Seed of the pool: vehicle, camera and water."""
+    severity: str = "realistic"
+    """nominal, realistic or hard."""
+    seed: int = 1
+    """Of the noise."""
+    vehicle: str = "finsrov"
+    """Name or file."""
+
+    @property
+    def row(self) -> str:  # type: ignore[override]
+        """Of the table."""
+        return self.scenario
+
+    @property
+    def target(self) -> str:  # type: ignore[override]
+        """Variant and motion."""
+        return f"{self.variant} {self.motion}".strip()
+
+    def described(self) -> dict[str, Any]:
+        """Everything that decides the result."""
+        return {**asdict(self), "vehicle": load_vehicle(self.vehicle).sha256}
+
+
+def play(job: FaultJob, path: Path) -> dict[str, Any]:
+    """Play a job in lock-step.
+
+    Args:
+        job: Which fault, in what motion, in which pool.
+        path: Not used: the record is read, and gone, before this ends.
+
+    Returns:
+        The measures of `measured`; `state` and `reason` of the bridge at the end; `raised`, what broke through, or
+        empty; `record_lost_s` and `record_problem`; `ok`.
+    """
+    start_warp()
+    with tempfile.TemporaryDirectory() as folder:
+        return _play(job, Path(folder) / "run.mcap")
+
+
+def _play(job: FaultJob, record: Path) -> dict[str, Any]:
+    scenario = SCENARIOS[job.scenario]
+    fault, (start, goal, when, _) = scenario.faults[job.variant], MOTIONS[job.motion]
+    vehicle = load_vehicle(job.vehicle)
+    box = inset(vehicle.safety.workspace_lower, vehicle.safety.workspace_upper)
+    settings = BridgeSettings.of(
+        vehicle, **{"workspace_lower": box[0], "workspace_upper": box[1], **scenario.settings}
+    )
+    pool, site = stand_in_pool(
+        vehicle,
+        station_of(start),
+        plant=job.plant,
+        severity=job.severity,
+        seed=noise_seed(job.seed, job.target),
+    )
+    with Recorder(record, vehicle, {"command": "finssim experiment faults"}) as recorder:
+        runtime = Runtime(
+            vehicle, site, make_pilot("pid", vehicle), station_of(goal), arm=True,
+            bridge=Bridge(vehicle, settings), recorder=recorder,
+        )  # fmt: skip
+        bench = Bench(pool, FaultyWire(pool, RATE), runtime, recorder)
+        script = _Script(bench, fault, when)
+        raised = _run(bench, script)
+    if math.isnan(script.began):
+        raise RuntimeError(f"{job.key()}: the vehicle was never armed: {runtime.refusal}")
+    course = bench.wire.course()
+    ended = min(script.began + fault.lasts, float(course.time[-1]))
+    result = {
+        **measured(course, script.began, ended, box),
+        "state": script.state,
+        "reason": script.reason,
+        "raised": raised,
+        **_record_lost(record, script.steps if fault.cuts_record else runtime.counters.steps),
+        "provenance": provenance(),
+    }
+    return {**result, "ok": passed(result)}
+
+
+class _Script:
+    """Begins and ends the fault, and remembers how the bridge stood before the run was ended."""
+
+    def __init__(self, bench: Bench, fault: Fault, when: float) -> None:
+        self._bench, self._fault, self._when = bench, fault, when
+        self._armed = self._over = math.nan
+        self._ended = False
+        self.began = math.nan
+        """Pool's clock [s]; NaN before."""
+        self.steps = 0
+        """Of the robot until the fault."""
+        self.state = self.reason = ""
+
+    def look(self, runtime: Runtime) -> None:
+        """After every step of the robot."""
+        now, fault = self._bench.pool.time, self._fault
+        self.state, self.reason = runtime.bridge.state, runtime.bridge.reason
+        if math.isnan(self._armed) and not math.isnan(runtime.started):
+            self._armed = now
+        if math.isnan(self.began) and now >= self._armed + self._when:
+            self.began, self.steps = now, runtime.counters.steps
+            fault.begin(self._bench)
+        elif now >= self.began + fault.lasts and not self._ended:
+            self._ended = True
+            if fault.end is not None:
+                fault.end(self._bench)
+        elif now >= self.began and not self._ended and fault.during is not None:
+            fault.during(self._bench)
+
+    def over(self, runtime: Runtime) -> bool:
+        """Whether enough was seen."""
+        lasts = self._fault.lasts
+        watched = WATCHED if math.isinf(lasts) else max(WATCHED, lasts + AFTERWARDS)
+        return self._bench.pool.time >= self.began + watched
+
+
+def _run(bench: Bench, script: _Script) -> str:
+    """Run to the end; returns what was raised, in this thread or in another, or nothing."""
+    with _heard() as raised:
+        try:
+            run_lockstep(bench.runtime, bench.wire, LONGEST, rate=RATE, show=script.look, until=script.over)
+        except Exception as error:  # what breaks through is what this experiment looks for
+            raised.append(f"{type(error).__name__}: {error}")
+        finally:
+            bench.recorder.close()
+            for undo in bench.undo:
+                undo()
+            bench.pool.close()
+    return "; ".join(raised)
+
+
+@contextmanager
+def _heard() -> Iterator[list[str]]:
+    """Collects what threads raise."""
+    raised: list[str] = []
+    before = threading.excepthook
+    threading.excepthook = lambda args: raised.append(f"{args.exc_type.__name__}: {args.exc_value}")
+    try:
+        yield raised
+    finally:
+        threading.excepthook = before
+
+
+def _record_lost(path: Path, steps: int) -> dict[str, Any]:
+    """What a record of a run in lock-step lacks, each step of which leaves one state in it.
+
+    Returns:
+        `record_lost_s`: None where it cannot be read; `record_problem`: why, or empty.
+    """
+    try:
+        with open_record(path) as record:
+            states = sum(1 for _ in record.messages(("estimator_status",)))
+    except Exception as error:  # whatever keeps a reader from reading is the finding
+        return {"record_lost_s": None, "record_problem": f"{type(error).__name__}: {error}"}
+    return {"record_lost_s": max(steps - states, 0) / RATE, "record_problem": ""}
+
+
+def _record_cut(path: Path, at: float) -> dict[str, Any]:
+    """The same of a record that was cut at a time, robot's clock, which is this machine's [s]."""
+    try:
+        with open_record(path) as record:
+            newest = max(time for time, _, _ in record.sizes()) if record.cut else math.inf
+    except Exception as error:  # as above
+        return {"record_lost_s": None, "record_problem": f"{type(error).__name__}: {error}"}
+    return {"record_lost_s": max(at - newest, 0.0), "record_problem": ""}
+
+
+def _first_stop(path: Path, since: float) -> float | None:
+    """When the bridge first stopped enabling the motors after a time, by the record's events, robot's clock [s]."""
+    with open_record(path) as record:
+        for entry in record.messages(("events",)):
+            kind = json.loads(entry.message.data)["kind"]
+            if entry.time >= since and kind in ("hold", "fault", "disarmed"):
+                return entry.time
+    return None
+
+
+def play_kill(job: FaultJob, path: Path | None = None) -> dict[str, Any]:
+    """Play a job whose scenario is one of `KILLS`, in real time; returns what `play` does.
+
+    Raises:
+        ReliabilityError: The vehicle never drove, in three attempts: a machine with too much to do stops it
+            before it is to be killed.
+    """
+    begin, goal, _, delay = MOTIONS[job.motion]
+    for attempt in range(ATTEMPTS):
+        try:
+            with tempfile.TemporaryDirectory() as name:
+                folder = Path(name)
+                truth, record = folder / "truth", folder / "run.mcap"
+                world = ["--plant", str(job.plant), "--severity", job.severity, "--seed", str(job.seed)]
+                world += ["--camera", "corners", "--start", begin, "--truth", str(truth)]
+                ours = ["--policy", "pid", "--record", str(record)]
+                with pair(folder, job.vehicle, goal, pool=world, robot=ours) as both:
+                    await_thrust(truth, STILL, both.robot)
+                    time.sleep(delay)
+                    result = KILLS[job.scenario][1](job, both, truth, record)
+                break
+        except ReliabilityError:
+            if attempt == ATTEMPTS - 1:
+                raise
+    return {**result, "provenance": provenance(), "ok": passed(result)}
+
+
+def _kill_robot(job: FaultJob, both: Pair, file: Path, record: Path) -> dict[str, Any]:
+    """The motor controller is left alone: its own timeout has to stop the motors."""
+    began, killed = await_flush(file), time.monotonic()
+    both.robot.kill()
+    time.sleep(WATCHED_ALIVE)
+    both.pool.end()
+    truth, safety = read_truth(file), load_vehicle(job.vehicle).safety
+    course = Course(truth.time, truth.position, truth.thrust, np.full(len(truth.time), math.nan))
+    box = inset(safety.workspace_lower, safety.workspace_upper)
+    return {
+        **measured(course, began, float(truth.time[-1]), box),
+        "frames_off_s": 0.0,
+        "state": "gone",
+        "reason": "the motor controller stops by itself",
+        "raised": both.pool.broke(),
+        **_record_cut(record, killed),
+    }
+
+
+def _kill_pool(job: FaultJob, both: Pair, file: Path, record: Path) -> dict[str, Any]:
+    """Vehicle and camera fall silent: the robot has to stop commanding.
+
+    What it sends is heard at the pool's port, as soon as the system has given that free, and its bridge has put into
+    the record when it stopped: the later of the two counts.
+    """
+    began, killed = await_flush(file), time.monotonic()
+    both.pool.kill()
+    heard = _last_enabled(both, killed)
+    both.robot.end()
+    ended, truth = time.monotonic(), read_truth(file)
+    stopped = _first_stop(record, killed)
+    off = None if heard is None or stopped is None else max(heard, stopped - killed)
+    summary = json.loads(both.robot.said or "{}")
+    course = Course(truth.time, truth.position, truth.thrust, np.ones(len(truth.time)))
+    return {
+        **measured(course, began, began, None),
+        # Of the vehicle nothing is left: the last frame that would turn a motor counts in place of its thrust.
+        "thrust_gone_s": off,
+        "frames_off_s": off,
+        "state": summary.get("state", "no answer"),
+        "reason": summary.get("reason", ""),
+        "raised": both.robot.broke(),
+        **_record_cut(record, ended),
+    }
+
+
+def _last_enabled(both: Pair, killed: float) -> float | None:
+    """When the last frame that enables motors came after the kill [s]; None if they never ended."""
+    decoder, last = Decoder(MCU), killed
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:
+        end.bind(("127.0.0.1", both.port))
+        end.settimeout(0.1)
+        while both.robot.running and time.monotonic() < killed + WATCHED_ALIVE:
+            try:
+                data = end.recv(2048)
+            except TimeoutError:
+                continue
+            if any(command.enable for command in decoder.feed(data)):
+                last = time.monotonic()
+    # A process that has ended sends nothing more.
+    return last - killed if not both.robot.running or time.monotonic() - last > QUIET else None
+
+
+KILLS: dict[str, tuple[str, Callable[..., dict[str, Any]]]] = {
+    "kill-robot": ("kill -9 of the robot's process", _kill_robot),
+    "kill-pool": ("kill -9 of the pool's process", _kill_pool),
+}
+"""Name -> title and what plays it."""
+
+
+HEADS = (
+    "",
+    "trials",
+    "thrust gone [s]",
+    "frames off [s]",
+    "inside by [m]",
+    "ended",
+    "record lost [s]",
+    "verdict",
+)
+
+NOTE = (
+    f"Passed: no thrust above {STILL:g} N later than {STOP_WITHIN:g} s after the fault, or always inside the workspace "
+    f"(the vehicle file's less {INSET[0]:g} m at the sides, {INSET[2]:g} m above and below); nothing raised; record "
+    f"readable, lacking at most {LONGEST_LOSS:g} s. Thrust and position are true; thrust includes the motors' lag. "
+    "Times and record: the longest of the trials; inside by: the least distance to a face. drives on: thrusters still "
+    "worked when the fault ended or the trial was over."
+)
+
+
+def faults_table(result: Mapping[str, Any]) -> Shown:
+    """The table of a result of `faults_experiment`."""
+    rows = dict.fromkeys(trial["job"]["row"] for trial in result["trials"])
+    tried = {name: [t for t in result["trials"] if t["job"]["row"] == name] for name in rows}
+    good = sum(bool(t["ok"]) for name, trials in tried.items() if not _control(name) for t in trials)
+    total = sum(len(trials) for name, trials in tried.items() if not _control(name))
+    return Shown(
+        title="Faults",
+        headline=(
+            f"Faults in the virtual pool, severity {result['severity']}, pools: {len(result['seeds'])}; "
+            f"{result['vehicle']['name']} {result['vehicle']['sha256'][:12]}; passed: {good} of {total}"
+        ),
+        heads=HEADS,
+        rows=[_row(name, trials) for name, trials in tried.items()],
+        note=NOTE,
+        sentences=[
+            _complaint(t) for name, ts in tried.items() if not _control(name) for t in ts if not t["ok"]
+        ],
+    )
+
+
+def print_faults(result: Mapping[str, Any], console: Console) -> None:
+    """Print it."""
+    print_shown(faults_table(result), console)
+
+
+def _row(name: str, trials: Sequence[Mapping[str, Any]]) -> list[str]:
+    title = KILLS[name][0] if name in KILLS else SCENARIOS[name].title
+    margins = [t["margin_m"] for t in trials if t["margin_m"] is not None]
+    lost = [t["record_lost_s"] for t in trials if t["record_lost_s"] is not None]
+    return [
+        title,
+        str(len(trials)),
+        _longest(trials, "thrust_gone_s"),
+        _longest(trials, "frames_off_s"),
+        f"{min(margins):.2f}" if margins else "–",
+        _ended(trials),
+        f"{max(lost):.2f}" if len(lost) == len(trials) else "unreadable",
+        _verdict(name, trials),
+    ]
+
+
+def _longest(trials: Sequence[Mapping[str, Any]], key: str) -> str:
+    """The longest time, and how many trials went on driving."""
+    times = [t[key] for t in trials if t[key] is not None]
+    going = len(trials) - len(times)
+    words = [f"{max(times):.2f}"] if times else []
+    return ", ".join(words + ([f"{going} drive on" if times else "drives on"] if going else []))
+
+
+def _ended(trials: Sequence[Mapping[str, Any]]) -> str:
+    """States of the bridge, with their reasons, the most frequent first."""
+    counts = Counter(t["state"] + (f": {t['reason']}" if t["reason"] else "") for t in trials)
+    return "; ".join(f"{n} × {what}" if len(counts) > 1 else what for what, n in counts.most_common())
+
+
+def _verdict(name: str, trials: Sequence[Mapping[str, Any]]) -> str:
+    good = sum(bool(t["ok"]) for t in trials)
+    if _control(name):
+        return "fails, as it must" if not good else "PASSED, which a control must not"
+    return "passed" if good == len(trials) else f"FAILED {len(trials) - good}"
+
+
+def _complaint(trial: Mapping[str, Any]) -> str:
+    """What was wrong with a trial that failed."""
+    job, gone, margin = trial["job"], trial["thrust_gone_s"], trial["margin_m"]
+    went = "thrust never ended" if gone is None else f"thrust ended after {gone:.2f} s"
+    where = "" if margin is None else f", inside by {margin:.2f} m"
+    lost = trial["record_lost_s"]
+    record = trial["record_problem"] or ("" if lost is None else f"record lacks {lost:.2f} s")
+    raised = f"; raised {trial['raised']}" if trial["raised"] else ""
+    return f"{job['row']} {job['target']}, pool {job['plant']}: {went}{where}; {record}{raised}"
+
+
+def _control(name: str) -> bool:
+    return name in SCENARIOS and SCENARIOS[name].must_fail
+
+
+def faults_experiment(
+    *,
+    out: Path,
+    seeds: int = 1,
+    seed: int = 1,
+    scenarios: Sequence[str] | None = None,
+    severity: str = "realistic",
+    vehicle: str = "finsrov",
+    processes: int | None = None,
+    say: Say = lambda part, what: None,
+) -> dict[str, Any]:
+    """Play every fault in every motion and pool; a run that was interrupted goes on where it was.
+
+    Args:
+        out: Directory for `faults.json`, `faults.md` and `trials/`.
+        seeds: How many pools, each with its own vehicle, camera, water and noise.
+        seed: The first.
+        scenarios: Names; all if None.
+        severity: Of the pools: nominal, realistic or hard.
+        vehicle: Name or file.
+        processes: Trials at once; as many as processors if None.
+        say: Told the share that is done and what comes next.
+
+    Returns:
+        What `faults.json` holds; `ok`: every trial passed, and every control failed.
+
+    Raises:
+        ReliabilityError: An unknown scenario.
+    """
+    names = list(scenarios or (*KILLS, *SCENARIOS))
+    for name in names:
+        choice([*KILLS, *SCENARIOS], name, "scenario", ReliabilityError)
+    common = {"severity": severity, "vehicle": vehicle}
+    kills, jobs = list[FaultJob](), list[FaultJob]()
+    for name in names:
+        variants, motions = ([""], MOTIONS) if name in KILLS else _variants(name)
+        (kills if name in KILLS else jobs).extend(
+            FaultJob(scenario=name, variant=variant, motion=motion, plant=s, seed=s, **common)
+            for variant in variants
+            for motion in motions
+            for s in range(seed, seed + seeds)
+        )
+    weight = KILL_WEIGHT * len(kills)
+    share, folder, body = weight / (weight + len(jobs)), Path(out), load_vehicle(vehicle)
+    if kills:
+        say(0.0, f"{len(kills)} kills in real time")
+    # A kill has the machine to itself.
+    results = run_in_turn(
+        kills, folder / "trials", play_kill, show=lambda job, _: say(0.5 * share, job.target)
+    )
+    results += run_jobs(
+        jobs,
+        folder / "trials",
+        play,
+        processes=processes,
+        say=lambda part, what: say(share + (1.0 - share) * part, what),
+    )
+    rows = {name: [r for r in results if r["job"]["row"] == name] for name in names}
+    result = {
+        "experiment": "faults",
+        "severity": severity,
+        "seeds": list(range(seed, seed + seeds)),
+        "vehicle": {"name": body.name, "sha256": body.sha256},
+        "ok": all(row_ok(name, rows[name]) for name in names),
+        "trials": results,
+        "provenance": provenance(),
+    }
+    write_json(folder / "faults.json", result, markdown_of(faults_table(result)))
+    return result
+
+
+def _variants(name: str) -> tuple[Sequence[str], Sequence[str]]:
+    """Variants and motions of a scenario in lock-step."""
+    return list(SCENARIOS[name].faults), SCENARIOS[name].motions
+
+
+def row_ok(name: str, trials: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether the trials of a scenario came out as they must: a control has to fail."""
+    return bool(trials) and all(bool(trial["ok"]) is not _control(name) for trial in trials)

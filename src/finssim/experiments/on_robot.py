@@ -1,0 +1,527 @@
+"""Trials of a robot, real or virtual: waited for, brought to the start, played and recorded, one after the other."""
+
+from __future__ import annotations
+
+import math
+import shlex
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from rich.console import Console
+from rich.status import Status
+
+from finssim.control.guidance import Guide, Station
+from finssim.files import atomic_directory, refuse_unwritable
+from finssim.geometry.rotations import quat_yaw, wrap_angle
+from finssim.localization.pool import Pool, load_pool
+from finssim.robot.goals import check_reachable
+from finssim.robot.keyboard import Keyboard
+from finssim.robot.link.transports import DEFAULT_BIND
+from finssim.robot.perception import Perception
+from finssim.robot.pilots import Pilot, WrenchPilot, make_pilot
+from finssim.robot.recorder import Recorder
+from finssim.robot.robot import Reading
+from finssim.robot.runtime import Runtime
+from finssim.robot.wiring import Drive, Wiring, connected
+from finssim.vehicles import Vehicle, load_vehicle
+
+__all__ = [
+    "Attendant",
+    "OnRobot",
+    "Outcome",
+    "RobotError",
+    "RobotTrial",
+    "Session",
+    "check_starts",
+    "kept_folder",
+    "session",
+]
+
+GETTING_READY = 10.0
+"""Longest time until the estimator knows where the vehicle is, and it is armed [s]."""
+NEAR, TURNED = 0.10, math.radians(10.0)
+EXACTLY = (NEAR, TURNED, 0.05, math.radians(5.0), 2.0)
+"""A vehicle is at its start within this of it [m, rad] and no faster than this [m/s, rad/s] for so long [s]."""
+ROUGHLY = (0.15, math.radians(20.0), 0.1, math.inf, 10.0)
+"""The same where the start need not be exact: a PID tuned from guesses may circle its goal for ever."""
+APPROACH = 60.0
+"""Longest way to a start [s]."""
+
+Ended = Literal["over", "fault", "skipped", "interrupted", "not there"]
+"""How a trial ended: by itself, by the bridge, at the operator's wish, by Ctrl-C, or the start was never reached."""
+
+
+class Attendant(Protocol):
+    """The person beside the water."""
+
+    def keys(self) -> Sequence[str]:
+        """Pressed since the last call: enter goes on, x or space stops the thrusters, s skips, q ends; never waits."""
+
+    def line(self, text: str) -> None:
+        """How it stands now; called at every step."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotTrial:
+    """What is played. A new one for every attempt, since pilots remember."""
+
+    name: str
+    pilot: Pilot
+    guide: Guide
+    duration: float
+    """Longest, from arming [s]."""
+    over: Callable[[Runtime], bool]
+    """Whether it has come to its end."""
+    watch: Callable[[Runtime], None] = lambda runtime: None
+    """Looks on after every step of the trial itself."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placing:
+    """How a vehicle gets to where a trial begins."""
+
+    start: Station
+    by_hand: bool = False
+    """Somebody carries it there, and presses enter. False: the tuned PID steers it there."""
+    exact: bool = True
+    """Whether the trial is worth nothing from elsewhere; an excitation is."""
+    attendant: Attendant | None = None
+    """Nobody is asked if None: the way to the start begins as soon as the state is known."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a trial went."""
+
+    trial: RobotTrial
+    runtime: Runtime
+    ended: Ended
+    fault: str
+    """Why it ended before its time, or never began; empty if it did neither."""
+    begun: bool
+    """Whether the trial itself was begun, not only the way to its start."""
+
+
+def play_trial(
+    trial: RobotTrial,
+    drive: Drive,
+    vehicle: Vehicle,
+    site: Pool,
+    *,
+    perception: Perception | None = None,
+    recorder: Recorder | None = None,
+    placing: Placing | None = None,
+) -> Outcome:
+    """Play a trial.
+
+    Args:
+        trial: What to do.
+        drive: Runs the robot's software on its wires, or in lock-step with a world.
+        vehicle: As the robot knows it.
+        site: Camera, water and frames, as calibrated.
+        perception: Otherwise than by default.
+        recorder: Takes down the trial itself, not the way to its start.
+        placing: How the vehicle gets to the start; None: it is there already, at rest, as in a pool that begins.
+    """
+    stages = Stages(trial, vehicle, recorder, placing)
+    if placing is None:
+        runtime = Runtime(
+            vehicle, site, trial.pilot, trial.guide, arm=True, perception=perception, recorder=recorder
+        )
+        longest = GETTING_READY + trial.duration
+    else:
+        idle = WrenchPilot(lambda: np.zeros(6), vehicle, name="idle")
+        runtime = Runtime(vehicle, site, idle, placing.start, arm=False, perception=perception)
+        longest = math.inf
+    drive(runtime, duration=longest, show=stages.look, until=stages.over)
+    ended: Ended = stages.ended or ("interrupted" if math.isinf(longest) else "over")
+    return Outcome(trial, runtime, ended, stages.fault(runtime), stages.begun)
+
+
+class Stages:
+    """Waits for the vehicle and its attendant, sees it to the start, hands over to the trial, and ends it."""
+
+    def __init__(
+        self, trial: RobotTrial, vehicle: Vehicle, recorder: Recorder | None, placing: Placing | None
+    ) -> None:
+        self._trial, self._vehicle, self._recorder = trial, vehicle, recorder
+        self._placed = placing is None
+        self._placing = placing or Placing(start=Station((0.0, 0.0, 0.0), 0.0))
+        self._stage: Callable[[Runtime, float], bool] = self._play if self._placed else self._wait
+        self._since = math.nan
+        """When the stage began [s]."""
+        self._near_since: dict[tuple[float, ...], float] = {}
+        self.ended: Ended | None = None
+        self.begun = self._placed
+        self._reason = ""
+
+    def look(self, runtime: Runtime) -> None:
+        """After every step."""
+        if self.begun:
+            self._trial.watch(runtime)
+
+    def over(self, runtime: Runtime) -> bool:
+        """Whether to end; goes from stage to stage."""
+        assert runtime.reading is not None  # a step has been made
+        now = runtime.reading.time
+        self._since = now if math.isnan(self._since) else self._since
+        if runtime.bridge.state == "fault":
+            return self._end("fault")
+        return self._stage(runtime, now)
+
+    def fault(self, runtime: Runtime) -> str:
+        """Why the trial ended before its time, or never began; empty if it did neither."""
+        if runtime.bridge.state == "fault":
+            return runtime.bridge.reason
+        if self._reason:
+            return self._reason
+        if self.begun and math.isnan(runtime.started):
+            return f"never armed: {runtime.refusal or 'no state'}"
+        return "" if self.ended == "over" else "not finished"
+
+    def _end(self, how: Ended, reason: str = "") -> bool:
+        self.ended, self._reason = how, reason
+        return True
+
+    def _keys(self) -> Sequence[str]:
+        return self._placing.attendant.keys() if self._placing.attendant else ()
+
+    def _line(self, text: str) -> None:
+        if self._placing.attendant is not None:
+            self._placing.attendant.line(text)
+
+    def _wait(self, runtime: Runtime, now: float) -> bool:
+        """Thrusters cannot turn: until the state is known and the attendant says go."""
+        assert runtime.reading is not None
+        keys, reading = self._keys(), runtime.reading
+        if now == self._since:
+            return False  # what was pressed before anybody was asked means nothing
+        if "s" in keys:
+            return self._end("skipped", "skipped by the operator")
+        if "q" in keys:
+            return self._end("interrupted")
+        if not reading.ready:
+            self._line(f"waiting for the vehicle: {reading.reason}")
+            return False
+        there = self.there(reading, now)
+        if self._placing.by_hand and not there:
+            self._line(f"bring it to its start: {self._way(reading)}")
+            return False
+        if self._placing.attendant is not None and not {"\r", "\n"} & set(keys):
+            word = "play" if self._placing.by_hand else "let it go to its start and play"
+            self._line(f"enter: {word}; s: skip; q: end; {self._way(reading)}")
+            return False
+        if self._placing.by_hand:
+            self._begin(runtime, now)
+        else:
+            pilot = make_pilot("pid", self._vehicle)
+            runtime.hand_over(now, pilot, self._placing.start, arm=True)
+            self._stage, self._since = self._approach, now
+            self._near_since.clear()
+        return False
+
+    def _approach(self, runtime: Runtime, now: float) -> bool:
+        """The PID steers to the start."""
+        assert runtime.reading is not None
+        if {"x", " "} & set(self._keys()):
+            runtime.bridge.stop(now, "stopped by the operator")
+            return self._end("fault")
+        reading = runtime.reading
+        self._line(f"on the way to its start: {self._way(reading)}; x: stop")
+        if self.there(reading, now):
+            self._begin(runtime, now)
+        elif now - self._since > APPROACH:
+            why = runtime.refusal or self._way(reading)
+            return self._end("not there", f"not at its start after {APPROACH:g} s: {why}")
+        return False
+
+    def _begin(self, runtime: Runtime, now: float) -> None:
+        """Hand over to the trial: disarmed, and armed again for its pilot."""
+        runtime.hand_over(now, self._trial.pilot, self._trial.guide, arm=True, recorder=self._recorder)
+        self._stage, self._since, self.begun = self._play, now, True
+
+    def _play(self, runtime: Runtime, now: float) -> bool:
+        if {"x", " "} & set(self._keys()):
+            runtime.bridge.stop(now, "stopped by the operator")
+            return self._end("fault")
+        if self._trial.over(runtime):
+            return self._end("over")
+        if self._placed:
+            return False  # the drive ends it
+        t = 0.0 if math.isnan(runtime.t) else runtime.t
+        self._line(f"{t:.0f} s of {self._trial.duration:.0f} s; x: stop")
+        late = math.isnan(runtime.started) and now - self._since > GETTING_READY
+        return (late or t > self._trial.duration + GETTING_READY) and self._end("not there")
+
+    def there(self, reading: Reading, now: float) -> bool:
+        """Whether the vehicle has been at its start, at rest, for long enough."""
+        off = (
+            float(np.abs(reading.position - self._placing.start.position).max()),
+            abs(self._turn(reading)),
+            float(np.linalg.norm(reading.nu[:3])),
+            float(np.linalg.norm(reading.nu[3:])),
+        )
+        for bounds in (EXACTLY,) if self._placing.exact else (EXACTLY, ROUGHLY):
+            if not reading.ready or any(x > limit for x, limit in zip(off, bounds[:4], strict=True)):
+                self._near_since.pop(bounds, None)
+            elif now - self._near_since.setdefault(bounds, now) >= bounds[4]:
+                return True
+        return False
+
+    def _turn(self, reading: Reading) -> float:
+        return float(wrap_angle(self._placing.start.yaw - quat_yaw(reading.quaternion)))
+
+    def _way(self, reading: Reading) -> str:
+        """What is left of the way."""
+        x, y, z = self._placing.start.position - reading.position
+        return f"({x:+.2f}, {y:+.2f}, {z:+.2f}) m and {math.degrees(self._turn(reading)):+.0f}° to go"
+
+
+MARK = ".on-robot"
+"""File by which a folder of such trials is known."""
+ABORTED = "aborted"
+"""Folder of the records of trials that were stopped and do not count."""
+
+
+class RobotError(ValueError):
+    """Trials on a robot cannot be made, or cannot go on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnRobot:
+    """A robot, and how trials are made on it."""
+
+    wiring: Wiring
+    """Its wires; a virtual pool in a process of its own is another of them."""
+    pool_file: Path
+    """Camera, water and frames."""
+    arm: bool = False
+    """Thrusters may turn; trials are refused without it."""
+    by_hand: bool = False
+    """Somebody carries the vehicle to every start; False: the tuned PID steers it there."""
+    unattended: bool = False
+    """Nobody presses a key: the way to a start begins as soon as the state is known, and a fault ends it all."""
+
+    @property
+    def title(self) -> str:
+        """The robot's address."""
+        return f"{self.wiring.robot}{', lock-step' if self.wiring.lockstep else ''}"
+
+    @property
+    def options(self) -> str:
+        """Words of a command line that name it."""
+        wiring = self.wiring
+        words = ["--robot", wiring.robot, "--pool-file", str(self.pool_file)]
+        words += ["--bind", wiring.bind] if wiring.bind != DEFAULT_BIND else []
+        words += ["--pictures", wiring.pictures] if wiring.pictures else []
+        return shlex.join([*words, *(["--lockstep"] if wiring.lockstep else [])])
+
+
+class _Screen:
+    """A terminal: one line that changes, and keys."""
+
+    def __init__(self, keyboard: Keyboard, status: Status) -> None:
+        self._keyboard, self._status, self._newest = keyboard, status, -math.inf
+
+    def keys(self) -> Sequence[str]:
+        return self._keyboard.pressed()
+
+    def line(self, text: str) -> None:
+        now = time.monotonic()
+        if now - self._newest >= 0.25:
+            self._newest = now
+            self._status.update(text)
+
+
+class Session:
+    """An open robot; made by `session`."""
+
+    def __init__(
+        self,
+        robot: OnRobot,
+        vehicle: Vehicle,
+        site: Pool,
+        drive: Drive,
+        attendant: Attendant | None,
+        console: Console,
+    ) -> None:
+        self.robot, self.vehicle, self.site = robot, vehicle, site
+        self._drive, self._attendant, self._console = drive, attendant, console
+
+    def say(self, text: str) -> None:
+        """Tell whoever watches."""
+        self._console.print(text, highlight=False, markup=False)
+
+    def trial(
+        self,
+        make: Callable[[], RobotTrial],
+        start: Station,
+        record: Path,
+        *,
+        counts: bool,
+        exact: bool = True,
+        perception: Callable[[], Perception] | None = None,
+        about: Mapping[str, Any] | None = None,
+    ) -> Outcome | None:
+        """Play a trial until it is done, the operator skips it, or it cannot be.
+
+        Args:
+            make: The trial, anew for every attempt.
+            start: Where it begins.
+            record: File of its record, made once it is done; records of attempts that do not count go to `aborted/`.
+            counts: Whether a trial that the bridge stopped counts as it is; it is played again if not. One that the
+                operator stopped never counts.
+            exact: Whether the vehicle must be at its start to the centimetre and at rest, however long that takes.
+            perception: Otherwise than by default, made anew for every attempt.
+            about: Metadata of the record.
+
+        Returns:
+            How it went; None if it was skipped.
+
+        Raises:
+            RobotError: It cannot be played, and nobody is there to help.
+            KeyboardInterrupt: Ctrl-C, or the operator ended the session.
+        """
+        while True:
+            trial = make()
+            x, y, z = start.position
+            self.say(f"{trial.name}: from {x:.2f}, {y:.2f}, {z:.2f} m, {math.degrees(start.yaw):.0f}°")
+            placing = Placing(start=start, by_hand=self.robot.by_hand, exact=exact, attendant=self._attendant)
+            outcome, partial = self._attempt(trial, placing, record, perception, about or {})
+            stopped_by_hand = outcome.fault == "stopped by the operator"
+            done = outcome.ended == "over" or (
+                counts and outcome.begun and outcome.ended == "fault" and not stopped_by_hand
+            )
+            if done:
+                record.parent.mkdir(parents=True, exist_ok=True)
+                partial.replace(record)
+                return outcome
+            self._put_away(partial, record, outcome)
+            if outcome.ended == "skipped":
+                self.say(f"{trial.name}: skipped")
+                return None
+            if outcome.ended == "interrupted":
+                raise KeyboardInterrupt
+            if self._attendant is None:
+                raise RobotError(
+                    f"{trial.name}: {outcome.fault}: look at the vehicle, then give the command again: it goes on here"
+                )
+            self.say(f"{trial.name}: {outcome.fault}: once more, or s to skip it")
+
+    def _attempt(
+        self,
+        trial: RobotTrial,
+        placing: Placing,
+        record: Path,
+        perception: Callable[[], Perception] | None,
+        about: Mapping[str, Any],
+    ) -> tuple[Outcome, Path]:
+        """One attempt and its record, which is not yet in its place."""
+        partial = record.with_name(f".{record.stem}.partial.mcap")
+        partial.parent.mkdir(parents=True, exist_ok=True)
+        partial.unlink(missing_ok=True)
+        meta = {
+            "pilot": trial.pilot.describe(),
+            "guide": trial.guide.name,
+            "armed": True,
+            "robot": self.robot.wiring.robot,
+            "pool_sha256": self.site.sha256,
+            **about,
+        }
+        epoch = 0.0 if self.robot.wiring.lockstep else time.time() - time.monotonic()
+        files = {"pool.yaml": self.robot.pool_file}
+        with Recorder(partial, self.vehicle, meta, pictures="none", epoch=epoch, files=files) as recorder:
+            outcome = play_trial(
+                trial,
+                self._drive,
+                self.vehicle,
+                self.site,
+                perception=perception and perception(),
+                recorder=recorder,
+                placing=placing,
+            )
+        if recorder.problem and outcome.ended == "over":
+            raise RobotError(f"{record}: {recorder.problem}")
+        return outcome, partial
+
+    def _put_away(self, partial: Path, record: Path, outcome: Outcome) -> None:
+        """Keep what there is of a trial that was begun; nothing was recorded of one that was not."""
+        if not outcome.begun:
+            partial.unlink(missing_ok=True)
+            return
+        folder = record.parent / ABORTED
+        folder.mkdir(exist_ok=True)
+        number = 1 + sum(1 for _ in folder.glob(f"{record.stem}_*.mcap"))
+        partial.replace(folder / f"{record.stem}_{number}.mcap")
+
+
+@contextmanager
+def session(
+    robot: OnRobot,
+    vehicle: Vehicle,
+    *,
+    attendant: Attendant | None = None,
+    console: Console | None = None,
+) -> Iterator[Session]:
+    """Open a robot for trials.
+
+    Args:
+        robot: Which, and how.
+        vehicle: As its file has it.
+        attendant: Instead of the terminal's keyboard.
+        console: Where it is told how it stands; standard error if None.
+
+    Raises:
+        RobotError: It may not be armed, or nobody is there to press keys.
+        LinkError, LockstepError, LocalizationError: It cannot be reached, or its pool file cannot be used.
+    """
+    if not robot.arm:
+        raise RobotError("trials turn thrusters: give --arm when the water is clear of people and cables")
+    if robot.unattended and robot.by_hand:
+        raise RobotError(
+            "by hand somebody has to press enter at every start: leave --unattended or --by-hand out"
+        )
+    console = console or Console(stderr=True)
+    site = load_pool(robot.pool_file)
+    with ExitStack() as stack:
+        drive = stack.enter_context(connected(robot.wiring, vehicle, site))
+        if attendant is None and not robot.unattended:
+            if not sys.stdin.isatty():
+                raise RobotError(
+                    "nobody can press enter, as standard input is no terminal: run it in one, or give --unattended"
+                )
+            keyboard = Keyboard()
+            stack.enter_context(keyboard)
+            attendant = _Screen(keyboard, stack.enter_context(console.status("waiting for the vehicle")))
+        yield Session(robot, vehicle, site, drive, attendant, console)
+
+
+@contextmanager
+def kept_folder(out: Path) -> Iterator[Path]:
+    """A folder in which trials on a robot stay as they are made: new, empty, or begun by an earlier call.
+
+    Raises:
+        OutputError: It holds somebody's files.
+    """
+    if out.exists() and not (out / MARK).is_file():
+        refuse_unwritable(atomic_directory(out))
+    out.mkdir(parents=True, exist_ok=True)
+    (out / MARK).touch()
+    yield out
+
+
+def check_starts(starts: Mapping[str, Station], vehicle: str | Vehicle) -> None:
+    """Refuse starts outside the workspace of a vehicle before anything is armed.
+
+    Raises:
+        GoalError: One is; says which.
+    """
+    body = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
+    for name, start in starts.items():
+        check_reachable(Station(start.position, start.yaw, name=f"the start of {name}"), body)

@@ -1,1 +1,0 @@
-"""Trials on a robot: real or virtual, the same software, the same steps."""

@@ -1,0 +1,461 @@
+"""One trial of a controller by the robot's whole software: in the virtual pool, or from the same start on a robot."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import tempfile
+import time
+import zlib
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from finssim.control.controllers import CONTROLLERS
+from finssim.control.guidance import Guide, Station
+from finssim.control.policy_description import DESCRIPTION_FILE, NETWORK_FILE
+from finssim.control.trajectories import load_trajectory
+from finssim.control.trim import Trim
+from finssim.experiments import campaign
+from finssim.experiments.evaluate import Evaluation
+from finssim.experiments.metrics import summarize
+from finssim.experiments.motion import PERIOD, Motion, localization_errors, measure, on_grid
+from finssim.experiments.on_robot import (
+    Attendant,
+    OnRobot,
+    Outcome,
+    RobotError,
+    RobotTrial,
+    Session,
+    check_starts,
+    play_trial,
+    session,
+)
+from finssim.experiments.paper import T1_SETPOINTS, T1_START, in_room
+from finssim.experiments.recorded import RecordedError, read_record
+from finssim.experiments.trials import DURATION, Trials
+from finssim.files import atomic_write
+from finssim.geometry.rotations import quat_from_yaw, quat_yaw
+from finssim.localization.pool import Pool
+from finssim.pool import Truth, VirtualPool, draw_plant, read_truth
+from finssim.pool.camera import PoolCamera
+from finssim.pool.site import camera_of
+from finssim.provenance import provenance
+from finssim.quiet import start_warp
+from finssim.robot.ablation import NoisyInput
+from finssim.robot.goals import check_reachable
+from finssim.robot.lockstep import run_lockstep
+from finssim.robot.perception import Perception
+from finssim.robot.pilots import Pilot, make_pilot
+from finssim.robot.recorder import Recorder
+from finssim.robot.runtime import Runtime
+from finssim.tasks import task_named
+from finssim.tasks.agents import agent_for
+from finssim.vehicles import Vehicle, load_vehicle
+from finssim.vehicles.defaults import room
+
+__all__ = [
+    "HARDWARE",
+    "Job",
+    "noise_seed",
+    "play",
+    "play_in_pool",
+    "pool_evaluation",
+    "pool_jobs",
+    "read_series",
+    "run_on_robot",
+    "stand_in_pool",
+]
+
+Array = NDArray[np.float64]
+
+HARDWARE = "hardware"
+"""In place of the severity of a pool, and of what its camera sends."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job(campaign.Job):
+    """A controller, what it knows, where it is put, and what it is to do."""
+
+    row: str
+    """Of the table."""
+    controller: str
+    """Policy directory, or the name of a PID."""
+    target: str
+    """Setpoint of T1 (P01 ...), or trajectory of T2."""
+    vehicle: str = "finsrov"
+    """Name or file of the vehicle as controller and localization know it."""
+    pool_vehicle: str = "finsrov"
+    """Name or file of the vehicle around which the pool's own is drawn."""
+    plant: int = 1
+    """Seed of the pool: vehicle, camera and water."""
+    severity: str = "realistic"
+    """nominal, realistic or hard."""
+    seed: int = 1
+    """Of the noise of this trial; trials of different targets never share noise."""
+    camera: str = "pictures"
+    """pictures (drawn and searched for tags) or corners (of the tags, with noise)."""
+    fusion: bool = True
+    """Whether the controller sees the fused state, or what each sensor said last."""
+    trim: bool = False
+    """Whether an integral stands in front of the policy."""
+    position_noise: float = 0.0
+    """Added to what the controller sees, per axis [m]."""
+    yaw_noise: float = 0.0
+    """Added to what the controller sees [rad]."""
+    duration: float = 60.0
+    """[s]; of T2 the trajectory's own."""
+
+    @property
+    def task(self) -> str:
+        """t1 or t2."""
+        return "t1" if self.target in T1_SETPOINTS else "t2"
+
+    def described(self) -> dict[str, Any]:
+        """Everything that decides the result, with the contents of files in place of their names."""
+        fields = asdict(self)
+        fields.pop("row")
+        if self.controller not in CONTROLLERS:
+            fields["controller"] = {
+                name: hashlib.sha256((Path(self.controller) / name).read_bytes()).hexdigest()
+                for name in (DESCRIPTION_FILE, NETWORK_FILE)
+            }
+        for name in ("vehicle", "pool_vehicle"):
+            fields[name] = load_vehicle(fields[name]).sha256
+        return fields
+
+
+def noise_seed(*words: Any) -> int:
+    """A seed of what a trial is called: trials of other names never share noise."""
+    return zlib.crc32(" ".join(map(str, words)).encode()) & 0x7FFFFFFF
+
+
+def stand_in_pool(
+    vehicle: Vehicle,
+    start: Station,
+    *,
+    plant: int,
+    severity: Any,
+    seed: int,
+    camera: Any = "corners",
+    truth: Path | None = None,
+) -> tuple[VirtualPool, Pool]:
+    """A vehicle at rest at its start in a drawn pool, and the site as its calibration has it.
+
+    Args:
+        vehicle: Around which the pool's own is drawn.
+        start: Where it is.
+        plant: Seed of the pool: vehicle, camera and water.
+        severity: nominal, realistic or hard.
+        seed: Of the noise.
+        camera: pictures or corners.
+        truth: File of the truth; none if None.
+    """
+    true_site, known_site, settings = camera_of(vehicle, plant, severity)
+    pool = VirtualPool(
+        vehicle,
+        draw_plant(vehicle, plant, severity),
+        camera=PoolCamera(vehicle, true_site, mode=camera, settings=settings, seed=seed),
+        start=(np.asarray(start.position), quat_from_yaw(start.yaw)),
+        seed=seed,
+        truth=truth,
+    )
+    return pool, known_site
+
+
+def play_in_pool(
+    trial: RobotTrial,
+    start: Station,
+    vehicle: Vehicle,
+    standing: Vehicle,
+    *,
+    recorder: Recorder | None = None,
+    estimator: Mapping[str, Any],
+    **pool: Any,
+) -> Outcome:
+    """Play a trial by the robot's whole software in lock-step with a pool.
+
+    Args:
+        trial: What to do.
+        start: Where the vehicle is, at rest.
+        vehicle: As the robot knows it.
+        standing: Around which the pool's own is drawn.
+        recorder: Takes it down.
+        estimator: Options of `Perception`.
+        pool: As of `stand_in_pool`.
+    """
+    world, site = stand_in_pool(standing, start, **pool)
+    with closing(world):
+        return play_trial(
+            trial,
+            lambda runtime, **how: run_lockstep(runtime, world, **how),
+            vehicle,
+            site,
+            perception=Perception(vehicle, site, **estimator),
+            recorder=recorder,
+        )
+
+
+def job_trial(job: Job, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotTrial, Station]:
+    """The trial of a job, which ends when its time is over, and where it starts.
+
+    Args:
+        job: Who, and to what.
+        vehicle: As the robot knows it.
+        seed: Of noise on what the pilot sees.
+
+    Raises:
+        PolicyError, ControlError: The controller does not fit the vehicle or the task.
+    """
+    standing = load_vehicle(job.pool_vehicle)
+    guide: Guide
+    if job.task == "t1":
+        x, y, z, yaw = in_room(T1_SETPOINTS[job.target], standing).tolist()
+        guide, first = Station((x, y, z), yaw, name=job.target), in_room(T1_START, standing).tolist()
+    else:
+        guide = load_trajectory(job.target, vehicle=standing)
+        reference = guide.at(0.0)
+        first = [*reference.position.tolist(), float(reference.yaw)]
+    duration = guide.duration if math.isfinite(guide.duration) else job.duration
+    pilot: Pilot = make_pilot(job.controller, vehicle, task=job.task, trim=Trim() if job.trim else None)
+    if job.position_noise or job.yaw_noise:
+        pilot = NoisyInput(pilot, position_std=job.position_noise, yaw_std=job.yaw_noise, seed=seed)
+    trial = RobotTrial(
+        name=f"{job.row}, {job.target}",
+        pilot=pilot,
+        guide=guide,
+        duration=duration,
+        over=lambda runtime: runtime.t >= duration,
+        watch=_Estimates(),
+    )
+    return trial, Station((first[0], first[1], first[2]), first[3])
+
+
+class _Estimates:
+    """What the robot believed, at the period of the series."""
+
+    def __init__(self) -> None:
+        self.rows: list[tuple[float, ...]] = []
+
+    def __call__(self, runtime: Runtime) -> None:
+        reading, t = runtime.reading, runtime.t
+        if reading is None or math.isnan(t) or (self.rows and t < self.rows[-1][0] + PERIOD - 1e-6):
+            return
+        self.rows.append((t, *reading.position, float(quat_yaw(reading.quaternion))))
+
+
+def play(job: Job, path: Path) -> dict[str, Any]:
+    """Play a job in its pool.
+
+    Args:
+        job: Who, where and what.
+        path: PATH.npz takes the series of truth and estimate.
+
+    Returns:
+        The measures of its task, `fault` (why the bridge stopped it, or empty), `localization` (errors of the estimate
+        against the truth, rms) and how the robot's loop did.
+    """
+    start_warp()
+    began = time.perf_counter()
+    vehicle, standing = load_vehicle(job.vehicle), load_vehicle(job.pool_vehicle)
+    seed = noise_seed(job.seed, job.target)
+    trial, start = job_trial(job, vehicle, seed=seed)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "truth"
+        outcome = play_in_pool(
+            trial, start, vehicle, standing, estimator={"fusion": job.fusion}, plant=job.plant,
+            severity=job.severity, seed=seed, camera=job.camera, truth=file,
+        )  # fmt: skip
+        true = read_truth(file)
+    assert isinstance(trial.watch, _Estimates)
+    series = _series(true, outcome.runtime.started, trial.duration, np.array(trial.watch.rows))
+    write_series(path, series)
+    truth = Motion(**{name: series[name] for name in ("t", "position", "yaw", "quaternion", "thrust")})
+    estimate = Motion(t=series["estimate_t"], position=series["estimate"], yaw=series["estimate_yaw"])
+    return {
+        **measure(job.task, trial.guide, truth, vehicle.force_limits, stopped=bool(outcome.fault)),
+        "fault": outcome.fault,
+        "room": room(standing.body.size),
+        "localization": localization_errors(truth, estimate),
+        "missed_decisions": outcome.runtime.counters.missed,
+        "seconds": time.perf_counter() - began,
+        "provenance": provenance(),
+    }
+
+
+def _series(truth: Truth, started: float, duration: float, estimates: Array) -> dict[str, Array]:
+    """Truth from the start of the guide's time, and the estimates at their own times."""
+    t = truth.time - started
+    rows = np.flatnonzero((t >= 0.0) & (t <= duration + 1e-6))
+    rows = rows[:: max(1, round(PERIOD / np.median(np.diff(truth.time))))]
+    estimates = estimates.reshape(-1, 5)
+    return {
+        "t": t[rows],
+        **{name: getattr(truth, name)[rows] for name in ("position", "quaternion", "nu", "thrust")},
+        "yaw": np.asarray(quat_yaw(truth.quaternion[rows])),
+        "estimate_t": estimates[:, 0],
+        "estimate": estimates[:, 1:4],
+        "estimate_yaw": estimates[:, 4],
+    }
+
+
+def write_series(path: Path, series: dict[str, Array]) -> None:
+    """Write PATH.npz."""
+    with atomic_write(path.with_name(f"{path.name}.npz")) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **series)
+
+
+def read_series(path: Path) -> dict[str, Array]:
+    """Read PATH.npz, which a trial leaves for figures, at 10 Hz.
+
+    `t` [s], `position` [m], `yaw` [rad] of the truth, `estimate` and `estimate_yaw`, and more.
+    """
+    with np.load(path.with_name(f"{path.name}.npz")) as file:
+        return {name: file[name] for name in file.files}
+
+
+def run_on_robot(
+    jobs: Sequence[Job],
+    folder: Path,
+    robot: OnRobot,
+    *,
+    attendant: Attendant | None = None,
+    console: Console | None = None,
+) -> list[dict[str, Any]]:
+    """Play on a robot what has no result yet, scored by its own estimate; those that are skipped are left out.
+
+    A trial that the bridge stopped counts. With nobody beside the water nothing is played after it.
+
+    Args:
+        jobs: Of one vehicle; plant 0, severity and camera `HARDWARE`.
+        folder: Takes KEY.json, KEY.npz and KEY.mcap of each, made if missing.
+        robot: Which, and how; not opened where nothing is left to play.
+        attendant: Instead of the terminal's keyboard.
+        console: Where it is told how it stands; standard error if None.
+
+    Raises:
+        RobotError: A trial was stopped, and nobody is there to look at the vehicle; the next call goes on. Or every
+            trial was skipped.
+        GoalError: A start or a goal lies outside the workspace.
+        PolicyError, ControlError: A controller does not fit the vehicle.
+        KeyboardInterrupt: Ctrl-C, or the operator ended the session.
+    """
+    vehicle, console = load_vehicle(jobs[0].vehicle), console or Console(stderr=True)
+    trials = {job.target: job_trial(job, vehicle) for job in jobs}
+    check_starts({target: start for target, (_, start) in trials.items()}, vehicle)
+    for trial, _ in trials.values():
+        check_reachable(trial.guide, vehicle)
+
+    def show(job: Job, result: Mapping[str, Any]) -> None:
+        held = "done" if result["success"] else result["fault"] or "not held"
+        console.print(f"  {held}", highlight=False, markup=False)
+        if result["fault"] and robot.unattended:
+            raise RobotError(
+                f"{job.row}, {job.target}: stopped, which counts: {result['fault']}: look at the vehicle, then give "
+                "the command again, which goes on with the next trial"
+            )
+
+    with ExitStack() as stack:
+        opened: list[Session] = []
+
+        def play(job: Job, path: Path) -> dict[str, Any] | None:
+            if not opened:
+                opened.append(
+                    stack.enter_context(session(robot, vehicle, attendant=attendant, console=console))
+                )
+            return _play_on_robot(job, path, opened[0])
+
+        results = campaign.run_in_turn(jobs, folder, play, show=show)
+    if not results:
+        raise RobotError("every trial was skipped: there is nothing to report")
+    return results
+
+
+def _play_on_robot(job: Job, path: Path, opened: Session) -> dict[str, Any] | None:
+    """One job; PATH.mcap takes the record, PATH.npz the series of the estimate. None if it was skipped."""
+    began, vehicle, record = time.perf_counter(), opened.vehicle, path.with_name(f"{path.name}.mcap")
+    trial, start = job_trial(job, vehicle, seed=job.seed)
+    outcome = opened.trial(
+        lambda: job_trial(job, vehicle, seed=job.seed)[0],
+        start,
+        record,
+        counts=True,
+        perception=lambda: Perception(vehicle, opened.site, fusion=job.fusion),
+        about={"command": f"finssim experiment {job.task}", "row": job.row},
+    )
+    if outcome is None:
+        return None
+    try:
+        motion = read_record(record, job.task, vehicle, guide=trial.guide, duration=trial.duration).estimate
+    except RecordedError:  # stopped before its first decision
+        nowhere = np.full((2, 3), np.nan)
+        motion = Motion(t=np.array([0.0, 0.1]), position=nowhere, yaw=nowhere[:, 0])
+    write_series(path, {"t": motion.t, "position": motion.position, "yaw": motion.yaw})
+    return {
+        **measure(job.task, trial.guide, motion, vehicle.force_limits, stopped=bool(outcome.fault)),
+        "fault": outcome.fault,
+        "room": room(vehicle.body.size),
+        "localization": None,
+        "robot": opened.robot.title,
+        "record": record.name,
+        "missed_decisions": outcome.runtime.counters.missed,
+        "seconds": time.perf_counter() - began,
+        "provenance": provenance(),
+    }
+
+
+def pool_jobs(controllers: Mapping[str, str], targets: Sequence[str], **settings: Any) -> list[Job]:
+    """A trial of every controller on every setpoint.
+
+    Args:
+        controllers: Name of the row -> policy directory or name of a PID.
+        targets: Setpoints of T1.
+        settings: What all jobs have in common.
+    """
+    return [
+        Job(row=name, controller=controller, target=target, **settings)
+        for name, controller in controllers.items()
+        for target in targets
+    ]
+
+
+def pool_evaluation(jobs: Sequence[Job], results: Sequence[Mapping[str, Any]], folder: Path) -> Evaluation:
+    """The trials of one controller in the form of an evaluation.
+
+    Args:
+        jobs: Of one row, on setpoints.
+        results: Of `run_jobs`, in the same order.
+        folder: Where `run_jobs` left the series.
+    """
+    job, first = jobs[0], results[0]
+    vehicle, standing = load_vehicle(job.vehicle), load_vehicle(job.pool_vehicle)
+    agent = agent_for(job.controller, vehicle, task_named("t1"))
+    measures = [
+        {"trial": i, "setpoint": job.target}
+        | {key: value for key, value in result.items() if key not in ("job", "key", "provenance")}
+        for i, (job, result) in enumerate(zip(jobs, results, strict=True))
+    ]
+    plant = {"name": "pool", "title": f"virtual pool {job.plant}, {job.severity}, around {job.pool_vehicle}"}
+    if first.get("robot"):
+        plant = {"name": "hardware", "title": f"robot {first['robot']}, by its own estimate"}
+    result = {
+        "controller": agent.describe() | {"name": job.row},
+        "task": "t1",
+        "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
+        "hydrodynamics": "calibrated",
+        "plant": plant,
+        "camera": job.camera,
+        "seed": job.seed,
+        **summarize(measures),
+        "provenance": dict(first["provenance"]),
+    }
+    series = [read_series(folder / str(r["key"])) for r in results]
+    motions = [Motion(t=s["t"], position=s["position"], yaw=s["yaw"]) for s in series]
+    goals = np.array([in_room(T1_SETPOINTS[job.target], standing) for job in jobs])
+    return Evaluation(result, Trials(tuple(job.target for job in jobs), goals, *on_grid(motions, DURATION)))

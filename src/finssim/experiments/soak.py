@@ -1,0 +1,166 @@
+"""`finssim experiment soak`: the robot's whole software at work for hours of vehicle time, its memory watched."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from finssim.experiments.campaign import Say, write_json
+from finssim.experiments.pool_trial import stand_in_pool
+from finssim.pool import VirtualPool
+from finssim.provenance import provenance
+from finssim.robot.goals import station_of
+from finssim.robot.lockstep import run_lockstep
+from finssim.robot.pilots import make_pilot
+from finssim.robot.runtime import Runtime
+from finssim.vehicles import load_vehicle
+
+__all__ = ["print_soak", "soak"]
+
+Array = NDArray[np.float64]
+
+SAMPLED = 10.0
+"""Vehicle time between two samples [s]."""
+WARM = 0.25
+"""The first part of a run does not count: caches fill [-]."""
+FLAT = 1.0
+"""Memory is flat if it grows by less in an hour of vehicle time [MiB/h]; 20 MiB in 20 hours."""
+GOAL = "0,0,-0.5,0"
+HEADS = ("vehicle_s", "wall_s", "memory_mib", "error_m", "state")
+
+
+def soak(
+    *,
+    out: Path,
+    hours: float = 20.0,
+    seed: int = 1,
+    severity: str = "realistic",
+    vehicle: str = "finsrov",
+    say: Say = lambda part, what: None,
+) -> dict[str, Any]:
+    """Keep a station in lock-step with a virtual pool, and sample the memory of this process.
+
+    Args:
+        out: Directory for `soak.json` and `soak.csv`, which grows as the run does.
+        hours: Vehicle time [h]; Ctrl-C ends it before, and what was done until then counts.
+        seed: Of the pool.
+        severity: Of the pool: nominal, realistic or hard.
+        vehicle: Name or file.
+        say: Told the share that is done and how it goes.
+
+    Returns:
+        What `soak.json` holds: `verdict`, `slope_mib_per_h`, first and last memory [MiB], errors [m], and totals.
+    """
+    duration, folder = 3600.0 * hours, Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    body, station = load_vehicle(vehicle), station_of(GOAL)
+    pool, site = stand_in_pool(body, station, plant=seed, severity=severity, seed=seed)
+    runtime = Runtime(body, site, make_pilot("pid", body), station, arm=True)
+    began = time.perf_counter()
+    with (folder / "soak.csv").open("w", newline="", encoding="utf-8") as file:
+        samples = _Samples(file, pool, lambda t, words: say(min(t / duration, 1.0), words))
+        run_lockstep(
+            runtime, pool, duration, gentle=True, show=samples, until=lambda r: r.bridge.state == "fault"
+        )
+    took = time.perf_counter() - began
+    rows = np.array([row[:4] for row in samples.rows], float)
+    result = {
+        "experiment": "soak",
+        "vehicle_h": pool.time / 3600.0,
+        "wall_s": took,
+        "times_real_time": pool.time / took,
+        **verdict(rows[:, 0], rows[:, 2]),
+        "error_rms_m": float(np.sqrt(np.mean(rows[1:, 3] ** 2))) if len(rows) > 1 else None,
+        "error_max_m": float(rows[1:, 3].max()) if len(rows) > 1 else None,
+        "faults": [event.text for event in runtime.counters.events if event.kind == "fault"],
+        "missed_decisions": runtime.counters.missed,
+        "decisions": runtime.counters.decisions,
+        "fixes": runtime.counters.fixes,
+        "severity": severity,
+        "seed": seed,
+        "provenance": provenance(),
+    }
+    write_json(folder / "soak.json", result)
+    return result
+
+
+def verdict(vehicle_s: Array, memory: Array) -> dict[str, Any]:
+    """Whether memory is flat: its slope over all but the warm-up, by least squares.
+
+    Args:
+        vehicle_s: Time of each sample [s], (k,).
+        memory: [MiB], (k,).
+
+    Returns:
+        `verdict`: flat, grows, or too short to tell; `slope_mib_per_h`, None if too short; `first_mib`, `last_mib`.
+    """
+    kept = vehicle_s >= vehicle_s[-1] * WARM
+    ends = {"first_mib": float(memory[0]), "last_mib": float(memory[-1])}
+    if kept.sum() < 10:
+        return {"verdict": "too short to tell", "slope_mib_per_h": None, **ends}
+    slope = 3600.0 * float(np.polyfit(vehicle_s[kept], memory[kept], 1)[0])
+    return {"verdict": "flat" if slope < FLAT else "grows", "slope_mib_per_h": slope, **ends}
+
+
+def memory_mib() -> float:
+    """Memory of this process that is in use now [MiB]; the most it ever was where the system tells no more."""
+    try:
+        # Not statm, which on a machine of many processors may be tens of MiB behind.
+        told = Path("/proc/self/smaps_rollup").read_text(encoding="ascii")
+        return int(re.search(r"^Rss:\s+(\d+) kB", told, re.MULTILINE)[1]) / 1024.0  # type: ignore[index]
+    except OSError:
+        import resource
+
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+class _Samples:
+    """A row of the table for every so much of vehicle time."""
+
+    def __init__(self, file: Any, pool: VirtualPool, say: Any) -> None:
+        self.rows: list[tuple[float, float, float, float, str]] = []
+        self._file, self._writer, self._pool, self._say = file, csv.writer(file), pool, say
+        self._began, self._next = time.perf_counter(), 0.0
+        self._writer.writerow(HEADS)
+
+    def __call__(self, runtime: Runtime) -> None:
+        if self._pool.time >= self._next:
+            self._next += SAMPLED
+            self._sample(runtime)
+
+    def _sample(self, runtime: Runtime) -> None:
+        goal = runtime.guide.at(0.0).position
+        error = float(np.linalg.norm(self._pool.plant.position - goal))
+        wall = time.perf_counter() - self._began
+        row = (self._pool.time, wall, memory_mib(), error, runtime.bridge.state)
+        self.rows.append(row)
+        self._writer.writerow([f"{value:.4f}" if isinstance(value, float) else value for value in row])
+        self._file.flush()
+        self._say(row[0], f"{row[0] / 3600.0:.2f} h, {row[2]:.1f} MiB, {row[4]}")
+
+
+def print_soak(result: Mapping[str, Any], console: Console) -> None:
+    """Print what came out."""
+    slope = result["slope_mib_per_h"]
+    grown = "" if slope is None else f", {slope:+.2f} MiB per hour of vehicle time"
+    rms = result["error_rms_m"]
+    lines = [
+        f"{result['vehicle_h']:.2f} h of vehicle time in {result['wall_s'] / 60.0:.1f} min, "
+        f"{result['times_real_time']:.1f} times real time",
+        f"memory: {result['verdict']}{grown}; {result['first_mib']:.1f} MiB at the start, "
+        f"{result['last_mib']:.1f} at the end",
+        f"off the station: rms {math.nan if rms is None else 100.0 * rms:.1f} cm; "
+        f"faults: {'; '.join(result['faults']) or 'none'}; "
+        f"decisions missed: {result['missed_decisions']} of {result['decisions']}",
+    ]
+    for line in lines:
+        console.print(line, highlight=False, soft_wrap=True)

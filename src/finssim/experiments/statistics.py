@@ -1,0 +1,162 @@
+"""What figures are worth: bootstrap intervals over clusters, of paired differences, of robust aggregates over seeds.
+
+Aggregates over seeds are those of Agarwal et al. 2021, Deep RL at the Edge of the Statistical Precipice. Their scores
+are (runs, strata): one row for each training, one column for each setpoint, trajectory or kind of episode. A score that
+was not reached is infinitely bad: +inf where less is better, -inf where more is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = [
+    "Interval",
+    "RESAMPLES",
+    "SEED",
+    "Statistic",
+    "better",
+    "bootstrap",
+    "interquartile_mean",
+    "paired_difference",
+    "probability_of_improvement",
+    "with_bootstrap",
+    "with_interval",
+]
+
+Array = NDArray[np.float64]
+Statistic = Callable[..., Any]
+"""Of all values together, one number."""
+
+RESAMPLES = 2000
+SEED = 20260903
+TRIM = 0.25
+"""Part of the scores that is left out at each end."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A figure and where its bootstrap puts it."""
+
+    value: float
+    low: float
+    high: float
+    """2.5 and 97.5 %."""
+    count: int
+    """Trials or runs it rests on."""
+
+    @property
+    def excludes_zero(self) -> bool:
+        """Whether the sign is supported."""
+        return self.low > 0.0 or self.high < 0.0
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data; a number that is infinite is None."""
+        value, low, high = (x if math.isfinite(x) else None for x in (self.value, self.low, self.high))
+        return {"value": value, "ci95": [low, high], "count": self.count}
+
+
+def bootstrap(redraw: Callable[[np.random.Generator], ArrayLike], resamples: int | None = None) -> Array:
+    """Where 95 % of redrawn figures lie.
+
+    Args:
+        redraw: Draws the data with replacement and returns its figure, or figures.
+        resamples: How often; `RESAMPLES` if None.
+
+    Returns:
+        2.5 and 97.5 %, (2, ...), each one of the redrawn figures: nothing lies between a finite and an infinite one.
+    """
+    random = np.random.default_rng(SEED)
+    drawn = np.array([redraw(random) for _ in range(resamples or RESAMPLES)], float)
+    return np.asarray(np.quantile(drawn, (0.025, 0.975), axis=0, method="inverted_cdf"))
+
+
+def with_interval(
+    values: Mapping[Hashable, Sequence[float]], statistic: Statistic = np.mean
+) -> Interval | None:
+    """A statistic over all values and its interval from redrawing whole clusters.
+
+    Trials of one plant and seed share their vehicle, camera, water and network, so they are no independent draws: the
+    bootstrap draws clusters with replacement and keeps what is in each.
+
+    Args:
+        values: Cluster -> its values.
+        statistic: Of all values together.
+
+    Returns:
+        None without any value.
+    """
+    groups = [np.asarray(group, float) for group in values.values() if len(group)]
+    if not groups:
+        return None
+    low, high = bootstrap(
+        lambda random: statistic(
+            np.concatenate([groups[k] for k in random.integers(len(groups), size=len(groups))])
+        )
+    )
+    everything = np.concatenate(groups)
+    return Interval(float(statistic(everything)), float(low), float(high), len(everything))
+
+
+def paired_difference(
+    ours: Mapping[tuple[int, int, str], float], theirs: Mapping[tuple[int, int, str], float]
+) -> Interval | None:
+    """Mean of theirs - ours over the trials that both have, clustered by plant and seed.
+
+    Args:
+        ours: (plant, seed, target) -> figure of the reference.
+        theirs: The same of what is compared with it.
+    """
+    clusters: dict[Hashable, list[float]] = {}
+    for pair in sorted(ours.keys() & theirs.keys()):
+        clusters.setdefault(pair[:2], []).append(theirs[pair] - ours[pair])
+    return with_interval(clusters)
+
+
+def interquartile_mean(scores: Array) -> float:
+    """Mean of the middle half of all scores, runs and strata together.
+
+    Scores at the quartiles count by the part of them that lies inside, so that 5 scores have a middle half too.
+    """
+    x = np.sort(np.asarray(scores, dtype=float).ravel())
+    edges = np.arange(len(x) + 1) / len(x)
+    inside = np.clip(np.minimum(edges[1:], 1.0 - TRIM) - np.maximum(edges[:-1], TRIM), 0.0, None)
+    counted = inside > 0.0
+    return float(np.sum(inside[counted] * x[counted]) / np.sum(inside))
+
+
+def with_bootstrap(scores: Sequence[Array], statistic: Statistic, resamples: int | None = None) -> Interval:
+    """A statistic of one or more sets of scores, and where a bootstrap stratified by column puts it.
+
+    Runs are drawn with replacement in each column by itself; where every set has one run, the interval has no width.
+    """
+
+    def redraw(random: np.random.Generator) -> float:
+        rows = (random.integers(0, len(one), one.shape) for one in scores)
+        drawn = [np.take_along_axis(one, row, axis=0) for one, row in zip(scores, rows, strict=True)]
+        return float(statistic(*drawn))
+
+    low, high = bootstrap(redraw, resamples)
+    return Interval(float(statistic(*scores)), float(low), float(high), sum(map(len, scores)))
+
+
+def probability_of_improvement(a: Array, b: Array, less_is_better: bool) -> float:
+    """Chance that a run of `a` beats one of `b` in a stratum, mean over the strata; a tie counts half.
+
+    It is the Mann-Whitney statistic over the product of the counts.
+    """
+    left, right = a[:, None, :], b[None, :, :]
+    wins = (left < right) if less_is_better else (left > right)
+    return float(np.mean(wins + 0.5 * (left == right)))
+
+
+def better(interval: Interval) -> bool | None:
+    """Whether a probability of improvement says better (True), worse (False), or leaves it open (None)."""
+    if interval.low > 0.5:
+        return True
+    return False if interval.high < 0.5 else None

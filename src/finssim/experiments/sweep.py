@@ -1,0 +1,373 @@
+"""`finssim sweep`: trainings over settings and seeds, on one machine or many, and one table of what came of them."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import io
+import json
+import logging
+import os
+import socket
+import tarfile
+import tempfile
+import time
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from finssim.experiments.campaign import spread, write_json
+from finssim.experiments.compare import MEASURES
+from finssim.experiments.evaluate import evaluate_controller
+from finssim.experiments.plants import load_plant
+from finssim.experiments.tables import console_table, markdown_table
+from finssim.files import atomic_directory, plain_name
+from finssim.learning.train import train
+from finssim.provenance import provenance
+from finssim.tasks import TASKS
+from finssim.yaml_file import first_problem, read_mapping
+
+__all__ = ["SweepError", "sweep"]
+
+RESULT_FILE = "sweep.json"
+ROW_FILE = "sweep-row.json"
+PATIENCE = 10.0
+"""For an answer to a first knock [s]."""
+RETRIES = 3
+"""How often a job is begun anew after its worker was lost."""
+SAME_FOR_ALL = ("task", "out", "seed", "console", "shown", "interrupted", "resume", "device", "vehicle")
+"""Arguments of a training that a sweep sets itself."""
+FILES = ("vehicle", "plants", "randomize")
+"""Keys whose values may name files."""
+
+
+class SweepError(ValueError):
+    """A sweep that cannot be run."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training and the evaluation of what came of it."""
+
+    name: str
+    """Of the setting."""
+    seed: int
+    task: str
+    vehicle: str
+    options: Mapping[str, Any]
+    """Arguments of `finssim.learning.train.train`."""
+    plants: tuple[str, ...]
+    trials: int | None
+
+    @cached_property  # a file that is changed while the sweep runs must not rename its jobs
+    def key(self) -> str:
+        """Name of its folder: with a digest of everything that decides what comes of it, files too, then the seed.
+
+        Those of a setting differ in the number at their end alone, so that `finssim compare` takes them together.
+        """
+        about = [self.task, self.vehicle, dict(self.options), self.plants, self.trials]
+        digest = hashlib.sha256(json.dumps(about, sort_keys=True, default=str).encode())
+        for value in (self.vehicle, *self.plants, *self.options.values()):
+            if isinstance(value, str) and Path(value).is_absolute() and Path(value).is_file():
+                digest.update(Path(value).read_bytes())
+        return f"{self.name}-{digest.hexdigest()[:8]}-seed{self.seed}"
+
+
+class Evaluate(BaseModel):
+    """How each policy is tried."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    plants: tuple[str, ...] = Field(default=("nominal",), min_length=1)
+    trials: int | None = Field(default=None, ge=1)
+
+
+class Sweep(BaseModel):
+    """A sweep file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    task: str
+    vehicle: str = "finsrov"
+    seeds: tuple[int, ...]
+    """Of the trainings: a list, or how many, from 1."""
+    train: dict[str, Any] = Field(default_factory=dict)
+    """Options of every training, as `finssim train` takes them."""
+    settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    """Name -> options that differ."""
+    grid: dict[str, list[Any]] = Field(default_factory=dict)
+    """Option -> values; every combination is a setting, on top of each of `settings`."""
+    evaluate: Evaluate = Evaluate()
+
+    @field_validator("seeds", mode="before")
+    @classmethod
+    def _counted(cls, value: Any) -> Any:
+        return tuple(range(1, value + 1)) if isinstance(value, int) and not isinstance(value, bool) else value
+
+    @model_validator(mode="after")
+    def _known(self) -> Sweep:
+        if self.task not in TASKS:
+            raise ValueError(f"task is '{self.task}', expected one of {', '.join(TASKS)}")
+        if not self.seeds or len(set(self.seeds)) < len(self.seeds):
+            raise ValueError(f"seeds are {list(self.seeds)}, expected at least one, each once")
+        known = [name for name in inspect.signature(train).parameters if name not in SAME_FOR_ALL]
+        for options in (self.train, self.grid, *self.settings.values()):
+            for name in options:
+                if name not in known:
+                    raise ValueError(f"'{name}' is no option of a training; available: {', '.join(known)}")
+        return self
+
+    def jobs(self) -> list[Job]:
+        """Every setting with every seed; seed by seed, so that each setting has some results early."""
+        combinations = [dict(zip(self.grid, values, strict=True)) for values in product(*self.grid.values())]
+        variants = [
+            (_named(name, combination), {**self.train, **own, **combination})
+            for name, own in (self.settings or {"": {}}).items()
+            for combination in combinations
+        ]
+        return [
+            Job(name, seed, self.task, self.vehicle, options, self.evaluate.plants, self.evaluate.trials)
+            for seed in self.seeds
+            for name, options in variants
+        ]
+
+
+def _named(name: str, combination: Mapping[str, Any]) -> str:
+    """Of a setting: its own name and what the grid sets, as it names a folder.
+
+    Raises:
+        SweepError: It cannot.
+    """
+    parts = [name] if name else []
+    parts += [f"{option}-{Path(str(value)).stem}" for option, value in combination.items()]
+    return plain_name("_".join(parts) or "run", "setting", SweepError)
+
+
+def load_sweep(path: str | Path) -> Sweep:
+    """Read a sweep file; files that it names are taken from its own folder.
+
+    Raises:
+        SweepError: It is not there, or something in it is not as expected; says where.
+        PlantError: A plant that it names is not there, or wrong: told now, and not after the first training.
+    """
+    data = _placed(read_mapping(Path(path), SweepError, such_as="task: t1"), Path(path).parent)
+    try:
+        sweep = Sweep.model_validate(data)
+    except ValidationError as error:
+        raise SweepError(f"{path}: {first_problem(error)}") from error
+    for name in sweep.evaluate.plants:
+        load_plant(name)
+    return sweep
+
+
+def _placed(value: Any, folder: Path, key: Any = "") -> Any:
+    """What a sweep file holds, with files beside it by their whole paths."""
+    if isinstance(value, dict):
+        return {name: _placed(one, folder, name) for name, one in value.items()}
+    if isinstance(value, list):
+        return [_placed(one, folder, key) for one in value]
+    beside = folder / value if isinstance(value, str) and key in FILES else None
+    return str(beside.resolve()) if beside is not None and beside.is_file() else value
+
+
+def play(job: Job) -> tuple[dict[str, Any], bytes]:
+    """Train and evaluate, on whatever machine.
+
+    Returns:
+        A row of the table (results by plant, time, machine) and the policy directory, packed.
+    """
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    began = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "policy"
+        quiet = Console(file=io.StringIO())
+        train(job.task, out=out, vehicle=job.vehicle, seed=job.seed, console=quiet, **job.options)
+        trained = time.perf_counter() - began
+        results = {
+            plant.name: evaluate_controller(
+                out, plant, task=job.task, vehicle=job.vehicle, trials=job.trials
+            ).result
+            for plant in map(load_plant, job.plants)
+        }
+        packed = io.BytesIO()
+        with tarfile.open(fileobj=packed, mode="w:gz") as archive:
+            for path in sorted(out.iterdir()):
+                archive.add(path, arcname=path.name)
+        row = {"training_s": trained, "machine": socket.gethostname(), "plants": results}
+        return row, packed.getvalue()
+
+
+def _here(jobs: Sequence[Job], processes: int | None) -> Generator[tuple[Job, Any], None, None]:
+    """Each job with its outcome or its error, from processes of this machine."""
+    with closing(spread(play, jobs, processes)) as played:
+        for job, future in played:
+            yield job, future.exception() or future.result()
+
+
+def _on_cluster(jobs: Sequence[Job], address: str) -> Generator[tuple[Job, Any], None, None]:
+    """The same from a Ray cluster; a job whose worker or machine is lost begins anew elsewhere, `RETRIES` times.
+
+    Raises:
+        SweepError: Ray is not installed, or nothing answers at the address.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise SweepError("a cluster needs Ray: pip install 'finssim[sweep]'") from error
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    _knock(address)
+    try:
+        environment = {"env_vars": {"OMP_NUM_THREADS": "1"}}
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, runtime_env=environment)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise SweepError(f"no Ray cluster answers at {address}: {str(error).splitlines()[0]}") from error
+    try:
+        task = ray.remote(num_cpus=1, max_retries=RETRIES)(play)
+        waiting = {task.remote(job): job for job in jobs}
+        while waiting:
+            (reference,), _ = ray.wait(list(waiting), num_returns=1)
+            job = waiting.pop(reference)
+            try:
+                yield job, ray.get(reference)
+            except ray.exceptions.RayTaskError as error:  # the job itself raised
+                yield job, error.cause or error
+            except ray.exceptions.RayError as error:
+                yield job, SweepError(f"lost {RETRIES + 1} times: {str(error).splitlines()[0]}")
+    finally:
+        ray.shutdown()
+
+
+def _knock(address: str) -> None:
+    """Refuse an address where nothing listens at once: Ray itself tries for minutes."""
+    if address == "auto":
+        return
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not host or not port.isdigit():
+        raise SweepError(f"address is '{address}', expected HOST:PORT or auto")
+    try:
+        socket.create_connection((host, int(port)), timeout=PATIENCE).close()
+    except (OSError, OverflowError) as error:
+        raise SweepError(f"no Ray cluster answers at {address}: {error}") from error
+
+
+def sweep(
+    file: Path,
+    *,
+    out: Path,
+    address: str | None = None,
+    processes: int | None = None,
+    as_json: bool = False,
+    console: Console | None = None,
+) -> dict[str, Any]:
+    """Train and evaluate every setting with every seed; what is in the directory already is not done again.
+
+    Args:
+        file: What to do (`finssim.experiments.sweep.Sweep`).
+        out: Directory: `runs/` with a policy directory for each job, `sweep.json`, `sweep.md`.
+        address: Of a Ray cluster; processes of this machine if None.
+        processes: Jobs at once on this machine; as many as processors if None.
+        as_json: Print one JSON object in place of the table.
+        console: Where the table goes; standard output if None.
+
+    Returns:
+        What `sweep.json` has: `rows` (name, seed, run, training_s, machine, plants; or `error`), `ok`, provenance.
+
+    Raises:
+        SweepError: The file says what cannot be, or no cluster answers.
+        KeyboardInterrupt: After Ctrl-C; what was finished stays.
+    """
+    jobs, runs, began = load_sweep(file).jobs(), out / "runs", time.perf_counter()
+    files = {job.key: runs / job.key / ROW_FILE for job in jobs}
+    rows = {
+        key: json.loads(path.read_text(encoding="utf-8")) for key, path in files.items() if path.is_file()
+    }
+    missing = [job for job in jobs if job.key not in rows]
+    screen = Console(stderr=True)
+    columns = (
+        TextColumn("sweep"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    played = _here(missing, processes) if address is None else _on_cluster(missing, address)
+    with closing(played), Progress(*columns, console=screen, disable=not screen.is_terminal) as bar:
+        task = bar.add_task("sweep", total=len(jobs), completed=len(rows))
+        for job, outcome in played if missing else ():
+            rows[job.key] = row = _keep(job, outcome, runs)
+            bar.advance(task)
+            if not screen.is_terminal:
+                error = f": {row['error']}" if "error" in row else ""
+                screen.print(f"{len(rows)} of {len(jobs)}: {job.key}{error}", highlight=False)
+    result = {
+        "rows": [rows[job.key] for job in jobs],
+        "ok": all("error" not in row for row in rows.values()),
+        "seconds": time.perf_counter() - began,
+        "provenance": provenance(),
+    }
+    heads, cells = rows_of(result)
+    page = f"# Sweep\n\n{markdown_table(heads, cells, left=range(len(heads)))}\n"
+    write_json(out / RESULT_FILE, result, page)
+    if as_json:
+        print(json.dumps(result, allow_nan=False))
+    else:
+        (console or Console()).print(console_table(heads, cells, left=(0, 2)))
+    return result
+
+
+def _keep(job: Job, outcome: Any, runs: Path) -> dict[str, Any]:
+    """A job's row; with its policy it is written whole or not at all."""
+    about = {"name": job.name, "seed": job.seed, "run": job.key, "options": dict(job.options)}
+    if isinstance(outcome, BaseException):
+        return {**about, "error": f"{type(outcome).__name__}: {outcome}"}
+    row, packed = {**about, **outcome[0]}, io.BytesIO(outcome[1])
+    with atomic_directory(runs / job.key, replaces=ROW_FILE) as folder:
+        with tarfile.open(fileobj=packed, mode="r:gz") as archive:
+            archive.extractall(folder, filter="data")
+        (folder / ROW_FILE).write_text(json.dumps(row, indent=1) + "\n", encoding="utf-8")
+    return row
+
+
+def rows_of(result: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """The heads, and a row for each run and plant: its measures, or what went wrong."""
+    first: dict[str, Any] = next(
+        (one for row in result["rows"] for one in row.get("plants", {}).values()), {}
+    )
+    measures = list(first.get("metrics", ())) or [
+        name for name in MEASURES.get(str(first.get("task")), ()) if name in first
+    ]
+    rows = []
+    for row in result["rows"]:
+        if "error" in row:
+            words = [row["error"], *[""] * len(measures)][: len(measures)]
+            rows.append([row["name"], str(row["seed"]), "–", "–", *words])
+        for plant, one in row.get("plants", {}).items():
+            cells = [_cell(one, measure) for measure in measures]
+            rows.append([row["name"], str(row["seed"]), plant, f"{row['training_s']:.0f}", *cells])
+    return ["run", "seed", "plant", "time [s]", *measures], rows
+
+
+def _cell(result: Mapping[str, Any], measure: str) -> str:
+    if "metrics" in result:
+        value = result["metrics"][measure]["value"]
+    elif measure == "success":
+        return f"{result['success']}/{result['trials']}"
+    else:
+        value = result[measure]
+    return "–" if value is None else f"{value:.4g}"

@@ -1,0 +1,124 @@
+"""A campaign plays each trial once, keeps what is finished, and returns results in the order of its jobs."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from signal import SIGINT, SIGKILL, SIGTERM
+
+import pytest
+
+from finssim.experiments.campaign import run_jobs
+from finssim.experiments.pool_trial import Job
+from reference import played
+
+ROOT = Path(__file__).resolve().parents[2]
+JOBS = [Job(row="pid", controller="pid", target=target) for target in ("P01", "P02", "P03")]
+
+
+def marks(folder):
+    """Targets that were played, sorted."""
+    return sorted((folder / "played.txt").read_text().split())
+
+
+@pytest.mark.slow
+def test_results_come_in_the_order_of_the_jobs(tmp_path):
+    """Whatever process ended first."""
+    results = run_jobs(JOBS, tmp_path, played.known, processes=2)
+    assert [r["job"]["target"] for r in results] == ["P01", "P02", "P03"]
+    assert [r["success"] for r in results] == [True, False, True]
+
+
+@pytest.mark.slow
+def test_what_is_finished_is_not_played_again(tmp_path):
+    """A second call plays only what is new."""
+    run_jobs(JOBS[:2], tmp_path, played.known, processes=1)
+    told, shown = [], []
+    run_jobs(
+        JOBS,
+        tmp_path,
+        played.known,
+        processes=1,
+        say=lambda part, what: told.append(part),
+        show=lambda job, result: shown.append((job.target, result["success"])),
+    )
+    assert marks(tmp_path) == ["P01", "P02", "P03"]
+    assert told[-1] == 1.0 and shown == [("P03", True)]
+
+
+@pytest.mark.slow
+def test_a_trial_that_breaks_loses_no_other(tmp_path):
+    """Its error is raised; the results so far stay, whole."""
+    with pytest.raises(RuntimeError, match="P02 broke"):
+        run_jobs(JOBS, tmp_path, played.failing, processes=1)
+    kept = [json.loads(path.read_text()) for path in tmp_path.glob("*.json")]
+    assert [r["job"]["target"] for r in kept] == ["P01"]
+
+
+def gone(pid):
+    """Whether a process has ended."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    return Path(f"/proc/{pid}/stat").read_text().split()[2] == "Z"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("signal", [SIGTERM, SIGKILL, SIGINT], ids=lambda signal: signal.name)
+def test_workers_do_not_outlive_a_campaign(tmp_path, signal):
+    """However it ends: nobody is left playing trials that nobody waits for."""
+    program = (
+        "import sys; sys.path.insert(0, 'tests')\n"
+        "from pathlib import Path\nfrom reference import played\n"
+        "from finssim.experiments.campaign import run_jobs\n"
+        "from finssim.experiments.pool_trial import Job\n"
+        "if __name__ == '__main__':\n"
+        "    jobs = [Job(row='pid', controller='pid', target='P01')]\n"
+        f"    run_jobs(jobs, Path({str(tmp_path)!r}), played.endless, processes=1)\n"
+    )
+    script = tmp_path / "campaign_of_one.py"
+    script.write_text(program)
+    campaign = subprocess.Popen([sys.executable, script], cwd=ROOT, stderr=subprocess.DEVNULL)
+    mark = tmp_path / "pid.txt"
+    wait_until(lambda: mark.is_file() and mark.read_text())
+    worker = int(mark.read_text())
+    campaign.send_signal(signal)
+    campaign.wait(60.0)
+    wait_until(lambda: gone(worker))
+
+
+def wait_until(true):
+    """Wait for something that comes soon, or fail."""
+    for _ in range(1200):
+        if true():
+            return
+        time.sleep(0.1)
+    raise AssertionError("nothing happened for two minutes")
+
+
+def test_a_key_names_everything_that_decides_the_result():
+    """Another noise, camera or plant is another trial; another row of the same trial differs in its name alone."""
+    base = JOBS[0]
+    others = [
+        Job(row="pid", controller="pid", target="P01", **change)
+        for change in (
+            {"plant": 2},
+            {"seed": 2},
+            {"severity": "hard"},
+            {"camera": "corners"},
+            {"fusion": False},
+            {"trim": True},
+            {"position_noise": 0.05},
+            {"yaw_noise": 0.1},
+            {"vehicle": "bluerov2"},
+            {"pool_vehicle": "bluerov2"},
+            {"duration": 30.0},
+        )
+    ]
+    assert len({job.key() for job in (base, *others)}) == len(others) + 1
+    assert Job(row="x", controller="pid", target="P01").key().removeprefix("x") == base.key().removeprefix(
+        "pid"
+    )

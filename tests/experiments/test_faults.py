@@ -1,0 +1,74 @@
+"""`finssim experiment faults`, as a person types it, and its table."""
+
+import json
+
+import pytest
+
+from finssim import boundary
+from finssim.cli import app
+from finssim.experiments.faults import faults_table, row_ok
+
+GOOD = {
+    "ok": True, "thrust_gone_s": 0.4, "frames_off_s": 0.1, "margin_m": 0.2, "state": "fault", "reason": "silence",
+    "raised": "", "record_lost_s": 0.2, "record_problem": "",
+}  # fmt: skip
+
+
+def trial(row, **changes):
+    return {**GOOD, "job": {"row": row, "target": "up moving", "plant": 1}, **changes}
+
+
+def told(*trials):
+    result = {"severity": "realistic", "seeds": [1], "vehicle": {"name": "finsrov", "sha256": "0" * 64}}
+    shown = faults_table({**result, "trials": list(trials)})
+    return shown.rows, shown
+
+
+@pytest.mark.slow
+def test_the_command_plays_a_scenario_and_goes_on_where_it_was(capsys, tmp_path):
+    """The control, which fails as it must: status 0, a result and a table; again, without playing."""
+    words = ["experiment", "faults", "--scenarios", "control", "--processes", "1", "--out", str(tmp_path)]
+    assert boundary.run(app, [*words, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    (only,) = result["trials"]
+    assert result["ok"] and not only["ok"] and only["margin_m"] < 0.0
+    written = next((tmp_path / "trials").glob("*.json")).stat().st_mtime_ns
+    assert boundary.run(app, words) == 0
+    assert "control" in capsys.readouterr().out
+    assert next((tmp_path / "trials").glob("*.json")).stat().st_mtime_ns == written
+    assert "fails, as it must" in (tmp_path / "faults.md").read_text()
+
+
+def test_an_unknown_scenario_is_refused(capsys, tmp_path):
+    """With the names of those there are."""
+    assert boundary.run(app, ["experiment", "faults", "--scenarios", "flood", "--out", str(tmp_path)]) == 2
+    assert "unknown scenario 'flood'; available: kill-robot" in capsys.readouterr().err
+
+
+def test_a_row_shows_the_worst_of_its_trials():
+    """Longest times, least margin, and every way in which they ended."""
+    rows, shown = told(
+        trial("link-cut"),
+        trial("link-cut", thrust_gone_s=0.9, margin_m=0.1, reason="noise"),
+        trial("link-cut", thrust_gone_s=None, state="armed", reason="", record_lost_s=0.5),
+    )
+    (row,) = rows
+    assert row[1:5] == ["3", "0.90, 1 drive on", "0.10", "0.10"] and row[6:] == ["0.50", "passed"]
+    assert "1 × fault: noise" in row[5] and "1 × armed" in row[5]
+    assert "passed: 3 of 3" in shown.headline and not shown.sentences
+
+
+def test_what_failed_is_told():
+    """In its row, in the count, and in a sentence with its numbers."""
+    rows, shown = told(trial("mcu-reboot", ok=False, thrust_gone_s=None, margin_m=-0.3), trial("mcu-reboot"))
+    assert rows[0][-1] == "FAILED 1" and "passed: 1 of 2" in shown.headline
+    (sentence,) = shown.sentences
+    assert "thrust never ended, inside by -0.30 m" in sentence
+
+
+def test_a_control_that_passes_is_wrong():
+    """The table could not tell then."""
+    assert row_ok("control", [trial("control", ok=False)]) and not row_ok("control", [trial("control")])
+    assert not row_ok("link-cut", [trial("link-cut", ok=False)]) and not row_ok("link-cut", [])
+    rows, _ = told(trial("control"))
+    assert rows[0][-1] == "PASSED, which a control must not"

@@ -1,0 +1,35 @@
+"""Square waves: to and fro around where they began."""
+
+import numpy as np
+import pytest
+
+from finssim.calibration.excitation.travel import travel
+from finssim.experiments.excitation import box_of, place_of
+from finssim.experiments.programmes import PERIODS, shuttles
+from finssim.pool.plant_spec import Basin
+from finssim.vehicles import AXES, load_vehicle
+
+VEHICLE = load_vehicle("finsrov")
+
+
+@pytest.mark.parametrize("axis", PERIODS)
+def test_as_much_forward_as_back_and_named_by_axis_and_level(axis):
+    (programme,) = shuttles({axis: [1.0]}, VEHICLE)
+    push = programme.tau_desired[:, AXES.index(axis)]
+    assert programme.name == f"{axis}_shuttle_1" and programme.axes == (axis,)
+    assert (
+        abs(push.sum()) <= 0.25 * PERIODS[axis] * programme.rate + 1
+    )  # half of a push is left over at the end
+    assert set(np.unique(push)) == {-1.0, 0.0, 1.0}
+    assert (push[programme.phase != "excitation"] == 0.0).all()
+
+
+@pytest.mark.parametrize(("axis", "level"), [("surge", 18.0), ("sway", 13.5), ("heave", 13.5)])
+def test_the_way_fits_the_room_on_either_side_of_the_start(axis, level):
+    """By the damping of the vehicle's file; the start is the middle of the pool."""
+    (programme,) = shuttles({axis: [level]}, VEHICLE)
+    place = place_of(programme, VEHICLE, box_of(Basin()))
+    assert place.position[:2] == pytest.approx((0.0, 0.0), abs=1e-12)
+    assert (
+        travel(programme.tau_desired[:, AXES.index(axis)], programme.rate, axis, VEHICLE) < 2.0 * place.room
+    )
