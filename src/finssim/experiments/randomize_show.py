@@ -27,6 +27,7 @@ from finssim.experiments.tables import console_table
 from finssim.files import atomic_directory
 from finssim.provenance import provenance
 from finssim.vehicles import AXES, Vehicle, load_vehicle
+from finssim.vehicles.terms import unit_of
 
 __all__ = ["randomize_show"]
 
@@ -88,8 +89,11 @@ def rows_of(ranges: Ranges, vehicle: Vehicle, hydrodynamics: str = "calibrated")
             if nominal != 0.0:
                 keys = f"{family}.all", f"{family}.{axis}"
                 rows += scaled(f"{family}.{axis}", nominal, units[i // 3], *keys)
-    for factor in ("surge_damping", "mesh_drag"):
-        rows += scaled(factor, 1.0, "factor", factor)
+    rows += scaled("mesh_drag", 1.0, "factor", "mesh_drag")
+    for term in ranges.terms:
+        if term in INDEX and ENTRIES[INDEX[term]].unit == "1":
+            one = np.ndim(p.get(term, np.zeros(1))) == 0
+            rows += scaled(term, float(p[term]) if one else 1.0, unit_of(term) if one else "factor", term)
     rows += scaled(f"thrust ({name})", p["force_max"][0], "N", "thrust.all", "thrust.each.0")
     rows += scaled("thrust.failure, of each", 1.0, "factor", "thrust.failure.0")
     lag = ("time_constant.all", "time_constant.each.0")
