@@ -18,10 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from finssim.calibration.excitation.measurement import NoiseProfile
 from finssim.calibration.excitation.programmes import Programme
 from finssim.calibration.excitation.recording import record
-from finssim.calibration.excitation.synthetic import trials_of
+from finssim.calibration.excitation.synthetic import NoiseProfile, trials_of
 from finssim.calibration.hydrodynamics import fit_hydrodynamics
 from finssim.calibration.output.calibrate import calibrated
 from finssim.calibration.replay.replay import replay

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from calibration.made_steps import step_log
 from finssim.calibration.actuators.motor import fit_motor
-from finssim.calibration.actuators.speed_loop import LoopPlant, simulate_step, tune
+from finssim.calibration.actuators.speed_report import LoopPlant, simulate_step, tune
 from finssim.vehicles import load_vehicle
 
 PLANT = LoopPlant(gain=0.9, delay=0.05, time_constant=0.12, dead_minus=-30.0, dead_plus=35.0, limit=300.0)

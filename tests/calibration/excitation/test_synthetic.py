@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excitation.measurement import NOISE_PROFILES, NoiseProfile
 from finssim.calibration.excitation.programmes import programmes
 from finssim.calibration.excitation.recording import record
-from finssim.calibration.excitation.synthetic import simulate_programme, trials_of
+from finssim.calibration.excitation.synthetic import (
+    NOISE_PROFILES,
+    NoiseProfile,
+    simulate_programme,
+    trials_of,
+)
 from finssim.engine import Water
 from finssim.geometry.rotations import quat_rotate
 from finssim.vehicles import load_vehicle

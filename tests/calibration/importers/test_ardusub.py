@@ -8,9 +8,8 @@ import pytest
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.importers import import_trials
-from finssim.calibration.importers.ardupilot_log import Log
+from finssim.calibration.importers.ardusub import Log, velocity_stream
 from finssim.calibration.importers.ardusub_outputs import FRAMES, outputs_of
-from finssim.calibration.importers.ardusub_velocity import velocity_stream
 from finssim.calibration.importers.dispatch import read_trials
 from finssim.calibration.trials.trial_files import load_trial
 from finssim.geometry.frames import FROM_FOSSEN

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.regression.buoyant_rise import buoyant_rise
 from finssim.calibration.regression.free_decay import free_decay
-from finssim.calibration.regression.passive import passive
-from finssim.calibration.regression.pooling import pooled
+from finssim.calibration.regression.passive import buoyant_rise, passive, pooled
 from finssim.calibration.regression.regress import regress
 from finssim.calibration.trials.header import Header
 from finssim.calibration.trials.trial import Trial

@@ -7,13 +7,11 @@ import pytest
 
 from calibration.known_trials import trials, truth
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excitation.measurement import NoiseProfile
-from finssim.calibration.regression.axis_data import axis_data, prepare
+from finssim.calibration.excitation.synthetic import NoiseProfile
 from finssim.calibration.regression.axis_fit import fit_axis
-from finssim.calibration.regression.dive_and_coast import coasts
 from finssim.calibration.regression.instruments import Run, cut, joined, simulate_axis
 from finssim.calibration.regression.plant_terms import matrices
-from finssim.calibration.regression.regress import regress
+from finssim.calibration.regression.regress import axis_data, coasts, prepare, regress
 from finssim.calibration.trials.header import Header
 from finssim.vehicles import AXES
 

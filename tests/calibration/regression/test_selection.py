@@ -5,7 +5,7 @@ import pytest
 
 from calibration.known_trials import NOISE, trials, truth
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excitation.measurement import NoiseProfile
+from finssim.calibration.excitation.synthetic import NoiseProfile
 from finssim.calibration.regression.regress import regress
 
 

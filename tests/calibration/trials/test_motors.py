@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.calibration.trials.motors import delivered, thruster_motors, wrench_motors
+from finssim.calibration.trials.inputs import delivered, thruster_motors, wrench_motors
 from finssim.engine import Simulator
 from finssim.vehicles import load_vehicle
 

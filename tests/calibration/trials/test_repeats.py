@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from finssim.calibration.trials.repeats import new_samples
 from finssim.calibration.trials.trial import Trial
-from finssim.calibration.trials.trial_files import load_trial, write_trial
+from finssim.calibration.trials.trial_files import load_trial, new_samples, write_trial
 
 T = np.arange(1000) * 0.02
 

@@ -2,24 +2,309 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import contextlib
+import io
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.importers.ardupilot_log import Log, read_log
 from finssim.calibration.importers.ardusub_outputs import NEUTRAL, outputs_of
-from finssim.calibration.importers.ardusub_velocity import VELOCITY_KINDS, velocity_stream
 from finssim.calibration.importers.assemble import in_our_axes
 from finssim.calibration.importers.column_map import ArduSubMap
 from finssim.calibration.importers.source_map import Frame
 from finssim.calibration.importers.streams import Stream
 from finssim.calibration.importers.units import GRAVITY
+from finssim.calibration.trials.trial import Array
 from finssim.geometry.rotations import wrap_angle
 from finssim.vehicles import Vehicle
 
-__all__ = ["read_ardusub"]
+__all__ = ["Log", "read_ardusub", "velocity_stream"]
+
+# Messages of ArduPilot logs: DataFlash `.BIN` and telemetry `.tlog`, through pymavlink.
+
+DATAFLASH = b"\xa3\x95"
+"""First bytes of a DataFlash log."""
+
+AUTOPILOT = 1
+"""MAVLink component of the autopilot."""
+
+NO_AUTOPILOT = 8
+"""MAV_AUTOPILOT_INVALID, in the heartbeats of ground stations and cameras."""
+
+WRONG_CLOCK = 5.0
+"""A stamp farther than this from the time of receipt is of another clock [s]."""
+
+
+@dataclass(frozen=True)
+class Log:
+    """What a log holds, by kind of message."""
+
+    shown: str
+    telemetry: bool
+    """Whether it is a `.tlog`."""
+    times: dict[str, Array] = field(default_factory=dict)
+    """Kind -> times [s], (n,)."""
+    messages: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
+    """Kind -> fields of each message, n of them."""
+    parameters: dict[str, float] = field(default_factory=dict)
+    """The autopilot's parameters, as last said."""
+
+    def has(self, kind: str) -> bool:
+        """Whether there are two such messages at least."""
+        return len(self.messages.get(kind, ())) >= 2
+
+    def numbers(self, kind: str, name: str) -> Array:
+        """A field of every message of a kind, NaN where it has none, (n,)."""
+        return np.array([_number(message.get(name)) for message in self.messages[kind]], dtype=float)
+
+    def some(self, kind: str, name: str, value: int) -> Log:
+        """The log with only those messages of a kind whose field has that value; all where none has the field."""
+        if not any(name in message for message in self.messages.get(kind, ())):
+            return self
+        keep = [i for i, message in enumerate(self.messages[kind]) if message.get(name) == value]
+        return Log(
+            self.shown,
+            self.telemetry,
+            {**self.times, kind: self.times[kind][keep]},
+            {**self.messages, kind: [self.messages[kind][i] for i in keep]},
+            self.parameters,
+        )
+
+
+def read_log(path: Path, kinds: frozenset[str], *, received: bool = False) -> Log:
+    """The messages of some kinds; a log that was cut short is read up to the cut.
+
+    Args:
+        path: `.BIN` or `.tlog`.
+        kinds: Names of messages.
+        received: Whether telemetry is timed by its receipt, not by the stamps of the autopilot.
+
+    Raises:
+        CalibrationError: No such messages: it is no log, or an empty one.
+        ModuleNotFoundError: pymavlink is not installed.
+    """
+    try:
+        with path.open("rb") as file:
+            dataflash = file.read(2) == DATAFLASH
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be read: {error.strerror or error}") from None
+    log = Log(path.name, not dataflash)
+    clock = _Clock(received)
+    for kind, message, receipt in _messages(path, dataflash, kinds | {"PARM", "PARAM_VALUE", "HEARTBEAT"}):
+        if kind == "PARM":
+            log.parameters[message["Name"]] = float(message["Value"])
+        elif kind == "PARAM_VALUE":
+            log.parameters[message["param_id"]] = float(message["param_value"])
+        if kind in kinds:
+            log.messages.setdefault(kind, []).append(message)
+            clock.add(kind, message, receipt)
+    log.times.update(clock.times() if log.telemetry else clock.boot_times())
+    if not log.messages:
+        raise CalibrationError(
+            f"{path}: holds no messages that a trial could use: expected an ArduSub log, .BIN or .tlog"
+        )
+    return log
+
+
+class _Clock:
+    """Times of messages: the autopilot's stamps, laid on the times of receipt."""
+
+    def __init__(self, received: bool) -> None:
+        self.received = received
+        self.receipts: dict[str, list[float]] = {}
+        self.stamps: dict[str, list[float]] = {}
+        self.boots: dict[str, list[int]] = {}
+        self.offsets = [math.inf]
+        self.last = -math.inf
+
+    def add(self, kind: str, message: dict[str, Any], receipt: float) -> None:
+        stamp = _stamp(message)
+        if math.isfinite(stamp) and "VISION" not in kind:
+            if stamp < self.last - 1.0:  # the autopilot started again
+                self.offsets.append(math.inf)
+            self.last = stamp
+            # The message that travelled fastest tells the difference of the clocks.
+            self.offsets[-1] = min(self.offsets[-1], receipt - stamp)
+        self.receipts.setdefault(kind, []).append(receipt)
+        self.stamps.setdefault(kind, []).append(stamp)
+        self.boots.setdefault(kind, []).append(len(self.offsets) - 1)
+
+    def boot_times(self) -> dict[str, Array]:
+        """Stamps as they are, of a log that the autopilot wrote itself."""
+        return {kind: np.array(stamps) for kind, stamps in self.stamps.items()}
+
+    def times(self) -> dict[str, Array]:
+        found = {}
+        for kind, receipts in self.receipts.items():
+            receipt = np.array(receipts)
+            stamped = np.array(self.stamps[kind]) + np.array(self.offsets)[self.boots[kind]]
+            ours = np.isfinite(stamped) & (np.abs(stamped - receipt) < WRONG_CLOCK) & (not self.received)
+            found[kind] = np.where(ours, stamped, receipt)
+        return found
+
+
+def _stamp(message: dict[str, Any]) -> float:
+    """Seconds since the autopilot started; NaN where the message does not say."""
+    for name, unit in (("TimeUS", 1e-6), ("time_boot_ms", 1e-3), ("time_usec", 1e-6), ("usec", 1e-6)):
+        if message.get(name):
+            return float(message[name]) * unit
+    return math.nan
+
+
+def _messages(
+    path: Path, dataflash: bool, kinds: frozenset[str]
+) -> Iterator[tuple[str, dict[str, Any], float]]:
+    """Kind, fields and time of receipt [s] of each message of the autopilot."""
+    from pymavlink import DFReader, mavutil
+
+    complaints = io.StringIO()  # pymavlink prints what it skips at a cut
+    with contextlib.redirect_stderr(complaints), contextlib.redirect_stdout(complaints):
+        try:
+            log = (
+                DFReader.DFReader_binary(str(path))
+                if dataflash
+                else mavutil.mavlogfile(str(path), robust_parsing=True)
+            )
+        except Exception as error:  # pymavlink raises whatever it stumbles over
+            raise CalibrationError(f"{path}: not an ArduPilot log: {error}") from None
+        systems: set[int] = set()
+        try:
+            while True:
+                try:
+                    message = log.recv_match(type=sorted(kinds))
+                except Exception:  # the same, at the cut of a log
+                    break
+                if message is None:
+                    break
+                kind = message.get_type()
+                if not dataflash and not _of_autopilot(message, kind, systems):
+                    continue
+                yield kind, message.to_dict(), float(message._timestamp)
+        finally:
+            close = getattr(log, "close", None)
+            if close is not None:
+                close()
+
+
+def _of_autopilot(message: Any, kind: str, systems: set[int]) -> bool:
+    """Whether the vehicle's autopilot sent it; position sensors speak for themselves."""
+    if kind == "HEARTBEAT":
+        if message.autopilot == NO_AUTOPILOT:
+            return False
+        systems.add(message.get_srcSystem())
+    if kind.startswith("VISION"):
+        return True
+    return message.get_srcComponent() == AUTOPILOT and (not systems or message.get_srcSystem() in systems)
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, (int, float)) else math.nan
+
+
+# Velocity and position in ArduSub logs: what the autopilot estimates, and what a DVL or camera told it.
+
+VELOCITY_KINDS = frozenset(
+    (
+        "XKF1",
+        "NKF1",
+        "XKF4",
+        "NKF4",
+        "VISO",
+        "LOCAL_POSITION_NED",
+        "EKF_STATUS_REPORT",
+        "VISION_POSITION_DELTA",
+    )
+)
+
+HORIZONTAL_VELOCITY, RELATIVE_POSITION, ABSOLUTE_POSITION, STANDING_STILL = 2, 8, 16, 128
+"""Flags of the filter's state; the last says that it assumes a constant position, for it has no measurement of one."""
+
+ESTIMATES = {
+    "XKF1": ("XKF4", "SS", ("VN", "VE", "VD", "PN", "PE", "PD")),
+    "NKF1": ("NKF4", "SS", ("VN", "VE", "VD", "PN", "PE", "PD")),
+    "LOCAL_POSITION_NED": ("EKF_STATUS_REPORT", "flags", ("vx", "vy", "vz", "x", "y", "z")),
+}
+"""Kind of message -> the one of its filter's state, the field of that, and the fields of velocity and position."""
+
+LEAST_USABLE = 0.2
+"""Part of the estimates that must rest on a measurement of position or velocity."""
+
+
+def velocity_stream(log: Log, asked: Literal["auto", "ekf", "vision", "none"]) -> Stream | None:
+    """Velocity from position deltas if there are any, else velocity and position from the autopilot's estimate.
+
+    The estimate is left out where the filter had no measurement of horizontal position or velocity: what it says then
+    is that the vehicle stands still.
+    """
+    if asked == "none":
+        return None
+    if asked in ("auto", "vision"):
+        deltas = _position_deltas(log)
+        if deltas is not None or asked == "vision":
+            return deltas
+    return _estimate(log)
+
+
+def _position_deltas(log: Log) -> Stream | None:
+    """Position deltas over the time they took, body frame."""
+    if log.has("VISO"):
+        kind, dt = "VISO", log.numbers("VISO", "dt")
+        delta = np.stack([log.numbers(kind, f"PosD{axis}") for axis in "XYZ"], axis=-1)
+    elif log.has("VISION_POSITION_DELTA"):
+        kind = "VISION_POSITION_DELTA"
+        dt = 1e-6 * log.numbers(kind, "time_delta_usec")
+        delta = np.array([message["position_delta"] for message in log.messages[kind]], dtype=float)
+    else:
+        return None
+    good = dt > 1e-3
+    velocity = np.where(good[:, None], delta / np.where(good, dt, 1.0)[:, None], np.nan)
+    # A delta is the mean over the time before its stamp.
+    stream = Stream(
+        source=f"{log.shown} {kind}",
+        t=log.times[kind] - 0.5 * np.where(good, dt, 0.0),
+        channels=dict(zip("uvw", velocity.T, strict=True)),
+        notes=(f"u v w from {kind}, at the sensor: give velocity_at if it is not at the body origin",),
+    )
+    return in_our_axes(stream, FRD)
+
+
+def _estimate(log: Log) -> Stream | None:
+    kind = next((kind for kind in ESTIMATES if log.has(kind)), None)
+    if kind is None:
+        return None
+    status, flag_name, names = ESTIMATES[kind]
+    first_core = log.some(kind, "C", 0).some(status, "C", 0)
+    flags = _held(first_core, status, flag_name, first_core.times[kind])
+    moving = (flags & HORIZONTAL_VELOCITY > 0) & (flags & STANDING_STILL == 0)
+    source = f"{log.shown} {kind}"
+    if moving.mean() < LEAST_USABLE:
+        note = (
+            f"the velocity of {kind} is left out: in {1.0 - moving.mean():.0%} of it the autopilot had no measurement "
+            "of horizontal velocity or position"
+        )
+        return Stream(source=source, t=first_core.times[kind], notes=(note,))
+    placed = moving & (flags & (RELATIVE_POSITION | ABSOLUTE_POSITION) > 0)
+    values = [first_core.numbers(kind, name) for name in names]
+    channels = {c: np.where(moving, v, np.nan) for c, v in zip(("vx", "vy", "vz"), values[:3], strict=True)}
+    if placed.any():
+        channels |= {c: np.where(placed, v, np.nan) for c, v in zip("xyz", values[3:], strict=True)}
+    note = f"u v w from {kind}, an estimate by the autopilot's filter: smoother and later than a measurement"
+    return in_our_axes(Stream(source=source, t=first_core.times[kind], channels=channels, notes=(note,)), FRD)
+
+
+def _held(log: Log, kind: str, name: str, t: NDArray[np.float64]) -> NDArray[np.int64]:
+    """A field of flags at other times, each held until the next; all usable where the log has none."""
+    if not log.has(kind):
+        return np.full(len(t), HORIZONTAL_VELOCITY | RELATIVE_POSITION)
+    held = np.searchsorted(log.times[kind], t, side="right") - 1
+    return log.numbers(kind, name).astype(np.int64)[np.maximum(held, 0)]
+
 
 FRD = Frame(body="FRD", world="NED")
 

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from finssim.calibration.degeneracy import degeneracy
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.fit import Fit
+from finssim.calibration.fit import Estimate, Fit
+from finssim.calibration.regression.axis_estimates import USEFUL, outside, trim
 from finssim.calibration.simulation.bordered import huber
-from finssim.calibration.simulation.changes import changes
-from finssim.calibration.simulation.coarse_search import coarse_search
 from finssim.calibration.simulation.estimates import estimates
 from finssim.calibration.simulation.evidence import FEWEST_TRIALS, Findings, findings
 from finssim.calibration.simulation.excited import (
@@ -31,9 +30,229 @@ from finssim.calibration.simulation.parameters import Parameters
 from finssim.calibration.simulation.report import Clock, doubts, pictures, quality
 from finssim.calibration.simulation.segments import Segment, Streams, segments
 from finssim.calibration.simulation.shooting import Shooting
-from finssim.vehicles import Vehicle
+from finssim.vehicles import AXES, Vehicle
 
 __all__ = ["Stage", "Stages"]
+
+# A rough start where no regression gives one: an evolution strategy whose population are parallel worlds.
+
+FINE = 0.02
+"""Part of a coordinate's size around its bound where steps are linear; beyond, they are logarithmic."""
+
+
+def evolve(
+    cost: Callable[[Array], Array],
+    start: Array,
+    *,
+    sigma: float,
+    population: int,
+    generations: int,
+    seed: int,
+    tolerance: float = 1e-3,
+) -> tuple[Array, float]:
+    """Minimise by covariance matrix adaptation                                         (Hansen 2016, CMA-ES tutorial).
+
+    Args:
+        cost: Of many points at once, (n, P) -> (n,); infinite where a point has none.
+        start: First mean, (P,).
+        sigma: First standard deviation.
+        population: Points in a generation.
+        generations: At most.
+        seed: Of the draws.
+        tolerance: Standard deviation below which it stops.
+
+    Returns:
+        The best point seen, and its cost.
+    """
+    rng, n = np.random.default_rng(seed), len(start)
+    mu = population // 2
+    weights = np.log(mu + 0.5) - np.log(np.arange(1, mu + 1))
+    weights /= weights.sum()
+    mass = 1.0 / float(np.square(weights).sum())
+    c_path = (mass + 2.0) / (n + mass + 5.0)
+    damping = 1.0 + 2.0 * max(0.0, np.sqrt((mass - 1.0) / (n + 1.0)) - 1.0) + c_path
+    c_cum = (4.0 + mass / n) / (n + 4.0 + 2.0 * mass / n)
+    c_one = 2.0 / ((n + 1.3) ** 2 + mass)
+    c_mu = min(1.0 - c_one, 2.0 * (mass - 2.0 + 1.0 / mass) / ((n + 2.0) ** 2 + mass))
+    expected = np.sqrt(n) * (1.0 - 1.0 / (4.0 * n) + 1.0 / (21.0 * n * n))
+
+    mean, C, path_s, path_c = np.array(start, float), np.eye(n), np.zeros(n), np.zeros(n)
+    best, lowest = mean.copy(), float(cost(mean[None])[0])
+    for generation in range(generations):
+        values, vectors = np.linalg.eigh(C)
+        root = np.sqrt(np.maximum(values, 1e-20))
+        steps = (rng.standard_normal((population, n)) * root) @ vectors.T
+        costs = cost(mean + sigma * steps)
+        order = np.argsort(costs)
+        if costs[order[0]] < lowest:
+            best, lowest = mean + sigma * steps[order[0]], float(costs[order[0]])
+        chosen = steps[order[:mu]]
+        shift = weights @ chosen
+        mean = mean + sigma * shift
+        path_s = (1.0 - c_path) * path_s
+        path_s += np.sqrt(c_path * (2.0 - c_path) * mass) * (vectors @ ((vectors.T @ shift) / root))
+        length = float(np.linalg.norm(path_s))
+        steady = (
+            length / np.sqrt(1.0 - (1.0 - c_path) ** (2 * generation + 2))
+            < (1.4 + 2.0 / (n + 1.0)) * expected
+        )
+        path_c = (1.0 - c_cum) * path_c
+        if steady:
+            path_c += np.sqrt(c_cum * (2.0 - c_cum) * mass) * shift
+        C = (1.0 - c_one - c_mu) * C + c_one * np.outer(path_c, path_c) + c_mu * (chosen.T * weights) @ chosen
+        C = 0.5 * (C + C.T)
+        sigma *= float(np.exp(c_path / damping * (length / expected - 1.0)))
+        if sigma * root.max() < tolerance:
+            break
+    return best, lowest
+
+
+def coarse_search(
+    cost: Callable[[Array], Array],
+    start: Array,
+    low: Array,
+    high: Array,
+    scale: Array,
+    *,
+    population: int = 48,
+    generations: int = 25,
+    seed: int = 0,
+) -> tuple[Array, float]:
+    """Search a box over orders of magnitude.
+
+    A coordinate with a lower bound is searched in y = log(1 + (x - low) / (FINE scale)), the others in x / scale.
+
+    Args:
+        cost: Of many points at once, (n, P) -> (n,).
+        start: Where to begin, (P,).
+        low: Lower bounds, -inf where none, (P,).
+        high: Upper bounds, (P,).
+        scale: Sizes of the coordinates, (P,).
+        population: Points in a generation.
+        generations: At most.
+        seed: Of the draws.
+
+    Returns:
+        The best point seen, and its cost.
+    """
+    bounded = np.isfinite(low)
+    unit = FINE * scale
+    base = np.where(bounded, low, 0.0)
+
+    def inside(y: Array) -> Array:
+        grown = base + unit * np.expm1(np.clip(y, -50.0, 50.0))
+        return np.clip(np.where(bounded, grown, y * scale), low, high)
+
+    y = np.where(bounded, np.log1p(np.maximum(start - base, 0.0) / unit), start / scale)
+    best, lowest = evolve(
+        lambda points: cost(inside(points)),
+        y,
+        sigma=0.7,
+        population=population,
+        generations=generations,
+        seed=seed,
+        tolerance=0.03,
+    )
+    return inside(best), lowest
+
+
+# From a simulation-error fit to changes of the vehicle file: only what the trials determine.
+
+
+def changes(
+    p: Parameters,
+    x: Array,
+    found: dict[str, Estimate],
+    evidence: Findings,
+    axes: Sequence[str],
+    speed: dict[str, float],
+    scaled: bool,
+) -> dict[str, Any]:
+    """Changes of the vehicle file; an axis' damping changes as a pair, where its force at top speed is known.
+
+    Args:
+        p: What was free.
+        x: Where it ended, (P,).
+        found: Its estimates.
+        evidence: For the error of the damping force.
+        axes: Which to write.
+        speed: Highest speed of each axis [m/s or rad/s].
+        scaled: Whether a thrust scale belongs to the thrusters' curves.
+    """
+    out: dict[str, Any] = {}
+    base = f"hydrodynamics.{p.hydrodynamics}"
+    new = dict(
+        zip(("added_mass", "linear_damping", "quadratic_damping"), (m[0] for m in p.matrices(x)), strict=True)
+    )
+    chosen = p.set
+    written: dict[str, list[int]] = {"added_mass": [], "linear_damping": [], "quadratic_damping": []}
+    for axis in axes:
+        i = AXES.index(axis)
+        whole = found[f"{axis}.m_eff"]
+        half = 0.5 * (whole.ci95[1] - whole.ci95[0])
+        added = found[f"{axis}.added_mass"]
+        before = float(np.asarray(chosen.added_mass, float)[i, i])
+        if added.estimate > 0.0 and (half <= USEFUL * whole.estimate or outside(before, added.ci95)):
+            written["added_mass"].append(i)
+        if _force_known(p, x, evidence, axis, speed.get(axis, 0.0)):
+            written["linear_damping"].append(i)
+            written["quadratic_damping"].append(i)
+    # The numbers of axes that nobody measured, but that were simulated: the others hold with these.
+    for axis in p.unseen:
+        for rows in written.values():
+            rows.append(AXES.index(axis))
+    for family, rows in written.items():
+        old = np.asarray(getattr(chosen, family), float)
+        for i in rows:
+            for j in range(6):
+                # Couplings are written where both axes are, and where the fit did away with them.
+                if i == j or (new[family][i, j] != old[i, j] and (j in rows or new[family][i, j] == 0.0)):
+                    out[f"{base}.{family}.{i}.{j}"] = float(new[family][i, j])
+    water, body = p.vehicle.water, p.vehicle.body
+    volume = float(body.displaced_volume)
+    excess = found.get("buoyancy_excess")
+    if excess is not None and excess.identifiable:
+        volume = (p.vehicle.weight + excess.estimate) / (water.density * water.gravity)
+        out["body.displaced_volume"] = volume
+    stiff = [found[n] for n in ("roll.k", "pitch.k") if n in found]
+    before = p.expected[p.names.index("k")] if "k" in p.names else 0.0
+    stiff = [e for e in stiff if e.identifiable or (e.estimate > 0.0 and outside(before, e.ci95))]
+    if stiff:
+        out["body.center_of_buoyancy.2"] = float(p.buoyancy_height(stiff[0].estimate, volume))
+    out |= trim(found, water.density * water.gravity * volume, body.center_of_buoyancy)
+    for name, path in (("thrust_lag", "time_constant"), ("thrust_delay", "delay")):
+        if name in found and found[name].identifiable:
+            out[f"thrusters.*.{path}"] = max(found[name].estimate, 1e-4 if path == "time_constant" else 0.0)
+    for path in p.terms:
+        if found[path].identifiable:
+            out[f"{base}.{path}"] = found[path].estimate
+    if "thrust_scale" in found and found["thrust_scale"].identifiable and scaled:
+        scale = found["thrust_scale"].estimate
+        for name, thruster in p.vehicle.thrusters.items():
+            for key in ("c_plus", "c_minus", "force_min", "force_max"):
+                out[f"thrusters.{name}.{key}"] = scale * float(getattr(thruster, key))
+    return out
+
+
+def _force_known(p: Parameters, x: Array, found: Findings, axis: str, speed: float) -> bool:
+    """Whether the damping force of an axis at a speed is known to `USEFUL`, or excludes that of the vehicle file."""
+    i = AXES.index(axis)
+    unit = 1e-5 * np.maximum(np.abs(x), p.scale)
+    points = np.concatenate([x[None], np.clip(x + np.diag(unit), p.low, p.high)])
+    _, D1, D2 = p.matrices(points)
+    force = D1[:, i, i] * speed + D2[:, i, i] * speed**2
+    slope = (force[1:] - force[0]) / unit
+    before = float(p.set.linear_damping[i][i] * speed + p.set.quadratic_damping[i][i] * speed**2)
+    used = np.flatnonzero(slope)
+    V = found.covariance.trials[np.ix_(used, used)]
+    if found.covariance.alone[used].any():
+        V = found.covariance.local[np.ix_(used, used)]
+    if not np.isfinite(V).all():
+        return False
+    std = float(np.sqrt(max(slope[used] @ V @ slope[used], 0.0)))
+    close, excluded = 2.0 * std < USEFUL * force[0], abs(before - force[0]) > 2.0 * std
+    return bool(force[0] > 0.0 and (close or excluded))
+
 
 Array = NDArray[np.float64]
 

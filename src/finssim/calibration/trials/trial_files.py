@@ -7,17 +7,331 @@ import re
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import BaseModel, ValidationError
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.trials.header import Header
-from finssim.calibration.trials.header_file import header_text, read_header
-from finssim.calibration.trials.table_file import read_table, write_table
-from finssim.calibration.trials.trial import Trial
-from finssim.calibration.trials.trial_table import trial_from_table
+from finssim.calibration.trials.columns import COLUMNS, INPUT_PREFIXES, column_of
+from finssim.calibration.trials.conversion import (
+    factor_and_offset,
+    in_our_frames,
+    new_names,
+    shifted,
+    tidy_quaternions,
+    upside_down,
+)
+from finssim.calibration.trials.header import Conversion, Header, TrialWater
+from finssim.calibration.trials.table_file import Table, read_table, write_table
+from finssim.calibration.trials.time_base import ordered, sampled
+from finssim.calibration.trials.trial import PHASES, Trial
 from finssim.files import OutputError, atomic_directory
+from finssim.vehicles.part import did_you_mean
+from finssim.yaml_file import read_mapping
 
-__all__ = ["load_trial", "load_trials", "trials_at", "write_trial"]
+__all__ = ["load_trial", "load_trials", "new_samples", "trials_at", "write_trial"]
+
+# From the columns of a log to a trial: names, times, units, frames.
+
+# Samples that a log repeats: a stream of 10 Hz written into every row of a table of 50 Hz is still one of 10 Hz.
+
+FEWEST = 10
+"""Runs of equal rows that it takes to call a stream repeated."""
+
+LEAST = 0.2
+"""Part of the rows that are repeats; fewer do no harm."""
+
+REGULAR = 0.9
+"""Part of the runs that may not be much longer than the usual one: clocks repeat regularly, resting sensors do not."""
+
+
+def without_repeats(channels: dict[str, Array]) -> list[str]:
+    """Turn the repeated samples of measured streams into empty ones, in place; notes on what was found.
+
+    Left in, they would count as measurements of their own, and their steps as motion. Inputs are left alone: a command
+    that stays is a command.
+    """
+    groups: dict[str, list[str]] = {}
+    for name in channels:
+        if name in COLUMNS and COLUMNS[name].group != "command":
+            groups.setdefault(COLUMNS[name].group, []).append(name)
+    notes = []
+    for group, names in groups.items():
+        values = np.stack([channels[name] for name in names], axis=-1)
+        rows = np.flatnonzero(np.isfinite(values).any(axis=1))
+        new = new_samples(values[rows])
+        if not new.all():
+            for name in names:
+                channels[name] = channels[name].copy()
+                channels[name][rows[~new]] = np.nan
+            notes.append(
+                f"{group}: every new sample is repeated, {len(rows) / new.sum():.1f} rows on average; "
+                "repeats count as empty"
+            )
+    return notes
+
+
+def new_samples(values: Array) -> NDArray[np.bool_]:
+    """Which rows are new, (n, c) -> (n,); all where the rows do not repeat in a regular way.
+
+    Long runs are taken for rest: in them a row counts as new every usual run.
+    """
+    n = len(values)
+    everything = np.ones(n, bool)
+    if n < 2 * FEWEST:
+        return everything
+    same = ((values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))).all(axis=1)
+    starts = np.flatnonzero(np.concatenate([[True], ~same]))
+    lengths = np.diff(np.concatenate([starts, [n]]))
+    usual = int(np.median(lengths))
+    short = lengths[lengths <= usual + 1]
+    repeated = 1.0 - len(short) / short.sum()
+    regular = usual >= 2 and len(short) >= max(FEWEST, REGULAR * len(lengths)) and repeated >= LEAST
+    if not regular or all(_coarse(column) for column in values[starts].T):
+        return everything
+    since = np.arange(n) - np.repeat(starts, lengths)
+    return np.asarray(since % usual == 0) & ((since == 0) | np.repeat(lengths > usual + 1, lengths))
+
+
+def _coarse(changes: Array) -> bool:
+    """Whether most changes are of one size: the last digit of a sensor, which repeats for another reason."""
+    steps = np.abs(np.diff(changes))
+    steps = steps[steps > 0.0]
+    return len(steps) > 0 and float(np.mean(steps < 1.001 * steps.min())) > 0.5
+
+
+Array = NDArray[np.float64]
+
+EPOCH = 1.0e8
+"""Times later than this count from 1970 [s]; no vehicle has been on for three years."""
+
+
+def trial_from_table(name: str, table: Table, header: Header, path: Path | None = None) -> Trial:
+    """A trial from the columns of a log: renamed, scaled, in our frames, in order of time, with notes on every repair.
+
+    Args:
+        name: Of the trial.
+        table: Columns as logged.
+        header: Its `convert` section is applied; the trial's header no longer has it.
+        path: Where the log was read.
+
+    Raises:
+        CalibrationError: No time, fewer than two rows, no usable column, or a conversion of what is not there.
+    """
+    notes = list(table.notes)
+    names = new_names(table.columns, header.convert)
+    numbers = {names[old]: values for old, values in table.numbers.items()}
+    words = {names[old]: values for old, values in table.words.items()}
+    if "t" not in numbers and "t" not in words:
+        raise CalibrationError(_no_time(table.columns))
+    change = factor_and_offset([*numbers, *words], header.convert)
+    t = _seconds(numbers.pop("t", None), words.pop("t", None), change.get("t", (1.0, 0.0)), notes)
+    phase = _phases(words.pop("phase", None), notes)
+    channels = _canonical(numbers, list(words), notes)
+    for column, values in channels.items():
+        infinite = np.isinf(values)
+        if infinite.any():
+            notes.append(f"column '{column}': {infinite.sum()} infinite numbers count as empty")
+        factor, offset = change.get(column, (1.0, 0.0))
+        channels[column] = np.where(infinite, np.nan, values) * factor + offset
+    t, channels, phase = _in_order(t, channels, phase, notes)
+    notes += without_repeats(channels)
+    channels = in_our_frames(channels, header.convert)
+    notes += tidy_quaternions(channels)
+    if upside_down(channels):
+        notes.append(
+            "the attitude has the vehicle on its back most of the time: "
+            "are convert.body and convert.world what the log uses?"
+        )
+    if not any(np.isfinite(values).sum() >= 2 for values in channels.values()):
+        raise CalibrationError(
+            f"no usable column beside t: expected some of {', '.join(COLUMNS)}, "
+            f"{', '.join(f'{p}NAME' for p in INPUT_PREFIXES)} with numbers in them; "
+            f"found {', '.join(table.columns[:12])}"
+        )
+    old = t
+    t, channels = shifted(t, channels, header.convert)
+    if phase is not None and t is not old:
+        phase = phase[np.clip(np.searchsorted(old, t, side="right") - 1, 0, None)]
+    header = header.model_copy(update={"convert": type(header.convert)()})
+    return Trial(name=name, t=t, channels=channels, phase=phase, header=header, notes=tuple(notes), path=path)
+
+
+def _no_time(columns: list[str]) -> str:
+    like = [c for c in columns if re.search(r"time|stamp|^t\b|^t_|_t$|secs|sec$", c, re.IGNORECASE)]
+    hint = f"'{like[0]}'" if like else "the column of times"
+    return (
+        f"no column 't' (time in s); the log has {', '.join(columns[:12])}: say which it is in trial.yaml, "
+        f"'convert: {{rename: {{{like[0] if like else 'NAME'}: t}}}}' makes {hint} the time"
+    )
+
+
+def _seconds(
+    numbers: Array | None, words: list[str] | None, change: tuple[float, float], notes: list[str]
+) -> Array:
+    """Times in s from numbers or dates; those that count from 1970 begin at 0."""
+    factor, offset = change
+    if numbers is None:
+        try:
+            dates = np.array([w.removesuffix("Z") or "NaT" for w in words or []], dtype="datetime64[ns]")
+        except ValueError:
+            raise CalibrationError(
+                f"t holds '{(words or [''])[0]}', expected seconds or dates like 2024-05-01T12:00:00.25"
+            ) from None
+        known = dates[~np.isnat(dates)]
+        start = known[0] if len(known) else np.datetime64("NaT", "ns")
+        notes.append(f"t holds dates; times count from {start}")
+        return np.where(np.isnat(dates), np.nan, (dates - start) / np.timedelta64(1, "s"))
+    known = numbers[np.isfinite(numbers)]
+    if len(known) and abs(known[0] * factor + offset) > EPOCH:
+        notes.append(
+            f"t counts from 1970; times count from the first row, {known[0] * factor + offset:.6f} s"
+        )
+        return (numbers - known[0]) * factor
+    return numbers * factor + offset
+
+
+def _phases(words: list[str] | None, notes: list[str]) -> NDArray[np.str_] | None:
+    if words is None:
+        return None
+    table = {word: word.strip().lower() for word in set(words)}
+    unknown = sorted(word for word in table.values() if word not in PHASES and word)
+    if unknown:
+        notes.append(
+            f"phase '{unknown[0]}'{did_you_mean(unknown[0], list(PHASES))} known words are {', '.join(PHASES)}; "
+            f"{len(unknown)} unknown words count as empty"
+        )
+    return np.array([table[w] if table[w] in PHASES else "" for w in words], dtype=np.str_)
+
+
+def _canonical(numbers: dict[str, Array], words: list[str], notes: list[str]) -> dict[str, Array]:
+    """The columns of a trial among those of the log."""
+    channels = {column: values for column, values in numbers.items() if column_of(column)}
+    for column in words:
+        if column_of(column):
+            notes.append(f"column '{column}' holds words, not numbers, and was left out")
+    unknown = [column for column in [*numbers, *words] if not column_of(column)]
+    for column in unknown[:5]:
+        close = did_you_mean(column.lower(), [c for c in COLUMNS if c not in channels]).rstrip(";")
+        notes.append(f"column '{column}' is not one of a trial and was left out{close}")
+    if len(unknown) > 5:
+        notes.append(
+            f"{len(unknown) - 5} more columns are not of a trial and were left out: {', '.join(unknown[5:17])}"
+        )
+    return channels
+
+
+def _in_order(
+    t: Array, channels: dict[str, Array], phase: NDArray[np.str_] | None, notes: list[str]
+) -> tuple[Array, dict[str, Array], NDArray[np.str_] | None]:
+    """Rows with strictly increasing times."""
+    timed = np.isfinite(t)
+    if not timed.all():
+        notes.append(f"{(~timed).sum()} rows have no time and were left out")
+        t, channels = t[timed], {column: values[timed] for column, values in channels.items()}
+        phase = None if phase is None else phase[timed]
+    if len(t) < 2:
+        raise CalibrationError(f"{len(t)} rows with a time, expected at least 2")
+    t, rows, said = ordered(t, channels)
+    notes += said
+    phase = None if phase is None else phase[rows]
+    t, channels, kept, said = sampled(t, {column: values[rows] for column, values in channels.items()})
+    notes += said
+    if len(t) < 2:
+        raise CalibrationError(f"all rows have the time {t[0]:.6g} s: expected times that increase")
+    return t, channels, None if phase is None else phase[kept]
+
+
+# Reading and writing `trial.yaml`.
+
+_POINT = "3 numbers [x, y, z] in m"
+_MAP = "a map such as"
+
+EXPECTED = {
+    "vehicle": "the name or file of a vehicle",
+    "axis": "a list drawn from surge, sway, heave, roll, pitch, yaw",
+    "role": "fit or held-out",
+    "description": "words",
+    "inputs": "applied or commanded",
+    "inputs_between": "held or linear",
+    "passive": "true or false",
+    "wrench_at": f"{_POINT}, center_of_gravity or origin",
+    "velocity_at": _POINT,
+    "position_at": _POINT,
+    "acceleration_at": _POINT,
+    "depth_at": _POINT,
+    "acceleration": "specific_force, kinematic or auto",
+    "velocity": "ground or water",
+    "voltage": "a voltage > 0 in V",
+    "water": f"{_MAP} {{density: 1025.0}}",
+    "water.density": "a density > 0 in kg/m³",
+    "water.depth": "a depth > 0 in m",
+    "water.current": "3 numbers [x, y, z] in m/s, world frame",
+    "convert": f"{_MAP} {{body: FRD}}",
+    "convert.rename": f"{_MAP} {{vx_mps: u}}",
+    "convert.scale": f"{_MAP} {{yaw: 0.0174533}}, with factors that are not 0",
+    "convert.offset": f"{_MAP} {{depth: 0.05}}",
+    "convert.body": "FLU or FRD",
+    "convert.world": "z_up or NED",
+    "convert.time_offset": f"{_MAP} {{attitude: -0.08}}, in s",
+}
+"""Key -> what may stand there."""
+
+SECTIONS: dict[str, type[BaseModel]] = {"": Header, "water": TrialWater, "convert": Conversion}
+
+
+def read_header(path: Path) -> Header:
+    """The header in a `trial.yaml`; an empty file is an empty header.
+
+    Raises:
+        CalibrationError: Unreadable, or a key or value that is refused; one sentence per key.
+    """
+    if path.is_file() and path.stat().st_size < 65536 and not _content(path):
+        return Header()
+    tree = read_mapping(path, CalibrationError, such_as="vehicle: finsrov")
+    if isinstance(tree.get("axis"), str):
+        tree["axis"] = [tree["axis"]]
+    try:
+        header = Header.model_validate(tree)
+    except ValidationError as error:
+        sentences = dict.fromkeys(_sentence(detail, tree) for detail in error.errors())
+        raise CalibrationError("\n".join(f"{path}: {sentence}" for sentence in sentences)) from None
+    zero = [name for name, factor in header.convert.scale.items() if factor == 0.0]
+    if zero:
+        raise CalibrationError(f"{path}: convert.scale: {zero[0]} is 0, expected a factor that is not 0")
+    return header
+
+
+def header_text(header: Header) -> str:
+    """`trial.yaml` of a header: what differs from the defaults, without the conversions that have been done."""
+    tree = header.model_dump(mode="json", exclude_defaults=True, exclude={"convert"})
+    return yaml.safe_dump(tree, sort_keys=False, allow_unicode=True) if tree else "{}\n"
+
+
+def _content(path: Path) -> str:
+    """What a file holds besides comments and blank lines."""
+    lines = path.read_bytes().decode("utf-8", errors="replace").splitlines()
+    return "".join(line for line in lines if line.strip() and not line.lstrip().startswith("#"))
+
+
+def _sentence(detail: Any, tree: dict[Any, Any]) -> str:
+    """One pydantic complaint as `key is value, expected ...`."""
+    where = [str(part) for part in detail["loc"]]
+    section = where[0] if where[0] in SECTIONS and len(where) > 1 else ""
+    name = ".".join(where[: 2 if section else 1])
+    if detail["type"] == "extra_forbidden":
+        known = list(SECTIONS[section].model_fields)
+        return f"unknown key '{name}'{did_you_mean(where[-1], known)} known keys: {', '.join(known)}"
+    value: Any = tree
+    for part in name.split("."):
+        value = value.get(part) if isinstance(value, dict) else value
+    if detail["type"] == "finite_number" and isinstance(value, float):
+        return f"{name} is {value}, expected a finite number"
+    return f"{name} is {value!r}, expected {EXPECTED.get(name, detail['msg'])}"
+
 
 HEADER = "trial.yaml"
 DATA = ("data.csv", "data.parquet")

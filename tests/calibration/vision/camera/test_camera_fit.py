@@ -9,8 +9,14 @@ import pytest
 from calibration.vision.camera.board_views import LENSES, PHOTOGRAPHS, photographed, views
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.uncertainty import intervals, trial_covariance
-from finssim.calibration.vision.camera.camera_fit import MODELS, calibrate_camera
-from finssim.calibration.vision.camera.lens_bundle import adjust, evidence, lens_names, lens_vector
+from finssim.calibration.vision.camera.camera_fit import (
+    MODELS,
+    adjust,
+    calibrate_camera,
+    evidence,
+    lens_names,
+    lens_vector,
+)
 from finssim.localization.camera_file import load_camera
 
 

@@ -17,9 +17,7 @@ from finssim.calibration.vision.mounts.mount_model import (
     moved,
     residuals,
 )
-from finssim.calibration.vision.mounts.mount_solver import change
-from finssim.calibration.vision.mounts.mount_start import start_state
-from finssim.calibration.vision.mounts.tag_mounts import fit_mounts, reference_tag
+from finssim.calibration.vision.mounts.tag_mounts import change, fit_mounts, reference_tag, start_state
 from finssim.geometry.rotations import quat_conjugate, quat_from_euler, quat_rotate, quat_to_matrix
 from finssim.localization.detection.tags import corners
 
