@@ -20,6 +20,8 @@ __all__ = ["EPISODES", "Episodes", "run_episodes", "summarize_episodes"]
 
 EPISODES = 64
 """Unless told otherwise: an interval of a rate is then some ±0.12."""
+LABELS = ("trial", "record", "fault", "localization", "clock_offset_s")
+"""What a trial's row has besides its metrics."""
 RESAMPLES = 2000
 SEED = 20261122
 
@@ -114,7 +116,7 @@ def summarize_episodes(trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     Returns:
         `trials`, `valid` (episodes whose world did not break), `metrics` (name -> value, ci95) and `per_trial`.
     """
-    names = [name for name in trials[0] if name != "trial"]
+    names = [name for name in trials[0] if name not in LABELS]
     rng = np.random.default_rng(SEED)
     metrics: dict[str, Any] = {}
     for name in names:

@@ -29,6 +29,9 @@ def print_episodes(result: Mapping[str, Any], console: Console) -> None:
         highlight=False,
     )
     print_table([result], [plant["name"]], console)
+    for trial in result["per_trial"]:
+        if trial.get("fault"):
+            console.print(f"{trial['record']}: {trial['fault']}", highlight=False, markup=False)
 
 
 def print_episodes_by_plant(results: Sequence[Mapping[str, Any]], console: Console) -> None:

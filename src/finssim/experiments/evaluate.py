@@ -78,7 +78,7 @@ def evaluate(
 
     Args:
         controller: A policy directory, pid or pid-paper; or records of one, which are measured as they are.
-        task: Key of `TASKS`, or FILE.py:CLASS of one's own; of records t1 or t2.
+        task: Key of `TASKS`, or FILE.py:CLASS of one's own; of records a task of one vehicle.
         vehicle: A vehicle, a catalogue name or a file.
         hydrodynamics: Model, unless the plant names one.
         plant: Name or file, or several.

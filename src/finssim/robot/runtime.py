@@ -191,6 +191,8 @@ class Runtime:
                 period=self.pilot.period,
                 missed=self.counters.missed,
                 force=force,
+                observation=getattr(self.pilot, "observation", ()),
+                action=getattr(self.pilot, "action", ()),
                 vehicle_sha256=self.vehicle.sha256,
             )
 

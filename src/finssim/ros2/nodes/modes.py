@@ -77,13 +77,11 @@ class Modes:
             "force": runtime.force,
             "vehicle_sha256": self._node.vehicle.sha256,
             "task": pilot.describe().get("task", ""),
+            "observation": getattr(pilot, "observation", ()),
+            "action": getattr(pilot, "action", ()),
         }
         if self.switch.mode == "policy" and self._policy is not None:
-            values |= {
-                "policy_sha256": self._policy.describe().get("files", {}).get(NETWORK_FILE, ""),
-                "observation": self._policy.observation,
-                "action": self._policy.action,
-            }
+            values["policy_sha256"] = self._policy.describe().get("files", {}).get(NETWORK_FILE, "")
         return self._node.make.policy(stamp, self.switch.mode, values)
 
     def _newest(self) -> Array:
