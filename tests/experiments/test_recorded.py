@@ -20,6 +20,7 @@ from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.pool import draw_plant
 from finssim.pool.camera import PoolCamera
 from finssim.pool.site import camera_of
+from finssim.pool.task_site import Referee
 from finssim.pool.truth import read_truth
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.lockstep import run_lockstep
@@ -204,6 +205,7 @@ def test_a_memory_that_was_drawn_is_not_in_a_record(held, tmp_path):
     task = f"{tmp_path / 'go.py'}:Go"
     with pytest.raises(ControlError, match="begins with a memory that its reset draws"):
         read_record(held[0], task, FINSROV).measures(task, FINSROV)
+    assert Referee(task, [FINSROV], seed=1).metrics()["success"] == 0.0  # where it is played, it is scored
 
 
 @pytest.mark.parametrize(

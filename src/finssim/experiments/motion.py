@@ -69,7 +69,8 @@ class Motion:
         """What was done from a time on [s], by the last decision before it; empty where not known."""
         if self.action is None or t < self.t[0] - 1e-3:
             return np.zeros(0)
-        return self.action[int(np.searchsorted(self.t, t + 1e-3)) - 1]
+        done: Array = self.action[int(np.searchsorted(self.t, t + 1e-3)) - 1]
+        return done
 
     def _attitude(self, t: float) -> Array:
         if self.quaternion is None:

@@ -243,7 +243,7 @@ class GoalHistory:
         """The goal between the decisions."""
         rates = np.gradient(self.goal, self.t, axis=0) if len(self.t) > 1 else np.zeros_like(self.goal)
         pose, rate = (
-            np.stack([np.interp(t, self.t, column) for column in rows.T], axis=-1)
+            np.stack([np.interp(np.asarray(t, float), self.t, column) for column in rows.T], axis=-1)
             for rows in (self.goal, rates)
         )
         return Reference(pose[..., :3], rate[..., :3], pose[..., 3], rate[..., 3])

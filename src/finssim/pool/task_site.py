@@ -113,16 +113,15 @@ class Referee:
         device = self._state.steps.device
         if guide is not None and (start is None or self.arrays.reference.position is not None):
             fill_table(self.arrays.reference, [guide])
-        self._guide = None
-        if start is not None and guide is not None:
-            self._guide = guide
+        self._guide = guide if start is not None else None
+        if start is not None:
             self._put({task.vehicles[0]: start})
             self._aim(0.0)
         batch, mask = Batch(self._state, self.arrays, seed), wp.ones(1, dtype=wp.int32, device=device)
-        self._evaluate, start = Pipeline(1, device), Pipeline(1, device)
-        task.add_spawn(start, batch, mask)
-        task.add_observe(start, batch, mask)
-        start.run()
+        self._evaluate, opening = Pipeline(1, device), Pipeline(1, device)
+        task.add_spawn(opening, batch, mask)
+        task.add_observe(opening, batch, mask)
+        opening.run()
         task.add_evaluate(self._evaluate, batch)
         self.over = False
         begun = self.arrays.answers.begun
