@@ -118,10 +118,8 @@ def run(
     from finssim.quiet import start_warp
 
     start_warp()
-    from finssim.pool.sites import vehicle_at
     from finssim.robot.run import Wiring
     from finssim.robot.run import run as drive
-    from finssim.vehicles import load_vehicle
 
     status = drive(
         policy,
@@ -130,7 +128,8 @@ def run(
         goal=goal,
         trajectory=trajectory,
         pool_file=None if pool_file == "none" else Path(pool_file),
-        vehicle=vehicle_at(site, load_vehicle(vehicle)),
+        vehicle=vehicle,
+        site=site,
         wiring=Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep, team=team),
         record=record,
         duration=duration,

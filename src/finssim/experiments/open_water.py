@@ -20,7 +20,7 @@ from finssim.files import atomic_write
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.pool.draw_plant import draw_plant
 from finssim.pool.plant_spec import PlantSpec
-from finssim.pool.sites import positioning_of, site_of, vehicle_at
+from finssim.pool.sites import positioning_of, site_of
 from finssim.pool.truth import read_truth
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.provenance import provenance
@@ -31,6 +31,7 @@ from finssim.robot.perception import Perception
 from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import Vehicle, load_vehicle
+from finssim.vehicles.defaults import vehicle_at
 
 __all__ = ["WAYS", "open_water", "run", "swim", "way_of"]
 

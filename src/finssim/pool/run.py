@@ -25,7 +25,7 @@ from finssim.pool.picture_wire import PictureSink
 from finssim.pool.plant_spec import Basin, PlantSpec, PlantSpecError, Severity, load_plant_spec
 from finssim.pool.server import LockstepServer, serve_realtime
 from finssim.pool.site import camera_of
-from finssim.pool.sites import positioning_of, site_of, vehicle_at
+from finssim.pool.sites import positioning_of, site_of
 from finssim.pool.task_server import MediumServer, serve_task
 from finssim.pool.task_site import TaskSite
 from finssim.pool.virtual_pool import VirtualPool
@@ -36,6 +36,7 @@ from finssim.robot.link.udp import UdpTransport
 from finssim.robot.picture_memory import memory_path
 from finssim.tasks.observer import fitted_task
 from finssim.vehicles import Vehicle, load_vehicle
+from finssim.vehicles.defaults import vehicle_at
 
 __all__ = ["MCU_PORT", "PoolPlan", "make_plan", "run", "run_task"]
 

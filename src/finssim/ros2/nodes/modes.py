@@ -44,11 +44,11 @@ class Modes:
         """
         self._node = node
         self._wrench, self._wrench_at = np.zeros(6), -math.inf
-        pilots: dict[str, Any] = {name: make_pilot(name, node.vehicle) for name in CONTROLLERS}
+        pilots: dict[str, Any] = {name: make_pilot(name, node.filed) for name in CONTROLLERS}
         self._policy: AgentPilot | None = None
         if policy not in pilots:
             pilots["policy"] = self._policy = make_pilot(
-                policy, node.vehicle, task=task or None, trim=Trim() if trim else None
+                policy, node.filed, task=task or None, trim=Trim() if trim else None
             )
         pilots["teleop"] = WrenchPilot(self._newest, node.vehicle)
         self._pilots = {name: _Timed(pilot) for name, pilot in pilots.items()}

@@ -22,6 +22,7 @@ from finssim.ros2.nodes.conversions import nanoseconds
 from finssim.ros2.nodes.ros_messages import RosMessages, ros_type
 from finssim.ros2.topics import TOPICS, quality_profile
 from finssim.vehicles import load_vehicle
+from finssim.vehicles.defaults import vehicle_at
 
 __all__ = ["LISTENING", "RobotNode", "TwinError", "matched_callbacks"]
 
@@ -60,11 +61,14 @@ class RobotNode(Node):
             others: Of nodes that there must not be yet, besides one of its own name.
 
         Raises:
-            VehicleError: The parameter `vehicle` names none.
+            VehicleError: The parameters `vehicle` or `site` name none.
             TwinError: There is one of those nodes.
         """
         super().__init__(name)
-        self.vehicle = load_vehicle(self.parameter("vehicle", "finsrov"))
+        self.filed = load_vehicle(self.parameter("vehicle", "finsrov"))
+        """The vehicle as its file has it, which policies are trained for."""
+        self.vehicle = vehicle_at(self.parameter("site", "pool"), self.filed)
+        """The same as it is equipped for the site."""
         self.make = RosMessages(self.vehicle)
         self._below = "" if self.get_namespace() != "/" else f"{self.vehicle.name.replace('-', '_')}/"
         simulated = self.get_parameter("use_sim_time").value
