@@ -31,6 +31,8 @@ from finssim.vehicles.defaults import with_navigation
 __all__ = ["Messages", "floats"]
 
 MAP, BASE, IMU, LOG = "map", "base_link", "imu_link", "dvl_link"
+SHARED = ("", MAP, "camera", "camera_link", "camera_optical")
+"""Frames of the pool and its camera, which vehicles have in common."""
 
 IMU_VARIANCES = ((0.02, 0.02, 0.05), (0.01,) * 3, (0.1,) * 3)
 """Of attitude [rad²], rates [rad²/s²] and specific force [m²/s⁴], as the published bridge sends them."""
@@ -63,7 +65,13 @@ LEVELS = ("ok", "warn", "error", "stale")
 class Messages:
     """Makes messages of one vehicle; times are integers [ns]."""
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: Vehicle, prefix: str = "") -> None:
+        """
+        Args:
+            vehicle: Its instruments, thrusters and their order.
+            prefix: Of the vehicle's own frames, such as `robot_1/`, where several share /tf.
+        """
+        self._prefix = prefix
         self.types = types()
         self._of = self.types.types
         self.names = list(vehicle.thruster_names)
@@ -171,7 +179,7 @@ class Messages:
         of = self._of
         return of["nav_msgs/msg/Odometry"](
             self.header(stamp, MAP),
-            BASE,
+            self.frame(BASE),
             of["geometry_msgs/msg/PoseWithCovariance"](
                 self.pose(reading.position, reading.quaternion), numbers_of(pose)
             ),
@@ -187,7 +195,7 @@ class Messages:
         pose = of["geometry_msgs/msg/Transform"](
             self.vector(reading.position), self.quaternion(reading.quaternion)
         )
-        one = of["geometry_msgs/msg/TransformStamped"](self.header(stamp, MAP), BASE, pose)
+        one = of["geometry_msgs/msg/TransformStamped"](self.header(stamp, MAP), self.frame(BASE), pose)
         return of["tf2_msgs/msg/TFMessage"]([one])
 
     def estimator(self, stamp: int, reading: Reading, health: Mapping[str, Any]) -> Any:
@@ -278,9 +286,13 @@ class Messages:
         )
         return of["diagnostic_msgs/msg/DiagnosticArray"](self.header(stamp, ""), [status])
 
+    def frame(self, name: str) -> str:
+        """A frame's name as this vehicle says it."""
+        return name if name in SHARED else self._prefix + name
+
     def header(self, stamp: int, frame: str) -> Any:
         """Stamp and frame."""
-        return self._of["std_msgs/msg/Header"](self.time(stamp), frame)
+        return self._of["std_msgs/msg/Header"](self.time(stamp), self.frame(frame))
 
     def time(self, stamp: int) -> Any:
         """A time; one before or after those that the type has, 1901 to 2038, is the first or last of them."""

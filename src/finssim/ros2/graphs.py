@@ -49,6 +49,8 @@ class Plan:
     """Node, or `/**` for all -> parameters."""
     extra: tuple[str, ...] = ()
     """Nodes besides those of the graph: recorder, teleop."""
+    blind: bool = False
+    """Whether no camera looks, so that nothing is localized by it."""
 
     def __post_init__(self) -> None:
         if self.graph not in GRAPHS:
@@ -62,7 +64,8 @@ class Plan:
     @property
     def nodes(self) -> tuple[str, ...]:
         """In the order of their start."""
-        return GRAPHS[self.graph] + self.extra
+        left_out = ("camera", "localizer") if self.blind else ()
+        return (*(name for name in GRAPHS[self.graph] if name not in left_out), *self.extra)
 
     def set(self, node: str, **values: Any) -> None:
         """Give parameters; None leaves a node's own default."""

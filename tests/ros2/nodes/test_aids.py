@@ -14,52 +14,21 @@ activate(announce=False)
 import rclpy
 from rclpy.node import Node
 
-from finssim.pool.draw_plant import draw_plant
-from finssim.pool.sites import positioning_of, site_of
-from finssim.pool.virtual_pool import VirtualPool
-from finssim.robot.link.udp import UdpTransport
 from finssim.ros2.nodes.conversions import nanoseconds
 from finssim.ros2.nodes.hardware_bridge import HardwareBridge
 from finssim.ros2.nodes.ros_messages import ros_type
 from finssim.ros2.nodes.state_estimation import StateEstimation
 from finssim.ros2.topics import TOPICS, quality_profile
-from finssim.vehicles import load_vehicle
-from finssim.vehicles.defaults import vehicle_at
+from reference.sea import Sea
 
 PATIENCE = 40.0  # [s] on a busy machine
-FINSROV = vehicle_at("open-water", load_vehicle("finsrov"))
 HEARD = ("positioning", "dvl", "compass", "odometry", "estimator")
-
-
-class Sea:
-    """A vehicle at rest in open water on a UDP wire, and what a peer hears below a namespace."""
-
-    def __init__(self, name, place):
-        plant = site_of("open-water", draw_plant(FINSROV, 0, "nominal"))
-        self.world = VirtualPool(
-            FINSROV,
-            plant,
-            positioning=positioning_of("motion-capture", 1),
-            start=(place, (0.0, 0.0, 0.0, 1.0)),
-        )
-        self.end = UdpTransport(("127.0.0.1", 0), ("127.0.0.1", 9))
-        self.began, self.now, self.name = time.monotonic(), 0.0, name
-
-    def turn(self):
-        """Let the world go on to this moment."""
-        self.now = max(time.monotonic() - self.began, self.now)
-        for _, frame in self.world.exchange(self.now, self.end.receive()).frames:
-            self.end.send(frame)
-
-    def close(self):
-        self.world.close()
-        self.end.close()
 
 
 @pytest.fixture
 def sea():
     """One vehicle, its bridge and its estimator."""
-    made = Sea("finsrov", (3.0, -2.0, -4.0))
+    made = Sea((3.0, -2.0, -4.0))
     address = f"robot:='udp://127.0.0.1:{made.end.address[1]}'"
     options = [
         "vehicle:='finsrov'",
@@ -71,8 +40,7 @@ def sea():
     words = [word for option in options for word in ("-p", option)]
     rclpy.init(args=["--ros-args", "-r", "__ns:=/finsrov", *words])
     bridge, estimator, peer = HardwareBridge(), StateEstimation(), Node("peer")
-    made.end.close()
-    made.end = UdpTransport(made.end.address, bridge.transport.address)
+    made.know(bridge.transport.address)
     heard = {key: [] for key in HEARD}
     for key in HEARD:
         topic = TOPICS[key]

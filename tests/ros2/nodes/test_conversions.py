@@ -87,14 +87,15 @@ def test_what_a_navigation_instrument_said_comes_back_as_it_was(kind, values, st
     """All but its sequence; one of another frame is refused, and a variance that is no number is passed on."""
     key, message = MAKE.aid(STAMP, NavigationAid(7, kind, 0.25, values, std))
     message = wire(message)
-    back = aid_of(key, message, 0.25)
+    frame = TOPICS[key].frame
+    back = aid_of(key, message, 0.25, frame)
     assert (back.kind, back.age, nanoseconds(message.header.stamp)) == (kind, 0.25, STAMP)
     assert (back.values, back.std) == (pytest.approx(values), pytest.approx(std))
     message.header.frame_id = "odom"
-    assert aid_of(key, message, 0.25) == "of another frame"
+    assert aid_of(key, message, 0.25, frame) == "of another frame"
     if key == "positioning":
         message.header.frame_id, message.pose.covariance = "map", [math.nan] * 36
-        assert math.isnan(aid_of(key, message, 0.25).std[0])
+        assert math.isnan(aid_of(key, message, 0.25, frame).std[0])
 
 
 def test_an_imu_message_is_in_body_axes():

@@ -27,7 +27,6 @@ from finssim.robot.messages import (
 )
 from finssim.robot.record_messages import FIRST_TIME, LAST_TIME, UNKNOWN
 from finssim.robot.record_pictures import picture_of
-from finssim.robot.record_topics import TOPICS
 from finssim.robot.robot import Reading
 
 __all__ = [
@@ -85,16 +84,16 @@ def telemetry_of(message: Any) -> Telemetry:
     )
 
 
-def aid_of(key: str, message: Any, age: float) -> NavigationAid | str:
+def aid_of(key: str, message: Any, age: float, frame: str) -> NavigationAid | str:
     """What a navigation instrument measured, or why it cannot be used; what is no number is left to those who use it.
 
     Args:
         key: Of its topic: positioning, dvl or compass.
         message: As it came.
         age: Since its stamp [s].
+        frame: In which it must be.
     """
-    frame = message.header.frame_id.rpartition("/")[2]
-    if frame not in ("", TOPICS[key].frame):
+    if message.header.frame_id not in ("", frame):
         return "of another frame"
     if key == "dvl":
         return NavigationAid(0, VELOCITY, age, xyz(message.twist.twist.linear), (0.0, 0.0))
@@ -121,10 +120,10 @@ def force_of(message: Any, names: Sequence[str]) -> Array | str:
     return ordered if np.isfinite(ordered).all() else "it holds a thrust that is not finite"
 
 
-def wrench_of(message: Any) -> Array | None:
+def wrench_of(message: Any, frame: str = "base_link") -> Array | None:
     """The wrench of a WrenchStamped, body frame [N, N m], (6,); None where it is of another frame or not finite."""
     tau = np.array([*xyz(message.wrench.force), *xyz(message.wrench.torque)])
-    fits = message.header.frame_id in ("", "base_link")
+    fits = message.header.frame_id in ("", frame)
     return tau if fits and np.isfinite(tau).all() else None
 
 

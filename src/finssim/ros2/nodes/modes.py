@@ -89,7 +89,7 @@ class Modes:
         return self._wrench if fresh else np.zeros(6)
 
     def _on_wrench(self, message: Any) -> None:
-        tau = wrench_of(message)
+        tau = wrench_of(message, self._node.make.frame("base_link"))
         if tau is not None:
             self._wrench, self._wrench_at = tau, self._node.now()
 

@@ -69,7 +69,7 @@ class RobotNode(Node):
         """The vehicle as its file has it, which policies are trained for."""
         self.vehicle = vehicle_at(self.parameter("site", "pool"), self.filed)
         """The same as it is equipped for the site."""
-        self.make = RosMessages(self.vehicle)
+        self.make = RosMessages(self.vehicle, self.parameter("frame_prefix", ""))
         self._below = "" if self.get_namespace() != "/" else f"{self.vehicle.name.replace('-', '_')}/"
         simulated = self.get_parameter("use_sim_time").value
         self.base = 0 if simulated else self.get_clock().now().nanoseconds // 10**9 * 10**9

@@ -16,6 +16,7 @@ from finssim.ros2.nodes.conversions import aid_of, telemetry_of
 from finssim.ros2.nodes.fix_frame import FixFrame
 from finssim.ros2.nodes.frames import Frames
 from finssim.ros2.nodes.robot_node import RobotNode
+from finssim.ros2.topics import TOPICS
 
 __all__ = ["StateEstimation", "health_values"]
 
@@ -50,7 +51,8 @@ class StateEstimation(RobotNode):
 
     def _on_aid(self, key: str, message: Any) -> None:
         now = self.now()
-        aid = aid_of(key, message, now - self.seconds(message.header.stamp))
+        frame = self.make.frame(TOPICS[key].frame)
+        aid = aid_of(key, message, now - self.seconds(message.header.stamp), frame)
         if isinstance(aid, str):
             self.perception.estimator.refuse("aid", aid)
         else:
