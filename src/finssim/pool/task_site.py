@@ -25,6 +25,7 @@ from finssim.engine.launch import Pipeline
 from finssim.engine.state import State
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.localization.pool import Pool
+from finssim.pool.fleet import Fleet
 from finssim.pool.medium import Medium
 from finssim.pool.others import ScriptedPilot, TrueState, truth_of
 from finssim.pool.plant_spec import Basin, PlantSpec
@@ -206,14 +207,13 @@ class _Goal:
         return Reference(*rows, np.full(shape, yaw), np.zeros(shape))
 
 
-class TaskSite:
-    """One episode of a task in the virtual site, in lock-step.
+class TaskSite(Fleet):
+    """One episode of a task in the virtual site, with everybody by place.
 
     Attributes:
         referee: The task.
-        worlds: Plants and motor controllers, by place.
-        runtimes: The robots' software, by place.
-        medium: What carries their messages.
+        runtimes: The robots' software, of those that are not elsewhere.
+        carrier: What carries their messages: `medium`.
         scored: Control steps of the episode so far.
     """
 
@@ -262,7 +262,7 @@ class TaskSite:
             )
         self.task, goal = referee.task, guide or _Goal(referee)
         names = self.task.vehicles
-        self.worlds = {
+        worlds = {
             name: VirtualPool(
                 vehicle,
                 spec(vehicle),
@@ -275,8 +275,8 @@ class TaskSite:
             for i, (name, vehicle, place) in enumerate(zip(names, vehicles, referee.places(), strict=True))
         }
         site = (SITE,) if self._target() is not None else ()
-        self.medium = Medium(self._positions, communication, seed)
-        self.runtimes: dict[str, Runtime] = {}
+        super().__init__(worlds)
+        self.carrier = self.medium = Medium(self._positions, communication, seed)
         self.scored, self._since = 0, math.nan
         self._actions: dict[str, Array] = {}
         about = {"command": "finssim experiment stack", "guide": goal.name, "armed": True}
@@ -325,17 +325,28 @@ class TaskSite:
             run_together(
                 stacks,
                 longest,
-                carrier=self.medium if len(stacks) > 1 else None,
+                carrier=self.carrier if len(stacks) > 1 else None,
                 show=look,
                 until=lambda: self.referee.over or (duration is not None and self.scored * step >= duration),
             )
         finally:
-            for world in self.worlds.values():
-                world.close()
+            self.close()
             for runtime in self.runtimes.values():
                 if runtime.recorder is not None:
                     runtime.recorder.close()
         return self.referee.metrics()
+
+    @property
+    def over(self) -> bool:
+        """Whether the episode has ended."""
+        return self.referee.over
+
+    def turn(self, now: float, due: bool) -> None:
+        """Score; the episode begins when every agent's thrusters have been enabled."""
+        if self.scored or all(self.worlds[name].firmware.driving for name in self.task.agents):
+            self.score(now)
+        elif due:
+            self.tell_target()
 
     def score(self, now: float, since: float | None = None) -> None:
         """Let the task score what is true, as often as a control step has passed.
@@ -370,7 +381,7 @@ class TaskSite:
         target = self._target()
         if target is not None:
             now = max(world.time for world in self.worlds.values())
-            self.medium.send(now, SITE, encode_track("target", target, now), lossless=True)
+            self.carrier.send(now, SITE, encode_track("target", target, now), lossless=True)
 
     def _positions(self) -> dict[str, Array]:
         return {name: np.asarray(world.plant.position, float) for name, world in self.worlds.items()}

@@ -64,6 +64,10 @@ class Recorder:
         texts = {name: Path(file).read_bytes() for name, file in (files or {}).items()}
         texts |= _vehicle_file(vehicle)
         self._name, self._messages = vehicle.name, Messages(vehicle)
+        for (
+            topic
+        ) in TOPICS.values():  # compiles what packs a type: the first message of each must not wait for it
+            self._messages.types.get_msgdef(topic.type)
         self._pictures, self._epoch = pictures, round(epoch * 1e9)
         self._sink = RecordSink(Path(path), self._announce, chunk_seconds=chunk_seconds)
         about = {

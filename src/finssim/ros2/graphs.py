@@ -12,7 +12,7 @@ import yaml
 from finssim.ros2.errors import Ros2Error
 from finssim.ros2.topics import TOPICS, Topic
 
-__all__ = ["GRAPHS", "MCU_PORT", "NODES", "PARENT", "Plan", "run_node", "topics_of"]
+__all__ = ["GRAPHS", "MCU_PORT", "NODES", "Plan", "run_node", "topics_of"]
 
 NODES = {
     "camera": "finssim.ros2.nodes.camera:Camera",
@@ -34,8 +34,6 @@ GRAPHS = {"sim": ("sim", "controller"), "robot": ROBOT, "pool": ("virtual_pool",
 
 MCU_PORT = 58766
 """Of a virtual pool's motor controller, if not told otherwise; pictures leave from the next port."""
-PARENT = "FINSSIM_PARENT"
-"""Environment of a node: process without which it ends too."""
 
 
 @dataclass

@@ -150,6 +150,7 @@ class Observer:
         everywhere = wp.ones(1, dtype=wp.int32, device=state.steps.device)
         # An episode's first observation: what has been heard of the others is what is known of them now.
         task.add_observe(self._pipeline, Batch(state, self._arrays, 0), everywhere)
+        self._pipeline.run()  # a robot's first decision must not wait for the compiler
 
     def _aim(self, guide: Guide) -> None:
         """What of a guide is looked at ahead of time."""

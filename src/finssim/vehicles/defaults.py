@@ -25,6 +25,7 @@ __all__ = [
     "default_safety",
     "default_sensors",
     "default_tags",
+    "numbered",
     "room",
     "vehicle_at",
     "with_navigation",
@@ -132,6 +133,16 @@ def vehicle_at(site: str, vehicle: Vehicle) -> Vehicle:
     }
     fitted = with_navigation(vehicle) if site == "open-water" else vehicle
     return fitted.model_copy(update={"safety": vehicle.safety.model_copy(update=box)})
+
+
+def numbered(vehicle: Vehicle, number: int) -> Vehicle:
+    """The vehicle as one of several under one camera, from 0: its tags' ids go on after those of the one before."""
+    tags = vehicle.tags
+    if number == 0 or tags is None:
+        return vehicle
+    step = max(tags.mounts) - min(tags.mounts) + 1
+    mounts = {tag + number * step: mount for tag, mount in tags.mounts.items()}
+    return vehicle.model_copy(update={"tags": tags.model_copy(update={"mounts": mounts})})
 
 
 def default_mcu(given: Mapping[str, Any]) -> Mcu:
