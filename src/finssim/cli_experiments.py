@@ -346,6 +346,12 @@ def stack(
             help="Directory that keeps every episode; one that was interrupted goes on.", metavar="DIR"
         ),
     ] = None,
+    records: Annotated[
+        bool,
+        typer.Option(
+            "--records", help="Keep in --out what every agent recorded (.mcap), and its truth (.truth)."
+        ),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Play any task through the deployed software, all its vehicles in lock-step; print it beside the batch.
@@ -355,6 +361,8 @@ def stack(
 
     Example: finssim experiment stack team-pursuit --policy runs/team --episodes 20 --out runs/team-stack
     """
+    if records and out is None:
+        raise typer.BadParameter("--records are kept in a directory: give --out")
     from finssim.quiet import start_warp
 
     start_warp()
@@ -369,6 +377,7 @@ def stack(
         severity=severity,  # type: ignore[arg-type]
         seed=seed,
         out=out,
+        records=records,
         as_json=as_json,
         show=lambda line: typer.echo(line, err=True),
     )

@@ -119,7 +119,8 @@ def evaluate(
     task: Annotated[
         str,
         typer.Option(
-            help="Task to be tried on; finssim tasks lists them. One's own: FILE.py:CLASS. Of records t1 or t2.",
+            help="Task to be tried on; finssim tasks lists them. One's own: FILE.py:CLASS. Of records a task "
+            "of one vehicle.",
             metavar="TASK",
         ),
     ] = "t1",

@@ -32,9 +32,13 @@ def pool(
         bool, typer.Option("--lockstep", help="Time goes as fast as one robot asks, instead of in real time.")
     ] = False,
     camera: Annotated[
-        str,
-        typer.Option(help="What the camera sends: pictures, corners (of the tags) or none.", metavar="KIND"),
-    ] = "pictures",
+        str | None,
+        typer.Option(
+            help="What the camera sends: pictures, corners (of the tags) or none. If not given: pictures, over a team "
+            "corners, in open water and of a task none.",
+            metavar="KIND",
+        ),
+    ] = None,
     pictures: Annotated[
         str,
         typer.Option(
@@ -67,7 +71,10 @@ def pool(
         ),
     ] = None,
     truth: Annotated[
-        Path | None, typer.Option(help="File to write what truly happened into, for scoring.", metavar="FILE")
+        Path | None,
+        typer.Option(
+            help="File to write what truly happened into, for scoring; of a team a folder.", metavar="FILE"
+        ),
     ] = None,
     start: Annotated[
         str | None,
@@ -79,10 +86,18 @@ def pool(
     task: Annotated[
         str | None,
         typer.Option(
-            help="The site of a task in open water, in real time. Every agent has a motor controller, at --port, ten "
-            "ports on, and so on, for a robot at --robot, ten ports on, and so on; their messages go to the port five "
-            "after --port. What the task commands is commanded here, and the task scores what is true.",
+            help="The site of a task in open water, in real time, with ports as of --team; messages between the robots "
+            "go to the port five after --port. What the task commands is commanded here; the task scores what is true.",
             metavar="TASK",
+        ),
+    ] = None,
+    team: Annotated[
+        str | None,
+        typer.Option(
+            help="Several vehicles in one water, in real time: names or files with commas between, the agents of "
+            "--task, or side by side without. Each has a motor controller, at --port, ten ports on, and so on, for a "
+            "robot at --robot, ten ports on, and so on. A camera sees them all; each has tags of its own ids.",
+            metavar="NAME,NAME",
         ),
     ] = None,
     site: Annotated[
@@ -103,26 +118,27 @@ def pool(
     Example: finssim pool --plant 1 --severity realistic --pool-file pool.yaml --truth truth.fst
     """
     start_warp()
-    from finssim.pool.run import run, run_task
+    from finssim.pool.run import run, run_team
 
-    if task is not None:
-        if (
-            not plant.isdecimal()
-            or lockstep
-            or pool_file is not None
-            or truth is not None
-            or start is not None
-        ):
+    if task is not None or team is not None:
+        files = task is not None and (pool_file is not None or truth is not None)
+        if not plant.isdecimal() or lockstep or start is not None or files:
             raise typer.BadParameter(
-                "--task draws its plants, its time is real and its starts are its own: give a seed for --plant, leave "
-                "--lockstep, --pool-file, --truth and --start out"
+                "--team and --task draw their plants, their time is real and their starts are their own: give a seed "
+                "for --plant, leave --lockstep and --start out, and of a task --pool-file and --truth"
             )
-        run_task(
-            task,
-            vehicle,
+        names = [name.strip() for name in team.split(",")] if team is not None else [vehicle]
+        blind = task is not None or site == "open-water"
+        run_team(
+            names,
+            task=task,
             plant=int(plant),
             severity=severity,  # type: ignore[arg-type]
+            camera=camera or ("none" if blind else "corners"),  # type: ignore[arg-type]
+            site=site,
             positioning=positioning,
+            pool_file=pool_file,
+            truth=truth,
             port=port,
             bind=bind,
             robot=robot,
@@ -135,7 +151,7 @@ def pool(
         plant=plant,
         severity=severity,  # type: ignore[arg-type]
         lockstep=lockstep,
-        camera=camera,  # type: ignore[arg-type]
+        camera=camera or ("none" if site == "open-water" else "pictures"),  # type: ignore[arg-type]
         pictures=pictures,
         port=port,
         bind=bind,

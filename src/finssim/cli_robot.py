@@ -17,12 +17,12 @@ __all__ = ["robot_or_none", "run"]
 
 def run(
     policy: Annotated[
-        str,
+        str | None,
         typer.Option(
             help="A policy's directory, or pid, or pid-paper, or with --task one of the task's baselines.",
             metavar="DIR|NAME",
         ),
-    ],
+    ] = None,
     task: Annotated[
         str | None,
         typer.Option(
@@ -64,27 +64,46 @@ def run(
     bind: Bind = "127.0.0.1:54321",
     pictures: Pictures = None,
     pool_file: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="Pool file: camera, water plane and frames (.yaml); none where no camera looks.",
+            help="Pool file: camera, water plane and frames (.yaml); none where no camera looks. If not given: "
+            "pool.yaml, of --team none.",
             metavar="FILE|none",
         ),
-    ] = "pool.yaml",
+    ] = None,
     site: Annotated[
-        str,
+        str | None,
         typer.Option(
             help="Where: pool, tank or open-water. The workspace, and in open water Doppler log and compass, are then "
-            "those of finssim pool --site.",
+            "those of finssim pool --site. If not given: pool, of --team open-water.",
             metavar="NAME",
         ),
-    ] = "pool",
+    ] = None,
     team: Annotated[
+        str | None,
+        typer.Option(
+            help="In place of --policy: who steers all agents of a task, each with a stack in a process of its own. "
+            "Their motor controllers and own ends are those of --robot and --bind, ten ports on, and so on. An address "
+            "is taken for that of --messages.",
+            metavar="DIR|NAME",
+        ),
+    ] = None,
+    messages: Annotated[
         str,
         typer.Option(
-            help="What carries messages between vehicles, such as finssim pool --task: HOST:PORT.",
+            help="What carries messages between vehicles, such as finssim pool --task: HOST:PORT. Of --team the port "
+            "five after --robot if not given.",
             metavar="ADDRESS",
         ),
     ] = "",
+    number: Annotated[
+        int,
+        typer.Option(
+            help="This vehicle's number among several under one camera: its tags' ids go on after those of the one "
+            "before.",
+            min=0,
+        ),
+    ] = 0,
     vehicle: Vehicle = "finsrov",
     trim: Annotated[
         bool,
@@ -96,7 +115,11 @@ def run(
         str, typer.Option(help="Estimator: constant-velocity or error-state.", metavar="MODE")
     ] = "constant-velocity",
     record: Annotated[
-        Path | None, typer.Option(help="Record everything into this file (.mcap).", metavar="FILE")
+        Path | None,
+        typer.Option(
+            help="Record everything into this file (.mcap); of --team a folder with a file for each.",
+            metavar="FILE",
+        ),
     ] = None,
     duration: Annotated[
         float | None,
@@ -114,14 +137,38 @@ def run(
     Exit status 3: the run ended in a fault of the vehicle; 4: the vehicle said nothing.
 
     Example: finssim run --policy runs/hold --goal 0.5,0,-0.5,90 --pool-file pool.yaml --duration 60 --arm
+
+    Example: finssim run --team runs/team --duration 60 --arm
     """
     from finssim.quiet import start_warp
+    from finssim.robot.interrupt import follow_parent
 
+    follow_parent()
     start_warp()
-    from finssim.pool.sites import vehicle_at
+    if team is not None and _is_address(team):
+        team, messages = None, team
+    if (policy is None) == (team is None):
+        raise typer.BadParameter("who steers? give --policy for this vehicle, or --team for all of a task")
+    if team is not None:
+        if agent is not None or trajectory is not None or lockstep or number:
+            raise typer.BadParameter(
+                "--team has every agent in its place: leave --agent, --trajectory, --lockstep and --number out"
+            )
+        from finssim.robot.team_run import run_team
+
+        where = {"--site": site or "open-water", "--pool-file": pool_file or "none", "--goal": goal}
+        options = {**where, "--mode": mode, "--duration": duration}
+        given = [word for name, x in options.items() if x is not None for word in (name, str(x))]
+        flags = [name for name, on in (("--trim", trim), ("--arm", arm)) if on]
+        ends = {"robot": robot, "bind": bind, "messages": messages}
+        kept = {"record": record, "as_json": as_json}
+        status = run_team(team, [*given, *flags], task=task, vehicle=vehicle, **ends, **kept)  # type: ignore[arg-type]
+        if status:
+            raise typer.Exit(status)
+        return
+    assert policy is not None
     from finssim.robot.run import Wiring
     from finssim.robot.run import run as drive
-    from finssim.vehicles import load_vehicle
 
     status = drive(
         policy,
@@ -129,9 +176,11 @@ def run(
         agent=agent,
         goal=goal,
         trajectory=trajectory,
-        pool_file=None if pool_file == "none" else Path(pool_file),
-        vehicle=vehicle_at(site, load_vehicle(vehicle)),
-        wiring=Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep, team=team),
+        pool_file=None if pool_file == "none" else Path(pool_file or "pool.yaml"),
+        vehicle=vehicle,
+        site=site or "pool",
+        number=number,
+        wiring=Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep, team=messages),
         record=record,
         duration=duration,
         mode=mode,
@@ -141,6 +190,12 @@ def run(
     )
     if status:
         raise typer.Exit(status)
+
+
+def _is_address(text: str) -> bool:
+    """Whether that is HOST:PORT."""
+    host, _, port = text.rpartition(":")
+    return bool(host) and port.isdecimal()
 
 
 def robot_or_none(

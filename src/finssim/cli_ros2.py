@@ -71,6 +71,27 @@ def up(
         ),
     ] = False,
     vehicle: Vehicle = "finsrov",
+    namespace: Annotated[
+        str | None,
+        typer.Option(
+            help="What the vehicle's topics stand below and its own frames begin with, such as robot_1: one for each "
+            "of several vehicles in a graph. The vehicle's name, and no prefix, if not given.",
+            metavar="NAME",
+        ),
+    ] = None,
+    site: Annotated[
+        str,
+        typer.Option(
+            help="Where: pool, tank or open-water, where no camera looks and Doppler log and compass are aboard.",
+            metavar="NAME",
+        ),
+    ] = "pool",
+    positioning: Annotated[
+        str,
+        typer.Option(
+            help="Fixes on the wire of a virtual pool: none, motion-capture or usbl.", metavar="NAME"
+        ),
+    ] = "none",
     goal: Annotated[
         str | None,
         typer.Option(
@@ -110,7 +131,10 @@ def up(
     ] = None,
     pool_file: Annotated[
         Path | None,
-        typer.Option(help="Pool file: read by a robot, written by a virtual pool (.yaml).", metavar="FILE"),
+        typer.Option(
+            help="Pool file: read by a robot, written by a virtual pool (.yaml); none where no camera looks.",
+            metavar="FILE|none",
+        ),
     ] = None,
     plant: Annotated[
         str, typer.Option(help="Plant of a virtual pool: a seed, or a file.", metavar="SEED|FILE")

@@ -1,33 +1,41 @@
 """Records measured: the same measures of the same motion, from the robot's estimate, from a truth, on any clock."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from finssim import boundary
 from finssim.cli import app
+from finssim.control.errors import ControlError
 from finssim.control.guidance import Station
 from finssim.control.trajectories import load_trajectory
 from finssim.experiments.evaluate import evaluate
 from finssim.experiments.metrics import measure_trial
 from finssim.experiments.paper import T1_SETPOINTS
 from finssim.experiments.recorded import RecordedError, read_record
+from finssim.experiments.stack import site_of
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.pool import draw_plant
 from finssim.pool.camera import PoolCamera
 from finssim.pool.site import camera_of
+from finssim.pool.task_site import Referee
 from finssim.pool.truth import read_truth
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.pilots import make_pilot
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
+from finssim.tasks import task_named
+from finssim.tasks.baselines import BASELINES
 from finssim.vehicles import load_vehicle
+from reference.policies import linear, written
 
 pytestmark = pytest.mark.slow
 
 FINSROV = load_vehicle("finsrov")
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 X, Y, Z, YAW = T1_SETPOINTS["P03"]
 
 
@@ -130,7 +138,7 @@ def test_a_run_that_ended_early_counts_without_success(tmp_path):
 
 
 def test_a_trajectory_is_measured_by_the_name_in_the_record(tmp_path, capsys):
-    """The way is whole, the errors are a PID's; a truth of another run, t1 and other tasks are refused."""
+    """The way is whole, the errors are a PID's; a truth of another run, t1 and a task of several are refused."""
     guide = load_trajectory("straight")
     first = tuple(guide.at(0.0).position.tolist())
     record, truth, _ = driven(tmp_path, guide, guide.duration + 5.0, "t2", first)
@@ -141,7 +149,9 @@ def test_a_trajectory_is_measured_by_the_name_in_the_record(tmp_path, capsys):
     assert done.result["per_trial"][0]["p95_m"] < 0.08 and done.result["per_trial"][0]["success"]
     with pytest.raises(RecordedError, match="its goal moves"):
         read_record(record, "t1", FINSROV)
-    with pytest.raises(RecordedError, match="not in 'docking'"):
+    with pytest.raises(RecordedError, match="'pursuit' has 2 vehicles and .* is of one"):
+        read_record(record, "pursuit", FINSROV)
+    with pytest.raises(RecordedError, match="its goal moves, and 'docking' has one"):
         read_record(record, "docking", FINSROV)
     short = tmp_path / "short.csv"
     short.write_text("t,x,y,z,yaw\n0,0,0,0,0\n1,0,0,0,0\n")
@@ -150,6 +160,52 @@ def test_a_trajectory_is_measured_by_the_name_in_the_record(tmp_path, capsys):
     short.write_text("time,x,y\n0,0,0\n")
     with pytest.raises(RecordedError, match="columns time, x, y, expected t"):
         read_record(record, "t2", FINSROV, truth=short)
+
+
+@pytest.mark.parametrize("task", ["t3", "docking", "own_task", "own_task_torch"])
+def test_a_record_is_scored_as_the_episode_was(task, tmp_path, capsys):
+    """By the same referee, of the truth that the site wrote: the live score, but for the clock that is found again.
+
+    The truth's clock is found to 10 ms, and at 0.5 m/s that is 5 mm; the return is a mean over hundreds of steps.
+    """
+    who = next(iter(BASELINES.get(task, {})), "")
+    if task.startswith("own"):
+        task = f"{EXAMPLES / task}.py:KeepDepth"
+        gain = np.zeros((6, 2), np.float32)
+        gain[2] = 5.0, -2.0
+        who = str(written(linear(gain), tmp_path / "depth", task_named(task), 6))
+    live = site_of(task, who, [FINSROV], seed=3, record=tmp_path / "episode").run()
+    record, truth = (tmp_path / "episode" / f"vehicle.{kind}" for kind in ("mcap", "truth"))
+    assert boundary.run(app, ["evaluate", str(record), "--task", task, "--truth", str(truth), "--json"]) == 0
+    (scored,) = json.loads(capsys.readouterr().out)["per_trial"]
+    assert scored["fault"] == "" and scored["success"] == live["success"] == 1.0
+    assert scored["length"] == live["length"] and abs(scored["held"] - live["held"]) < 0.35
+    assert scored["return"] == pytest.approx(live["return"], rel=0.02)
+    assert 0.0005 < scored["localization"]["position_m"] < 0.05
+    known = read_record(record, task, FINSROV).measures(task, FINSROV)
+    assert known["success"] == 1.0 and known["return"] == pytest.approx(live["return"], rel=0.05)
+
+
+def test_an_episode_that_was_cut_short_counts_without_success(tmp_path, capsys):
+    """5 of 40 s of docking: the table says so beneath, and no return is told."""
+    site_of("docking", "align-insert", [FINSROV], seed=3, record=tmp_path).run(duration=5.0)
+    assert boundary.run(app, ["evaluate", str(tmp_path / "vehicle.mcap"), "--task", "docking"]) == 0
+    assert "vehicle.mcap: ended early" in capsys.readouterr().out
+    (done,) = evaluate([tmp_path / "vehicle.mcap"], task="docking", json=True)
+    (trial,) = done.result["per_trial"]
+    assert trial["success"] == 0.0 and trial["return"] is None and done.result["valid"] == 0
+
+
+def test_a_memory_that_was_drawn_is_not_in_a_record(held, tmp_path):
+    """A task in torch that remembers where it began is refused by name."""
+    text = (EXAMPLES / "own_task_torch.py").read_text().split("if __name__")[0]
+    text = text.replace("class KeepDepth(TorchTask):", "class Go(TorchTask):\n    memory = {'last': 3}\n")
+    start = "memory={'last': w.uniform(low, high)}, position="
+    (tmp_path / "go.py").write_text(text.replace("Start(position=", f"Start({start}"))
+    task = f"{tmp_path / 'go.py'}:Go"
+    with pytest.raises(ControlError, match="begins with a memory that its reset draws"):
+        read_record(held[0], task, FINSROV).measures(task, FINSROV)
+    assert Referee(task, [FINSROV], seed=1).metrics()["success"] == 0.0  # where it is played, it is scored
 
 
 @pytest.mark.parametrize(

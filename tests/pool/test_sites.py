@@ -10,11 +10,12 @@ from finssim.pool.draw_plant import draw_plant
 from finssim.pool.plant_spec import PlantSpec, PlantSpecError
 from finssim.pool.positioning import POSITIONING, Positioning
 from finssim.pool.run import make_plan
-from finssim.pool.sites import OPEN, SITES, positioning_of, site_of, vehicle_at
+from finssim.pool.sites import OPEN, positioning_of, site_of
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.link.decoder import Decoder
 from finssim.robot.messages import HEADING, POSE, POSITION, VELOCITY, NavigationAid
 from finssim.vehicles import load_vehicle
+from finssim.vehicles.defaults import SITES, vehicle_at
 
 HEAVY = load_vehicle("bluerov2_heavy")
 

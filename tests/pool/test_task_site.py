@@ -18,7 +18,7 @@ from finssim.tasks import TASKS, task_named
 from finssim.tasks.baselines import BASELINES
 from finssim.tasks.communication import Communication
 from finssim.vehicles import load_vehicle
-from reference.policies import written
+from reference.policies import linear, written
 
 FINSROV = load_vehicle("finsrov")
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -54,15 +54,6 @@ def test_a_policy_of_ones_own_task_runs_through_the_stack(example, tmp_path):
     assert site.run()["success"] == 1.0
     pilot = site.runtimes["vehicle"].pilot
     assert isinstance(pilot, AgentPilot) and pilot.describe()["task"] == "keep-depth"
-
-
-def linear(gain):
-    import torch
-    from torch import nn
-
-    layer = nn.Linear(gain.shape[1], gain.shape[0], bias=False)
-    layer.weight.data = torch.from_numpy(gain)
-    return nn.Sequential(layer)
 
 
 @pytest.mark.slow

@@ -8,6 +8,16 @@ from finssim.vehicles import load_vehicle
 FINSROV = load_vehicle("finsrov")
 
 
+def linear(gain):
+    """A network without bias: action = gain · observation."""
+    import torch
+    from torch import nn
+
+    layer = nn.Linear(gain.shape[1], gain.shape[0], bias=False)
+    layer.weight.data = torch.from_numpy(gain)
+    return nn.Sequential(layer)
+
+
 def written(network, folder, task, size):
     """A policy directory of a network."""
     description = PolicyDescription(

@@ -8,7 +8,17 @@ import yaml
 
 from finssim.files import OutputError
 from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
-from finssim.robot.messages import CommandEcho, Picture, TagCorners, Telemetry
+from finssim.robot.messages import (
+    HEADING,
+    POSE,
+    POSITION,
+    VELOCITY,
+    CommandEcho,
+    NavigationAid,
+    Picture,
+    TagCorners,
+    Telemetry,
+)
 from finssim.robot.record_topics import TOPICS
 from finssim.robot.robot import Reading
 from finssim.vehicles import load_vehicle
@@ -19,6 +29,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2.metadata import dump_qos_v8, parse_qos
 
+from finssim.robot.record_info import describe_record
 from finssim.robot.record_messages import Messages
 from finssim.robot.record_reader import open_record
 from finssim.robot.recorder import Recorder
@@ -70,6 +81,11 @@ def full(tmp_path_factory):
         recorder.echo(0.08, echo)
         recorder.picture(0.09, Picture(0.085, 1, picture))
         recorder.picture(0.10, Picture(0.095, 2, tags=(TagCorners(15, np.arange(8.0).reshape(4, 2)),)))
+        recorder.aid(0.105, NavigationAid(1, POSITION, 0.1, (1.0, 2.0, -3.0), (0.5, 0.0)))
+        recorder.aid(0.106, NavigationAid(2, POSE, 0.02, (1.0, 2.0, np.pi / 2), (0.002, 0.005)))
+        recorder.aid(0.107, NavigationAid(3, VELOCITY, 0.06, (0.4, 0.1, -0.1), (0.0, 0.0)))
+        recorder.aid(0.108, NavigationAid(4, HEADING, 0.02, (np.pi / 2, 0.0, 0.0), (0.0, 0.0)))
+        recorder.aid(0.109, NavigationAid(5, 99, 0.02, (1.0, 0.0, 0.0), (0.0, 0.0)))
         recorder.event(0.11, "arm", "by hand", source="keyboard")
         recorder.diagnostics(0.12, "link", "warn", "3 lost", {"lost": 3})
     assert recorder.problem == "" and recorder.dropped == 0
@@ -140,6 +156,31 @@ def test_rosbags_reads_back_what_the_robot_did(full):
     assert picture.format == "jpeg" and bytes(picture.data[:2]) == b"\xff\xd8"
 
 
+def test_rosbags_reads_back_what_navigation_instruments_said(full):
+    """At the time of the measurement, in map, log and body; what is not measured is as uncertain as can be."""
+    found = messages(full)
+    (_, fix), (time, pose) = found["/finsrov/positioning/pose"]  # an unknown kind makes no message
+    assert time == 1_700_000_000_106_000_000
+    assert (fix.header.frame_id, fix.header.stamp.nanosec) == ("map", 5_000_000)
+    assert (fix.pose.pose.position.x, fix.pose.pose.position.z) == (1.0, -3.0)
+    assert np.diag(fix.pose.covariance.reshape(6, 6)).tolist() == [0.25] * 3 + [1e6] * 3
+    assert pose.pose.pose.orientation.z == pytest.approx(np.sin(np.pi / 4))
+    assert np.diag(pose.pose.covariance.reshape(6, 6)) == pytest.approx([4e-6, 4e-6, 1e6, 1e6, 1e6, 25e-6])
+    ((_, log),) = found["/finsrov/dvl/twist"]
+    assert (log.header.frame_id, log.header.stamp.nanosec) == ("dvl_link", 47_000_000)
+    assert (log.twist.twist.linear.x, log.twist.twist.linear.z) == (0.4, -0.1)
+    assert log.twist.covariance[[0, 35]] == pytest.approx([0.008**2, 1e6])
+    ((_, compass),) = found["/finsrov/compass/imu"]
+    assert compass.header.frame_id == "base_link" and compass.orientation.w == pytest.approx(
+        np.cos(np.pi / 4)
+    )
+    assert compass.orientation_covariance[[0, 8]] == pytest.approx([1e6, np.radians(0.4) ** 2])
+    assert compass.angular_velocity_covariance[0] == compass.linear_acceleration_covariance[0] == -1.0
+    with open_record(full) as record:
+        told = describe_record(record)["topics"]
+    assert told["/finsrov/positioning/pose"]["messages"] == 2
+
+
 def test_the_mcap_library_finds_summary_metadata_and_vehicle_file(full):
     """An independent reader checks every checksum and decodes each message."""
     from mcap.reader import make_reader
@@ -149,7 +190,7 @@ def test_the_mcap_library_finds_summary_metadata_and_vehicle_file(full):
         reader = make_reader(file, validate_crcs=True, decoder_factories=[decoders])
         assert reader.get_header().profile == "ros2"
         summary = reader.get_summary()
-        assert summary.statistics.message_count == 17 == len(list(reader.iter_decoded_messages()))
+        assert summary.statistics.message_count == 21 == len(list(reader.iter_decoded_messages()))
         (about,) = [m.metadata for m in reader.iter_metadata()]
         (kept,) = list(reader.iter_attachments())
     assert about["vehicle_sha256"] == VEHICLE.sha256

@@ -15,7 +15,9 @@ from finssim.robot.link.frames import encode_telemetry
 from finssim.robot.lockstep_codec import decode_request, encode_delivery, receive
 from finssim.robot.messages import Delivery
 from finssim.robot.record_reader import open_record
+from finssim.tasks import task_named
 from finssim.vehicles import load_vehicle
+from reference.policies import linear, written
 from reference.rounds import Rounds, overhead, without_latency
 
 POOL = overhead()
@@ -116,6 +118,20 @@ def test_the_error_state_estimator_can_be_chosen(capsys, pool_file):
     assert status == 0 and summary["fixes"] > 20
     assert finssim(*words, "--robot", world.address, "--mode", "psychic") == 2
     assert "unknown mode 'psychic'" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_policy_runs_where_the_vehicle_is_equipped_otherwise(capsys, tmp_path):
+    """Open water has another workspace, a log and a compass; policy and record stay those of the vehicle's file."""
+    policy = written(linear(np.zeros((6, 16), np.float32)), tmp_path / "policy", task_named("t1"), 6)
+    words = ("--policy", str(policy), "--goal", "0,0,-5,0", "--pool-file", "none", "--site", "open-water")
+    ends = ("--robot", "udp://127.0.0.1:9", "--bind", "127.0.0.1:0", "--duration", "0.5")
+    record = tmp_path / "run.mcap"
+    assert boundary.run(app, ["run", *words, *ends, "--record", str(record)]) == 4  # nobody is there
+    capsys.readouterr()
+    with open_record(record) as opened:
+        assert opened.metadata["vehicle_sha256"] == load_vehicle("finsrov").sha256
+        assert opened.metadata["site"] == "open-water"
 
 
 def test_a_trajectory_can_be_followed_in_place_of_a_goal(capsys, pool_file):

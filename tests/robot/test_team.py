@@ -74,10 +74,10 @@ def test_the_newest_counts_and_strangers_are_not_listened_to():
 def test_nothing_is_decided_before_all_have_been_heard():
     team = Team("herder", ("prey", "left"))
     team.hear(4.0, [encode_track("prey", HERE, 4.0)])
-    waiting = team.known(4.0, reading(4.0))
+    waiting = team.known(reading(4.0))
     assert not waiting.ready and waiting.reason == "nothing heard of left"
     team.hear(4.1, [encode_track("left", HERE, 4.1)])
-    assert team.known(4.1, reading(4.1)).ready and set(team.known(4.1, reading(4.1)).tracks) == {
+    assert team.known(reading(4.1)).ready and set(team.known(reading(4.1)).tracks) == {
         "prey",
         "left",
     }

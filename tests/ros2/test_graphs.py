@@ -68,6 +68,10 @@ def told(graph, tmp_path, **choices):
             "hardware_bridge",
             {"robot": "serial:/dev/x"},
         ),
+        ("robot", {"site": "open-water"}, "state_estimation", {"pool_file": "none"}),
+        ("robot", {"site": "open-water"}, "**", {"vehicle": "finsrov", "site": "open-water"}),
+        ("pool", {"namespace": "robot_1"}, "**", {"frame_prefix": "robot_1/"}),
+        ("pool", {"site": "open-water", "positioning": "usbl"}, "virtual_pool", {"camera": "none"}),
         ("robot", {"robot": "dry-run", "pool_file": FILE}, "camera", {"pictures": "none"}),
         ("robot", {"pictures": "shm:a", "pool_file": FILE}, "camera", {"pictures": "shm:a"}),
     ],
@@ -81,6 +85,8 @@ def test_choices_reach_their_node(tmp_path, graph, choices, node, parameters):
 def test_extra_nodes_are_started_where_asked_for():
     """Recorder and teleoperation."""
     assert plan_of("sim", Options(), FILE).nodes == GRAPHS["sim"]
+    blind = plan_of("robot", Options(site="open-water"), FILE).nodes
+    assert blind == ("hardware_bridge", "state_estimation", "controller")
     both = plan_of("sim", Options(record=Path("r.mcap"), teleop="joy"), FILE)
     assert both.nodes == (*GRAPHS["sim"], "recorder", "teleop")
 

@@ -130,3 +130,47 @@ def test_a_trajectory_longer_than_an_episode_is_seen_to_its_end():
     seen = observer.observe(me, circle, t)
     np.testing.assert_allclose(seen[:3], 0.0, atol=1e-4)
     np.testing.assert_allclose(seen[12:15], circle.at(t).velocity, atol=1e-3)
+
+
+TORCH = (EXAMPLES / "own_task_torch.py").read_text().split("if __name__")[0]
+
+
+def in_torch(folder, heave, more=""):
+    """A task in torch whose second part of the observation is something else."""
+    text = TORCH.replace("w.velocity[:, 2]\n", f"{heave}\n")
+    text = text.replace("class KeepDepth(TorchTask):", f"class KeepDepth(TorchTask):\n    {more}\n")
+    assert heave in text
+    (folder / "task.py").write_text(text)
+    return f"{folder / 'task.py'}:KeepDepth"
+
+
+@pytest.mark.parametrize("heave", ["w.memory['last'][:, 0]", "w.held"])
+def test_what_no_robot_knows_is_refused_before_it_runs(tmp_path, heave):
+    """A memory that reward writes, and how long the tolerance was kept; in a simulation both are there."""
+    name = in_torch(tmp_path, heave, "memory = {'last': 1}")
+    assert np.isfinite(Environment(task_named(name), FINSROV, worlds=2, seed=1).reset()).all()
+    with pytest.raises(
+        ControlError, match="'keep-depth' cannot be observed on a robot: it looks at w"
+    ) as error:
+        Observer(name, FINSROV)
+    assert heave.partition("[:")[0] in str(error.value)
+
+
+def test_a_memory_that_is_not_observed_is_no_hindrance(tmp_path):
+    assert Observer(in_torch(tmp_path, "w.velocity[:, 2].abs()", "memory = {'last': 1}"), FINSROV)
+
+
+@pytest.mark.parametrize("action", ["w.action[:, 0]", "w.previous_action[:, 0]"])
+def test_a_task_in_torch_sees_its_last_actions_on_a_robot(tmp_path, action):
+    """The one that was just done, and the one before, as in the batch; none where it begins again."""
+    name = in_torch(tmp_path, action)
+    env, observer = Environment(task_named(name), FINSROV, worlds=1, seed=1), Observer(name, FINSROV)
+    me, goal = Track(np.zeros(3), quat_from_yaw(0.0), np.zeros(6)), Station((0.0, 0.0, -0.5), 0.0)
+    env.reset()
+    observer.observe(me, goal, 0.0)
+    for k in range(1, 5):
+        done = np.full((1, 6), 0.1 * k)
+        seen = env.step(done).observation[0, 1]
+        assert observer.observe(me, goal, 0.1 * k, done[0])[1] == seen
+    observer.restart()
+    assert observer.observe(me, goal, 0.0)[1] == 0.0

@@ -73,6 +73,8 @@ class Drive:
     """Where the vehicle should be: x, y, z [m], yaw [rad], world frame, (N, 4)."""
     force: Array
     """Thrusts that were asked for, canonical order [N], (N, n)."""
+    action: Array
+    """What the pilot did, in [-1, 1], (N, size); of size 0 where the record does not tell it, as of a person."""
     stretch: NDArray[np.int64]
     """Number of the stretch a decision belongs to, (N,): all through it the robot was armed, the estimate ready and
     the driver at the helm. Negative: in none."""
@@ -178,7 +180,10 @@ def _numbers(rows: list[dict[str, Any]]) -> dict[str, Array]:
     goals = [row["goal"].pose for row in rows]
     # The goal is level: its quaternion turns about z alone.
     yaw = [2.0 * math.atan2(g.orientation.z, g.orientation.w) for g in goals]
+    actions = [np.asarray(row["policy_info"].action, dtype=float) for row in rows]
+    alike = len({len(action) for action in actions}) == 1
     return {
+        "action": np.array(actions) if alike else np.zeros((len(rows), 0)),
         "position": np.array([_xyz(p.position) for p in poses]),
         "quaternion": np.array([(*_xyz(p.orientation), p.orientation.w) for p in poses]),
         "nu": np.array([(*_xyz(t.linear), *_xyz(t.angular)) for t in twists]),

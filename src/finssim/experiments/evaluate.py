@@ -307,7 +307,7 @@ def evaluate(
 
     Args:
         controller: A policy directory, pid or pid-paper; or records of one, which are measured as they are.
-        task: Key of `TASKS`, or FILE.py:CLASS of one's own; of records t1 or t2.
+        task: Key of `TASKS`, or FILE.py:CLASS of one's own; of records a task of one vehicle.
         vehicle: A vehicle, a catalogue name or a file.
         plant: Name or file, or several.
         observe: What is seen in every plant: truth, estimator or sensors; what the plant says if None.

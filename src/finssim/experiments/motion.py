@@ -1,4 +1,4 @@
-"""The motion of one trial of a robot, by the truth or by an estimate, and the published measures of it."""
+"""The motion of one trial of a robot, by the truth or by an estimate; its measures, published or the task's own."""
 
 from __future__ import annotations
 
@@ -11,9 +11,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.control.guidance import Guide
-from finssim.experiments.metrics import ERRORS, measure_tracking, measure_trial
+from finssim.control.tracking import Track
+from finssim.experiments.metrics import ERRORS, MAX_GAP, measure_tracking, measure_trial
+from finssim.geometry.rotations import (
+    quat_conjugate,
+    quat_from_yaw,
+    quat_inverse_rotate,
+    quat_multiply,
+    quat_to_rotvec,
+)
+from finssim.pool.task_site import Referee
+from finssim.tasks import Task
+from finssim.vehicles import Vehicle
 
-__all__ = ["PERIOD", "Motion", "localization_errors", "measure", "on_grid"]
+__all__ = ["PERIOD", "Motion", "follows", "localization_errors", "measure", "on_grid", "score"]
 
 Array = NDArray[np.float64]
 
@@ -33,8 +44,83 @@ class Motion:
     """Heading [rad], (T,)."""
     quaternion: Array | None = None
     """Body to world, xyzw, (T, 4); None where roll and pitch are not known."""
+    nu: Array | None = None
+    """Velocity of the body origin, body frame [m/s, rad/s], (T, 6); None where it is not measured."""
     thrust: Array | None = None
     """Of each thruster [N], (T, n); None where not known."""
+    action: Array | None = None
+    """What was done from then on, in [-1, 1], (T, size); None where not known."""
+
+    def at(self, t: float) -> Track:
+        """Where the vehicle was at a time [s], between the samples; velocities that are not measured are differences
+        over a `PERIOD` to either side."""
+        position = self._between(self.position, t)
+        quaternion = self._attitude(t)
+        if self.nu is not None:
+            return Track(position, quaternion, self._between(self.nu, t))
+        first, last = max(t - PERIOD, float(self.t[0])), min(t + PERIOD, float(self.t[-1]))
+        way = self._between(self.position, last) - self._between(self.position, first)
+        turn = quat_to_rotvec(quat_multiply(quat_conjugate(self._attitude(first)), self._attitude(last)))
+        linear = np.asarray(quat_inverse_rotate(quaternion, way))
+        return Track(position, quaternion, np.concatenate([linear, turn]) / max(last - first, 1e-9))
+
+    def done(self, t: float) -> Array:
+        """What was done from a time on [s], by the last decision before it; empty where not known."""
+        if self.action is None or t < self.t[0] - 1e-3:
+            return np.zeros(0)
+        done: Array = self.action[int(np.searchsorted(self.t, t + 1e-3)) - 1]
+        return done
+
+    def _attitude(self, t: float) -> Array:
+        if self.quaternion is None:
+            return np.asarray(quat_from_yaw(float(np.interp(t, self.t, np.unwrap(self.yaw)))))
+        flips = np.cumprod(
+            np.where(np.sum(self.quaternion[1:] * self.quaternion[:-1], axis=1) < 0.0, -1.0, 1.0)
+        )
+        q = self._between(self.quaternion * np.concatenate([[1.0], flips])[:, None], t)
+        return q / np.linalg.norm(q)
+
+    def _between(self, columns: Array, t: float) -> Array:
+        return np.array([np.interp(t, self.t, column) for column in columns.T])
+
+
+def follows(task: Task) -> bool:
+    """Whether it follows a reference that is known ahead."""
+    return hasattr(task, "knot_spacing")
+
+
+def score(
+    task: Task, vehicle: Vehicle, guide: Guide, motion: Motion, done: Motion, duration: float
+) -> tuple[dict[str, float | None], str]:
+    """How the task itself measures an episode of one vehicle that was played elsewhere.
+
+    Args:
+        task: Fitted to the vehicle.
+        vehicle: Which was driven.
+        guide: Where the task's goal is, by the time from the start.
+        motion: By which it is measured, from the start.
+        done: With the actions.
+        duration: Up to when it was played [s].
+
+    Returns:
+        Its metrics, None where there is none; and why there are none, in a sentence, which counts without success.
+    """
+    size = 0 if done.action is None else done.action.shape[1]
+    referee = Referee(task, [vehicle], guide=guide, start=motion.at(0.0), action_size=size or None)
+    (name,), fault = task.agents, ""
+    times = np.concatenate([[0.0], motion.t, [duration]])
+    widest = int(np.argmax(np.diff(times)))
+    if times[widest + 1] - times[widest] > MAX_GAP:
+        fault = f"no position from {times[widest]:.1f} to {times[widest + 1]:.1f} s"
+    for k in range(round(duration / task.control_step) if not fault else 0):
+        actions = {name: done.done(k * task.control_step)}
+        referee.look({name: motion.at((k + 1) * task.control_step)}, actions)
+        if referee.over:
+            break
+    if not referee.over:
+        unknown: dict[str, float | None] = dict.fromkeys(referee.metrics())
+        return unknown | ({"success": 0.0} if "success" in unknown else {}), fault or "ended early"
+    return {key: x if math.isfinite(x) else None for key, x in referee.metrics().items()}, ""
 
 
 def measure(

@@ -17,7 +17,7 @@ from finssim.experiments.campaign import Say, choice, write_json
 from finssim.experiments.tables import console_table
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.pool import PlantSpec, VirtualPool, draw_plant, read_truth
-from finssim.pool.sites import positioning_of, site_of, vehicle_at
+from finssim.pool.sites import positioning_of, site_of
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.robot.lockstep import run_lockstep
@@ -26,6 +26,7 @@ from finssim.robot.perception import Perception
 from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import Vehicle, load_vehicle
+from finssim.vehicles.defaults import vehicle_at
 
 __all__ = ["open_water", "print_open_water"]
 

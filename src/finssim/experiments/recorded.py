@@ -11,18 +11,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from finssim.calibration.trials.table_file import read_table
-from finssim.control.guidance import Guide
+from finssim.control.guidance import Guide, Reference
 from finssim.control.trajectories import load_trajectory
 from finssim.experiments.driven import SAME_GOAL, Drive, read_drive, station_at, trajectory_of
-from finssim.experiments.motion import Motion, localization_errors, measure, on_grid
+from finssim.experiments.motion import Motion, follows, localization_errors, measure, on_grid, score
 from finssim.experiments.paper import T1_SETPOINTS, in_room
 from finssim.experiments.trials import DURATION, TrackingTrials, Trials
 from finssim.geometry.rotations import quat_yaw
 from finssim.pool.truth import read_truth
 from finssim.robot.record_reader import open_record
+from finssim.tasks.observer import fitted_task
 from finssim.vehicles import Vehicle
 from finssim.viewer.frame import ViewError
 from finssim.viewer.sources.alignment import offset_between
@@ -32,8 +33,8 @@ __all__ = ["RecordedError", "RecordedTrial", "measured_records", "read_record"]
 
 Array = NDArray[np.float64]
 
-MEASURED = ("t1", "t2")
-"""Tasks whose measures need no more than the motion and where the vehicle should have been."""
+PUBLISHED = ("t1", "t2")
+"""Tasks that are measured as in the paper; every other one measures itself."""
 EARLY = 0.5
 """A trial that lacks more than this of its end was stopped [s]."""
 
@@ -56,14 +57,26 @@ class RecordedTrial:
     """By which it is measured: the truth, or the estimate."""
     stopped: bool
     """Whether it ended before its time."""
+    duration: float
+    """Up to when it is measured [s]."""
     offset: float | None
     """Added to the truth's times to put them on the robot's clock [s]; None without a truth."""
 
     def measures(self, task: str, vehicle: Vehicle) -> dict[str, Any]:
-        """What `motion.measure` says, and how far the estimate was from the truth."""
+        """What `motion.measure` says of T1 and T2 and the task of itself, and how far the estimate was from the truth.
+
+        Raises:
+            ControlError: The task cannot score what was played elsewhere.
+        """
+        if task in PUBLISHED:
+            fault = "ended early" if self.stopped else ""
+            row = measure(task, self.guide, self.motion, vehicle.force_limits, stopped=self.stopped)
+        else:
+            fitted = fitted_task(task, vehicle)
+            row, fault = score(fitted, vehicle, self.guide, self.motion, self.estimate, self.duration)
         return {
-            **measure(task, self.guide, self.motion, vehicle.force_limits, stopped=self.stopped),
-            "fault": "ended early" if self.stopped else "",
+            **row,
+            "fault": fault,
             "localization": None if self.offset is None else localization_errors(self.motion, self.estimate),
             "clock_offset_s": self.offset,
         }
@@ -82,44 +95,59 @@ def read_record(
 
     Args:
         path: MCAP file of `finssim run`, `experiment --robot` or the ROS 2 graph.
-        task: t1 or t2.
+        task: Of one vehicle: its name, or FILE.py:CLASS of one's own.
         vehicle: The very one that was driven.
-        guide: What was followed in t2; by the record's own words if None.
+        guide: What was followed, of a task that follows a reference; by the record's own words if None.
         truth: Truth file of a virtual pool, or a table (.csv, .parquet) of motion capture, world frame: columns t [s],
             x, y, z of the body origin [m], and qx, qy, qz, qw or yaw [rad]. Its clock may be any: it is laid over the
             robot's where the distance between the two motions is least.
         duration: Of a trial of t1 [s].
 
     Raises:
-        RecordedError: Another task, a record of a drive by hand, of several goals, or a truth of another run.
-        RecordError, DriveError: The record cannot be used.
+        RecordedError: A task of several vehicles, a record of a drive by hand, of several goals, without what the task
+            needs, or a truth of another run.
+        RecordError, DriveError, ControlError: The record or the task cannot be used.
         CalibrationError, TruthError: The truth cannot be read.
     """
-    if task not in MEASURED:
+    fitted = fitted_task(task, vehicle)
+    if len(fitted.vehicles) > 1:
         raise RecordedError(
-            f"records are measured in {' and '.join(MEASURED)}, not in '{task}': its measures need more than a motion"
+            f"task '{task}' has {len(fitted.vehicles)} vehicles and {path} is of one: finssim pool --task and finssim "
+            "experiment stack score it as it is played"
         )
     drive = read_drive(path, vehicle)
     pilot = _pilot(path)
     steered = drive.stretch >= 0
     if not (steered & (drive.since >= 0.0)).any():
         raise RecordedError(f"{path}: the robot was never armed with its state known: nothing was done in it")
-    the_guide = _station(drive, steered) if task == "t1" else guide or trajectory_of(drive, vehicle)
-    whole = min(the_guide.duration, duration) if task == "t1" else the_guide.duration
+    if task not in PUBLISHED and not drive.action.shape[1]:
+        raise RecordedError(
+            f"{path}: does not tell what the pilot did, in [-1, 1], which '{task}' scores: record a run of this version"
+        )
+    if follows(fitted):
+        the_guide = guide or trajectory_of(drive, vehicle)
+    else:
+        the_guide = GoalHistory.of(drive, steered) if fitted.moving else _station(drive, steered, task)
+    longest = {"t1": duration, "t2": math.inf}.get(task, fitted.time_limit)
+    whole = min(the_guide.duration, longest)
     rows = steered & (drive.since >= 0.0) & (drive.since <= whole + 1e-6)
     estimate = Motion(
         t=drive.since[rows],
         position=drive.position[rows],
         yaw=np.asarray(quat_yaw(drive.quaternion[rows])),
         quaternion=drive.quaternion[rows],
+        nu=drive.nu[rows],
         thrust=drive.force[rows],
+        action=drive.action[rows],
     )
     last = float(estimate.t[-1])
     stopped = last < whole - EARLY
+    played = last if stopped else whole
     motion, offset = estimate, None
     if truth is not None:
-        motion, offset = _truth(truth, drive, last if stopped else whole)
-    return RecordedTrial(path, the_guide, pilot or {"name": drive.driver}, estimate, motion, stopped, offset)
+        motion, offset = _truth(truth, drive, played)
+    about = pilot or {"name": drive.driver}
+    return RecordedTrial(path, the_guide, about, estimate, motion, stopped, played, offset)
 
 
 def measured_records(
@@ -129,14 +157,14 @@ def measured_records(
     *,
     trajectory: str | Path | None = None,
     truth: Path | None = None,
-) -> tuple[dict[str, Any], list[dict[str, Any]], Trials | TrackingTrials]:
-    """What an evaluation says of records: who and where, the measures by trial, and the motions for its figure.
+) -> tuple[dict[str, Any], list[dict[str, Any]], Trials | TrackingTrials | None]:
+    """What an evaluation says of records: who and where, the measures by trial, and of t1 and t2 the motions to draw.
 
     Args:
         records: MCAP files.
-        task: t1 or t2.
+        task: As of `read_record`.
         vehicle: The very one that was driven.
-        trajectory: Name or file of what was followed in t2; the record's own if None.
+        trajectory: Name or file of what was followed; the record's own if None.
         truth: As of `read_record`, of one record or of all.
 
     Raises:
@@ -150,11 +178,10 @@ def measured_records(
         raise RecordedError(
             f"the records are of several controllers ({names}): evaluate those of one at a time"
         )
-    named = "setpoint" if task == "t1" else "trajectory"
     measures = [
         {
             "trial": i,
-            named: _setpoint(trial.guide, vehicle) if task == "t1" else trial.guide.name,
+            **_goal_named(task, trial.guide, vehicle),
             "record": trial.path.name,
             **trial.measures(task, vehicle),
         }
@@ -174,7 +201,7 @@ def measured_records(
         ],
         "truth": None if truth is None else truth.name,
     }
-    return described, measures, _trials(found, task, vehicle)
+    return described, measures, _trials(found, task, vehicle) if task in PUBLISHED else None
 
 
 def _pilot(path: Path) -> dict[str, Any]:
@@ -189,16 +216,60 @@ def _pilot(path: Path) -> dict[str, Any]:
         ) from None
 
 
-def _station(drive: Drive, steered: NDArray[np.bool_]) -> Guide:
-    """The one goal that was held."""
+@dataclass(frozen=True)
+class GoalHistory:
+    """Where a moving goal was, as the record has it; it is a guide."""
+
+    t: Array
+    """Time since the start [s], (T,)."""
+    goal: Array
+    """x, y, z [m] and yaw without jumps [rad], world frame, (T, 4)."""
+    name: str = "recorded"
+    duration: float = math.inf
+
+    @classmethod
+    def of(cls, drive: Drive, steered: NDArray[np.bool_]) -> GoalHistory:
+        """Of what was done.
+
+        Raises:
+            RecordedError: There was no goal.
+        """
+        goals, rows = _goals(drive, steered), steered & (drive.since >= 0.0)
+        return cls(drive.since[rows], np.column_stack([goals[:, :3], np.unwrap(goals[:, 3])]))
+
+    def at(self, t: ArrayLike) -> Reference:
+        """The goal between the decisions."""
+        rates = np.gradient(self.goal, self.t, axis=0) if len(self.t) > 1 else np.zeros_like(self.goal)
+        pose, rate = (
+            np.stack([np.interp(np.asarray(t, float), self.t, column) for column in rows.T], axis=-1)
+            for rows in (self.goal, rates)
+        )
+        return Reference(pose[..., :3], rate[..., :3], pose[..., 3], rate[..., 3])
+
+
+def _goals(drive: Drive, steered: NDArray[np.bool_]) -> Array:
+    """Where the vehicle should have been, by decision."""
     if not drive.has_goal:
         raise RecordedError(f"{drive.path}: was driven by hand to no goal: a record of finssim run has one")
-    goals = drive.goal[steered & (drive.since >= 0.0)]
+    return drive.goal[steered & (drive.since >= 0.0)]
+
+
+def _station(drive: Drive, steered: NDArray[np.bool_], task: str) -> Guide:
+    """The one goal that was held, or the dock."""
+    goals = _goals(drive, steered)
     if float(np.abs(goals - goals[0]).max()) > SAME_GOAL:
         raise RecordedError(
-            f"{drive.path}: its goal moves: measure it with --task t2, or record each station by itself"
+            f"{drive.path}: its goal moves, and '{task}' has one: measure it with --task t2 or t3, or record each "
+            "station by itself"
         )
     return station_at(goals[0])
+
+
+def _goal_named(task: str, guide: Guide, vehicle: Vehicle) -> dict[str, str]:
+    """What a trial of t1 and t2 went to, for its row."""
+    if task not in PUBLISHED:
+        return {}
+    return {"setpoint": _setpoint(guide, vehicle)} if task == "t1" else {"trajectory": guide.name}
 
 
 def _setpoint(guide: Guide, vehicle: Vehicle) -> str:
@@ -221,7 +292,7 @@ def _goal(guide: Guide) -> list[float]:
 
 def _truth(path: Path, drive: Drive, until: float) -> tuple[Motion, float]:
     """The true motion from the guide's start to a time after it [s], and what was added to its times."""
-    time, position, yaw, quaternion = _table(path)
+    time, position, yaw, quaternion, nu = _table(path)
     try:
         offset = offset_between(PoseSeries(drive.time, drive.position, drive.quaternion), time, position)
     except ViewError as error:
@@ -234,16 +305,17 @@ def _truth(path: Path, drive: Drive, until: float) -> tuple[Motion, float]:
             position=position[rows],
             yaw=yaw[rows],
             quaternion=None if quaternion is None else quaternion[rows],
+            nu=None if nu is None else nu[rows],
         ),
         offset,
     )
 
 
-def _table(path: Path) -> tuple[Array, Array, Array, Array | None]:
-    """Times [s], positions [m], headings [rad] and orientations of a truth; the last None where it has none."""
+def _table(path: Path) -> tuple[Array, Array, Array, Array | None, Array | None]:
+    """Times [s], positions [m], headings [rad], orientations and velocities of a truth; None where it has none."""
     if path.suffix.lower() not in (".csv", ".txt", ".tsv", ".parquet"):
         found = read_truth(path)
-        return found.time, found.position, np.asarray(quat_yaw(found.quaternion)), found.quaternion
+        return found.time, found.position, np.asarray(quat_yaw(found.quaternion)), found.quaternion, found.nu
     columns = read_table(path).numbers
     attitude = ("qx", "qy", "qz", "qw")
     turned = set(attitude) <= set(columns)
@@ -261,7 +333,7 @@ def _table(path: Path) -> tuple[Array, Array, Array, Array | None]:
         )
     quaternion = rows[:, 4:8] if turned else None
     yaw = rows[:, 4] if quaternion is None else np.asarray(quat_yaw(quaternion))
-    return rows[:, 0], rows[:, 1:4], yaw, quaternion
+    return rows[:, 0], rows[:, 1:4], yaw, quaternion, None
 
 
 def _trials(found: Sequence[RecordedTrial], task: str, vehicle: Vehicle) -> Trials | TrackingTrials:

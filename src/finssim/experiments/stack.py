@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from rich.table import Table
 
 from finssim.control.guidance import Guide
 from finssim.control.trajectories import TRAJECTORIES
+from finssim.experiments.motion import follows
 from finssim.experiments.trials import summarize_episodes
 from finssim.files import atomic_write
 from finssim.pool.camera import PoolCamera
@@ -47,6 +49,7 @@ def site_of(
     severity: Severity = "nominal",
     guide: Guide | None = None,
     communication: Communication | None = None,
+    record: Path | None = None,
 ) -> TaskSite:
     """One episode of a task in the virtual site, with a controller for all agents.
 
@@ -62,6 +65,7 @@ def site_of(
         severity: How far the plants are from the vehicle files.
         guide: The reference, of a task that follows one.
         communication: Of what the vehicles tell each other; the task's own if None.
+        record: Folder that takes PLACE.mcap and PLACE.truth of every agent; None: nothing is kept.
 
     Raises:
         PolicyError, ControlError, BaselineError: Controller, vehicles and task do not fit.
@@ -84,6 +88,7 @@ def site_of(
         if pool
         else None,
         positioning="none" if pool else "motion-capture",
+        record=record,
     )
 
 
@@ -97,6 +102,7 @@ def play(
     severity: Severity = "nominal",
     seed: int = 1,
     out: Path | None = None,
+    records: bool = False,
     as_json: bool = False,
     show: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
@@ -111,6 +117,7 @@ def play(
         severity: How far the plants are from the vehicle file.
         seed: Of the first episode; the others follow.
         out: Folder that keeps each episode as it ends; what is there already is not played again.
+        records: Also keep what every agent recorded, and the truth, in a folder of `out` for each episode.
         as_json: Print one JSON object.
         show: Called with a line after each episode.
 
@@ -129,8 +136,13 @@ def play(
     }  # fmt: skip
     rows = _kept(out, about)
     for k in range(len(rows), episodes):
-        guide = list(TRAJECTORIES.values())[k % len(TRAJECTORIES)] if _follows(fitted) else None
-        site = site_of(task, who, vehicles, seed=seed + k, plant=plant, severity=severity, guide=guide)
+        guide = list(TRAJECTORIES.values())[k % len(TRAJECTORIES)] if follows(fitted) else None
+        record = out / f"episode_{k}" if out is not None and records else None
+        if record is not None:
+            shutil.rmtree(record, ignore_errors=True)  # of an episode that was interrupted
+        site = site_of(
+            task, who, vehicles, seed=seed + k, plant=plant, severity=severity, guide=guide, record=record
+        )
         measured = site.run()
         rows.append({"trial": k, **{name: x if np.isfinite(x) else None for name, x in measured.items()}})
         if out is not None:
@@ -153,11 +165,6 @@ def _kept(out: Path | None, about: Mapping[str, Any]) -> list[dict[str, Any]]:
         return []
     data = json.loads((out / ROWS).read_text(encoding="utf-8"))
     return list(data["episodes"]) if {**about, "episodes": data.get("episodes")} == data else []
-
-
-def _follows(task: Task) -> bool:
-    """Whether it follows a reference that is known ahead."""
-    return hasattr(task, "knot_spacing")
 
 
 def _batch(task: str, who: str, vehicles: Sequence[Vehicle], seed: int) -> list[dict[str, Any]]:

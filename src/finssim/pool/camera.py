@@ -36,6 +36,7 @@ class PoolCamera:
         settings: CameraSettings | None = None,
         basin: Basin | None = None,
         seed: int = 0,
+        noise_seed: int | None = None,
     ) -> None:
         """
         Args:
@@ -46,6 +47,7 @@ class PoolCamera:
             settings: How it takes pictures, from `camera_of`.
             basin: What the pictures show around the vehicle; that of plants drawn around it if None.
             seed: Of ripples, noise, jitter and losses.
+            noise_seed: Of the noise alone, for another vehicle in the same corners; `seed` if None.
 
         Raises:
             PlantSpecError: The vehicle has no tags, or there is no such mode.
@@ -61,7 +63,7 @@ class PoolCamera:
         ripples = Ripples(rms_slope=s.ripples, seed=seed) if s.ripples else None
         self._view: CornerCamera | PictureCamera
         if mode == "corners":
-            self._view = CornerCamera(tags, site, ripples, pixel_noise=s.pixel_noise, seed=seed)
+            self._view = CornerCamera(tags, site, ripples, pixel_noise=s.pixel_noise, seed=noise_seed or seed)
         else:
             self._view = PictureCamera(
                 tags,

@@ -15,7 +15,7 @@ from finssim.control.tracking import Measured, Track
 from finssim.engine.launch import Pipeline
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.robot import Reading
-from finssim.tasks.observer import fitted_task, one_world
+from finssim.tasks.observer import fitted_task, one_world, unscored
 from finssim.tasks.task import Batch, Task
 from finssim.vehicles import Vehicle
 
@@ -77,6 +77,7 @@ class ScriptedPilot:
         mode = action or task.action
         self._mode = action_mode(mode, vehicles[-1])
         state, self._arrays = one_world(task, len(self._mode.labels))
+        unscored(self._arrays)
         self._state = state
         self._pipeline = Pipeline(1, wp.get_device("cpu"))
         task.add_command(self._pipeline, Batch(state, self._arrays, seed))

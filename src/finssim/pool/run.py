@@ -6,7 +6,7 @@ import logging
 import math
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,14 +19,16 @@ import typer
 from finssim.control.guidance import Station
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.localization.pool import Pool, write_pool
+from finssim.pool.camera import PoolCamera
 from finssim.pool.draw_plant import draw_plant
+from finssim.pool.fleet import Fleet
 from finssim.pool.picture_process import CameraPlan, PictureProcess, PictureWire
-from finssim.pool.picture_wire import PictureSink
+from finssim.pool.picture_wire import PictureSink, UdpSender
 from finssim.pool.plant_spec import Basin, PlantSpec, PlantSpecError, Severity, load_plant_spec
 from finssim.pool.server import LockstepServer, serve_realtime
 from finssim.pool.site import camera_of
-from finssim.pool.sites import positioning_of, site_of, vehicle_at
-from finssim.pool.task_server import MediumServer, serve_task
+from finssim.pool.sites import positioning_of, site_of
+from finssim.pool.task_server import MediumServer, serve_fleet
 from finssim.pool.task_site import TaskSite
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.goals import station_of
@@ -36,13 +38,16 @@ from finssim.robot.link.udp import UdpTransport
 from finssim.robot.picture_memory import memory_path
 from finssim.tasks.observer import fitted_task
 from finssim.vehicles import Vehicle, load_vehicle
+from finssim.vehicles.defaults import numbered, vehicle_at
 
-__all__ = ["MCU_PORT", "PoolPlan", "make_plan", "run", "run_task"]
+__all__ = ["MCU_PORT", "PoolPlan", "make_plan", "run", "run_team", "swimming"]
 
 MCU_PORT = 58766
 """Of the motor controller; pictures come from the next port, lock-step is the one after."""
 MESSAGES = 5
 """The messages of a team are this far from the first port."""
+ROOM = 2.0
+"""Vehicles of a team start so many lengths of the longest apart."""
 MEMORY = "pool"
 """Name of the shared memory of a pool on the default port; on others the port follows: pool-40000."""
 
@@ -169,37 +174,93 @@ def run(
         _realtime(plan, make_world, (bind, port), host_port(robot, "--robot"), wire, longest)
 
 
-def run_task(
-    task: str,
-    vehicle: str,
+def run_team(
+    team: Sequence[str],
     *,
+    task: str | None,
     plant: int,
     severity: Severity,
+    camera: Literal["pictures", "corners", "none"],
+    site: str,
     positioning: str,
     port: int,
     bind: str,
     robot: str,
+    pool_file: Path | None,
+    truth: Path | None,
     duration: float | None,
     seed: int,
 ) -> None:
-    """Run the site of a task in open water, with a robot for each of its agents; arguments as of the command."""
+    """Run a site of several vehicles, or of a task, with a robot for each; arguments as of the command.
+
+    Args:
+        team: Vehicles, by place; one for all of a task.
+        task: That is played in open water and scored; None: the vehicles swim side by side.
+        truth: Folder that takes NAME.truth of each, without a task.
+    """
     logging.basicConfig(level=logging.WARNING, format="finssim: %(message)s", stream=sys.stderr)
-    body = load_vehicle(vehicle)
-    fitted = fitted_task(task, body)
-    vehicles = [body] * len(fitted.vehicles)
-    if not 0 < port <= 65535 - 10 * len(fitted.agents):
-        raise LinkError(
-            f"port {port}: expected room for ten ports to each of {len(fitted.agents)} vehicles after it"
+    positioning_of(positioning, seed)  # refuses what is none
+    bodies = [load_vehicle(name) for name in team]
+    made: Fleet
+    calibrated = None
+    if task is None:
+        made, calibrated = swimming(
+            bodies, plant, severity, camera, site, positioning, truth=truth, seed=seed
+        )
+        names = tuple(made.worlds)
+    else:
+        made = _playing(task, bodies, plant, severity, positioning, seed)
+        names = made.task.agents
+    if not 0 < port <= 65535 - 10 * len(names):
+        raise LinkError(f"port {port}: expected room for ten ports to each of {len(names)} vehicles after it")
+    host, theirs = host_port(robot, "--robot")
+    with _stoppable() as asked, ExitStack() as stack:
+        stack.callback(made.close)
+        messages, sinks = None, []
+        if isinstance(made, TaskSite):
+            messages = MediumServer((bind, port + MESSAGES), made.carrier, names)
+            stack.callback(messages.close)
+        transports = {}
+        for i, name in enumerate(names):
+            transports[name] = UdpTransport((bind, port + 10 * i), (host, theirs + 10 * i))
+            stack.callback(transports[name].close)
+            _say(f"{name}: {_name(transports[name].address)}, for {_name(transports[name].peer)} alone")
+            if calibrated is not None:
+                sinks.append(UdpSender((bind, port + 10 * i + 1), (host, theirs + 10 * i + 1)))
+                stack.callback(sinks[-1].close)
+        if calibrated is not None and pool_file is not None:
+            write_pool(calibrated, pool_file)
+            _say(f"pool file: {pool_file}")
+        if messages is not None and isinstance(made, TaskSite):
+            _tell_goal(made)
+            _say(f"messages: {_name(messages.address)}")
+        longest = math.inf if duration is None else duration
+        tell = partial(_tell_episode, made)
+        took = serve_fleet(made, transports, messages, sinks=sinks, duration=longest, until=asked, over=tell)
+    if not made.over:
+        _tell_episode(made)
+    _say(f"ended after {took:.1f} s")
+
+
+def _playing(
+    task: str, bodies: Sequence[Vehicle], plant: int, severity: Severity, positioning: str, seed: int
+) -> TaskSite:
+    """The site of a task in open water; its own vehicles are of the first type."""
+    fitted = fitted_task(task, bodies[0])
+    if len(bodies) not in (1, len(fitted.agents)):
+        raise PlantSpecError(
+            f"--team names {len(bodies)} vehicles, but task '{fitted.name}' has {len(fitted.agents)} agents: "
+            f"{', '.join(fitted.agents)}"
         )
     if fitted.moving and len(fitted.vehicles) == 1:
         raise PlantSpecError(
             f"task '{fitted.name}' moves its goal, of which a robot elsewhere is not told: take finssim experiment "
             "stack, or a task of several vehicles"
         )
-    host, theirs = host_port(robot, "--robot")
-    site = TaskSite(
+    agents = list(bodies) * (len(fitted.agents) // len(bodies))
+    return TaskSite(
         task,
-        vehicles,
+        [*agents, *[bodies[0]] * len(fitted.others)],
         lambda v: site_of("open-water", draw_plant(v, plant, severity)),
         None,
         None,
@@ -207,29 +268,89 @@ def run_task(
         communication=getattr(fitted, "communication", None),
         positioning=positioning,
     )
-    with _stoppable() as asked, ExitStack() as stack:
-        messages = MediumServer((bind, port + MESSAGES), site.medium, fitted.agents)
-        stack.callback(messages.close)
-        transports = {}
-        for i, name in enumerate(fitted.agents):
-            transports[name] = UdpTransport((bind, port + 10 * i), (host, theirs + 10 * i))
-            stack.callback(transports[name].close)
-            _say(f"{name}: {_name(transports[name].address)}, for {_name(transports[name].peer)} alone")
-        if not fitted.moving:
-            x, y, z = site.referee.arrays.goal_position.numpy()[0]
-            yaw = math.degrees(float(quat_yaw(site.referee.arrays.goal_quaternion.numpy()[0].astype(float))))
-            _say(f"goal: {x:.3f},{y:.3f},{z:.3f},{yaw:.1f}")
-        _say(f"messages: {_name(messages.address)}")
-        longest = math.inf if duration is None else duration
-        tell = partial(_tell_episode, site)
-        took = serve_task(site, transports, messages, duration=longest, until=asked, over=tell)
-    if not site.referee.over:
-        _tell_episode(site)
-    _say(f"ended after {took:.1f} s")
 
 
-def _tell_episode(site: TaskSite) -> None:
+def swimming(
+    bodies: Sequence[Vehicle],
+    plant: int,
+    severity: Severity,
+    camera: str,
+    site: str,
+    positioning: str,
+    *,
+    truth: Path | None,
+    seed: int,
+) -> tuple[Fleet, Pool | None]:
+    """Vehicles side by side, robot_1 and so on, and what their robots may know of the one camera.
+
+    Args:
+        bodies: As their files have them.
+        plant: Seed of the first plant and of the camera; the others' follow.
+        severity: Of plants and camera.
+        camera: corners or none.
+        site: Where, a name of `SITES`.
+        positioning: On every robot's wire: none, motion-capture or usbl.
+        truth: Folder that takes NAME.truth of each; none if None.
+        seed: Of instruments and noise.
+
+    Raises:
+        PlantSpecError: They have no room, or the camera cannot be there.
+    """
+    if camera == "pictures" and site != "open-water":
+        raise PlantSpecError("the one camera over a team sends corners: give --camera corners, or none")
+    if site == "open-water" and camera != "none":
+        raise PlantSpecError("no camera hangs over open water: give --camera none, and a positioning")
+    ours = [numbered(vehicle_at(site, body), i) for i, body in enumerate(bodies)]
+    specs = [site_of(site, draw_plant(v, plant + i, severity)) for i, v in enumerate(ours)]
+    basin = specs[0].basin
+    apart = ROOM * max(max(v.body.size) for v in ours)
+    if apart * len(ours) > basin.length:
+        raise PlantSpecError(
+            f"{len(ours)} vehicles {apart:.1f} m apart have no room in {basin.length:g} m: take a larger --site"
+        )
+    eyes: list[PoolCamera | None] = [None] * len(ours)
+    calibrated = None
+    if camera == "corners":
+        true, calibrated, settings = camera_of(ours[0], plant, severity, basin=basin)
+        for i, v in enumerate(ours):
+            own = camera_of(v, plant, severity, basin=basin)[2]
+            eyes[i] = PoolCamera(
+                v,
+                true,
+                mode="corners",
+                settings=replace(settings, mounts=own.mounts),
+                seed=seed,
+                noise_seed=seed + 1000 * (i + 1),
+            )
+    worlds = {}
+    for i, (v, spec, eye) in enumerate(zip(ours, specs, eyes, strict=True)):
+        name = f"robot_{i + 1}"
+        x = apart * (i - 0.5 * (len(ours) - 1))
+        worlds[name] = VirtualPool(
+            v,
+            spec,
+            camera=eye,
+            positioning=positioning_of(positioning, seed + i),
+            start=((x, 0.0, -0.5 * basin.depth), quat_from_yaw(0.0)),
+            seed=seed + i,
+            truth=None if truth is None else truth / f"{name}.truth",
+        )
+    return Fleet(worlds), calibrated
+
+
+def _tell_goal(site: TaskSite) -> None:
+    """Where the task's goal is, of one that stands still."""
+    if site.task.moving:
+        return
+    x, y, z = site.referee.arrays.goal_position.numpy()[0]
+    yaw = math.degrees(float(quat_yaw(site.referee.arrays.goal_quaternion.numpy()[0].astype(float))))
+    _say(f"goal: {x:.3f},{y:.3f},{z:.3f},{yaw:.1f}")
+
+
+def _tell_episode(site: Fleet) -> None:
     """How the episode went, in a line."""
+    if not isinstance(site, TaskSite):
+        return
     if site.referee.over:
         _say("episode: " + ", ".join(f"{name} {value:.4g}" for name, value in site.referee.metrics().items()))
     else:

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
 from finssim.pool.plant_spec import Basin, PlantSpec, PlantSpecError
 from finssim.pool.positioning import POSITIONING, Positioning
 from finssim.pool.water_spec import Circulation, Swell
-from finssim.vehicles import Vehicle
-from finssim.vehicles.defaults import with_navigation
+from finssim.vehicles.defaults import SITES
 
-__all__ = ["SITES", "positioning_of", "site_of", "vehicle_at"]
+__all__ = ["positioning_of", "site_of"]
 
-OPEN = Basin(length=2000.0, width=2000.0, depth=20.0)
-TANK = Basin(length=10.0, width=6.0, depth=5.0)
-SITES = ("pool", "tank", "open-water")
+TANK, OPEN = (
+    Basin(length=size[0], width=size[1], depth=size[2]) for size in SITES.values() if size is not None
+)
 STREAM = {"nominal": 0.0, "realistic": 0.1, "hard": 0.25}
 """Current of open water by severity [m/s]."""
 SWELL = {"nominal": 0.0, "realistic": 0.05, "hard": 0.15}
@@ -61,20 +59,6 @@ def site_of(name: str, spec: PlantSpec) -> PlantSpec:
     return spec.model_copy(
         update={"basin": OPEN, "tether": None, "circulation": Circulation(stream=stream, waves=waves)}
     )
-
-
-def vehicle_at(name: str, vehicle: Vehicle) -> Vehicle:
-    """The vehicle as it is equipped for a site: a workspace as large, and in open water Doppler log and compass."""
-    if name == "pool":
-        return vehicle
-    basin = OPEN if name == "open-water" else TANK
-    half = np.array([0.5 * basin.length, 0.5 * basin.width])
-    box: dict[str, Any] = {
-        "workspace_lower": np.array([*-half, -basin.depth]),
-        "workspace_upper": np.array([*half, 0.0]),
-    }
-    fitted = with_navigation(vehicle) if name == "open-water" else vehicle
-    return fitted.model_copy(update={"safety": vehicle.safety.model_copy(update=box)})
 
 
 def positioning_of(name: str, seed: int) -> Positioning | None:

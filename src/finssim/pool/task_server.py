@@ -1,20 +1,23 @@
-"""`finssim pool --task`: the site of a task in real time, with a motor controller for each agent on its own port."""
+"""`finssim pool --team` and `--task`: several vehicles in real time, with a motor controller for each on its port."""
 
 from __future__ import annotations
 
 import math
 import socket
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 
+from finssim.pool.fleet import Fleet, one_picture
 from finssim.pool.medium import Medium
-from finssim.pool.task_site import TaskSite
+from finssim.pool.picture_wire import PictureSink
 from finssim.robot.link.layout import LinkError
 from finssim.robot.link.transports import Transport
+from finssim.robot.messages import Picture
 from finssim.robot.team import decode_track
 
-__all__ = ["MediumServer", "serve_task"]
+__all__ = ["MediumServer", "serve_fleet"]
 
 TICK = 0.003
 """Between looks at the wires [s]."""
@@ -74,11 +77,12 @@ class MediumServer:
         self._socket.close()
 
 
-def serve_task(
-    site: TaskSite,
+def serve_fleet(
+    site: Fleet,
     transports: Mapping[str, Transport],
-    messages: MediumServer,
+    messages: MediumServer | None = None,
     *,
+    sinks: Sequence[PictureSink] = (),
     duration: float = math.inf,
     until: Callable[[], bool] = lambda: False,
     over: Callable[[], None] = lambda: None,
@@ -87,15 +91,14 @@ def serve_task(
 ) -> float:
     """Let the site live in real time until the time is over or `until` says so.
 
-    The episode begins when every agent's thrusters have been enabled.
-
     Args:
-        site: With agents in other processes.
-        transports: To the robot of each agent, by its place.
-        messages: Between the robots.
+        site: With robots in other processes.
+        transports: To the robot of each of these vehicles, by name.
+        messages: Between the robots; None: they tell each other nothing.
+        sinks: Take the one camera's pictures, one for each robot.
         duration: How long [s].
         until: Asked at every tick.
-        over: Called once, when the task's episode has ended; the site lives on.
+        over: Called once, when the site says that it is over; it lives on.
         clock: This machine's clock [s].
         wait: Waits so long [s].
 
@@ -111,25 +114,29 @@ def serve_task(
         if behind > MOST_BEHIND:
             start += behind - TICK
         now = min(max(clock() - start, now), duration)
+        pictures: list[Picture] = []
         for name, transport in transports.items():
-            for _, frame in site.worlds[name].exchange(now, transport.receive()).frames:
+            delivery = site.worlds[name].exchange(now, transport.receive())
+            pictures += delivery.pictures
+            for _, frame in delivery.frames:
                 transport.send(frame)
+        for picture in one_picture(pictures):
+            for sink in sinks:
+                sink.send(replace(picture, time=start + picture.time), clock())
         due = now * RATE >= steps + 1
         for name, runtime in site.runtimes.items():
             delivery = site.worlds[name].exchange(now, sent[name])
             sent[name], frames[name] = [], frames[name] + list(delivery.frames)
-            if due:
+            if due and site.medium is not None:
                 sent[name] = runtime.step(now, frames[name], (), site.medium.receive(now, name))
                 frames[name] = []
                 for datagram in runtime.told:
                     site.medium.send(now, name, datagram)
         steps = math.floor(now * RATE)
-        messages.poll(now)
-        if site.scored or all(site.worlds[name].firmware.driving for name in transports):
-            site.score(now)
-        elif due:
-            site.tell_target()
-        if site.referee.over and not told:
+        if messages is not None:
+            messages.poll(now)
+        site.turn(now, due)
+        if site.over and not told:
             told = True
             over()
         wait(max(TICK - (clock() - start - now), 0.0))

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,8 +22,10 @@ from finssim.control.guidance import Guide, Reference
 from finssim.control.modes import action_mode
 from finssim.control.tracking import Track
 from finssim.engine.launch import Pipeline
-from finssim.geometry.rotations import quat_yaw
+from finssim.engine.state import State
+from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.localization.pool import Pool
+from finssim.pool.fleet import Fleet
 from finssim.pool.medium import Medium
 from finssim.pool.others import ScriptedPilot, TrueState, truth_of
 from finssim.pool.plant_spec import Basin, PlantSpec
@@ -30,13 +35,16 @@ from finssim.robot.bridge import Bridge
 from finssim.robot.bridge_settings import BridgeSettings
 from finssim.robot.lockstep import run_together
 from finssim.robot.perception import Perception
-from finssim.robot.pilots import Pilot
+from finssim.robot.pilots import AgentPilot, Pilot
+from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.robot.team import Team, encode_track
+from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.communication import Communication
 from finssim.tasks.observer import fitted_task, one_world
 from finssim.tasks.reference import fill_table
 from finssim.tasks.task import Batch, Task
+from finssim.tasks.terms import Terms
 from finssim.vehicles import Vehicle
 
 __all__ = ["Referee", "TaskSite"]
@@ -47,8 +55,27 @@ SITE = "site"
 """Who tells where a target is that no vehicle is."""
 
 
+@wp.func
+def as_told(state: State, arrays: TaskArrays, w: int):
+    """In place of a task's draws: vehicle and goal are where they have been put."""
+
+
+@cache
+def _told(kind: type[Task]) -> type[Task]:
+    """A task whose start is told instead of drawn, and its goal's motion instead of made."""
+
+    def terms(task: Task) -> Terms:
+        made = kind.terms(task)
+        return replace(made, start=as_told, advance=None if task.moving else made.advance)
+
+    return type(kind.__name__, (kind,), {"terms": terms, "__module__": kind.__module__})
+
+
 class Referee:
     """The task itself, of one episode, on the true state.
+
+    An episode that was played elsewhere is scored too, of a task of one vehicle: `start` tells where it began, the
+    guide where its goal is. Contact forces are not known there, nor in a site without a dock: none is counted.
 
     Attributes:
         task: Fitted to the vehicles.
@@ -56,28 +83,59 @@ class Referee:
     """
 
     def __init__(
-        self, task: str | Task, vehicles: Sequence[Vehicle], *, seed: int, guide: Guide | None = None
+        self,
+        task: str | Task,
+        vehicles: Sequence[Vehicle],
+        *,
+        seed: int = 0,
+        guide: Guide | None = None,
+        start: Track | None = None,
+        action_size: int | None = None,
     ) -> None:
-        """Draw where everybody starts.
+        """Draw where everybody starts, or put the only vehicle where it was.
 
         Args:
             task: A task, its name, or FILE.py:CLASS of one's own.
             vehicles: One for each of its places.
             seed: Of the episode.
             guide: The reference, of a task that follows one; drawn as in training if None.
+            start: Where the vehicle was at the beginning of an episode that was played elsewhere, with a guide that
+                tells where its goal is; drawn if None.
+            action_size: Numbers in the action of a vehicle; those of the task's own action mode if None.
+
+        Raises:
+            ControlError: A task in plain torch whose memory begins with what is drawn, for an episode played elsewhere.
         """
         self.task = task = fitted_task(task, vehicles)
-        self._state, self.arrays = one_world(task, len(action_mode(task.action, vehicles[0]).labels))
+        if start is not None:
+            task = _told(type(task))(**{one.name: getattr(task, one.name) for one in fields(task)})
+        size = action_size or len(action_mode(task.action, vehicles[0]).labels)
+        self._state, self.arrays = one_world(task, size)
         device = self._state.steps.device
-        if guide is not None:
+        if guide is not None and (start is None or self.arrays.reference.position is not None):
             fill_table(self.arrays.reference, [guide])
+        self._guide = guide if start is not None else None
+        if start is not None:
+            self._put({task.vehicles[0]: start})
+            self._aim(0.0)
         batch, mask = Batch(self._state, self.arrays, seed), wp.ones(1, dtype=wp.int32, device=device)
-        self._evaluate, start = Pipeline(1, device), Pipeline(1, device)
-        task.add_spawn(start, batch, mask)
-        task.add_observe(start, batch, mask)
-        start.run()
+        self._evaluate, opening = Pipeline(1, device), Pipeline(1, device)
+        task.add_spawn(opening, batch, mask)
+        task.add_observe(opening, batch, mask)
+        opening.run()
         task.add_evaluate(self._evaluate, batch)
         self.over = False
+        begun = self.arrays.answers.begun
+        if start is not None and begun is not None and begun.numpy().any():
+            raise ControlError(
+                f"task '{task.name}' begins with a memory that its reset draws, and only where it was drawn can it be "
+                "scored: finssim experiment stack scores it as it is played"
+            )
+
+    @property
+    def time(self) -> float:
+        """Of the last control step that was scored, in the episode [s]."""
+        return int(self._state.steps.numpy()[0]) * self.task.control_step
 
     def places(self) -> list[tuple[Array, Array]]:
         """Position and quaternion where every vehicle starts."""
@@ -94,6 +152,17 @@ class Referee:
         if self.over:
             return
         a, state = self.arrays, self._state
+        self._put(truth)
+        self._aim(self.time + self.task.control_step)
+        for i, name in enumerate(self.task.agents):
+            action = actions.get(name, np.zeros(0))
+            a.action.numpy()[0, i * a.action_size : i * a.action_size + len(action)] = action
+        state.steps.numpy()[0] += 1
+        self._evaluate.run()
+        self.over = bool(a.terminated.numpy()[0] or a.truncated.numpy()[0])
+
+    def _put(self, truth: Mapping[str, Track]) -> None:
+        """Where everybody is, by place."""
         for v, name in enumerate(self.task.vehicles):
             one = truth[name]
             for row, value in (
@@ -101,13 +170,17 @@ class Referee:
                 ("quaternion", one.quaternion),
                 ("velocity", one.nu),
             ):
-                getattr(state, row).numpy()[0, v] = value
-        for i, name in enumerate(self.task.agents):
-            action = actions.get(name, np.zeros(0))
-            a.action.numpy()[0, i * a.action_size : i * a.action_size + len(action)] = action
-        state.steps.numpy()[0] += 1
-        self._evaluate.run()
-        self.over = bool(a.terminated.numpy()[0] or a.truncated.numpy()[0])
+                getattr(self._state, row).numpy()[0, v] = value
+
+    def _aim(self, t: float) -> None:
+        """Put the goal where the guide has it, of an episode that was played elsewhere; t in the episode [s]."""
+        if self._guide is None:
+            return
+        a, now = self.arrays, self._guide.at(t)
+        a.goal_position.numpy()[0] = now.position
+        a.goal_quaternion.numpy()[0] = quat_from_yaw(float(now.yaw))
+        if a.target.velocity is not None:
+            a.target.velocity.numpy()[0] = now.velocity
 
     def metrics(self) -> dict[str, float]:
         """How the episode went; see `Task.metrics`."""
@@ -123,24 +196,24 @@ class _Goal:
         self._referee = referee
 
     def at(self, t: Any) -> Reference:
-        """The goal's pose and velocity now, whatever the time."""
+        """The goal's pose and velocity at a time [s], as it has moved since the last control step."""
         a, shape = self._referee.arrays, np.shape(t)
         moving = a.target.velocity is not None
         velocity = a.target.velocity.numpy()[0].astype(float) if moving else np.zeros(3)
-        place = a.goal_position.numpy()[0].astype(float)
+        since = np.asarray(t, float) - self._referee.time
+        place = a.goal_position.numpy()[0].astype(float) + since[..., None] * velocity
         yaw = float(quat_yaw(a.goal_quaternion.numpy()[0].astype(float)))
         rows = (np.broadcast_to(row, (*shape, 3)).copy() for row in (place, velocity))
         return Reference(*rows, np.full(shape, yaw), np.zeros(shape))
 
 
-class TaskSite:
-    """One episode of a task in the virtual site, in lock-step.
+class TaskSite(Fleet):
+    """One episode of a task in the virtual site, with everybody by place.
 
     Attributes:
         referee: The task.
-        worlds: Plants and motor controllers, by place.
-        runtimes: The robots' software, by place.
-        medium: What carries their messages.
+        runtimes: The robots' software, of those that are not elsewhere.
+        carrier: What carries their messages: `medium`.
         scored: Control steps of the episode so far.
     """
 
@@ -157,6 +230,7 @@ class TaskSite:
         communication: Communication | None = None,
         camera: Callable[[Vehicle], Any] | None = None,
         positioning: str = "none",
+        record: Path | None = None,
     ) -> None:
         """Put everybody where the task starts.
 
@@ -171,18 +245,24 @@ class TaskSite:
             communication: Of what the vehicles tell each other; None: everything arrives at once.
             camera: Makes the overhead camera of a vehicle; None: there is none.
             positioning: Fixes on every robot's wire: none, motion-capture or usbl.
+            record: Folder that takes PLACE.mcap and PLACE.truth of every agent; None: nothing is kept.
 
         Raises:
             ControlError, PlantSpecError: Task, vehicles and guide do not fit, or there is no such positioning.
         """
-        self.referee = referee = Referee(task, vehicles, seed=seed, guide=guide)
+        steering = (
+            {} if pilots is None else {name: pilots(name) for name in fitted_task(task, vehicles).agents}
+        )
+        modes = [pilot.mode for pilot in steering.values() if isinstance(pilot, AgentPilot)]
+        size = len(modes[0].labels) if modes else None
+        self.referee = referee = Referee(task, vehicles, seed=seed, guide=guide, action_size=size)
         if guide is None and referee.arrays.reference.position is not None:
             raise ControlError(
                 f"task '{referee.task.name}' follows a reference that is known ahead: give a trajectory"
             )
         self.task, goal = referee.task, guide or _Goal(referee)
         names = self.task.vehicles
-        self.worlds = {
+        worlds = {
             name: VirtualPool(
                 vehicle,
                 spec(vehicle),
@@ -190,32 +270,41 @@ class TaskSite:
                 positioning=positioning_of(positioning, seed + i) if name in self.task.agents else None,
                 start=place,
                 seed=seed + i,
+                truth=record / f"{name}.truth" if record is not None and name in steering else None,
             )
             for i, (name, vehicle, place) in enumerate(zip(names, vehicles, referee.places(), strict=True))
         }
         site = (SITE,) if self._target() is not None else ()
-        self.medium = Medium(self._positions, communication, seed)
-        self.runtimes: dict[str, Runtime] = {}
+        super().__init__(worlds)
+        self.carrier = self.medium = Medium(self._positions, communication, seed)
         self.scored, self._since = 0, math.nan
+        self._actions: dict[str, Array] = {}
+        about = {"command": "finssim experiment stack", "guide": goal.name, "armed": True}
         period = self.task.control_step if communication is None else communication.period
         for i, (name, vehicle) in enumerate(zip(names, vehicles, strict=True)):
             world = self.worlds[name]
             agent = name in self.task.agents
-            if agent and pilots is None:
+            pilot: Pilot
+            if name in steering:
+                pilot = steering[name]
+            elif agent:
                 continue
+            else:
+                pilot = ScriptedPilot(self.task, vehicles, lambda: truth_of(self.worlds), seed=seed)
             others = (*(other for other in names if other != name), *(("target",) if site else ()))
             team = Team(name, others if agent else (), period=period, turn=period * i / len(names))
             self.runtimes[name] = Runtime(
                 vehicle,
                 pool,
-                pilots(name)
-                if agent and pilots is not None
-                else ScriptedPilot(self.task, vehicles, lambda: truth_of(self.worlds), seed=seed),
+                pilot,
                 goal,
                 arm=True,
                 perception=Perception(vehicle, pool) if agent else TrueState(world),
                 bridge=Bridge(vehicle, _limits(vehicle, world.spec.basin)),
                 team=team if len(names) > 1 else None,
+                recorder=Recorder(record / f"{name}.mcap", vehicle, {"pilot": pilot.describe(), **about})
+                if record is not None and agent
+                else None,
             )
 
     def run(self, duration: float | None = None) -> dict[str, float]:
@@ -236,14 +325,28 @@ class TaskSite:
             run_together(
                 stacks,
                 longest,
-                carrier=self.medium if len(stacks) > 1 else None,
+                carrier=self.carrier if len(stacks) > 1 else None,
                 show=look,
                 until=lambda: self.referee.over or (duration is not None and self.scored * step >= duration),
             )
         finally:
-            for world in self.worlds.values():
-                world.close()
+            self.close()
+            for runtime in self.runtimes.values():
+                if runtime.recorder is not None:
+                    runtime.recorder.close()
         return self.referee.metrics()
+
+    @property
+    def over(self) -> bool:
+        """Whether the episode has ended."""
+        return self.referee.over
+
+    def turn(self, now: float, due: bool) -> None:
+        """Score; the episode begins when every agent's thrusters have been enabled."""
+        if self.scored or all(self.worlds[name].firmware.driving for name in self.task.agents):
+            self.score(now)
+        elif due:
+            self.tell_target()
 
     def score(self, now: float, since: float | None = None) -> None:
         """Let the task score what is true, as often as a control step has passed.
@@ -257,9 +360,12 @@ class TaskSite:
             self.tell_target()
         if now - self._since >= (self.scored + 1) * self.task.control_step - 1e-6:
             self.scored += 1
-            actions = {name: getattr(one.pilot, "action", np.zeros(0)) for name, one in self.runtimes.items()}
-            self.referee.look(truth_of(self.worlds), actions)
+            self.referee.look(truth_of(self.worlds), self._actions)
             self.tell_target()
+        # A robot that has just decided acts from now on: what is scored is what was done until now.
+        self._actions = {
+            name: getattr(one.pilot, "action", np.zeros(0)) for name, one in self.runtimes.items()
+        }
 
     def _target(self) -> Track | None:
         """What drifts in the water, of a task with such a thing."""
@@ -275,7 +381,7 @@ class TaskSite:
         target = self._target()
         if target is not None:
             now = max(world.time for world in self.worlds.values())
-            self.medium.send(now, SITE, encode_track("target", target, now), lossless=True)
+            self.carrier.send(now, SITE, encode_track("target", target, now), lossless=True)
 
     def _positions(self) -> dict[str, Array]:
         return {name: np.asarray(world.plant.position, float) for name, world in self.worlds.items()}

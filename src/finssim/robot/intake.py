@@ -55,7 +55,7 @@ class Intake:
                 elif isinstance(message, CommandEcho):
                     self._echo(arrival, message)
                 elif isinstance(message, NavigationAid):
-                    self._perception.aid(arrival, message)
+                    self._aid(arrival, message)
         for picture in pictures:
             verdict = self._perception.picture(now, picture)
             self._counters.picture(picture.time, verdict in USED)
@@ -69,6 +69,11 @@ class Intake:
         self._bridge.telemetry(arrival, telemetry)
         if self.recorder is not None:
             self.recorder.telemetry(arrival, telemetry, time)
+
+    def _aid(self, arrival: float, aid: NavigationAid) -> None:
+        self._perception.aid(arrival, aid)
+        if self.recorder is not None:
+            self.recorder.aid(arrival, aid)
 
     def _echo(self, arrival: float, echo: CommandEcho) -> None:
         self._bridge.echo(arrival, echo)

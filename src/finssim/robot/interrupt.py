@@ -2,13 +2,34 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["interruptible"]
+__all__ = ["PARENT", "follow_parent", "interruptible"]
+
+PARENT = "FINSSIM_PARENT"
+"""Environment of a process: the one without which it ends too."""
+ORPHANED = 0.5
+"""Between looks whether it is there [s]."""
+
+
+def follow_parent() -> None:
+    """End with the process that started this one, even if that was killed."""
+    parent = os.environ.get(PARENT, "")
+    if not parent.isdecimal():
+        return
+
+    def watch() -> None:
+        while os.getppid() == int(parent):
+            time.sleep(ORPHANED)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, name="launcher", daemon=True).start()
 
 
 @contextmanager

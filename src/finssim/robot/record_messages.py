@@ -12,14 +12,27 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.geometry.rotations import quat_conjugate, quat_from_yaw, quat_multiply, quat_to_matrix
-from finssim.robot.messages import CommandEcho, Picture, Telemetry
+from finssim.robot.aboard import POSITION_STD, YAW_STD
+from finssim.robot.messages import (
+    HEADING,
+    POSE,
+    POSITION,
+    VELOCITY,
+    CommandEcho,
+    NavigationAid,
+    Picture,
+    Telemetry,
+)
 from finssim.robot.record_types import types
 from finssim.robot.robot import Reading
 from finssim.vehicles import Vehicle
+from finssim.vehicles.defaults import with_navigation
 
 __all__ = ["Messages", "floats"]
 
-MAP, BASE, IMU = "map", "base_link", "imu_link"
+MAP, BASE, IMU, LOG = "map", "base_link", "imu_link", "dvl_link"
+SHARED = ("", MAP, "camera", "camera_link", "camera_optical")
+"""Frames of the pool and its camera, which vehicles have in common."""
 
 IMU_VARIANCES = ((0.02, 0.02, 0.05), (0.01,) * 3, (0.1,) * 3)
 """Of attitude [rad²], rates [rad²/s²] and specific force [m²/s⁴], as the published bridge sends them."""
@@ -52,7 +65,13 @@ LEVELS = ("ok", "warn", "error", "stale")
 class Messages:
     """Makes messages of one vehicle; times are integers [ns]."""
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: Vehicle, prefix: str = "") -> None:
+        """
+        Args:
+            vehicle: Its instruments, thrusters and their order.
+            prefix: Of the vehicle's own frames, such as `robot_1/`, where several share /tf.
+        """
+        self._prefix = prefix
         self.types = types()
         self._of = self.types.types
         self.names = list(vehicle.thruster_names)
@@ -62,6 +81,9 @@ class Messages:
         # Multiplying by a constant quaternion from the right is a matrix, and a call of it takes a microsecond.
         self._to_body = quat_multiply(np.eye(4), quat_conjugate(q_body_imu)).T
         self._imu_variances = [np.diag(v).ravel() for v in IMU_VARIANCES]
+        sensors = with_navigation(vehicle).sensors
+        assert sensors.dvl is not None and sensors.compass is not None
+        self._log_std, self._compass_std = sensors.dvl.noise_std, sensors.compass.noise_std
         thrusters = vehicle.thrusters.values()
         self._outputs = [t.motor_index for t in thrusters if t.motor_index is not None]
         signs = np.array([float(t.motor_sign or 1) for t in thrusters])
@@ -106,6 +128,35 @@ class Messages:
             motor_rpm=floats(telemetry.motor_rpm or ()),
         )
 
+    def aid(self, stamp: int, aid: NavigationAid) -> tuple[str, Any] | None:
+        """What a navigation instrument measured, with the key of its topic; None where there is no such instrument.
+
+        What it does not measure has the variance `UNKNOWN`; rates and specific force of a compass are told as missing.
+        """
+        x, y, z = aid.values
+        std, turn = aid.std[0] or POSITION_STD, aid.std[1] or YAW_STD
+        of, none = self._of, np.array([-1.0, *[0.0] * 8])
+        if aid.kind == VELOCITY:
+            twist = of["geometry_msgs/msg/Twist"](self.vector(aid.values), self.vector((0.0, 0.0, 0.0)))
+            covariance = np.diag([*[self._log_std**2] * 3, *[UNKNOWN] * 3]).ravel()
+            measured = of["geometry_msgs/msg/TwistWithCovariance"](twist, covariance)
+            kind = "geometry_msgs/msg/TwistWithCovarianceStamped"
+            return "dvl", of[kind](self.header(stamp, LOG), measured)
+        if aid.kind == HEADING:
+            level = np.diag([UNKNOWN, UNKNOWN, self._compass_std**2]).ravel()
+            heading = self.quaternion(quat_from_yaw(x))
+            rest = self.vector((0.0, 0.0, 0.0))
+            made = of["sensor_msgs/msg/Imu"](self.header(stamp, BASE), heading, level, rest, none, rest, none)
+            return "compass", made
+        if aid.kind not in (POSITION, POSE):
+            return None
+        posed = aid.kind == POSE
+        unknown = (UNKNOWN, UNKNOWN, UNKNOWN, turn**2) if posed else (std**2, UNKNOWN, UNKNOWN, UNKNOWN)
+        pose = self.pose((x, y, 0.0 if posed else z), quat_from_yaw(z if posed else 0.0))
+        covariance = np.diag([std**2, std**2, *unknown]).ravel()
+        fix = of["geometry_msgs/msg/PoseWithCovariance"](pose, covariance)
+        return "positioning", of["geometry_msgs/msg/PoseWithCovarianceStamped"](self.header(stamp, MAP), fix)
+
     def shafts(self, stamp: int, motor_rpm: Sequence[float]) -> Any | None:
         """Measured shaft speeds by thruster, with the signs of positive thrust [rad/s]; None if not of all."""
         if len(self._outputs) < len(self.names) or len(motor_rpm) <= max(self._outputs):
@@ -128,7 +179,7 @@ class Messages:
         of = self._of
         return of["nav_msgs/msg/Odometry"](
             self.header(stamp, MAP),
-            BASE,
+            self.frame(BASE),
             of["geometry_msgs/msg/PoseWithCovariance"](
                 self.pose(reading.position, reading.quaternion), numbers_of(pose)
             ),
@@ -144,7 +195,7 @@ class Messages:
         pose = of["geometry_msgs/msg/Transform"](
             self.vector(reading.position), self.quaternion(reading.quaternion)
         )
-        one = of["geometry_msgs/msg/TransformStamped"](self.header(stamp, MAP), BASE, pose)
+        one = of["geometry_msgs/msg/TransformStamped"](self.header(stamp, MAP), self.frame(BASE), pose)
         return of["tf2_msgs/msg/TFMessage"]([one])
 
     def estimator(self, stamp: int, reading: Reading, health: Mapping[str, Any]) -> Any:
@@ -235,9 +286,13 @@ class Messages:
         )
         return of["diagnostic_msgs/msg/DiagnosticArray"](self.header(stamp, ""), [status])
 
+    def frame(self, name: str) -> str:
+        """A frame's name as this vehicle says it."""
+        return name if name in SHARED else self._prefix + name
+
     def header(self, stamp: int, frame: str) -> Any:
         """Stamp and frame."""
-        return self._of["std_msgs/msg/Header"](self.time(stamp), frame)
+        return self._of["std_msgs/msg/Header"](self.time(stamp), self.frame(frame))
 
     def time(self, stamp: int) -> Any:
         """A time; one before or after those that the type has, 1901 to 2038, is the first or last of them."""

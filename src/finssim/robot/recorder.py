@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from finssim.provenance import provenance
 from finssim.robot.mcap_writer import McapWriter
-from finssim.robot.messages import CommandEcho, Picture, Telemetry
+from finssim.robot.messages import CommandEcho, NavigationAid, Picture, Telemetry
 from finssim.robot.record_messages import Messages
 from finssim.robot.record_pictures import jpeg
 from finssim.robot.record_sink import RecordSink
@@ -64,6 +64,10 @@ class Recorder:
         texts = {name: Path(file).read_bytes() for name, file in (files or {}).items()}
         texts |= _vehicle_file(vehicle)
         self._name, self._messages = vehicle.name, Messages(vehicle)
+        for (
+            topic
+        ) in TOPICS.values():  # compiles what packs a type: the first message of each must not wait for it
+            self._messages.types.get_msgdef(topic.type)
         self._pictures, self._epoch = pictures, round(epoch * 1e9)
         self._sink = RecordSink(Path(path), self._announce, chunk_seconds=chunk_seconds)
         about = {
@@ -147,6 +151,12 @@ class Recorder:
         """What the motor controller made of a command."""
         at = self._ns(now)
         self._put("echo", at, self._messages.echo(at, echo))
+
+    def aid(self, now: float, aid: NavigationAid) -> None:
+        """A fix, velocity or heading of a navigation instrument that came now [s], stamped with its measurement."""
+        made = self._messages.aid(self._ns(now - aid.age), aid)
+        if made is not None:
+            self._put(made[0], self._ns(now), made[1])
 
     def policy(self, now: float, pilot: str, **values: Any) -> None:
         """One decision of a controller; fields of `finssim_msgs/PolicyInfo`."""

@@ -26,6 +26,7 @@ from finssim.robot.summary import Summary, show
 from finssim.robot.team import Team
 from finssim.robot.wiring import POOL_ADDRESS, Drive, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
+from finssim.vehicles.defaults import numbered, vehicle_at
 
 __all__ = ["FAULT", "POOL_ADDRESS", "UNHEARD", "Wiring", "run"]
 
@@ -48,6 +49,8 @@ def run(
     trajectory: str | None,
     pool_file: Path | None,
     vehicle: str | Vehicle = "finsrov",
+    site: str = "pool",
+    number: int = 0,
     task: str | None = None,
     agent: str | None = None,
     wiring: Wiring | None = None,
@@ -65,7 +68,9 @@ def run(
         goal: "x,y,z,yaw_deg" or a file.
         trajectory: Name or file, in place of a goal.
         pool_file: Camera, water and frames; None: no camera looks, and the pool frame is the world's.
-        vehicle: A vehicle, its name or file.
+        vehicle: A vehicle, its name or file, for which a policy must have been trained.
+        site: Where it is, by which it is equipped: pool, tank or open-water.
+        number: Among several under one camera, by which its tags have other ids.
         task: That the policy must have been trained for, or whose baseline acts.
         agent: Place of this vehicle in a task of several.
         wiring: How the robot is connected; to the virtual pool of this machine if None.
@@ -80,7 +85,8 @@ def run(
         Exit status: 0, `FAULT` or `UNHEARD`.
     """
     wiring, console = wiring or Wiring(), Console(stderr=True)
-    ours = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
+    filed = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
+    ours = numbered(vehicle_at(site, filed), number)
     guide = _GO if wiring.team and goal is None and trajectory is None else guide_of(goal, trajectory)
     if guide is not _GO:
         check_reachable(guide, ours)
@@ -90,13 +96,19 @@ def run(
             "its own in the file",
             highlight=False,
         )
-    pilot = _pilot(policy, ours, task, trim, agent=agent, follows=trajectory is not None)
+    pilot = _pilot(policy, filed, task, trim, agent=agent, follows=trajectory is not None)
     pool = None if pool_file is None else load_pool(pool_file)
     perception = Perception(ours, pool, mode=mode)
-    meta = {"command": "finssim run", "pilot": pilot.describe(), "guide": guide.name, "armed": arm}
+    meta = {
+        "command": "finssim run",
+        "site": site,
+        "pilot": pilot.describe(),
+        "guide": guide.name,
+        "armed": arm,
+    }
     record_with = (
         record,
-        ours,
+        filed,
         {**meta, **({"pool_sha256": pool.sha256} if pool else {})},
         pool_file,
         wiring,
@@ -161,7 +173,7 @@ def _team(pilot: Pilot, wiring: Wiring) -> Team | None:
         return None
     if len(names) < 2:
         raise ControlError(
-            "--team is for a policy or baseline of a task of several vehicles: give it with --task"
+            "--messages is for a policy or baseline of a task of several vehicles: give it with --task"
         )
     talk = getattr(observer.task, "communication", None)
     period = observer.task.control_step if talk is None else talk.period

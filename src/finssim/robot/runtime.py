@@ -104,7 +104,7 @@ class Runtime:
         if self.team is not None:
             self.told = self.team.tell(now, reading)
             self.team.hear(now, heard)
-            reading = self.team.known(now, reading)
+            reading = self.team.known(reading)
         self.reading = reading
         self.bridge.reading(now, reading)
         self._begin(now, reading)
@@ -191,6 +191,8 @@ class Runtime:
                 period=self.pilot.period,
                 missed=self.counters.missed,
                 force=force,
+                observation=getattr(self.pilot, "observation", ()),
+                action=getattr(self.pilot, "action", ()),
                 vehicle_sha256=self.vehicle.sha256,
             )
 

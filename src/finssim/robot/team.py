@@ -97,7 +97,6 @@ class Team:
         *,
         period: float = 0.1,
         turn: float = 0.0,
-        stale: float = 10.0,
     ) -> None:
         """
         Args:
@@ -105,10 +104,9 @@ class Team:
             others: Names that are listened to: of the task's other vehicles, and of what else it goes to.
             period: Between two messages of its own [s].
             turn: When in the period it is its turn [s].
-            stale: A track that was measured so long ago is forgotten [s]; never, as in training, if infinite.
         """
         self.name, self.tracks, self.refused = name, dict[str, Track](), 0
-        self._others, self._period, self._turn, self._stale = frozenset(others), period, turn, stale
+        self._others, self._period, self._turn = frozenset(others), period, turn
         self._ticks: Ticks | None = None
 
     def hear(self, now: float, datagrams: Sequence[bytes]) -> None:
@@ -123,9 +121,11 @@ class Team:
             if known is None or track.time > known.time:
                 self.tracks[name] = track
 
-    def known(self, now: float, reading: Reading) -> Reading:
-        """The reading with what is known of the others; not ready before all have been heard of."""
-        self.tracks = {name: one for name, one in self.tracks.items() if now - one.time <= self._stale}
+    def known(self, reading: Reading) -> Reading:
+        """The reading with what is known of the others; not ready before all have been heard of.
+
+        However old a message is, it stands, as in training: who is lost stops alone.
+        """
         missing = sorted(self._others - self.tracks.keys())
         reading = replace(reading, tracks=dict(self.tracks))
         if not missing or not reading.ready:

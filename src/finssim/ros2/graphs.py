@@ -12,7 +12,7 @@ import yaml
 from finssim.ros2.errors import Ros2Error
 from finssim.ros2.topics import TOPICS, Topic
 
-__all__ = ["GRAPHS", "MCU_PORT", "NODES", "PARENT", "Plan", "run_node", "topics_of"]
+__all__ = ["GRAPHS", "MCU_PORT", "NODES", "Plan", "run_node", "topics_of"]
 
 NODES = {
     "camera": "finssim.ros2.nodes.camera:Camera",
@@ -34,8 +34,6 @@ GRAPHS = {"sim": ("sim", "controller"), "robot": ROBOT, "pool": ("virtual_pool",
 
 MCU_PORT = 58766
 """Of a virtual pool's motor controller, if not told otherwise; pictures leave from the next port."""
-PARENT = "FINSSIM_PARENT"
-"""Environment of a node: process without which it ends too."""
 
 
 @dataclass
@@ -49,6 +47,8 @@ class Plan:
     """Node, or `/**` for all -> parameters."""
     extra: tuple[str, ...] = ()
     """Nodes besides those of the graph: recorder, teleop."""
+    blind: bool = False
+    """Whether no camera looks, so that nothing is localized by it."""
 
     def __post_init__(self) -> None:
         if self.graph not in GRAPHS:
@@ -62,7 +62,8 @@ class Plan:
     @property
     def nodes(self) -> tuple[str, ...]:
         """In the order of their start."""
-        return GRAPHS[self.graph] + self.extra
+        left_out = ("camera", "localizer") if self.blind else ()
+        return (*(name for name in GRAPHS[self.graph] if name not in left_out), *self.extra)
 
     def set(self, node: str, **values: Any) -> None:
         """Give parameters; None leaves a node's own default."""

@@ -11,7 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from finssim.ros2.graphs import PARENT, Plan
+from finssim.robot.interrupt import PARENT
+from finssim.ros2.graphs import Plan
 
 __all__ = ["Supervisor"]
 

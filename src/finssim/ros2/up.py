@@ -16,6 +16,7 @@ from finssim.ros2.errors import Ros2Error
 from finssim.ros2.graphs import MCU_PORT, Plan, topics_of
 from finssim.ros2.supervisor import Supervisor
 from finssim.vehicles import load_vehicle
+from finssim.vehicles.defaults import vehicle_at
 
 if TYPE_CHECKING:
     from finssim.ros2.watcher import Watcher
@@ -33,6 +34,9 @@ class Options:
     """What a person may choose."""
 
     vehicle: str = "finsrov"
+    namespace: str | None = None
+    site: str = "pool"
+    positioning: str = "none"
     policy: str = "pid"
     task: str | None = None
     trim: bool = False
@@ -68,27 +72,36 @@ def plan_of(graph: str, options: Options, pool_file: Path) -> Plan:
         Ros2Error: There is no such graph, or a robot without pool file.
         VehicleError, GoalError, ControlError: A vehicle, goal or trajectory that cannot be used.
     """
-    o, vehicle = options, load_vehicle(options.vehicle)
+    o, vehicle = options, vehicle_at(options.site, load_vehicle(options.vehicle))
+    blind = o.site == "open-water" or str(o.pool_file) == "none"
     if o.goal is not None or o.trajectory is not None:
         check_reachable(guide_of(o.goal, o.trajectory), vehicle)
     extra = (*(("recorder",) if o.record else ()), *(("teleop",) if o.teleop else ()))
-    plan = Plan(graph, o.vehicle, vehicle.name.replace("-", "_"), extra=extra)
-    if graph == "robot" and o.pool_file is None:
-        raise Ros2Error("a robot needs its pool file: give --pool-file")
+    namespace = o.namespace or vehicle.name.replace("-", "_")
+    plan = Plan(graph, o.vehicle, namespace, extra=extra, blind=blind)
+    if graph == "robot" and o.pool_file is None and not blind:
+        raise Ros2Error("a robot needs its pool file: give --pool-file, or none where no camera looks")
+    plan.set("/**", site=o.site, frame_prefix=f"{o.namespace}/" if o.namespace else None)
     plan.set("controller", policy=o.policy, task=o.task, trim=o.trim, goal=o.goal, trajectory=o.trajectory)
     plan.set("sim", start=o.start, hydrodynamics=o.hydrodynamics, seed=o.seed)
     _wire(plan, o)
     for node in ("camera", "localizer", "state_estimation"):
-        plan.set(node, pool_file=str(pool_file))
+        plan.set(node, pool_file="none" if blind else str(pool_file))
     if o.record is not None:
-        located = graph != "sim"
+        located = graph != "sim" and not blind
         plan.set("recorder", record=str(o.record), pool_file=str(pool_file) if located else None)
     plan.set("teleop", device=o.teleop, other=o.policy if o.policy.startswith("pid") else "policy")
     if graph == "pool":
         plan.set(
-            "virtual_pool", plant=o.plant, severity=o.severity, camera=o.camera, port=o.port, seed=o.seed
+            "virtual_pool",
+            plant=o.plant,
+            severity=o.severity,
+            camera="none" if blind else o.camera,
+            port=o.port,
+            seed=o.seed,
+            positioning=o.positioning,
         )
-        plan.set("virtual_pool", bind=o.bind, pool_file=str(pool_file), start=o.start)
+        plan.set("virtual_pool", bind=o.bind, pool_file=None if blind else str(pool_file), start=o.start)
         plan.set("virtual_pool", truth=None if o.truth is None else str(o.truth))
     return plan
 
@@ -130,14 +143,17 @@ def up(graph: str, options: Options, say: Callable[[str], None]) -> int:
         for name, topic in topics_of(plan):
             say(f"  {name}  {topic.type}  {topic.meaning}")
         with interruptible() as interrupted:
-            vehicle = f"vehicle:='{options.vehicle}'"
-            rclpy.init(args=["--ros-args", "-r", f"__ns:=/{plan.namespace}", "-p", vehicle])
+            told = plan.parameters["/**"]
+            own = (f"{name}:='{told[name]}'" for name in ("vehicle", "site", "frame_prefix") if name in told)
+            words = [word for setting in own for word in ("-p", setting)]
+            rclpy.init(args=["--ros-args", "-r", f"__ns:=/{plan.namespace}", *words])
             try:
                 watcher = Watcher(plan.nodes, arm=options.arm)
                 with Supervisor(plan, parameters, say) as nodes:
                     if graph == "pool":
                         nodes.start("virtual_pool")
-                        _await(pool_file, nodes, interrupted)
+                        if not plan.blind:
+                            _await(pool_file, nodes, interrupted)
                     for name in plan.nodes:
                         if name != "virtual_pool":
                             nodes.start(name)

@@ -27,15 +27,18 @@ class VirtualPoolNode(RobotNode):
             "robot": self.parameter("bind", DEFAULT_BIND),
             "pool_file": _path(self.parameter("pool_file", "")),
             "truth": _path(self.parameter("truth", "")),
-            "start": self.parameter("start", "0,0,-0.5,0"),
+            "start": self.parameter("start", "") or None,
+            "positioning": self.parameter("positioning", "none"),
             "seed": self.parameter("seed", 0),
         }
         self._vehicle_name = self.get_parameter("vehicle").value
+        self._site = self.get_parameter("site").value
         self.event("start", f"plant {self.plan['plant']}, {self.plan['severity']}")
 
     def spin(self) -> None:
         """Be the pool until SIGINT or SIGTERM."""
-        serve(self._vehicle_name, lockstep=False, bind="127.0.0.1", duration=None, **self.plan)
+        where = {"bind": "127.0.0.1", "site": self._site, **self.plan}
+        serve(self._vehicle_name, lockstep=False, duration=None, **where)
 
 
 def _path(text: str) -> Path | None:

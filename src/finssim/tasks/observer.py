@@ -27,7 +27,7 @@ from finssim.tasks.reference import fill_table
 from finssim.tasks.task import Batch, Task
 from finssim.vehicles import Vehicle
 
-__all__ = ["Observer", "fitted_task", "one_world"]
+__all__ = ["Observer", "fitted_task", "one_world", "unscored"]
 
 Array = NDArray[np.float64]
 
@@ -125,13 +125,12 @@ class Observer:
         """
         if guide is not self._guide:
             self._guide = guide
+            self._arrays.action.zero_()
             self._aim(guide)
         a, now = self._arrays, guide.at(t)
+        self._remember(np.zeros(self._action_size) if previous is None else np.asarray(previous, float))
         a.time.numpy()[0] = t
         self._steps[0] = max(round(t / self.task.control_step), 0)
-        if previous is not None:
-            first = self._place * self._action_size
-            a.previous_action.numpy()[0, first : first + self._action_size] = previous
         a.goal_position.numpy()[0] = now.position
         a.goal_quaternion.numpy()[0] = quat_from_yaw(now.yaw)
         if a.target.velocity is not None:
@@ -142,14 +141,27 @@ class Observer:
         rows: NDArray[np.float32] = a.observation.numpy()[0].reshape(len(self.task.agents), -1)
         return rows[self._place].copy()
 
+    def _remember(self, action: Array) -> None:
+        """What was done last, as the observation finds it: one in torch is asked before the step is taken down."""
+        own = slice(self._place * self._action_size, (self._place + 1) * self._action_size)
+        a = self._arrays
+        done = a.action.numpy()[0, own].copy()
+        a.action.numpy()[0, own] = action
+        a.previous_action.numpy()[0, own] = done if self._in_torch else action
+
     def _build(self, task: Task) -> None:
-        """Arrays of one world, and what observes it."""
+        """Arrays of one world, and what observes it; nothing is scored there."""
         state, self._arrays = one_world(task, self._action_size)
+        self._in_torch = unscored(self._arrays)
         self._steps = state.steps.numpy()
         self._pipeline = Pipeline(1, state.steps.device)
         everywhere = wp.ones(1, dtype=wp.int32, device=state.steps.device)
         # An episode's first observation: what has been heard of the others is what is known of them now.
         task.add_observe(self._pipeline, Batch(state, self._arrays, 0), everywhere)
+        try:
+            self._pipeline.run()  # a robot's first decision must not wait for the compiler
+        except EnvironmentSetupError as error:
+            raise ControlError(f"task '{task.name}' cannot be observed on a robot: {error}") from None
 
     def _aim(self, guide: Guide) -> None:
         """What of a guide is looked at ahead of time."""
@@ -197,6 +209,14 @@ class Observer:
 def _velocity(track: Measured) -> Array:
     """World frame [m/s], (3,)."""
     return quat_rotate(np.asarray(track.quaternion), np.asarray(track.nu)[:3])
+
+
+def unscored(arrays: TaskArrays) -> bool:
+    """Take from a task in torch what only a scored episode has: who looks at it is then refused; whether it is one."""
+    if arrays.answers.memory is None:
+        return False
+    arrays.answers.memory = None
+    return True
 
 
 def one_world(task: Task, action_size: int) -> tuple[State, TaskArrays]:

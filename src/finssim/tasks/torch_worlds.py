@@ -8,6 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.task import Batch
 from finssim.tasks.torch_kernels import draw
 
@@ -29,6 +30,8 @@ class Worlds:
         goal_quaternion: What `reset` gave, (worlds, 4).
         held: Time within the tolerance of success up to the step before, without a break [s], (worlds,).
         memory: The task's own numbers by name, (worlds, size).
+
+    On a robot nothing is drawn or scored: `held` and `memory` are not known there, and who looks at them is refused.
     """
 
     def __init__(
@@ -54,9 +57,11 @@ class Worlds:
         self.device = wp.device_to_torch(state.steps.device)
         self.goal_position = wp.to_torch(arrays.goal_position, requires_grad=False)
         self.goal_quaternion = wp.to_torch(arrays.goal_quaternion, requires_grad=False)
-        self.held = wp.to_torch(arrays.held, requires_grad=False)
-        kept = wp.to_torch(arrays.answers.memory, requires_grad=False)
-        self.memory = dict(zip(memory, kept.split(list(memory.values()), dim=1), strict=True))
+        self._held = wp.to_torch(arrays.held, requires_grad=False)
+        self.memory: Mapping[str, Tensor] = _Unknown()
+        if arrays.answers.memory is not None:
+            kept = wp.to_torch(arrays.answers.memory, requires_grad=False)
+            self.memory = dict(zip(memory, kept.split(list(memory.values()), dim=1), strict=True))
         self._action, self._previous = (
             wp.to_torch(x, requires_grad=False) for x in (arrays.action, arrays.previous_action)
         )
@@ -72,6 +77,13 @@ class Worlds:
         """Start a call of the task's functions: draws are counted from here."""
         self._place = self._first
         return self
+
+    @property
+    def held(self) -> Tensor:
+        """Time within the tolerance of success up to the step before, without a break [s], (worlds,)."""
+        if isinstance(self.memory, _Unknown):
+            raise _unknown("w.held")
+        return self._held
 
     @property
     def action(self) -> Tensor:
@@ -120,3 +132,17 @@ class Worlds:
 
     def _by_agent(self, rows: Tensor) -> Tensor:
         return rows if self._agents == 1 else rows.view(self.count, self._agents, -1)
+
+
+class _Unknown(dict[str, Tensor]):
+    """A task's memory where nobody keeps one."""
+
+    def __missing__(self, name: str) -> Tensor:
+        raise _unknown(f"w.memory['{name}']")
+
+
+def _unknown(name: str) -> EnvironmentSetupError:
+    return EnvironmentSetupError(
+        f"it looks at {name}, which reset, reward and inside make, and on a robot none of them runs: look at what is "
+        "measured, the goal, the actions and the time alone"
+    )

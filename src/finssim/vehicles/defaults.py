@@ -13,17 +13,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from finssim.vehicles.equipment import Compass, DepthSensor, Dvl, Imu, Mcu, Mount, Safety, Sensors, Tags
+from finssim.vehicles.errors import VehicleError
 
 if TYPE_CHECKING:
     from finssim.vehicles.vehicle import Vehicle
 
 __all__ = [
     "DEFAULTS",
+    "SITES",
     "default_mcu",
     "default_safety",
     "default_sensors",
     "default_tags",
+    "numbered",
     "room",
+    "vehicle_at",
     "with_navigation",
 ]
 
@@ -31,6 +35,12 @@ LENGTH = 0.6
 """Vehicles up to this long have the published pool, which FinsROV (0.56 m) fits [m]; for others everything grows."""
 POOL = (4.0, 2.0, 1.0)
 """The published pool: length, width and depth [m]."""
+SITES: Mapping[str, tuple[float, float, float] | None] = {
+    "pool": None,
+    "tank": (10.0, 6.0, 5.0),
+    "open-water": (2000.0, 2000.0, 20.0),
+}
+"""Where a vehicle may swim: length, width and depth [m]; of the pool as the vehicle's file has its workspace."""
 EDGE = (0.2, 0.4)
 """Largest edge of a tag, part of the vehicle's length and of its width: two with their margins fit on the top."""
 APART = 0.15
@@ -103,6 +113,36 @@ def with_navigation(vehicle: Vehicle) -> Vehicle:
     own = vehicle.sensors
     fitted = own.model_copy(update={"dvl": own.dvl or dvl, "compass": own.compass or compass})
     return vehicle.model_copy(update={"sensors": fitted})
+
+
+def vehicle_at(site: str, vehicle: Vehicle) -> Vehicle:
+    """The vehicle as it is equipped for a site: a workspace as large, and in open water Doppler log and compass.
+
+    Raises:
+        VehicleError: There is no such site.
+    """
+    if site not in SITES:
+        raise VehicleError(f"unknown site '{site}'; available: {', '.join(SITES)}")
+    size = SITES[site]
+    if size is None:
+        return vehicle
+    length, width, depth = size
+    box = {
+        "workspace_lower": np.array([-0.5 * length, -0.5 * width, -depth]),
+        "workspace_upper": np.array([0.5 * length, 0.5 * width, 0.0]),
+    }
+    fitted = with_navigation(vehicle) if site == "open-water" else vehicle
+    return fitted.model_copy(update={"safety": vehicle.safety.model_copy(update=box)})
+
+
+def numbered(vehicle: Vehicle, number: int) -> Vehicle:
+    """The vehicle as one of several under one camera, from 0: its tags' ids go on after those of the one before."""
+    tags = vehicle.tags
+    if number == 0 or tags is None:
+        return vehicle
+    step = max(tags.mounts) - min(tags.mounts) + 1
+    mounts = {tag + number * step: mount for tag, mount in tags.mounts.items()}
+    return vehicle.model_copy(update={"tags": tags.model_copy(update={"mounts": mounts})})
 
 
 def default_mcu(given: Mapping[str, Any]) -> Mcu:

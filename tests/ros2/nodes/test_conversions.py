@@ -10,10 +10,20 @@ from hypothesis import strategies as st
 
 from finssim.control.guidance import Station
 from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
-from finssim.robot.messages import Picture, TagCorners, Telemetry
+from finssim.robot.messages import (
+    HEADING,
+    POSE,
+    POSITION,
+    VELOCITY,
+    NavigationAid,
+    Picture,
+    TagCorners,
+    Telemetry,
+)
 from finssim.robot.robot import Reading
 from finssim.ros2.codec import codec_of
 from finssim.ros2.nodes.conversions import (
+    aid_of,
     compressed_of,
     force_of,
     image_of,
@@ -62,6 +72,30 @@ def test_telemetry_comes_back_as_it_was(rpm):
     message = wire(MAKE.telemetry(STAMP, STAMP + 5, telemetry(motor_rpm=rpm)))
     assert telemetry_of(message) == telemetry(motor_rpm=rpm)
     assert (nanoseconds(message.header.stamp), nanoseconds(message.received)) == (STAMP, STAMP + 5)
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "std"),
+    [
+        (POSITION, (1.0, -2.0, -3.0), (0.5, 0.0)),
+        (POSE, (1.0, -2.0, 3.1), (0.002, 0.005)),
+        (VELOCITY, (0.4, -0.1, 0.02), (0.0, 0.0)),
+        (HEADING, (-3.1, 0.0, 0.0), (0.0, 0.0)),
+    ],
+)
+def test_what_a_navigation_instrument_said_comes_back_as_it_was(kind, values, std):
+    """All but its sequence; one of another frame is refused, and a variance that is no number is passed on."""
+    key, message = MAKE.aid(STAMP, NavigationAid(7, kind, 0.25, values, std))
+    message = wire(message)
+    frame = TOPICS[key].frame
+    back = aid_of(key, message, 0.25, frame)
+    assert (back.kind, back.age, nanoseconds(message.header.stamp)) == (kind, 0.25, STAMP)
+    assert (back.values, back.std) == (pytest.approx(values), pytest.approx(std))
+    message.header.frame_id = "odom"
+    assert aid_of(key, message, 0.25, frame) == "of another frame"
+    if key == "positioning":
+        message.header.frame_id, message.pose.covariance = "map", [math.nan] * 36
+        assert math.isnan(aid_of(key, message, 0.25, frame).std[0])
 
 
 def test_an_imu_message_is_in_body_axes():

@@ -11,8 +11,13 @@ from launch_ros.parameter_descriptions import ParameterValue
 COMMON = {
     "vehicle": ("", "vehicle of the catalogue, or its YAML file; finsrov where neither this nor a file says"),
     "namespace": ("finsrov", "what the vehicle's topics stand below"),
+    "frame_prefix": ("", "of the vehicle's own frames in /tf, such as robot_1/, where several share a graph"),
+    "site": ("", "pool, tank or open-water"),
     "params_file": ("", "your own parameter file, in place of the package's"),
 }
+
+EVERYWHERE = ("vehicle", "frame_prefix", "site")
+"""Parameters of every node."""
 
 
 def description(graph, arguments, nodes):
@@ -21,7 +26,7 @@ def description(graph, arguments, nodes):
     Args:
         graph: Name of the package's parameter file.
         arguments: Launch argument -> (default, meaning); an argument left empty leaves a parameter to the file.
-        nodes: Function of the arguments' values that gives executable -> its parameters, all but `vehicle`.
+        nodes: Function of the arguments' values that gives executable -> its parameters, all but `EVERYWHERE`.
     """
     declared = {**COMMON, **arguments}
     own = os.path.join(get_package_share_directory("finssim_ros"), "config", f"{graph}.yaml")
@@ -38,7 +43,7 @@ def description(graph, arguments, nodes):
                 namespace=given["namespace"],
                 parameters=[
                     given["params_file"] or own,
-                    *_given({"vehicle": given["vehicle"], **parameters}),
+                    *_given({**{name: given[name] for name in EVERYWHERE}, **parameters}),
                 ],
                 output="screen",
             )

@@ -15,12 +15,22 @@ from finssim.control.guidance import Station
 from finssim.control.trajectories import Trajectory
 from finssim.control.trajectory_file import through_points
 from finssim.geometry.rotations import quat_yaw
-from finssim.robot.messages import Picture, TagCorners, Telemetry
-from finssim.robot.record_messages import FIRST_TIME, LAST_TIME
+from finssim.robot.messages import (
+    HEADING,
+    POSE,
+    POSITION,
+    VELOCITY,
+    NavigationAid,
+    Picture,
+    TagCorners,
+    Telemetry,
+)
+from finssim.robot.record_messages import FIRST_TIME, LAST_TIME, UNKNOWN
 from finssim.robot.record_pictures import picture_of
 from finssim.robot.robot import Reading
 
 __all__ = [
+    "aid_of",
     "compressed_of",
     "force_of",
     "image_of",
@@ -74,6 +84,30 @@ def telemetry_of(message: Any) -> Telemetry:
     )
 
 
+def aid_of(key: str, message: Any, age: float, frame: str) -> NavigationAid | str:
+    """What a navigation instrument measured, or why it cannot be used; what is no number is left to those who use it.
+
+    Args:
+        key: Of its topic: positioning, dvl or compass.
+        message: As it came.
+        age: Since its stamp [s].
+        frame: In which it must be.
+    """
+    if message.header.frame_id not in ("", frame):
+        return "of another frame"
+    if key == "dvl":
+        return NavigationAid(0, VELOCITY, age, xyz(message.twist.twist.linear), (0.0, 0.0))
+    if key == "compass":
+        heading = float(quat_yaw(np.array(xyzw(message.orientation))))
+        return NavigationAid(0, HEADING, age, (heading, 0.0, 0.0), (0.0, 0.0))
+    pose, covariance = message.pose.pose, np.array(message.pose.covariance, float)
+    std, turn = math.sqrt(max(covariance[0], 0.0)), math.sqrt(max(covariance[35], 0.0))
+    x, y, z = xyz(pose.position)
+    if not covariance[35] < UNKNOWN:
+        return NavigationAid(0, POSITION, age, (x, y, z), (std, 0.0))
+    return NavigationAid(0, POSE, age, (x, y, float(quat_yaw(np.array(xyzw(pose.orientation))))), (std, turn))
+
+
 def force_of(message: Any, names: Sequence[str]) -> Array | str:
     """The thrusts of a ThrusterCommand in canonical order [N], or why it cannot be used."""
     told, force = list(message.names), [float(f) for f in message.force]
@@ -86,10 +120,10 @@ def force_of(message: Any, names: Sequence[str]) -> Array | str:
     return ordered if np.isfinite(ordered).all() else "it holds a thrust that is not finite"
 
 
-def wrench_of(message: Any) -> Array | None:
+def wrench_of(message: Any, frame: str = "base_link") -> Array | None:
     """The wrench of a WrenchStamped, body frame [N, N m], (6,); None where it is of another frame or not finite."""
     tau = np.array([*xyz(message.wrench.force), *xyz(message.wrench.torque)])
-    fits = message.header.frame_id in ("", "base_link")
+    fits = message.header.frame_id in ("", frame)
     return tau if fits and np.isfinite(tau).all() else None
 
 

@@ -14,7 +14,7 @@ from finssim.robot.counters import Counters
 from finssim.robot.intake import Intake
 from finssim.robot.link.frames import encode_command
 from finssim.robot.link.transports import DEFAULT_BIND, open_transport
-from finssim.robot.messages import CommandEcho, Telemetry
+from finssim.robot.messages import CommandEcho, NavigationAid, Telemetry
 from finssim.robot.unlocated import Unlocated
 from finssim.robot.wiring import POOL_ADDRESS
 from finssim.ros2.nodes.bridge_topics import BridgeTopics
@@ -38,7 +38,7 @@ class HardwareBridge(RobotNode):
         self.bridge = Bridge(self.vehicle, BridgeSettings.of(self.vehicle, need_reading=located))
         self.counters, self.shafts = Counters(), np.zeros(0)
         self.intake = Intake(Unlocated(self.vehicle), self.bridge, self.counters, self)
-        self.sends("imu", "pressure", "telemetry", "shafts", "echo")
+        self.sends("imu", "pressure", "telemetry", "shafts", "echo", "positioning", "dvl", "compass")
         self.topics = BridgeTopics(self, self.bridge)
         self.create_timer(1.0 / self.parameter("rate", 60.0), self._turn)
         self.create_timer(1.0, self._tell)
@@ -57,6 +57,12 @@ class HardwareBridge(RobotNode):
     def echo(self, now: float, echo: CommandEcho) -> None:
         """Publish what the motor controller made of a command."""
         self.send("echo", self.make.echo(self.ns(now), echo))
+
+    def aid(self, now: float, aid: NavigationAid) -> None:
+        """Publish what a navigation instrument measured, stamped with its measurement."""
+        made = self.make.aid(self.ns(now - aid.age), aid)
+        if made is not None:
+            self.send(*made)
 
     def _speeds(self, stamp: int, rpm: Sequence[float] | None) -> Any:
         message = None if rpm is None else self.make.shafts(stamp, rpm)

@@ -44,11 +44,11 @@ class Modes:
         """
         self._node = node
         self._wrench, self._wrench_at = np.zeros(6), -math.inf
-        pilots: dict[str, Any] = {name: make_pilot(name, node.vehicle) for name in CONTROLLERS}
+        pilots: dict[str, Any] = {name: make_pilot(name, node.filed) for name in CONTROLLERS}
         self._policy: AgentPilot | None = None
         if policy not in pilots:
             pilots["policy"] = self._policy = make_pilot(
-                policy, node.vehicle, task=task or None, trim=Trim() if trim else None
+                policy, node.filed, task=task or None, trim=Trim() if trim else None
             )
         pilots["teleop"] = WrenchPilot(self._newest, node.vehicle)
         self._pilots = {name: _Timed(pilot) for name, pilot in pilots.items()}
@@ -77,13 +77,11 @@ class Modes:
             "force": runtime.force,
             "vehicle_sha256": self._node.vehicle.sha256,
             "task": pilot.describe().get("task", ""),
+            "observation": getattr(pilot, "observation", ()),
+            "action": getattr(pilot, "action", ()),
         }
         if self.switch.mode == "policy" and self._policy is not None:
-            values |= {
-                "policy_sha256": self._policy.describe().get("files", {}).get(NETWORK_FILE, ""),
-                "observation": self._policy.observation,
-                "action": self._policy.action,
-            }
+            values["policy_sha256"] = self._policy.describe().get("files", {}).get(NETWORK_FILE, "")
         return self._node.make.policy(stamp, self.switch.mode, values)
 
     def _newest(self) -> Array:
@@ -91,7 +89,7 @@ class Modes:
         return self._wrench if fresh else np.zeros(6)
 
     def _on_wrench(self, message: Any) -> None:
-        tau = wrench_of(message)
+        tau = wrench_of(message, self._node.make.frame("base_link"))
         if tau is not None:
             self._wrench, self._wrench_at = tau, self._node.now()
 

@@ -33,7 +33,7 @@ class RecorderNode(RobotNode):
             return
         files = {"pool.yaml": pool_file} if pool_file else {}
         names = {key: self.resolve_topic_name(self.topic(key)) for key in TOPICS}
-        self.mcap = _WireRecord(Path(path), self.vehicle, {"command": "ros2 recorder"}, files, names)
+        self.mcap = _WireRecord(Path(path), self.filed, {"command": "ros2 recorder"}, files, names)
         for key in TOPICS:
             if key not in LEFT_OUT and (pictures or key != "picture"):
                 self.hears(key, self._taker(key), raw=True)

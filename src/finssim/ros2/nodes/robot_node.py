@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -17,16 +15,15 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
-from finssim.ros2.graphs import PARENT
+from finssim.robot.interrupt import follow_parent
 from finssim.ros2.nodes.conversions import nanoseconds
 from finssim.ros2.nodes.ros_messages import RosMessages, ros_type
 from finssim.ros2.topics import TOPICS, quality_profile
 from finssim.vehicles import load_vehicle
+from finssim.vehicles.defaults import numbered, vehicle_at
 
 __all__ = ["LISTENING", "RobotNode", "TwinError", "matched_callbacks"]
 
-ORPHANED = 0.5
-"""Between looks whether it is there [s]."""
 URGENCY = -10
 """Niceness of a node that others wait for; only a privileged user may have it, others do without."""
 LISTENING = 1.0
@@ -60,12 +57,17 @@ class RobotNode(Node):
             others: Of nodes that there must not be yet, besides one of its own name.
 
         Raises:
-            VehicleError: The parameter `vehicle` names none.
+            VehicleError: The parameters `vehicle` or `site` name none.
             TwinError: There is one of those nodes.
         """
         super().__init__(name)
-        self.vehicle = load_vehicle(self.parameter("vehicle", "finsrov"))
-        self.make = RosMessages(self.vehicle)
+        self.filed = load_vehicle(self.parameter("vehicle", "finsrov"))
+        """The vehicle as its file has it, which policies are trained for."""
+        self.vehicle = numbered(
+            vehicle_at(self.parameter("site", "pool"), self.filed), self.parameter("number", 0)
+        )
+        """The same as it is equipped for the site, with the tags of its number among several."""
+        self.make = RosMessages(self.vehicle, self.parameter("frame_prefix", ""))
         self._below = "" if self.get_namespace() != "/" else f"{self.vehicle.name.replace('-', '_')}/"
         simulated = self.get_parameter("use_sim_time").value
         self.base = 0 if simulated else self.get_clock().now().nanoseconds // 10**9 * 10**9
@@ -166,7 +168,7 @@ class RobotNode(Node):
         Returns:
             Exit status: 0, or `REFUSED` with a sentence on standard error.
         """
-        _follow_parent()
+        follow_parent()
         if cls.urgent:
             with suppress(PermissionError):
                 os.nice(URGENCY)
@@ -210,17 +212,3 @@ def _refused(error: Exception) -> int:
     """Say in one sentence what cannot be done."""
     print(f"finssim: {' '.join(str(error).split())}", file=sys.stderr)
     return REFUSED
-
-
-def _follow_parent() -> None:
-    """End with the launcher, even if it was killed."""
-    parent = os.environ.get(PARENT, "")
-    if not parent.isdecimal():
-        return
-
-    def watch() -> None:
-        while os.getppid() == int(parent):
-            time.sleep(ORPHANED)
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    threading.Thread(target=watch, name="launcher", daemon=True).start()

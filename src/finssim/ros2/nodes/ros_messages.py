@@ -33,8 +33,8 @@ def ros_type(name: str) -> Any:
 class RosMessages(Messages):
     """As `robot.record_messages`, for publishers; and what a record does not hold."""
 
-    def __init__(self, vehicle: Vehicle) -> None:
-        super().__init__(vehicle)
+    def __init__(self, vehicle: Vehicle, prefix: str = "") -> None:
+        super().__init__(vehicle, prefix)
         self._of = _Makers()
 
     def fix(self, stamp: int, position: Any, quaternion: Any, covariance: Any) -> Any:
@@ -95,7 +95,7 @@ class RosMessages(Messages):
             [
                 of["geometry_msgs/msg/TransformStamped"](
                     self.header(stamp, parent),
-                    child,
+                    self.frame(child),
                     of["geometry_msgs/msg/Transform"](self.vector(p), self.quaternion(q)),
                 )
                 for parent, child, (p, q) in parts

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,11 @@ from finssim.localization.fusion.health import Health
 from finssim.localization.pool import load_pool
 from finssim.robot.intake import USED
 from finssim.robot.perception import Perception
-from finssim.ros2.nodes.conversions import telemetry_of
+from finssim.ros2.nodes.conversions import aid_of, telemetry_of
 from finssim.ros2.nodes.fix_frame import FixFrame
 from finssim.ros2.nodes.frames import Frames
 from finssim.ros2.nodes.robot_node import RobotNode
+from finssim.ros2.topics import TOPICS
 
 __all__ = ["StateEstimation", "health_values"]
 
@@ -24,14 +26,18 @@ class StateEstimation(RobotNode):
 
     def __init__(self) -> None:
         super().__init__("state_estimation")
-        pool = load_pool(self.parameter("pool_file", "pool.yaml"))
+        file = self.parameter("pool_file", "pool.yaml")
+        pool = None if file == "none" else load_pool(file)
         mode = self.parameter("mode", "constant-velocity")
         self.perception = Perception(self.vehicle, pool, mode=mode)
-        self.fixes = FixFrame(pool, self.perception.estimator)
         self.sends("odometry", "estimator", "diagnostics", "event")
         self.frames = Frames(self, pool)
         self.hears("telemetry", self._on_telemetry)
-        self.hears("fix", self._on_fix)
+        if pool is not None:
+            self.fixes = FixFrame(pool, self.perception.estimator)
+            self.hears("fix", self._on_fix)
+        for key in ("positioning", "dvl", "compass"):
+            self.hears(key, partial(self._on_aid, key))
         self.create_timer(1.0 / self.parameter("rate", 60.0), self._estimate)
         self.create_timer(1.0, self._tell)
 
@@ -42,6 +48,15 @@ class StateEstimation(RobotNode):
     def _on_fix(self, message: Any) -> None:
         time = self.seconds(message.header.stamp)
         self.perception.estimator.add(self.fixes.from_map(message, time, self.now()))
+
+    def _on_aid(self, key: str, message: Any) -> None:
+        now = self.now()
+        frame = self.make.frame(TOPICS[key].frame)
+        aid = aid_of(key, message, now - self.seconds(message.header.stamp), frame)
+        if isinstance(aid, str):
+            self.perception.estimator.refuse("aid", aid)
+        else:
+            self.perception.aid(now, aid)
 
     def _estimate(self) -> None:
         now = self.now()
