@@ -8,8 +8,7 @@ import pytest
 from finssim import boundary
 from finssim.cli import app
 from finssim.tasks import TASKS, make
-from finssim.tasks.attribute_docs import attribute_docs
-from finssim.tasks.describe import describe_task
+from finssim.tasks.describe import attribute_docs, describe_task
 from finssim.tasks.station_keeping import StationKeeping
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own_task_torch.py"

@@ -5,9 +5,9 @@ import pytest
 import torch
 from torch import nn
 
+from finssim.learning.export import write_graph
 from finssim.learning.layers import Adam, Arrays, Gru, Parameters, Row, Stack
 from finssim.learning.network import Activation, Cell, Linear, Network, first_memory
-from finssim.learning.onnx_graph import write_graph
 from finssim.learning.recurrent import RecurrentNetwork, plain_network
 
 LIBRARIES = pytest.mark.parametrize("device", [None, "cpu"], ids=["numpy", "torch"])

@@ -10,7 +10,7 @@ import pytest
 from finssim.engine.randomize import Randomization
 from finssim.engine.ranges_file import Ranges
 from finssim.tasks import Environment, EnvironmentSetupError, StationKeeping
-from finssim.tasks.draw_log import LogError, read_draws
+from finssim.tasks.drawing import LogError, read_draws
 
 RANGES = Ranges(name="test", mass=(0.9, 1.3), current=(0.0, 0.2))
 

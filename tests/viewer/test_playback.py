@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from finssim.viewer.playback import LONGEST_TURN, Playback
+from finssim.viewer.app import LONGEST_TURN, Playback
 
 
 def test_a_recording_stops_at_its_end_and_starts_again_from_there():

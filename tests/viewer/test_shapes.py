@@ -6,9 +6,8 @@ import pytest
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.robot.messages import TagCorners
 from finssim.vehicles import load_vehicle
+from finssim.viewer.app import FIRST, LINE, blank, draw_picture, legend_of, plots_of
 from finssim.viewer.frame import Curve, Picture, Pose
-from finssim.viewer.picture_panel import FIRST, LINE, blank, draw_picture
-from finssim.viewer.plots import legend_of, plots_of
 from finssim.viewer.shapes import ARROW, force_arrows, hull_of, line_of, tag_plates, wall_mesh
 
 FINSROV = load_vehicle("finsrov")

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
 import math
+import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict, fields, is_dataclass
 from typing import Any
 
 from finssim.control.modes import Thruster8, action_mode
-from finssim.tasks.attribute_docs import attribute_docs
 from finssim.tasks.baselines import BASELINES
 from finssim.tasks.given import crew
 from finssim.tasks.make import task_named
@@ -17,7 +18,30 @@ from finssim.tasks.sensing import Sensing, seen_with
 from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle
 
-__all__ = ["describe_task"]
+__all__ = ["attribute_docs", "describe_task"]
+
+# The sentences written under a dataclass' fields: Python does not keep them, their source does.
+
+
+def attribute_docs(kind: type) -> dict[str, str]:
+    """Field -> the string that follows it, of a class and those it is derived from; where the source can be had."""
+    found: dict[str, str] = {}
+    for base in reversed(kind.__mro__[:-1]):
+        try:
+            (tree,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        except (OSError, TypeError, SyntaxError):
+            continue
+        body = tree.body if isinstance(tree, ast.ClassDef) else []
+        for line, after in zip(body, body[1:], strict=False):
+            told = after.value if isinstance(after, ast.Expr) else None
+            if (
+                isinstance(line, ast.AnnAssign)
+                and isinstance(line.target, ast.Name)
+                and isinstance(told, ast.Constant)
+            ):
+                found[line.target.id] = " ".join(str(told.value).split())
+    return found
+
 
 APART = ("name", "observation", "control_step", "substeps", "time_limit", "training_noise")
 """Fields that are told by themselves."""

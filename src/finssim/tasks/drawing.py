@@ -1,20 +1,178 @@
 """What randomisation does in one environment: the draws, how their ranges grow, what agents and logs are told."""
 
-from collections.abc import Iterator
+from __future__ import annotations
 
+import csv
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from finssim.engine import Simulator
 from finssim.engine.launch import Pipeline
 from finssim.engine.packed import Packed
 from finssim.engine.randomize import Draws, Randomization
+from finssim.engine.ranges_table import ENTRIES, INDEX
+from finssim.files import atomic_write
+from finssim.provenance import provenance
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.curriculum import Schedule
-from finssim.tasks.draw_log import DrawLog
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.task import Task
 
-__all__ = ["Drawing"]
+__all__ = ["Drawing", "LogError", "read_draws"]
+
+# What was drawn for every episode, and how the episode went: kept while a run goes on, written as CSV or NPZ.
+
+COUNTS = ("world", "episode", "length")
+OUTCOMES = ("episode_return", "held")
+
+
+class LogError(ValueError):
+    """A log of draws that cannot be written or read."""
+
+
+@dataclass(frozen=True)
+class DrawnEpisodes:
+    """Episodes that ended, in the order of their ends."""
+
+    names: tuple[str, ...]
+    """Entries of the table that vary."""
+    units: tuple[str, ...]
+    values: NDArray[np.float32]
+    """(episodes, vehicles, len(names)); nominal factors are 1."""
+    world: NDArray[np.int64]
+    episode: NDArray[np.int64]
+    """Number of the episode in its world, from 1."""
+    length: NDArray[np.int64]
+    """Control steps."""
+    episode_return: NDArray[np.float64]
+    held: NDArray[np.float64]
+    """Time inside the tolerance when it ended [s]."""
+    about: Mapping[str, Any]
+    """Ranges, vehicles and provenance."""
+
+    def column(self, name: str, vehicle: int = 0) -> NDArray[np.float32]:
+        """One entry of every episode.
+
+        Raises:
+            LogError: It was not drawn.
+        """
+        if name not in self.names:
+            raise LogError(f"'{name}' was not drawn; drawn were: {', '.join(self.names)}")
+        return np.asarray(self.values[:, vehicle, self.names.index(name)])
+
+
+class DrawLog:
+    """Collects, world by world, what each episode had when it ends."""
+
+    def __init__(self, draws: Draws, arrays: TaskArrays) -> None:
+        """Start with the episodes that are running."""
+        self._draws, self._arrays = draws, arrays
+        self._values: list[NDArray[np.float32]] = []
+        self._rows: list[NDArray[np.float64]] = []
+        self._now = self._draws.numpy()
+        self._episode = np.array(draws.simulator.state.episode.numpy())
+        self._open = np.ones(len(self._episode), bool)
+
+    def look(self) -> None:
+        """Take what the running episodes have; episodes that were cut off from outside are left out."""
+        episode = np.array(self._draws.simulator.state.episode.numpy())
+        self._open |= episode != self._episode
+        self._now, self._episode = self._draws.numpy(), episode
+
+    def after_step(self) -> None:
+        """Take the episodes that ended in this step."""
+        a = self._arrays
+        ended = np.flatnonzero((a.done.numpy() != 0) & self._open)
+        if not len(ended):
+            return
+        columns = (a.final_length, a.final_return, a.final_held)
+        outcome = np.stack([array.numpy()[ended].astype(float) for array in columns], axis=1)
+        self._values.append(self._now[ended])
+        self._rows.append(np.column_stack([ended, self._episode[ended], outcome]))
+        self._now[ended] = self._draws.values.numpy()[ended][..., [INDEX[n] for n in self._draws.names]]
+        episode = self._draws.simulator.state.episode.numpy()[ended]
+        self._open[ended] = episode != self._episode[ended]  # without automatic reset a world waits for one
+        self._episode[ended] = episode
+
+    def episodes(self) -> DrawnEpisodes:
+        """All that ended so far."""
+        names, vehicles = tuple(self._draws.names), self._draws.simulator.vehicles
+        rows = np.concatenate([np.zeros((0, 5)), *self._rows])
+        empty = np.zeros((0, len(vehicles), len(names)), np.float32)
+        world, episode, length = (rows[:, i].astype(np.int64) for i in range(3))
+        about = {
+            "ranges": self._draws.randomization.ranges.model_dump(mode="json"),
+            "vehicles": [{"name": v.name, "sha256": v.sha256} for v in vehicles],
+            "seed": self._draws.simulator.seed,
+            "provenance": provenance(),
+        }
+        units = tuple(ENTRIES[INDEX[name]].unit for name in names)
+        values = np.concatenate([empty, *self._values])
+        return DrawnEpisodes(names, units, values, world, episode, length, rows[:, 3], rows[:, 4], about)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the episodes so far.
+
+        Args:
+            path: A .npz file, which `read_draws` reads back, or a .csv table: a row for each vehicle of each episode.
+
+        Raises:
+            LogError: Another suffix.
+            OutputError: The place cannot be written.
+        """
+        target, episodes = Path(path), self.episodes()
+        if target.suffix not in (".npz", ".csv"):
+            raise LogError(f"{path} ends in '{target.suffix}', expected .npz or .csv")
+        with atomic_write(target) as temporary:
+            (_write_npz if target.suffix == ".npz" else _write_csv)(temporary, episodes)
+        return target
+
+
+def _write_npz(path: Path, e: DrawnEpisodes) -> None:
+    columns = {name: getattr(e, name) for name in (*COUNTS, *OUTCOMES, "values")}
+    words = {name: np.array(getattr(e, name), dtype=str) for name in ("names", "units")}
+    with path.open("wb") as file:
+        np.savez_compressed(file, **columns, **words, about=np.array(json.dumps(dict(e.about))))
+
+
+def _write_csv(path: Path, e: DrawnEpisodes) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow([*COUNTS, *OUTCOMES, "vehicle", *e.names])
+        for i, drawn in enumerate(e.values):
+            outcome = [*(getattr(e, n)[i] for n in COUNTS), *(f"{getattr(e, n)[i]:.7g}" for n in OUTCOMES)]
+            for vehicle, row in enumerate(drawn):
+                writer.writerow([*outcome, vehicle, *(f"{x:.7g}" for x in row)])
+
+
+def read_draws(path: str | Path) -> DrawnEpisodes:
+    """Read what `DrawLog.save` wrote.
+
+    Args:
+        path: A .npz file.
+
+    Raises:
+        LogError: It is not such a file.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            data = {name: file[name] for name in file.files}
+        words = {name: tuple(map(str, data[name])) for name in ("names", "units")}
+        numbers = {name: data[name] for name in (*COUNTS, *OUTCOMES, "values")}
+        return DrawnEpisodes(**words, **numbers, about=json.loads(str(data["about"])))
+    except FileNotFoundError:
+        raise LogError(f"{path}: no such file") from None
+    except (KeyError, OSError, ValueError) as error:
+        raise LogError(
+            f"{path}: not a log of draws ({error}): give a .npz file that DrawLog.save wrote"
+        ) from None
 
 
 class Drawing:

@@ -4,18 +4,467 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from io import StringIO
+from itertools import groupby
+from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import viser
 
-from finssim.viewer.frame import Source
-from finssim.viewer.panel import Panel
-from finssim.viewer.playback import Playback
-from finssim.viewer.scene import Scene
+from finssim.localization.pool import Pool
+from finssim.viewer.frame import Curve, Frame, Picture, Pose, Source, Stage
+from finssim.viewer.shapes import box_edges, force_arrows, hull_of, line_of, tag_plates, wall_mesh, wxyz
 
-__all__ = ["View"]
+__all__ = ["LONGEST_TURN", "Playback", "View", "blank", "draw_picture", "legend_of", "plots_of"]
+
+# The three-dimensional part of a view: the stage is built once, and every frame moves what moves.
+
+Colour = tuple[int, int, int]
+
+COLOURS: dict[str, Colour] = {
+    "truth": (240, 140, 20),
+    "estimate": (40, 110, 235),
+    "goal": (20, 160, 80),
+    "force": (215, 30, 60),
+    "trail": (200, 110, 10),
+    "wall": (214, 228, 236),
+    "water": (70, 150, 205),
+    "box": (90, 110, 125),
+}
+"""What is drawn in which colour."""
+PICTURE_HEIGHT = 0.16
+"""Of the frustum that stands for the camera [m]."""
+
+
+class Scene:
+    """Draws frames of one stage."""
+
+    def __init__(self, server: viser.ViserServer, stage: Stage) -> None:
+        """
+        Args:
+            server: Of the page.
+            stage: What stands still.
+        """
+        self._scene, self.stage = server.scene, stage
+        self._scene.set_up_direction("+z")
+        self._scene.configure_default_lights(True, cast_shadow=False)
+        self._water()
+        self._bodies = {name: self._vehicle(name) for name in ("truth", "estimate")}
+        size = float(np.max(stage.vehicle.body.size))
+        self._goal = self._scene.add_frame(
+            "/goal",
+            axes_length=0.6 * size,
+            axes_radius=0.02 * size,
+            origin_radius=0.05 * size,
+            origin_color=COLOURS["goal"],
+            visible=False,
+        )
+        self._arrows = self._scene.add_arrows(
+            "/forces",
+            np.zeros((1, 2, 3)),
+            COLOURS["force"],
+            shaft_radius=0.02 * size,
+            head_radius=0.05 * size,
+            head_length=0.1 * size,
+            visible=False,
+        )
+        self._trail = self._line("/trail", np.zeros((1, 2, 3)), "trail", 2.5)
+        self._trail.visible = False
+        path = line_of(stage.path)
+        if len(path):
+            self._line("/path", path, "goal", 2.0)
+        if stage.site is not None:
+            self._camera(stage.site)
+        self._look(server)
+
+    def draw(self, frame: Frame) -> None:
+        """Move everything to where it is in a frame."""
+        self._place("truth", frame.truth, ghost=False)
+        self._place("estimate", frame.estimate, ghost=frame.truth is not None)
+        self._show(self._goal, frame.goal)
+        shown = frame.truth or frame.estimate
+        arrows = force_arrows(self.stage.vehicle, frame.force, shown) if shown else np.zeros((0, 2, 3))
+        _set_points(self._arrows, arrows)
+        _set_points(self._trail, line_of(frame.trail))
+
+    def _place(self, name: str, pose: Pose | None, *, ghost: bool) -> None:
+        """Put a body where it is; a ghost is a net of lines, which hides nothing of the body that it lies upon."""
+        body, hull = self._bodies[name]
+        self._show(body, pose)
+        if hull.wireframe != ghost:
+            hull.wireframe = ghost
+
+    def _show(self, node: Any, pose: Pose | None) -> None:
+        known = pose is not None and bool(np.isfinite(pose.position).all())
+        if known and pose is not None:
+            node.position, node.wxyz = tuple(pose.position), wxyz(pose.quaternion)
+        node.visible = known
+
+    def _vehicle(self, name: str) -> tuple[Any, Any]:
+        """The body's node and its hull."""
+        vehicle = self.stage.vehicle
+        body = self._scene.add_frame(f"/{name}", show_axes=False, visible=False)
+        mesh = hull_of(vehicle)
+        hull = self._scene.add_mesh_simple(
+            f"/{name}/hull", mesh.vertices, mesh.faces, color=COLOURS[name], flat_shading=True, side="double"
+        )
+        plates = tag_plates(vehicle)
+        for part, plate, colour in zip(
+            ("plates", "tags"), plates or (), ((250,) * 3, (25,) * 3), strict=False
+        ):
+            self._scene.add_mesh_simple(
+                f"/{name}/{part}", plate.vertices, plate.faces, color=colour, side="double"
+            )
+        nose = np.array([[[0.0, 0.0, 0.0], [0.75 * float(vehicle.body.size[0]), 0.0, 0.0]]])
+        self._line(f"/{name}/nose", nose, name, 3.0)
+        return body, hull
+
+    def _water(self) -> None:
+        """Walls and floor, or the edges of a box, and the surface."""
+        lower, upper = self.stage.lower, self.stage.upper
+        if self.stage.walls:
+            walls = wall_mesh(lower, upper)
+            self._scene.add_mesh_simple(
+                "/pool/walls", walls.vertices, walls.faces, color=COLOURS["wall"], flat_shading=True
+            )
+            width, length = float(upper[0] - lower[0]), float(upper[1] - lower[1])
+            middle = (*(0.5 * (lower + upper)[:2]).tolist(), float(lower[2]) + 0.003)
+            self._scene.add_grid(
+                "/pool/floor", width, length, cell_size=0.25, section_size=1.0, position=middle
+            )
+        self._line("/pool/edges", box_edges(lower, upper), "box", 1.5)
+        x0, y0, x1, y1 = *lower[:2], *upper[:2]
+        surface = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
+        self._scene.add_mesh_simple(
+            "/pool/surface",
+            surface,
+            np.array([[0, 1, 2], [0, 2, 3]]),
+            color=COLOURS["water"],
+            opacity=0.16,
+            side="double",
+            cast_shadow=False,
+        )
+
+    def _camera(self, site: Pool) -> None:
+        """The overhead camera where its calibration has it."""
+        lens, T = site.camera.lens, site.T_wp
+        T_pc = np.eye(4)
+        T_pc[:3, 3] = site.camera.position
+        rotation = viser.transforms.SO3.from_quaternion_xyzw(np.asarray(site.camera.orientation, float))
+        T_pc[:3, :3] = rotation.as_matrix()
+        pose = viser.transforms.SE3.from_matrix(T @ T_pc)
+        self._scene.add_camera_frustum(
+            "/camera",
+            fov=2.0 * math.atan(0.5 * lens.height / lens.fy),
+            aspect=lens.width / lens.height,
+            scale=PICTURE_HEIGHT,
+            thickness=0.008,
+            color=COLOURS["box"],
+            position=pose.translation(),
+            wxyz=pose.rotation().wxyz,
+        )
+
+    def _line(self, name: str, points: Array, colour: str, width: float) -> Any:
+        return self._scene.add_line_segments(
+            name, points, COLOURS[colour], thickness=width, thickness_units="screen"
+        )
+
+    def _look(self, server: viser.ViserServer) -> None:
+        """Where the eye is at first: beside and above the water."""
+        lower, upper = self.stage.lower, self.stage.upper
+        middle, reach = 0.5 * (lower + upper), float(np.linalg.norm(upper - lower))
+        server.initial_camera.look_at = tuple(middle)
+        server.initial_camera.position = tuple(middle + reach * np.array([-0.31, -0.56, 0.52]))
+        server.initial_camera.up = (0.0, 0.0, 1.0)
+
+
+def _set_points(node: Any, points: Array) -> None:
+    if len(points):
+        node.points = points.astype(np.float32)
+    node.visible = bool(len(points))
+
+
+# Curves as the browser's plots take them.
+
+LINES = ("#d9480f", "#1c6ef2", "#2b8a3e", "#862e9c")
+"""Colours, in the order of the curves."""
+
+
+class Plot:
+    """Curves of one title, over the same times."""
+
+    def __init__(self, title: str, curves: Sequence[Curve]) -> None:
+        self.title, self.curves = title, list(curves)
+
+    def data(self, now: float) -> tuple[Array, ...]:
+        """Time, and for every curve all of it and the part up to a time [s]."""
+        time = self.curves[0].time
+        past = time <= now + 1e-9
+        columns = [time]
+        for curve in self.curves:
+            columns += [curve.value, np.where(past, curve.value, np.nan)]
+        return tuple(np.ascontiguousarray(column, float) for column in columns)
+
+    def series(self) -> tuple[Any, ...]:
+        """How they are drawn: all of a curve faintly, what has been in full."""
+        drawn: list[Any] = [{"label": "t [s]"}]
+        for curve, colour in zip(self.curves, LINES, strict=False):
+            drawn += [{"label": "", "stroke": f"{colour}40", "width": 1}]
+            drawn += [{"label": curve.label, "stroke": colour, "width": 2}]
+        return tuple(drawn)
+
+
+def plots_of(curves: Sequence[Curve]) -> list[Plot]:
+    """Curves by title, in the order in which titles first appear."""
+    order = list(dict.fromkeys(curve.plot for curve in curves))
+    sorted_curves = sorted(curves, key=lambda curve: order.index(curve.plot))
+    return [Plot(title, list(same)) for title, same in groupby(sorted_curves, key=lambda curve: curve.plot)]
+
+
+def legend_of(plots: Sequence[Plot]) -> str:
+    """Which colour is which curve, as markup; curves of the same place in their plots share label and colour."""
+    labels = dict.fromkeys(
+        (colour, curve.label) for plot in plots for colour, curve in zip(LINES, plot.curves, strict=False)
+    )
+    return " · ".join(f'<span style="color:{colour}">■</span> {label}' for colour, label in labels)
+
+
+# The clock of a view: it runs, stands, runs faster, and is set.
+
+SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+"""Times as fast as real."""
+LONGEST_TURN = 0.1
+"""What one turn of the loop may advance at single speed [s]: a world that is slower than real time slows the clock."""
+
+NEARLY = 0.05
+"""So near to its end a recording is over [s]: a slider need not reach it to the last digit."""
+
+
+class Playback:
+    """Where in a source's time the view is."""
+
+    def __init__(self, duration: float, *, speed: float = 1.0, playing: bool = True) -> None:
+        """
+        Args:
+            duration: Of the source [s]; infinite for a live one.
+            speed: Times as fast as real.
+            playing: Whether it runs from the start.
+        """
+        self.duration, self.speed, self.playing = duration, speed, playing
+        self.time = 0.0
+        """[s]"""
+
+    @property
+    def live(self) -> bool:
+        """Whether there is no end, and no way back."""
+        return math.isinf(self.duration)
+
+    def advance(self, elapsed: float) -> float:
+        """Let so much real time go by [s]; returns the new time [s]. A recording stops at its end."""
+        if self.playing:
+            self.time += min(elapsed, LONGEST_TURN) * self.speed
+            if self.time >= self.duration:
+                self.time, self.playing = self.duration, False
+        return self.time
+
+    def play(self, playing: bool) -> None:
+        """Run or stand; from the end, run from the beginning."""
+        if playing and self.time >= self.duration - NEARLY:
+            self.time = 0.0
+        self.playing = playing
+
+    def seek(self, time: float) -> None:
+        """Go to a time [s], within the source's; a live source has no other than its own."""
+        if not self.live:
+            self.time = min(max(time, 0.0), self.duration)
+
+
+# The camera's picture with the tags outlined, in the panel's size, and the tags enlarged in a corner.
+
+Image = npt.NDArray[np.uint8]
+Array = npt.NDArray[np.float64]
+
+WIDTH = 480
+"""Of the drawn picture, at least, if the camera has so many [px]."""
+DARK, LINE, FIRST = (30, 45, 58), (40, 230, 90), (255, 70, 60)
+"""Ground without a picture, the outline of a tag, and its first edge."""
+INSET = 70
+"""Half the edge of the part that is enlarged [px of the camera]."""
+ENLARGED = 1.5
+"""How much larger than in the camera's picture that part is drawn."""
+
+
+def blank() -> Image:
+    """What is shown before the first picture, (h, w, 3)."""
+    return np.full((WIDTH * 9 // 16, WIDTH, 3), DARK, np.uint8)
+
+
+def draw_picture(picture: Picture) -> Image:
+    """A picture in colours, smaller by a whole number, (h, w, 3)."""
+    rows, columns = picture.size if picture.image is None else picture.image.shape[:2]
+    every = max(1, columns // WIDTH)
+    if picture.image is None:
+        full = np.full((rows, columns, 3), DARK, np.uint8)
+    else:
+        full = np.repeat(picture.image[:, :, None], 3, axis=2)
+    shown = np.ascontiguousarray(full[::every, ::every])
+    outlines = [np.asarray(tag.corners, float) for tag in picture.tags]
+    for corners in outlines:
+        _outline(shown, corners / every, reach=0)
+    if outlines:
+        _inset(shown, full, outlines)
+    return shown
+
+
+def _inset(shown: Image, full: Image, outlines: list[Array]) -> None:
+    """Put the surroundings of the tags, enlarged, into the lower left corner."""
+    middle = np.concatenate(outlines).mean(axis=0)
+    size = min(round(2 * INSET * ENLARGED), shown.shape[0], shown.shape[1])
+    first = middle - 0.5 * size / ENLARGED
+    x, y = ((first[:, None] + (np.arange(size) + 0.5) / ENLARGED).round().astype(int)).clip(0)
+    part = full[np.minimum(y, full.shape[0] - 1)][:, np.minimum(x, full.shape[1] - 1)].copy()
+    for corners in outlines:
+        _outline(part, (corners - first) * ENLARGED, reach=1)
+    part[:2], part[:, -2:] = 255, 255
+    shown[-size:, :size] = part
+
+
+def _outline(image: Image, corners: Array, reach: int) -> None:
+    """Draw a tag's edges, lines `reach` pixels to either side; what lies outside is left out."""
+    for i in range(4):
+        a, b = corners[i], corners[(i + 1) % 4]
+        if not np.isfinite([a, b]).all():
+            continue
+        steps = int(np.ceil(np.abs(b - a).max())) + 1
+        x, y = np.linspace(a, b, min(steps, 4000)).round().astype(int).T
+        for dx in range(-reach, reach + 1):
+            for dy in range(-reach, reach + 1):
+                u, v = x + dx, y + dy
+                inside = (u >= 0) & (v >= 0) & (u < image.shape[1]) & (v < image.shape[0])
+                image[v[inside], u[inside]] = FIRST if i == 0 else LINE
+
+
+# The side of a view: clock, health, the camera's picture, events and plots.
+
+SLIDER_STEP = 0.02
+"""Of the time slider [s]."""
+
+
+class Panel:
+    """Controls and figures of one stage."""
+
+    def __init__(self, server: viser.ViserServer, stage: Stage, playback: Playback) -> None:
+        """
+        Args:
+            server: Of the page.
+            stage: What is looked at.
+            playback: The clock that the controls set.
+        """
+        self._server, self._gui, self._playback = server, server.gui, playback
+        self._gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
+        self._gui.set_panel_label("FinsSim")
+        self._gui.main_panel.dock_right()
+        self._gui.add_markdown(f"**{stage.title}**  \n{_legend()}")
+        self._slider: Any = None
+        self._button: Any = None
+        self._speed: Any = None
+        self._shown = 0.0
+        self._controls(playback)
+        self._status = self._gui.add_markdown("")
+        self._image: Any = None
+        if stage.site is not None:
+            with self._gui.add_folder("camera"):
+                self._image = self._gui.add_image(blank(), jpeg_quality=70)
+        self._seen: Picture | None = None
+        with self._gui.add_folder("errors") as self._figures:
+            self._named = self._gui.add_markdown("")
+        self._plots: dict[tuple[str, ...], Any] = {}
+        with self._gui.add_folder("events"):
+            self._events = self._gui.add_markdown("none yet")
+        self._last_events: tuple[str, ...] = ()
+
+    def read(self) -> None:
+        """Do what the person at the controls wants."""
+        playback = self._playback
+        playback.speed = float(self._speed.value.removesuffix("x"))
+        label = "pause" if playback.playing else "play"
+        if self._button.label != label:
+            self._button.label = label
+        if self._slider is not None and abs(self._slider.value - self._shown) > 0.5 * SLIDER_STEP:
+            playback.seek(float(self._slider.value))
+            self._shown = float(self._slider.value)
+
+    def show(self, frame: Frame) -> None:
+        """Put a frame's figures on the panel."""
+        playback = self._playback
+        if self._slider is None:
+            self._clock.content = f"{frame.time:.1f} s"
+        elif self._shown != playback.time:
+            self._slider.value = self._shown = min(round(playback.time, 2), self._slider.max)
+        rows = "".join(f"| {name} | {text} |\n" for name, text in frame.status.items())
+        content = f"| | |\n|---|---|\n{rows}" if rows else ""
+        if content != self._status.content:
+            self._status.content = content
+        if self._image is not None and frame.picture is not self._seen:
+            self._seen = frame.picture
+            self._image.image = blank() if frame.picture is None else draw_picture(frame.picture)
+        events = tuple(frame.events)
+        if events != self._last_events:
+            self._last_events = events
+            self._events.content = "  \n".join(_plain(line) for line in reversed(events)) or "none yet"
+
+    def plot(self, curves: Any, now: float) -> None:
+        """Draw curves, up to a time in full [s]."""
+        plots = plots_of(curves)
+        named = legend_of(plots)
+        if named != self._named.content:
+            self._named.content = named
+        for plot in plots:
+            key = (plot.title, *(curve.label for curve in plot.curves))
+            if key not in self._plots:
+                for old in [k for k in self._plots if k[0] == plot.title]:
+                    self._plots.pop(old).remove()
+                with self._figures:
+                    self._plots[key] = self._gui.add_uplot(
+                        plot.data(now),
+                        plot.series(),
+                        title=plot.title,
+                        scales={"x": {"time": False}},
+                        legend={"show": False},
+                        aspect=2.0,
+                    )
+            else:
+                self._plots[key].data = plot.data(now)
+
+    def _controls(self, playback: Playback) -> None:
+        gui = self._gui
+        if playback.live:
+            self._clock = gui.add_markdown("0.0 s")
+        else:
+            steps = max(1, math.floor(playback.duration / SLIDER_STEP))
+            self._slider = gui.add_slider("time [s]", 0.0, round(steps * SLIDER_STEP, 2), SLIDER_STEP, 0.0)
+        self._button = gui.add_button("pause" if playback.playing else "play")
+        speeds = tuple(f"{speed:g}x" for speed in SPEEDS)
+        first = f"{playback.speed:g}x"
+        options = speeds if first in speeds else (first, *speeds)
+        self._speed = gui.add_dropdown("speed", options, initial_value=first)
+        self._button.on_click(lambda _: playback.play(not playback.playing))
+
+
+def _legend() -> str:
+    names = ("truth", "estimate", "goal", "force")
+    return " · ".join(
+        f'<span style="color:rgb{COLOURS[name]}">■</span> {name}'.replace(", ", ",") for name in names
+    )
+
+
+def _plain(text: str) -> str:
+    """A line in which nothing is markup."""
+    return "".join(f"\\{c}" if c in "\\`*_{}[]<>#|" else c for c in text)
+
 
 RATE = 20.0
 """Frames a second [Hz]."""

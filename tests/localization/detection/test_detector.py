@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from finssim.localization.detection.detector import LIBRARIES, detector
-from finssim.localization.detection.detector_fit import fit_tag
+from finssim.localization.detection.detector import LIBRARIES, detector, fit_tag
 from finssim.localization.detection.families import FAMILIES, bitmap, family_named, printable
 from finssim.localization.errors import LocalizationError
 from reference.tag_picture import draw, pose_corners

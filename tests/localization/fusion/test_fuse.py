@@ -15,12 +15,11 @@ from finssim.localization.detection.detections import Detection, Frame, write_de
 from finssim.localization.detection.tags import tag_corners_b
 from finssim.localization.errors import LocalizationError
 from finssim.localization.fusion.estimator import MODELS
-from finssim.localization.fusion.fuse import fuse, run
+from finssim.localization.fusion.fuse import COLUMNS, fuse, run
 from finssim.localization.fusion.fuse_log import load_log
-from finssim.localization.fusion.fuse_output import COLUMNS
 from finssim.localization.fusion.fuse_settings import site_of
 from finssim.localization.fusion.streams import refusal
-from finssim.localization.locate.localize_output import write_rows as write_localized
+from finssim.localization.locate.localize import write_rows as write_localized
 from finssim.localization.pool import load_pool
 from finssim.localization.poses.measurement import Constraints
 from finssim.localization.poses.methods import METHODS

@@ -7,8 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from finssim.localization.detection.detections import Detection
-from finssim.localization.poses.methods import METHODS
-from finssim.localization.poses.weighted_fit import weighted_fit
+from finssim.localization.poses.methods import METHODS, weighted_fit
 from localization.poses.seen_vehicle import POOLS, TAGS, known, seen
 
 POOL = POOLS["level water"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,10 +11,113 @@ import numpy.typing as npt
 
 from finssim.geometry.optics.camera import Camera
 from finssim.geometry.optics.interface import Interface
-from finssim.geometry.optics.snell import Stack, solve_stack
 from finssim.geometry.optics.status import Status, StatusArray
 
-__all__ = ["Projection", "Refraction", "project", "refract", "seen_at"]
+__all__ = ["Projection", "Refraction", "project", "refract", "seen_at", "solve_stack"]
+
+# The ray between two points across a stack of plane-parallel layers.
+#
+# Snell's law keeps n_i sin(theta_i) along the ray. With u = tan(theta) in the medium of least index n_m and
+# a_i = n_i/n_m, layer i of thickness t_i moves the ray sideways by t_i u / s_i, s_i = sqrt(a_i² + (a_i² - 1) u²). The
+# ray that moves by r in all is found from g = u/r:
+#
+#     phi(g) = sum_i t_i g / s_i - 1 = 0
+#
+# phi rises and is concave in g >= 0, so Newton's method started left of the root walks to it without ever passing it,
+# from anywhere and for any indices; and as only r² enters, nothing happens at r = 0.
+
+_STEPS = 100
+_THINNEST = 1e-15
+"""Least thickness of a layer [m]: with none at all a grazing ray would have no angle."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stack:
+    """The solution: thicknesses, indices, and the ray through them."""
+
+    thickness: list[Array | float]
+    """t_i [m], (...) each."""
+    index: list[float]
+    r2: Array
+    """Squared sideways distance [m²], (...)."""
+    g: Array
+    """u/r [1/m], (...)."""
+
+    @property
+    def near_slope(self) -> Array:
+        """k_0 = tan(theta)/r next to the camera [1/m], (...)."""
+        return self.g if self.index[0] == min(self.index) else self.g / self._s(self.index[0])
+
+    def _s(self, index: float) -> Array:
+        a2 = (index / min(self.index)) ** 2
+        return np.asarray(np.sqrt(a2 + (a2 - 1.0) * self.r2 * self.g**2))
+
+    def derivatives(self) -> StackDerivatives:
+        """How k_0, the slope next to the camera, changes (implicit function theorem).
+
+        With P = sin(theta_i) n_i/r, the same in all layers, c_i = n_i cos(theta_i): k_i = P/c_i and
+        sum t_i k_i = 1.
+        """
+        omega = np.sqrt(1.0 + self.r2 * self.g * self.g)
+        P = self.g * (min(self.index) / omega)
+        c = [self._s(n) * (min(self.index) / omega) for n in self.index]
+        thin = [t / (x * x * x) for t, x in zip(self.thickness, c, strict=True)]  # t_i/c_i³
+        by_P = sum(t * n**2 for t, n in zip(thin, self.index, strict=True))
+        half = 0.5 * P * P * P
+        steep = 1.0 / (c[0] * c[0] * c[0])
+        towards = -(self.index[0] ** 2) * steep / by_P
+        return StackDerivatives(
+            k=self.near_slope,
+            by_r2=half * (steep + towards * sum(thin)),
+            by_near=towards * P / c[0],
+            by_far=towards * P / c[-1],
+            by_far_index=-towards * thin[-1] * P * self.index[-1],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class StackDerivatives:
+    """k = tan(theta)/r next to the camera, and its derivatives, (...) each."""
+
+    k: Array
+    by_r2: Array
+    by_near: Array
+    """With respect to the camera's distance from the interface."""
+    by_far: Array
+    """With respect to the point's distance from the far face."""
+    by_far_index: Array
+
+
+def solve_stack(r2: Array, thickness: Sequence[Array | float], index: list[float]) -> Stack:
+    """Find the ray that crosses all layers and moves sideways by r in all.
+
+    Args:
+        r2: Squared sideways distance [m²], (...).
+        thickness: Of each layer, from the camera to the point [m], (...) each or one number; negative counts as none.
+        index: Refractive index of each layer.
+    """
+    least = min(index)
+    layers = [max(t, _THINNEST) if isinstance(t, float) else np.maximum(t, _THINNEST) for t in thickness]
+    square = [(n / least) ** 2 for n in index]
+    thin = sum(t for t, a2 in zip(layers, square, strict=True) if a2 == 1.0)
+    denser = [(t, a2, (a2 - 1.0) * r2) for t, a2 in zip(layers, square, strict=True) if a2 != 1.0]
+    # All angles small: phi is concave, so the step from zero stops left of the root.
+    g = lowest = 1.0 / (thin + sum(t / math.sqrt(a2) for t, a2, _ in denser) + 0.0 * r2)
+    for _ in range(_STEPS if denser else 0):
+        g2 = g * g
+        moved, slope = thin, thin
+        for t, a2, b in denser:
+            s2 = a2 + b * g2
+            part = t / np.sqrt(s2)
+            moved = moved + part
+            slope = slope + part * (a2 / s2)
+        step = (moved * g - 1.0) / slope
+        g = np.maximum(g - step, lowest)
+        # The error after a step is at most 1.5 times the square of the step: nothing is left to gain.
+        if not (np.abs(step) > 3e-8 * g).any():
+            break
+    return Stack(layers, index, r2, g)
+
 
 Array = npt.NDArray[np.float64]
 

@@ -2,31 +2,401 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
+import re
 import sys
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from functools import cache
+from pathlib import Path, PurePath
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from finssim.files import atomic_write, refuse_unwritable
-from finssim.localization.detection.detections import Frame
+from finssim.geometry.optics import Lens
+from finssim.geometry.rotations import wrap_angle
+from finssim.localization.detection.detections import Frame, read_detections
+from finssim.localization.detection.families import family_named
+from finssim.localization.detection.tags import tag_corners_b
 from finssim.localization.errors import LocalizationError
-from finssim.localization.locate.localize_inputs import Seeing, frames_of
-from finssim.localization.locate.localize_known import known_of
-from finssim.localization.locate.localize_output import Row, summary_lines, summary_of, write_rows
-from finssim.localization.locate.localize_truth import load_truth
-from finssim.localization.locate.locator import Locator
+from finssim.localization.locate.localize_known import Known, known_of
+from finssim.localization.locate.series import Series, series
 from finssim.localization.pool import Pool, load_pool
-from finssim.localization.poses.methods import NEEDS_DEPTH
+from finssim.localization.poses.measurement import Measurement, refused
+from finssim.localization.poses.methods import METHODS, NEEDS_DEPTH
 from finssim.provenance import provenance
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["Run", "run"]
+__all__ = ["COLUMNS", "Locator", "Run", "run", "write_rows"]
+
+# Poses of a vehicle from the tags of one picture after the other, with what else is known at each exposure.
+
+
+class Locator:
+    """Measures the pose in one picture after the other; it remembers nothing of them."""
+
+    def __init__(
+        self,
+        pool: Pool,
+        vehicle: Vehicle,
+        known: Known,
+        *,
+        method: str = "refractive",
+        pixel_std: float = 0.5,
+        family: str | None = None,
+    ) -> None:
+        """
+        Args:
+            pool: Camera and water.
+            vehicle: Its tags.
+            known: Height and tilt over time.
+            method: A name of `METHODS`.
+            pixel_std: Standard deviation of a corner, per axis [px].
+            family: Of the tags; None: that of the vehicle file.
+
+        Raises:
+            LocalizationError: Unknown method, no depth where it needs one, a vehicle without tags, or no error at all.
+        """
+        if method not in METHODS:
+            raise LocalizationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
+        if method in NEEDS_DEPTH and known.depth is None:
+            raise LocalizationError(
+                f"method {method} needs --depth FILE (columns t, depth) or --depth METRES, the depth of the pressure "
+                "port; --method refractive-6dof does without"
+            )
+        tags = vehicle.file_tags
+        if tags is None:
+            raise LocalizationError(
+                f"{vehicle.name}: the vehicle file has no tags: add a section tags: with family, edge and mounts"
+            )
+        if not (math.isfinite(pixel_std) and pixel_std > 0.0):
+            raise LocalizationError(
+                f"pixel_std is {pixel_std}, expected the error of a corner in pixels, such as 0.3"
+            )
+        self.known, self.family = known, family_named(family or tags.family).name
+        self._pool, self._method, self._pixel_std = pool, method, pixel_std
+        self._tags_b = tag_corners_b(tags)
+
+    @property
+    def tags(self) -> tuple[int, ...]:
+        """Ids of the vehicle's tags."""
+        return tuple(self._tags_b)
+
+    def locate(self, frame: Frame) -> Measurement:
+        """The pose in one picture, or why there is none."""
+        seen = [found for found in frame.detections if _name(found.family) in ("", self.family)]
+        needs_height = self._method in NEEDS_DEPTH
+        constraints = None
+        if seen:
+            known = self.known.at(frame.time - self._pool.latency, needs_height=needs_height)
+            if isinstance(known, str):
+                return refused(self._method, known)
+            constraints = known
+        elif frame.detections:
+            other = ", ".join(sorted({found.family for found in frame.detections}))
+            return refused(self._method, f"no tag of family {self.family} seen: {other}")
+        return METHODS[self._method](seen, self._pool, self._tags_b, constraints, self._pixel_std)
+
+
+@cache
+def _name(family: str) -> str:
+    """The family's own name, such as `tag25h9` for `25h9`; unknown ones as they are."""
+    try:
+        return family_named(family).name if family else ""
+    except LocalizationError:
+        return family
+
+
+# The table that `finssim localize` writes, and its summary.
+
+Row = tuple[Frame, Measurement]
+
+COLUMNS = (
+    *("time", "image", "x", "y", "z", "yaw", "std_x", "std_y", "std_yaw", "roll", "pitch"),
+    *("qx", "qy", "qz", "qw", "cov_xy", "cov_xyaw", "cov_yyaw", "residual_px", "tags", "corners", "medium"),
+    *("status", "reason"),
+)
+"""Metres and radians, pool frame; z of the body origin; q turns body vectors into the pool's. `time` is the stamp of
+the picture. A refused picture has empty numbers, status `refused` and a reason."""
+
+
+def write_rows(rows: Sequence[Row], out: Path) -> None:
+    """Write one row for each picture.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    with atomic_write(out) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        for frame, found in rows:
+            writer.writerow(_cells(frame, found))
+
+
+def _cells(frame: Frame, found: Measurement) -> list[Any]:
+    time = "" if math.isnan(frame.time) else repr(float(frame.time))
+    tags = " ".join(map(str, found.tags))
+    if not found.ok:
+        return [time, frame.image, *[""] * (len(COLUMNS) - 7), tags, "", "", "refused", found.reason]
+    C = found.covariance
+    numbers = [found.x, found.y, found.z, found.yaw, *found.std, found.roll, found.pitch, *found.quaternion]
+    numbers += [C[0, 1], C[0, 2], C[1, 2], found.residual_px]
+    words = [f"{float(x):.9g}" for x in numbers]
+    return [time, frame.image, *words, tags, found.corners, found.medium, "ok", ""]
+
+
+def summary_of(rows: Sequence[Row]) -> dict[str, Any]:
+    """Figures of a run, as plain values."""
+    located = [found for _, found in rows if found.ok]
+    reasons = Counter(_short(found.reason) for _, found in rows if not found.ok)
+    rejected: Counter[str] = Counter()
+    for _, found in rows:
+        rejected.update(found.rejected)
+    return {
+        "frames": len(rows),
+        "located": len(located),
+        "refused": dict(reasons.most_common()),
+        "corners_rejected": dict(rejected.most_common()),
+        "median_residual_px": _median([found.residual_px for found in located]),
+        "median_std_m": _median([float(np.hypot(*found.std[:2])) for found in located]),
+        "median_std_yaw_deg": _median([math.degrees(found.std[2]) for found in located]),
+    }
+
+
+def summary_lines(summary: dict[str, Any]) -> list[str]:
+    """The summary for a person."""
+    lines = [f"{summary['located']} of {summary['frames']} pictures located with method {summary['method']}"]
+    lines += [f"refused {n:5d}: {reason}" for reason, n in summary["refused"].items()]
+    if summary["corners_rejected"]:
+        words = ", ".join(f"{n} {reason}" for reason, n in summary["corners_rejected"].items())
+        lines.append(f"corners not used: {words}")
+    if summary["located"]:
+        lines.append(
+            f"median residual {summary['median_residual_px']:.2f} px; standard deviations "
+            f"{100 * summary['median_std_m']:.2f} cm, {summary['median_std_yaw_deg']:.2f} degrees (median)"
+        )
+    truth = summary.get("truth")
+    if truth:
+        words = f"against the truth, {truth['compared']} pictures: RMSE {100 * truth['rmse_m']:.2f} cm, "
+        words += f"P95 {100 * truth['p95_m']:.2f} cm"
+        if "rmse_yaw_deg" in truth:
+            words += f"; yaw RMSE {truth['rmse_yaw_deg']:.2f} degrees"
+        lines.append(words)
+    return lines
+
+
+def _short(reason: str) -> str:
+    """A reason without its particulars, for counting."""
+    return re.split(r"[:(]", reason, maxsplit=1)[0].strip()
+
+
+def _median(values: list[float]) -> float | None:
+    return float(np.median(values)) if values else None
+
+
+# How far measured positions are from surveyed ones.
+
+Array = npt.NDArray[np.float64]
+
+TIMES = ("t", "time", "time_s", "timestamp")
+
+
+class Truth:
+    """Positions by picture, or by time."""
+
+    def __init__(self, by_image: dict[str, Array], by_time: Series | None) -> None:
+        """x, y [m] and yaw (its cosine and sine, NaN where not known), pool frame, (4,) each."""
+        self._by_image, self._by_time = by_image, by_time
+
+    def of(self, image: str, exposure: float) -> Array | None:
+        """x, y [m] and yaw [rad] (or NaN), (3,); None where they are not known."""
+        found: Array | str | None = self._by_image.get(PurePath(image).name) if image else None
+        if found is None and self._by_time is not None:
+            found = self._by_time.at(exposure)
+        if found is None or isinstance(found, str):
+            return None
+        return np.array([found[0], found[1], math.atan2(found[3], found[2])])
+
+    def figures(self, rows: Sequence[Row], latency: float) -> dict[str, Any] | None:
+        """RMSE and 95th percentile of the horizontal distance [m], RMSE of yaw [degrees]; None without any picture.
+
+        Args:
+            rows: What was measured.
+            latency: Time stamp of a picture minus its exposure [s].
+        """
+        errors = []
+        for frame, found in rows:
+            true = self.of(frame.image, frame.time - latency)
+            if found.ok and true is not None:
+                errors.append([found.x - true[0], found.y - true[1], float(wrap_angle(found.yaw - true[2]))])
+        if not errors:
+            return None
+        e = np.array(errors)
+        far = np.hypot(e[:, 0], e[:, 1])
+        figures = {
+            "compared": len(errors),
+            "rmse_m": float(np.sqrt(np.mean(far**2))),
+            "p95_m": float(np.percentile(far, 95)),
+            "mean_x_m": float(e[:, 0].mean()),
+            "mean_y_m": float(e[:, 1].mean()),
+        }
+        turned = e[np.isfinite(e[:, 2]), 2]
+        if len(turned):
+            figures["rmse_yaw_deg"] = float(np.degrees(np.sqrt(np.mean(turned**2))))
+        return figures
+
+
+def load_truth(path: str | Path, longest_gap: float = 1.0) -> Truth:
+    """Read a table with columns x, y [m], and image or t [s], and yaw [rad] or yaw_deg where it is known; pool frame.
+
+    Raises:
+        LocalizationError: Unreadable, without these columns, or with a cell that is no number; names file and line.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        raise LocalizationError(f"{path}: cannot be read: {error.strerror or error}") from None
+    rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines()) if row]
+    names = [name.lower() for name in rows[0]] if rows else []
+    time = next((name for name in TIMES if name in names), None)
+    if not {"x", "y"} <= set(names) or (time is None and "image" not in names):
+        raise LocalizationError(
+            f"{path}: columns {','.join(names)[:80]}, expected image or t, x, y and perhaps yaw"
+        )
+    by_image: dict[str, Array] = {}
+    times, values = [], []
+    for number, row in enumerate(rows[1:], start=2):
+        cells = dict(zip(names, row, strict=False))
+        value = _value(cells, f"{path}: line {number}")
+        if cells.get("image"):
+            by_image[PurePath(cells["image"]).name] = value
+        if time and cells.get(time):
+            times.append(_number(cells[time], time, f"{path}: line {number}"))
+            values.append(value)
+    by_time = (
+        series("truth", np.array(times), np.array(values), longest_gap, where=str(path)) if times else None
+    )
+    return Truth(by_image, by_time)
+
+
+def _value(cells: dict[str, str], where: str) -> Array:
+    yaw = math.nan
+    if cells.get("yaw"):
+        yaw = _number(cells["yaw"], "yaw", where)
+    elif cells.get("yaw_deg"):
+        yaw = math.radians(_number(cells["yaw_deg"], "yaw_deg", where))
+    x, y = (_number(cells.get(name, ""), name, where) for name in "xy")
+    return np.array([x, y, math.cos(yaw), math.sin(yaw)])
+
+
+def _number(cell: str, name: str, where: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise LocalizationError(
+            f"{where}: {name} is '{cell[:40]}', expected a finite number: correct or remove it"
+        )
+    return value
+
+
+# Pictures with the tags found in them: from pictures and videos, or from detection files.
+
+TABLES = (".csv", ".tsv", ".txt")
+"""Suffixes of detection files."""
+
+
+@dataclass(frozen=True)
+class Seeing:
+    """How tags are found in pictures; see `detector`."""
+
+    family: str
+    tags: tuple[int, ...] = ()
+    """Those looked for in videos, near where they were a picture before."""
+    library: str | None = None
+    refine: str = "fit"
+    gamma: float = 1.0
+    times: Path | None = None
+    """File with the time stamps of the pictures."""
+
+
+def frames_of(
+    inputs: Sequence[Path],
+    lens: Lens,
+    seeing: Seeing,
+    notes: list[str],
+) -> tuple[Iterator[Frame], int | None]:
+    """Frames one after the other, and how many there will be where that is known.
+
+    Args:
+        inputs: Pictures, folders of them, videos or detection files.
+        lens: Of the camera: pictures of another size are refused.
+        seeing: How tags are found in pictures.
+        notes: Takes one sentence on each thing that was left out.
+
+    Raises:
+        LocalizationError: An input is not there, of unknown kind or cannot be read.
+    """
+    if not inputs:
+        raise LocalizationError(
+            "no input: give pictures, a folder of them, a video, or a detections file (.csv)"
+        )
+    tables = [path for path in inputs if path.suffix.lower() in TABLES]
+    if tables and len(tables) < len(inputs):
+        raise LocalizationError("detection files and pictures are mixed: give the ones or the others")
+    if tables:
+        frames = [frame for path in tables for frame in read_detections(path, notes)]
+        return iter(frames), len(frames)
+    return _seen(inputs, lens, seeing, notes), _count(inputs)
+
+
+def _seen(
+    inputs: Sequence[Path],
+    lens: Lens,
+    seeing: Seeing,
+    notes: list[str],
+) -> Iterator[Frame]:
+    from finssim.localization.detection.detector import detector
+    from finssim.localization.detection.pictures import pictures
+    from finssim.localization.detection.region import RegionTracker
+
+    find = detector(seeing.family, library=seeing.library, refine=seeing.refine, gamma=seeing.gamma)
+    film, tracker = "", None
+    for time, name, image in pictures(list(inputs), times=seeing.times, tell=notes.append):
+        if image.shape != (lens.height, lens.width):
+            raise LocalizationError(
+                f"{name}: {image.shape[1]} x {image.shape[0]} pixels, expected {lens.width} x {lens.height} as the "
+                "pool file's lens: calibrate at the size at which you record"
+            )
+        of_film, number, _ = name.rpartition("#")
+        if not number:  # a picture for itself
+            yield Frame(time, name, tuple(find.detect(image)))
+            continue
+        if tracker is None or of_film != film:
+            film, tracker = of_film, RegionTracker(find, seeing.tags or None)
+        yield Frame(time, name, tuple(tracker.detect(image, time)))
+
+
+def _count(inputs: Sequence[Path]) -> int | None:
+    """How many pictures there are; None with videos."""
+    from finssim.localization.detection.pictures import PICTURE_FILES
+
+    count = 0
+    for path in inputs:
+        inside = path.iterdir() if path.is_dir() else [path]
+        here = sum(file.suffix.lower() in PICTURE_FILES for file in inside)
+        if not here:
+            return None
+        count += here
+    return count
 
 
 @dataclass
