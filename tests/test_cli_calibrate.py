@@ -151,9 +151,12 @@ HYDRODYNAMICS = ["calibrate", "hydrodynamics", "TRIALS", "--vehicle", "finsrov"]
         ([*HYDRODYNAMICS, "--out", "/proc/x/v.yaml"], "write elsewhere"),
         ([*HYDRODYNAMICS, "--out", "v.yaml", "--axes", "surg"], "unknown axis 'surg'"),
         ([*HYDRODYNAMICS, "--out", "v.yaml", "--method", "magic"], "unknown method 'magic'"),
-        ([*HYDRODYNAMICS, "--out", "v.yaml", "--full"], "--full needs --method simulation"),
         (
-            [*HYDRODYNAMICS, "--out", "v.yaml", "--estimate", "thrust_lag"],
+            [*HYDRODYNAMICS, "--out", "v.yaml", "--method", "regression", "--full"],
+            "--full needs --method simulation",
+        ),
+        (
+            [*HYDRODYNAMICS, "--out", "v.yaml", "--method", "regression", "--estimate", "thrust_lag"],
             "--estimate needs --method simulation",
         ),
         ([*HYDRODYNAMICS, "--out", "v.yaml", "--damping", "cubic"], "cubic"),

@@ -127,17 +127,17 @@ def test_finsrov_roll_and_pitch_are_told_to_be_placeholders(key, axis):
 
 
 def test_bluerov2_heavy_thrusters_are_the_published_ned_ones():
-    """Rows of the published matrix in NED: surge, sway and yaw from the four horizontals."""
+    """Rows of the published matrix in NED, turned: the axes point where ArduSub's positive output pushes, against it."""
     vehicle = load_vehicle("bluerov2_heavy")
     s = math.sqrt(0.5)
     positions = np.array(
         [[0.156, 0.111, 0.085], [0.156, -0.111, 0.085], [-0.156, 0.111, 0.085], [-0.156, -0.111, 0.085]]
     )
-    directions = np.array([[s, -s, 0], [s, s, 0], [-s, -s, 0], [-s, s, 0]])
+    directions = -np.array([[s, -s, 0], [s, s, 0], [-s, -s, 0], [-s, s, 0]])
     for name, position, direction in zip(("T1", "T2", "T3", "T4"), positions, directions, strict=True):
         np.testing.assert_allclose(vehicle.thrusters[name].position, FLIP * position, atol=1e-12)
         np.testing.assert_allclose(vehicle.thrusters[name].axis, FLIP * direction, atol=1e-8)
-    ned = FLIP6 @ vehicle.thruster_matrix()
+    ned = -FLIP6 @ vehicle.thruster_matrix()
     published_yaw = [-0.1888, 0.1888, 0.1888, -0.1888]
     np.testing.assert_allclose(ned[5, :4], published_yaw, atol=5e-5)
     np.testing.assert_allclose(ned[3, :4], [0.06, -0.06, 0.06, -0.06], atol=2e-4)
