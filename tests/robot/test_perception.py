@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.geometry.rotations import quat_from_yaw
+from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.localization.errors import LocalizationError
-from finssim.robot.messages import Picture, TagCorners
+from finssim.robot.messages import POSE, NavigationAid, Picture, TagCorners
 from finssim.robot.perception import Perception
 from finssim.vehicles import load_vehicle
 from reference.rounds import Rounds, overhead, without_latency, yaw_between
@@ -62,6 +62,23 @@ def test_the_world_frame_of_the_pool_file_is_that_of_the_reading():
     turned = overhead(world_position=(0.1, -0.2, 0.0), world_orientation=tuple(quat_from_yaw(0.7).tolist()))
     world = Rounds(turned, VEHICLE)
     readings = run(world, Perception(VEHICLE, turned), 3.0)[90:]
+    assert all(r.ready for r in readings)
+    assert np.all(errors(world, readings) < (0.01, math.radians(0.5), 0.03, 0.01))
+
+
+def test_fixes_of_another_instrument_are_of_the_world_too():
+    """In the same turned pool, motion capture in place of the pictures: world axes in, world axes out."""
+    turned = overhead(world_position=(0.1, -0.2, 0.0), world_orientation=tuple(quat_from_yaw(0.7).tolist()))
+    world = Rounds(turned, VEHICLE)
+    perception = Perception(VEHICLE, turned)
+
+    def fix(t, picture):
+        x, y, _ = world.position(picture.time)
+        yaw = float(quat_yaw(np.asarray(world.quaternion(picture.time))))
+        aid = NavigationAid(0, POSE, t - picture.time, (float(x), float(y), yaw), (0.003, 0.005))
+        perception.aid(t, aid)
+
+    readings = run(world, perception, 3.0, picture=fix)[90:]
     assert all(r.ready for r in readings)
     assert np.all(errors(world, readings) < (0.01, math.radians(0.5), 0.03, 0.01))
 

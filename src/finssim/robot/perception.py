@@ -17,7 +17,7 @@ from finssim.localization.fusion.estimator import Estimator
 from finssim.localization.fusion.fuse_detections import Fixes
 from finssim.localization.fusion.fuse_settings import Settings, settings_of, site_of
 from finssim.localization.fusion.health import Estimate, Health, health_of
-from finssim.localization.fusion.streams import DepthSample, ImuSample, VisionSample
+from finssim.localization.fusion.streams import DepthSample, HeadingSample, ImuSample, Sample, VisionSample
 from finssim.localization.pool import Pool
 from finssim.localization.poses.measurement import axes_of_up
 from finssim.robot.aboard import Aboard, Stuck
@@ -141,7 +141,7 @@ class Perception:
         sample = self._aboard.aid(aid, arrival)
         if isinstance(sample, str):
             return self.estimator.refuse("aid", sample)
-        return self.estimator.add(sample)
+        return self.estimator.add(self._frame.in_pool(sample))
 
     def reading(self, now: float) -> Reading:
         """The state at a time [s], in world and body axes."""
@@ -217,6 +217,21 @@ class _WorldFrame:
         self._R_wg = self._R_wp @ axes_of_up(up)
         self._q_wg = tuple(matrix_to_quat(self._R_wg).tolist())
         self._plain = bool(np.allclose(self._R_wp, np.eye(3), atol=1e-12))
+        # Heading of the pool frame's level axes, in which the estimator counts yaw.
+        self._yaw = math.atan2(self._R_wg[1, 0], self._R_wg[0, 0])
+
+    def in_pool(self, sample: Sample) -> Sample:
+        """A fix or heading of the world, in the pool frame; a velocity is the body's own and stays."""
+        if isinstance(sample, HeadingSample):
+            return replace(sample, yaw=math.remainder(sample.yaw - self._yaw, math.tau))
+        if not isinstance(sample, VisionSample):
+            return sample
+        (x, y), (cos, sin) = (
+            np.array(sample.position) - self._t[:2],
+            (math.cos(self._yaw), math.sin(self._yaw)),
+        )
+        yaw = None if sample.yaw is None else math.remainder(sample.yaw - self._yaw, math.tau)
+        return replace(sample, position=(cos * x + sin * y, cos * y - sin * x), yaw=yaw)
 
     def state(self, estimate: Estimate) -> tuple[Array, Array, Array]:
         """Position [m], attitude xyzw, velocity in body axes [m/s]."""
