@@ -81,7 +81,6 @@ HOMES = {
         "learning/torchrl_env.py",
         "tasks/torch_rotations.py",
         "tasks/torch_task.py",
-        "tasks/torch_worlds.py",
     },
     "stable_baselines3": {
         "learning/learners/sb3_ppo.py",
@@ -109,7 +108,7 @@ HOMES = {
     "pettingzoo": {"learning/pettingzoo_env.py"},
     "minari": {"learning/demonstrations.py"},
     "ray": {"experiments/sweep.py"},
-    "onnx": {"learning/onnx_graph.py"},
+    "onnx": {"learning/export.py"},
     "onnxruntime": {"control/policy.py"},
     "mujoco": {"engine/scene_model.py", "engine/scene_picture.py", "experiments/bench.py"},
     "pandas": {"engine/recorder.py"},
@@ -119,13 +118,13 @@ HOMES = {
         "calibration/replay/figure.py",
         "calibration/actuators/thruster_figure.py",
         "calibration/vision/camera/camera_figures.py",
-        "calibration/vision/pool/pool_figures.py",
+        "calibration/vision/pool/pool_report.py",
         "experiments/figures.py",
         "vehicles/picture.py",
     },
-    "pymavlink": {"calibration/importers/ardupilot_log.py"},
+    "pymavlink": {"calibration/importers/ardusub.py"},
     "rosbags": {
-        "calibration/importers/rosbag.py",
+        "calibration/importers/dispatch.py",
         "robot/record_types.py",
         "ros2/codec.py",
         "ros2/definitions.py",
@@ -158,7 +157,7 @@ HOMES = {
         "ros2/watcher.py",
         "ros2_worlds/sim.py",
     },
-    "viser": {"viewer/app.py", "viewer/panel.py", "viewer/scene.py"},
+    "viser": {"viewer/app.py"},
     "mitsuba": {"experiments/mitsuba_renderer.py"},
 }
 """Library -> the files that may import it, each of which does."""

@@ -20,6 +20,9 @@ BIN = Path(sys.executable).parent
 SMALL = {"train": ["--steps", "4096", "--worlds", "64"], "evaluate": ["--trials", "2"]}
 """Options that make a command's run small; a later option wins over an earlier one."""
 
+EXAMPLES = [path for path in sorted((ROOT / "examples").glob("*.py")) if path.name != "own_term.py"]
+"""Without the one whose term stays known in the process; `tests/physics/test_own_term.py` runs it in one of its own."""
+
 SHORT = {
     "learn_with_pettingzoo.py": ("TURNS, TRIES = 30, 4", "TURNS, TRIES = 2, 2"),
     "learn_with_rsl_rl.py": ("60", "2"),
@@ -103,7 +106,7 @@ def test_python_blocks_run(code, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.py")), ids=lambda path: path.name)
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
 def test_examples_run(path, tmp_path, monkeypatch, capsys):
     """Every example runs from any folder and prints what it found; as it stands, but for trainings, which are short."""
     code = path.read_text(encoding="utf-8")

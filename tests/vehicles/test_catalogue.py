@@ -127,7 +127,7 @@ def test_finsrov_roll_and_pitch_are_told_to_be_placeholders(key, axis):
 
 
 def test_bluerov2_heavy_thrusters_are_the_published_ned_ones():
-    """Rows of the published matrix in NED, turned: the axes point where ArduSub's positive output pushes, against it."""
+    """Rows of the published matrix in NED, turned: axes point where ArduSub's positive output pushes, against it."""
     vehicle = load_vehicle("bluerov2_heavy")
     s = math.sqrt(0.5)
     positions = np.array(

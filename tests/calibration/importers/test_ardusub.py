@@ -162,7 +162,7 @@ def test_an_explicit_map_of_outputs_comes_first(tmp_path):
     (tmp_path / "map.yaml").write_text(text)
     (trial,) = read_trials([BIN], column_map=tmp_path / "map.yaml")
     (usual,) = read_trials([BIN], vehicle="bluerov2")
-    np.testing.assert_array_equal(trial.channels["pwm_T2"], usual.channels["pwm_T1"])
+    np.testing.assert_array_equal(trial.channels["pwm_T2"], 3000.0 - usual.channels["pwm_T1"])
     np.testing.assert_array_equal(trial.channels["pwm_T3"], 3000.0 - usual.channels["pwm_T3"])
     (tmp_path / "map.yaml").write_text(text.replace("C1: T2", "C1: T9"))
     with pytest.raises(CalibrationError, match=r"ardusub.outputs.C1: bluerov2 has no thruster 'T9'"):

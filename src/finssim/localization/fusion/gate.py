@@ -18,7 +18,7 @@ Array = npt.NDArray[np.float64]
 LONGEST_SUPPORT = 200
 """Believed measurements that are counted."""
 
-OUTVOTED = 4
+OUTVOTED = 6
 """A state that a gyro carries gives way to a run of refused measurements with this part of its own support."""
 
 
@@ -193,7 +193,7 @@ def judge_carried(
     """As `judge`, for the distance of a measurement from a state that another sensor carries on, as a gyro does yaw.
 
     Between two measurements the state is right to a fraction of a degree, so that a jump is the measurement's error, or
-    the state was wrong all along. What has been believed for long gives way only to a run of a quarter of its support,
+    the state was wrong all along. What has been believed for long gives way only to a run of a sixth of its support,
     and is kept as a rival: a measurement that agrees with a rival of more support brings it back at once.
 
     Args:
