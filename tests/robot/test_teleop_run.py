@@ -209,11 +209,12 @@ def test_pictures_come_to_the_port_after_the_robots_own():
 
 def test_a_terminal_that_closes_ends_a_loop_in_good_order():
     """As Ctrl-C does; where hanging up is ignored, it stays so."""
-    with interruptible() as interrupted:
-        os.kill(os.getpid(), signal.SIGHUP)
-        assert interrupted()
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup has it ignored from the start
     try:
+        with interruptible() as interrupted:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert interrupted()
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
         with interruptible() as interrupted:
             os.kill(os.getpid(), signal.SIGHUP)
             assert not interrupted()
