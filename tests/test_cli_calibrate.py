@@ -159,6 +159,11 @@ HYDRODYNAMICS = ["calibrate", "hydrodynamics", "TRIALS", "--vehicle", "finsrov"]
             [*HYDRODYNAMICS, "--out", "v.yaml", "--method", "regression", "--estimate", "thrust_lag"],
             "--estimate needs --method simulation",
         ),
+        ([*HYDRODYNAMICS, "--out", "v.yaml", "--fix", "yaw=0.6"], "expected AXIS.m=NUMBER"),
+        (
+            [*HYDRODYNAMICS, "--out", "v.yaml", "--method", "simulation", "--fix", "yaw.m=0.6"],
+            "known inertias need the regression",
+        ),
         ([*HYDRODYNAMICS, "--out", "v.yaml", "--damping", "cubic"], "cubic"),
         ([*HYDRODYNAMICS, "--out", "v.yaml", "--ranges", "r.json"], "r.json ends in '.json'"),
         ([*HYDRODYNAMICS, "--out", "v.yaml", "--report", "/proc/x/r"], "write elsewhere"),

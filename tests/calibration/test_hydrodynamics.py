@@ -8,9 +8,13 @@ import pytest
 
 from finssim.calibration.check.check import check_trials
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.hydrodynamics import LIKELY_SCALE, fit_hydrodynamics
+from finssim.calibration.excitation.programmes import programmes
+from finssim.calibration.excitation.synthetic import simulate_programme
+from finssim.calibration.fit import Estimate
+from finssim.calibration.hydrodynamics import fit_hydrodynamics
 from finssim.calibration.importers.dispatch import read_trials
 from finssim.calibration.output.calibrate import calibrated
+from finssim.calibration.regression.axis_estimates import trim
 from finssim.calibration.replay.replay import replay
 from finssim.vehicles import load_vehicle
 
@@ -117,16 +121,44 @@ def test_options_belong_to_their_method(joystick):
             fit_hydrodynamics(fitted, vehicle, **options)
 
 
-def test_without_any_motion_a_battery_decides_the_scale(joystick):
-    """Where no inertia is found, the scale is what batteries have."""
+def test_a_known_inertia_tells_the_thrust(joystick):
+    """Yaw's inertia given: the scale is what makes the motion agree with it, and is surer than batteries are."""
     fitted, _ = joystick
-    still = [
-        replace(
-            t, channels={c: v for c, v in t.channels.items() if c.startswith("pwm_") or c in ("r", "yaw")}
-        )
-        for t in fitted
-        if t.name.startswith("yaw")
-    ]
-    fit = fit_hydrodynamics(still, load_vehicle("bluerov2_heavy"), method="regression", known={"yaw": 0.6})
-    assert fit.estimates["thrust_scale"].estimate == pytest.approx(LIKELY_SCALE, rel=0.3)
-    assert np.isfinite(fit.estimates["thrust_scale"].ci95).all()
+    vehicle = load_vehicle("bluerov2_heavy")
+    free = fit_hydrodynamics(fitted, vehicle, method="regression", axes=["yaw"])
+    ratio = free.estimates["yaw.m_eff"].estimate / free.estimates["thrust_scale"].estimate
+    fit = fit_hydrodynamics(fitted, vehicle, method="regression", axes=["yaw"], known={"yaw": 0.9})
+    scale = fit.estimates["thrust_scale"]
+    assert scale.estimate == pytest.approx(0.9 / ratio, rel=0.03)
+    assert scale.ci95[1] < 1.2 * scale.ci95[0]
+    assert fit.estimates["yaw.m_eff"].ci95 == (0.9, 0.9)
+
+
+def test_a_vehicle_that_lies_tilted_keeps_its_tilt():
+    """The centre of buoyancy that constant moments of roll and pitch give holds the vehicle where they did."""
+    k, buoyancy, tilts = 2.0, 110.0, {"roll.bias": 0.2, "pitch.bias": -0.3}
+    found = {
+        name: Estimate(name=name, estimate=b, ci95=(b - 0.1, b + 0.1), unit="N m", identifiable=True)
+        for name, b in tilts.items()
+    }
+    moved = trim(found, buoyancy, (0.01, 0.0, 0.05))
+    arm = buoyancy * np.array(
+        [moved["body.center_of_buoyancy.0"] - 0.01, moved["body.center_of_buoyancy.1"], k / buoyancy]
+    )
+    moment = np.cross(arm, [0.0, 0.0, 1.0])  # level: what b takes off on the left side of the equation
+    np.testing.assert_allclose(moment[:2], [-tilts["roll.bias"], -tilts["pitch.bias"]], atol=1e-12)
+    unsure = {"roll.bias": replace(found["roll.bias"], ci95=(-0.1, 0.5))}
+    assert trim(unsure, buoyancy, (0.0, 0.0, 0.05)) == {}
+
+
+@pytest.mark.parametrize("lead", [0.0, 0.1])
+def test_a_replay_allows_for_two_clocks(lead):
+    """Motion stamped a tenth of a second early: named, and the score is that of one clock."""
+    vehicle = load_vehicle("bluerov2_heavy")
+    (trial,) = simulate_programme(programmes("yaw", vehicle)[:1], vehicle, seed=2, inputs=("command",))
+    n = round(lead * 50)
+    channels = {c: v[: len(v) - n] if c.startswith("command") else v[n:] for c, v in trial.channels.items()}
+    moved = replace(trial, t=trial.t[: len(trial.t) - n], channels=channels, phase=None)
+    result = replay([moved], vehicle)
+    assert result.pairs[0].late.get("calibrated", 0.0) == pytest.approx(-lead, abs=0.011)
+    assert result.scores["calibrated"][0]["yaw"].value < 0.03

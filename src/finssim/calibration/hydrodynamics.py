@@ -107,8 +107,8 @@ def fit_hydrodynamics(
     if known and method == "simulation":
         raise CalibrationError("known inertias need the regression: the simulation method fits every inertia")
 
-    def regression(body: Vehicle) -> Fit:
-        return regress(trials, body, axes=axes, damping=damping, known=known, estimate=estimate, seed=seed)
+    def regression(body: Vehicle, inertias: Mapping[str, float] = known) -> Fit:
+        return regress(trials, body, axes=axes, damping=damping, known=inertias, estimate=estimate, seed=seed)
 
     def simulation(body: Vehicle) -> Fit:
         from finssim.calibration.simulation.fit import fit_by_simulation
@@ -120,18 +120,20 @@ def fit_hydrodynamics(
 
     scale, std = 1.0, 0.0
     if "thrust_scale" not in estimate and _unknown_voltage(trials, vehicle):
-        scale, std = _thrust_scale(_or_none(regression, vehicle), vehicle, known)
+        free = _or_none(lambda body: regression(body, {}), vehicle)
+        scale, std = _thrust_scale(free, vehicle, known)
     body = vehicle.replace(_scaled(vehicle, scale)) if std else vehicle
+    before = _scores(vehicle, trials)
     driven = [trial for trial in trials if not trial.header.passive]
     if method == "simulation" or asked:
         fit = simulation(body)
     elif method == "regression" or known or not driven:
         fit = regression(body)
     else:
-        fit = _better(regression, simulation, body, trials)
+        fit = _better(regression, simulation, body, trials, before)
     if std:
-        fit = _with_scale(fit, vehicle, scale, std)
-    return replace(fit, warnings=(*fit.warnings, *_worse(fit, trials)))
+        fit = _with_scale(fit, vehicle, scale, std, known)
+    return replace(fit, warnings=(*fit.warnings, *_worse(fit, trials, before)))
 
 
 def _or_none(fit: Callable[[Vehicle], Fit], vehicle: Vehicle) -> Fit | None:
@@ -146,12 +148,13 @@ def _better(
     simulation: Callable[[Vehicle], Fit],
     body: Vehicle,
     trials: Sequence[Trial],
+    before: Mapping[str, float],
 ) -> Fit:
     """The regression where it replays every axis well and better than the file; else whichever replays better."""
     first = _or_none(regression, body)
     if first is None:
         return simulation(body)
-    before, after = _scores(body, trials), _scores(calibrated(first), trials)
+    after = _scores(calibrated(first), trials)
     if after and all(
         value <= ENOUGH and value <= before.get(axis, math.inf) for axis, value in after.items()
     ):
@@ -161,7 +164,7 @@ def _better(
         return first
     other = _scores(calibrated(second), trials)
     means = [_mean(scores, {*after, *other}) for scores in (after, other)]
-    return second if means[1] < means[0] else first
+    return second if means[1] < means[0] else replace(first, interrupted=second.interrupted)
 
 
 def _mean(scores: Mapping[str, float], axes: set[str]) -> float:
@@ -187,11 +190,11 @@ def _scores(vehicle: Vehicle, trials: Sequence[Trial]) -> dict[str, float]:
     return {axis: float(np.median(found)) for axis, found in values.items()}
 
 
-def _worse(fit: Fit, trials: Sequence[Trial]) -> list[str]:
+def _worse(fit: Fit, trials: Sequence[Trial], before: Mapping[str, float]) -> list[str]:
     """A sentence for each axis that the calibrated vehicle replays worse than the file it came from."""
     if not fit.changes:
         return []
-    before, after = _scores(fit.vehicle, trials), _scores(calibrated(fit), trials)
+    after = _scores(calibrated(fit), trials)
     return [
         f"{axis}: the calibrated vehicle replays these trials worse (NRMSE {value:.2f}) than the vehicle file does "
         f"({before[axis]:.2f}): do not use it for this axis; try --method "
@@ -234,14 +237,13 @@ def _thrust_scale(fit: Fit | None, vehicle: Vehicle, known: Mapping[str, float])
     said, weight = [math.log(LIKELY_SCALE)], [SCALE_STD**-2]
     for i, axis in enumerate(AXES):
         found = fit.estimates.get(f"{axis}.m_eff") if fit is not None else None
-        if found is None or not found.estimate > 0.0 or axis in ("roll", "pitch"):
+        if found is None or not found.estimate > 0.0 or (axis in ("roll", "pitch") and axis not in known):
             continue  # a stiffness that nobody knows goes with the inertia of roll and pitch
-        expected = float(plant.M_RB[i, i] + plant.M_A[i, i])
+        expected = known.get(axis, float(plant.M_RB[i, i] + plant.M_A[i, i]))
         std = INERTIA_STD if i > 2 else ADDED_MASS_STD * float(plant.M_A[i, i]) / expected
+        std = GIVEN_STD if axis in known else std
         value = found.estimate
         half = 0.5 * (found.ci95[1] - found.ci95[0]) / value
-        if axis in known:
-            continue
         if math.isfinite(half) and half < 0.5:
             said.append(math.log(expected / value))
             weight.append(1.0 / (std**2 + (0.5 * half) ** 2 + 1e-4))
@@ -249,13 +251,15 @@ def _thrust_scale(fit: Fit | None, vehicle: Vehicle, known: Mapping[str, float])
     return math.exp(sum(w * x for w, x in zip(weight, said, strict=True)) / total), total**-0.5
 
 
-def _with_scale(fit: Fit, vehicle: Vehicle, scale: float, std: float) -> Fit:
+def _with_scale(fit: Fit, vehicle: Vehicle, scale: float, std: float, known: Mapping[str, float]) -> Fit:
     """The fit with the scale among its estimates and in its intervals."""
     low, high = math.exp(-1.96 * std), math.exp(1.96 * std)
     fitted = fit.settings.get("axes", ())
     found = dict(fit.estimates)
     for name, e in fit.estimates.items():
         axis, _, kind = name.partition(".")
+        if axis in known and kind in ("m_eff", "added_mass"):
+            continue
         in_term = e.path == f"hydrodynamics.calibrated.{name}"
         if name == "buoyancy_excess" or in_term or (axis in fitted and kind in MULTIPLIED):
             rigid = found[f"{axis}.m_eff"].estimate - e.estimate if kind == "added_mass" else 0.0

@@ -73,8 +73,11 @@ def test_the_frame_of_six_axes_keeps_directions():
     np.testing.assert_allclose(out, [0.0, -1.0, 1.0, 0.0, -0.3, -0.3, -0.3, -0.3])
 
 
-def test_directions_and_gain():
-    """MOT_n_DIRECTION turns a motor's pulses; the pilot gain scales the sticks before the mixer."""
+def test_directions_and_gain(tmp_path):
+    """MOT_n_DIRECTION turns a motor's pulses; the pilot gain scales the sticks before the mixer; both from the map."""
+    text = "vehicle: bluerov2\nardusub: {frame: VECTORED, gain: 0.5, motor_directions: [1, 1, 1, 1, -1, 1]}\n"
+    found = trial(tmp_path, text, stick_throttle=1.0)
+    assert (found.series("pwm_T5")[1][0], found.series("pwm_T6")[1][0]) == (1700.0, 1300.0)
     turned = mixed_pulses("VECTORED", demand(throttle=0.5), directions=[1, 1, 1, 1, -1, 1])[0]
     np.testing.assert_allclose(turned[4:], [1700.0, 1300.0])
 

@@ -193,10 +193,8 @@ def curves_of(name: str, result: Bench, before: Thruster) -> list[Curve]:
     if result.speeds_measured:
         force = rows.force[order]
         curves += [
-            _curve_of_thruster_quality(
-                f"{name}: thrust", "shaft speed [rpm]", "thrust [N]", rpm, force, fitted
-            ),
-            _curve_of_thruster_quality(
+            _quality_curve(f"{name}: thrust", "shaft speed [rpm]", "thrust [N]", rpm, force, fitted),
+            _quality_curve(
                 f"{name}: residual",
                 "shaft speed [rpm]",
                 "measured - fitted [N]",
@@ -217,21 +215,17 @@ def curves_of(name: str, result: Bench, before: Thruster) -> list[Curve]:
         if result.speeds_measured:
             measured = level.speed[order] * TO_RPM
             curves.append(
-                _curve_of_thruster_quality(
-                    f"{name}: speed from pulse{label}", *axes, pulse, measured, speed * TO_RPM
-                )
+                _quality_curve(f"{name}: speed from pulse{label}", *axes, pulse, measured, speed * TO_RPM)
             )
         curves.append(
-            _curve_of_thruster_quality(
+            _quality_curve(
                 f"{name}: thrust from pulse{label}", axes[0], "thrust [N]", pulse, level.force[order], thrust
             )
         )
     return curves
 
 
-def _curve_of_thruster_quality(
-    title: str, x_label: str, y_label: str, x: Array, measured: Array, fitted: Array
-) -> Curve:
+def _quality_curve(title: str, x_label: str, y_label: str, x: Array, measured: Array, fitted: Array) -> Curve:
     return Curve(
         title=title, x_label=x_label, y_label=y_label, x=x, measured=measured, fitted=fitted, kind="scatter"
     )

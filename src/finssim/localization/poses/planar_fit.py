@@ -92,7 +92,7 @@ def rigid_fit(Q: Array, points: Array, A: Array, huber: float) -> RigidFit | Non
     step_number = 0
     while step_number < _MOST_STEPS and not converged:
         step_number += 1
-        inverse = _inverse_of_rigid_fit(now.H, damping)
+        inverse = _damped_inverse(now.H, damping)
         if inverse is None:
             return None
         step = -inverse @ now.g
@@ -103,7 +103,7 @@ def rigid_fit(Q: Array, points: Array, A: Array, huber: float) -> RigidFit | Non
             xi, now, damping = trial, then, max(0.1 * damping, 1e-12)
         else:
             damping = max(10.0 * damping, 1e-6)
-    inverse = _inverse_of_rigid_fit(now.H, 0.0)
+    inverse = _damped_inverse(now.H, 0.0)
     if inverse is None:
         return None
     where = (float(xi[0]), float(xi[1]), math.remainder(float(xi[2]), math.tau))
@@ -119,7 +119,7 @@ class _State:
     missed: Array
 
 
-def _inverse_of_rigid_fit(H: Array, damping: float) -> Array | None:
+def _damped_inverse(H: Array, damping: float) -> Array | None:
     """Inverse of H + damping diag(H) by its adjugate, None where it is singular: np.linalg costs four times as much."""
     (a, d, e), (_, b, f), (_, _, c) = H.tolist()
     scale = a * b * c

@@ -33,7 +33,7 @@ __all__ = [
 
 # Where a board stands before a camera: a closed form from viewing rays, then least squares on the pixels.
 
-STEPS_BOARD_POSE = 40
+POSE_STEPS = 40
 
 
 class BoardPose(NamedTuple):
@@ -121,7 +121,7 @@ def board_pose(
     cost = float(np.sum(residual**2))
     if not np.isfinite(cost):
         return None
-    for _ in range(STEPS_BOARD_POSE):
+    for _ in range(POSE_STEPS):
         J = pose_jacobian(lens, pose, points_c).reshape(-1, 6)
         normal, gradient = J.T @ J, J.T @ residual.ravel()
         step = np.linalg.solve(normal + damping * np.diag(np.diagonal(normal)), gradient)

@@ -90,11 +90,11 @@ def tag_estimates(
         before = mounts.get(tag, pose)
         turn = np.degrees(quat_to_rotvec(matrix_to_quat(pose.R @ before.R.T)))
         for i, axis in enumerate(AXES):
-            estimates[f"tags.{tag}.turn_{axis}"] = _estimate_of_mount_estimates(
+            estimates[f"tags.{tag}.turn_{axis}"] = _mount_estimate(
                 f"tags.{tag}.turn_{axis}", turn[i], np.degrees(half[i]), "deg", tag, reference
             )
         for i, axis in enumerate(AXES):
-            estimates[f"tags.{tag}.{axis}"] = _estimate_of_mount_estimates(
+            estimates[f"tags.{tag}.{axis}"] = _mount_estimate(
                 f"tags.{tag}.{axis}",
                 pose.t[i],
                 half[3 + i],
@@ -133,7 +133,7 @@ def _told(found: MountFit, tag: int) -> Array:
     return np.concatenate([turn, place])
 
 
-def _estimate_of_mount_estimates(
+def _mount_estimate(
     name: str, value: float, half: float, unit: str, tag: int, reference: int, path: str | None = None
 ) -> Estimate:
     sure = bool(np.isfinite(half))
