@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from finssim.calibration.vision.pool.observations import Observations
-from finssim.calibration.vision.pool.pool_fit import PoolFit, calibrate_pool
-from finssim.calibration.vision.pool.pool_settings import Settings
+from finssim.calibration.vision.pool_fit import PoolFit, calibrate_pool
+from finssim.calibration.vision.pool_model import Settings
+from finssim.calibration.vision.survey import Observations
 from finssim.geometry.optics import Camera, Interface, Layer, Lens, project
 from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_from_yaw, quat_to_matrix
 from finssim.localization.detection.tags import corners

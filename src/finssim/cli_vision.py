@@ -52,7 +52,7 @@ def camera(
 
     Example: finssim calibrate camera board/*.jpg --board 9x6 --square 0.025 --out camera.yaml
     """
-    from finssim.calibration.vision.camera.camera_command import run
+    from finssim.calibration.vision.camera_command import run
 
     run(
         images,
@@ -169,7 +169,7 @@ def pool(
 
     Example: finssim calibrate pool points.csv --surveyed survey.csv --camera camera.yaml --out pool.yaml
     """
-    from finssim.calibration.vision.pool.pool_command import run
+    from finssim.calibration.vision.pool_command import run
 
     run(
         inputs,
@@ -232,7 +232,7 @@ def mounts(
 
     Example: finssim calibrate mounts log --pool pool.yaml --vehicle mine.yaml --out mine.yaml
     """
-    from finssim.calibration.vision.mounts.mounts_command import run
+    from finssim.calibration.vision.mounts_command import run
 
     run(
         log,

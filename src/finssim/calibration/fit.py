@@ -36,6 +36,13 @@ class Estimate:
     path: str | None = None
     """Dotted path of the number in the vehicle file, where it has one."""
 
+    @classmethod
+    def within(cls, name: str, value: float, half: float, unit: str, sure: bool, note: str = "") -> Estimate:
+        """An estimate with an interval of `half` to each side, and a note where it is not `sure`."""
+        ci95 = (float(value - half), float(value + half))
+        note = "" if sure else note
+        return cls(name=name, estimate=float(value), ci95=ci95, unit=unit, identifiable=bool(sure), note=note)
+
     def as_json(self) -> dict[str, Any]:
         """Plain values; a number that is not finite becomes None."""
 

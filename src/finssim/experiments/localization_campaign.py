@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.vision.pool.observations import Observations, observe
-from finssim.calibration.vision.pool.pool_fit import PoolFit, calibrate_pool
-from finssim.calibration.vision.pool.pool_record import pool_record
-from finssim.calibration.vision.pool.pool_settings import Settings
-from finssim.calibration.vision.pool.survey import read_survey
+from finssim.calibration.vision.pool_command import pool_record
+from finssim.calibration.vision.pool_fit import PoolFit, calibrate_pool
+from finssim.calibration.vision.pool_model import Settings
+from finssim.calibration.vision.survey import Observations, observe, read_survey
 from finssim.experiments.campaign import choice
 from finssim.geometry.optics import Camera, Interface, Lens, Projection, Status, project
 from finssim.geometry.rotations import matrix_to_quat, quat_from_euler, quat_to_matrix

@@ -15,7 +15,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.gridspec import SubplotSpec
 
-__all__ = ["draw_correlation", "draw_curves", "draw_estimates", "fit_pictures"]
+__all__ = [
+    "BLUE",
+    "GRAY",
+    "ORANGE",
+    "draw_correlation",
+    "draw_curves",
+    "draw_estimates",
+    "fit_pictures",
+    "new_figure",
+    "png",
+]
 
 BLUE, ORANGE, GRAY = "#0072B2", "#D55E00", "0.6"
 PER_FIGURE = 6
@@ -35,7 +45,7 @@ def fit_pictures(fit: Fit) -> dict[str, tuple[str, bytes]]:
         found["correlation.png"] = ("Correlation of the errors", draw_correlation(fit.correlation))
     for i, figure in enumerate(draw_curves(fit.curves), start=1):
         found[f"curves_{i}.png"] = ("Measured and fitted, and the residual", figure)
-    return {name: (text, _png(figure)) for name, (text, figure) in found.items()}
+    return {name: (text, png(figure)) for name, (text, figure) in found.items()}
 
 
 def draw_estimates(estimates: Sequence[Estimate]) -> Figure | None:
@@ -52,7 +62,7 @@ def draw_estimates(estimates: Sequence[Estimate]) -> Figure | None:
     ]
     if not shown:
         return None
-    figure = _figure(7.2, 0.9 + 0.27 * len(shown))
+    figure = new_figure(7.2, 0.9 + 0.27 * len(shown))
     axes = figure.subplots()
     rows = np.arange(len(shown))[::-1]
     for row, estimate in zip(rows, shown, strict=True):
@@ -79,7 +89,7 @@ def draw_estimates(estimates: Sequence[Estimate]) -> Figure | None:
 def draw_correlation(correlation: Correlation) -> Figure:
     """The matrix, blue where errors go together, orange where they go against each other."""
     n = len(correlation.names)
-    figure = _figure(max(3.6, 1.9 + 0.36 * n), max(3.0, 1.3 + 0.36 * n))
+    figure = new_figure(max(3.6, 1.9 + 0.36 * n), max(3.0, 1.3 + 0.36 * n))
     axes = figure.subplots()
     image = axes.imshow(correlation.matrix, vmin=-1.0, vmax=1.0, cmap="RdBu")
     axes.set_xticks(range(n), correlation.names, rotation=60, ha="right", fontsize=8)
@@ -104,7 +114,7 @@ def draw_curves(curves: Sequence[Curve]) -> Iterator[Figure]:
         rows = math.ceil(len(part) / columns)
         width, height = (3.9 * columns if columns > 1 else 5.4), 2.9 * rows
         # A fixed layout: finding the best one takes longer than drawing.
-        figure = _figure(width, height, constrained=False)
+        figure = new_figure(width, height, constrained=False)
         grid = figure.add_gridspec(
             rows,
             columns,
@@ -120,7 +130,8 @@ def draw_curves(curves: Sequence[Curve]) -> Iterator[Figure]:
         yield figure
 
 
-def _png(figure: Figure) -> bytes:
+def png(figure: Figure) -> bytes:
+    """The same bytes for the same figure."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=120, metadata={"Software": None})
     return buffer.getvalue()
@@ -152,7 +163,8 @@ def _draw(figure: Figure, cell: SubplotSpec, curve: Curve) -> None:
         axes.spines[["top", "right"]].set_visible(False)
 
 
-def _figure(width: float, height: float, constrained: bool = True) -> Figure:
+def new_figure(width: float, height: float, constrained: bool = True) -> Figure:
+    """An empty figure, its size in inches."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

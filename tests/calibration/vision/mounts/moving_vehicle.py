@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from finssim.calibration.vision.mounts.mount_model import Moment, Pose
+from finssim.calibration.vision.tag_mounts import Moment, Pose
 from finssim.geometry.optics import Camera, Interface, Lens, project
 from finssim.geometry.rotations import (
     quat_conjugate,

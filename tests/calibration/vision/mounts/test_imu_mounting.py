@@ -7,13 +7,15 @@ import pytest
 
 from calibration.vision.mounts.moving_vehicle import motion
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.vision.mounts.imu_mounting import (
+from finssim.calibration.vision.sensor_mounts import (
+    Attitude,
+    Gyro,
     fit_imu_mounting,
     level_from_rest,
     rotation_between,
+    turn_pairs,
     turn_residual,
 )
-from finssim.calibration.vision.mounts.turns import Attitude, Gyro, turn_pairs
 from finssim.geometry.rotations import (
     quat_conjugate,
     quat_from_rotvec,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.vision.mounts.pressure_offset import SALT, fit_depth
+from finssim.calibration.vision.sensor_mounts import SALT, fit_depth
 
 
 def readings(rng, span, *, offset=0.03, scale=1.0, noise=0.004, count=120):

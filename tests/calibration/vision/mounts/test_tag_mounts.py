@@ -7,17 +7,20 @@ import pytest
 
 from calibration.vision.mounts.moving_vehicle import EDGE, MOUNTS, POOL, PORT, moments, motion
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.vision.mounts.mount_model import (
+from finssim.calibration.vision.tag_mounts import (
     Moment,
     MountState,
     Noise,
     Pose,
     Rig,
+    change,
+    fit_mounts,
     moment_blocks,
     moved,
+    reference_tag,
     residuals,
+    start_state,
 )
-from finssim.calibration.vision.mounts.tag_mounts import change, fit_mounts, reference_tag, start_state
 from finssim.geometry.rotations import quat_conjugate, quat_from_euler, quat_rotate, quat_to_matrix
 from finssim.localization.detection.tags import corners
 
@@ -75,7 +78,7 @@ def test_a_rocking_vehicle_tells_its_tags_whole(fitted):
     assert not fitted.frozen
     off = errors(fitted, fitted.free)
     for name, error in off.items():
-        assert abs(error) < 2.5 * fitted.interval(name)[1], name
+        assert abs(error) < 2.5 * fitted.half_width(name), name
     assert np.linalg.norm([off["16.x"], off["16.y"]]) < 5e-4
     assert np.degrees(max(abs(off[f"reference.turn_{axis}"]) for axis in "xyz")) < 1.0
     assert np.linalg.norm([off[f"reference.{axis}"] for axis in "xy"]) < 0.01
@@ -143,7 +146,7 @@ def test_intervals_hold_the_truth():
     for seed in range(6):
         seen = moments(motion(tilt=0.2, seconds=20.0), np.random.default_rng(100 + seed))
         fit = fit_mounts(RIG, FILE, seen)
-        inside += [abs(error) < fit.interval(name)[1] for name, error in errors(fit, fit.free).items()]
+        inside += [abs(error) < fit.half_width(name) for name, error in errors(fit, fit.free).items()]
     assert np.mean(inside) > 0.85
 
 

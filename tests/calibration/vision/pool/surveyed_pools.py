@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from finssim.calibration.vision.pool.observations import Observations
+from finssim.calibration.vision.survey import Observations
 from finssim.geometry.optics import Camera, Interface, Layer, Lens, Status, project
 from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_to_matrix
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.vision.pool.observations import observe, observe_combined
-from finssim.calibration.vision.pool.survey import read_survey
+from finssim.calibration.vision.survey import observe, observe_combined, read_survey
 from finssim.localization.detection.detections import Detection, Frame, write_detections
 
 SQUARE = np.array([[10.0, 10.0], [20.0, 10.0], [20.0, 20.0], [10.0, 20.0]])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.vision.pool.pool_fit import calibrate_pool
-from finssim.calibration.vision.pool.pool_settings import Settings
+from finssim.calibration.vision.pool_fit import calibrate_pool
+from finssim.calibration.vision.pool_model import Settings
 from finssim.geometry.optics import Camera, Interface, project
 
 from .surveyed_pools import (

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.calibration.vision.pool.pool_model import NAMES, PoolModel, extended_lens
+from finssim.calibration.vision.pool_model import NAMES, PoolModel, extended_lens
 from finssim.geometry.optics import Interface
 
 from .surveyed_pools import (

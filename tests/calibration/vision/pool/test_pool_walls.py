@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.calibration.vision.pool.pool_fit import calibrate_pool
-from finssim.calibration.vision.pool.pool_refine import CAMERA
-from finssim.calibration.vision.pool.pool_settings import Settings
+from finssim.calibration.vision.pool_fit import calibrate_pool
+from finssim.calibration.vision.pool_model import Settings
+from finssim.calibration.vision.pool_refine import CAMERA
 from finssim.geometry.optics import Interface, Status, project
 from finssim.geometry.rotations import quat_from_rotvec, quat_to_matrix
 

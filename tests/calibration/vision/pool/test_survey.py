@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.vision.pool.survey import read_survey
+from finssim.calibration.vision.survey import read_survey
 
 
 def written(folder, text):

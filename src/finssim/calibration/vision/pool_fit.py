@@ -2,223 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Correlation, Estimate
-from finssim.calibration.vision.pool.observations import Observations
-from finssim.calibration.vision.pool.pool_estimates import correlation, estimates
-from finssim.calibration.vision.pool.pool_held_out import HeldOut, error_vectors, held_out, rms
-from finssim.calibration.vision.pool.pool_model import NAMES, PoolModel, extended_lens
-from finssim.calibration.vision.pool.pool_noise import Noise, Whitener
-from finssim.calibration.vision.pool.pool_refine import Refined, refine, touched, touching_advice
-from finssim.calibration.vision.pool.pool_search import UP, Found, prior_of, search, shifted_settings
-from finssim.calibration.vision.pool.pool_settings import Settings, active_names, lens_std
-from finssim.calibration.vision.pool.pool_solver import Prior, residuals, solve
+from finssim.calibration.vision.pool_advice import advice, correlation, estimates
+from finssim.calibration.vision.pool_model import (
+    NAMES,
+    PoolModel,
+    Prior,
+    Settings,
+    active_names,
+    clearances,
+    extended_lens,
+    lens_std,
+    residuals,
+    solve,
+)
+from finssim.calibration.vision.pool_refine import (
+    HeldOut,
+    Noise,
+    Refined,
+    Whitener,
+    error_vectors,
+    held_out,
+    refine,
+    rms,
+    touched,
+    touching_advice,
+)
+from finssim.calibration.vision.pool_search import UP, Found, prior_of, search, shifted_settings
+from finssim.calibration.vision.survey import Observations
 from finssim.geometry.optics import Lens
 
-__all__ = ["PoolFit", "calibrate_pool"]
-
-# What a survey cannot tell, and what to measure so that the next one can.
-
-NARROW = np.radians(20.0)
-"""Angle of incidence below which refraction looks like a nearer floor."""
-
-ONE_DEPTH = 0.02
-"""Spread of depths, over the distance to the camera, below which they count as one."""
-
-SAME_PLACE = 0.005
-"""Two places of the plane nearer than this are one [m]."""
-
-CERTAIN = 0.999
-"""Share of the marks above the water that are taken for such."""
-
-MOST_NAMES = 12
-"""Rows that a sentence names."""
-
-WHOLE_LENS = "--fit pose,height,tilt,index,focal,center,distortion"
-
-
-def advice(
-    fit: Refined,
-    seen: Observations,
-    surface: bool,
-    settings: Settings,
-    table: Mapping[str, Estimate],
-    minima: Sequence[tuple[float, float]],
-) -> list[str]:
-    """Sentences for the user, the gravest first.
-
-    Args:
-        fit: In the frame of `seen`.
-        seen: All rows.
-        surface: The plane is a water surface.
-        settings: Options, in the same frame.
-        table: Estimates.
-        minima: Other places where the search came to rest.
-    """
-    found = [*_place(fit, seen, surface, settings, table), *_conflicts(fit, surface, settings)]
-    found += [*_numbers(fit, seen), *_left_out(fit, seen, surface)]
-    place = table["camera_height" if surface else "camera_distance"]
-    close = [
-        clearance
-        for ratio, clearance in minima
-        if ratio < 1.1 and abs(clearance - place.estimate) > SAME_PLACE
-    ]
-    if close and not place.identifiable:
-        found.append(
-            f"another place of the plane fits about as well (camera {close[0]:.2f} m from it instead of "
-            f"{place.estimate:.2f} m): measure it with a tape"
-        )
-    return found
-
-
-def _place(
-    fit: Refined, seen: Observations, surface: bool, settings: Settings, table: Mapping[str, Estimate]
-) -> list[str]:
-    """On camera height, water height and index, which few points cannot separate."""
-    model, wet = fit.model, seen.subset(fit.used & ~seen.dry)
-    height = table["camera_height" if surface else "camera_distance"]
-    half = 0.5 * (height.ci95[1] - height.ci95[0])
-    n = model.interface.normal
-    across = (wet.points - model.camera.position) - ((wet.points - model.camera.position) @ n)[:, None] * n
-    radius = float(np.linalg.norm(across, axis=1).max())
-    whole = model.clearance + model.depth
-    steepest = float(np.arctan2(radius, whole))
-    levels = float(np.ptp(wet.points @ n))
-    told = settings.known_depth
-    what = "camera height, water height" if surface else "distances of camera and points from the wall"
-    tape = (
-        "measure the water's height with a tape and give --water-height"
-        if surface
-        else "measure where the wall is and give --plane"
-    )
-    found = []
-    if steepest < NARROW:
-        found.append(
-            f"all points lie within {100 * radius:.0f} cm of the axis through the camera ({np.degrees(steepest):.0f} "
-            f"degrees off it): {what} and index are not separable"
-            + ("" if told else f": {tape}")
-            + ", or add points further out"
-        )
-    if levels < ONE_DEPTH * whole and half > 0.01 * whole:
-        found.append(
-            f"all points are at one depth (within {100 * levels:.0f} cm): {what} are told only by how refraction bends "
-            f"rays far out, here to ±{1000 * half:.0f} mm"
-            + ("" if told else f": {tape}")
-            + ", or survey some points at another depth"
-        )
-    if not height.identifiable:
-        found.append(
-            f"{height.name} is not determined ({height.estimate:.3f} m, 95 % from {height.ci95[0]:.3f} to "
-            f"{height.ci95[1]:.3f}): positions at the depths surveyed are right all the same, at other depths they are "
-            "not to be trusted"
-        )
-    focal = table["focal"]
-    loose = focal.ci95[1] - focal.ci95[0] > 0.02 * focal.estimate
-    if fit.active[NAMES.index("focal")] and loose and levels < 0.05 * whole:
-        found.append(
-            "the focal length was fitted to points of one depth: it and the camera's height stand for each other; "
-            "calibrate the camera by itself (finssim calibrate camera)"
-        )
-    return found
-
-
-def _conflicts(fit: Refined, surface: bool, settings: Settings) -> list[str]:
-    """Where the pixels pull an estimate far from what was known."""
-    found, prior, model = [], fit.prior, fit.model
-    focal = NAMES.index("focal")
-    place = "water's height" if surface else "plane's place"
-    lens = "" if fit.active[focal] else f"; or let the lens be fitted ({WHOLE_LENS})"
-    if np.isfinite(prior.index_std):
-        pull = (model.interface.index_far - settings.index) / prior.index_std
-        if abs(pull) > 3.0:
-            found.append(
-                f"the pixels want an index of {model.interface.index_far:.4f} in place of {settings.index:g}, "
-                f"{abs(pull):.1f} times the error given: check the window, the {place} and the camera file{lens}"
-            )
-    pull = np.log(model.camera.lens.fx / prior.start.camera.lens.fx) / prior.lens_std[0]
-    if fit.active[focal] and abs(pull) > 2.0:
-        found.append(
-            f"the focal length came out {100.0 * (np.exp(pull * prior.lens_std[0]) - 1.0):+.0f} % from the camera "
-            f"file's, further than was expected ({100.0 * prior.lens_std[0]:.1f} %): give --focal-sigma 0.3 if "
-            "the file is a guess"
-        )
-    if np.isfinite(prior.tilt_std) and prior.normal is not None:
-        lean = float(np.arccos(np.clip(model.interface.normal @ prior.normal, -1.0, 1.0)))
-        if lean > 3.0 * prior.tilt_std:
-            found.append(
-                f"the pixels want the plane {np.degrees(lean):.2f} degrees tilted: the survey's axis may not be "
-                f"plumb; raise --tilt-sigma or level the survey{lens}"
-            )
-    return found
-
-
-def _numbers(fit: Refined, seen: Observations) -> list[str]:
-    found = []
-    locations = len(np.unique(seen.location[fit.used]))
-    if locations < 12:
-        found.append(f"{locations} surveyed places: intervals from so few are rough; survey 20 or more")
-    if fit.noise.pixel > 1.5:
-        found.append(
-            f"residuals of {fit.noise.pixel:.1f} px are larger than corners are usually found (0.1 to 0.5 px): check "
-            f"the camera file, or let the lens be fitted ({WHOLE_LENS})"
-        )
-    if fit.noise.scale > 2.0:
-        found.append(
-            f"the survey seems {fit.noise.scale:.1f} times less exact than said "
-            f"({1000 * fit.noise.survey * fit.noise.scale:.1f} mm): measure again, or give --survey-sigma"
-        )
-    return found
-
-
-def _left_out(fit: Refined, seen: Observations, surface: bool) -> list[str]:
-    """Rows that were left out: marks above the water that nobody called dry, and others."""
-    above = _above(fit, seen)
-    wrong = int((~fit.used & ~above).sum())
-    found = []
-    if above.any():
-        names = [seen.names[i] for i in np.flatnonzero(above)]
-        where = "above the water found" if surface else "on the camera's side of the plane found"
-        one = len(names) == 1
-        found.append(
-            f"{', '.join(names[:MOST_NAMES])}{', ...' if len(names) > MOST_NAMES else ''} "
-            f"{'lies' if one else 'lie'} {where}, and straight lines meet {'it' if one else 'them'}: mark "
-            f"{'it' if one else 'them'} dry (a column dry with yes), which makes the camera's place surer"
-        )
-    if wrong:
-        found.append(
-            f"{wrong} {'more ' if above.any() else ''}row{'s were' if wrong > 1 else ' was'} left out as wrong: check "
-            "ids and coordinates"
-        )
-    return found
-
-
-def _above(fit: Refined, seen: Observations) -> NDArray[np.bool_]:
-    """Rows left out that lie on the camera's side of the plane and are met by straight lines, as far as the pose is
-    told, (N,)."""
-    model, noise = fit.model, fit.noise
-    side = seen.points @ model.interface.normal + model.interface.offset > 0.0
-    rows = np.flatnonzero(~fit.used & ~seen.dry & side)
-    found = np.zeros(len(seen), bool)
-    if not len(rows):
-        return found
-    points, dry = seen.points[rows], np.ones(len(rows), bool)
-    r = seen.pixels[rows] - model.predict(points, dry)
-    J, J_point = model.jacobians(points, dry)
-    sigma = noise.scale * np.where(np.isfinite(seen.sigma[rows]), seen.sigma[rows], noise.survey)
-    V = J @ fit.covariance @ J.transpose(0, 2, 1) + noise.pixel**2 * np.eye(2)
-    V = V + J_point @ J_point.transpose(0, 2, 1) * sigma[:, None, None] ** 2
-    ok = np.isfinite(r).all(axis=1) & np.isfinite(V).all(axis=(1, 2))
-    d2 = np.einsum("ni,nij,nj->n", r[ok], np.linalg.inv(V[ok]), r[ok])
-    found[rows[ok]] = d2 < float(chi2.ppf(CERTAIN, 2))
-    return found if 2 * found.sum() > len(rows) else np.zeros(len(seen), bool)  # some are met by chance
-
+__all__ = ["EXACT_LENS", "PoolFit", "calibrate_pool", "doubted"]
 
 Array = NDArray[np.float64]
 
@@ -489,3 +309,185 @@ def _pinhole(here: Observations, found: Found, told: Settings, fit: Refined) -> 
         solution,
         fit.dof,
     )
+
+
+STRAIGHTER = 0.7
+"""Held-out error of straight lines over that of refraction below which refraction is not believed."""
+
+ENOUGH = 8
+"""Held-out rows from which the two are compared."""
+
+TOUCHING = 0.01
+"""Distance of the camera from the plane, over that of the points from the camera, below which it lies on it."""
+
+ODD, ABSURD = 3.0, 10.0
+"""Residuals of a camera on the plane [px] above which it is doubted, and refused."""
+
+TOO_DEEP = 1.5
+"""Depth of the points below the plane as it was told, over the deepest that a camera above it could see so large."""
+
+FLAT = 0.02
+"""Thickness of the points, over their lesser width, below which their mirror image cannot be told from them."""
+
+AGAINST = 0.002
+"""Clearance of a point from the plane below which the plane ends against it [m]."""
+
+MOST_ABOVE = 0.4
+"""Share of the points that may be marks above the water."""
+
+MET = 4.0, 3.0
+"""Residual of straight lines that meets a mark: so many residuals of the rest, and so many pixels more."""
+
+MOST_NAMES = 12
+"""Marks that a sentence names."""
+
+EXACT_LENS = (
+    "the lens is taken as exact, because neither the camera file nor the options tell its errors: if its focal length "
+    "or centre is off, the intervals of the camera's place are too narrow; a lens that was calibrated is usually known "
+    "to 0.3 % and 4 px, --focal-sigma 0.003 --center-sigma 4"
+)
+"""A note, not an alarm: what the intervals of most camera files rest on."""
+
+
+def doubted(fit: PoolFit, lens: Lens, *, lens_told: bool = True) -> PoolFit:
+    """The calibration with what speaks against it put before its advice.
+
+    Args:
+        fit: The calibration.
+        lens: That it began with.
+        lens_told: Somebody said how sure the lens is.
+
+    Raises:
+        CalibrationError: It cannot be a camera before water; says which number to check.
+    """
+    _refuse_depth(fit)
+    _refuse_touching(fit)
+    found = [*_straight(fit), *_touching(fit), *_unmarked(fit, lens), *_handed(fit)]
+    exact = [] if lens_told or "focal" in fit.lens_fitted else [EXACT_LENS]
+    return replace(fit, advice=(*found, *fit.advice), notes=(*fit.notes, *exact))
+
+
+def _refuse_depth(fit: PoolFit) -> None:
+    """Refuse a plane told so far from the points that the camera, seen through it, would be between."""
+    told, option = _told_depth(fit)
+    camera = fit.pinhole.model
+    apparent = abs(float(fit.model.interface.normal @ (camera.camera.position - camera.reference)))
+    if told > TOO_DEEP * fit.model.interface.index_far * apparent:
+        raise CalibrationError(
+            f"{option} puts the plane {told:.3g} m from the points, but by the pixels the camera is only about "
+            f"{apparent:.3g} m from them: check its unit (metres) and the survey's; nothing is written"
+        )
+
+
+def _told_depth(fit: PoolFit) -> tuple[float, str]:
+    """Distance of the plane from the middle of the points under water as it was measured [m], and by which option."""
+    settings, middle = fit.settings, fit.seen.points[~fit.seen.dry].mean(axis=0)
+    if settings.water_height is not None:
+        return abs(settings.water_height - float(middle[2])), f"--water-height {settings.water_height:g}"
+    if settings.water_depth is not None:
+        return abs(settings.water_depth), f"--water-depth {settings.water_depth:g}"
+    if settings.plane is not None:
+        normal = np.array(settings.plane[:3])
+        return abs(float(normal @ middle) + settings.plane[3]) / float(np.linalg.norm(normal)), "--plane"
+    return 0.0, ""
+
+
+def _refuse_touching(fit: PoolFit) -> None:
+    error = rms(fit.residual[fit.used])
+    if _on_plane(fit) and error > ABSURD:
+        raise CalibrationError(
+            f"the camera ends on the plane itself, with residuals of {error:.0f} px: no camera before this plane sees "
+            "the points so; check the unit and sign of the water's height, the window's thickness [m], the index, and "
+            "whether there is water between at all; nothing is written"
+        )
+
+
+def _touching(fit: PoolFit) -> list[str]:
+    error = rms(fit.residual[fit.used])
+    if not _on_plane(fit) or error <= ODD:
+        return []
+    return [
+        f"the camera ends on the plane itself, with residuals of {error:.1f} px: the plane's place, the window, the "
+        "index or the camera file is wrong; do not use this pool file"
+    ]
+
+
+def _on_plane(fit: PoolFit) -> bool:
+    model = fit.model
+    return model.clearance < TOUCHING * (model.clearance + max(model.depth, 0.0))
+
+
+def _straight(fit: PoolFit) -> list[str]:
+    """Where straight lines foretell points better than refraction."""
+    bent, straight = fit.held_out, fit.pinhole_held_out
+    if bent is None or straight is None or len(bent.rows) < ENOUGH:
+        return []
+    errors = rms(bent.pixels), rms(straight.pixels)
+    if not errors[1] < STRAIGHTER * errors[0]:
+        return []
+    return [
+        f"straight lines meet held-out points better ({errors[1]:.2f} px) than refraction does ({errors[0]:.2f} px): "
+        "there is probably no water between camera and points, or the index, the window or the place given for the "
+        "plane is wrong; do not use this pool file under water"
+    ]
+
+
+def _unmarked(fit: PoolFit, lens: Lens) -> list[str]:
+    """Marks above the water that nobody called dry, for which the plane was put over them, or the lens bent."""
+    seen, rows = fit.seen, _highest(fit)
+    if not rows.any():
+        return []
+    try:
+        other = calibrate_pool(seen.subset(~rows), lens, fit.settings)
+    except (CalibrationError, np.linalg.LinAlgError):
+        return []
+    marks = seen.subset(rows)
+    above = clearances(other.model, marks.points) + other.model.interface.thickness < 0.0
+    if not (above & _met(other, marks)).all():
+        return []
+    listed = ", ".join(marks.names[:MOST_NAMES]) + (", ..." if len(marks) > MOST_NAMES else "")
+    return [
+        f"without {listed}, the plane is found {other.model.clearance:.2f} m from the camera in place of "
+        f"{fit.model.clearance:.2f} m, beyond them, and straight lines meet them: mark them dry (a column dry with "
+        "yes); do not use this pool file"
+    ]
+
+
+def _highest(fit: PoolFit) -> NDArray[np.bool_]:
+    """Points nearest to the plane, down to the widest gap between heights, (N,).
+
+    None of them where nothing is odd: the plane ends against no point, and the lens gave up nothing.
+    """
+    seen, model = fit.seen, fit.model
+    distance = np.where(seen.dry, np.inf, clearances(model, seen.points))
+    bent = fit.settings.fit is None and bool(fit.lens_fitted)
+    order = np.sort(distance[~seen.dry])
+    most = int(MOST_ABOVE * len(order))
+    if most < 1 or not (bent or float(distance[fit.used].min()) < AGAINST):
+        return np.zeros(len(seen), bool)
+    gap = int(np.argmax(np.diff(order[: most + 1])))
+    return np.asarray(distance <= order[gap])
+
+
+def _met(fit: PoolFit, marks: Observations) -> NDArray[np.bool_]:
+    """Which marks the camera sees where straight lines say, (K,)."""
+    off = marks.pixels - fit.model.predict(marks.points, np.ones(len(marks), bool))
+    times, more = MET
+    return np.asarray(np.linalg.norm(off, axis=1) < times * rms(fit.residual[fit.used]) + more)
+
+
+def _handed(fit: PoolFit) -> list[str]:
+    """A flat survey whose z points down, or is left-handed: the same pixels, unless the water's height is told."""
+    settings = fit.settings
+    if not fit.surface or fit.model.interface.normal[2] > 0.0:
+        return []
+    if settings.water_height is not None or settings.plane is not None:
+        return []
+    values = np.linalg.svd(fit.seen.points - fit.seen.points.mean(axis=0), compute_uv=False)
+    if values[2] >= FLAT * values[1]:
+        return []
+    return [
+        "flat points cannot tell whether the survey's z points down or its x and y are left-handed (seen from the "
+        "camera, y to the right of x): it is taken for the first; if z points up, every height but theirs comes out "
+        "mirrored: negate y in the survey, or give --water-height, which tells the two apart"
+    ]

@@ -1,33 +1,279 @@
-"""Where tags sit on a vehicle, from pictures taken while it moves: what the motion tells, and what it cannot."""
+"""Where tags sit on a vehicle, from what a camera above the water, an IMU and a pressure sensor measure while it moves.
+
+A vehicle carries tags; one is the reference tag r, the others are placed relative to it. Unknown are the pose of every
+moment, and shared by all moments: the mount of the reference tag, the other tags relative to it, a turn of the IMU, and
+an offset of the depth. The pixels of a corner follow from refraction (`finssim.geometry.optics.project`).
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.uncertainty import Covariance, intervals, trial_covariance
-from finssim.calibration.vision.mounts.arrow import Block, arrow_evidence, arrow_step
-from finssim.calibration.vision.mounts.imu_mounting import rotation_between
-from finssim.calibration.vision.mounts.mount_model import (
-    HUBER,
-    Moment,
-    MountState,
-    Noise,
-    Pose,
-    Rig,
-    moment_blocks,
-    moved,
-    residuals,
+from finssim.calibration.vision.least_squares import (
+    Block,
+    arrow_evidence,
+    arrow_step,
+    block_of,
+    descent,
+    huber_cost,
+    huber_weight,
 )
-from finssim.geometry.optics import back_project
-from finssim.geometry.rotations import matrix_to_quat, quat_rotate, quat_to_matrix, quat_to_rotvec
+from finssim.calibration.vision.sensor_mounts import rotation_between
+from finssim.geometry.optics import back_project, project, projection_jacobians
+from finssim.geometry.rotations import (
+    matrix_to_quat,
+    quat_from_rotvec,
+    quat_rotate,
+    quat_to_matrix,
+    quat_to_rotvec,
+    skew,
+)
+from finssim.localization.pool import Pool
 
-__all__ = ["MOST_MOMENTS", "MountFit", "change", "fit_mounts", "reference_tag", "start_state"]
+__all__ = [
+    "AXES",
+    "Moment",
+    "MountFit",
+    "MountState",
+    "Noise",
+    "Pose",
+    "Rig",
+    "UNSURE_LENGTH",
+    "change",
+    "fit_mounts",
+    "moment_blocks",
+    "moved",
+    "reference_tag",
+    "residuals",
+    "start_state",
+]
+
+Array = NDArray[np.float64]
+
+AXES = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
+"""Of a small motion of a tag: about the outer axes [rad], and along them [m]."""
+
+SENSORS = ("imu.turn_x", "imu.turn_y", "imu.turn_z", "depth.offset", "centre.x", "centre.y")
+"""Shared unknowns that are not of tags."""
+
+HUBER = 3.0
+"""Corners further off than this many standard deviations count linearly."""
+
+
+class Pose(NamedTuple):
+    """A frame in another one."""
+
+    R: Array
+    """(3, 3)"""
+    t: Array
+    """[m], (3,)"""
+
+    def at(self, points: Array) -> Array:
+        """Points of the inner frame in the outer one, (..., 3)."""
+        return np.asarray(points @ self.R.T + self.t)
+
+    def then(self, inner: Pose) -> Pose:
+        """The pose of what lies in this frame at `inner`."""
+        return Pose(self.R @ inner.R, self.R @ inner.t + self.t)
+
+    @property
+    def inverse(self) -> Pose:
+        """The outer frame in the inner one."""
+        return Pose(self.R.T.copy(), -self.R.T @ self.t)
+
+    def stepped(self, step: Array) -> Pose:
+        """After a small turn about the outer axes (3) and a shift (3)."""
+        return Pose(quat_to_matrix(quat_from_rotvec(step[:3])) @ self.R, self.t + step[3:])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Moment:
+    """What was measured when one picture was taken."""
+
+    time: float
+    """[s]"""
+    corners: Mapping[int, Array]
+    """Tag -> pixels of its corners as printed, (4, 2)."""
+    up: Array | None = None
+    """Direction of up by the IMU, in body axes as its mount in the vehicle file has them, (3,)."""
+    depth: float | None = None
+    """Of the pressure port [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rig:
+    """What is taken as known."""
+
+    pool: Pool
+    corners_t: Array
+    """Corners of a tag in its own frame [m], (4, 3)."""
+    port: Array
+    """Pressure port, body frame [m], (3,)."""
+    reference: int
+    """The reference tag."""
+    centre: Array | None = None
+    """Body point that stays where it is while the vehicle turns on the spot [m], (3,); None if it does not."""
+
+    @property
+    def edge(self) -> float:
+        """Of a tag [m]."""
+        return float(np.linalg.norm(self.corners_t[0] - self.corners_t[1]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise:
+    """Standard deviations."""
+
+    pixel: float = 0.3
+    """Of a coordinate of a corner [px]."""
+    up: float = 0.009
+    """Of roll and pitch [rad]."""
+    depth: float = 0.01
+    """[m]"""
+    centre: float = 0.02
+    """Of the place of the centre while turning on the spot [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MountState:
+    """Everything that is estimated."""
+
+    reference: Pose
+    """Reference tag in the body."""
+    others: Mapping[int, Pose]
+    """Other tags in the frame of the reference tag."""
+    poses: Sequence[Pose]
+    """Body in the pool at every moment."""
+    imu_turn: Array = field(default_factory=lambda: np.eye(3))
+    """Turn of the IMU's body axes into the body, (3, 3)."""
+    depth_offset: float = 0.0
+    """Reading less true depth [m]."""
+    centre: Array = field(default_factory=lambda: np.zeros(2))
+    """Where the centre stays, pool x and y [m], (2,)."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the shared unknowns, in the order of a step."""
+        return (*(f"{tag}.{axis}" for tag in ("reference", *self.others) for axis in AXES), *SENSORS)
+
+    def mount(self, tag: int, reference: int) -> Pose:
+        """A tag in the body."""
+        return self.reference if tag == reference else self.reference.then(self.others[tag])
+
+
+def moved(state: MountState, shared: Array, own: Sequence[Array]) -> MountState:
+    """After a step of the shared unknowns, in the order of `names`, and of each moment's pose."""
+    tail = 6 + 6 * len(state.others)
+    return replace(
+        state,
+        reference=state.reference.stepped(shared[:6]),
+        others={
+            tag: pose.stepped(shared[6 + 6 * i : 12 + 6 * i])
+            for i, (tag, pose) in enumerate(state.others.items())
+        },
+        poses=[pose.stepped(step) for pose, step in zip(state.poses, own, strict=True)],
+        imu_turn=quat_to_matrix(quat_from_rotvec(shared[tail : tail + 3])) @ state.imu_turn,
+        depth_offset=state.depth_offset + float(shared[tail + 3]),
+        centre=state.centre + shared[tail + 4 :],
+    )
+
+
+def corner_points(rig: Rig, state: MountState, moments: Sequence[Moment]) -> Array:
+    """Corners of all tags of all moments in the pool, tags in each moment's order, (n, 4, 3)."""
+    mounts = {
+        tag: state.mount(tag, rig.reference).at(rig.corners_t) for tag in (rig.reference, *state.others)
+    }
+    return np.array(
+        [pose.at(mounts[tag]) for pose, m in zip(state.poses, moments, strict=True) for tag in m.corners]
+    )
+
+
+def residuals(
+    rig: Rig, state: MountState, moments: Sequence[Moment], noise: Noise
+) -> tuple[Array, NDArray[np.int64], list[Array]]:
+    """Measured less predicted corners [px] (n, 4, 2), NaN out of sight, their moments (n,), and the whitened rest."""
+    seen = np.array([pixels for m in moments for pixels in m.corners.values()])
+    owner = np.repeat(np.arange(len(moments)), [len(m.corners) for m in moments])
+    predicted = project(rig.pool.camera, rig.pool.interface, corner_points(rig, state, moments)).pixels
+    rest = [
+        np.concatenate([np.zeros(0), *(r for _, _, r in _others(rig, state, pose, m, noise))])
+        for pose, m in zip(state.poses, moments, strict=True)
+    ]
+    return seen - predicted, owner, rest
+
+
+def moment_blocks(rig: Rig, state: MountState, moments: Sequence[Moment], noise: Noise) -> list[Block]:
+    """Weighted normal equations of every moment, shared unknowns in the order of `MountState.names`."""
+    pixels, _, _ = residuals(rig, state, moments, noise)
+    J = projection_jacobians(rig.pool.camera, rig.pool.interface, corner_points(rig, state, moments)).point
+    root = (
+        np.sqrt(huber_weight(np.linalg.norm(pixels, axis=-1), HUBER * noise.pixel))[..., None] / noise.pixel
+    )
+    k, blocks = 0, []
+    for pose, moment in zip(state.poses, moments, strict=True):
+        rows = _others(rig, state, pose, moment, noise)
+        for tag in moment.corners:
+            A, B = _corner_rows(rig, state, pose, tag, J[k])
+            weighted = (root[k][..., None] * A, root[k][..., None] * B, root[k] * pixels[k])
+            rows.append(tuple(x.reshape(8, *x.shape[2:]) for x in weighted))
+            k += 1
+        blocks.append(block_of(*map(np.concatenate, zip(*rows, strict=True))))
+    return blocks
+
+
+def _corner_rows(rig: Rig, state: MountState, pose: Pose, tag: int, J: Array) -> tuple[Array, Array]:
+    """Derivatives of a tag's pixels with respect to the shared unknowns (4, 2, P) and the pose (4, 2, 6), from those
+    with respect to its corners in the pool, J (4, 2, 3)."""
+    in_reference = rig.corners_t if tag == rig.reference else state.others[tag].at(rig.corners_t)
+    in_body = state.reference.at(in_reference)
+    own = np.concatenate([-J @ skew(in_body @ pose.R.T), J], axis=-1)
+    A = np.zeros((4, 2, len(state.names)))
+    J_b = J @ pose.R
+    A[..., 0:3] = -J_b @ skew(in_reference @ state.reference.R.T)
+    A[..., 3:6] = J_b
+    if tag != rig.reference:
+        J_r, start = J_b @ state.reference.R, 6 + 6 * list(state.others).index(tag)
+        A[..., start : start + 3] = -J_r @ skew(rig.corners_t @ state.others[tag].R.T)
+        A[..., start + 3 : start + 6] = J_r
+    return A, own
+
+
+def _others(
+    rig: Rig, state: MountState, pose: Pose, moment: Moment, noise: Noise
+) -> list[tuple[Array, Array, Array]]:
+    """Whitened rows of IMU, depth and centre: shared, own, residual."""
+    up_p = rig.pool.interface.normal
+    tail, count = 6 + 6 * len(state.others), len(state.names)
+    rows = []
+    if moment.up is not None:
+        felt = state.imu_turn @ moment.up
+        A, B = np.zeros((3, count)), np.zeros((3, 6))
+        A[:, tail : tail + 3] = skew(felt)
+        B[:, :3] = pose.R.T @ skew(up_p)
+        rows.append((A / noise.up, B / noise.up, (felt - pose.R.T @ up_p) / noise.up))
+    if moment.depth is not None:
+        arm = pose.R @ rig.port
+        predicted = -(up_p @ (pose.t + arm) + rig.pool.interface.offset) + state.depth_offset
+        A, B = np.zeros((1, count)), np.zeros((1, 6))
+        A[0, tail + 3] = 1.0
+        B[0, :3], B[0, 3:] = up_p @ skew(arm), -up_p
+        rows.append((A / noise.depth, B / noise.depth, np.array([moment.depth - predicted]) / noise.depth))
+    if rig.centre is not None:
+        arm = pose.R @ rig.centre
+        A, B = np.zeros((2, count)), np.zeros((2, 6))
+        A[:, tail + 4 :] = -np.eye(2)
+        B[:, :3], B[:, 3:] = -skew(arm)[:2], np.eye(3)[:2]
+        rows.append((A / noise.centre, B / noise.centre, (state.centre - (pose.t + arm)[:2]) / noise.centre))
+    return rows
+
 
 # Where a vehicle is, roughly, from one tag, its tilt and the file's mounts: enough for least squares to begin.
 
@@ -64,7 +310,7 @@ def start_pose(rig: Rig, mounts: Mapping[int, Pose], moment: Moment) -> Pose | N
             continue
         R = level.R @ mounts[tag].R.T  # of a body whose tag is level
         up_p, up_b = rig.pool.interface.normal, moment.up
-        R = _least_turn(R @ (R.T @ up_p if up_b is None else up_b), up_p) @ R
+        R = quat_to_matrix(rotation_between(up_p[None], (R @ up_b if up_b is not None else up_p)[None])) @ R
         return Pose(R, level.t - R @ mounts[tag].t)
     return None
 
@@ -75,7 +321,6 @@ def level_tag(rig: Rig, pixels: Array) -> Pose | None:
     if not np.isfinite(rays.direction).all():
         return None
     n, b = rig.pool.interface.normal, rig.pool.interface.offset
-    edge = float(np.linalg.norm(rig.corners_t[0] - rig.corners_t[1]))
 
     def at(depth: float) -> Array:
         down = (-depth - b - rays.origin @ n) / (rays.direction @ n)
@@ -88,7 +333,7 @@ def level_tag(rig: Rig, pixels: Array) -> Pose | None:
     low, high = 0.0, DEEPEST
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if size(middle) < edge else (low, middle)
+        low, high = (middle, high) if size(middle) < rig.edge else (low, middle)
     points = at(0.5 * (low + high))
     right = points[1] + points[2] - points[0] - points[3]
     x = right - (right @ n) * n
@@ -109,16 +354,6 @@ def _place_unknown(rig: Rig, mounts: dict[int, Pose], moments: Sequence[Moment])
                 break
 
 
-def _least_turn(a: Array, b: Array) -> Array:
-    """Smallest rotation that takes unit vector a to b, (3, 3)."""
-    v, c = np.cross(a, b), float(a @ b)
-    if c < -0.999:  # opposite: about any axis across
-        across = np.linalg.svd(a[None])[2][1]
-        return np.asarray(2.0 * np.outer(across, across) - np.eye(3))
-    S = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-    return np.asarray(np.eye(3) + S + S @ S / (1.0 + c))
-
-
 # Least squares over mounts and moments, in those unknowns that are left free.
 
 STEPS = 60
@@ -130,14 +365,6 @@ def restricted(block: Block, state: MountState, free: Sequence[str]) -> Block:
     return Block(block.aa[np.ix_(index, index)], block.ab[index], block.bb, block.a[index], block.b)
 
 
-def _cost(rig: Rig, state: MountState, moments: Sequence[Moment], noise: Noise) -> float:
-    corner, _, rest = residuals(rig, state, moments, noise)
-    r = np.linalg.norm(corner, axis=-1) / noise.pixel
-    robust = np.where(r <= HUBER, r**2, HUBER * (2.0 * r - HUBER))
-    total = float(np.sum(robust)) + sum(float(np.sum(part**2)) for part in rest)
-    return total if math.isfinite(total) else math.inf
-
-
 def minimise(
     rig: Rig,
     state: MountState,
@@ -146,24 +373,26 @@ def minimise(
     free: Sequence[str],
     steps: int = STEPS,
 ) -> MountState:
+    """The state that suits the moments best, nearby, over their poses and the shared unknowns `free`."""
     index = [state.names.index(name) for name in free]
-    damping, cost, failures = 1e-3, _cost(rig, state, moments, noise), 0
-    for _ in range(steps):
+
+    def cost(state: MountState) -> float:
+        corner, _, rest = residuals(rig, state, moments, noise)
+        total = huber_cost(np.linalg.norm(corner, axis=-1) / noise.pixel, HUBER)
+        total += float(np.sum(np.concatenate(rest) ** 2))
+        return total if math.isfinite(total) else math.inf
+
+    def steps_from(state: MountState) -> Callable[[float], MountState]:
         blocks = [restricted(block, state, free) for block in moment_blocks(rig, state, moments, noise)]
-        step, own = arrow_step(blocks, damping)
-        shared = np.zeros(len(state.names))
-        shared[index] = step
-        candidate = moved(state, shared, own)
-        after = _cost(rig, candidate, moments, noise)
-        if after < cost:
-            done = cost - after < 1e-7 * cost
-            state, cost, failures, damping = candidate, after, 0, max(0.1 * damping, 1e-9)
-            if done:
-                break
-        else:
-            damping, failures = 10.0 * damping, failures + 1
-            if failures > 8:
-                break
+
+        def stepped(damping: float) -> MountState:
+            shared = np.zeros(len(state.names))
+            shared[index], own = arrow_step(blocks, damping)
+            return moved(state, shared, own)
+
+        return stepped
+
+    *_, (state, _) = descent(state, cost, steps_from, rounds=steps, tolerance=1e-7)
     return state
 
 
@@ -189,8 +418,6 @@ def change(before: MountState, after: MountState, free: Sequence[str]) -> Array:
     every = np.concatenate(total)
     return every[[before.names.index(name) for name in free]]
 
-
-Array = NDArray[np.float64]
 
 MOST_MOMENTS = 150
 """Moments that are used, spread over the recording; more tell the same."""
@@ -236,17 +463,21 @@ class MountFit:
     left_out: int
     """Moments left out as far off."""
 
-    def interval(self, name: str) -> tuple[float, float]:
-        """Half-width-centred 95 % interval about zero of an error of a shared unknown; infinite if it is not free."""
+    def half_width(self, name: str) -> float:
+        """Of the 95 % interval of a shared unknown; infinite if it is not free."""
         if name not in self.free:
-            return -math.inf, math.inf
-        i = self.free.index(name)
-        low, high = intervals(np.zeros(len(self.free)), self.covariance)[i]
-        return float(low), float(high)
+            return math.inf
+        return float(intervals(np.zeros(len(self.free)), self.covariance)[self.free.index(name), 1])
 
     def std(self, name: str) -> float:
         """Standard deviation of a shared unknown; infinite if it is not free."""
         return float(self.covariance.std[self.free.index(name)]) if name in self.free else math.inf
+
+    @property
+    def port_depths(self) -> Array:
+        """Depth of the pressure port at every moment by the poses [m], (n,)."""
+        n, b = self.rig.pool.interface.normal, self.rig.pool.interface.offset
+        return np.array([-(n @ pose.at(self.rig.port) + b) for pose in self.state.poses])
 
 
 def reference_tag(moments: Sequence[Moment], mounts: Mapping[int, Pose]) -> int:
@@ -272,6 +503,7 @@ def fit_mounts(
     *,
     estimate: str = "tags",
     noise: Noise | None = None,
+    held_out: bool = True,
 ) -> MountFit:
     """Mounts of all tags, or of the sensors, from moments of a moving vehicle.
 
@@ -286,6 +518,7 @@ def fit_mounts(
         estimate: `tags`: IMU and pressure port in the file are right. `sensors`: the reference tag in the file is
             right, and the IMU's turn and the depth's offset are estimated.
         noise: Standard deviations.
+        held_out: Fit parts of the recording too, for the error at the others.
 
     Raises:
         CalibrationError: Too few moments show a tag in the water.
@@ -326,7 +559,7 @@ def fit_mounts(
         theta=change(origin, state, free),
         covariance=covariance,
         rms=float(np.sqrt(np.nanmean(np.sum(corner**2, axis=-1)))),
-        held_out_rms=_held_out(rig, state, used, sigma, free),
+        held_out_rms=_held_out(rig, state, used, sigma, free) if held_out else math.nan,
         left_out=left_out,
     )
 
@@ -359,16 +592,18 @@ def _spread(moments: Sequence[Moment]) -> list[Moment]:
 def _wanted(rig: Rig, state: MountState, moments: Sequence[Moment], estimate: str) -> tuple[str, ...]:
     """Shared unknowns that the sensors at hand could tell."""
     up, depth = any(m.up is not None for m in moments), any(m.depth is not None for m in moments)
-    others = [name for name in state.names if name.partition(".")[0].isdigit()]
-    angles, height, place = ["turn_x", "turn_y", "turn_z"], ["z"], ["x", "y"]
+    others = _of_others(state)
     if estimate == "sensors":
-        own = [f"imu.{axis}" for axis in angles if up] + (["depth.offset"] if depth else [])
-        return (*others, *own)
-    wanted = [f"reference.{axis}" for axis in angles if up]
-    wanted += [f"reference.{axis}" for axis in height if depth]
-    wanted += [f"reference.{axis}" for axis in place if (depth and up) or rig.centre is not None]
-    centre = ["centre.x", "centre.y"] if rig.centre is not None else []
-    return (*wanted, *others, *centre)
+        return (*others, *SENSORS[: 3 if up else 0], *SENSORS[3 : 4 if depth else 3])
+    across = (depth and up) or rig.centre is not None
+    told = {"turn_x": up, "turn_y": up, "turn_z": up, "z": depth, "x": across, "y": across}
+    wanted = [f"reference.{axis}" for axis, is_told in told.items() if is_told]
+    return (*wanted, *others, *(SENSORS[4:] if rig.centre is not None else ()))
+
+
+def _of_others(state: MountState) -> tuple[str, ...]:
+    """Shared unknowns of the tags that are placed relative to the reference tag."""
+    return tuple(name for name in state.names if name[0].isdigit())
 
 
 def _without_far(
@@ -416,14 +651,13 @@ def _by_vision(
     wrong sign. Where the vehicle never tilts, the smallest turn is taken.
     """
     blind = [replace(moment, up=None) for moment in moments]
-    others = tuple(name for name in state.names if name.partition(".")[0].isdigit())
-    state = minimise(rig, state, blind, noise, others, steps=15)
+    state = minimise(rig, state, blind, noise, _of_others(state), steps=15)
     known = [i for i, moment in enumerate(moments) if moment.up is not None]
     if not known:
         return state
     seen = np.array([state.poses[i].R.T @ rig.pool.interface.normal for i in known])
     felt = np.array([moments[i].up for i in known])
-    q = rotation_between(felt, seen, np.ones(len(known)), (0.0, 0.0, 0.0, 1.0))
+    q = rotation_between(felt, seen)
     better = np.sum((felt - quat_rotate(q, seen)) ** 2) < BETTER * np.sum((felt - seen) ** 2)
     if 2.0 * math.acos(min(1.0, abs(float(q[3])))) < TURNED or not better:
         return minimise(rig, state, moments, noise, ())

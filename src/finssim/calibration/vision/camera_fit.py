@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -12,24 +12,182 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Correlation, Estimate
-from finssim.calibration.uncertainty import Evidence, intervals, trial_covariance
-from finssim.calibration.vision.camera.boards import BoardView
-from finssim.calibration.vision.camera.camera_advice import camera_advice
-from finssim.calibration.vision.camera.lens_reach import LensReach, lens_reach
-from finssim.calibration.vision.mounts.arrow import Block, arrow_evidence, arrow_step, block_of
+from finssim.calibration.uncertainty import Covariance, Evidence, intervals, trial_covariance
+from finssim.calibration.vision.boards import BoardView
+from finssim.calibration.vision.least_squares import Block, arrow_evidence, arrow_step, block_of
 from finssim.geometry.optics import Lens, OpticsError
 from finssim.geometry.rotations import quat_from_rotvec, quat_to_matrix, skew
 
 __all__ = [
+    "COLUMNS",
     "CameraFit",
     "MODELS",
-    "View",
+    "ROWS",
     "adjust",
     "calibrate_camera",
     "evidence",
     "lens_names",
     "lens_vector",
 ]
+
+Array = NDArray[np.float64]
+
+COLUMNS, ROWS = 12, 9
+"""Cells of the picture in which corners are counted."""
+
+TWO_SIGMA_PLANE = 5.991
+"""95 % point of chi-squared with two degrees of freedom."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensReach:
+    """Over a grid of cells of the picture."""
+
+    counts: NDArray[np.int64]
+    """Corners in each cell, (rows, columns)."""
+    error95: Array
+    """Radius of the 95 % circle of a pixel whose direction is known, at the cell's centre [px], (rows, columns); a turn
+    of the whole camera, which any pose takes up, is not in it. NaN where the lens cannot see."""
+    edges: dict[str, float]
+    """Empty border of the picture at left, right, top, bottom, as a share of its width or height."""
+
+    @property
+    def inside(self) -> float:
+        """Largest error in cells with corners [px]."""
+        return float(np.nanmax(np.where(self.counts > 0, self.error95, np.nan)))
+
+    @property
+    def anywhere(self) -> float:
+        """Largest error over the picture [px]."""
+        return float(np.nanmax(self.error95))
+
+
+def lens_reach(lens: Lens, pixels: Array, covariance: Covariance) -> LensReach:
+    """Count corners over the picture and carry the covariance of the lens to pixels.
+
+    Args:
+        lens: The lens.
+        pixels: All corners used, (n, 2).
+        covariance: Of the lens's numbers, in the order of `Lens.parameter_jacobian`.
+    """
+    u_edges = np.linspace(-0.5, lens.width - 0.5, COLUMNS + 1)
+    v_edges = np.linspace(-0.5, lens.height - 0.5, ROWS + 1)
+    counts = np.histogram2d(pixels[:, 1], pixels[:, 0], (v_edges, u_edges))[0].astype(np.int64)
+    u, v = np.meshgrid(0.5 * (u_edges[1:] + u_edges[:-1]), 0.5 * (v_edges[1:] + v_edges[:-1]))
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    return LensReach(
+        counts=counts,
+        error95=_error95(lens, np.stack([u, v], axis=-1), counts > 0, covariance),
+        edges={
+            "left": float((low[0] + 0.5) / lens.width),
+            "right": float((lens.width - 0.5 - high[0]) / lens.width),
+            "top": float((low[1] + 0.5) / lens.height),
+            "bottom": float((lens.height - 0.5 - high[1]) / lens.height),
+        },
+    )
+
+
+def _error95(lens: Lens, pixels: Array, covered: NDArray[np.bool_], covariance: Covariance) -> Array:
+    """d pixel = A d lens + B turn, with the turn that takes most of it away over the covered cells, (rows, columns)."""
+    rays, ok = lens.rays(pixels)
+    safe = np.where(ok[..., None], rays, np.array([0.0, 0.0, 1.0]))
+    A = lens.parameter_jacobian(safe)
+    B = -lens.project_jacobian(safe) @ skew(safe)
+    fitted = covered & ok
+    turn = -np.linalg.pinv(B[fitted].reshape(-1, 3)) @ A[fitted].reshape(-1, A.shape[-1])
+    J = A + B @ turn
+    if not np.isfinite(covariance.local).all():
+        return np.full(pixels.shape[:-1], np.nan)
+    # The information gives the shape, the disagreement of the views the size: alone, theirs would lack directions.
+    ratio = covariance.std**2 / np.maximum(np.diagonal(covariance.local), 1e-300)
+    S = max(float(np.mean(ratio)), 1.0) * J @ covariance.local @ np.swapaxes(J, -1, -2)
+    radius = np.sqrt(TWO_SIGMA_PLANE * np.maximum(np.linalg.eigvalsh(S)[..., -1], 0.0))
+    return np.asarray(np.where(ok, radius, np.nan))
+
+
+BORDER = 0.10
+"""Empty share of the picture's width or height that is spoken of."""
+
+FLAT = math.radians(10.0)
+"""Tilt below which a board tells next to nothing of the focal length."""
+
+TILTED = math.radians(20.0)
+FEW_VIEWS = 10
+LARGE_ERROR = 1.0
+"""Uncertainty somewhere in the picture that is spoken of [px]."""
+
+
+def camera_advice(
+    lens: Lens,
+    views: Sequence[View],
+    estimates: Mapping[str, Estimate],
+    reach: LensReach,
+) -> tuple[str, ...]:
+    """Sentences on coverage, tilt and what cannot be told; none if there is nothing to say."""
+    return (
+        *_tilt(views),
+        *_border(reach),
+        *_number(views),
+        *_open(lens, estimates),
+        *_far(reach),
+    )
+
+
+def _tilt(views: Sequence[View]) -> list[str]:
+    tilts = np.array([view.tilt for view in views])
+    if tilts.max() < FLAT:
+        return [
+            f"all views are within {math.degrees(tilts.max()):.0f} degrees of fronto-parallel: focal length and "
+            "distance are not separable: tilt the board by 20 to 50 degrees about both its axes"
+        ]
+    if np.sum(tilts > TILTED) < 3:
+        return [
+            f"only {int(np.sum(tilts > TILTED))} views show the board tilted by more than 20 degrees: the focal length "
+            "rests on them: tilt the board in more pictures"
+        ]
+    return []
+
+
+def _border(reach: LensReach) -> list[str]:
+    empty = {side: share for side, share in reach.edges.items() if share > BORDER}
+    if not empty:
+        return []
+    words = ", ".join(f"{100.0 * share:.0f} % of the {side} edge" for side, share in empty.items())
+    return [
+        f"no corner within {words}: distortion there is extrapolated: take pictures with the board in the corners"
+    ]
+
+
+def _number(views: Sequence[View]) -> list[str]:
+    if len(views) >= FEW_VIEWS:
+        return []
+    return [f"{len(views)} views are few: intervals are wide and rest on single pictures: take 15 to 30"]
+
+
+def _open(lens: Lens, estimates: Mapping[str, Estimate]) -> list[str]:
+    unsure = [e for e in estimates.values() if not e.identifiable]
+    sentences = []
+    if unsure:
+        names = ", ".join(e.name for e in unsure)
+        sentences.append(
+            f"the pictures do not determine {names}: {unsure[0].note}: take more, with the board tilted"
+        )
+    nothing = [e.name for e in estimates.values() if e.identifiable and e.note]
+    if lens.model == "rational" and len(nothing) >= 3:
+        sentences.append(
+            f"{', '.join(nothing)} are not told apart from 0: plumb_bob does as well: --model plumb_bob"
+        )
+    return sentences
+
+
+def _far(reach: LensReach) -> list[str]:
+    if not np.isfinite(reach.anywhere) or reach.anywhere < LARGE_ERROR:
+        return []
+    return [
+        f"pixels are known to {reach.inside:.2f} px (95 %) where corners were seen, but only to "
+        f"{reach.anywhere:.1f} px at the worst place of the picture"
+    ]
+
 
 # Where a board stands before a camera: a closed form from viewing rays, then least squares on the pixels.
 
@@ -340,8 +498,6 @@ def evidence(bundle: Bundle, views: Sequence[BoardView]) -> Evidence:
     return arrow_evidence([_block(bundle, view, i, free) for i, view in enumerate(views)], names, "views")
 
 
-Array = NDArray[np.float64]
-
 MODELS = ("plumb_bob", "rational", "fisheye")
 
 FEWEST_VIEWS = 4
@@ -427,7 +583,7 @@ def calibrate_camera(
     """Fit a lens to views of a board.
 
     Args:
-        views: From `finssim.calibration.vision.camera.boards.see_board`; all of one size.
+        views: From `finssim.calibration.vision.boards.see_board`; all of one size.
         model: plumb_bob, rational or fisheye.
         seed: Of the split for the held-out error.
         progress: Told the part done, 0 to 1, and a few words.

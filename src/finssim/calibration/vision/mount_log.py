@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.vision.mounts.mount_model import Moment
-from finssim.calibration.vision.mounts.turns import Gyro
+from finssim.calibration.vision.sensor_mounts import Gyro
+from finssim.calibration.vision.tag_mounts import Moment
 from finssim.geometry.rotations import quat_inverse_rotate
 from finssim.localization.detection.detections import most_certain, read_detections
 from finssim.localization.fusion.attitude import TiltGains, follow, in_body_axes, tilt_from, up_of
@@ -20,7 +20,7 @@ from finssim.localization.fusion.fuse_table import StreamTable, read_stream_tabl
 from finssim.localization.pool import Pool
 from finssim.vehicles import Vehicle
 
-__all__ = ["MountLog", "Stream", "read_mount_log"]
+__all__ = ["MountLog", "read_mount_log"]
 
 Array = NDArray[np.float64]
 

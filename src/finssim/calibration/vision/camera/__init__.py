@@ -1,1 +1,0 @@
-"""The lens, from pictures of a board."""

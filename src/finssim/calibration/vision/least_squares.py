@@ -1,0 +1,225 @@
+"""Least squares for everything that is calibrated by sight: descent, robust weights, unknowns that one picture owns.
+
+Levenberg and Marquardt's descent takes any state; `arrow_step` is its step where many small groups of unknowns, such as
+the poses of pictures, share only a few; `tukey` is for rows of which some are plainly wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.calibration.uncertainty import Evidence
+
+__all__ = [
+    "Block",
+    "TukeyFit",
+    "arrow_evidence",
+    "arrow_step",
+    "block_of",
+    "descent",
+    "huber_cost",
+    "huber_weight",
+    "tukey",
+]
+
+Array = NDArray[np.float64]
+State = TypeVar("State")
+
+TUKEY = 4.685
+"""Standard deviations from which a row has no weight: 95 % efficient on normal errors."""
+
+STEADIEST = 1e10
+"""Damping at which no step leads down any more."""
+
+
+def descent(
+    state: State,
+    cost: Callable[[State], float],
+    steps_from: Callable[[State], Callable[[float], State | None]],
+    *,
+    rounds: int,
+    tolerance: float,
+) -> Iterator[tuple[State, float]]:
+    """The start and every better state, with its cost, until nothing is gained (Levenberg and Marquardt).
+
+    Args:
+        state: Where to begin.
+        cost: What falls; infinite where a state makes no sense.
+        steps_from: Linearises at a state: damping -> the state a damped step away, or None where there is none.
+        rounds: Linearisations, at most.
+        tolerance: Relative gain with which it ends.
+    """
+    value, damping = cost(state), 1e-3
+    yield state, value
+    for _ in range(rounds):
+        step = steps_from(state)
+        while True:
+            trial = step(damping)
+            after = np.inf if trial is None else cost(trial)
+            if trial is not None and after <= value:
+                break
+            damping *= 5.0
+            if damping > STEADIEST:
+                return
+        gain, state, value = value - after, trial, after
+        yield state, value
+        if gain <= tolerance * max(value, 1e-12) and damping < 1.0:
+            return
+        damping = max(damping / 6.0, 1e-12)
+
+
+def huber_weight(size: Array, limit: float) -> Array:
+    """1 up to a limit, falling as 1 / size beyond."""
+    return np.asarray(np.minimum(1.0, limit / np.maximum(size, 1e-300)))
+
+
+def huber_cost(size: Array, limit: float) -> float:
+    """Sum of squares of what is within a limit, growing linearly beyond."""
+    return float(np.sum(np.where(size <= limit, size**2, limit * (2.0 * size - limit))))
+
+
+class Block(NamedTuple):
+    """Weighted normal equations of one group, such as a picture with its pose."""
+
+    aa: Array
+    """Shared by shared, (P, P)."""
+    ab: Array
+    """Shared by own, (P, Q)."""
+    bb: Array
+    """Own by own, (Q, Q)."""
+    a: Array
+    """Right side of the shared, (P,)."""
+    b: Array
+    """Right side of the own, (Q,)."""
+
+
+def block_of(shared: Array, own: Array, residual: Array) -> Block:
+    """From whitened rows.
+
+    Args:
+        shared: Derivatives of the prediction with respect to the shared unknowns, (n, P).
+        own: And to the group's own, (n, Q).
+        residual: Measured less predicted, (n,).
+    """
+    return Block(shared.T @ shared, shared.T @ own, own.T @ own, shared.T @ residual, own.T @ residual)
+
+
+def arrow_step(blocks: Sequence[Block], damping: float) -> tuple[Array, list[Array]]:
+    """One damped Gauss-Newton step (Marquardt), (P,) and (Q,) each.
+
+    A shared direction that nothing tells gets no step.
+    """
+    solved = [_eliminated(block, damping) for block in blocks]
+    total = np.sum([reduced for reduced, _, _ in solved], axis=0)
+    right = np.sum([score for _, score, _ in solved], axis=0)
+    scale = np.sqrt(np.maximum(np.diagonal(total), 1e-300))
+    step, *_ = np.linalg.lstsq(total / np.outer(scale, scale), right / scale, rcond=1e-13)
+    step = step / scale
+    return step, [inner[:, -1] - inner[:, :-1] @ step for _, _, inner in solved]
+
+
+def arrow_evidence(
+    blocks: Sequence[Block], names: tuple[str, ...], unit: str, groups: int | None = None
+) -> Evidence:
+    """What each group says about the shared unknowns once its own are taken out.
+
+    Args:
+        blocks: At the solution.
+        names: Of the shared unknowns.
+        unit: What a group is.
+        groups: Join consecutive blocks into that many; None keeps each for itself.
+    """
+    normal, score, _ = zip(*(_eliminated(block, 0.0) for block in blocks), strict=True)
+    parts = np.array_split(np.arange(len(blocks)), min(groups or len(blocks), len(blocks)))
+    return Evidence(
+        names=names,
+        normal=np.array([np.sum([normal[i] for i in p], axis=0) for p in parts]),
+        score=np.array([np.sum([score[i] for i in p], axis=0) for p in parts]),
+        unit=unit,
+    )
+
+
+def _eliminated(block: Block, damping: float) -> tuple[Array, Array, Array]:
+    """Damped normal matrix (P, P) and right side (P,) of the shared alone; (bb + damping) ⁻¹ [abᵀ b], (Q, P + 1)."""
+    diagonal = np.diagonal(block.bb)
+    bb = block.bb + damping * np.diag(diagonal) + 1e-14 * float(diagonal.max()) * np.eye(len(diagonal))
+    inner = np.linalg.solve(bb, np.column_stack([block.ab.T, block.b]))
+    aa = block.aa + damping * np.diag(np.diagonal(block.aa))
+    return aa - block.ab @ inner[:, :-1], block.a - block.ab @ inner[:, -1], inner
+
+
+@dataclass(frozen=True, kw_only=True)
+class TukeyFit(Generic[State]):
+    """Where `tukey` ended. Rows without a measurement (NaN) are left out of everything."""
+
+    state: State
+    residual: Array
+    """Measured less predicted, (n, k)."""
+    jacobian: Array
+    """Of the prediction, (n, k, P)."""
+    weight: Array
+    """0 where a row disagrees, (n,)."""
+    sigma: float
+    """Robust standard deviation of a residual."""
+
+    @property
+    def rms(self) -> float:
+        """Weighted root mean square length of the residuals."""
+        return float(np.sqrt(np.average(np.sum(self.residual**2, axis=1), weights=self.weight)))
+
+    @property
+    def rejected(self) -> int:
+        """Rows without weight."""
+        return int(np.sum(self.weight <= 0.0))
+
+    def evidence(self, names: tuple[str, ...]) -> Evidence:
+        """What consecutive blocks of rows, a dozen where there are enough, say of the first unknowns."""
+        J, w = self.jacobian[..., : len(names)], self.weight / self.sigma**2
+        parts = np.array_split(np.arange(len(J)), max(2, min(12, len(J) // 4)))
+        return Evidence(
+            names=names,
+            normal=np.array([np.einsum("n,nki,nkj->ij", w[p], J[p], J[p]) for p in parts]),
+            score=np.array([np.einsum("n,nki,nk->i", w[p], J[p], self.residual[p]) for p in parts]),
+            unit="blocks",
+        )
+
+
+def tukey(
+    state: State,
+    linearise: Callable[[State], tuple[Array, Array]],
+    moved: Callable[[State, Array], State],
+    *,
+    rounds: int = 12,
+    rcond: float = 1e-9,
+) -> TukeyFit[State]:
+    """Gauss-Newton steps with Tukey's weights, their scale from the median residual.
+
+    Args:
+        state: Where to begin; the first weights follow from it.
+        linearise: Residuals (n, k) and the derivatives of the prediction (n, k, P) at a state.
+        moved: The state a step (P,) away.
+        rounds: Steps, at most.
+        rcond: Of the largest singular value: directions below it get no step.
+    """
+    for last in (False,) * rounds + (True,):
+        residual, J = linearise(state)
+        good = np.isfinite(residual).all(axis=1) & np.isfinite(J).all(axis=(1, 2))
+        residual, J = residual[good], J[good]
+        k = residual.shape[1]
+        sigma = max(1.4826 * float(np.median(np.abs(residual))), 1e-9)
+        size = np.linalg.norm(residual, axis=1)
+        weight = np.clip(1.0 - (size / (TUKEY * k**0.5 * sigma)) ** 2, 0.0, None) ** 2
+        if last:
+            break
+        root = np.sqrt(weight)[:, None]
+        rows, right = (root[..., None] * J).reshape(len(J) * k, -1), (root * residual).ravel()
+        step, *_ = np.linalg.lstsq(rows, right, rcond=rcond)
+        state = moved(state, step)
+        if np.abs(step).max() < 1e-9:
+            break
+    return TukeyFit(state=state, residual=residual, jacobian=J, weight=weight, sigma=sigma)

@@ -1,1 +1,0 @@
-"""Where tags, IMU and pressure port sit on the vehicle, from its motion."""

@@ -1,0 +1,442 @@
+"""What `finssim calibrate mounts` runs: read a log, find the mounts, write the vehicle, report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from finssim.calibration.errors import CalibrationError
+from finssim.calibration.fit import Curve, Estimate, Fit
+from finssim.calibration.output.calibrate import calibrated, doubts, kept
+from finssim.calibration.output.fit_output import fit_json, print_fit
+from finssim.calibration.output.report import FIT_FILE, write_report
+from finssim.calibration.output.vehicle_file import check_vehicle_path, write_vehicle
+from finssim.calibration.vision.mount_log import MountLog, read_mount_log
+from finssim.calibration.vision.report import command_line, publish
+from finssim.calibration.vision.sensor_mounts import (
+    UNSURE_TURN,
+    Attitude,
+    DepthFit,
+    ImuMounting,
+    fit_depth,
+    fit_imu_mounting,
+    imu_clock,
+    turn_residual,
+)
+from finssim.calibration.vision.tag_mounts import (
+    AXES,
+    UNSURE_LENGTH,
+    MountFit,
+    Noise,
+    Pose,
+    Rig,
+    fit_mounts,
+    reference_tag,
+    residuals,
+)
+from finssim.files import atomic_directory, atomic_write, refuse_unwritable
+from finssim.geometry.rotations import (
+    matrix_to_quat,
+    quat_conjugate,
+    quat_from_rotvec,
+    quat_multiply,
+    quat_to_matrix,
+    quat_to_rotvec,
+    skew,
+)
+from finssim.localization.detection.tags import corners
+from finssim.localization.pool import Pool, load_pool
+from finssim.vehicles import Vehicle, load_vehicle
+
+__all__ = ["run"]
+
+Array = NDArray[np.float64]
+
+ESTIMATES = ("tags", "sensors")
+
+STUDENT = 2.2
+"""95 % point of Student's distribution with the degrees of freedom of a dozen blocks."""
+
+EDGE_STD = 0.25e-3
+"""Standard deviation of a tag's edge measured with a ruler [m]: it makes every distance wrong by the same share."""
+
+KEPT = "the motion does not tell it: kept from the file"
+
+
+def distance_std(found: MountFit) -> float:
+    """Error of every depth from an edge that is measured a little wrong: its share of the apparent distance [m]."""
+    interface = found.rig.pool.interface
+    above = float(interface.normal @ found.rig.pool.camera.position) + interface.offset
+    below = -float(np.median([interface.normal @ pose.t for pose in found.state.poses])) - interface.offset
+    return EDGE_STD / found.rig.edge * (above * interface.index_far / interface.index_near + below)
+
+
+def tag_estimates(
+    found: MountFit, mounts: Mapping[int, Pose], vehicle: Vehicle
+) -> tuple[list[Estimate], dict[str, Any]]:
+    """Estimates of every tag, and the mounts to write; a tag of which nothing is told keeps the file's."""
+    estimates, written, told = [], {}, False
+    for tag, mount in vehicle.tags.mounts.items():  # type: ignore[union-attr]
+        written[tag] = {"position": list(mount.position), "orientation": list(mount.orientation)}
+    for tag in (found.rig.reference, *found.state.others):
+        pose, half = found.state.mount(tag, found.rig.reference), _half_widths(found, tag)
+        if not np.isfinite(half).any():
+            continue
+        told = True
+        written[tag] = {"position": pose.t.tolist(), "orientation": matrix_to_quat(pose.R).tolist()}
+        turn = quat_to_rotvec(matrix_to_quat(pose.R @ mounts.get(tag, pose).R.T))
+        note = f"{KEPT}, and it defines the body's axes and origin"
+        if tag != found.rig.reference:
+            note = "too few pictures show this tag together with others"
+        for axis, value, width in zip(AXES, np.append(np.degrees(turn), pose.t), half, strict=True):
+            unit, width = ("deg", math.degrees(width)) if "turn" in axis else ("m", width)
+            name = f"tags.{tag}.{axis}"
+            estimate = Estimate.within(name, value, width, unit, math.isfinite(width), note)
+            if unit == "m":
+                estimate = replace(estimate, path=f"tags.mounts.{tag}.position.{'xyz'.index(axis)}")
+            estimates.append(estimate)
+    return estimates, {"tags.mounts": dict(sorted(written.items()))} if told else {}
+
+
+def _half_widths(found: MountFit, tag: int) -> Array:
+    """Half widths of a tag's 95 % intervals, turn about the body axes [rad] and position [m], (6,).
+
+    What is kept from the file counts as exact for the other tags, which are told relative to it; for the reference tag
+    itself it is infinite.
+    """
+    own = np.array([found.half_width(f"reference.{axis}") for axis in AXES])
+    own[5] = np.hypot(own[5], 1.96 * distance_std(found))
+    if tag == found.rig.reference:
+        return own
+    R, arm = found.state.reference.R, found.state.reference.R @ found.state.others[tag].t
+    shared = np.where(np.isfinite(own), own, 0.0) ** 2
+    relative = np.array([found.half_width(f"{tag}.{axis}") for axis in AXES]) ** 2
+    turn = shared[:3] + R**2 @ relative[:3]
+    position = shared[3:] + skew(arm) ** 2 @ shared[:3] + R**2 @ relative[3:]
+    return np.sqrt(np.concatenate([turn, position]))
+
+
+def imu_orientation(
+    found: MountFit, imu: ImuMounting | CalibrationError | None, vehicle: Vehicle
+) -> tuple[list[Estimate], dict[str, Any]]:
+    """The IMU's orientation from its tilt and from its gyro, each by what it tells."""
+    if vehicle.sensors.imu is None:
+        return [], {}
+    start = np.asarray(vehicle.sensors.imu.orientation)
+    std = np.array([found.std(f"imu.turn_{axis}") for axis in "xyz"])
+    q, information = quat_multiply(matrix_to_quat(found.state.imu_turn), start), np.diag(1.0 / std**2)
+    if isinstance(imu, ImuMounting) and np.isfinite(imu.covariance).all():
+        second = np.linalg.inv(imu.covariance)
+        between = quat_to_rotvec(quat_multiply(imu.orientation, quat_conjugate(q)))
+        q = quat_multiply(quat_from_rotvec(np.linalg.pinv(information + second) @ second @ between), q)
+        information = information + second
+    known = np.diagonal(information) > 1e-6
+    half = np.where(known, STUDENT * np.sqrt(np.diagonal(np.linalg.pinv(information))), np.inf)
+    turn = np.degrees(quat_to_rotvec(quat_multiply(q, quat_conjugate(start))))
+    estimates = [
+        Estimate.within(
+            f"imu.turn_{axis}", turn[i], math.degrees(half[i]), "deg", half[i] < UNSURE_TURN, KEPT
+        )
+        for i, axis in enumerate("xyz")
+    ]
+    orientation = {"sensors.imu.orientation": (q / np.linalg.norm(q)).tolist()}
+    return estimates, orientation if (half < UNSURE_TURN).any() else {}
+
+
+def of_frozen(found: MountFit) -> list[str]:
+    """What the motion does not tell of the tags, one sentence each."""
+    sentences, tag = [], found.rig.reference
+    frozen = [name.partition(".")[2] for name in found.frozen if name.startswith("reference.")]
+    turns = " and ".join(name[-1] for name in frozen if "turn" in name)
+    lengths = " and ".join(name for name in frozen if "turn" not in name)
+    if turns:
+        sentences.append(
+            f"the motion does not tell the turn of tag {tag} about body {turns}: it keeps the file's, which so "
+            "defines the body's axes: rock the vehicle by 10 degrees and more about two axes to tell it from the IMU"
+        )
+    if lengths:
+        sentences.append(
+            f"the motion does not tell {lengths} of tag {tag} to {100.0 * UNSURE_LENGTH:g} cm: it keeps "
+            "the file's, which so defines the body's origin: measure one tag by hand, rock further, or turn on the "
+            "spot about a known point (--turns-about)"
+        )
+    others = sorted({name.partition(".")[0] for name in found.frozen if name[0].isdigit()}, key=int)
+    if others:
+        sentences.append(
+            f"tag {', '.join(others)}: too few pictures show it together with others to tell its place"
+        )
+    return sentences
+
+
+def of_imu(imu: ImuMounting | CalibrationError | None, estimate: str) -> list[str]:
+    """What is to be said of the gyro, one sentence each."""
+    if isinstance(imu, CalibrationError):
+        return [f"the gyro was not used: {imu}"]
+    if imu is None:
+        return []
+    turns = {axis: imu.estimates[f"imu.turn_{axis}"] for axis in "xyz"}
+    return [
+        *imu.advice,
+        *(
+            f"the gyro says that the IMU is turned by {turn.estimate:.0f} deg about body {axis} against the "
+            "tags found: check sensors.imu.orientation, or estimate it (--estimate sensors)"
+            for axis, turn in turns.items()
+            if estimate == "tags" and turn.identifiable and not turn.ci95[0] - 2.0 < 0.0 < turn.ci95[1] + 2.0
+        ),
+    ]
+
+
+def calibrate_mounts(
+    log: MountLog,
+    pool: Pool,
+    vehicle: Vehicle,
+    *,
+    name: str,
+    estimate: str = "tags",
+    centre: Sequence[float] | None = None,
+    seed: int = 0,
+) -> Fit:
+    """Where tags sit in the body, or how IMU and pressure port do, with everything that the motion tells.
+
+    Args:
+        log: The recording.
+        pool: Camera and water.
+        vehicle: Gives the tags' edge and the mounts so far.
+        name: Of the recording.
+        estimate: `tags`: IMU and pressure port are right in the file, tags are written. `sensors`: the tag that is seen
+            most is right in the file; the IMU's orientation, the port's height and the other tags are written.
+        centre: Body point that stays in place while the vehicle turns on the spot [m], if the recording is of that.
+        seed: Recorded; nothing here is random.
+
+    Raises:
+        CalibrationError: Unknown `estimate`, a vehicle without tags, a pool whose plane is no water surface, or a
+            recording with too little in it.
+    """
+    if estimate not in ESTIMATES:
+        raise CalibrationError(f"unknown estimate '{estimate}'; available: {', '.join(ESTIMATES)}")
+    tags = vehicle.file_tags
+    if tags is None:
+        raise CalibrationError(
+            f"{vehicle.name} has no tags: give its file a section tags with edge and one mount"
+        )
+    if not pool.is_surface:
+        raise CalibrationError(
+            "the pool's plane is no water surface: mounts need the camera above level water"
+        )
+    mounts = {
+        tag: Pose(quat_to_matrix(mount.orientation), np.asarray(mount.position, float))
+        for tag, mount in tags.mounts.items()
+    }
+    depth = vehicle.sensors.depth
+    rig = Rig(
+        pool=pool,
+        corners_t=corners(tags.edge),
+        port=np.zeros(3) if depth is None else np.asarray(depth.position, float),
+        reference=reference_tag(log.moments(), mounts),
+        centre=None if centre is None else np.asarray(centre, float),
+    )
+    clock = _clock(rig, mounts, log)
+    sure = clock is not None and clock.identifiable and not clock.ci95[0] <= 0.0 <= clock.ci95[1]
+    offset = clock.estimate if clock is not None and sure else 0.0
+    found = fit_mounts(rig, mounts, log.moments(offset), estimate=estimate)
+    imu = _imu(found, log, vehicle, offset)
+    rows, changes = tag_estimates(found, mounts, vehicle)
+    warnings = [*log.notes, *of_frozen(found), *of_imu(imu, estimate)]
+    quality = {"corners [px]": _figures(found.rms, found.left_out, len(found.moments), found.held_out_rms)}
+    if estimate == "sensors":
+        of_tilt, written = imu_orientation(found, imu, vehicle)
+        rows, changes = rows + of_tilt, changes | written
+    if isinstance(imu, ImuMounting):
+        rows += [row for row in imu.estimates.values() if "turn" not in row.name]
+        held_out = math.degrees(_turns_held_out(found, log, imu))
+        turns = _figures(math.degrees(imu.residual), imu.rejected, imu.windows, held_out)
+        quality["turns of the gyro [deg]"] = turns
+    rows += [clock] if clock is not None else []
+    pressure = _pressure(rig, found, mounts) if estimate == "sensors" else None
+    if pressure is not None:
+        rows += pressure.estimates.values()
+        warnings += pressure.advice
+        if pressure.estimates["depth.offset"].identifiable and depth is not None:
+            changes["sensors.depth.position.2"] = float(depth.position[2]) - pressure.offset
+        quality["depth [m]"] = _figures(pressure.rms, pressure.rejected)
+    return Fit(
+        kind="mounts",
+        method="vision",
+        vehicle=vehicle,
+        estimates={row.name: row for row in rows},
+        changes=changes,
+        quality=quality,
+        warnings=tuple(warnings),
+        curves=_curves(found),
+        trials={name: log.sha256},
+        settings={"estimate": estimate, "seed": seed, "reference_tag": found.rig.reference},
+    )
+
+
+def _figures(
+    rmse: float, rejected: int, samples: int | None = None, held_out: float = math.nan
+) -> dict[str, float]:
+    """Figures of a part of the fit; without samples nothing was held out."""
+    if samples is None:
+        return {"rmse": rmse, "rejected": float(rejected)}
+    figures = {"rmse": rmse, "rmse_held_out": held_out, "samples": float(samples)}
+    return {**figures, "rejected": float(rejected)}
+
+
+def _attitude(found: MountFit) -> Attitude:
+    times = np.array([moment.time for moment in found.moments])
+    return Attitude(t=times, quaternion=matrix_to_quat(np.array([pose.R for pose in found.state.poses])))
+
+
+def _window(attitude: Attitude) -> float:
+    return max(0.5, float(np.median(np.diff(attitude.t))))
+
+
+def _clock(rig: Rig, mounts: Mapping[int, Pose], log: MountLog) -> Estimate | None:
+    """What is to be added to the IMU's times, by turns that the pixels alone tell: tilts by the IMU agree with its gyro
+    whatever its clock does."""
+    if log.turning is None:
+        return None
+    blind = [replace(moment, up=None, depth=None) for moment in log.moments()]
+    alone = fit_mounts(rig, mounts, blind, estimate="sensors", held_out=False)
+    return imu_clock(_attitude(alone), rig.pool.interface.normal, log.turning.t, log.turning.values[:, 0])
+
+
+def _imu(
+    found: MountFit, log: MountLog, vehicle: Vehicle, offset: float
+) -> ImuMounting | CalibrationError | None:
+    """The IMU from the attitudes that the pixels and the tilt give; the refusal itself where they say too little."""
+    if log.gyro is None or vehicle.sensors.imu is None:
+        return None
+    attitude, start = _attitude(found), vehicle.sensors.imu.orientation
+    try:
+        return fit_imu_mounting(attitude, log.gyro, start=start, window=_window(attitude), time_offset=offset)
+    except CalibrationError as error:
+        return error
+
+
+def _turns_held_out(found: MountFit, log: MountLog, imu: ImuMounting) -> float:
+    """Disagreement of the second half's turns with the mounting of the first, robust rms [rad]; NaN if it is short."""
+    assert log.gyro is not None
+    every = _attitude(found)
+    half, window = len(every.t) // 2, _window(every)
+    first, second = (
+        Attitude(t=every.t[part], quaternion=every.quaternion[part])
+        for part in (slice(None, half), slice(half, None))
+    )
+    options = {"start": imu.orientation, "time_offset": imu.time_offset}
+    try:
+        return turn_residual(
+            fit_imu_mounting(first, log.gyro, window=window, **options), second, log.gyro, window=window
+        )
+    except CalibrationError:
+        return math.nan
+
+
+def _pressure(rig: Rig, found: MountFit, mounts: Mapping[int, Pose]) -> DepthFit | None:
+    """Depths by the pixels alone, with the mounts found, against what the sensor said."""
+    reading = {moment.time: moment.depth for moment in found.moments if moment.depth is not None}
+    if not reading:
+        return None
+    turned = [
+        replace(moment, depth=None, up=None if moment.up is None else found.state.imu_turn @ moment.up)
+        for moment in found.moments
+    ]
+    known = {tag: found.state.mount(tag, rig.reference) for tag in (rig.reference, *found.state.others)}
+    alone = fit_mounts(rig, {**mounts, **known}, turned, estimate="sensors", held_out=False)
+    readings = [reading.get(moment.time, math.nan) for moment in alone.moments]
+    return fit_depth(alone.port_depths, readings, known_std=distance_std(found))
+
+
+def _curves(found: MountFit) -> tuple[Curve, ...]:
+    """For the report: first corners, tilt and depth as measured and as the fit has them, over time."""
+    rig, state, moments = found.rig, found.state, found.moments
+    t = np.array([moment.time for moment in moments])
+    pixels, owner, _ = residuals(rig, state, moments, Noise())
+    tags = np.array([tag for moment in moments for tag in moment.corners])
+    seen = np.array([corner for moment in moments for corner in moment.corners.values()])
+    curves = []
+
+    def add(title: str, label: str, t: Array, measured: Array, fitted: Array) -> None:
+        if np.isfinite(measured).any():
+            columns = {"x": t, "measured": measured, "fitted": fitted}
+            curves.append(Curve(title=title, x_label="time [s]", y_label=label, **columns))
+
+    for tag in np.unique(tags):
+        of = tags == tag
+        for i, axis in enumerate("uv"):
+            measured = seen[of, 0, i]
+            fitted = measured - pixels[of, 0, i]
+            add(f"tag {tag}, top-left corner", f"{axis} [px]", t[owner[of]], measured, fitted)
+    felt = np.array([np.full(3, math.nan) if m.up is None else state.imu_turn @ m.up for m in moments])
+    up = np.array([pose.R.T @ rig.pool.interface.normal for pose in state.poses])
+    for i, axis in enumerate("xy"):
+        add("tilt by the IMU", f"up along body {axis} [-]", t, felt[:, i], up[:, i])
+    depth = np.array([math.nan if m.depth is None else m.depth for m in moments])
+    add("pressure port", "depth [m]", t, depth, found.port_depths + state.depth_offset)
+    return tuple(curves)
+
+
+def run(
+    log: Path,
+    *,
+    pool: Path,
+    vehicle: str,
+    out: Path,
+    estimate: str = "tags",
+    turns_about: Sequence[float] | None = None,
+    report: Path | None = None,
+    seed: int = 0,
+    as_json: bool = False,
+) -> Vehicle:
+    """Find mounts in a recording and write the vehicle.
+
+    Args:
+        log: Folder with detections.csv, imu.csv, depth.csv.
+        pool: Pool file.
+        vehicle: Name or file.
+        out: Vehicle file to write, .yaml.
+        estimate: `tags` (sensors are right in the file) or `sensors` (the tag seen most is).
+        turns_about: Body point that stays in place while the vehicle turns on the spot [m], (3,).
+        report: Directory of the report, or None.
+        seed: Recorded.
+        as_json: Print one JSON object in place of the table.
+
+    Returns:
+        The vehicle written.
+
+    Raises:
+        CalibrationError, LocalizationError, VehicleError, OutputError: As they say; nothing is written then.
+    """
+    refuse_unwritable(atomic_write(check_vehicle_path(out)))
+    if report is not None:
+        refuse_unwritable(atomic_directory(report, replaces=FIT_FILE))
+    where, body = load_pool(pool), load_vehicle(vehicle)
+    recording = read_mount_log(log, where, body)
+    fit = calibrate_mounts(
+        recording, where, body, name=Path(log).name, estimate=estimate, centre=turns_about, seed=seed
+    )
+    after = calibrated(fit)
+    warnings = doubts(fit, after)
+    write_vehicle(after, out)
+    if report is not None:
+        options = {"pool": pool, "vehicle": vehicle, "out": out, "estimate": estimate, "seed": seed}
+        point = None if turns_about is None else ",".join(f"{x:g}" for x in turns_about)
+        command = command_line("mounts", [log], {**options, "turns_about": point})
+        write_report(fit, report, after, command=command, warnings=warnings, out=out)
+
+    def show(console: Console) -> None:
+        print_fit(fit, after, console, warnings)
+        if unchanged := kept(fit, after):
+            console.print(f"kept from the file: {', '.join(unchanged)}", highlight=False, markup=False)
+
+    record = fit_json(fit, after, out=out, warnings=warnings) if as_json else None
+    publish(record, show, (out, report))
+    return after

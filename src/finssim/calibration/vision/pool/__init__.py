@@ -1,1 +1,0 @@
-"""Camera pose and water plane, from surveyed points."""

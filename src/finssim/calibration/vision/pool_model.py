@@ -1,0 +1,543 @@
+"""One camera before one plane: predicted pixels, what is known beforehand, and least squares for both."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from finssim.calibration.errors import CalibrationError
+from finssim.calibration.vision.survey import Observations
+from finssim.geometry.optics import Camera, Interface, Layer, Lens, Status, project, projection_jacobians
+from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_to_matrix, skew
+
+__all__ = [
+    "LENS_NAMES",
+    "NAMES",
+    "PoolModel",
+    "Prior",
+    "Settings",
+    "Solution",
+    "active_names",
+    "clearances",
+    "extended_lens",
+    "lens_std",
+    "normal_equations",
+    "residuals",
+    "solve",
+]
+
+Array = NDArray[np.float64]
+
+POSE_NAMES = ("camera_x", "camera_y", "camera_z", "rotation_x", "rotation_y", "rotation_z")
+LENS_NAMES = (
+    "focal",
+    "center_x",
+    "center_y",
+    "distortion_1",
+    "distortion_2",
+    "distortion_3",
+    "distortion_4",
+    "distortion_5",
+)
+NAMES = (*POSE_NAMES, "tilt_x", "tilt_y", "depth", "index", *LENS_NAMES)
+"""Order of every vector of parameters: camera centre [m], rotation by pool axes [rad], tilt of the plane about the
+reference point [rad], distance of the plane from the reference point [m], index beyond it, logarithm of the focal
+length, optical centre [px], first five coefficients of distortion as the lens lists them."""
+
+_LENGTHS = {"plumb_bob": 5, "rational": 8, "fisheye": 4}
+
+
+def extended_lens(lens: Lens) -> Lens:
+    """The same lens with room for coefficients of distortion that it leaves out."""
+    missing = _LENGTHS[lens.model] - len(lens.distortion)
+    return replace(lens, distortion=(*lens.distortion, *([0.0] * missing))) if missing > 0 else lens
+
+
+@dataclass(frozen=True)
+class PoolModel:
+    """Camera and plane. All in the pool frame."""
+
+    camera: Camera
+    interface: Interface
+    reference: Array
+    """Point of the survey under water that the plane turns about and is told from, (3,) [m]."""
+    refractive: bool = True
+    """False: straight lines, as if nothing were between the camera and the points."""
+
+    @property
+    def depth(self) -> float:
+        """Distance of the plane from the reference point, towards the camera [m]."""
+        return -float(self.interface.normal @ self.reference + self.interface.offset)
+
+    @property
+    def clearance(self) -> float:
+        """Distance of the camera from the plane, on its own side [m]."""
+        return float(self.interface.normal @ self.camera.position + self.interface.offset)
+
+    @cached_property
+    def tangents(self) -> Array:
+        """Directions that the plane's normal tilts towards, (2, 3)."""
+        return np.stack([np.asarray(e, float) for e in self.interface.tangents()])
+
+    def predict(self, points: Array, dry: NDArray[np.bool_]) -> Array:
+        """Pixels of points, (N, 3) -> (N, 2); NaN where the camera cannot see them or they are beyond no plane.
+
+        Args:
+            points: Pool frame [m].
+            dry: Points on the camera's side of the plane, seen in a straight line, (N,).
+        """
+        pixels = np.full((len(points), 2), np.nan)
+        wet = ~dry if self.refractive else np.zeros(len(points), bool)
+        if wet.any():
+            seen = project(self.camera, self.interface, points[wet])
+            good = (seen.status == Status.OK) | (seen.status == Status.OUTSIDE_IMAGE)
+            pixels[wet] = np.where(good[:, None], seen.pixels, np.nan)
+        if not wet.all():
+            direct, ok = self.camera.lens.project(self._optical(points[~wet]))
+            pixels[~wet] = np.where(ok[:, None], direct, np.nan)
+        return pixels
+
+    def jacobians(self, points: Array, dry: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """Derivatives of `predict`: by the parameters in the order of `NAMES` (N, 2, 18), by the point (N, 2, 3)."""
+        J, J_point = np.zeros((len(points), 2, len(NAMES))), np.zeros((len(points), 2, 3))
+        wet = ~dry if self.refractive else np.zeros(len(points), bool)
+        if wet.any():
+            of = projection_jacobians(self.camera, self.interface, points[wet])
+            tilt = of.interface[..., :2] - of.interface[..., 2:] * (self.tangents @ self.reference)
+            parts = (of.pose, tilt, -of.interface[..., 2:], of.index[..., None], self._lens_columns(of.lens))
+            J[wet], J_point[wet] = np.concatenate(parts, axis=-1), of.point
+        if not wet.all():
+            J[~wet], J_point[~wet] = self._direct_jacobians(points[~wet])
+        return J, J_point
+
+    def moved(self, step: Array) -> PoolModel:
+        """The model a small step away, (18,) in the order of `NAMES`."""
+        camera, plane = self.camera, self.interface
+        turn = quat_to_matrix(quat_from_rotvec(step[3:6]))
+        orientation = matrix_to_quat(turn @ np.asarray(camera.R_pc))
+        normal = plane.normal + step[6:8] @ self.tangents
+        normal = normal / np.linalg.norm(normal)
+        offset = -(self.depth + step[8]) - float(normal @ self.reference)
+        return replace(
+            self,
+            camera=Camera(_lens_moved(camera.lens, step[10:]), camera.position + step[:3], orientation),
+            interface=replace(
+                plane, normal=normal, offset=offset, index_far=float(plane.index_far + step[9])
+            ),
+        )
+
+    def shifted(self, vector: Array) -> PoolModel:
+        """The same model in a frame whose origin is at `-vector` of this one: everything moves by `vector` [m]."""
+        plane = self.interface
+        return replace(
+            self,
+            camera=replace(self.camera, position=self.camera.position + vector),
+            interface=replace(plane, offset=float(plane.offset - plane.normal @ vector)),
+            reference=self.reference + vector,
+        )
+
+    def _optical(self, points: Array) -> Array:
+        return np.asarray((points - self.camera.position) @ np.asarray(self.camera.R_pc))
+
+    def _lens_columns(self, of_lens: Array) -> Array:
+        """Derivatives by fx fy cx cy and distortion as those by log focal, centre and distortion, (N, 2, 8)."""
+        lens = self.camera.lens
+        focal = of_lens[..., 0] * lens.fx + of_lens[..., 1] * lens.fy
+        known = of_lens[..., 4:9]
+        zeros = np.zeros((*known.shape[:-1], 5 - known.shape[-1]))
+        return np.concatenate([focal[..., None], of_lens[..., 2:4], known, zeros], axis=-1)
+
+    def _direct_jacobians(self, points: Array) -> tuple[Array, Array]:
+        optical, R_pc = self._optical(points), np.asarray(self.camera.R_pc)
+        by_point = self.camera.lens.project_jacobian(optical) @ R_pc.T
+        by_turn = by_point @ skew(points - self.camera.position)
+        lens = self._lens_columns(self.camera.lens.parameter_jacobian(optical))
+        plane = np.zeros((len(points), 2, 4))
+        return np.concatenate([-by_point, by_turn, plane, lens], axis=-1), by_point
+
+
+def _lens_moved(lens: Lens, step: Array) -> Lens:
+    if not step.any():
+        return lens
+    factor = float(np.exp(step[0]))
+    terms = list(lens.distortion)
+    for i, change in enumerate(step[3:8]):
+        if i < len(terms):
+            terms[i] += float(change)
+    return replace(
+        lens,
+        fx=lens.fx * factor,
+        fy=lens.fy * factor,
+        cx=lens.cx + float(step[1]),
+        cy=lens.cy + float(step[2]),
+        distortion=tuple(terms),
+    )
+
+
+INTERFACES = ("auto", "surface", "wall")
+
+FITTED = {
+    "pose": NAMES[:6],
+    "height": ("depth",),
+    "tilt": ("tilt_x", "tilt_y"),
+    "index": ("index",),
+    "focal": ("focal",),
+    "center": ("center_x", "center_y"),
+    "distortion": NAMES[13:],
+}
+"""What may be fitted -> its parameters."""
+
+LENS_STD = (0.05, 0.03, 0.03, 0.15, 0.15, 0.02, 0.02, 0.1)
+"""How far a camera file that is only roughly right may be off: log focal, centre in widths of the image, distortion."""
+
+
+THICKEST = 0.5
+"""Thickness of a window beyond which another unit than metres is meant [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Options; standard deviations are of what is known before the pictures."""
+
+    interface: str = "auto"
+    """`surface` (normal along the survey's z), `wall` (any direction) or `auto`."""
+    plane: tuple[float, float, float, float] | None = None
+    """Surveyed plane n . X + b = 0 as n_x, n_y, n_z, b [m]; the sense of n does not matter."""
+    window: tuple[Layer, ...] = ()
+    """Layers between, the first one next to the camera."""
+    water_height: float | None = None
+    """z of the surface in the survey's frame [m]."""
+    water_depth: float | None = None
+    """Distance from the middle of the surveyed points to the surface [m], for a survey of one plane."""
+    water_height_sigma: float = 0.005
+    """Of either, or of the surveyed plane's position [m]."""
+    index: float = 1.333
+    """Of the water."""
+    index_sigma: float = 0.003
+    """Of that; 0 holds it."""
+    index_near: float = 1.0003
+    """On the camera's side."""
+    tilt_sigma: float | None = None
+    """Of the plane's direction [rad]; None: 0.2 degrees for a surface, 0.5 for a surveyed plane, free for a wall."""
+    fit: tuple[str, ...] | None = None
+    """Of `FITTED`; None: pose, height, tilt and index, and the lens where held-out points get better by it."""
+    focal_sigma: float = 0.0
+    """Of the camera file's focal length, relative; 0 holds it unless `fit` names it."""
+    center_sigma: float = 0.0
+    """Of the camera file's optical centre along each axis [px]; 0 holds it unless `fit` names it."""
+    pixel_sigma: float | None = None
+    """Of a pixel [px]; None: from the residuals."""
+    survey_sigma: float = 0.002
+    """Of a surveyed coordinate [m]."""
+    survey_yaw_sigma: float = math.radians(0.5)
+    """Of a tag's direction [rad]."""
+    folds: int = 5
+    """Parts that are held out in turn."""
+    seed: int = 0
+    """Of the parts and of samples."""
+
+    def __post_init__(self) -> None:
+        if self.interface not in INTERFACES:
+            raise CalibrationError(
+                f"unknown interface '{self.interface}'; available: {', '.join(INTERFACES)} (a window or wall of known "
+                "place is --plane)"
+            )
+        for name in self.fit or ():
+            if name not in FITTED:
+                raise CalibrationError(f"unknown '{name}' to fit; available: {', '.join(FITTED)}")
+        if self.fit is not None and "pose" not in self.fit:
+            raise CalibrationError("fit leaves the pose out: the camera's pose is always fitted, add pose")
+        known = [self.water_height is not None, self.water_depth is not None, self.plane is not None]
+        if sum(known) > 1:
+            raise CalibrationError(
+                "the place of the water is given twice: give one of its height, depth and plane"
+            )
+        if self.fit is not None and "height" not in self.fit and not any(known):
+            raise CalibrationError(
+                "fit leaves the height out and none is given: add height, or give --water-height"
+            )
+        for layer in self.window:
+            if layer.thickness > THICKEST:
+                raise CalibrationError(
+                    f"window is {layer.thickness:g} m thick, expected at most {THICKEST:g}: thickness is in metres, "
+                    "10 mm of glass are 0.010:1.52"
+                )
+        _positive("index", self.index, 1.0, 2.5)
+        _positive("index sigma", self.index_sigma, 0.0, 1.0)
+        _positive("tilt sigma [deg]", math.degrees(self.tilt_sigma or 0.0), 0.0, 180.0)
+        _positive("water height sigma", self.water_height_sigma, 0.0, 10.0)
+        _positive("survey sigma", self.survey_sigma, 0.0, 1.0)
+        _positive("survey yaw sigma [deg]", math.degrees(self.survey_yaw_sigma), 0.0, 180.0)
+        _positive("focal sigma", self.focal_sigma, 0.0, 10.0)
+        _positive("center sigma", self.center_sigma, 0.0, 1e4)
+        if self.pixel_sigma is not None:
+            _positive("pixel sigma", self.pixel_sigma, 1e-3, 100.0)
+        if self.folds < 2:
+            raise CalibrationError(f"folds is {self.folds}, expected at least 2")
+        if self.plane is not None and not np.linalg.norm(self.plane[:3]) > 0.0:
+            raise CalibrationError(f"plane has normal {self.plane[:3]}, expected a direction")
+
+    @property
+    def known_depth(self) -> bool:
+        """Whether a measurement of the plane's place is given."""
+        return any(x is not None for x in (self.water_height, self.water_depth, self.plane))
+
+
+def active_names(settings: Settings, extra: tuple[str, ...] = ()) -> NDArray[np.bool_]:
+    """Which of `NAMES` are fitted, (18,)."""
+    groups = list(settings.fit or ("pose", "height", "tilt", "index")) + list(extra)
+    if settings.focal_sigma > 0.0:
+        groups.append("focal")
+    if settings.center_sigma > 0.0:
+        groups.append("center")
+    names = {name for group in groups for name in FITTED[group]}
+    if settings.index_sigma <= 0.0:
+        names -= {"index"}
+    if settings.tilt_sigma is not None and settings.tilt_sigma <= 0.0:
+        names -= {"tilt_x", "tilt_y"}
+    if settings.known_depth and settings.water_height_sigma <= 0.0:
+        names -= {"depth"}
+    return np.array([name in names for name in NAMES])
+
+
+def lens_std(settings: Settings, width: int) -> tuple[float, ...]:
+    """Standard deviations of `LENS_NAMES` before the pictures."""
+    focal, x, y, *distortion = LENS_STD
+    if settings.focal_sigma > 0.0:
+        focal = settings.focal_sigma
+    if settings.center_sigma > 0.0:
+        return (focal, settings.center_sigma, settings.center_sigma, *distortion)
+    return (focal, x * width, y * width, *distortion)
+
+
+def _positive(what: str, value: float, least: float, most: float) -> None:
+    if not (math.isfinite(value) and least <= value <= most):
+        raise CalibrationError(f"{what} is {value:g}, expected a number from {least:g} to {most:g}")
+
+
+LOST = 500.0
+"""Residual that stands for a point the model cannot see at all [px]."""
+
+NEARER = 0.1
+"""Part of its distance from a point or the camera that one step must leave the plane."""
+
+MOST_BOUNDS = 60
+"""Points looked at in one step, those that the plane comes nearest to."""
+
+Whitening = Callable[[Array], Array]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prior:
+    """What is known beforehand: Gaussian, each standard deviation infinite where nothing is."""
+
+    normal: Array | None = None
+    """Into the camera's side, (3,)."""
+    tilt_std: float = np.inf
+    """[rad]"""
+    depth: float = np.nan
+    """Distance of the plane from the reference point [m]."""
+    depth_std: float = np.inf
+    start: PoolModel
+    """Holds index and lens that `index_std` and `lens_std` are about."""
+    index_std: float = np.inf
+    lens_std: tuple[float, ...] = (np.inf,) * 8
+    """Of log focal, centre [px], distortion."""
+
+    def rows(self, model: PoolModel) -> tuple[Array, Array]:
+        """Residuals (M,) of the priors, each over its standard deviation, and their derivatives (M, 18)."""
+        r: list[float] = []
+        J: list[Array] = []
+
+        def add(residual: float, std: float, columns: dict[int, float]) -> None:
+            if np.isfinite(std) and std > 0.0:
+                row = np.zeros(len(NAMES))
+                for k, value in columns.items():
+                    row[k] = value / std
+                r.append(residual / std)
+                J.append(row)
+
+        if self.normal is not None:
+            for e in self._tangents():
+                along = model.tangents @ e
+                add(float(model.interface.normal @ e), self.tilt_std, {6: along[0], 7: along[1]})
+        if np.isfinite(self.depth):
+            add(model.depth - self.depth, self.depth_std, {8: 1.0})
+        add(model.interface.index_far - self.start.interface.index_far, self.index_std, {9: 1.0})
+        for k, (now, before) in enumerate(zip(lens_values(model), lens_values(self.start), strict=True)):
+            add(now - before, self.lens_std[k], {10 + k: 1.0})
+        return np.array(r), np.array(J).reshape(-1, len(NAMES))
+
+    def _tangents(self) -> Array:
+        assert self.normal is not None
+        axis = np.eye(3)[int(np.argmin(np.abs(self.normal)))]
+        e1 = np.cross(self.normal, axis)
+        e1 /= np.linalg.norm(e1)
+        return np.stack([e1, np.cross(self.normal, e1)])
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Where the search ended."""
+
+    model: PoolModel
+    cost: float
+    """Half the sum of squares of whitened residuals and priors."""
+    iterations: int
+    converged: bool
+
+
+def lens_values(model: PoolModel) -> list[float]:
+    """Log focal length, centre and five coefficients of distortion of the model's lens."""
+    lens = model.camera.lens
+    terms = (*lens.distortion, *([0.0] * 5))[:5]
+    return [float(np.log(lens.fx)), lens.cx, lens.cy, *terms]
+
+
+def residuals(model: PoolModel, seen: Observations) -> tuple[Array, NDArray[np.bool_]]:
+    """Measured minus predicted pixel (N, 2), and where there is one (N,); `LOST` elsewhere."""
+    r = seen.pixels - model.predict(seen.points, seen.dry)
+    ok = np.isfinite(r).all(axis=1)
+    return np.where(ok[:, None], r, LOST), ok
+
+
+def solve(
+    start: PoolModel,
+    seen: Observations,
+    whiten: Whitening,
+    active: NDArray[np.bool_],
+    prior: Prior,
+    *,
+    iterations: int = 60,
+    tolerance: float = 1e-9,
+) -> Solution:
+    """Minimise |whiten(measured - predicted)|² plus the priors.
+
+    Args:
+        start: Where to begin.
+        seen: The rows.
+        whiten: Turns residuals (N, 2) and derivatives (N, 2, P) into independent rows of unit variance.
+        active: Which of `NAMES` move, (18,).
+        prior: Of those and of the others.
+        iterations: At most.
+        tolerance: Relative change of the cost at which the search ends.
+    """
+    model = start
+    cost = _cost(model, seen, whiten, prior)
+    damping, free = 1e-3, np.flatnonzero(active)
+    for iteration in range(iterations):
+        N, g = normal_equations(model, seen, whiten, free, prior)
+        bounds = _bounds(model, seen, free)
+        scale = np.sqrt(np.maximum(np.diagonal(N), 1e-300))
+        H, b = N / np.outer(scale, scale), g / scale
+        while True:
+            step = np.zeros(len(NAMES))
+            step[free] = _sliding(H + damping * np.eye(len(free)), b, scale, bounds) / scale
+            trial = _tried(model, step, seen, 8 in free)
+            new = np.inf if trial is None else _cost(trial, seen, whiten, prior)
+            if new <= cost:
+                break
+            damping *= 4.0
+            if damping > 1e10:
+                return Solution(model, cost, iteration, True)
+        assert trial is not None
+        gain, model, cost = cost - new, trial, new
+        damping = max(damping / 6.0, 1e-12)
+        if gain <= tolerance * max(cost, 1e-12) and damping < 1.0:
+            return Solution(model, cost, iteration + 1, True)
+    return Solution(model, cost, iterations, False)
+
+
+def normal_equations(
+    model: PoolModel, seen: Observations, whiten: Whitening, free: NDArray[np.intp], prior: Prior
+) -> tuple[Array, Array]:
+    """Information (P, P) and gradient (P,) at a model, by the parameters `free`, priors included."""
+    r, ok = residuals(model, seen)
+    J = model.jacobians(seen.points, seen.dry)[0][..., free]
+    J = np.where((ok & np.isfinite(J).all(axis=(1, 2)))[:, None, None], J, 0.0)
+    A, e = whiten(J), whiten(r)
+    r_prior, J_prior = prior.rows(model)
+    J_prior = J_prior[:, free]
+    return A.T @ A + J_prior.T @ J_prior, A.T @ e - J_prior.T @ r_prior
+
+
+def _cost(model: PoolModel, seen: Observations, whiten: Whitening, prior: Prior) -> float:
+    if model.refractive and (model.clearance <= 0.0 or not 1.0 < model.interface.index_far < 3.0):
+        return np.inf
+    e = whiten(residuals(model, seen)[0])
+    r = prior.rows(model)[0]
+    return 0.5 * float(e @ e + r @ r)
+
+
+def clearances(model: PoolModel, points: Array) -> Array:
+    """Distances of points from the far side of the plane and its window, on their own side positive, (N,) [m]."""
+    return model.depth - (points - model.reference) @ model.interface.normal - model.interface.thickness
+
+
+def _bounds(model: PoolModel, seen: Observations, free: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Clearances of the points in the water and of the camera (M,), and their derivatives by the parameters (M, P)."""
+    if not model.refractive:
+        return np.zeros(0), np.zeros((0, len(free)))
+    wet, n = seen.points[~seen.dry], model.interface.normal
+    distance = clearances(model, wet)
+    wet, distance = wet[distance > 0.0], distance[distance > 0.0]
+    rows = np.zeros((len(wet) + 1, len(NAMES)))
+    rows[:-1, 6:8] = -(wet - model.reference) @ model.tangents.T
+    rows[:-1, 8] = 1.0
+    rows[-1, :3] = n
+    rows[-1, 6:8] = model.tangents @ (model.camera.position - model.reference)
+    rows[-1, 8] = -1.0
+    return np.append(distance, model.clearance), rows[:, free]
+
+
+def _sliding(H: Array, b: Array, scale: Array, bounds: tuple[Array, Array]) -> Array:
+    """The least of x H x / 2 - b x among steps that leave every clearance a tenth of what it is.
+
+    A problem of least distance, solved by non-negative least squares (Lawson and Hanson, Solving Least Squares
+    Problems, ch. 23).
+    """
+    x = np.linalg.solve(H, b)
+    distance, rows = bounds
+    left = distance + (rows / scale) @ x
+    if np.all(left >= NEARER * distance):
+        return x
+    near = np.argsort(left / np.maximum(distance, 1e-300))[:MOST_BOUNDS]
+    values, vectors = np.linalg.eigh(H)
+    root = vectors / np.sqrt(np.maximum(values, 1e-14))
+    G = (rows[near] / scale) @ root
+    length = np.maximum(np.linalg.norm(G, axis=1), 1e-300)
+    h = (NEARER * distance[near] - left[near]) / length
+    size = float(np.abs(h).max())
+    E = np.concatenate([(G / length[:, None]).T, h[None] / size])
+    try:
+        weight, off = nnls(E, np.append(np.zeros(len(x)), 1.0))
+    except RuntimeError:
+        return x
+    r = E @ weight - np.append(np.zeros(len(x)), 1.0)
+    return x if off < 1e-9 else np.asarray(x - root @ r[:-1] / r[-1] * size)
+
+
+def _tried(model: PoolModel, step: Array, seen: Observations, movable: bool) -> PoolModel | None:
+    """The model a step away, or None where the step leads out of all sense.
+
+    What a turn of the plane takes from a clearance beyond first order is given back by its depth where that may move.
+    """
+    if not np.isfinite(step).all() or np.abs(step[3:8]).max() > 1.0 or abs(step[10]) > 0.5:
+        return None
+    try:
+        trial = model.moved(step)
+        if model.refractive and movable:
+            before = clearances(model, seen.points)
+            held = (before > 0.0) & ~seen.dry
+            short = 0.5 * NEARER * before - clearances(trial, seen.points)
+            if held.any() and (back := float(short[held].max())) > 0.0:
+                trial = model.moved(step + back * (np.arange(len(NAMES)) == 8))
+        return trial
+    except ValueError:
+        return None

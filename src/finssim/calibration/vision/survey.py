@@ -1,0 +1,758 @@
+"""What was surveyed in a pool, and the pixels that belong to it, from tables as people write them and from pictures."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.calibration.errors import CalibrationError
+from finssim.geometry.rotations import quat_from_euler, quat_rotate
+from finssim.localization.detection.detections import Frame, most_certain, read_detections
+from finssim.localization.detection.tags import corners
+from finssim.localization.errors import LocalizationError
+from finssim.localization.fields import Fields
+from finssim.yaml_file import read_mapping
+
+__all__ = ["Observations", "observe", "observe_combined", "read_survey"]
+
+Array = NDArray[np.float64]
+
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
+"""Metres in one of each."""
+
+LENGTHS = ("x", "y", "z", "sigma", "edge")
+
+_ALIASES = {
+    "u": (
+        "u",
+        "px",
+        "pxx",
+        "col",
+        "column",
+        "ximg",
+        "ximage",
+        "imagex",
+        "imgx",
+        "xpx",
+        "upx",
+        "pixelx",
+        "xpixel",
+    )
+    + ("pixelu", "upixel", "xpix", "pixx", "imgu", "imageu", "uimg"),
+    "v": ("v", "py", "pxy", "row", "yimg", "yimage", "imagey", "imgy", "ypx", "vpx", "pixely", "ypixel")
+    + ("pixelv", "vpixel", "ypix", "pixy", "imgv", "imagev", "vimg"),
+    "x": (
+        "x",
+        "worldx",
+        "floorx",
+        "xworld",
+        "xfloor",
+        "objx",
+        "objectx",
+        "xobj",
+        "xw",
+        "wx",
+        "poolx",
+        "xpool",
+    )
+    + ("xp", "tankx", "xtank", "realx", "xreal", "easting"),
+    "y": (
+        "y",
+        "worldy",
+        "floory",
+        "yworld",
+        "yfloor",
+        "objy",
+        "objecty",
+        "yobj",
+        "yw",
+        "wy",
+        "pooly",
+        "ypool",
+    )
+    + ("yp", "tanky", "ytank", "realy", "yreal", "northing"),
+    "z": (
+        "z",
+        "worldz",
+        "floorz",
+        "zworld",
+        "zfloor",
+        "objz",
+        "objectz",
+        "zobj",
+        "zw",
+        "wz",
+        "poolz",
+        "zpool",
+    )
+    + ("zp", "tankz", "ztank", "realz", "zreal", "elevation"),
+    "id": (
+        "id",
+        "point",
+        "pointid",
+        "pt",
+        "ptid",
+        "name",
+        "marker",
+        "markerid",
+        "label",
+        "n",
+        "no",
+        "nr",
+        "index",
+    ),
+    "tag": ("tag", "tagid"),
+    "image": ("image", "img", "file", "filename", "imagename", "picture", "photo", "frame"),
+    "sigma": ("sigma", "std", "error", "uncertainty", "survey_sigma", "surveysigma"),
+    "edge": ("edge", "size", "tagsize", "tagedge", "side"),
+    "yaw": ("yaw", "heading", "psi"),
+    "roll": ("roll", "phi"),
+    "pitch": ("pitch", "theta"),
+    "group": ("group", "location", "board", "target"),
+    "dry": ("dry", "above", "abovewater", "inair", "air"),
+}
+_BY_WORD = {word: name for name, words in _ALIASES.items() for word in words}
+
+_UNIT_AT_END = re.compile(r"[\s_]*[\[(]\s*([^\])]*?)\s*[\])]\s*$|_(m|cm|mm|in|inch|ft|deg|rad|px)$")
+_UNIT_COMMENT = re.compile(
+    r"#.*\bunits?\b\s*[:=]?\s*(?:in\s+)?\[?(m|cm|mm|in|inch|ft|metres?|meters?)\b", re.IGNORECASE
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a table."""
+
+    line: int
+    """Of the file, from 1."""
+    words: dict[str, str]
+    """Cells that are not empty, by the standard name of their column."""
+    numbers: dict[str, float]
+    """Those that are numbers: lengths in metres, angles in radians, pixels."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of rows with standard column names."""
+
+    path: str
+    columns: tuple[str, ...]
+    rows: tuple[Row, ...]
+    united: bool
+    """Whether the file, or its reader, says the unit of lengths."""
+    notes: tuple[str, ...] = ()
+
+    def refuse(self, row: Row, sentence: str) -> CalibrationError:
+        """The error that says so of a row."""
+        return CalibrationError(f"{self.path}: line {row.line}: {sentence}")
+
+
+def unit_factor(unit: str) -> float:
+    """Metres in one of a unit.
+
+    Raises:
+        CalibrationError: It is unknown.
+    """
+    try:
+        return UNITS[unit]
+    except KeyError:
+        raise CalibrationError(f"unknown unit '{unit}'; available: {', '.join(UNITS)}") from None
+
+
+def read_table(path: str | Path, *, unit: str | None = None) -> Table:
+    """Read a table of points, pixels or tags.
+
+    Columns may have any case and order; lengths may carry their unit (`x_mm`, `x [mm]`, `X (cm)`) or a comment line may
+    (`# unit: mm`); else they are metres, or of `unit`. Angles are `yaw_deg` or `yaw_rad`; a bare `yaw` is in radians
+    if all of its numbers are below 2 pi, else in degrees. Separators: comma, semicolon, tab or blanks.
+
+    Args:
+        path: The file.
+        unit: Of lengths, where the file does not say.
+
+    Raises:
+        CalibrationError: Unreadable, no header, a cell that must be a number is none; names the line.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        raise CalibrationError(f"cannot read {path}: {error.strerror or error}") from error
+    lines = [(i, line.strip()) for i, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    said = next((m[1].lower() for _, line in lines if (m := _UNIT_COMMENT.match(line))), None)
+    comments = [line for _, line in lines if line.startswith(("#", "%", "//"))]
+    lines = [(i, line) for i, line in lines if not line.startswith(("#", "%", "//"))]
+    if lines and comments and _known(lines[0][1]) < 2:  # the header itself may be behind a comment sign
+        head = max((line.lstrip("#%/ ") for line in comments), key=_known)
+        lines = [(0, head), *lines] if _known(head) >= 2 else lines
+    if not lines:
+        what = "holds nothing but comments" if comments else "is empty"
+        raise CalibrationError(
+            f"{path}: the file {what}: expected a line of names, such as id,x,y,z, and rows"
+        )
+    if _is_numeric(lines[0][1]):
+        raise CalibrationError(
+            f"{path}: the first line is no header: name the columns, such as id,x,y,z or u,v,x,y,z"
+        )
+    default = "m" if said and said.startswith("met") else said or unit
+    return _table(str(path), lines, default)
+
+
+def _table(path: str, lines: list[tuple[int, str]], default: str | None) -> Table:
+    split = _splitter(lines[0][1])
+    heads = [_column(word) for word in split(lines[0][1])]
+    names = [name for name, _ in heads]
+    twice = sorted({name for name in names if name and names.count(name) > 1})
+    if twice:
+        raise CalibrationError(f"{path}: two columns mean '{twice[0]}': leave one of them")
+    united = default is not None or any(unit in UNITS for _, unit in heads)
+    cells = [(i, split(line)) for i, line in lines[1:]]
+    factors = [
+        _factor(name, unit, default, [c[k] for _, c in cells if k < len(c)])
+        for k, (name, unit) in enumerate(heads)
+    ]
+    rows = []
+    for i, words in cells:
+        given = {n: w for n, w in zip(names, words, strict=False) if n and w}
+        numbers = {
+            n: x * f
+            for (n, w), f in zip(zip(names, words, strict=False), factors, strict=False)
+            if n and (x := _number(w)) is not None and math.isfinite(x)
+        }
+        row = Row(i, given, numbers)
+        _check(path, row)
+        if given:
+            rows.append(row)
+    return Table(path, tuple(n for n in names if n), tuple(rows), united)
+
+
+def _check(path: str, row: Row) -> None:
+    """Refuse words where numbers belong; an empty cell or NaN is a missing number, which is the reader's affair."""
+    for name in ("u", "v", "x", "y", "z", "sigma", "edge", "yaw", "roll", "pitch"):
+        word = row.words.get(name)
+        if (
+            word is not None
+            and _number(word) is None
+            and word.lower() not in ("none", "null", "na", "n/a", "-")
+        ):
+            raise CalibrationError(
+                f"{path}: line {row.line}: {name} is '{word}', expected a number: the whole file is refused; correct "
+                "the cell, or empty it to have the row left out"
+            )
+
+
+def _column(word: str) -> tuple[str, str]:
+    """Standard name (empty: of no use here) and unit of a column."""
+    word = word.strip().strip("\"'")
+    found = _UNIT_AT_END.search(word)
+    unit = (found[1] or found[2] or "").lower() if found else ""
+    bare = word[: found.start()] if found else word
+    plain = re.sub(r"[\s_\-.]", "", bare.lower())
+    name = _BY_WORD.get(plain, "")
+    if unit == "px" and name in ("x", "y"):
+        name = {"x": "u", "y": "v"}[name]
+    return name or (plain if re.fullmatch(r"[uv][0-3]", plain) else ""), unit
+
+
+def _factor(name: str, unit: str, default: str | None, words: list[str]) -> float:
+    if name in LENGTHS:
+        return unit_factor(unit or default or "m")
+    if name in ("yaw", "roll", "pitch"):
+        if unit == "deg":
+            return math.pi / 180.0
+        values = [x for word in words if (x := _number(word)) is not None]
+        degrees = unit != "rad" and any(abs(x) > 2.0 * math.pi for x in values)
+        return math.pi / 180.0 if degrees else 1.0
+    return 1.0
+
+
+def _splitter(head: str):  # type: ignore[no-untyped-def]
+    for mark in ("\t", ";", ","):
+        if mark in head:
+            return lambda line: [cell.strip() for cell in next(csv.reader([line], delimiter=mark))]
+    return str.split
+
+
+def _known(head: str) -> int:
+    """How many columns of a line of names mean something here."""
+    return sum(bool(_column(word)[0]) for word in _splitter(head)(head))
+
+
+def _number(word: str) -> float | None:
+    try:
+        return float(word)
+    except ValueError:
+        return None
+
+
+def _is_numeric(line: str) -> bool:
+    return all(_number(word) is not None for word in re.split(r"[,;\s]+", line.strip()) if word)
+
+
+# Tags on one board, surveyed as a whole: a YAML file that says where the first lies and how the others follow.
+
+PRINTED = 0.0005
+"""Standard error of a tag on a board where the file gives none [m]: printers and glue do no better."""
+
+
+def grid_points(path: str | Path) -> tuple[dict[int, np.ndarray], float]:
+    """Corners of the tags of a grid.
+
+        grid: {first: 0, columns: 6, rows: 4, spacing: [0.13, 0.13], edge: 0.1, position: [0.2, 0.3, 0], yaw_deg: 90}
+
+    Ids run along a column's x, then from row to row; `spacing` is from centre to centre along the printed x and y (a
+    negative second number counts rows downwards); `position` is the centre of the first tag; `yaw_deg`, `pitch_deg`,
+    `roll_deg` turn the board.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Tag id -> corners in the survey's frame [m], (4, 3); and their standard error within the board (`sigma`) [m].
+
+    Raises:
+        CalibrationError: A key is missing, unknown or senseless.
+    """
+    try:
+        tree = read_mapping(Path(path), LocalizationError, such_as="grid: {first: 0, columns: 6, rows: 4}")
+        top = Fields(tree, str(path))
+        fields = top.section("grid")
+        top.finish()
+        first, columns, rows = (int(fields.number(key)) for key in ("first", "columns", "rows"))
+        dx, dy = fields.numbers("spacing", 2)
+        edge, position = fields.number("edge"), fields.numbers("position", 3)
+        angles = [fields.number(f"{name}_deg", 0.0) for name in ("roll", "pitch", "yaw")]
+        sigma = fields.number("sigma", PRINTED)
+        fields.finish()
+    except LocalizationError as error:
+        raise CalibrationError(str(error)) from None
+    if columns < 1 or rows < 1 or edge <= 0.0 or min(abs(dx), abs(dy)) < edge:
+        raise CalibrationError(
+            f"{path}: grid of {columns} x {rows} tags of {edge:g} m every {dx:g}, {dy:g} m: expected at least one tag, "
+            "an edge above 0 and a spacing above the edge"
+        )
+    turn = quat_from_euler(*np.radians(angles))
+    found = {}
+    for row in range(rows):
+        for column in range(columns):
+            flat = corners(edge) + np.array([column * dx, row * dy, 0.0])
+            found[first + row * columns + column] = np.asarray(position) + quat_rotate(turn, flat)
+    return found, sigma
+
+
+WIDEST = 300.0
+"""Spread of coordinates beyond which metres are not believed unless the file says so [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Points that were surveyed together, so that one error moves them all: a tag's corners, or a single point."""
+
+    name: str
+    points: Array
+    """Pool frame [m], (K, 3); a tag's corners in the order of `localization.tags.corners`."""
+    sigma: float
+    """Standard error of each coordinate [m]; NaN where the survey does not say."""
+    is_tag: bool = False
+    dry: bool = False
+    """On the camera's side of the water."""
+    group: str = ""
+    """Points of one rigid target; empty: by itself."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """All that was surveyed."""
+
+    path: str
+    points: dict[str, Placed] = field(default_factory=dict)
+    """Single points by id."""
+    tags: dict[int, Placed] = field(default_factory=dict)
+    """Fixed tags by id."""
+    locations: dict[str, list[tuple[int | None, Placed]]] = field(default_factory=dict)
+    """Image -> tags that lay there (id, or None for whichever was seen)."""
+    notes: tuple[str, ...] = ()
+
+
+def corner_name(tag: str, corner: int) -> str:
+    """How a report calls a tag's corner."""
+    return f"{tag}/{corner}"
+
+
+def read_survey(
+    path: str | Path, *, unit: str | None = None, edge: float | None = None, z: float | None = None
+) -> Survey:
+    """Read a survey.
+
+    Columns `id,x,y,z` for points; `tag,x,y,z,yaw_deg[,roll_deg,pitch_deg],edge` for fixed tags (centre and attitude
+    of the tag frame); `image,x,y,z,yaw_deg[,tag],edge` for one tag that was moved from picture to picture. `sigma`
+    gives a row its own standard error, `dry` marks what is above the water, `group` ties points to one target.
+
+    Args:
+        path: CSV file, or YAML of a grid of tags (`survey_grid.grid_points`).
+        unit: Of lengths where the file says none.
+        edge: Of all tags [m] where the table has no such column.
+        z: Height of all points [m] where the table has no such column.
+
+    Raises:
+        CalibrationError: A column or number is missing, or an id has two positions; names the line.
+    """
+    if Path(path).suffix.lower() in (".yaml", ".yml"):
+        tags, sigma = grid_points(path)
+        placed = {tag: Placed(f"tag {tag}", at, sigma, is_tag=True) for tag, at in tags.items()}
+        return Survey(str(path), tags=placed)
+    table = read_table(path, unit=unit)
+    _need(table, z)
+    notes: list[str] = []
+    survey = Survey(str(path))
+    placed_where: dict[str, int] = {}
+    for row in table.rows:
+        missing = [n for n in ("x", "y") if n not in row.numbers]
+        if missing or ("z" not in row.numbers and z is None):
+            notes.append(f"{table.path}: line {row.line}: left out: {', '.join(missing) or 'z'} is missing")
+            continue
+        _place(survey, table, row, edge, z, placed_where)
+    if not (survey.points or survey.tags or survey.locations):
+        raise CalibrationError(f"{path}: no surveyed point in it: give rows of id,x,y,z")
+    _plausible(survey, table)
+    return Survey(survey.path, survey.points, survey.tags, survey.locations, tuple(notes))
+
+
+def _need(table: Table, z: float | None) -> None:
+    for name in ("x", "y"):
+        if name not in table.columns:
+            raise CalibrationError(
+                f"{table.path}: no column '{name}': a survey has id,x,y,z or tag,x,y,z,yaw_deg,edge"
+            )
+    if "z" not in table.columns and z is None:
+        raise CalibrationError(f"{table.path}: no column 'z': add it, or give the height of all points (--z)")
+    if not {"id", "tag", "image"} & set(table.columns):
+        raise CalibrationError(f"{table.path}: no column names the points: add id, tag or image")
+
+
+def _place(
+    survey: Survey, table: Table, row: Row, edge: float | None, z: float | None, where: dict[str, int]
+) -> None:
+    position = np.array([row.numbers["x"], row.numbers["y"], row.numbers.get("z", z)], float)
+    sigma = row.numbers.get("sigma", float("nan"))
+    dry = row.words.get("dry", "").lower() in ("1", "1.0", "true", "yes", "y", "dry", "x")
+    group = row.words.get("group", "")
+    edge = row.numbers.get("edge", edge)
+    tag = row.words.get("tag") or (row.words.get("id") if edge is not None else None)
+    if "image" not in row.words and tag is None:
+        name = row.words.get("id", "")
+        if not name:
+            raise table.refuse(row, "no id")
+        here = Placed(name, position[None], sigma, dry=dry, group=group)
+        _once(table, row, f"point '{name}'", survey.points.get(name), here, where)
+        survey.points[name] = here
+        return
+    if edge is None or edge <= 0.0:
+        raise table.refuse(row, "a tag without its edge: add a column edge [m], or give --edge")
+    turn = quat_from_euler(*(row.numbers.get(n, 0.0) for n in ("roll", "pitch", "yaw")))
+    number = None if tag is None else _integer(table, row, tag)
+    name = row.words.get("image") or f"tag {number}"
+    at = position + quat_rotate(turn, corners(edge))
+    here = Placed(name, np.asarray(at), sigma, is_tag=True, dry=dry, group=group)
+    if "image" in row.words:
+        survey.locations.setdefault(name, []).append((number, here))
+    else:
+        assert number is not None
+        _once(table, row, name, survey.tags.get(number), here, where)
+        survey.tags[number] = here
+
+
+def _integer(table: Table, row: Row, word: str) -> int:
+    try:
+        return int(float(word))
+    except ValueError:
+        raise table.refuse(row, f"tag is '{word}', expected its number") from None
+
+
+def _once(
+    table: Table, row: Row, name: str, before: Placed | None, here: Placed, where: dict[str, int]
+) -> None:
+    if before is not None and np.abs(before.points - here.points).max() > 1e-6:
+        raise table.refuse(row, f"{name} was at another place in line {where[name]}: keep one of the two")
+    where[name] = row.line
+
+
+def _plausible(survey: Survey, table: Table) -> None:
+    here = [
+        *survey.points.values(),
+        *survey.tags.values(),
+        *(p for t in survey.locations.values() for _, p in t),
+    ]
+    spread = np.ptp(np.concatenate([p.points for p in here]), axis=0).max()
+    if spread > WIDEST and not table.united:
+        raise CalibrationError(
+            f"{table.path}: the points spread over {spread:.0f} m: if they are not in metres, write the unit into the "
+            "header (x_mm) or give --unit mm"
+        )
+
+
+_DETECTIONS = {"u0", "v0", "u3", "v3"}
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Pixels of N surveyed points; points of one location share the error of its survey."""
+
+    pixels: Array
+    """(N, 2), integers at pixel centres."""
+    points: Array
+    """Pool frame [m], (N, 3)."""
+    location: NDArray[np.intp]
+    """Index into `locations`, (N,)."""
+    names: tuple[str, ...]
+    """What each row is called: the point's id or tag/corner, with its picture where there are several."""
+    locations: tuple[str, ...]
+    sigma: Array
+    """Standard error of the survey [m], (N,); NaN where it does not say."""
+    arm: Array
+    """Displacement of the point by a turn of its location about z [m/rad], (N, 3); zero for single points."""
+    dry: NDArray[np.bool_]
+    """On the camera's side of the plane, (N,)."""
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def subset(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Observations:
+        """Some of the rows; locations keep their indices."""
+        index = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else np.asarray(rows)
+        return replace(
+            self,
+            pixels=self.pixels[index],
+            points=self.points[index],
+            location=self.location[index],
+            names=tuple(self.names[i] for i in index),
+            sigma=self.sigma[index],
+            arm=self.arm[index],
+            dry=self.dry[index],
+        )
+
+    def shifted(self, vector: Array) -> Observations:
+        """The same in a frame in which every point lies `vector` further [m]."""
+        return replace(self, points=self.points + vector)
+
+
+def observe(inputs: Sequence[Path], survey: Survey, *, family: str | None = None) -> Observations:
+    """Match files of detections or pixels with a survey.
+
+    Args:
+        inputs: Detections CSV (`image,tag,u0,v0,...`), pixel CSV (`[image,]id,u,v`), or pictures, in which tags of
+            `family` are looked for.
+        survey: Where everything lay.
+        family: Of the tags in pictures.
+
+    Raises:
+        CalibrationError: Nothing of it is in the survey, or a file cannot be read; names ids and lines.
+    """
+    rows = _Rows()
+    tables, pictures = [], []
+    for path in map(Path, inputs):
+        is_table = path.suffix.lower() in (".csv", ".txt", ".tsv", ".dat")
+        (tables if is_table else pictures).append(path)
+    for path in tables:
+        if _is_detections(path):
+            _match_frames(rows, read_detections(path, rows.notes), survey)
+        else:
+            _match_table(rows, read_table(path), survey)
+    if pictures:
+        _match_frames(rows, _detect(pictures, family), survey)
+    return rows.observations(", ".join(str(path) for path in inputs), survey)
+
+
+def observe_combined(
+    paths: Sequence[Path], *, unit: str | None = None, z: float | None = None
+) -> Observations:
+    """Read tables that hold pixel and point in one row: `u,v,x,y,z`, with `id`, `group`, `sigma`, `dry` where given.
+
+    Raises:
+        CalibrationError: A column or number is missing.
+    """
+    rows = _Rows()
+    for path in paths:
+        table = read_table(path, unit=unit)
+        needed = ["u", "v", "x", "y", *(["z"] if z is None else [])]
+        missing = [name for name in needed if name not in table.columns]
+        if missing:
+            raise CalibrationError(
+                f"{path}: no column '{missing[0]}': name the columns u,v,x,y,z, or give a survey (--surveyed)"
+                + ("; points of one height may leave z out and give --z" if missing == ["z"] else "")
+            )
+        spread = max((abs(row.numbers.get(n, 0.0)) for row in table.rows for n in "xyz"), default=0.0)
+        if spread > 300.0 and not table.united:
+            raise CalibrationError(
+                f"{path}: coordinates reach {spread:.0f} m: if they are not in metres, write the unit into the header "
+                "(x_mm) or give --unit mm"
+            )
+        for row in table.rows:
+            if all(name in row.numbers for name in needed):
+                rows.add_combined(row, row.numbers.get("z", z))
+            else:
+                rows.notes.append(f"{path}: line {row.line}: left out: a number is missing")
+    return rows.observations(", ".join(map(str, paths)), None)
+
+
+class _Rows:
+    """Rows as they are gathered."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+        self.unknown: dict[str, int] = {}
+        self._pixels: list[Array] = []
+        self._placed: list[tuple[Placed, int]] = []
+        self._names: list[str] = []
+        self._images: list[str] = []
+        self._seen: set[tuple[object, ...]] = set()
+        self._points: dict[tuple[object, ...], Placed] = {}
+
+    def add(self, image: str, name: str, placed: Placed, corner: int, pixel: Array) -> None:
+        key = (image, id(placed), corner, float(pixel[0]), float(pixel[1]))
+        if key in self._seen:
+            self.notes.append(f"{name} is there twice with the same pixel: counted once")
+            return
+        self._seen.add(key)
+        self._pixels.append(np.asarray(pixel, float))
+        self._placed.append((placed, corner))
+        self._names.append(name)
+        self._images.append(image)
+
+    def add_combined(self, row: Row, z: float | None) -> None:
+        point = np.array([row.numbers["x"], row.numbers["y"], z], float)
+        name = row.words.get("id") or row.words.get("tag") or f"line {row.line}"
+        dry = row.words.get("dry", "").lower() in ("1", "1.0", "true", "yes", "y", "dry")
+        sigma = row.numbers.get("sigma", float("nan"))
+        new = Placed(name, point[None], sigma, dry=dry, group=row.words.get("group", ""))
+        placed = self._points.setdefault((name, *point.tolist()), new)
+        pixel = np.array([row.numbers["u"], row.numbers["v"]])
+        self.add(row.words.get("image", ""), name, placed, 0, pixel)
+
+    def observations(self, source: str, survey: Survey | None) -> Observations:
+        if self.unknown:
+            shown = ", ".join(list(self.unknown)[:8]) + (", ..." if len(self.unknown) > 8 else "")
+            self.notes.append(f"not in the survey, so left out: {shown}")
+        if not self._pixels:
+            known = [] if survey is None else [*survey.points, *map(str, survey.tags), *survey.locations]
+            what = f"; observed: {', '.join(list(self.unknown)[:5])}" if self.unknown else ""
+            raise CalibrationError(
+                f"{source}: no observation belongs to a surveyed point "
+                f"(surveyed: {', '.join(known[:5]) or 'none'}{what})"
+            )
+        order: dict[object, int] = {}
+        location = np.array([order.setdefault(p.group or id(p), len(order)) for p, _ in self._placed])
+        labels: dict[int, str] = {}
+        for i, (placed, _) in zip(location, self._placed, strict=True):
+            labels.setdefault(int(i), placed.group or placed.name)
+        several = len(set(self._images)) > 1
+        return Observations(
+            pixels=np.stack(self._pixels),
+            points=np.stack([p.points[k] for p, k in self._placed]),
+            location=location,
+            names=tuple(
+                f"{image}: {name}" if several and image and not name.startswith(image) else name
+                for image, name in zip(self._images, self._names, strict=True)
+            ),
+            locations=tuple(labels[i] for i in range(len(labels))),
+            sigma=np.array([p.sigma for p, _ in self._placed]),
+            arm=np.stack([_arm(p, k) for p, k in self._placed]),
+            dry=np.array([p.dry for p, _ in self._placed]),
+            notes=(*(survey.notes if survey else ()), *self.notes),
+        )
+
+
+def _arm(placed: Placed, corner: int) -> Array:
+    if not placed.is_tag:
+        return np.zeros(3)
+    x, y, _ = placed.points[corner] - placed.points.mean(axis=0)
+    return np.array([-y, x, 0.0])
+
+
+def _is_detections(path: Path) -> bool:
+    try:
+        text = path.read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        raise CalibrationError(f"cannot read {path}: {error.strerror or error}") from error
+    head = next(
+        (line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), ""
+    )
+    plain = {re.sub(r"[\s\"']", "", cell).lower() for cell in re.split(r"[,;\t]", head)}
+    numbered = [cell for cell in plain if re.search(r"\d", cell) and re.search(r"[uvxy]", cell)]
+    return plain >= _DETECTIONS or len(numbered) >= 8
+
+
+def _match_frames(rows: _Rows, frames: Sequence[Frame], survey: Survey) -> None:
+    for frame in frames:
+        lay = survey.locations.get(frame.image) or survey.locations.get(Path(frame.image).name, [])
+        if survey.locations and not lay and not survey.tags:
+            rows.unknown.setdefault(frame.image or "a picture without a name", 0)
+            continue
+        found = most_certain(frame.detections)
+        for detection in found:
+            placed = survey.tags.get(detection.tag)
+            for tag, here in lay:
+                if tag == detection.tag or (tag is None and len(found) == 1):
+                    placed = here
+            if placed is None:
+                rows.unknown.setdefault(f"tag {detection.tag}", 0)
+                continue
+            for corner, pixel in enumerate(np.asarray(detection.corners, float)):
+                if np.isfinite(pixel).all():
+                    rows.add(frame.image, corner_name(placed.name, corner), placed, corner, pixel)
+
+
+def _match_table(rows: _Rows, table: Table, survey: Survey) -> None:
+    missing = [name for name in ("u", "v") if name not in table.columns]
+    if missing or not {"id", "tag"} & set(table.columns):
+        raise CalibrationError(
+            f"{table.path}: no column '{missing[0] if missing else 'id'}': pixels are a table of id,u,v"
+        )
+    for row in table.rows:
+        name = row.words.get("id") or row.words.get("tag") or ""
+        placed, corner = _find(survey, name)
+        if placed is None:
+            rows.unknown.setdefault(name or f"line {row.line}", 0)
+        elif "u" not in row.numbers or "v" not in row.numbers:
+            rows.notes.append(f"{table.path}: line {row.line}: left out: {name} has no pixel")
+        else:
+            pixel = np.array([row.numbers["u"], row.numbers["v"]])
+            rows.add(row.words.get("image", ""), name, placed, corner, pixel)
+
+
+def _find(survey: Survey, name: str) -> tuple[Placed | None, int]:
+    """A point by its id, also where one file writes 7 and the other 7.0, or a corner `tag/0`."""
+    if name in survey.points:
+        return survey.points[name], 0
+    tag, _, corner = name.partition("/")
+    if corner in ("0", "1", "2", "3") and tag.isdigit() and int(tag) in survey.tags:
+        return survey.tags[int(tag)], int(corner)
+    try:
+        value = float(name)
+    except ValueError:
+        return None, 0
+    return next((p for key, p in survey.points.items() if _same_number(key, value)), None), 0
+
+
+def _same_number(key: str, value: float) -> bool:
+    try:
+        return float(key) == value
+    except ValueError:
+        return False
+
+
+def _detect(paths: Sequence[Path], family: str | None) -> list[Frame]:
+    from finssim.localization.detection.detector import detector
+    from finssim.localization.detection.pictures import pictures
+
+    if family is None:
+        raise CalibrationError("pictures need the family of the tags in them: give --family, such as tag25h9")
+    find = detector(family)
+    return [Frame(time, name, tuple(find.detect(image))) for time, name, image in pictures(paths)]
