@@ -2,43 +2,40 @@
 
 from __future__ import annotations
 
-import io
-import json
 import math
-import os
-import shlex
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Estimate
+from finssim.calibration.output.fit_figures import BLUE, GRAY, ORANGE, new_figure, png
 from finssim.calibration.output.fit_output import interval_text, number_text
 from finssim.calibration.vision.boards import Board, BoardView, board_found, parse_size, see_board
 from finssim.calibration.vision.camera_fit import COLUMNS, MODELS, ROWS, CameraFit, calibrate_camera
-from finssim.files import atomic_directory, atomic_write, refuse_unwritable
+from finssim.calibration.vision.report import (
+    Report,
+    command_line,
+    correlation_json,
+    html_row,
+    picture_axes,
+    plain,
+    publish,
+    refuse_places,
+)
 from finssim.localization.camera_file import write_camera
 from finssim.localization.detection.pictures import pictures
-from finssim.page import html_page, html_picture, html_table
+from finssim.page import html_table
 from finssim.provenance import provenance
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["run"]
-
-# A lens calibration as a table, as JSON, as the record in a camera file, and as a folder to look at.
-
-RECORD_FILE, REPORT_FILE = "fit.json", "report.html"
 
 READING = (
     "The interval holds the true value in 19 of 20 such calibrations: it comes from how much the pictures disagree, "
@@ -46,16 +43,26 @@ READING = (
     "picture and by the residual of views that it was not fitted to."
 )
 
+DIGITS = 7
+"""Of the numbers in a record."""
+
+ARROW_SHARE = 0.06
+"""Length of the 95th percentile of the residuals, in widths of the image."""
+
+OF_A_VIDEO = 15
+"""Of a video every so many pictures are looked at: its neighbours show the same view."""
+
 
 def camera_record(fit: CameraFit) -> dict[str, Any]:
     """What a camera file remembers: estimates, intervals, residuals and where they come from, as plain values."""
+    estimates = {}
+    for name, e in fit.estimates.items():
+        ci95 = [plain(x, DIGITS) for x in e.ci95]
+        estimates[name] = {"estimate": plain(e.estimate, DIGITS), "ci95": ci95, "unit": e.unit}
     return {
-        "estimates": {
-            name: {"estimate": _rounded(e.estimate), "ci95": [_rounded(x) for x in e.ci95], "unit": e.unit}
-            for name, e in fit.estimates.items()
-        },
-        "rms_px": _rounded(fit.rms),
-        "held_out_rms_px": _rounded(fit.held_out_rms),
+        "estimates": estimates,
+        "rms_px": plain(fit.rms, DIGITS),
+        "held_out_rms_px": plain(fit.held_out_rms, DIGITS),
         "views": len(fit.used),
         "left_out": {view.name: view.left_out for view in fit.views if view.left_out},
         "advice": list(fit.advice),
@@ -67,6 +74,7 @@ def camera_record(fit: CameraFit) -> dict[str, Any]:
 
 def camera_json(fit: CameraFit, out: Path | None = None) -> dict[str, Any]:
     """What `--json` prints: the record, the lens, every view, the correlation of the errors and the coverage."""
+    reach = fit.reach
     return {
         "kind": "camera",
         **camera_record(fit),
@@ -74,120 +82,138 @@ def camera_json(fit: CameraFit, out: Path | None = None) -> dict[str, Any]:
         "per_view": [
             {
                 "name": view.name,
-                "rms_px": _rounded(view.rms),
-                "tilt_deg": _rounded(math.degrees(view.tilt)),
+                "rms_px": plain(view.rms, DIGITS),
+                "tilt_deg": plain(math.degrees(view.tilt), DIGITS),
                 "corners": len(view.pixels),
                 "left_out": view.left_out or None,
             }
             for view in fit.views
         ],
-        "error95_px": {"where_seen": _rounded(fit.reach.inside), "anywhere": _rounded(fit.reach.anywhere)},
-        "empty_edges": {side: _rounded(share) for side, share in fit.reach.edges.items()},
-        "correlation": {
-            "names": list(fit.correlation.names),
-            "matrix": [[_rounded(x) for x in row] for row in fit.correlation.matrix],
+        "error95_px": {
+            "where_seen": plain(reach.inside, DIGITS),
+            "anywhere": plain(reach.anywhere, DIGITS),
         },
+        "empty_edges": {side: plain(share, DIGITS) for side, share in reach.edges.items()},
+        "correlation": correlation_json(fit.correlation, DIGITS),
         "out": None if out is None else str(out),
     }
 
 
-def print_camera(fit: CameraFit, console: Console) -> None:
-    """Print estimates, residuals and advice; fits 100 columns."""
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("parameter", "estimate", "95 % interval", "unit", "note"):
-        table.add_column(heading, justify="right" if heading == "estimate" else "left", overflow="fold")
-    for estimate in fit.estimates.values():
-        table.add_row(*_cells(estimate), style="" if estimate.identifiable else "yellow")
-    console.print(
-        f"{fit.settings['model']} lens from {len(fit.used)} of {len(fit.views)} views", highlight=False
-    )
-    console.print(table)
-    for sentence in summary(fit):
-        console.print(f"  {sentence}", highlight=False, markup=False)
-    for view in fit.views:
-        if view.left_out:
-            console.print(f"- {view.name} left out: {view.left_out}", highlight=False, markup=False)
-    for sentence in fit.advice:
-        console.print(f"! {sentence}", highlight=False, markup=False, style="yellow")
-
-
-def summary(fit: CameraFit) -> list[str]:
-    """The figures that say how good the calibration is."""
+def camera_report(fit: CameraFit) -> Report:
+    """The calibration in words."""
     worst = max(fit.used, key=lambda view: view.rms)
     held_out = "too few views to hold any out"
     if math.isfinite(fit.held_out_rms):
         held_out = f"views held out: {fit.held_out_rms:.3f} px"
-    found = [
+    summary = [
         f"residual {fit.rms:.3f} px rms of a corner, worst view {worst.name} {worst.rms:.3f} px; {held_out}"
     ]
     if math.isfinite(fit.reach.anywhere):
-        found.append(
+        summary.append(
             f"a pixel is known to {fit.reach.inside:.2f} px (95 %) where corners were seen, to "
             f"{fit.reach.anywhere:.2f} px anywhere in the picture"
         )
-    return found
+    return Report(
+        title="Camera calibration",
+        headline=f"{fit.settings['model']} lens from {len(fit.used)} of {len(fit.views)} views",
+        estimates=list(fit.estimates.values()),
+        cells=_cells,
+        summary=summary,
+        notes=[f"{view.name} left out: {view.left_out}" for view in fit.views if view.left_out],
+        advice=fit.advice,
+        advice_title="What to photograph next",
+        reading=READING,
+    )
 
 
-def write_camera_report(fit: CameraFit, folder: str | os.PathLike[str], *, command: str = "") -> None:
-    """Write `report.html`, its pictures as PNG and `fit.json`.
-
-    Raises:
-        OutputError: The folder holds other files, or cannot be written.
-    """
-    from finssim.calibration.vision.camera_command import camera_pictures
-
-    pictures = camera_pictures(fit)
-    with atomic_directory(folder, replaces=RECORD_FILE) as temporary:
-        for name, (_, data) in pictures.items():
-            (temporary / name).write_bytes(data)
-        (temporary / RECORD_FILE).write_text(json.dumps(camera_json(fit), indent=1), encoding="utf-8")
-        (temporary / REPORT_FILE).write_text(_page(fit, pictures, command), encoding="utf-8")
+def _cells(estimate: Estimate) -> tuple[str, ...]:
+    value = f"{estimate.estimate:.2f}" if estimate.unit == "px" else number_text(estimate.estimate)
+    return estimate.name, value, interval_text(estimate), estimate.unit, estimate.note
 
 
-def _page(fit: CameraFit, pictures: dict[str, tuple[str, bytes]], command: str) -> str:
-    rows = [_row(_cells(e), "" if e.identifiable else "doubt") for e in fit.estimates.values()]
-    views = [
-        _row(
+def _views_table(fit: CameraFit) -> str:
+    rows = [
+        html_row(
             (v.name, f"{v.rms:.3f}", f"{math.degrees(v.tilt):.0f}", str(len(v.pixels)), v.left_out or "used"),
             "doubt" if v.left_out else "",
         )
         for v in fit.views
     ]
-    said = "".join(f'<li class="warning">{escape(sentence)}</li>' for sentence in fit.advice)
-    sections = [
-        f'<p class="lead">{escape(" · ".join(summary(fit)))}</p>',
-        html_table(("parameter", "estimate", "95 % interval", "unit", "note"), rows),
-        f'<p class="note">{escape(READING)}</p>',
-        f"<h2>What to photograph next</h2><ul>{said}</ul>" if said else "",
-        *(f"<h2>{escape(text)}</h2>{html_picture(data, text)}" for text, data in pictures.values()),
-        "<h2>Views</h2>",
-        html_table(("view", "rms [px]", "tilt [deg]", "corners", "state"), views),
-        f"<pre>{escape(command)}</pre>" if command else "",
-    ]
-    return html_page("Camera calibration", [section for section in sections if section])
+    return html_table(("view", "rms [px]", "tilt [deg]", "corners", "state"), rows)
 
 
-def _row(cells: tuple[str, ...], kind: str) -> str:
-    inner = "".join(f"<td>{escape(cell)}</td>" for cell in cells)
-    return f'<tr class="{kind}">{inner}</tr>' if kind else f"<tr>{inner}</tr>"
+# Pictures of a lens calibration: where corners were seen, how well the picture is known, what is left over.
 
 
-def _cells(estimate: Estimate) -> tuple[str, ...]:
-    return (
-        estimate.name,
-        f"{estimate.estimate:.2f}" if estimate.unit == "px" else number_text(estimate.estimate),
-        interval_text(estimate),
-        estimate.unit,
-        estimate.note,
+def camera_pictures(fit: CameraFit) -> dict[str, tuple[str, bytes]]:
+    """File name -> what the picture shows, and the PNG."""
+    drawn = {
+        "coverage.png": ("Where corners were seen, and how well pixels are known there", _coverage(fit)),
+        "residuals.png": ("Corners less what the lens predicts, enlarged", _residuals(fit)),
+        "views.png": ("Residual of every picture", _per_view(fit)),
+    }
+    return {name: (text, png(figure)) for name, (text, figure) in drawn.items()}
+
+
+def _coverage(fit: CameraFit) -> Figure:
+    from matplotlib.colors import LogNorm
+
+    width, height = fit.lens.width, fit.lens.height
+    figure = new_figure(7.4, 7.4 * height / width + 0.3)
+    axes = figure.subplots()
+    error = fit.reach.error95
+    image = axes.imshow(
+        np.clip(np.ma.masked_invalid(error), 0.03, 30.0),
+        extent=(-0.5, width - 0.5, height - 0.5, -0.5),
+        cmap="viridis_r",
+        norm=LogNorm(0.03, 30.0),
+        alpha=0.75,
     )
+    for i, j in np.argwhere(np.isfinite(error)):
+        u, v = (j + 0.5) / COLUMNS * width, (i + 0.5) / ROWS * height
+        axes.text(u, v, f"{error[i, j]:.1f}", ha="center", va="center", fontsize=7, color="0.25")
+    for view in fit.views:
+        mark = {"color": ORANGE, "marker": "x"} if view.left_out else {"color": "black", "marker": "."}
+        axes.plot(*view.pixels.T, linestyle="", markersize=2.5, **mark)
+    picture_axes(axes, fit.lens)
+    axes.set_title("corners (crosses: left out) and 95 % uncertainty of a pixel [px]", fontsize=9)
+    figure.colorbar(image, ax=axes, shrink=0.8, label="px")
+    return figure
 
 
-def _rounded(x: float) -> float | None:
-    return float(f"{x:.7g}") if math.isfinite(x) else None
+def _residuals(fit: CameraFit) -> Figure:
+    pixels = np.concatenate([view.pixels for view in fit.used])
+    residuals = np.concatenate([view.residuals for view in fit.used])
+    size = np.percentile(np.linalg.norm(residuals, axis=1), 95.0)
+    figure = new_figure(7.4, 4.0)
+    field, cloud = figure.subplots(1, 2, width_ratios=(1.9, 1.0))
+    factor = ARROW_SHARE * fit.lens.width / max(size, 1e-9)
+    arrows = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "width": 0.0022}
+    field.quiver(*pixels.T, *(factor * residuals.T), color=BLUE, **arrows)
+    picture_axes(field, fit.lens)
+    field.set_title(f"residuals, {factor:.0f} times enlarged", fontsize=9)
+    cloud.plot(*residuals.T, ".", color=BLUE, markersize=2.5)
+    limit = 1.1 * float(np.abs(residuals).max())
+    cloud.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal")
+    cloud.set(xlabel="along u [px]", ylabel="along v [px]")
+    cloud.axhline(0.0, color=GRAY, linewidth=0.6)
+    cloud.axvline(0.0, color=GRAY, linewidth=0.6)
+    cloud.set_title(f"rms {fit.rms:.3f} px", fontsize=9)
+    return figure
 
 
-OF_A_VIDEO = 15
-"""Of a video every so many pictures are looked at: its neighbours show the same view."""
+def _per_view(fit: CameraFit) -> Figure:
+    figure = new_figure(7.4, 1.0 + 0.2 * len(fit.views))
+    axes = figure.subplots()
+    rows = np.arange(len(fit.views))[::-1]
+    colors = [ORANGE if view.left_out else BLUE for view in fit.views]
+    axes.barh(rows, [view.rms for view in fit.views], color=colors, height=0.7)
+    axes.set_yticks(rows, [view.name for view in fit.views], fontsize=7)
+    axes.axvline(fit.held_out_rms, color="black", linewidth=0.8, linestyle="--", label="views held out")
+    axes.set_xlabel("rms of a corner's distance [px]; orange: left out")
+    axes.legend(fontsize=7, frameon=False)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
 
 
 def run(
@@ -228,7 +254,7 @@ def run(
     """
     if model not in MODELS:
         raise CalibrationError(f"unknown lens model '{model}'; available: {', '.join(MODELS)}")
-    _refuse_places(out, report)
+    refuse_places(out, report, "camera")
     screen = Console(stderr=True)
     chosen = _board(board, square, charuco, marker, dictionary)
     if chosen is None:
@@ -244,25 +270,19 @@ def run(
     with _progress(screen) as progress:
         fit = calibrate_camera(views, model=model, seed=seed, progress=progress)
     fit.settings.update(board=chosen.words, square=chosen.square)
-    record = {**camera_record(fit), "without_board": without}
-    write_camera(out, fit.lens, record)
+    write_camera(out, fit.lens, {**camera_record(fit), "without_board": without})
+    words = camera_report(fit)
     if report is not None:
-        command = _command(images, out, board, square, charuco, marker, dictionary, model, seed)
-        write_camera_report(fit, report, command=command)
-    _show(fit, out, report, as_json)
+        kind = {"board": board}
+        if charuco is not None:
+            kind = {"charuco": charuco, "dictionary": dictionary, "marker": marker}
+        options = {"out": out, "square": square, **kind, "model": model, "seed": seed}
+        repeat = [command_line("camera", images, options)]
+        words.write(report, camera_json(fit), camera_pictures(fit), repeat, {"Views": _views_table(fit)})
+    publish(camera_json(fit, out) if as_json else None, words.show, (out, report))
     if fit.interrupted:
         raise KeyboardInterrupt
     return fit
-
-
-def _refuse_places(out: Path, report: Path | None) -> None:
-    if Path(out).suffix not in (".yaml", ".yml"):
-        raise CalibrationError(
-            f"{out} ends in '{Path(out).suffix}', expected .yaml: name a camera file to write"
-        )
-    refuse_unwritable(atomic_write(out))
-    if report is not None:
-        refuse_unwritable(atomic_directory(report, replaces=RECORD_FILE))
 
 
 def _board(
@@ -311,150 +331,3 @@ def _progress(screen: Console) -> Iterator[Callable[[float, str], None]]:
     with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as bars:
         bar = bars.add_task("fit", total=1.0)
         yield lambda part, words: bars.update(bar, completed=part, description=words)
-
-
-def _show(fit: CameraFit, out: Path, report: Path | None, as_json: bool) -> None:
-    if as_json:
-        print(json.dumps(camera_json(fit, out), allow_nan=False))
-        return
-    console = Console() if sys.stdout.isatty() else Console(width=100)
-    print_camera(fit, console)
-    for place in filter(None, (out, report)):
-        console.print(f"written: {place}", highlight=False, markup=False, soft_wrap=True)
-
-
-def _command(
-    images: Sequence[Path],
-    out: Path,
-    board: str | None,
-    square: float,
-    charuco: str | None,
-    marker: float | None,
-    dictionary: str,
-    model: str,
-    seed: int,
-) -> str:
-    """The command line that does this again."""
-    words = [
-        "finssim",
-        "calibrate",
-        "camera",
-        *map(str, images),
-        "--out",
-        str(out),
-        "--square",
-        f"{square:g}",
-    ]
-    if charuco is not None:
-        words += ["--charuco", charuco, "--dictionary", dictionary]
-        words += [] if marker is None else ["--marker", f"{marker:g}"]
-    elif board is not None:
-        words += ["--board", board]
-    return shlex.join([*words, "--model", model, "--seed", str(seed)])
-
-
-BLUE, ORANGE, GRAY = "#0072B2", "#D55E00", "0.6"
-ARROW_SHARE = 0.06
-"""Length of the 95th percentile of the residuals, in widths of the image."""
-
-
-def camera_pictures(fit: CameraFit) -> dict[str, tuple[str, bytes]]:
-    """File name -> what the picture shows, and the PNG."""
-    return {
-        "coverage.png": (
-            "Where corners were seen, and how well pixels are known there",
-            _png(_draw_coverage(fit)),
-        ),
-        "residuals.png": ("Corners less what the lens predicts, enlarged", _png(_draw_residuals(fit))),
-        "views.png": ("Residual of every picture", _png(_draw_views(fit))),
-    }
-
-
-def _frame(axes: Axes, fit: CameraFit) -> None:
-    axes.set_xlim(-0.5, fit.lens.width - 0.5)
-    axes.set_ylim(fit.lens.height - 0.5, -0.5)
-    axes.set_aspect("equal")
-    axes.set_xlabel("u [px]")
-    axes.set_ylabel("v [px]")
-
-
-def _draw_coverage(fit: CameraFit) -> Figure:
-    from matplotlib.colors import LogNorm
-
-    figure = _figure(7.4, 7.4 * fit.lens.height / fit.lens.width + 0.3)
-    axes = figure.subplots()
-    error = np.ma.masked_invalid(fit.reach.error95)
-    extent = (-0.5, fit.lens.width - 0.5, fit.lens.height - 0.5, -0.5)
-    shown = axes.imshow(
-        np.clip(error, 0.03, 30.0), extent=extent, cmap="viridis_r", norm=LogNorm(0.03, 30.0), alpha=0.75
-    )
-    for i in range(ROWS):
-        for j in range(COLUMNS):
-            if not error.mask.any() or not error.mask[i, j]:
-                u, v = (j + 0.5) / COLUMNS * fit.lens.width, (i + 0.5) / ROWS * fit.lens.height
-                axes.text(u, v, f"{error[i, j]:.1f}", ha="center", va="center", fontsize=7, color="0.25")
-    for view in fit.views:
-        mark = {"color": ORANGE, "marker": "x"} if view.left_out else {"color": "black", "marker": "."}
-        axes.plot(*view.pixels.T, linestyle="", markersize=2.5, **mark)
-    _frame(axes, fit)
-    axes.set_title("corners (crosses: left out) and 95 % uncertainty of a pixel [px]", fontsize=9)
-    figure.colorbar(shown, ax=axes, shrink=0.8, label="px")
-    return figure
-
-
-def _draw_residuals(fit: CameraFit) -> Figure:
-    pixels = np.concatenate([view.pixels for view in fit.used])
-    residuals = np.concatenate([view.residuals for view in fit.used])
-    size = np.percentile(np.linalg.norm(residuals, axis=1), 95.0)
-    figure = _figure(7.4, 4.0)
-    field, cloud = figure.subplots(1, 2, width_ratios=(1.9, 1.0))
-    factor = ARROW_SHARE * fit.lens.width / max(size, 1e-9)
-    field.quiver(
-        *pixels.T, *(factor * residuals.T), color=BLUE, angles="xy", scale_units="xy", scale=1.0, width=0.0022
-    )
-    _frame(field, fit)
-    field.set_title(f"residuals, {factor:.0f} times enlarged", fontsize=9)
-    cloud.plot(*residuals.T, ".", color=BLUE, markersize=2.5)
-    limit = 1.1 * float(np.abs(residuals).max())
-    cloud.set_xlim(-limit, limit)
-    cloud.set_ylim(limit, -limit)
-    cloud.set_aspect("equal")
-    cloud.axhline(0.0, color=GRAY, linewidth=0.6)
-    cloud.axvline(0.0, color=GRAY, linewidth=0.6)
-    cloud.set_xlabel("along u [px]")
-    cloud.set_ylabel("along v [px]")
-    cloud.set_title(f"rms {fit.rms:.3f} px", fontsize=9)
-    return figure
-
-
-def _draw_views(fit: CameraFit) -> Figure:
-    figure = _figure(7.4, 1.0 + 0.2 * len(fit.views))
-    axes = figure.subplots()
-    rows = np.arange(len(fit.views))[::-1]
-    axes.barh(
-        rows,
-        [view.rms for view in fit.views],
-        color=[ORANGE if view.left_out else BLUE for view in fit.views],
-        height=0.7,
-    )
-    axes.set_yticks(rows, [view.name for view in fit.views], fontsize=7)
-    axes.axvline(fit.held_out_rms, color="black", linewidth=0.8, linestyle="--", label="views held out")
-    axes.set_xlabel("rms of a corner's distance [px]; orange: left out")
-    axes.legend(fontsize=7, frameon=False)
-    axes.spines[["top", "right"]].set_visible(False)
-    return figure
-
-
-def _figure(width: float, height: float) -> Figure:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _png(figure: Figure) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=120, metadata={"Software": None})
-    return buffer.getvalue()

@@ -18,6 +18,7 @@ from finssim.calibration.output.calibrate import calibrated, doubts, kept
 from finssim.calibration.output.fit_output import fit_json, print_fit
 from finssim.calibration.output.report import FIT_FILE, write_report
 from finssim.calibration.output.vehicle_file import check_vehicle_path, write_vehicle
+from finssim.calibration.vision.least_squares import Pose
 from finssim.calibration.vision.mount_log import MountLog, read_mount_log
 from finssim.calibration.vision.report import command_line, publish
 from finssim.calibration.vision.sensor_mounts import (
@@ -35,7 +36,6 @@ from finssim.calibration.vision.tag_mounts import (
     UNSURE_LENGTH,
     MountFit,
     Noise,
-    Pose,
     Rig,
     fit_mounts,
     reference_tag,

@@ -27,98 +27,36 @@ Array = NDArray[np.float64]
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
 """Metres in one of each."""
 
-LENGTHS = ("x", "y", "z", "sigma", "edge")
+LENGTHS, ANGLES = ("x", "y", "z", "sigma", "edge"), ("yaw", "roll", "pitch")
+
+WIDEST = 300.0
+"""Spread of coordinates beyond which metres are not believed unless the file says so [m]."""
 
 _ALIASES = {
-    "u": (
-        "u",
-        "px",
-        "pxx",
-        "col",
-        "column",
-        "ximg",
-        "ximage",
-        "imagex",
-        "imgx",
-        "xpx",
-        "upx",
-        "pixelx",
-        "xpixel",
-    )
-    + ("pixelu", "upixel", "xpix", "pixx", "imgu", "imageu", "uimg"),
-    "v": ("v", "py", "pxy", "row", "yimg", "yimage", "imagey", "imgy", "ypx", "vpx", "pixely", "ypixel")
-    + ("pixelv", "vpixel", "ypix", "pixy", "imgv", "imagev", "vimg"),
-    "x": (
-        "x",
-        "worldx",
-        "floorx",
-        "xworld",
-        "xfloor",
-        "objx",
-        "objectx",
-        "xobj",
-        "xw",
-        "wx",
-        "poolx",
-        "xpool",
-    )
-    + ("xp", "tankx", "xtank", "realx", "xreal", "easting"),
-    "y": (
-        "y",
-        "worldy",
-        "floory",
-        "yworld",
-        "yfloor",
-        "objy",
-        "objecty",
-        "yobj",
-        "yw",
-        "wy",
-        "pooly",
-        "ypool",
-    )
-    + ("yp", "tanky", "ytank", "realy", "yreal", "northing"),
-    "z": (
-        "z",
-        "worldz",
-        "floorz",
-        "zworld",
-        "zfloor",
-        "objz",
-        "objectz",
-        "zobj",
-        "zw",
-        "wz",
-        "poolz",
-        "zpool",
-    )
-    + ("zp", "tankz", "ztank", "realz", "zreal", "elevation"),
-    "id": (
-        "id",
-        "point",
-        "pointid",
-        "pt",
-        "ptid",
-        "name",
-        "marker",
-        "markerid",
-        "label",
-        "n",
-        "no",
-        "nr",
-        "index",
-    ),
-    "tag": ("tag", "tagid"),
-    "image": ("image", "img", "file", "filename", "imagename", "picture", "photo", "frame"),
-    "sigma": ("sigma", "std", "error", "uncertainty", "survey_sigma", "surveysigma"),
-    "edge": ("edge", "size", "tagsize", "tagedge", "side"),
-    "yaw": ("yaw", "heading", "psi"),
-    "roll": ("roll", "phi"),
-    "pitch": ("pitch", "theta"),
-    "group": ("group", "location", "board", "target"),
-    "dry": ("dry", "above", "abovewater", "inair", "air"),
+    "u": "u px pxx col column ximg ximage imagex imgx xpx upx pixelx xpixel pixelu upixel xpix pixx imgu "
+    "imageu uimg",
+    "v": "v py pxy row yimg yimage imagey imgy ypx vpx pixely ypixel pixelv vpixel ypix pixy imgv imagev "
+    "vimg",
+    "x": "x worldx floorx xworld xfloor objx objectx xobj xw wx poolx xpool xp tankx xtank realx xreal "
+    "easting",
+    "y": "y worldy floory yworld yfloor objy objecty yobj yw wy pooly ypool yp tanky ytank realy yreal "
+    "northing",
+    "z": "z worldz floorz zworld zfloor objz objectz zobj zw wz poolz zpool zp tankz ztank realz zreal "
+    "elevation",
+    "id": "id point pointid pt ptid name marker markerid label n no nr index",
+    "tag": "tag tagid",
+    "image": "image img file filename imagename picture photo frame",
+    "sigma": "sigma std error uncertainty survey_sigma surveysigma",
+    "edge": "edge size tagsize tagedge side",
+    "yaw": "yaw heading psi",
+    "roll": "roll phi",
+    "pitch": "pitch theta",
+    "group": "group location board target",
+    "dry": "dry above abovewater inair air",
 }
-_BY_WORD = {word: name for name, words in _ALIASES.items() for word in words}
+"""Standard name of a column -> what people call it, without case, blanks and signs."""
+
+_BY_WORD = {word: name for name, words in _ALIASES.items() for word in words.split()}
 
 _UNIT_AT_END = re.compile(r"[\s_]*[\[(]\s*([^\])]*?)\s*[\])]\s*$|_(m|cm|mm|in|inch|ft|deg|rad|px)$")
 _UNIT_COMMENT = re.compile(
@@ -137,6 +75,30 @@ class Row:
     numbers: dict[str, float]
     """Those that are numbers: lengths in metres, angles in radians, pixels."""
 
+    def missing(self, *names: str) -> list[str]:
+        """Of some columns, those without a number."""
+        return [name for name in names if name not in self.numbers]
+
+    def position(self, z: float | None) -> Array:
+        """x, y and z [m], (3,); `z` where the table has none."""
+        return np.array([self.numbers["x"], self.numbers["y"], self.numbers.get("z", z)], float)
+
+    @property
+    def pixel(self) -> Array:
+        """(2,)"""
+        return np.array([self.numbers["u"], self.numbers["v"]])
+
+    def placed(self, name: str, points: Array, *, is_tag: bool = False) -> Placed:
+        """Points with what the row says of them."""
+        return Placed(
+            name,
+            points,
+            self.numbers.get("sigma", math.nan),
+            is_tag=is_tag,
+            dry=self.words.get("dry", "").lower() in ("1", "1.0", "true", "yes", "y", "dry", "x"),
+            group=self.words.get("group", ""),
+        )
+
 
 @dataclass(frozen=True)
 class Table:
@@ -147,23 +109,19 @@ class Table:
     rows: tuple[Row, ...]
     united: bool
     """Whether the file, or its reader, says the unit of lengths."""
-    notes: tuple[str, ...] = ()
+
+    def refuse_other_units(self, points: Array) -> None:
+        """Refuse coordinates (n, 3) that would be metres only in a lake."""
+        spread = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+        if spread > WIDEST and not self.united:
+            raise CalibrationError(
+                f"{self.path}: the points spread over {spread:.0f} m: if they are not in metres, write the unit into "
+                "the header (x_mm) or give --unit mm"
+            )
 
     def refuse(self, row: Row, sentence: str) -> CalibrationError:
         """The error that says so of a row."""
         return CalibrationError(f"{self.path}: line {row.line}: {sentence}")
-
-
-def unit_factor(unit: str) -> float:
-    """Metres in one of a unit.
-
-    Raises:
-        CalibrationError: It is unknown.
-    """
-    try:
-        return UNITS[unit]
-    except KeyError:
-        raise CalibrationError(f"unknown unit '{unit}'; available: {', '.join(UNITS)}") from None
 
 
 def read_table(path: str | Path, *, unit: str | None = None) -> Table:
@@ -219,28 +177,20 @@ def _table(path: str, lines: list[tuple[int, str]], default: str | None) -> Tabl
     ]
     rows = []
     for i, words in cells:
-        given = {n: w for n, w in zip(names, words, strict=False) if n and w}
-        numbers = {
-            n: x * f
-            for (n, w), f in zip(zip(names, words, strict=False), factors, strict=False)
-            if n and (x := _number(w)) is not None and math.isfinite(x)
-        }
-        row = Row(i, given, numbers)
+        columns = [(n, w, f) for n, w, f in zip(names, words, factors, strict=False) if n and w]
+        numbers = {n: x * f for n, w, f in columns if (x := _number(w)) is not None and math.isfinite(x)}
+        row = Row(i, {n: w for n, w, _ in columns}, numbers)
         _check(path, row)
-        if given:
+        if columns:
             rows.append(row)
     return Table(path, tuple(n for n in names if n), tuple(rows), united)
 
 
 def _check(path: str, row: Row) -> None:
     """Refuse words where numbers belong; an empty cell or NaN is a missing number, which is the reader's affair."""
-    for name in ("u", "v", "x", "y", "z", "sigma", "edge", "yaw", "roll", "pitch"):
-        word = row.words.get(name)
-        if (
-            word is not None
-            and _number(word) is None
-            and word.lower() not in ("none", "null", "na", "n/a", "-")
-        ):
+    for name in ("u", "v", *LENGTHS, *ANGLES):
+        word = row.words.get(name, "0")
+        if _number(word) is None and word.lower() not in ("none", "null", "na", "n/a", "-"):
             raise CalibrationError(
                 f"{path}: line {row.line}: {name} is '{word}', expected a number: the whole file is refused; correct "
                 "the cell, or empty it to have the row left out"
@@ -262,8 +212,11 @@ def _column(word: str) -> tuple[str, str]:
 
 def _factor(name: str, unit: str, default: str | None, words: list[str]) -> float:
     if name in LENGTHS:
-        return unit_factor(unit or default or "m")
-    if name in ("yaw", "roll", "pitch"):
+        unit = unit or default or "m"
+        if unit not in UNITS:
+            raise CalibrationError(f"unknown unit '{unit}'; available: {', '.join(UNITS)}")
+        return UNITS[unit]
+    if name in ANGLES:
         if unit == "deg":
             return math.pi / 180.0
         values = [x for word in words if (x := _number(word)) is not None]
@@ -346,10 +299,6 @@ def grid_points(path: str | Path) -> tuple[dict[int, np.ndarray], float]:
     return found, sigma
 
 
-WIDEST = 300.0
-"""Spread of coordinates beyond which metres are not believed unless the file says so [m]."""
-
-
 @dataclass(frozen=True, eq=False)
 class Placed:
     """Points that were surveyed together, so that one error moves them all: a tag's corners, or a single point."""
@@ -413,15 +362,16 @@ def read_survey(
     survey = Survey(str(path))
     placed_where: dict[str, int] = {}
     for row in table.rows:
-        missing = [n for n in ("x", "y") if n not in row.numbers]
-        if missing or ("z" not in row.numbers and z is None):
-            notes.append(f"{table.path}: line {row.line}: left out: {', '.join(missing) or 'z'} is missing")
+        if missing := row.missing("x", "y", *(["z"] if z is None else [])):
+            notes.append(f"{table.path}: line {row.line}: left out: {', '.join(missing)} is missing")
             continue
         _place(survey, table, row, edge, z, placed_where)
     if not (survey.points or survey.tags or survey.locations):
         raise CalibrationError(f"{path}: no surveyed point in it: give rows of id,x,y,z")
-    _plausible(survey, table)
-    return Survey(survey.path, survey.points, survey.tags, survey.locations, tuple(notes))
+    every = [*survey.points.values(), *survey.tags.values()]
+    every += [placed for tags in survey.locations.values() for _, placed in tags]
+    table.refuse_other_units(np.concatenate([placed.points for placed in every]))
+    return replace(survey, notes=tuple(notes))
 
 
 def _need(table: Table, z: float | None) -> None:
@@ -439,17 +389,13 @@ def _need(table: Table, z: float | None) -> None:
 def _place(
     survey: Survey, table: Table, row: Row, edge: float | None, z: float | None, where: dict[str, int]
 ) -> None:
-    position = np.array([row.numbers["x"], row.numbers["y"], row.numbers.get("z", z)], float)
-    sigma = row.numbers.get("sigma", float("nan"))
-    dry = row.words.get("dry", "").lower() in ("1", "1.0", "true", "yes", "y", "dry", "x")
-    group = row.words.get("group", "")
     edge = row.numbers.get("edge", edge)
     tag = row.words.get("tag") or (row.words.get("id") if edge is not None else None)
     if "image" not in row.words and tag is None:
         name = row.words.get("id", "")
         if not name:
             raise table.refuse(row, "no id")
-        here = Placed(name, position[None], sigma, dry=dry, group=group)
+        here = row.placed(name, row.position(z)[None])
         _once(table, row, f"point '{name}'", survey.points.get(name), here, where)
         survey.points[name] = here
         return
@@ -458,8 +404,7 @@ def _place(
     turn = quat_from_euler(*(row.numbers.get(n, 0.0) for n in ("roll", "pitch", "yaw")))
     number = None if tag is None else _integer(table, row, tag)
     name = row.words.get("image") or f"tag {number}"
-    at = position + quat_rotate(turn, corners(edge))
-    here = Placed(name, np.asarray(at), sigma, is_tag=True, dry=dry, group=group)
+    here = row.placed(name, row.position(z) + quat_rotate(turn, corners(edge)), is_tag=True)
     if "image" in row.words:
         survey.locations.setdefault(name, []).append((number, here))
     else:
@@ -481,23 +426,6 @@ def _once(
     if before is not None and np.abs(before.points - here.points).max() > 1e-6:
         raise table.refuse(row, f"{name} was at another place in line {where[name]}: keep one of the two")
     where[name] = row.line
-
-
-def _plausible(survey: Survey, table: Table) -> None:
-    here = [
-        *survey.points.values(),
-        *survey.tags.values(),
-        *(p for t in survey.locations.values() for _, p in t),
-    ]
-    spread = np.ptp(np.concatenate([p.points for p in here]), axis=0).max()
-    if spread > WIDEST and not table.united:
-        raise CalibrationError(
-            f"{table.path}: the points spread over {spread:.0f} m: if they are not in metres, write the unit into the "
-            "header (x_mm) or give --unit mm"
-        )
-
-
-_DETECTIONS = {"u0", "v0", "u3", "v3"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -588,17 +516,12 @@ def observe_combined(
                 f"{path}: no column '{missing[0]}': name the columns u,v,x,y,z, or give a survey (--surveyed)"
                 + ("; points of one height may leave z out and give --z" if missing == ["z"] else "")
             )
-        spread = max((abs(row.numbers.get(n, 0.0)) for row in table.rows for n in "xyz"), default=0.0)
-        if spread > 300.0 and not table.united:
-            raise CalibrationError(
-                f"{path}: coordinates reach {spread:.0f} m: if they are not in metres, write the unit into the header "
-                "(x_mm) or give --unit mm"
-            )
-        for row in table.rows:
-            if all(name in row.numbers for name in needed):
-                rows.add_combined(row, row.numbers.get("z", z))
-            else:
-                rows.notes.append(f"{path}: line {row.line}: left out: a number is missing")
+        complete = [row for row in table.rows if not row.missing(*needed)]
+        table.refuse_other_units(np.array([row.position(z) for row in complete]).reshape(-1, 3))
+        for row in complete:
+            rows.add_combined(row, z)
+        lost = [row.line for row in table.rows if row.missing(*needed)]
+        rows.notes += [f"{path}: line {line}: left out: a number is missing" for line in lost]
     return rows.observations(", ".join(map(str, paths)), None)
 
 
@@ -627,14 +550,10 @@ class _Rows:
         self._images.append(image)
 
     def add_combined(self, row: Row, z: float | None) -> None:
-        point = np.array([row.numbers["x"], row.numbers["y"], z], float)
         name = row.words.get("id") or row.words.get("tag") or f"line {row.line}"
-        dry = row.words.get("dry", "").lower() in ("1", "1.0", "true", "yes", "y", "dry")
-        sigma = row.numbers.get("sigma", float("nan"))
-        new = Placed(name, point[None], sigma, dry=dry, group=row.words.get("group", ""))
-        placed = self._points.setdefault((name, *point.tolist()), new)
-        pixel = np.array([row.numbers["u"], row.numbers["v"]])
-        self.add(row.words.get("image", ""), name, placed, 0, pixel)
+        new = row.placed(name, row.position(z)[None])
+        placed = self._points.setdefault((name, *new.points[0].tolist()), new)
+        self.add(row.words.get("image", ""), name, placed, 0, row.pixel)
 
     def observations(self, source: str, survey: Survey | None) -> Observations:
         if self.unknown:
@@ -686,7 +605,7 @@ def _is_detections(path: Path) -> bool:
     )
     plain = {re.sub(r"[\s\"']", "", cell).lower() for cell in re.split(r"[,;\t]", head)}
     numbered = [cell for cell in plain if re.search(r"\d", cell) and re.search(r"[uvxy]", cell)]
-    return plain >= _DETECTIONS or len(numbered) >= 8
+    return plain >= {"u0", "v0", "u3", "v3"} or len(numbered) >= 8
 
 
 def _match_frames(rows: _Rows, frames: Sequence[Frame], survey: Survey) -> None:
@@ -720,11 +639,10 @@ def _match_table(rows: _Rows, table: Table, survey: Survey) -> None:
         placed, corner = _find(survey, name)
         if placed is None:
             rows.unknown.setdefault(name or f"line {row.line}", 0)
-        elif "u" not in row.numbers or "v" not in row.numbers:
+        elif row.missing("u", "v"):
             rows.notes.append(f"{table.path}: line {row.line}: left out: {name} has no pixel")
         else:
-            pixel = np.array([row.numbers["u"], row.numbers["v"]])
-            rows.add(row.words.get("image", ""), name, placed, corner, pixel)
+            rows.add(row.words.get("image", ""), name, placed, corner, row.pixel)
 
 
 def _find(survey: Survey, name: str) -> tuple[Placed | None, int]:
@@ -734,18 +652,9 @@ def _find(survey: Survey, name: str) -> tuple[Placed | None, int]:
     tag, _, corner = name.partition("/")
     if corner in ("0", "1", "2", "3") and tag.isdigit() and int(tag) in survey.tags:
         return survey.tags[int(tag)], int(corner)
-    try:
-        value = float(name)
-    except ValueError:
-        return None, 0
-    return next((p for key, p in survey.points.items() if _same_number(key, value)), None), 0
-
-
-def _same_number(key: str, value: float) -> bool:
-    try:
-        return float(key) == value
-    except ValueError:
-        return False
+    value = _number(name)
+    same = (placed for key, placed in survey.points.items() if value is not None and _number(key) == value)
+    return next(same, None), 0
 
 
 def _detect(paths: Sequence[Path], family: str | None) -> list[Frame]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.uncertainty import Covariance, intervals, trial_covariance
 from finssim.calibration.vision.least_squares import (
     Block,
+    Pose,
     arrow_evidence,
     arrow_step,
     block_of,
@@ -44,7 +44,6 @@ __all__ = [
     "MountFit",
     "MountState",
     "Noise",
-    "Pose",
     "Rig",
     "UNSURE_LENGTH",
     "change",
@@ -66,32 +65,6 @@ SENSORS = ("imu.turn_x", "imu.turn_y", "imu.turn_z", "depth.offset", "centre.x",
 
 HUBER = 3.0
 """Corners further off than this many standard deviations count linearly."""
-
-
-class Pose(NamedTuple):
-    """A frame in another one."""
-
-    R: Array
-    """(3, 3)"""
-    t: Array
-    """[m], (3,)"""
-
-    def at(self, points: Array) -> Array:
-        """Points of the inner frame in the outer one, (..., 3)."""
-        return np.asarray(points @ self.R.T + self.t)
-
-    def then(self, inner: Pose) -> Pose:
-        """The pose of what lies in this frame at `inner`."""
-        return Pose(self.R @ inner.R, self.R @ inner.t + self.t)
-
-    @property
-    def inverse(self) -> Pose:
-        """The outer frame in the inner one."""
-        return Pose(self.R.T.copy(), -self.R.T @ self.t)
-
-    def stepped(self, step: Array) -> Pose:
-        """After a small turn about the outer axes (3) and a shift (3)."""
-        return Pose(quat_to_matrix(quat_from_rotvec(step[:3])) @ self.R, self.t + step[3:])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from finssim.calibration.vision.tag_mounts import Moment, Pose
+from finssim.calibration.vision.least_squares import Pose
+from finssim.calibration.vision.tag_mounts import Moment
 from finssim.geometry.optics import Camera, Interface, Lens, project
 from finssim.geometry.rotations import (
     quat_conjugate,

@@ -7,11 +7,11 @@ import pytest
 
 from calibration.vision.mounts.moving_vehicle import EDGE, MOUNTS, POOL, PORT, moments, motion
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.vision.least_squares import Pose
 from finssim.calibration.vision.tag_mounts import (
     Moment,
     MountState,
     Noise,
-    Pose,
     Rig,
     change,
     fit_mounts,

@@ -87,7 +87,7 @@ def test_a_floor_needs_no_column_of_heights(tmp_path):
 
 def test_numbers_that_cannot_be_metres_are_refused(tmp_path):
     path = written(tmp_path, "c.csv", "u,v,x,y,z\n5,6,1500,200,0\n")
-    with pytest.raises(CalibrationError, match="reach 1500 m.*--unit mm"):
+    with pytest.raises(CalibrationError, match="spread over 1500 m.*--unit mm"):
         observe_combined([path])
     assert observe_combined([path], unit="mm").points[0, 0] == pytest.approx(1.5)
 
