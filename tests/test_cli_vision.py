@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from calibration.vision.camera.board_views import PHOTOGRAPHS
-from calibration.vision.mounts.moving_vehicle import MOUNTS, POOL, PORT, motion, write_log
-from calibration.vision.pool.surveyed_pools import FLOOR, PLUMB_BOB, SOLID, overhead, survey
+from calibration.vision.board_views import PHOTOGRAPHS
+from calibration.vision.moving_vehicle import MOUNTS, POOL, PORT, motion, write_log
+from calibration.vision.surveyed_pools import FLOOR, PLUMB_BOB, SOLID, overhead, survey
 from finssim import boundary
 from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.cli import app

@@ -132,6 +132,7 @@ HOMES = {
     },
     "cv2": {
         "calibration/vision/boards.py",
+        "calibration/vision/pool_search.py",
         "localization/detection/detector_opencv.py",
         "localization/detection/pictures.py",
         "robot/record_pictures.py",

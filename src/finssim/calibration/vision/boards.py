@@ -155,27 +155,19 @@ def _chessboard(image: NDArray[np.uint8], columns: int, rows: int) -> tuple[Arra
         found, corners = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
     if not found:
         return None
-    grid = np.asarray(corners, float).reshape(rows, columns, 2)
-    return _refined(image, grid.reshape(-1, 2), _spacing(grid)), np.arange(columns * rows)
+    pixels = np.asarray(corners, float).reshape(-1, 2)
+    return _refined(image, pixels), np.arange(columns * rows)
 
 
-def _spacing(grid: Array) -> Array:
-    """Distance of each corner of a grid to its nearest neighbour [px], (n,)."""
-    along = np.linalg.norm(np.diff(grid, axis=1), axis=-1)
-    down = np.linalg.norm(np.diff(grid, axis=0), axis=-1)
-    sides = np.full((4, *grid.shape[:2]), np.inf)
-    sides[0, :, 1:], sides[1, :, :-1] = along, along
-    sides[2, 1:], sides[3, :-1] = down, down
-    return np.asarray(sides.min(axis=0).ravel())
-
-
-def _refined(image: NDArray[np.uint8], pixels: Array, spacing: Array) -> Array:
+def _refined(image: NDArray[np.uint8], pixels: Array) -> Array:
     """Corners where the gradients around them say, each within a window that holds no other corner.
 
     A window as wide as is usual pulls the corners of a small or oblique board towards their neighbours, by pixels.
     """
     import cv2
 
+    distance = np.linalg.norm(pixels[:, None] - pixels[None], axis=-1)
+    spacing = np.where(distance > 0.0, distance, np.inf).min(axis=1)
     half = np.clip((REFINE_SHARE * spacing).astype(int), NARROWEST, WIDEST)
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3)
     refined = pixels.copy()
@@ -199,17 +191,12 @@ def _charuco(image: NDArray[np.uint8], board: Board) -> tuple[Array, NDArray[np.
     drawn = cv2.aruco.CharucoBoard(
         (board.columns, board.rows), board.square, board.marker, cv2.aruco.getPredefinedDictionary(code)
     )
-    for legacy in (
-        False,
-        True,
-    ):  # boards drawn before OpenCV 4.6 start with the other colour if rows are even
+    # Boards drawn before OpenCV 4.6 start with the other colour if rows are even.
+    for legacy in (False, True):
         drawn.setLegacyPattern(legacy)
         pixels, ids, _, _ = cv2.aruco.CharucoDetector(drawn).detectBoard(image)
         if ids is not None and len(ids) >= 6:
             index = np.asarray(ids).ravel().astype(np.int64)
             at = np.asarray(pixels, float).reshape(-1, 2)
-            distance = np.linalg.norm(at[:, None] - at[None], axis=-1) + np.where(
-                np.eye(len(at)), np.inf, 0.0
-            )
-            return _refined(image, at, distance.min(axis=1)), index
+            return _refined(image, at), index
     return None

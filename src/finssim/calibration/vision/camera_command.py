@@ -89,10 +89,7 @@ def camera_json(fit: CameraFit, out: Path | None = None) -> dict[str, Any]:
             }
             for view in fit.views
         ],
-        "error95_px": {
-            "where_seen": plain(reach.inside, DIGITS),
-            "anywhere": plain(reach.anywhere, DIGITS),
-        },
+        "error95_px": {"where_seen": plain(reach.inside, DIGITS), "anywhere": plain(reach.anywhere, DIGITS)},
         "empty_edges": {side: plain(share, DIGITS) for side, share in reach.edges.items()},
         "correlation": correlation_json(fit.correlation, DIGITS),
         "out": None if out is None else str(out),

@@ -31,16 +31,9 @@ from finssim.geometry.optics import Lens, OpticsError
 from finssim.geometry.rotations import skew
 
 __all__ = [
-    "COLUMNS",
-    "CameraFit",
-    "MODELS",
-    "ROWS",
-    "adjust",
-    "calibrate_camera",
-    "evidence",
-    "lens_names",
+    "COLUMNS", "CameraFit", "MODELS", "ROWS", "adjust", "calibrate_camera", "evidence", "lens_names",
     "lens_vector",
-]
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
@@ -60,6 +53,9 @@ HUBER = 2.0
 
 STEPS, POSE_STEPS, RESCALINGS = 100, 40, 6
 """Most steps of a lens and of a pose, and how often the standard deviation is made anew."""
+
+STEADY = 0.01
+"""Relative change of that standard deviation with which it is good: it only decides which corners weigh less."""
 
 FEWEST_VIEWS = 4
 
@@ -255,7 +251,7 @@ def adjust(views: Sequence[BoardView], lens: Lens, poses: Sequence[Pose] | None 
             bundle = _minimise(bundle, views, free)
             if bundle.interrupted:
                 return bundle
-            if abs(bundle.sigma - sigma) < 1e-3 * sigma:
+            if stage != names or abs(bundle.sigma - sigma) < STEADY * sigma:
                 break
     return bundle
 
@@ -366,8 +362,6 @@ class CameraFit:
     """Root of the mean squared distance of corners over the views used [px]."""
     held_out_rms: float
     """The same for views that the lens was not fitted to, only their pose; NaN if there are too few views [px]."""
-    sigma: float
-    """Robust standard deviation of one coordinate of a corner [px]."""
     reach: LensReach
     """How well pixels are known over the picture."""
     advice: tuple[str, ...]
@@ -424,7 +418,6 @@ def calibrate_camera(
         views=every,
         rms=_rms(np.concatenate(bundle.residuals)),
         held_out_rms=held_out,
-        sigma=bundle.sigma,
         reach=reach,
         advice=camera_advice(bundle.lens, [v for v in every if not v.left_out], estimates, reach),
         settings={"model": model, "seed": seed},

@@ -17,19 +17,9 @@ from finssim.calibration.uncertainty import Evidence
 from finssim.geometry.rotations import quat_from_rotvec, quat_to_matrix, skew
 
 __all__ = [
-    "Block",
-    "Pose",
-    "TukeyFit",
-    "arrow_evidence",
-    "arrow_step",
-    "block_of",
-    "descent",
-    "huber_cost",
-    "huber_weight",
-    "linear_map",
-    "pose_of_plane",
-    "tukey",
-]
+    "Block", "Pose", "TukeyFit", "arrow_evidence", "arrow_step", "block_of", "descent", "huber_cost",
+    "huber_weight", "linear_map", "pose_of_plane", "tukey",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 State = TypeVar("State")

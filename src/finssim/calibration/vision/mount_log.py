@@ -81,15 +81,10 @@ class MountLog:
         found = []
         for time, corners in self.pictures:
             up = None if self.up is None else self.up.at(time - imu_offset)
+            up = None if up is None else up / np.linalg.norm(up)
             depth = None if self.depth is None else self.depth.at(time)
-            found.append(
-                Moment(
-                    time=time,
-                    corners=corners,
-                    up=None if up is None else up / np.linalg.norm(up),
-                    depth=None if depth is None else float(depth[0]),
-                )
-            )
+            depth = None if depth is None else float(depth[0])
+            found.append(Moment(time=time, corners=corners, up=up, depth=depth))
         return tuple(found)
 
 
@@ -113,65 +108,57 @@ def read_mount_log(folder: str | Path, pool: Pool, vehicle: Vehicle) -> MountLog
     time = np.array([frame.time for frame in frames]) - pool.latency
     if not np.isfinite(time).all():
         raise CalibrationError(f"{folder / DETECTIONS}: pictures without a time: add a column 'time' [s]")
-    up, gyro = _imu(folder / IMU, vehicle, notes)
+    up, gyro, turning = _imu(folder / IMU, vehicle, notes)
     pictures = tuple(
         (float(time[i]), {d.tag: np.asarray(d.corners, float) for d in most_certain(frames[i].detections)})
         for i in np.argsort(time, kind="stable")
     )
+    depth = _depth(folder / DEPTH, notes)
+    files = [folder / name for name in (DETECTIONS, IMU, DEPTH) if (folder / name).is_file()]
+    sha256 = hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
     return MountLog(
-        pictures=pictures,
-        up=up,
-        gyro=gyro,
-        turning=_turning(up, gyro, vehicle),
-        depth=_depth(folder / DEPTH, notes),
-        sha256=_digest(folder),
-        notes=tuple(notes),
+        pictures=pictures, up=up, gyro=gyro, turning=turning, depth=depth, sha256=sha256, notes=tuple(notes)
     )
 
 
-def _imu(path: Path, vehicle: Vehicle, notes: list[str]) -> tuple[Stream | None, Gyro | None]:
-    """Up in body axes, and the gyro in its own."""
+def _imu(path: Path, vehicle: Vehicle, notes: list[str]) -> tuple[Stream | None, Gyro | None, Stream | None]:
+    """Up in body axes, the gyro in its own, and the angular rate about the vertical."""
     if not path.is_file():
         notes.append(f"no {IMU}: how tags sit in the body is not told, only how they sit to one another")
-        return None, None
+        return None, None, None
     table = read_stream_table(path)
     notes.extend(table.notes)
-    mount = np.array([0.0, 0.0, 0.0, 1.0])
-    if vehicle.sensors.imu is not None:
-        mount = np.asarray(vehicle.sensors.imu.orientation)
+    imu = vehicle.sensors.imu
+    mount = np.array([0.0, 0.0, 0.0, 1.0] if imu is None else imu.orientation)
     own = table.has(*SENSOR_RATE) and not table.has(*RATE)
-    rate = _columns(table, SENSOR_RATE if own else RATE)
-    force = _columns(table, SENSOR_FORCE if own else FORCE)
+
+    def columns(names: tuple[str, ...]) -> Array | None:
+        """In body axes."""
+        if not table.has(*names):
+            return None
+        return in_body_axes(table.columns(*names), mount) if own else table.columns(*names)
+
+    rate, force = columns(SENSOR_RATE if own else RATE), columns(SENSOR_FORCE if own else FORCE)
+    clean = None if rate is None else _stream(table.t, rate)
     gyro = None
-    if rate is not None and np.isfinite(rate).all(axis=1).sum() > 2:
-        good = np.isfinite(rate).all(axis=1)
-        clean = _stream(table.t[good], rate[good] if own else quat_inverse_rotate(mount, rate[good]))
-        gyro = Gyro(t=clean.t, rate=clean.values)
+    if clean is not None and len(clean.t) > 2:
+        gyro = Gyro(t=clean.t, rate=quat_inverse_rotate(mount, clean.values))
     up = _up(table)
     if up is not None:
         up = in_body_axes(up, mount) if own else up
     elif rate is not None and force is not None:
-        omega, felt = (in_body_axes(x, mount) if own else x for x in (rate, force))
-        up = _tilt(table.t, omega, felt, vehicle.water.gravity)
+        up = _tilt(table.t, rate, force, vehicle.water.gravity)
         notes.append(f"{IMU} holds no attitude: roll and pitch are made from gyro and accelerometer")
     else:
         notes.append(f"{IMU} holds neither an attitude nor rates with accelerations: no tilt is known")
-        return None, gyro
-    good = np.isfinite(up).all(axis=1)
-    return _stream(table.t[good], up[good]), gyro
-
-
-def _turning(up: Stream | None, gyro: Gyro | None, vehicle: Vehicle) -> Stream | None:
-    if up is None or gyro is None or len(up.t) < 2:
-        return None
-    mount = np.array([0.0, 0.0, 0.0, 1.0])
-    if vehicle.sensors.imu is not None:
-        mount = np.asarray(vehicle.sensors.imu.orientation)
-    within = (gyro.t >= up.t[0]) & (gyro.t <= up.t[-1])
-    t = gyro.t[within]
-    up_s = quat_inverse_rotate(mount, up.values)
-    rate = sum(gyro.rate[within, i] * np.interp(t, up.t, up_s[:, i]) for i in range(3))
-    return Stream(t=t, values=np.asarray(rate)[:, None]) if len(t) > 2 else None
+        return None, gyro, None
+    tilt = _stream(table.t, up)
+    if gyro is None or clean is None or len(tilt.t) < 2:
+        return tilt, gyro, None
+    within = (clean.t >= tilt.t[0]) & (clean.t <= tilt.t[-1])
+    t, omega = clean.t[within], clean.values[within]
+    about = sum(omega[:, i] * np.interp(t, tilt.t, tilt.values[:, i]) for i in range(3))
+    return tilt, gyro, Stream(t=t, values=np.asarray(about)[:, None]) if len(t) > 2 else None
 
 
 def _up(table: StreamTable) -> Array | None:
@@ -185,35 +172,26 @@ def _up(table: StreamTable) -> Array | None:
     return None
 
 
-def _columns(table: StreamTable, names: tuple[str, ...]) -> Array | None:
-    return table.columns(*names) if table.has(*names) else None
-
-
 def _tilt(t: Array, omega: Array, force: Array, gravity: float) -> Array:
     """Up from gyro and accelerometer, (m, 3); NaN until the filter has settled and after a gap.
 
     It runs twice: the first time learns the gyro's bias, with which the second starts.
     """
-    gains = TiltGains(gravity=gravity)
-    _, learnt = _filtered(t, omega, force, gains, np.zeros(3))
-    return _filtered(t, omega, force, gains, learnt)[0]
-
-
-def _filtered(t: Array, omega: Array, force: Array, gains: TiltGains, bias: Array) -> tuple[Array, Array]:
-    """Up (m, 3), and the bias at the end."""
+    gains, bias = TiltGains(gravity=gravity), np.zeros(3)
     up = np.full((len(t), 3), np.nan)
-    tilt, since, last = None, 0.0, 0.0
-    for i in np.flatnonzero(np.isfinite(omega).all(axis=1)):
-        if tilt is None or t[i] - last > gains.longest_gap:
-            if not np.isfinite(force[i]).all():
-                continue
-            tilt, since = replace(tilt_from(force[i]), bias=bias), t[i]
-        else:
-            tilt = follow(tilt, omega[i], force[i], t[i] - last, gains)
-        last = t[i]
-        if t[i] - since >= SETTLING:
-            up[i] = tilt.up
-    return up, bias if tilt is None else tilt.bias
+    for _ in range(2):
+        tilt, since, last = None, 0.0, 0.0
+        for i in np.flatnonzero(np.isfinite(omega).all(axis=1)):
+            if tilt is None or t[i] - last > gains.longest_gap:
+                if not np.isfinite(force[i]).all():
+                    continue
+                tilt, since = replace(tilt_from(force[i]), bias=bias), t[i]
+            else:
+                tilt = follow(tilt, omega[i], force[i], t[i] - last, gains)
+            last = t[i]
+            up[i] = tilt.up if t[i] - since >= SETTLING else np.nan
+        bias = bias if tilt is None else tilt.bias
+    return up
 
 
 def _depth(path: Path, notes: list[str]) -> Stream | None:
@@ -226,20 +204,11 @@ def _depth(path: Path, notes: list[str]) -> Stream | None:
         raise CalibrationError(
             f"{path}: no column 'depth': add the depth of the pressure port [m], positive down"
         )
-    depth = table.numbers["depth"]
-    good = np.isfinite(depth)
-    return _stream(table.t[good], depth[good][:, None])
+    return _stream(table.t, table.columns("depth"))
 
 
 def _stream(t: Array, values: Array) -> Stream:
-    """In order of time, once each."""
-    times, first = np.unique(t, return_index=True)
-    return Stream(t=times, values=values[first])
-
-
-def _digest(folder: Path) -> str:
-    digest = hashlib.sha256()
-    for name in (DETECTIONS, IMU, DEPTH):
-        if (folder / name).is_file():
-            digest.update((folder / name).read_bytes())
-    return digest.hexdigest()
+    """In order of time, once each, without rows that hold no number."""
+    good = np.isfinite(values).all(axis=1)
+    times, first = np.unique(t[good], return_index=True)
+    return Stream(t=times, values=values[good][first])

@@ -35,7 +35,6 @@ from finssim.calibration.vision.tag_mounts import (
     AXES,
     UNSURE_LENGTH,
     MountFit,
-    Noise,
     Rig,
     fit_mounts,
     reference_tag,
@@ -359,7 +358,7 @@ def _curves(found: MountFit) -> tuple[Curve, ...]:
     """For the report: first corners, tilt and depth as measured and as the fit has them, over time."""
     rig, state, moments = found.rig, found.state, found.moments
     t = np.array([moment.time for moment in moments])
-    pixels, owner, _ = residuals(rig, state, moments, Noise())
+    pixels, owner, _ = residuals(rig, state, moments)
     tags = np.array([tag for moment in moments for tag in moment.corners])
     seen = np.array([corner for moment in moments for corner in moment.corners.values()])
     curves = []

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Correlation, Estimate
-from finssim.calibration.vision.pool_advice import advice, correlation, estimates
+from finssim.calibration.vision.pool_advice import advice, estimates
 from finssim.calibration.vision.pool_model import (
     NAMES,
     PoolModel,
@@ -20,6 +20,7 @@ from finssim.calibration.vision.pool_model import (
     extended_lens,
     lens_std,
     residuals,
+    shifted_settings,
     solve,
 )
 from finssim.calibration.vision.pool_refine import (
@@ -32,9 +33,8 @@ from finssim.calibration.vision.pool_refine import (
     refine,
     rms,
     touched,
-    touching_advice,
 )
-from finssim.calibration.vision.pool_search import UP, Found, prior_of, search, shifted_settings
+from finssim.calibration.vision.pool_search import UP, Found, prior_of, search
 from finssim.calibration.vision.survey import Observations
 from finssim.geometry.optics import Lens
 
@@ -51,7 +51,7 @@ LEVEL = np.radians(3.0)
 MOST_LEAN = np.radians(5.0)
 """A surface tilted further from the survey's z than this is none [rad]."""
 
-LENS_STEPS = ((), ("focal", "center"), ("focal", "center", "distortion"))
+LENS_STEPS = (("focal", "center"), ("focal", "center", "distortion"))
 """What the lens gives up where held-out points get better by it."""
 
 BETTER = 0.9
@@ -96,11 +96,6 @@ class PoolFit:
         rows = np.flatnonzero(~self.used)
         return [self.seen.names[i] for i in rows[np.argsort(-size[rows])]]
 
-    @property
-    def normal(self) -> Array:
-        """Of the planes on which errors in the water are told, (3,)."""
-        return UP if self.surface else self.model.interface.normal
-
     def residual_json(self) -> dict[str, float | int]:
         """Figures of the rows used."""
         error = self.error[self.used]
@@ -135,7 +130,8 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
     found = search(here, extended_lens(lens), told)
     notes = list(seen.notes)
     fit = _best_lens(here, found, told, notes)
-    if not found.surface and settings.interface == "auto" and settings.plane is None and _level(fit):
+    level = abs(float(fit.model.interface.normal[2])) > np.cos(LEVEL)
+    if level and not found.surface and settings.interface == "auto" and settings.plane is None:
         found, notes = replace(found, surface=True), list(seen.notes)
         fit = _best_lens(here, found, told, notes)
     fit = _released(here, told, fit, notes)
@@ -147,14 +143,15 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
     pinhole = _pinhole(here, found, told, fit)
     normal = UP if found.surface else fit.model.interface.normal
     parts = [held_out(f, here, settings.folds, settings.seed, normal) for f in (fit, pinhole)]
-    table = estimates(fit, found.surface, told, centre)
+    table, errors = estimates(fit, found.surface, told, centre)
     touching = touched(fit, here)
+    contradicted = _contradicted(here, told, fit)
     return PoolFit(
         model=fit.model.shifted(centre),
         surface=found.surface,
         settings=settings,
         estimates=table,
-        correlation=correlation(fit),
+        correlation=errors,
         seen=seen,
         used=fit.used,
         noise=fit.noise,
@@ -166,45 +163,39 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
         pinhole_held_out=parts[1],
         lens_fitted=_lens_groups(fit.active),
         notes=tuple(notes),
-        advice=(
-            *touching_advice(touching),
-            *_contradicted(here, told, fit),
-            *advice(fit, here, found.surface, told, table, found.minima),
-        ),
+        advice=tuple(advice(fit, here, found.surface, told, table, found.minima, touching, contradicted)),
         minima=found.minima,
         touching=touching,
     )
 
 
-def _first_noise(settings: Settings) -> Noise:
-    return Noise(
-        pixel=settings.pixel_sigma or 0.4,
-        survey=max(settings.survey_sigma, 1e-7),
-        survey_yaw=settings.survey_yaw_sigma,
-    )
-
-
 def _refined(
-    here: Observations, model: PoolModel, found: Found, told: Settings, active: NDArray[np.bool_]
+    here: Observations, model: PoolModel, told: Settings, active: NDArray[np.bool_], prior: Prior
 ) -> Refined:
-    start = replace(found.model, interface=replace(found.model.interface, index_far=told.index))
-    prior = prior_of(model, start, told, found.surface, lens_std(told, model.camera.lens.width))
-    return refine(model, here, active, prior, _first_noise(told), pixel_known=told.pixel_sigma is not None)
+    pixel, survey = told.pixel_sigma or 0.4, max(told.survey_sigma, 1e-7)
+    noise = Noise(pixel=pixel, survey=survey, survey_yaw=told.survey_yaw_sigma)
+    return refine(model, here, active, prior, noise, pixel_known=told.pixel_sigma is not None)
 
 
 def _best_lens(here: Observations, found: Found, told: Settings, notes: list[str]) -> Refined:
     """The fit as asked; where nobody asked, the lens is fitted as far as held-out points get better by it."""
-    best = _refined(here, found.model, found, told, active_names(told))
+    start = replace(found.model, interface=replace(found.model.interface, index_far=told.index))
+
+    def fitted(model: PoolModel, active: NDArray[np.bool_]) -> Refined:
+        stds = lens_std(told, model.camera.lens.width)
+        return _refined(here, model, told, active, prior_of(model, start, told, found.surface, stds))
+
+    best = fitted(found.model, active_names(told))
     if told.fit is not None:
         return best
     normal = UP if found.surface else best.model.interface.normal
     error = _generalisation(best, here, told, normal)
-    for extra in LENS_STEPS[1:]:
+    for extra in LENS_STEPS:
         active = active_names(told, extra)
         if 2 * len(here) < 3 * active.sum() or not np.isfinite(error):
             break
         try:
-            other = _refined(here, best.model, found, told, active)
+            other = fitted(best.model, active)
         except (CalibrationError, np.linalg.LinAlgError):
             continue
         further = _generalisation(other, here, told, normal)
@@ -249,11 +240,6 @@ def _released(here: Observations, told: Settings, fit: Refined, notes: list[str]
     return free
 
 
-def _level(fit: Refined) -> bool:
-    """Whether a plane of free direction came out as level as a water surface is."""
-    return bool(abs(float(fit.model.interface.normal[2])) > np.cos(LEVEL))
-
-
 def _leans(free: Refined, normal: Array) -> bool:
     """Whether the tilt is small enough to be one, and told by the pixels rather than free to go anywhere."""
     lean = float(np.arccos(np.clip(free.model.interface.normal @ normal, -1.0, 1.0)))
@@ -279,12 +265,11 @@ def _contradicted(here: Observations, told: Settings, fit: Refined) -> list[str]
 def _without(here: Observations, told: Settings, fit: Refined, loose: Prior) -> Refined | None:
     """The fit with a prior loosened, where the pixels contradict that prior; else None."""
     try:
-        known = told.pixel_sigma is not None
-        free = refine(fit.model, here, fit.active, loose, _first_noise(told), pixel_known=known)
+        free = _refined(here, fit.model, told, fit.active, loose)
     except (CalibrationError, np.linalg.LinAlgError):
         return None
     held = solve(free.model, here.subset(free.used), free.whiten, fit.active, fit.prior)
-    return free if 2.0 * (held.cost - free.solution.cost) > DOUBT else None
+    return free if 2.0 * (held.cost - free.cost) > DOUBT else None
 
 
 def _pinhole(here: Observations, found: Found, told: Settings, fit: Refined) -> Refined:
@@ -297,19 +282,12 @@ def _pinhole(here: Observations, found: Found, told: Settings, fit: Refined) -> 
     end = solve(model, part, Whitener(np.zeros((len(part), 2, 3)), part, alike), active, prior).model
     alike = replace(alike, pixel=max(0.05, rms(residuals(end, part)[0]) / np.sqrt(2.0)))
     whiten = Whitener(end.jacobians(part.points, part.dry)[1], part, alike)
-    solution = solve(end, part, whiten, active, prior)
-    return Refined(
-        solution.model,
-        alike,
-        fit.used,
-        whiten,
-        active,
-        prior,
-        np.zeros((len(NAMES), len(NAMES))),
-        solution,
-        fit.dof,
-    )
+    model, cost = solve(end, part, whiten, active, prior)
+    nothing = np.zeros((len(NAMES), len(NAMES)))
+    return Refined(model, alike, fit.used, whiten, active, prior, nothing, cost, fit.dof)
 
+
+# What a finished calibration of a pool says against itself: no water, a wrong unit, a frame that cannot be told.
 
 STRAIGHTER = 0.7
 """Held-out error of straight lines over that of refraction below which refraction is not believed."""
@@ -361,10 +339,9 @@ def doubted(fit: PoolFit, lens: Lens, *, lens_told: bool = True) -> PoolFit:
         CalibrationError: It cannot be a camera before water; says which number to check.
     """
     _refuse_depth(fit)
-    _refuse_touching(fit)
-    found = [*_straight(fit), *_touching(fit), *_unmarked(fit, lens), *_handed(fit)]
+    found = [*_touching(fit), *_unmarked(fit, lens), *_handed(fit)]
     exact = [] if lens_told or "focal" in fit.lens_fitted else [EXACT_LENS]
-    return replace(fit, advice=(*found, *fit.advice), notes=(*fit.notes, *exact))
+    return replace(fit, advice=(*_straight(fit), *found, *fit.advice), notes=(*fit.notes, *exact))
 
 
 def _refuse_depth(fit: PoolFit) -> None:
@@ -387,34 +364,26 @@ def _told_depth(fit: PoolFit) -> tuple[float, str]:
     if settings.water_depth is not None:
         return abs(settings.water_depth), f"--water-depth {settings.water_depth:g}"
     if settings.plane is not None:
-        normal = np.array(settings.plane[:3])
-        return abs(float(normal @ middle) + settings.plane[3]) / float(np.linalg.norm(normal)), "--plane"
+        normal, offset = settings.unit_plane
+        return abs(float(normal @ middle) + offset), "--plane"
     return 0.0, ""
 
 
-def _refuse_touching(fit: PoolFit) -> None:
-    error = rms(fit.residual[fit.used])
-    if _on_plane(fit) and error > ABSURD:
+def _touching(fit: PoolFit) -> list[str]:
+    """Where the camera comes to rest on the plane, which it cannot pass; refused where that is absurd."""
+    model, error = fit.model, rms(fit.residual[fit.used])
+    if model.clearance >= TOUCHING * (model.clearance + max(model.depth, 0.0)) or error <= ODD:
+        return []
+    if error > ABSURD:
         raise CalibrationError(
             f"the camera ends on the plane itself, with residuals of {error:.0f} px: no camera before this plane sees "
             "the points so; check the unit and sign of the water's height, the window's thickness [m], the index, and "
             "whether there is water between at all; nothing is written"
         )
-
-
-def _touching(fit: PoolFit) -> list[str]:
-    error = rms(fit.residual[fit.used])
-    if not _on_plane(fit) or error <= ODD:
-        return []
     return [
         f"the camera ends on the plane itself, with residuals of {error:.1f} px: the plane's place, the window, the "
         "index or the camera file is wrong; do not use this pool file"
     ]
-
-
-def _on_plane(fit: PoolFit) -> bool:
-    model = fit.model
-    return model.clearance < TOUCHING * (model.clearance + max(model.depth, 0.0))
 
 
 def _straight(fit: PoolFit) -> list[str]:

@@ -6,36 +6,28 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.vision.least_squares import descent
 from finssim.calibration.vision.survey import Observations
 from finssim.geometry.optics import Camera, Interface, Layer, Lens, Status, project, projection_jacobians
 from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_to_matrix, skew
 
 __all__ = [
-    "LENS_NAMES",
-    "NAMES",
-    "PoolModel",
-    "Prior",
-    "Settings",
-    "Solution",
-    "active_names",
-    "clearances",
-    "extended_lens",
-    "lens_std",
-    "normal_equations",
-    "residuals",
-    "solve",
-]
+    "LENS_NAMES", "NAMES", "PoolModel", "Prior", "Settings", "Solution", "active_names", "clearances",
+    "extended_lens", "lens_std", "normal_equations", "residuals", "shifted_settings", "solve",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
 POSE_NAMES = ("camera_x", "camera_y", "camera_z", "rotation_x", "rotation_y", "rotation_z")
-LENS_NAMES = (
+LENS_NAMES = ("focal", "center_x", "center_y", *(f"distortion_{k}" for k in range(1, 6)))
+NAMES = (
     "focal",
     "center_x",
     "center_y",
@@ -84,6 +76,12 @@ class PoolModel:
     def tangents(self) -> Array:
         """Directions that the plane's normal tilts towards, (2, 3)."""
         return np.stack([np.asarray(e, float) for e in self.interface.tangents()])
+
+    @property
+    def lens_values(self) -> Array:
+        """Log focal length, centre [px] and five coefficients of distortion, (8,)."""
+        lens = self.camera.lens
+        return np.array([np.log(lens.fx), lens.cx, lens.cy, *lens.distortion, 0.0, 0.0, 0.0, 0.0, 0.0])[:8]
 
     def predict(self, points: Array, dry: NDArray[np.bool_]) -> Array:
         """Pixels of points, (N, 3) -> (N, 2); NaN where the camera cannot see them or they are beyond no plane.
@@ -165,18 +163,16 @@ class PoolModel:
 def _lens_moved(lens: Lens, step: Array) -> Lens:
     if not step.any():
         return lens
-    factor = float(np.exp(step[0]))
-    terms = list(lens.distortion)
-    for i, change in enumerate(step[3:8]):
-        if i < len(terms):
-            terms[i] += float(change)
+    factor, count = float(np.exp(step[0])), min(5, len(lens.distortion))
+    distortion = np.array(lens.distortion)
+    distortion[:count] += step[3 : 3 + count]
     return replace(
         lens,
         fx=lens.fx * factor,
         fy=lens.fy * factor,
         cx=lens.cx + float(step[1]),
         cy=lens.cy + float(step[2]),
-        distortion=tuple(terms),
+        distortion=tuple(distortion.tolist()),
     )
 
 
@@ -196,6 +192,19 @@ FITTED = {
 LENS_STD = (0.05, 0.03, 0.03, 0.15, 0.15, 0.02, 0.02, 0.1)
 """How far a camera file that is only roughly right may be off: log focal, centre in widths of the image, distortion."""
 
+
+RANGES = {
+    "index": ("index", 1.0, 1.0, 2.5),
+    "index_sigma": ("index sigma", 1.0, 0.0, 1.0),
+    "tilt_sigma": ("tilt sigma [deg]", np.degrees(1.0), 0.0, 180.0),
+    "water_height_sigma": ("water height sigma", 1.0, 0.0, 10.0),
+    "survey_sigma": ("survey sigma", 1.0, 0.0, 1.0),
+    "survey_yaw_sigma": ("survey yaw sigma [deg]", np.degrees(1.0), 0.0, 180.0),
+    "focal_sigma": ("focal sigma", 1.0, 0.0, 10.0),
+    "center_sigma": ("center sigma", 1.0, 0.0, 1e4),
+    "pixel_sigma": ("pixel sigma", 1.0, 1e-3, 100.0),
+}
+"""Setting -> what it is called, units that one of its own makes, least and most in those."""
 
 THICKEST = 0.5
 """Thickness of a window beyond which another unit than metres is meant [m]."""
@@ -268,16 +277,12 @@ class Settings:
                     f"window is {layer.thickness:g} m thick, expected at most {THICKEST:g}: thickness is in metres, "
                     "10 mm of glass are 0.010:1.52"
                 )
-        _positive("index", self.index, 1.0, 2.5)
-        _positive("index sigma", self.index_sigma, 0.0, 1.0)
-        _positive("tilt sigma [deg]", math.degrees(self.tilt_sigma or 0.0), 0.0, 180.0)
-        _positive("water height sigma", self.water_height_sigma, 0.0, 10.0)
-        _positive("survey sigma", self.survey_sigma, 0.0, 1.0)
-        _positive("survey yaw sigma [deg]", math.degrees(self.survey_yaw_sigma), 0.0, 180.0)
-        _positive("focal sigma", self.focal_sigma, 0.0, 10.0)
-        _positive("center sigma", self.center_sigma, 0.0, 1e4)
-        if self.pixel_sigma is not None:
-            _positive("pixel sigma", self.pixel_sigma, 1e-3, 100.0)
+        for field, (name, per, least, most) in RANGES.items():
+            value = getattr(self, field)
+            if value is not None and not least <= per * value <= most:
+                raise CalibrationError(
+                    f"{name} is {per * value:g}, expected a number from {least:g} to {most:g}"
+                )
         if self.folds < 2:
             raise CalibrationError(f"folds is {self.folds}, expected at least 2")
         if self.plane is not None and not np.linalg.norm(self.plane[:3]) > 0.0:
@@ -288,37 +293,43 @@ class Settings:
         """Whether a measurement of the plane's place is given."""
         return any(x is not None for x in (self.water_height, self.water_depth, self.plane))
 
+    @property
+    def unit_plane(self) -> tuple[Array, float]:
+        """n of length 1, (3,), and b [m] of the surveyed plane."""
+        assert self.plane is not None
+        length = float(np.linalg.norm(self.plane[:3]))
+        return np.array(self.plane[:3]) / length, self.plane[3] / length
+
+
+def shifted_settings(settings: Settings, vector: Array) -> Settings:
+    """The same in a frame in which every point lies `vector` further [m]."""
+    if settings.water_height is not None:
+        return replace(settings, water_height=settings.water_height + float(vector[2]))
+    if settings.plane is not None:
+        n, b = np.array(settings.plane[:3]), settings.plane[3]
+        return replace(settings, plane=(*map(float, n), float(b - n @ vector)))
+    return settings
+
 
 def active_names(settings: Settings, extra: tuple[str, ...] = ()) -> NDArray[np.bool_]:
     """Which of `NAMES` are fitted, (18,)."""
-    groups = list(settings.fit or ("pose", "height", "tilt", "index")) + list(extra)
-    if settings.focal_sigma > 0.0:
-        groups.append("focal")
-    if settings.center_sigma > 0.0:
-        groups.append("center")
-    names = {name for group in groups for name in FITTED[group]}
-    if settings.index_sigma <= 0.0:
-        names -= {"index"}
-    if settings.tilt_sigma is not None and settings.tilt_sigma <= 0.0:
-        names -= {"tilt_x", "tilt_y"}
-    if settings.known_depth and settings.water_height_sigma <= 0.0:
-        names -= {"depth"}
+    held = {
+        "index": settings.index_sigma <= 0.0,
+        "tilt": settings.tilt_sigma is not None and settings.tilt_sigma <= 0.0,
+        "height": settings.known_depth and settings.water_height_sigma <= 0.0,
+    }
+    groups = {*(settings.fit or ("pose", "height", "tilt", "index")), *extra}
+    groups |= {name for name in ("focal", "center") if getattr(settings, f"{name}_sigma") > 0.0}
+    names = {name for group in groups if not held.get(group) for name in FITTED[group]}
     return np.array([name in names for name in NAMES])
 
 
 def lens_std(settings: Settings, width: int) -> tuple[float, ...]:
     """Standard deviations of `LENS_NAMES` before the pictures."""
     focal, x, y, *distortion = LENS_STD
-    if settings.focal_sigma > 0.0:
-        focal = settings.focal_sigma
-    if settings.center_sigma > 0.0:
-        return (focal, settings.center_sigma, settings.center_sigma, *distortion)
-    return (focal, x * width, y * width, *distortion)
-
-
-def _positive(what: str, value: float, least: float, most: float) -> None:
-    if not (math.isfinite(value) and least <= value <= most):
-        raise CalibrationError(f"{what} is {value:g}, expected a number from {least:g} to {most:g}")
+    center = settings.center_sigma
+    across = (center, center) if center > 0.0 else (x * width, y * width)
+    return (settings.focal_sigma or focal, *across, *distortion)
 
 
 LOST = 500.0
@@ -352,52 +363,27 @@ class Prior:
 
     def rows(self, model: PoolModel) -> tuple[Array, Array]:
         """Residuals (M,) of the priors, each over its standard deviation, and their derivatives (M, 18)."""
-        r: list[float] = []
-        J: list[Array] = []
-
-        def add(residual: float, std: float, columns: dict[int, float]) -> None:
-            if np.isfinite(std) and std > 0.0:
-                row = np.zeros(len(NAMES))
-                for k, value in columns.items():
-                    row[k] = value / std
-                r.append(residual / std)
-                J.append(row)
-
+        r, J = np.zeros(12), np.eye(len(NAMES))[6:]
+        std = np.array([np.inf, np.inf, self.depth_std, self.index_std, *self.lens_std])
         if self.normal is not None:
-            for e in self._tangents():
-                along = model.tangents @ e
-                add(float(model.interface.normal @ e), self.tilt_std, {6: along[0], 7: along[1]})
-        if np.isfinite(self.depth):
-            add(model.depth - self.depth, self.depth_std, {8: 1.0})
-        add(model.interface.index_far - self.start.interface.index_far, self.index_std, {9: 1.0})
-        for k, (now, before) in enumerate(zip(lens_values(model), lens_values(self.start), strict=True)):
-            add(now - before, self.lens_std[k], {10 + k: 1.0})
-        return np.array(r), np.array(J).reshape(-1, len(NAMES))
-
-    def _tangents(self) -> Array:
-        assert self.normal is not None
-        axis = np.eye(3)[int(np.argmin(np.abs(self.normal)))]
-        e1 = np.cross(self.normal, axis)
-        e1 /= np.linalg.norm(e1)
-        return np.stack([e1, np.cross(self.normal, e1)])
+            across = np.stack([np.asarray(e, float) for e in Interface(self.normal, 0.0).tangents()])
+            r[:2], J[:2, 6:8], std[:2] = (
+                across @ model.interface.normal,
+                across @ model.tangents.T,
+                self.tilt_std,
+            )
+        r[2:4] = model.depth - self.depth, model.interface.index_far - self.start.interface.index_far
+        r[4:] = model.lens_values - self.start.lens_values
+        given = np.isfinite(r) & np.isfinite(std) & (std > 0.0)
+        return r[given] / std[given], J[given] / std[given, None]
 
 
-@dataclass(frozen=True)
-class Solution:
+class Solution(NamedTuple):
     """Where the search ended."""
 
     model: PoolModel
     cost: float
     """Half the sum of squares of whitened residuals and priors."""
-    iterations: int
-    converged: bool
-
-
-def lens_values(model: PoolModel) -> list[float]:
-    """Log focal length, centre and five coefficients of distortion of the model's lens."""
-    lens = model.camera.lens
-    terms = (*lens.distortion, *([0.0] * 5))[:5]
-    return [float(np.log(lens.fx)), lens.cx, lens.cy, *terms]
 
 
 def residuals(model: PoolModel, seen: Observations) -> tuple[Array, NDArray[np.bool_]]:
@@ -428,30 +414,28 @@ def solve(
         iterations: At most.
         tolerance: Relative change of the cost at which the search ends.
     """
-    model = start
-    cost = _cost(model, seen, whiten, prior)
-    damping, free = 1e-3, np.flatnonzero(active)
-    for iteration in range(iterations):
+    free = np.flatnonzero(active)
+
+    def steps_from(model: PoolModel) -> Callable[[float], PoolModel | None]:
         N, g = normal_equations(model, seen, whiten, free, prior)
-        bounds = _bounds(model, seen, free)
-        scale = np.sqrt(np.maximum(np.diagonal(N), 1e-300))
+        bounds, scale = _bounds(model, seen, free), np.sqrt(np.maximum(np.diagonal(N), 1e-300))
         H, b = N / np.outer(scale, scale), g / scale
-        while True:
+
+        def stepped(damping: float) -> PoolModel | None:
             step = np.zeros(len(NAMES))
             step[free] = _sliding(H + damping * np.eye(len(free)), b, scale, bounds) / scale
-            trial = _tried(model, step, seen, 8 in free)
-            new = np.inf if trial is None else _cost(trial, seen, whiten, prior)
-            if new <= cost:
-                break
-            damping *= 4.0
-            if damping > 1e10:
-                return Solution(model, cost, iteration, True)
-        assert trial is not None
-        gain, model, cost = cost - new, trial, new
-        damping = max(damping / 6.0, 1e-12)
-        if gain <= tolerance * max(cost, 1e-12) and damping < 1.0:
-            return Solution(model, cost, iteration + 1, True)
-    return Solution(model, cost, iterations, False)
+            return _tried(model, step, seen, 8 in free)
+
+        return stepped
+
+    def cost(model: PoolModel) -> float:
+        if model.refractive and (model.clearance <= 0.0 or not 1.0 < model.interface.index_far < 3.0):
+            return np.inf
+        e, r = whiten(residuals(model, seen)[0]), prior.rows(model)[0]
+        return 0.5 * float(e @ e + r @ r)
+
+    *_, end = descent(start, cost, steps_from, rounds=iterations, tolerance=tolerance)
+    return Solution(*end)
 
 
 def normal_equations(
@@ -465,14 +449,6 @@ def normal_equations(
     r_prior, J_prior = prior.rows(model)
     J_prior = J_prior[:, free]
     return A.T @ A + J_prior.T @ J_prior, A.T @ e - J_prior.T @ r_prior
-
-
-def _cost(model: PoolModel, seen: Observations, whiten: Whitening, prior: Prior) -> float:
-    if model.refractive and (model.clearance <= 0.0 or not 1.0 < model.interface.index_far < 3.0):
-        return np.inf
-    e = whiten(residuals(model, seen)[0])
-    r = prior.rows(model)[0]
-    return 0.5 * float(e @ e + r @ r)
 
 
 def clearances(model: PoolModel, points: Array) -> Array:

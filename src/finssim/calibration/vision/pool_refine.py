@@ -15,7 +15,6 @@ from finssim.calibration.vision.pool_model import (
     NAMES,
     PoolModel,
     Prior,
-    Solution,
     clearances,
     normal_equations,
     residuals,
@@ -26,18 +25,9 @@ from finssim.calibration.vision.survey import Observations
 from finssim.geometry.optics import back_project
 
 __all__ = [
-    "CAMERA",
-    "HeldOut",
-    "Noise",
-    "Refined",
-    "Whitener",
-    "error_vectors",
-    "held_out",
-    "refine",
-    "rms",
-    "touched",
-    "touching_advice",
-]
+    "CAMERA", "HeldOut", "Noise", "Refined", "Whitener", "error_vectors", "held_out", "refine", "rms",
+    "surprise", "touched",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
@@ -67,6 +57,17 @@ class Noise:
     scale: float = 1.0
     """Of all survey errors, as the residuals tell it."""
 
+    def survey_modes(self, J_point: Array, seen: Observations) -> Array:
+        """What one standard error of a location's x, y, z and of a tag's direction does to each pixel [px], (N, 2, 4).
+
+        Args:
+            J_point: Derivative of the pixel by the point, (N, 2, 3).
+            seen: The rows.
+        """
+        sigma = np.where(np.isfinite(seen.sigma), seen.sigma, self.survey)[:, None, None]
+        turn = self.survey_yaw * np.einsum("nij,nj->ni", J_point, seen.arm)[..., None]
+        return np.asarray(self.scale * np.concatenate([J_point * sigma, turn], axis=-1))
+
 
 class Whitener:
     """Makes residuals independent and of unit variance; rows of one location belong together.
@@ -74,20 +75,14 @@ class Whitener:
     V_l = sigma² 1 + J_l B_l S B_lᵀ J_lᵀ: a location is displaced as a whole, and a tag turned, by the survey's error.
     """
 
-    def __init__(
-        self, J_point: Array, seen: Observations, noise: Noise, weights: Array | None = None
-    ) -> None:
+    def __init__(self, J_point: Array, seen: Observations, noise: Noise) -> None:
         """
         Args:
             J_point: Derivative of the pixel by the point, (N, 2, 3).
             seen: The rows.
             noise: Standard errors.
-            weights: Factors of robust weighting on each row's pixel information, (N,), or None.
         """
-        sigma = noise.scale * np.where(np.isfinite(seen.sigma), seen.sigma, noise.survey)
-        turn = noise.scale * noise.survey_yaw * np.einsum("nij,nj->ni", J_point, seen.arm)
-        modes = np.concatenate([J_point * sigma[:, None, None], turn[..., None]], axis=-1)
-        variance = noise.pixel**2 / (np.ones(len(seen)) if weights is None else np.maximum(weights, 1e-6))
+        modes = noise.survey_modes(J_point, seen)
         self.logdet = 0.0
         self._groups: list[tuple[NDArray[np.intp], Array]] = []
         order = np.argsort(seen.location, kind="stable")
@@ -97,7 +92,7 @@ class Whitener:
             B = modes[rows].reshape(len(rows), 2 * count, 4)
             V = B @ B.transpose(0, 2, 1)
             index = np.arange(2 * count)
-            V[:, index, index] += np.repeat(variance[rows], 2, axis=-1)
+            V[:, index, index] += noise.pixel**2
             L = np.linalg.cholesky(V)
             self.logdet += 2.0 * float(np.log(L[:, index, index]).sum())
             self._groups.append((rows, np.linalg.inv(L)))
@@ -110,16 +105,6 @@ class Whitener:
             block = values[rows].reshape(len(rows), L_inverse.shape[-1], -1)
             parts.append((L_inverse @ block).reshape(-1, *tail))
         return np.concatenate(parts)
-
-    @property
-    def locations(self) -> list[NDArray[np.intp]]:
-        """Rows of whitened values that belong to one location each."""
-        found, start = [], 0
-        for rows, L_inverse in self._groups:
-            size = L_inverse.shape[-1]
-            found += [np.arange(start + i * size, start + (i + 1) * size) for i in range(len(rows))]
-            start += len(rows) * size
-        return found
 
 
 def estimate_noise(
@@ -207,7 +192,8 @@ class Refined:
     prior: Prior
     covariance: Array
     """Of all parameters, zero where held, (18, 18)."""
-    solution: Solution
+    cost: float
+    """Half the sum of squares that was minimised."""
     dof: float
     """Rows of residuals less parameters."""
 
@@ -247,32 +233,17 @@ def refine(
         _refuse_few(used, seen, int(active.sum()))
         rows = seen.subset(used)
         J, J_point = model.jacobians(rows.points, rows.dry)
-        information = _information(model, prior, free)
-        noise = estimate_noise(
-            residuals(model, rows)[0],
-            J[..., free],
-            J_point,
-            rows,
-            noise,
-            information,
-            pixel_known=pixel_known,
-        )
+        J_prior = prior.rows(model)[1][:, free]
+        off, information = residuals(model, rows)[0], J_prior.T @ J_prior
+        noise = estimate_noise(off, J[..., free], J_point, rows, noise, information, pixel_known=pixel_known)
         whiten = Whitener(J_point, rows, noise)
-        solution = solve(model, rows, whiten, active, prior)
-        model, before = solution.model, used
+        (model, cost), before = solve(model, rows, whiten, active, prior), used
         used = _plausible(model, seen, noise)
         if np.array_equal(used, before):
             break
     covariance = _covariance(model, rows, whiten, free, prior)
     dof = max(3.0, 2.0 * len(rows) - len(free))
-    return Refined(model, noise, before, whiten, active, prior, covariance, solution, dof)
-
-
-def refit(start: Refined, seen: Observations, rows: NDArray[np.bool_]) -> PoolModel:
-    """The same fit to some of the rows, errors as they were."""
-    part = seen.subset(rows)
-    whiten = Whitener(start.model.jacobians(part.points, part.dry)[1], part, start.noise)
-    return solve(start.model, part, whiten, start.active, start.prior).model
+    return Refined(model, noise, before, whiten, active, prior, covariance, cost, dof)
 
 
 def touched(fit: Refined, seen: Observations) -> tuple[str, ...]:
@@ -298,29 +269,29 @@ def touched(fit: Refined, seen: Observations) -> tuple[str, ...]:
     return (*((CAMERA,) if fit.model.clearance < TOUCHING else ()), *names)
 
 
-def touching_advice(names: tuple[str, ...]) -> list[str]:
-    """A sentence where the plane came to rest against the points or the camera, by the names of `touched`."""
-    if not names:
-        return []
-    listed = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
-    return [
-        f"the plane ends against {listed}, which it cannot pass: where nothing touches it in truth, the pixels want it "
-        "further on than it can be; check the coordinates of what it touches, the thickness of the window, the index "
-        "and the camera file"
-    ]
-
-
 def _plausible(model: PoolModel, seen: Observations, noise: Noise) -> NDArray[np.bool_]:
     """Rows whose residual is of the size that the errors of pixel and survey make, whatever it shares with others."""
-    r, ok = residuals(model, seen)
-    J_point = np.where(ok[:, None, None], model.jacobians(seen.points, seen.dry)[1], 0.0)
-    sigma = noise.scale * np.where(np.isfinite(seen.sigma), seen.sigma, noise.survey)
-    turn = noise.scale * noise.survey_yaw * np.einsum("nij,nj->ni", J_point, seen.arm)
-    V = J_point @ J_point.transpose(0, 2, 1) * sigma[:, None, None] ** 2 + turn[:, :, None] * turn[:, None, :]
-    V = V + noise.pixel**2 * np.eye(2)
-    d2 = np.einsum("ni,nij,nj->n", r, np.linalg.inv(V), r)
+    d2 = surprise(model, seen, noise)
     inner = max(1.0, float(np.median(d2)) / float(chi2.ppf(0.5, 2)))
-    return np.asarray(ok & (d2 < inner * chi2.ppf(1.0 - CHANCE / len(seen), 2)))
+    return np.asarray(d2 < inner * chi2.ppf(1.0 - CHANCE / len(seen), 2))
+
+
+def surprise(model: PoolModel, seen: Observations, noise: Noise, covariance: Array | None = None) -> Array:
+    """Squared residuals over what the errors of pixel and survey make of them, (N,); infinite where there is none.
+
+    Args:
+        model: Predicts.
+        seen: The rows.
+        noise: Standard errors.
+        covariance: Of the model's parameters, if their errors count too, (18, 18).
+    """
+    r, ok = residuals(model, seen)
+    J, J_point = (np.where(ok[:, None, None], part, 0.0) for part in model.jacobians(seen.points, seen.dry))
+    modes = noise.survey_modes(J_point, seen)
+    V = modes @ modes.transpose(0, 2, 1) + noise.pixel**2 * np.eye(2)
+    if covariance is not None:
+        V = V + J @ covariance @ J.transpose(0, 2, 1)
+    return np.where(ok, np.einsum("ni,nij,nj->n", r, np.linalg.inv(V), r), np.inf)
 
 
 def _refuse_few(used: NDArray[np.bool_], seen: Observations, parameters: int) -> None:
@@ -334,11 +305,6 @@ def _refuse_few(used: NDArray[np.bool_], seen: Observations, parameters: int) ->
         raise CalibrationError(
             f"{int(used.sum())} usable points for {parameters} parameters: survey at least 4, better 20"
         )
-
-
-def _information(model: PoolModel, prior: Prior, free: NDArray[np.intp]) -> Array:
-    J = prior.rows(model)[1][:, free]
-    return np.asarray(J.T @ J)
 
 
 def _covariance(
@@ -404,16 +370,18 @@ def held_out(fit: Refined, seen: Observations, folds: int, seed: int, normal: Ar
     folds = min(folds, len(names))
     if folds < 2:
         return None
-    part = np.empty(int(place.max()) + 1, int)
-    part[np.random.default_rng(seed).permutation(names)] = np.arange(len(names)) % folds
+    fold = np.empty(int(place.max()) + 1, int)
+    fold[np.random.default_rng(seed).permutation(names)] = np.arange(len(names)) % folds
     pixels, points, rows = [], [], []
     for k in range(folds):
         inside = np.zeros(len(seen), bool)
-        inside[used] = part[place[used]] != k
-        outside = used[part[place[used]] == k]
+        inside[used] = fold[place[used]] != k
+        outside = used[fold[place[used]] == k]
         if 2 * inside.sum() < 8 or len(np.unique(seen.points[inside].round(6), axis=0)) < 4:
             return None
-        model = refit(fit, seen, inside)
+        part = seen.subset(inside)  # the errors stay as they were
+        whiten = Whitener(fit.model.jacobians(part.points, part.dry)[1], part, fit.noise)
+        model = solve(fit.model, part, whiten, fit.active, fit.prior).model
         here = seen.subset(outside)
         r, ok = residuals(model, here)
         rows.append(outside[ok])
@@ -424,19 +392,12 @@ def held_out(fit: Refined, seen: Observations, folds: int, seed: int, normal: Ar
 
 def error_vectors(model: PoolModel, seen: Observations, normal: Array) -> Array:
     """Where each pixel's ray meets the plane through its point, minus the point [m], (N, 3); NaN where it does not."""
-    origin, direction = _rays(model, seen)
-    with np.errstate(all="ignore"):
-        length = ((seen.points - origin) @ normal) / (direction @ normal)
-    return np.asarray(origin + length[:, None] * direction - seen.points)
-
-
-def _rays(model: PoolModel, seen: Observations) -> tuple[Array, Array]:
-    """Origins and directions (N, 3), straight from the camera for what is dry."""
     rays, ok = model.camera.lens.rays(seen.pixels)
     origin = np.broadcast_to(np.asarray(model.camera.position), seen.points.shape).copy()
     direction = np.where(ok[:, None], rays, np.nan) @ np.asarray(model.camera.R_pc).T
-    if model.refractive and not seen.dry.all():
-        wet = ~seen.dry
-        water = back_project(model.camera, model.interface, seen.pixels[wet])
-        origin[wet], direction[wet] = water.origin, water.direction
-    return origin, direction
+    if model.refractive and not seen.dry.all():  # what is dry is seen straight from the camera
+        water = back_project(model.camera, model.interface, seen.pixels[~seen.dry])
+        origin[~seen.dry], direction[~seen.dry] = water.origin, water.direction
+    with np.errstate(all="ignore"):
+        length = ((seen.points - origin) @ normal) / (direction @ normal)
+    return np.asarray(origin + length[:, None] * direction - seen.points)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.vision.least_squares import huber_weight
 from finssim.calibration.vision.pool_model import (
     NAMES,
     PoolModel,
@@ -20,14 +21,23 @@ from finssim.calibration.vision.pool_model import (
 )
 from finssim.calibration.vision.survey import Observations
 from finssim.geometry.optics import Camera, Interface, Lens
-from finssim.geometry.rotations import matrix_to_quat
+from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_to_matrix
 
-__all__ = ["Found", "RobustPixels", "UP", "prior_of", "search", "shifted_settings"]
+__all__ = ["Found", "RobustPixels", "UP", "prior_of", "search"]
 
 Array = NDArray[np.float64]
 
-DRAWS = 60
-"""Samples of few points, of which the one that suits most of the others is kept."""
+UP = np.array([0.0, 0.0, 1.0])
+SURFACE_TILT, PLANE_TILT = np.radians(0.2), np.radians(0.5)
+
+DRAWS, DRAWN = 60, 6
+"""Samples of that many points, of which those that suit most of the others are kept."""
+
+FLAT, SOLID = 0.02, 0.2
+"""Thickness of the points, over their lesser width, from which they count as solid, and no longer as flat."""
+
+STARTS = 12
+"""Straight-line poses that are refined."""
 
 SHARES = (0.1, 0.3, 0.55, 0.8, 1.0, 1.2)
 """Depth of the water as a part of the straight-line distance between camera and points: the camera is on the surface
@@ -36,15 +46,27 @@ at 1.33."""
 REACHED = (1.0, 0.75)
 """Parts of the points that the plane begins before: all, or not the highest, which may be wrong or above the water."""
 
+ENOUGH = 500
+"""Rows from which the search begins; the fit takes all."""
+
+ANYWHERE = 0.5
+"""Depth of the water over the distance of the camera, where nobody measured it, and the standard deviation of that: so
+weak that it only decides where the pixels say nothing."""
+
+MIRRORED = 0.6
+"""Residual of the mirror image over that of the best model, below which the survey's frame is left-handed."""
+
+SAME = 1.15
+"""A surface that fits within this factor of a wall is taken for a surface."""
+
 
 class RobustPixels:
     """Whitening of rows one by one with Huber's weights, from residuals at one model."""
 
     def __init__(self, model: PoolModel, seen: Observations, least: float = 0.3) -> None:
-        size = np.linalg.norm(residuals(model, seen)[0], axis=1)
+        size = _sizes(model, seen)
         self.scale = max(least, 1.2 * float(np.median(size)) / 1.1774)
-        weight = np.minimum(1.0, 2.0 * self.scale / np.maximum(size, 1e-12))
-        self._root = np.sqrt(weight) / self.scale
+        self._root = np.sqrt(huber_weight(size, 2.0 * self.scale)) / self.scale
 
     def __call__(self, values: Array) -> Array:
         scaled = values * self._root.reshape(-1, *([1] * (values.ndim - 1)))
@@ -62,19 +84,20 @@ def pinhole_poses(seen: Observations, lens: Lens, seed: int = 0) -> list[Solutio
     rays, ok = lens.rays(seen.pixels)
     front = ok & (rays[:, 2] > 0.05)
     X, rays = seen.points[front], rays[front]
-    centre = X.mean(axis=0) if len(X) else np.zeros(3)
-    values = np.linalg.svd(X - centre, compute_uv=False) if len(X) >= 3 else np.zeros(3)
-    if len(np.unique(X.round(6), axis=0)) < 4 or values[1] < 1e-3 * values[0]:
+    count = len(np.unique(X.round(6), axis=0))
+    values = np.linalg.svd(X - X.mean(axis=0), compute_uv=False) if count >= 3 else np.zeros(3)
+    if count < 4 or values[1] < 1e-3 * values[0]:
         raise CalibrationError(
-            f"{len(np.unique(X.round(6), axis=0))} usable points"
-            + (" on one line" if len(X) >= 4 else "")
-            + ": expected at least 4 that do not lie on one line; whether the camera file belongs to these "
-            "pixels decides which are usable"
+            f"{count} usable points{' on one line' if len(X) >= 4 else ''}: expected at least 4 that do not lie on one "
+            "line; whether the camera file belongs to these pixels decides which are usable"
         )
-    near = [_straight(R, C, seen, lens) for R, C in _candidates(X, rays, values, seed)]
+    plane, reference = Interface(UP, 0.0), seen.points[~seen.dry].mean(axis=0)
+    near = []
+    for R_cp, C in _candidates(X, rays[:, :2] / rays[:, 2:], np.random.default_rng(seed)):
+        camera = Camera(lens, C, matrix_to_quat(R_cp.T))
+        near.append(_straightened(PoolModel(camera, plane, reference, refractive=False), seen, 10))
     # Most starts have met by now, and what has met ends at one pose.
-    near = _distinct([_refined(model, seen, 10) for model in near])
-    found = _distinct([_refined(s.model, seen, 30) for s in near])
+    found = _distinct([_straightened(s.model, seen, 30) for s in _distinct(near)])
     found = [s for s in found if np.median(_sizes(s.model, seen)) <= 0.2 * lens.width]
     if not found:
         raise CalibrationError(
@@ -83,133 +106,52 @@ def pinhole_poses(seen: Observations, lens: Lens, seed: int = 0) -> list[Solutio
     return found
 
 
-def _candidates(X: Array, rays: Array, values: Array, seed: int) -> Iterator[tuple[Array, Array]]:
-    """(R_pc, C_p) from homographies of the best plane, from the direct linear transform, and from turned cubes."""
-    rng = np.random.default_rng(seed)
-    flatness = values[2] / values[1]
-    if flatness < 0.2:
-        yield from _plane_poses(X, rays, rng)
-    if flatness > 0.02 and len(X) >= 6:
-        yield from _solid_poses(X, rays, rng)
-    if len(X) < 12 or flatness > 0.02:
-        for R in _cube():
-            C = _position(R, X, rays)
-            if C is not None:
-                yield R, C
+def _candidates(X: Array, xy: Array, rng: np.random.Generator) -> list[tuple[Array, Array]]:
+    """R_cp and C_p from points and their directions x / z, y / z: of all, of small samples, and of all that agree.
 
+    Of flat points each pose has a reflection about the line of sight, which the water may turn into the better one.
+    """
+    import cv2
 
-def _plane_poses(X: Array, rays: Array, rng: np.random.Generator) -> Iterator[tuple[Array, Array]]:
-    """Pose from the homography of a plane, and its reflection about the line of sight."""
     centre = X.mean(axis=0)
-    axes = np.linalg.svd(X - centre)[2]
-    axes[2] = np.cross(axes[0], axes[1])
-    flat = (X - centre) @ axes.T
-    size = float(np.abs(flat[:, :2]).max())
-    plane = np.column_stack([flat[:, :2] / size, np.ones(len(X))])
-    H = _consensus(plane, rays, 4, rng)
-    if H is None:
-        return
-    H = H @ np.diag([1.0 / size, 1.0 / size, 1.0])
-    H = H / (0.5 * (np.linalg.norm(H[:, 0]) + np.linalg.norm(H[:, 1])))
-    if H[2, 2] < 0.0:
-        H = -H
-    U, _, Vt = np.linalg.svd(np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])]))
-    R_cl, t = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt, H[:, 2]
-    sight = t / np.linalg.norm(t)
-    for R in (R_cl, (2.0 * np.outer(sight, sight) - np.eye(3)) @ R_cl @ np.diag([-1.0, -1.0, 1.0])):
-        R_pc = axes.T @ R.T
-        yield R_pc, centre - R_pc @ t
+    _, values, axes = np.linalg.svd(X - centre)
+    flat, flatness = X - np.outer((X - centre) @ axes[2], axes[2]), values[2] / values[1]
+
+    def poses(rows: NDArray[np.intp]) -> Iterator[tuple[Array, Array, Array]]:
+        solvers = [(cv2.SOLVEPNP_IPPE, flat)] if flatness < SOLID else []
+        solvers += [(cv2.SOLVEPNP_SQPNP, X)] if flatness > FLAT else []
+        for solver, points in solvers:
+            try:
+                _, turns, shifts, _ = cv2.solvePnPGeneric(
+                    points[rows], xy[rows], np.eye(3), None, flags=solver
+                )
+            except cv2.error:  # a sample on one line, say
+                continue
+            for turn, shift in zip(turns, shifts, strict=True):
+                R = quat_to_matrix(quat_from_rotvec(turn.ravel()))
+                at = X @ R.T + shift.ravel()
+                off = np.linalg.norm(at[:, :2] / np.maximum(at[:, 2:], 1e-9) - xy, axis=1)
+                if np.isfinite(off).all() and np.median(at[:, 2]) > 0.0:
+                    yield off, R, -R.T @ shift.ravel()
+
+    every = np.arange(len(X))
+    samples = [every]
+    if len(X) > DRAWN:
+        samples += [rng.choice(len(X), DRAWN, replace=False) for _ in range(DRAWS)]
+    runs = sorted((run for rows in samples for run in poses(rows)), key=lambda run: np.median(run[0]))
+    for _ in range(3 if runs else 0):
+        agreeing = np.flatnonzero(runs[0][0] < max(4.0 * np.median(runs[0][0]), 1e-4))
+        if len(agreeing) >= 4:
+            runs = [*poses(agreeing), *runs]
+    return [(R, C) for _, R, C in runs[:STARTS]]
 
 
-def _solid_poses(X: Array, rays: Array, rng: np.random.Generator) -> Iterator[tuple[Array, Array]]:
-    centre = X.mean(axis=0)
-    size = float(np.abs(X - centre).max())
-    P = _consensus(np.column_stack([(X - centre) / size, np.ones(len(X))]), rays, 6, rng)
-    if P is None:
-        return
-    for sign in (1.0, -1.0):
-        U, s, Vt = np.linalg.svd(sign * P[:, :3])
-        if np.linalg.det(U @ Vt) > 0.0:
-            R_cp = U @ Vt
-            yield R_cp.T, centre - size * R_cp.T @ (sign * P[:, 3] / s.mean())
-
-
-def _consensus(points: Array, rays: Array, least: int, rng: np.random.Generator) -> Array | None:
-    """Linear map of homogeneous points (N, k) to rays: the best of many small samples, then of all that agree."""
-    best, threshold = None, np.inf
-    samples = [np.arange(len(points))]
-    if len(points) > least:
-        samples += [rng.choice(len(points), least, replace=False) for _ in range(DRAWS)]
-    for sample in samples:
-        M = _linear(points[sample], rays[sample])
-        error = float(np.median(_angle(M, points, rays)))
-        if error < threshold:
-            best, threshold = M, error
-    if best is None:
-        return None
-    for _ in range(3):
-        near = _angle(best, points, rays) < max(4.0 * threshold, 1e-4)
-        if near.sum() >= least:
-            best = _linear(points[near], rays[near])
-    return best
-
-
-def _linear(points: Array, rays: Array) -> Array:
-    """Least-squares M (3, k) of ray x M point = 0."""
-    x, y = (rays[:, :2] / rays[:, 2:]).T
-    zero = np.zeros_like(points)
-    rows = np.concatenate(
-        [
-            np.concatenate([points, zero, -x[:, None] * points], axis=1),
-            np.concatenate([zero, points, -y[:, None] * points], axis=1),
-        ]
-    )
-    M = np.linalg.svd(rows, full_matrices=len(rows) < rows.shape[1])[2][-1].reshape(3, -1)
-    return np.asarray(M if np.median((M @ points.T)[2]) >= 0.0 else -M)
-
-
-def _angle(M: Array, points: Array, rays: Array) -> Array:
-    towards = points @ M.T
-    length = np.linalg.norm(towards, axis=1)
-    return np.arccos(np.clip(np.sum(towards * rays, axis=1) / np.maximum(length, 1e-300), -1.0, 1.0))
-
-
-def _cube() -> Iterator[Array]:
-    """The 24 turns of a cube."""
-    for i, j in ((i, j) for i in range(3) for j in range(3) if i != j):
-        for a in (1.0, -1.0):
-            for b in (1.0, -1.0):
-                R = np.zeros((3, 3))
-                R[i, 0], R[j, 1] = a, b
-                R[:, 2] = np.cross(R[:, 0], R[:, 1])
-                yield R
-
-
-def _position(R_pc: Array, X: Array, rays: Array) -> Array | None:
-    """Camera centre nearest to all rays' lines through their points; None where the points would lie behind it."""
-    r = rays @ R_pc.T
-    across = np.eye(3) - r[:, :, None] * r[:, None, :]
-    M = across.sum(axis=0)
-    if np.linalg.cond(M) > 1e8:
-        return None
-    C = np.linalg.solve(M, (across @ X[:, :, None]).sum(axis=0)[:, 0])
-    return np.asarray(C) if np.median(np.sum((X - C) * r, axis=1)) > 0.0 else None
-
-
-def _straight(R_pc: Array, C: Array, seen: Observations, lens: Lens) -> PoolModel:
-    """A camera without water before it."""
-    camera = Camera(lens, C, matrix_to_quat(R_pc))
-    plane = Interface(np.array([0.0, 0.0, 1.0]), 0.0)
-    return PoolModel(camera, plane, seen.points[~seen.dry].mean(axis=0), refractive=False)
-
-
-def _refined(model: PoolModel, seen: Observations, iterations: int) -> Solution:
+def _straightened(model: PoolModel, seen: Observations, iterations: int) -> Solution:
     """The straight-line pose nearby that suits the pixels better, judged by a scale common to all."""
     active = np.array([name in NAMES[:6] for name in NAMES])
     whiten, prior = RobustPixels(model, seen), Prior(start=model)
     model = solve(model, seen, whiten, active, prior, iterations=iterations, tolerance=1e-6).model
-    size = _sizes(model, seen)
-    return Solution(model, float(np.minimum(size, 3.0 * np.median(size)).mean()), 0, True)
+    return Solution(model, _score(model, seen))
 
 
 def _sizes(model: PoolModel, seen: Observations) -> Array:
@@ -217,20 +159,25 @@ def _sizes(model: PoolModel, seen: Observations) -> Array:
     return np.asarray(np.linalg.norm(residuals(model, seen)[0], axis=1))
 
 
+def _score(model: PoolModel, seen: Observations) -> float:
+    """Mean length of the residuals [px], long ones counted as three medians."""
+    size = _sizes(model, seen)
+    return float(np.minimum(size, 3.0 * np.median(size)).mean())
+
+
 def _distinct(solutions: list[Solution]) -> list[Solution]:
-    """The best first, without those that are another's pose."""
+    """The best first, without those that are another's pose to a degree and a hundredth of the distance."""
     kept: list[Solution] = []
     for s in sorted(solutions, key=lambda s: s.cost):
-        if all(_apart(s.model, k.model) for k in kept):
+        here, reach = s.model.camera, 0.01 * np.linalg.norm(s.model.camera.position - s.model.reference)
+        others = (k.model.camera for k in kept)
+        if all(
+            np.trace(here.R_pc.T @ other.R_pc) < 3.0 - 3e-4
+            or np.linalg.norm(here.position - other.position) > reach
+            for other in others
+        ):
             kept.append(s)
     return kept
-
-
-def _apart(a: PoolModel, b: PoolModel) -> bool:
-    """Whether two poses differ by more than a degree or a hundredth of the distance."""
-    turn = np.trace(a.camera.R_pc.T @ b.camera.R_pc)
-    far = np.linalg.norm(a.camera.position - a.reference)
-    return bool(turn < 3.0 - 3e-4 or np.linalg.norm(a.camera.position - b.camera.position) > 0.01 * far)
 
 
 def plane_starts(
@@ -268,22 +215,6 @@ def plane_starts(
             yield replace(pinhole, camera=replace(camera, position=position), interface=here, refractive=True)
 
 
-UP = np.array([0.0, 0.0, 1.0])
-SURFACE_TILT, PLANE_TILT = np.radians(0.2), np.radians(0.5)
-ENOUGH = 500
-"""Rows from which the search begins; the fit takes all."""
-
-ANYWHERE = 0.5
-"""Depth of the water over the distance of the camera, where nobody measured it, and the standard deviation of that: so
-weak that it only decides where the pixels say nothing."""
-
-MIRRORED = 0.6
-"""Residual of the mirror image over that of the best model, below which the survey's frame is left-handed."""
-
-SAME = 1.15
-"""A surface that fits within this factor of a wall is taken for a surface."""
-
-
 @dataclass(frozen=True)
 class Found:
     """Where the search ended."""
@@ -309,8 +240,7 @@ def search(seen: Observations, lens: Lens, settings: Settings) -> Found:
     near = [p.model for p in poses[:3] if p.cost < 3.0 * poses[0].cost + 0.5]
     runs: list[tuple[float, PoolModel, bool]] = []
     for surface, normals in _families(near[0], seen, settings):
-        best = _family(near, normals, seen, settings, surface)
-        runs += [(value, model, surface) for value, model in best]
+        runs += _family(near, normals, seen, settings, surface)
     # Bent rays come first: straight ones may fit the mirror image of a good survey better than the survey.
     _refuse_left_handed(seen, lens, min([_score(near[0], seen), *(run[0] for run in runs)]))
     if not runs:
@@ -361,43 +291,34 @@ def prior_of(
 
 def known_plane(model: PoolModel, settings: Settings, surface: bool) -> tuple[Array | None, float]:
     """Normal towards the camera, and distance of the plane from the reference point; None and NaN where unknown."""
-    towards = model.camera.position - model.reference
+    towards, depth = model.camera.position - model.reference, settings.water_depth
     if settings.plane is not None:
-        normal = np.array(settings.plane[:3]) / np.linalg.norm(settings.plane[:3])
-        depth = -(normal @ model.reference + settings.plane[3] / np.linalg.norm(settings.plane[:3]))
+        normal, offset = settings.unit_plane
         sign = 1.0 if normal @ towards > 0.0 else -1.0
-        return sign * normal, float(sign * depth)
-    if not surface:
-        return None, np.nan if settings.water_depth is None else settings.water_depth
+        return sign * normal, float(-sign * (normal @ model.reference + offset))
     normal = UP if towards[2] > 0.0 else -UP
-    if settings.water_height is not None:
+    if surface and settings.water_height is not None:
         return normal, float(normal[2] * (settings.water_height - model.reference[2]))
-    return normal, np.nan if settings.water_depth is None else settings.water_depth
-
-
-def _score(model: PoolModel, seen: Observations) -> float:
-    """Mean length of the residuals [px], long ones counted as three medians."""
-    size = np.linalg.norm(residuals(model, seen)[0], axis=1)
-    return float(np.minimum(size, 3.0 * np.median(size)).mean())
+    return normal if surface else None, np.nan if depth is None else depth
 
 
 def _families(pinhole: PoolModel, seen: Observations, settings: Settings) -> list[tuple[bool, list[Array]]]:
     """(surface?, normals to try)."""
     if settings.plane is not None:
-        normal = np.array(settings.plane[:3]) / np.linalg.norm(settings.plane[:3])
+        normal, _ = settings.unit_plane
         return [(bool(abs(normal[2]) > 0.9), [normal])]
+    surface = [(True, [UP])]
+    if settings.interface == "surface" or settings.interface == "auto" and settings.water_height is not None:
+        return surface
     towards = pinhole.camera.position - pinhole.reference
     towards = towards / np.linalg.norm(towards)
     axes = np.linalg.svd(seen.points - seen.points.mean(axis=0), full_matrices=True)[2]
-    walls = [towards, -np.asarray(pinhole.camera.R_pc)[:, 2], *np.eye(3), *axes]
     facing: list[Array] = []
-    for n in walls:
+    for n in (towards, -np.asarray(pinhole.camera.R_pc)[:, 2], *np.eye(3), *axes):
         n = n if n @ towards > 0.0 else -n
         if n @ towards > 0.35 and all(n @ other < 0.995 for other in facing):
             facing.append(n)
-    families = {"surface": [(True, [UP])], "wall": [(False, facing)]}
-    both = families["surface"] + (families["wall"] if settings.water_height is None else [])
-    return {**families, "auto": both}[settings.interface]
+    return [*(surface if settings.interface == "auto" else []), (False, facing)]
 
 
 def _family(
@@ -406,24 +327,21 @@ def _family(
     seen: Observations,
     settings: Settings,
     surface: bool,
-) -> list[tuple[float, PoolModel]]:
-    """Ends of the search from all starts of one family, the best first."""
+) -> list[tuple[float, PoolModel, bool]]:
+    """Ends of the search from all starts of one family: residual [px], model, surface?; the best first."""
     plane = Interface(UP, 0.0, settings.index_near, settings.index, settings.window)
-    rough: list[tuple[float, PoolModel]] = []
+    starts: list[PoolModel] = []
     for pinhole in poses:
         _refuse_wrong_side(pinhole, settings, surface)
         _, depth = known_plane(pinhole, settings, surface)
-        for start in plane_starts(pinhole, normals, plane, seen, depth):
-            model = _descend(start, seen, settings, surface, (6, 4))
-            if model is not None:
-                rough.append((_score(model, seen), model))
-    rough.sort(key=lambda pair: pair[0])
-    fine = []
-    for _, model in rough[:4]:
-        end = _descend(model, seen, settings, surface, (30, 40))
-        if end is not None:
-            fine.append((_score(end, seen), end))
-    return sorted(fine, key=lambda pair: pair[0])
+        starts += plane_starts(pinhole, normals, plane, seen, depth)
+    ends: list[tuple[float, PoolModel]] = []
+    for counts, most in (((6, 4), len(starts)), ((30, 40), 4)):
+        models = [_descend(model, seen, settings, surface, counts) for model in starts[:most]]
+        ends = [(_score(model, seen), model) for model in models if model is not None]
+        ends.sort(key=lambda pair: pair[0])
+        starts = [model for _, model in ends]
+    return [(value, model, surface) for value, model in ends]
 
 
 def _descend(
@@ -432,13 +350,12 @@ def _descend(
     """Pose alone, then pose and plane."""
     start = model
     for count, names in zip(counts, (NAMES[:6], NAMES[:9]), strict=True):
-        whiten = RobustPixels(model, seen)
         prior = prior_of(model, start, settings, surface, (np.inf,) * 8)
         active = np.array([name in names for name in NAMES])
-        end = solve(model, seen, whiten, active, prior, iterations=count, tolerance=1e-7)
-        if not np.isfinite(end.cost):
+        whiten = RobustPixels(model, seen)
+        model, cost = solve(model, seen, whiten, active, prior, iterations=count, tolerance=1e-7)
+        if not np.isfinite(cost):
             return None
-        model = end.model
     return model
 
 
@@ -484,14 +401,3 @@ def _choose(runs: list[tuple[float, PoolModel, bool]], count: int) -> tuple[floa
         if spare <= 0.0 or level[0] <= SAME * freedom * best[0] + 0.02 or upright:
             return level
     return best
-
-
-def shifted_settings(settings: Settings, vector: Array) -> Settings:
-    """The same in a frame in which every point lies `vector` further [m]."""
-    changed = settings
-    if settings.water_height is not None:
-        changed = replace(changed, water_height=settings.water_height + float(vector[2]))
-    if settings.plane is not None:
-        n, b = np.array(settings.plane[:3]), settings.plane[3]
-        changed = replace(changed, plane=(*map(float, n), float(b - n @ vector)))
-    return changed

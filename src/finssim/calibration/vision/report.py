@@ -31,18 +31,9 @@ if TYPE_CHECKING:
     from finssim.geometry.optics import Lens
 
 __all__ = [
-    "AS_GIVEN",
-    "Report",
-    "command_line",
-    "correlation_json",
-    "draw_arrows",
-    "html_row",
-    "picture_axes",
-    "plain",
-    "plain_axes",
-    "publish",
-    "refuse_places",
-]
+    "AS_GIVEN", "Report", "command_line", "correlation_json", "draw_arrows", "html_row", "picture_axes",
+    "plain", "plain_axes", "publish", "refuse_places",
+]  # fmt: skip
 
 HEADS = ("parameter", "estimate", "95 % interval", "unit", "note")
 REPORT_FILE, MARKDOWN_FILE, RECORD_FILE = "report.html", "report.md", "fit.json"

@@ -26,20 +26,9 @@ from finssim.geometry.rotations import (
 )
 
 __all__ = [
-    "Attitude",
-    "DepthFit",
-    "Gyro",
-    "ImuMounting",
-    "SALT",
-    "UNSURE_TURN",
-    "fit_depth",
-    "fit_imu_mounting",
-    "imu_clock",
-    "level_from_rest",
-    "rotation_between",
-    "turn_pairs",
-    "turn_residual",
-]
+    "Attitude", "DepthFit", "Gyro", "ImuMounting", "SALT", "UNSURE_TURN", "fit_depth", "fit_imu_mounting",
+    "imu_clock", "level_from_rest", "rotation_between", "turn_pairs", "turn_residual",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
@@ -198,10 +187,7 @@ class ImuMounting:
 
 
 def rotation_between(
-    vectors_a: Array,
-    vectors_b: Array,
-    weights: ArrayLike = 1.0,
-    start: ArrayLike = (0.0, 0.0, 0.0, 1.0),
+    vectors_a: Array, vectors_b: Array, weights: ArrayLike = 1.0, start: ArrayLike = (0.0, 0.0, 0.0, 1.0)
 ) -> Array:
     """Rotation q_ab with a = R_ab b in least squares; where the vectors leave it open, as in `start`  (Kabsch 1976).
 
@@ -499,8 +485,6 @@ class DepthFit:
     """1 where the depths span too little to tell."""
     estimates: dict[str, Estimate]
     """depth.offset [m] and depth.scale [-]."""
-    span: float
-    """Of the known depths [m]."""
     rms: float
     """Of what is left over, robust [m]."""
     rejected: int
@@ -546,7 +530,6 @@ def fit_depth(known: ArrayLike, reading: ArrayLike, *, known_std: float = 0.0) -
         offset=float(offset),
         scale=float(scale),
         estimates={row.name: row for row in rows},
-        span=float(np.ptp(x)),
         rms=fit.rms,
         rejected=fit.rejected,
         advice=_depth_advice(rows[1], float(np.ptp(x))),

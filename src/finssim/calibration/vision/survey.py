@@ -8,6 +8,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,9 +111,8 @@ class Table:
     united: bool
     """Whether the file, or its reader, says the unit of lengths."""
 
-    def refuse_other_units(self, points: Array) -> None:
-        """Refuse coordinates (n, 3) that would be metres only in a lake."""
-        spread = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    def refuse_other_units(self, spread: float) -> None:
+        """Refuse coordinates that would be metres only in a lake."""
         if spread > WIDEST and not self.united:
             raise CalibrationError(
                 f"{self.path}: the points spread over {spread:.0f} m: if they are not in metres, write the unit into "
@@ -314,6 +314,11 @@ class Placed:
     group: str = ""
     """Points of one rigid target; empty: by itself."""
 
+    def arm(self, corner: int) -> Array:
+        """Displacement of a corner by a turn of its tag about z [m/rad], (3,)."""
+        x, y, _ = self.points[corner] - self.points.mean(axis=0)
+        return np.array([-y, x, 0.0])
+
 
 @dataclass(frozen=True)
 class Survey:
@@ -327,11 +332,6 @@ class Survey:
     locations: dict[str, list[tuple[int | None, Placed]]] = field(default_factory=dict)
     """Image -> tags that lay there (id, or None for whichever was seen)."""
     notes: tuple[str, ...] = ()
-
-
-def corner_name(tag: str, corner: int) -> str:
-    """How a report calls a tag's corner."""
-    return f"{tag}/{corner}"
 
 
 def read_survey(
@@ -357,24 +357,6 @@ def read_survey(
         placed = {tag: Placed(f"tag {tag}", at, sigma, is_tag=True) for tag, at in tags.items()}
         return Survey(str(path), tags=placed)
     table = read_table(path, unit=unit)
-    _need(table, z)
-    notes: list[str] = []
-    survey = Survey(str(path))
-    placed_where: dict[str, int] = {}
-    for row in table.rows:
-        if missing := row.missing("x", "y", *(["z"] if z is None else [])):
-            notes.append(f"{table.path}: line {row.line}: left out: {', '.join(missing)} is missing")
-            continue
-        _place(survey, table, row, edge, z, placed_where)
-    if not (survey.points or survey.tags or survey.locations):
-        raise CalibrationError(f"{path}: no surveyed point in it: give rows of id,x,y,z")
-    every = [*survey.points.values(), *survey.tags.values()]
-    every += [placed for tags in survey.locations.values() for _, placed in tags]
-    table.refuse_other_units(np.concatenate([placed.points for placed in every]))
-    return replace(survey, notes=tuple(notes))
-
-
-def _need(table: Table, z: float | None) -> None:
     for name in ("x", "y"):
         if name not in table.columns:
             raise CalibrationError(
@@ -384,48 +366,51 @@ def _need(table: Table, z: float | None) -> None:
         raise CalibrationError(f"{table.path}: no column 'z': add it, or give the height of all points (--z)")
     if not {"id", "tag", "image"} & set(table.columns):
         raise CalibrationError(f"{table.path}: no column names the points: add id, tag or image")
+    notes: list[str] = []
+    survey, lines, every = Survey(str(path)), {}, []
+    for row in table.rows:
+        if missing := row.missing("x", "y", *(["z"] if z is None else [])):
+            notes.append(f"{table.path}: line {row.line}: left out: {', '.join(missing)} is missing")
+            continue
+        name, tag, here = _surveyed(table, row, edge, z)
+        every.append(here.points)
+        if "image" in row.words:
+            survey.locations.setdefault(name, []).append((tag, here))
+            continue
+        before = survey.points.get(name) if tag is None else survey.tags.get(tag)
+        if before is not None and np.abs(before.points - here.points).max() > 1e-6:
+            label = f"point '{name}'" if tag is None else name
+            raise table.refuse(
+                row, f"{label} was at another place in line {lines[name]}: keep one of the two"
+            )
+        lines[name] = row.line
+        if tag is None:
+            survey.points[name] = here
+        else:
+            survey.tags[tag] = here
+    if not every:
+        raise CalibrationError(f"{path}: no surveyed point in it: give rows of id,x,y,z")
+    table.refuse_other_units(np.ptp(np.concatenate(every), axis=0).max())
+    return replace(survey, notes=tuple(notes))
 
 
-def _place(
-    survey: Survey, table: Table, row: Row, edge: float | None, z: float | None, where: dict[str, int]
-) -> None:
+def _surveyed(table: Table, row: Row, edge: float | None, z: float | None) -> tuple[str, int | None, Placed]:
+    """What a row places: its name, the number of its tag (None: a point, or any tag), and where it is."""
     edge = row.numbers.get("edge", edge)
-    tag = row.words.get("tag") or (row.words.get("id") if edge is not None else None)
-    if "image" not in row.words and tag is None:
+    word = row.words.get("tag") or (row.words.get("id") if edge is not None else None)
+    if "image" not in row.words and word is None:
         name = row.words.get("id", "")
         if not name:
             raise table.refuse(row, "no id")
-        here = row.placed(name, row.position(z)[None])
-        _once(table, row, f"point '{name}'", survey.points.get(name), here, where)
-        survey.points[name] = here
-        return
+        return name, None, row.placed(name, row.position(z)[None])
     if edge is None or edge <= 0.0:
         raise table.refuse(row, "a tag without its edge: add a column edge [m], or give --edge")
+    if word is not None and _number(word) is None:
+        raise table.refuse(row, f"tag is '{word}', expected its number")
+    tag = None if word is None else int(float(word))
+    name = row.words.get("image") or f"tag {tag}"
     turn = quat_from_euler(*(row.numbers.get(n, 0.0) for n in ("roll", "pitch", "yaw")))
-    number = None if tag is None else _integer(table, row, tag)
-    name = row.words.get("image") or f"tag {number}"
-    here = row.placed(name, row.position(z) + quat_rotate(turn, corners(edge)), is_tag=True)
-    if "image" in row.words:
-        survey.locations.setdefault(name, []).append((number, here))
-    else:
-        assert number is not None
-        _once(table, row, name, survey.tags.get(number), here, where)
-        survey.tags[number] = here
-
-
-def _integer(table: Table, row: Row, word: str) -> int:
-    try:
-        return int(float(word))
-    except ValueError:
-        raise table.refuse(row, f"tag is '{word}', expected its number") from None
-
-
-def _once(
-    table: Table, row: Row, name: str, before: Placed | None, here: Placed, where: dict[str, int]
-) -> None:
-    if before is not None and np.abs(before.points - here.points).max() > 1e-6:
-        raise table.refuse(row, f"{name} was at another place in line {where[name]}: keep one of the two")
-    where[name] = row.line
+    return name, tag, row.placed(name, row.position(z) + quat_rotate(turn, corners(edge)), is_tag=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -506,7 +491,7 @@ def observe_combined(
     Raises:
         CalibrationError: A column or number is missing.
     """
-    rows = _Rows()
+    rows, points = _Rows(), {}
     for path in paths:
         table = read_table(path, unit=unit)
         needed = ["u", "v", "x", "y", *(["z"] if z is None else [])]
@@ -517,82 +502,72 @@ def observe_combined(
                 + ("; points of one height may leave z out and give --z" if missing == ["z"] else "")
             )
         complete = [row for row in table.rows if not row.missing(*needed)]
-        table.refuse_other_units(np.array([row.position(z) for row in complete]).reshape(-1, 3))
+        table.refuse_other_units(max((np.abs(row.position(z)).max() for row in complete), default=0.0))
         for row in complete:
-            rows.add_combined(row, z)
+            name = row.words.get("id") or row.words.get("tag") or f"line {row.line}"
+            new = row.placed(name, row.position(z)[None])
+            placed = points.setdefault((name, *new.points[0].tolist()), new)
+            rows.add(_Match(row.words.get("image", ""), name, placed, 0, row.pixel))
         lost = [row.line for row in table.rows if row.missing(*needed)]
         rows.notes += [f"{path}: line {line}: left out: a number is missing" for line in lost]
     return rows.observations(", ".join(map(str, paths)), None)
 
 
+class _Match(NamedTuple):
+    """A pixel of a surveyed point."""
+
+    image: str
+    name: str
+    placed: Placed
+    corner: int
+    pixel: Array
+
+
 class _Rows:
-    """Rows as they are gathered."""
+    """Matches as they are gathered."""
 
     def __init__(self) -> None:
         self.notes: list[str] = []
-        self.unknown: dict[str, int] = {}
-        self._pixels: list[Array] = []
-        self._placed: list[tuple[Placed, int]] = []
-        self._names: list[str] = []
-        self._images: list[str] = []
-        self._seen: set[tuple[object, ...]] = set()
-        self._points: dict[tuple[object, ...], Placed] = {}
+        self.unknown: dict[str, None] = {}
+        self._matches: dict[tuple[object, ...], _Match] = {}
 
-    def add(self, image: str, name: str, placed: Placed, corner: int, pixel: Array) -> None:
-        key = (image, id(placed), corner, float(pixel[0]), float(pixel[1]))
-        if key in self._seen:
-            self.notes.append(f"{name} is there twice with the same pixel: counted once")
-            return
-        self._seen.add(key)
-        self._pixels.append(np.asarray(pixel, float))
-        self._placed.append((placed, corner))
-        self._names.append(name)
-        self._images.append(image)
-
-    def add_combined(self, row: Row, z: float | None) -> None:
-        name = row.words.get("id") or row.words.get("tag") or f"line {row.line}"
-        new = row.placed(name, row.position(z)[None])
-        placed = self._points.setdefault((name, *new.points[0].tolist()), new)
-        self.add(row.words.get("image", ""), name, placed, 0, row.pixel)
+    def add(self, match: _Match) -> None:
+        key = (match.image, id(match.placed), match.corner, *match.pixel.tolist())
+        if key in self._matches:
+            self.notes.append(f"{match.name} is there twice with the same pixel: counted once")
+        self._matches.setdefault(key, match)
 
     def observations(self, source: str, survey: Survey | None) -> Observations:
         if self.unknown:
-            shown = ", ".join(list(self.unknown)[:8]) + (", ..." if len(self.unknown) > 8 else "")
-            self.notes.append(f"not in the survey, so left out: {shown}")
-        if not self._pixels:
+            listed = ", ".join(list(self.unknown)[:8]) + (", ..." if len(self.unknown) > 8 else "")
+            self.notes.append(f"not in the survey, so left out: {listed}")
+        matches = list(self._matches.values())
+        if not matches:
             known = [] if survey is None else [*survey.points, *map(str, survey.tags), *survey.locations]
-            what = f"; observed: {', '.join(list(self.unknown)[:5])}" if self.unknown else ""
+            seen = f"; observed: {', '.join(list(self.unknown)[:5])}" if self.unknown else ""
             raise CalibrationError(
                 f"{source}: no observation belongs to a surveyed point "
-                f"(surveyed: {', '.join(known[:5]) or 'none'}{what})"
+                f"(surveyed: {', '.join(known[:5]) or 'none'}{seen})"
             )
-        order: dict[object, int] = {}
-        location = np.array([order.setdefault(p.group or id(p), len(order)) for p, _ in self._placed])
-        labels: dict[int, str] = {}
-        for i, (placed, _) in zip(location, self._placed, strict=True):
-            labels.setdefault(int(i), placed.group or placed.name)
-        several = len(set(self._images)) > 1
+        labels = {m.placed.group or id(m.placed): m.placed.group or m.placed.name for m in reversed(matches)}
+        order = {
+            key: i for i, key in enumerate(dict.fromkeys(m.placed.group or id(m.placed) for m in matches))
+        }
+        several = len({m.image for m in matches}) > 1
         return Observations(
-            pixels=np.stack(self._pixels),
-            points=np.stack([p.points[k] for p, k in self._placed]),
-            location=location,
+            pixels=np.stack([m.pixel for m in matches]),
+            points=np.stack([m.placed.points[m.corner] for m in matches]),
+            location=np.array([order[m.placed.group or id(m.placed)] for m in matches]),
             names=tuple(
-                f"{image}: {name}" if several and image and not name.startswith(image) else name
-                for image, name in zip(self._images, self._names, strict=True)
+                f"{m.image}: {m.name}" if several and m.image and not m.name.startswith(m.image) else m.name
+                for m in matches
             ),
-            locations=tuple(labels[i] for i in range(len(labels))),
-            sigma=np.array([p.sigma for p, _ in self._placed]),
-            arm=np.stack([_arm(p, k) for p, k in self._placed]),
-            dry=np.array([p.dry for p, _ in self._placed]),
+            locations=tuple(labels[key] for key in order),
+            sigma=np.array([m.placed.sigma for m in matches]),
+            arm=np.stack([m.placed.arm(m.corner) for m in matches]),
+            dry=np.array([m.placed.dry for m in matches]),
             notes=(*(survey.notes if survey else ()), *self.notes),
         )
-
-
-def _arm(placed: Placed, corner: int) -> Array:
-    if not placed.is_tag:
-        return np.zeros(3)
-    x, y, _ = placed.points[corner] - placed.points.mean(axis=0)
-    return np.array([-y, x, 0.0])
 
 
 def _is_detections(path: Path) -> bool:
@@ -612,7 +587,7 @@ def _match_frames(rows: _Rows, frames: Sequence[Frame], survey: Survey) -> None:
     for frame in frames:
         lay = survey.locations.get(frame.image) or survey.locations.get(Path(frame.image).name, [])
         if survey.locations and not lay and not survey.tags:
-            rows.unknown.setdefault(frame.image or "a picture without a name", 0)
+            rows.unknown[frame.image or "a picture without a name"] = None
             continue
         found = most_certain(frame.detections)
         for detection in found:
@@ -621,11 +596,11 @@ def _match_frames(rows: _Rows, frames: Sequence[Frame], survey: Survey) -> None:
                 if tag == detection.tag or (tag is None and len(found) == 1):
                     placed = here
             if placed is None:
-                rows.unknown.setdefault(f"tag {detection.tag}", 0)
+                rows.unknown[f"tag {detection.tag}"] = None
                 continue
             for corner, pixel in enumerate(np.asarray(detection.corners, float)):
                 if np.isfinite(pixel).all():
-                    rows.add(frame.image, corner_name(placed.name, corner), placed, corner, pixel)
+                    rows.add(_Match(frame.image, f"{placed.name}/{corner}", placed, corner, pixel))
 
 
 def _match_table(rows: _Rows, table: Table, survey: Survey) -> None:
@@ -638,11 +613,11 @@ def _match_table(rows: _Rows, table: Table, survey: Survey) -> None:
         name = row.words.get("id") or row.words.get("tag") or ""
         placed, corner = _find(survey, name)
         if placed is None:
-            rows.unknown.setdefault(name or f"line {row.line}", 0)
+            rows.unknown[name or f"line {row.line}"] = None
         elif row.missing("u", "v"):
             rows.notes.append(f"{table.path}: line {row.line}: left out: {name} has no pixel")
         else:
-            rows.add(row.words.get("image", ""), name, placed, corner, row.pixel)
+            rows.add(_Match(row.words.get("image", ""), name, placed, corner, row.pixel))
 
 
 def _find(survey: Survey, name: str) -> tuple[Placed | None, int]:

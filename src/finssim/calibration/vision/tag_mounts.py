@@ -39,21 +39,9 @@ from finssim.geometry.rotations import (
 from finssim.localization.pool import Pool
 
 __all__ = [
-    "AXES",
-    "Moment",
-    "MountFit",
-    "MountState",
-    "Noise",
-    "Rig",
-    "UNSURE_LENGTH",
-    "change",
-    "fit_mounts",
-    "moment_blocks",
-    "moved",
-    "reference_tag",
-    "residuals",
-    "start_state",
-]
+    "AXES", "Moment", "MountFit", "MountState", "Noise", "Rig", "UNSURE_LENGTH", "change", "fit_mounts",
+    "moment_blocks", "moved", "reference_tag", "residuals", "start_state",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
@@ -82,6 +70,20 @@ class Moment:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Noise:
+    """Standard deviations."""
+
+    pixel: float = 0.3
+    """Of a coordinate of a corner [px]."""
+    up: float = 0.009
+    """Of roll and pitch [rad]."""
+    depth: float = 0.01
+    """[m]"""
+    centre: float = 0.02
+    """Of the place of the centre while turning on the spot [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Rig:
     """What is taken as known."""
 
@@ -94,25 +96,12 @@ class Rig:
     """The reference tag."""
     centre: Array | None = None
     """Body point that stays where it is while the vehicle turns on the spot [m], (3,); None if it does not."""
+    noise: Noise = field(default_factory=Noise)
 
     @property
     def edge(self) -> float:
         """Of a tag [m]."""
         return float(np.linalg.norm(self.corners_t[0] - self.corners_t[1]))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Noise:
-    """Standard deviations."""
-
-    pixel: float = 0.3
-    """Of a coordinate of a corner [px]."""
-    up: float = 0.009
-    """Of roll and pitch [rad]."""
-    depth: float = 0.01
-    """[m]"""
-    centre: float = 0.02
-    """Of the place of the centre while turning on the spot [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,29 +159,28 @@ def corner_points(rig: Rig, state: MountState, moments: Sequence[Moment]) -> Arr
 
 
 def residuals(
-    rig: Rig, state: MountState, moments: Sequence[Moment], noise: Noise
+    rig: Rig, state: MountState, moments: Sequence[Moment]
 ) -> tuple[Array, NDArray[np.int64], list[Array]]:
     """Measured less predicted corners [px] (n, 4, 2), NaN out of sight, their moments (n,), and the whitened rest."""
     seen = np.array([pixels for m in moments for pixels in m.corners.values()])
     owner = np.repeat(np.arange(len(moments)), [len(m.corners) for m in moments])
     predicted = project(rig.pool.camera, rig.pool.interface, corner_points(rig, state, moments)).pixels
     rest = [
-        np.concatenate([np.zeros(0), *(r for _, _, r in _others(rig, state, pose, m, noise))])
+        np.concatenate([np.zeros(0), *(r for _, _, r in _others(rig, state, pose, m))])
         for pose, m in zip(state.poses, moments, strict=True)
     ]
     return seen - predicted, owner, rest
 
 
-def moment_blocks(rig: Rig, state: MountState, moments: Sequence[Moment], noise: Noise) -> list[Block]:
+def moment_blocks(rig: Rig, state: MountState, moments: Sequence[Moment]) -> list[Block]:
     """Weighted normal equations of every moment, shared unknowns in the order of `MountState.names`."""
-    pixels, _, _ = residuals(rig, state, moments, noise)
+    pixels, _, _ = residuals(rig, state, moments)
     J = projection_jacobians(rig.pool.camera, rig.pool.interface, corner_points(rig, state, moments)).point
-    root = (
-        np.sqrt(huber_weight(np.linalg.norm(pixels, axis=-1), HUBER * noise.pixel))[..., None] / noise.pixel
-    )
+    pixel = rig.noise.pixel
+    root = np.sqrt(huber_weight(np.linalg.norm(pixels, axis=-1), HUBER * pixel))[..., None] / pixel
     k, blocks = 0, []
     for pose, moment in zip(state.poses, moments, strict=True):
-        rows = _others(rig, state, pose, moment, noise)
+        rows = _others(rig, state, pose, moment)
         for tag in moment.corners:
             A, B = _corner_rows(rig, state, pose, tag, J[k])
             weighted = (root[k][..., None] * A, root[k][..., None] * B, root[k] * pixels[k])
@@ -219,32 +207,28 @@ def _corner_rows(rig: Rig, state: MountState, pose: Pose, tag: int, J: Array) ->
     return A, own
 
 
-def _others(
-    rig: Rig, state: MountState, pose: Pose, moment: Moment, noise: Noise
-) -> list[tuple[Array, Array, Array]]:
+def _others(rig: Rig, state: MountState, pose: Pose, moment: Moment) -> list[tuple[Array, Array, Array]]:
     """Whitened rows of IMU, depth and centre: shared, own, residual."""
-    up_p = rig.pool.interface.normal
-    tail, count = 6 + 6 * len(state.others), len(state.names)
+    n, noise, tail = rig.pool.interface.normal, rig.noise, len(state.names) - len(SENSORS)
     rows = []
+
+    def add(std: float, first: int, shared: Array, turn: Array, shift: Array, residual: Array) -> None:
+        A = np.zeros((len(residual), len(state.names)))
+        A[:, first : first + shared.shape[1]] = shared
+        rows.append((A / std, np.hstack([turn, shift]) / std, residual / std))
+
     if moment.up is not None:
-        felt = state.imu_turn @ moment.up
-        A, B = np.zeros((3, count)), np.zeros((3, 6))
-        A[:, tail : tail + 3] = skew(felt)
-        B[:, :3] = pose.R.T @ skew(up_p)
-        rows.append((A / noise.up, B / noise.up, (felt - pose.R.T @ up_p) / noise.up))
+        felt, up_b = state.imu_turn @ moment.up, pose.R.T @ n
+        add(noise.up, tail, skew(felt), pose.R.T @ skew(n), np.zeros((3, 3)), felt - up_b)
     if moment.depth is not None:
         arm = pose.R @ rig.port
-        predicted = -(up_p @ (pose.t + arm) + rig.pool.interface.offset) + state.depth_offset
-        A, B = np.zeros((1, count)), np.zeros((1, 6))
-        A[0, tail + 3] = 1.0
-        B[0, :3], B[0, 3:] = up_p @ skew(arm), -up_p
-        rows.append((A / noise.depth, B / noise.depth, np.array([moment.depth - predicted]) / noise.depth))
+        predicted = -(n @ (pose.t + arm) + rig.pool.interface.offset) + state.depth_offset
+        off = np.array([moment.depth - predicted])
+        add(noise.depth, tail + 3, np.ones((1, 1)), (n @ skew(arm))[None], -n[None], off)
     if rig.centre is not None:
-        arm = pose.R @ rig.centre
-        A, B = np.zeros((2, count)), np.zeros((2, 6))
-        A[:, tail + 4 :] = -np.eye(2)
-        B[:, :3], B[:, 3:] = -skew(arm)[:2], np.eye(3)[:2]
-        rows.append((A / noise.centre, B / noise.centre, (state.centre - (pose.t + arm)[:2]) / noise.centre))
+        arm, across = pose.R @ rig.centre, np.eye(3)[:2]
+        off = state.centre - across @ (pose.t + arm)
+        add(noise.centre, tail + 4, -np.eye(2), -across @ skew(arm), across, off)
     return rows
 
 
@@ -339,24 +323,19 @@ def restricted(block: Block, state: MountState, free: Sequence[str]) -> Block:
 
 
 def minimise(
-    rig: Rig,
-    state: MountState,
-    moments: Sequence[Moment],
-    noise: Noise,
-    free: Sequence[str],
-    steps: int = STEPS,
+    rig: Rig, state: MountState, moments: Sequence[Moment], free: Sequence[str], steps: int = STEPS
 ) -> MountState:
     """The state that suits the moments best, nearby, over their poses and the shared unknowns `free`."""
     index = [state.names.index(name) for name in free]
 
     def cost(state: MountState) -> float:
-        corner, _, rest = residuals(rig, state, moments, noise)
-        total = huber_cost(np.linalg.norm(corner, axis=-1) / noise.pixel, HUBER)
+        corner, _, rest = residuals(rig, state, moments)
+        total = huber_cost(np.linalg.norm(corner, axis=-1) / rig.noise.pixel, HUBER)
         total += float(np.sum(np.concatenate(rest) ** 2))
         return total if math.isfinite(total) else math.inf
 
     def steps_from(state: MountState) -> Callable[[float], MountState]:
-        blocks = [restricted(block, state, free) for block in moment_blocks(rig, state, moments, noise)]
+        blocks = [restricted(block, state, free) for block in moment_blocks(rig, state, moments)]
 
         def stepped(damping: float) -> MountState:
             shared = np.zeros(len(state.names))
@@ -425,8 +404,6 @@ class MountFit:
     """Shared unknowns that were estimated, of `state.names`."""
     frozen: tuple[str, ...]
     """Those that the motion does not tell, kept as they were."""
-    theta: Array
-    """Steps from the start: angles as rotation vectors about the outer axes [rad], lengths [m], (free,)."""
     covariance: Covariance
     """Of `free`."""
     rms: float
@@ -475,7 +452,6 @@ def fit_mounts(
     moments: Sequence[Moment],
     *,
     estimate: str = "tags",
-    noise: Noise | None = None,
     held_out: bool = True,
 ) -> MountFit:
     """Mounts of all tags, or of the sensors, from moments of a moving vehicle.
@@ -490,13 +466,11 @@ def fit_mounts(
         moments: In order of time.
         estimate: `tags`: IMU and pressure port in the file are right. `sensors`: the reference tag in the file is
             right, and the IMU's turn and the depth's offset are estimated.
-        noise: Standard deviations.
         held_out: Fit parts of the recording too, for the error at the others.
 
     Raises:
         CalibrationError: Too few moments show a tag in the water.
     """
-    sigma = noise or Noise()
     some = _spread([moment for moment in moments if moment.corners])
     state, kept = start_state(rig, mounts, some)
     used = [some[i] for i in kept]
@@ -508,51 +482,48 @@ def fit_mounts(
     unknown = sorted({tag for m in used for tag in m.corners} - {rig.reference} - state.others.keys())
     used = [replace(m, corners={t: c for t, c in m.corners.items() if t not in unknown}) for m in used]
     origin = state
-    state = _by_vision(rig, state, used, sigma, estimate)
-    state, used, left_out = _without_far(rig, state, used, sigma)
+    state = _by_vision(rig, state, used, estimate)
+    state, used, left_out = _without_far(rig, state, used)
     wanted = _wanted(rig, state, used, estimate)
-    free = _hopeful(rig, state, used, sigma, wanted)
+    free = _hopeful(rig, state, used, wanted)
     state = as_before(state, origin, [name for name in wanted if name not in free])
     while True:
-        state = minimise(rig, state, used, sigma, free)
-        blocks = [restricted(block, state, free) for block in moment_blocks(rig, state, used, sigma)]
+        state = minimise(rig, state, used, free)
+        blocks = [restricted(block, state, free) for block in moment_blocks(rig, state, used)]
         covariance = trial_covariance(arrow_evidence(blocks, free, "blocks", BLOCKS))
         worst = _least_told(free, intervals(np.zeros(len(free)), covariance)[:, 1])
         if worst is None:
             break
         free = tuple(name for name in free if name != worst)
         state = as_before(state, origin, [name for name in wanted if name not in free])
-    corner, _, _ = residuals(rig, state, used, sigma)
+    corner, _, _ = residuals(rig, state, used)
     return MountFit(
         state=state,
         rig=rig,
         moments=tuple(used),
         free=free,
         frozen=tuple(name for name in wanted if name not in free),
-        theta=change(origin, state, free),
         covariance=covariance,
         rms=float(np.sqrt(np.nanmean(np.sum(corner**2, axis=-1)))),
-        held_out_rms=_held_out(rig, state, used, sigma, free) if held_out else math.nan,
+        held_out_rms=_held_out(rig, state, used, free) if held_out else math.nan,
         left_out=left_out,
     )
 
 
-def _held_out(
-    rig: Rig, state: MountState, moments: Sequence[Moment], noise: Noise, free: tuple[str, ...]
-) -> float:
+def _held_out(rig: Rig, state: MountState, moments: Sequence[Moment], free: tuple[str, ...]) -> float:
     """Mounts from every other sixth of the recording, tried on the sixths between, and the other way round."""
-    part = np.arange(len(moments)) * 6 // len(moments) % 2
-    squares = []
-    for fold in (0, 1):
-        fitted, tried = np.flatnonzero(part == fold).tolist(), np.flatnonzero(part != fold).tolist()
-        some = replace(state, poses=[state.poses[i] for i in fitted])
-        mounts = minimise(rig, some, [moments[i] for i in fitted], noise, free, steps=10)
-        rest = [moments[i] for i in tried]
-        test = minimise(
-            rig, replace(mounts, poses=[state.poses[i] for i in tried]), rest, noise, (), steps=10
-        )
-        squares.append(np.sum(residuals(rig, test, rest, noise)[0] ** 2, axis=-1).ravel())
-    return float(np.sqrt(np.nanmean(np.concatenate(squares))))
+    fold = np.arange(len(moments)) * 6 // len(moments) % 2
+
+    def fitted(state: MountState, k: int, free: tuple[str, ...]) -> tuple[MountState, list[Moment]]:
+        index = np.flatnonzero(fold == k).tolist()
+        some, state = [moments[i] for i in index], replace(state, poses=[poses[i] for i in index])
+        return minimise(rig, state, some, free, steps=10), some
+
+    poses, corners = state.poses, []
+    for k in (0, 1):
+        test, others = fitted(fitted(state, k, free)[0], 1 - k, ())
+        corners.append(np.sum(residuals(rig, test, others)[0] ** 2, axis=-1).ravel())
+    return float(np.sqrt(np.nanmean(np.concatenate(corners))))
 
 
 def _spread(moments: Sequence[Moment]) -> list[Moment]:
@@ -580,14 +551,14 @@ def _of_others(state: MountState) -> tuple[str, ...]:
 
 
 def _without_far(
-    rig: Rig, state: MountState, moments: Sequence[Moment], noise: Noise
+    rig: Rig, state: MountState, moments: Sequence[Moment]
 ) -> tuple[MountState, list[Moment], int]:
     """Moments whose best corner is far off even alone, as a wrongly read tag's, go."""
-    corner, owner, _ = residuals(rig, state, moments, noise)
+    corner, owner, _ = residuals(rig, state, moments)
     distance = np.linalg.norm(corner, axis=-1)
     far = np.array([np.median(distance[owner == i]) for i in range(len(moments))])
     usual = float(np.nanmedian(far))
-    keep = np.isfinite(far) & (far <= max(FAR * usual, 3.0 * noise.pixel))
+    keep = np.isfinite(far) & (far <= max(FAR * usual, 3.0 * rig.noise.pixel))
     state = replace(state, poses=[pose for pose, ok in zip(state.poses, keep, strict=True) if ok])
     return state, [m for m, ok in zip(moments, keep, strict=True) if ok], int(np.sum(~keep))
 
@@ -602,10 +573,10 @@ def _least_told(free: Sequence[str], half: Array) -> str | None:
 
 
 def _hopeful(
-    rig: Rig, state: MountState, moments: Sequence[Moment], noise: Noise, free: tuple[str, ...]
+    rig: Rig, state: MountState, moments: Sequence[Moment], free: tuple[str, ...]
 ) -> tuple[str, ...]:
     """Without what the geometry alone rules out: least squares would wander along it."""
-    blocks = moment_blocks(rig, state, moments, noise)
+    blocks = moment_blocks(rig, state, moments)
     while True:
         some = [restricted(block, state, free) for block in blocks]
         local = trial_covariance(arrow_evidence(some, free, "blocks", 1)).local
@@ -615,16 +586,14 @@ def _hopeful(
         free = tuple(name for name in free if name != worst)
 
 
-def _by_vision(
-    rig: Rig, state: MountState, moments: Sequence[Moment], noise: Noise, estimate: str
-) -> MountState:
+def _by_vision(rig: Rig, state: MountState, moments: Sequence[Moment], estimate: str) -> MountState:
     """Poses from the pixels, and a reference tag or an IMU turned so that up by the IMU is up by the pixels.
 
     A tag or an IMU that is mounted a quarter turn away from what the file says would otherwise start with tilts of the
     wrong sign. Where the vehicle never tilts, the smallest turn is taken.
     """
     blind = [replace(moment, up=None) for moment in moments]
-    state = minimise(rig, state, blind, noise, _of_others(state), steps=15)
+    state = minimise(rig, state, blind, _of_others(state), steps=15)
     known = [i for i, moment in enumerate(moments) if moment.up is not None]
     if not known:
         return state
@@ -633,7 +602,7 @@ def _by_vision(
     q = rotation_between(felt, seen)
     better = np.sum((felt - quat_rotate(q, seen)) ** 2) < BETTER * np.sum((felt - seen) ** 2)
     if 2.0 * math.acos(min(1.0, abs(float(q[3])))) < TURNED or not better:
-        return minimise(rig, state, moments, noise, ())
+        return minimise(rig, state, moments, ())
     turn = Pose(quat_to_matrix(q), np.zeros(3))
     if estimate == "sensors":
         state = replace(state, imu_turn=turn.R.T.copy())
@@ -641,4 +610,4 @@ def _by_vision(
         mount = Pose(turn.R @ state.reference.R, state.reference.t)
         back = state.reference.then(mount.inverse)
         state = replace(state, reference=mount, poses=[pose.then(back) for pose in state.poses])
-    return minimise(rig, state, moments, noise, ())
+    return minimise(rig, state, moments, ())

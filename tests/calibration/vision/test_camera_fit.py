@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.vision.camera.board_views import LENSES, PHOTOGRAPHS, photographed, views
+from calibration.vision.board_views import LENSES, PHOTOGRAPHS, photographed, views
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.uncertainty import intervals, trial_covariance
 from finssim.calibration.vision.camera_fit import (

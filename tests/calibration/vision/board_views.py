@@ -10,7 +10,7 @@ from finssim.geometry.optics import Lens
 from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
 from finssim.localization.detection.pictures import pictures
 
-PHOTOGRAPHS = Path(__file__).resolve().parents[3] / "data" / "opencv_chessboards"
+PHOTOGRAPHS = Path(__file__).resolve().parents[2] / "data" / "opencv_chessboards"
 BOARD = Board(columns=9, rows=6, square=0.03)
 
 LENSES = {

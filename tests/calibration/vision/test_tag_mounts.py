@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.vision.mounts.moving_vehicle import EDGE, MOUNTS, POOL, PORT, moments, motion
+from calibration.vision.moving_vehicle import EDGE, MOUNTS, POOL, PORT, moments, motion
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.vision.least_squares import Pose
 from finssim.calibration.vision.tag_mounts import (
@@ -50,13 +50,13 @@ def test_derivatives_are_those_of_the_prediction(rocked):
     some = [replace(m, corners=dict(m.corners)) for m in rocked[:3]]
     rig = replace(RIG, centre=np.array([0.02, 0.01, 0.0]))
     state, _ = start_state(rig, FILE, some)
-    noise = Noise(pixel=1e3)  # no corner is far off
+    rig = replace(rig, noise=Noise(pixel=1e3))  # no corner is far off
 
     def cost(s):
-        pixels, _, rest = residuals(rig, s, some, noise)
-        return 0.5 * (np.sum((pixels / noise.pixel) ** 2) + sum(np.sum(r**2) for r in rest))
+        pixels, _, rest = residuals(rig, s, some)
+        return 0.5 * (np.sum((pixels / rig.noise.pixel) ** 2) + sum(np.sum(r**2) for r in rest))
 
-    blocks = moment_blocks(rig, state, some, noise)
+    blocks = moment_blocks(rig, state, some)
     still, h = [np.zeros(6)] * 3, 1e-5
     slope = np.sum([block.a for block in blocks], axis=0)
     for k in range(len(state.names)):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from calibration.vision.camera.board_views import PHOTOGRAPHS
+from calibration.vision.board_views import PHOTOGRAPHS
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.vision.camera_command import run
 from finssim.localization.camera_file import load_camera

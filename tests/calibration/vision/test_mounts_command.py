@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from calibration.vision.mounts.moving_vehicle import MOUNTS, POOL, PORT, motion, write_log
+from calibration.vision.moving_vehicle import MOUNTS, POOL, PORT, motion, write_log
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.calibration.vision.mount_log import read_mount_log

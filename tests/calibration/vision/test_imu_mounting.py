@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.vision.mounts.moving_vehicle import motion
+from calibration.vision.moving_vehicle import motion
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.vision.sensor_mounts import (
     Attitude,
@@ -25,7 +25,7 @@ from finssim.geometry.rotations import (
     quat_to_rotvec,
 )
 
-HINSDALE = Path(__file__).resolve().parents[3] / "data" / "hinsdale"
+HINSDALE = Path(__file__).resolve().parents[2] / "data" / "hinsdale"
 MOUNTS = {
     "published flip": np.array([0.0, 0.0, 1.0, 0.0]),
     "as the body": np.array([0.0, 0.0, 0.0, 1.0]),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calibration.vision.mounts.moving_vehicle import motion
+from calibration.vision.moving_vehicle import motion
 from finssim.calibration.vision.sensor_mounts import Attitude, imu_clock
 from finssim.geometry.rotations import quat_conjugate, quat_from_rotvec, quat_multiply, quat_to_rotvec
 
