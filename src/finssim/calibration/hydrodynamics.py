@@ -24,7 +24,7 @@ from finssim.calibration.trials.inputs import drive
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import AXES, Vehicle
 
-__all__ = ["METHODS", "fit_hydrodynamics"]
+__all__ = ["METHODS", "fit_hydrodynamics", "scaled"]
 
 METHODS = ("auto", "regression", "simulation")
 
@@ -127,7 +127,7 @@ def fit_hydrodynamics(
     if "thrust_scale" not in estimate and _unknown_voltage(trials, vehicle):
         free = _or_none(lambda body: regression(body, known={}, trust=False), vehicle)
         scale, std = _thrust_scale(free, vehicle, known)
-    body = vehicle.replace(_scaled(vehicle, scale)) if std else vehicle
+    body = vehicle.replace(scaled(vehicle, scale)) if std else vehicle
     before = _scores(vehicle, trials)
     driven = [trial for trial in trials if not trial.header.passive]
     if method == "simulation" or asked:
@@ -224,7 +224,7 @@ def _unknown_voltage(trials: Sequence[Trial], vehicle: Vehicle) -> bool:
     return sources == {"pwm"} and silent
 
 
-def _scaled(vehicle: Vehicle, scale: float) -> dict[str, Any]:
+def scaled(vehicle: Vehicle, scale: float) -> dict[str, Any]:
     """Changes of the vehicle file that multiply every thrust."""
     return {
         f"thrusters.{name}.{key}": scale * float(getattr(thruster, key))
@@ -283,7 +283,7 @@ def _with_scale(fit: Fit, vehicle: Vehicle, scale: float, std: float, known: Map
         fit,
         vehicle=vehicle,
         estimates=found,
-        changes={**_scaled(vehicle, scale), **fit.changes},
+        changes={**scaled(vehicle, scale), **fit.changes},
         warnings=(warning, *fit.warnings),
     )
 
