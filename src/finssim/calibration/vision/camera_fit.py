@@ -48,6 +48,9 @@ MODELS = tuple(DISTORTION_NAMES)
 FOCAL_SHARES = np.geomspace(0.2, 4.0, 25)
 """Focal lengths that are tried at the start, in widths of the image."""
 
+LEAST_FOCAL = 0.1
+"""Widths of the image below which a focal length makes no sense: level boards would let it shrink for ever."""
+
 HUBER = 2.0
 """Residuals beyond this many standard deviations count linearly."""
 
@@ -293,6 +296,8 @@ def _minimise(bundle: Bundle, views: Sequence[BoardView], free: NDArray[np.bool_
             try:
                 lens = replace(bundle.lens, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion))
             except OpticsError:  # a focal length below zero, say
+                return None
+            if fx < LEAST_FOCAL * lens.width:
                 return None
             return _bundle(lens, poses, views)
 

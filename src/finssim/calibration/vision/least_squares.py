@@ -114,7 +114,7 @@ def linear_map(points: Array, rays: Array) -> Array | None:
         Up to a scale, or None where the points leave it open.
     """
     rows = np.einsum("nij,nk->nijk", skew(rays), points).reshape(-1, 3 * points.shape[1])
-    _, values, vectors = np.linalg.svd(rows)
+    _, values, vectors = np.linalg.svd(rows, full_matrices=False)
     if values[-2] < 1e-9 * values[0]:
         return None
     M = vectors[-1].reshape(3, -1)
