@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Mapping
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from rich.console import Console
 
@@ -44,17 +44,40 @@ FIGURES = {
 REPORT_FILE = "report.html"
 
 
-def ablation(*, out: Path, say: Say = lambda part, what: None, **options: Any) -> dict[str, Any]:
-    """Play both experiments, or go on with them where their folders lie in `out`, and compare their rows.
+def ablation(
+    *,
+    out: Path,
+    plants: Annotated[int, (1, 1000)] = 3,
+    seeds: Annotated[int, (1, 1000)] = 3,
+    seed: int = 1,
+    severity: str = "realistic",
+    camera: str = "corners",
+    vehicle: str = "finsrov",
+    steps: Annotated[int | None, (1, None)] = None,
+    processes: Annotated[int | None, (1, None)] = None,
+    say: Say = lambda part, what: None,
+) -> dict[str, Any]:
+    """What each module is worth: differences of paired trials with intervals, and a sentence that they support.
+
+    Example: finssim experiment ablation --seeds 3 --out ablation
 
     Args:
-        out: Directory for `ablation.json`, `ablation.md` and the folders `t1` and `t2`.
+        out (DIR): Directory for JSON, Markdown, figures, policies and trials; one that was interrupted goes on.
+        plants: Virtual pools, each with its own vehicle, water and camera.
+        seeds: Trainings of each policy, each tried with its own noise.
+        seed: Seed of every random number; equal seeds give equal results.
+        severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
+        camera (MODE): corners (projected through the rippling water, with noise), or pictures (drawn, and searched for
+            tags: several times slower).
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        steps: Control steps to learn from, all worlds together; what the task needs if not given.
+        processes: Trials at once; as many as processors if not given.
         say: Told the share that is done and what comes next.
-        options: As of `transfer_experiment`.
 
     Returns:
         Experiment -> its result, without the single trials.
     """
+    options = {name: value for name, value in locals().items() if name not in ("out", "say")}
     results = {}
     for k, (name, spec) in enumerate(SPECS.items()):
         result = transfer_experiment(
@@ -102,20 +125,37 @@ def _table(spec: Spec, result: Mapping[str, Any]) -> Shown:
 
 
 def everything(
-    *, out: Path, seeds: int = 3, seed: int = 1, say: Say = lambda part, what: None, **options: Any
+    *,
+    out: Path,
+    plants: Annotated[int, (1, 1000)] = 3,
+    seeds: Annotated[int, (1, 1000)] = 3,
+    seed: int = 1,
+    severity: str = "realistic",
+    camera: str = "corners",
+    steps: Annotated[int | None, (1, None)] = None,
+    processes: Annotated[int | None, (1, None)] = None,
+    say: Say = lambda part, what: None,
 ) -> dict[str, Any]:
-    """Run every experiment that has no result in `out` yet, and write the report.
+    """Run localization, replay, t1, t2 and ablation, and write one report with the paper's figures beside ours.
+
+    Example: finssim experiment all --seeds 1 --plants 1 --out everything
 
     Args:
-        out: Directory for `report.html` and a folder for each experiment.
-        seeds: Of each.
-        seed: The first.
+        out (DIR): Directory for JSON, Markdown, figures, policies and trials; one that was interrupted goes on.
+        plants: Virtual pools, each with its own vehicle, water and camera.
+        seeds: Trainings of each policy, each tried with its own noise.
+        seed: Seed of every random number; equal seeds give equal results.
+        severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
+        camera (MODE): corners (projected through the rippling water, with noise), or pictures (drawn, and searched for
+            tags: several times slower).
+        steps: Control steps to learn from, all worlds together; what the task needs if not given.
+        processes: Trials at once; as many as processors if not given.
         say: Told the share that is done and what comes next.
-        options: As of `ablation`.
 
     Returns:
         Experiment -> what its JSON file holds, without single trials; `report`: its path.
     """
+    options = {name: value for name, value in locals().items() if name not in ("out", "say")}
     out = Path(out)
 
     def once(name: str, file: str, work: Callable[..., Any], begun: float) -> dict[str, Any]:
@@ -136,9 +176,7 @@ def everything(
             "localization", localization.RESULT_FILE, localization.localization_experiment, 0.0
         ),
         "replay": once("replay", replay.RESULT_FILE, replay.replay_experiment, 0.1),
-        **ablation(
-            out=out, seeds=seeds, seed=seed, say=lambda part, what: say(0.2 + 0.8 * part, what), **options
-        ),
+        **ablation(out=out, say=lambda part, what: say(0.2 + 0.8 * part, what), **options),
     }
     with atomic_write(out / REPORT_FILE) as temporary:
         temporary.write_text(_report(results, out), encoding="utf-8")

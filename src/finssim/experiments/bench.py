@@ -191,8 +191,19 @@ def measure(device: str = "cpu", progress: Callable[[str], None] = lambda _: Non
     }
 
 
-def bench(as_json: bool = False, device: str = "cpu") -> None:
-    """Measure and print; one JSON object if asked for."""
+def bench(
+    *,
+    device: str = "cpu",
+    as_json: bool = False,
+) -> None:
+    """Measure this machine's speed: physics steps/s, environment steps/s, mesh faces/s.
+
+    Example: finssim bench --json > bench.json
+
+    Args:
+        device (DEVICE): Where to compute: cpu or cuda.
+        as_json: Print one JSON object instead of tables.
+    """
     console = Console(stderr=True)
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task("", total=len(MODELS) * len(WORLDS) + len(ACTIONS) * len(WORLDS) + 4)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -425,26 +425,28 @@ FEWEST = 3
 
 
 def compare(
-    *,
     runs: Sequence[str],
+    *,
     out: Path,
+    measures: Annotated[Sequence[str], "--measure"] = (),
     vehicle: str = "finsrov",
     plant: str = "nominal",
-    trials: int | None = None,
-    measures: Sequence[str] = (),
+    trials: Annotated[int | None, (1, None)] = None,
     seed: int = 42,
     say: Say = lambda part, what: None,
 ) -> dict[str, Any]:
-    """Evaluate every run on the same trials, and write `compare.json`, `compare.md` and `compare.png`.
+    """Compare trainings over seeds: interquartile means with intervals, who is likely better, learning curves.
+
+    Example: finssim compare runs/hold-seed1 runs/hold-seed2 runs/hold-seed3 sac=runs/sac-1 --out compared
 
     Args:
-        runs: Policy directories, each DIR or NAME=DIR; those of one name differ in the seed alone.
-        out: Directory; evaluations that are there already are not made again.
-        vehicle: Name or file that all are evaluated with.
-        plant: Name or file.
-        trials: Of each run; the task's own number if None.
-        measures: Which to compare; the task's own if none.
-        seed: Of what the plant draws.
+        runs (RUN...): Policy directories, each DIR or NAME=DIR; those of one name differ in the seed alone.
+        out (DIR): Directory for table, figure and evaluations.
+        measures: What to compare; the task's own measures if not given. May be given several times.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        plant (FILE|NAME): What differs from the vehicle file, as for evaluate.
+        trials: Trials of each run; as many as evaluate makes if not given.
+        seed: Seed of every random number; equal seeds give equal results.
         say: Told the share that is done and what comes next.
 
     Raises:

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from os import environ
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from rich.console import Console
 
@@ -108,28 +108,32 @@ FULL = Scope(
 
 
 def demo(
-    out: Path,
+    out: Annotated[Path, "--out"] = Path("demo"),
     *,
     vehicle: str = "finsrov",
-    steps: int | None = None,
-    seed: int = SEED,
+    seed: int = 1,
+    steps: Annotated[int | None, (1, None)] = None,
     console: Console | None = None,
     scope: Scope | None = None,
-    processes: int | None = None,
+    processes: Annotated[int | None, "python"] = None,
     robot: OnRobot | None = None,
     attendant: Attendant | None = None,
 ) -> Path:
-    """Identify a vehicle in the virtual pool, train T1 in what was identified, and let the policy hold setpoints there.
+    """Identify a vehicle in the virtual pool or on a robot, train in it, deploy there beside two PIDs, write a report.
 
     Trials are recorded and controllers deployed through the robot's whole software: camera, localization, fusion,
-    controller, allocation, bridge and the motor controller's protocol. Beside the policy, `pid` and `pid-paper` try
-    the same setpoints in the same pool, `pid` tuned from the identified vehicle.
+    controller, allocation, bridge and the motor controller's protocol. Beside the policy, `pid` and `pid-paper` try the
+    same setpoints in the same pool, `pid` tuned from the identified vehicle.
+
+    Example: finssim demo --vehicle bluerov2_heavy --out demo
+
+    Example: finssim demo --robot udp://10.0.0.2:58766 --pool-file pool.yaml --arm --out demo
 
     Args:
-        out: Directory for trials, vehicle, policy, results and `report.html`; an earlier one there is replaced.
-        vehicle: Name or file.
-        steps: Control steps to train; as `finssim train --randomize pool` if None.
-        seed: Of the noise and of the training.
+        out: Directory of trials, vehicle, policy, results and report.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        seed: Seed of every random number; equal seeds give equal results.
+        steps: Control steps to learn from, all worlds together; what the task needs if not given.
         console: Where progress is shown; standard error if None.
         scope: How much of it; `FULL` if None.
         processes: As many as there are processors if None.

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import yaml
@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.excitation.excite import excite as write_programmes
 from finssim.calibration.excitation.programmes import Programme, programmes
-from finssim.calibration.importers.dispatch import read_trials
+from finssim.calibration.importers.dispatch import print_folders, read_trials
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import load_trial, load_trials, write_trial
 from finssim.control.guidance import Station
@@ -44,7 +45,7 @@ from finssim.robot.runtime import Runtime
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.defaults import room
 
-__all__ = ["excite_in_pool", "excite_on_robot", "pool_trials", "trials_on_robot"]
+__all__ = ["excite", "excite_in_pool", "excite_on_robot", "pool_trials", "trials_on_robot"]
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Lower and upper corner of the water that a vehicle may be in, world frame [m]."""
@@ -341,6 +342,110 @@ def pool_trials(
                 f"the bridge stopped every {name} trial in the virtual pool: {results[0]['fault']}: give lower levels"
             )
     return trials
+
+
+def excite(
+    axes: str,
+    *,
+    vehicle: str,
+    out: Path,
+    kind: str = "published",
+    levels: Sequence[str] | None = None,
+    repeats: Annotated[int, (1, 100)] = 1,
+    simulate: bool = False,
+    pool: Annotated[int | None, (0, None)] = None,
+    severity: str | None = None,
+    pool_vehicle: str | None = None,
+    hydrodynamics: str = "calibrated",
+    noise: str = "sensors",
+    inputs: Annotated[Sequence[str], ","] = ("rpm", "wrench"),
+    rate: float = 50.0,
+    coast: float = 30.0,
+    duration: float = 60.0,
+    room: float | None = None,
+    robot: OnRobot | None = None,
+    seed: int = 0,
+    as_json: bool = False,
+) -> list[Path]:
+    """Write excitation programmes (wrench [N, N m] and thrust [N] at 50 Hz) for a robot, or run them in a simulation.
+
+    Example: finssim excite surge,yaw --vehicle finsrov --pool 1 --out trials
+
+    Example: finssim excite all --vehicle finsrov --robot udp://10.0.0.2:58766 --pool-file pool.yaml --arm --out trials
+
+    Args:
+        axes (AXES): all, or of surge,sway,heave,roll,pitch,yaw separated by commas.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        out (DIR): Directory of the programmes or trials.
+        kind (KIND): published (steps, dive-and-coast, pulses), validation, or multisine.
+        levels (LEVELS): Magnitudes [N, N m]: "5,10" for every axis or "surge=5,10"; may be given several times.
+        repeats: How often every programme comes.
+        simulate: Run them in the simulator and write the trials they make.
+        pool (SEED): Seed of a virtual pool: the robot's whole software plays them there, records, and makes trials.
+        severity (NAME): Of that pool: nominal, realistic or hard; realistic if not given.
+        pool_vehicle (NAME|FILE): Vehicle around which that pool's own is drawn; the robot's if not given.
+        hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
+        noise (NAME): Noise of simulated trials: sensors, published or none.
+        inputs (NAMES): Inputs that simulated trials log, of wrench,rpm,force,pwm,command.
+        rate: Rows of a simulated trial per second [Hz].
+        coast: Longest coast after a dive [s].
+        duration: Of a multi-sine [s].
+        room: Longest way along a linear axis [m]: lowers the levels to fit a pool.
+        robot: The robot that plays them, in place of a simulation.
+        seed: Seed of every random number; equal seeds give equal results.
+        as_json: Print one JSON object instead of tables.
+
+    Returns:
+        The folders of the trials or programmes.
+
+    Raises:
+        CalibrationError, RobotError, VehicleError, OutputError: As they say.
+    """
+    plan: dict[str, Any] = {
+        "kind": kind, "levels": _levels(levels or ()), "repeats": repeats, "coast": coast, "duration": duration,
+    }  # fmt: skip
+    of_pool = severity is not None or pool_vehicle is not None
+    if robot is not None and (simulate or pool is not None or of_pool):
+        raise CalibrationError(
+            "--robot is where it is done: leave --simulate, --pool and what tells of it out"
+        )
+    if pool is not None and (simulate or room is not None):
+        raise CalibrationError("--pool goes with neither --simulate nor --room: a pool has its own room")
+    if pool is None and of_pool:
+        raise CalibrationError(
+            "--severity and --pool-vehicle tell of a virtual pool: name one with --pool SEED"
+        )
+    if robot is not None:
+        folders = excite_on_robot(axes, vehicle=vehicle, out=out, robot=robot, seed=seed, room=room, **plan)
+    elif pool is not None:
+        folders = excite_in_pool(
+            axes, vehicle=vehicle, out=out, plant=pool, pool_vehicle=pool_vehicle,
+            severity=severity or "realistic", seed=seed, **plan,
+        )  # fmt: skip
+    else:
+        folders = write_programmes(
+            axes, vehicle=vehicle, out=out, simulate=simulate, rate=rate, noise=noise, seed=seed, room=room,
+            hydrodynamics=hydrodynamics, inputs=inputs, **plan,
+        )  # fmt: skip
+    print_folders(folders, as_json)
+    return folders
+
+
+def _levels(words: Sequence[str]) -> dict[str, list[float]] | list[float] | None:
+    """Levels by axis from `surge=5,10`, or for every axis from `5,10`."""
+    named: dict[str, list[float]] = {}
+    for word in words:
+        axis, _, numbers = word.rpartition("=")
+        try:
+            values = [float(number) for number in numbers.split(",")]
+        except ValueError:
+            values = [math.nan]
+        if not all(map(math.isfinite, values)):
+            raise CalibrationError(f"levels are '{word}', expected numbers such as 5,10 or surge=5,10")
+        named.setdefault(axis.strip(), []).extend(values)
+    if "" in named and len(named) > 1:
+        raise CalibrationError("levels are given for every axis and for single ones: give one of the two")
+    return named.get("", named) or None
 
 
 def excite_in_pool(

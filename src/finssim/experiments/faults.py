@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -508,24 +508,28 @@ def _control(name: str) -> bool:
 def faults_experiment(
     *,
     out: Path,
-    seeds: int = 1,
+    seeds: Annotated[int, (1, 1000)] = 1,
     seed: int = 1,
-    scenarios: Sequence[str] | None = None,
+    scenarios: Annotated[Sequence[str] | None, ","] = None,
     severity: str = "realistic",
     vehicle: str = "finsrov",
-    processes: int | None = None,
+    processes: Annotated[int | None, (1, None)] = None,
     say: Say = lambda part, what: None,
 ) -> dict[str, Any]:
-    """Play every fault in every motion and pool; a run that was interrupted goes on where it was.
+    """Break one thing after another while a vehicle drives: time until thrust is gone [s], place in the workspace [m].
+
+    Exit status 3: a fault did what it must not.
+
+    Example: finssim experiment faults --scenarios link-cut,blind-3 --out faults
 
     Args:
-        out: Directory for `faults.json`, `faults.md` and `trials/`.
-        seeds: How many pools, each with its own vehicle, camera, water and noise.
-        seed: The first.
-        scenarios: Names; all if None.
-        severity: Of the pools: nominal, realistic or hard.
-        vehicle: Name or file.
-        processes: Trials at once; as many as processors if None.
+        out (DIR): Directory for JSON, Markdown, figures, policies and trials; one that was interrupted goes on.
+        seeds: Virtual pools, each with its own vehicle, water and noise.
+        seed: Seed of every random number; equal seeds give equal results.
+        scenarios (NAMES): Faults, separated by commas; all if not given.
+        severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        processes: Trials at once; as many as processors if not given.
         say: Told the share that is done and what comes next.
 
     Returns:

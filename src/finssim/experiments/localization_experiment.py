@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -399,23 +399,25 @@ class _Drawn:
 
 def localization_experiment(
     *,
-    renderer: str = "own",
-    seeds: int = 3,
     out: Path,
+    renderer: str = "own",
+    seeds: Annotated[int, (1, 1000)] = 3,
     seed: int = 1,
     say: Say = lambda part, what: None,
     **size: Any,
 ) -> dict[str, Any]:
-    """Draw the published test, calibrate on one half of its places, locate the tag at the other half.
+    """Locate a tag at places that the calibration has not seen, by refractive and pinhole methods: RMSE, P95 [cm].
 
     Every seed draws the places' survey errors, readings, camera file, plumb line, ripples and noise anew. Ctrl-C keeps
     the seeds that are finished, or of the first what there is.
 
+    Example: finssim experiment localization --seeds 3 --out localization
+
     Args:
-        renderer: `own`, `mitsuba`, or `geometry` (corners by exact projection and white noise, without pictures).
-        seeds: How many drawings.
-        out: Directory for `localization.json`, `.md`, figures, and of the first seed survey, detections and pool files.
-        seed: The first.
+        out (DIR): Directory for JSON, Markdown and figures.
+        renderer (NAME): own, mitsuba (slow), or geometry (no pictures: exact corners with noise).
+        seeds: Repetitions with other errors.
+        seed: Seed of every random number; equal seeds give equal results.
         say: Told the share that is done and what comes next.
         size: Of `draw_campaign`: locations (places along and across the pool) and images; as published if not given.
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,24 +131,26 @@ class SeedResult:
 
 def replay_experiment(
     *,
-    seeds: int,
     out: Path,
+    seeds: Annotated[int, (1, 1000)] = 3,
     seed: int = 1,
-    vehicle: str = "finsrov",
+    vehicle: Annotated[str, "python"] = "finsrov",
     plant: ReplayPlant | None = None,
-    repeats: int = REPEATS,
-    axes: Sequence[str] = AXES,
+    repeats: Annotated[int, "python"] = REPEATS,
+    axes: Annotated[Sequence[str], "python"] = AXES,
     say: Say = lambda part, what: None,
 ) -> dict[str, Any]:
-    """Trials from the hidden plant, identification on half of them, three models replayed on the other half.
+    """Identify on half of the trials of a plant outside the model class, replay three models on the other half.
 
     The calibrated model is what the fit found; mesh and simplified have the vehicle file's published numbers. Ctrl-C
     keeps the seeds that are finished.
 
+    Example: finssim experiment replay --seeds 3 --out experiment
+
     Args:
-        seeds: How many: each has its own trials, fit and replays.
-        out: Directory for `replay_experiment.json`, `.md`, the envelope figure and the calibrated vehicles.
-        seed: The first.
+        out (DIR): Directory for JSON, Markdown and figures.
+        seeds: Repetitions with other noise and starts.
+        seed: Seed of every random number; equal seeds give equal results.
         vehicle: Name or file of the vehicle whose file the operator starts from.
         plant: The hidden plant; the shipped one if None.
         repeats: Of every level and direction, an even number.

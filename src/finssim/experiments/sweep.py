@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from rich.console import Console
@@ -271,18 +271,22 @@ def sweep(
     *,
     out: Path,
     address: str | None = None,
-    processes: int | None = None,
+    processes: Annotated[int | None, (1, None)] = None,
     as_json: bool = False,
     console: Console | None = None,
 ) -> dict[str, Any]:
-    """Train and evaluate every setting with every seed; what is in the directory already is not done again.
+    """Train every setting with every seed on one machine or many, and evaluate each policy; goes on where it was.
+
+    Exit status 3: a training failed, which the table tells.
+
+    Example: finssim sweep sweep.yaml --out swept
 
     Args:
-        file: What to do (`finssim.experiments.sweep.Sweep`).
-        out: Directory: `runs/` with a policy directory for each job, `sweep.json`, `sweep.md`.
-        address: Of a Ray cluster; processes of this machine if None.
-        processes: Jobs at once on this machine; as many as processors if None.
-        as_json: Print one JSON object in place of the table.
+        file (FILE): What to train: task, seeds, settings (.yaml).
+        out (DIR): Directory of the runs; those that it has are kept.
+        address (ADDRESS): Of a Ray cluster to join, HOST:PORT or auto; this machine alone if not given.
+        processes: Trainings at once on this machine; one a processor if not given.
+        as_json: Print one JSON object instead of tables.
         console: Where the table goes; standard output if None.
 
     Returns:

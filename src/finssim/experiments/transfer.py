@@ -5,25 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from rich.console import Console
 
 from finssim.calibration.output.calibrated_ranges import write_ranges
 from finssim.control.policy import Policy
 from finssim.control.policy_description import PolicyError
-from finssim.experiments.campaign import Say, choice, run_experiment, run_jobs, write_json
+from finssim.experiments.campaign import Say, choice, run_jobs, write_json
 from finssim.experiments.identify import identify
 from finssim.experiments.on_robot import Attendant, OnRobot
 from finssim.experiments.pool_trial import HARDWARE, Job, play, run_on_robot
 from finssim.experiments.statistics import Interval, Statistic, paired_difference, with_interval
-from finssim.experiments.tables import Shown, markdown_of, print_shown
+from finssim.experiments.tables import Shown, markdown_of
 from finssim.files import atomic_directory
 from finssim.learning.train import train
 from finssim.provenance import provenance
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["INTERVALS", "MEASURES", "Row", "Spec", "Training", "finished", "run", "transfer_experiment"]
+__all__ = ["INTERVALS", "MEASURES", "Row", "Spec", "Training", "finished", "transfer_experiment"]
 
 Results = Mapping[str, Sequence[Mapping[str, Any]]]
 """Row -> results of its trials."""
@@ -108,34 +108,20 @@ class Spec:
         return {key: theirs[key] - reference[key] for key in self.differences}
 
 
-def run(spec: Spec, **options: Any) -> dict[str, Any]:
-    """Run an experiment with a progress bar, print its table (or one JSON object) and write the directory.
-
-    Arguments as of `run_experiment` and `transfer_experiment`.
-    """
-    return run_experiment(
-        f"experiment {spec.name}",
-        lambda **given: transfer_experiment(spec, **given),
-        lambda result, screen: print_shown(spec.shown(result), screen),
-        bar=options.get("robot") is None,
-        **options,
-    )
-
-
 def transfer_experiment(
     spec: Spec,
     *,
     out: Path,
-    plants: int = 3,
-    seeds: int = 3,
+    plants: Annotated[int, (1, 1000)] = 3,
+    seeds: Annotated[int, (1, 1000)] = 3,
     seed: int = 1,
-    rows: Sequence[str] | None = None,
-    targets: Sequence[str] | None = None,
     severity: str = "realistic",
     camera: str = "corners",
+    rows: Annotated[Sequence[str] | None, ","] = None,
+    targets: Annotated[Sequence[str] | None, "python"] = None,
     vehicle: str = "finsrov",
-    steps: int | None = None,
-    processes: int | None = None,
+    steps: Annotated[int | None, (1, None)] = None,
+    processes: Annotated[int | None, (1, None)] = None,
     robot: OnRobot | None = None,
     attendant: Attendant | None = None,
     say: Say = lambda part, what: None,
@@ -147,17 +133,18 @@ def transfer_experiment(
 
     Args:
         spec: Which experiment.
-        out: Directory for NAME.json, NAME.md, the figure, `policies/` and `trials/`.
-        plants: How many pools, each with its own vehicle, camera and water.
-        seeds: How many trainings of each policy, each tried with its own noise.
-        seed: The first of both.
-        rows: Keys of the rows; all if None.
+        out (DIR): Directory for JSON, Markdown, figures, policies and trials; one that was interrupted goes on.
+        plants: Virtual pools, each with its own vehicle, water and camera.
+        seeds: Trainings of each policy, each tried with its own noise.
+        seed: Seed of every random number; equal seeds give equal results.
+        severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
+        camera (MODE): corners (projected through the rippling water, with noise), or pictures (drawn, and searched for
+            tags: several times slower).
+        rows (NAMES): Rows of the table, separated by commas; all if not given.
         targets: What is played; the published ones if None.
-        severity: Of the pools: nominal, realistic or hard.
-        camera: corners or pictures.
-        vehicle: Name or file.
-        steps: Of each training; the task's own if None.
-        processes: Trials at once; as many as processors if None.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        steps: Control steps to learn from, all worlds together; what the task needs if not given.
+        processes: Trials at once; as many as processors if not given.
         robot: Play on a robot, one trial after the other, instead of in pools; plants, severity and camera are its own.
         attendant: The person beside that robot, instead of the terminal's keyboard.
         say: Told the share that is done and what comes next.
@@ -168,6 +155,8 @@ def transfer_experiment(
     Raises:
         ValueError: An unknown row, target, severity or camera, or a number below 1.
     """
+    if robot is not None and (plants, severity, camera) != (3, "realistic", "corners"):
+        raise ValueError("a robot has its own plant and camera: leave --plants, --severity and --camera out")
     rows, targets = list(rows or spec.rows), list(targets or spec.targets)
     for known, kind, names in (
         (spec.rows, "row", rows),

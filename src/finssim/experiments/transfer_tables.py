@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from rich.console import Console
 
 from finssim.control.trajectories import TRAJECTORIES, load_trajectory
 from finssim.experiments.evaluate import T1_COLUMNS, TrackingRun, cells, draw_tracking
@@ -18,11 +19,11 @@ from finssim.experiments.figures import (
 )
 from finssim.experiments.paper import PAPER_T2, T1_SETPOINTS, paper_row, paper_t2_row
 from finssim.experiments.pool_trial import read_series
-from finssim.experiments.tables import Shown, figure_text
-from finssim.experiments.transfer import INTERVALS, Results, Row, Spec, Training
+from finssim.experiments.tables import Shown, figure_text, print_shown
+from finssim.experiments.transfer import INTERVALS, Results, Row, Spec, Training, transfer_experiment
 from finssim.experiments.trials import T2_TRAJECTORIES
 
-__all__ = ["T1", "T2", "played_in"]
+__all__ = ["T1", "T2", "played_in", "print_transfer", "t1", "t2"]
 
 DR = "hold_for_position"
 """The published ranges of station keeping."""
@@ -252,3 +253,38 @@ T2 = Spec(
     draw=_draw_t2,
 )
 """`finssim experiment t2`."""
+
+
+def t1(*, setpoints: Annotated[Sequence[str] | None, ","] = None, **options: Any) -> dict[str, Any]:
+    """Station keeping in the virtual pool (the paper's Table IV): success, errors [m, deg], time to settle [s], jitter.
+
+    With --robot the published protocol on a vehicle, guided on the screen, marked as hardware.
+
+    Example: finssim experiment t1 --rows calibrated,pid --seeds 1 --out t1
+
+    Example: finssim experiment t1 --rows pid --seeds 1 --robot serial:/dev/ttyUSB0 --pool-file p.yaml --arm --out hw
+
+    Args:
+        setpoints (NAMES): Setpoints, separated by commas; all published ones if not given.
+        options: As of `experiments.transfer.transfer_experiment`.
+    """
+    return transfer_experiment(T1, targets=setpoints, **options)
+
+
+def t2(*, trajectories: Annotated[Sequence[str] | None, ","] = None, **options: Any) -> dict[str, Any]:
+    """Trajectory tracking in the virtual pool (the paper's Table V): horizontal and vertical RMSE, 3-D P95 [m].
+
+    With --robot the published protocol on a vehicle, guided on the screen, marked as hardware.
+
+    Example: finssim experiment t2 --rows calibrated-dr,pid --trajectories lemniscate --seeds 1 --out t2
+
+    Args:
+        trajectories (NAMES): Trajectories, separated by commas; all published ones if not given.
+        options: As of `experiments.transfer.transfer_experiment`.
+    """
+    return transfer_experiment(T2, targets=trajectories, **options)
+
+
+def print_transfer(result: Mapping[str, Any], console: Console) -> None:
+    """Print the table of either."""
+    print_shown({"t1": T1, "t2": T2}[result["experiment"]].shown(result), console)
