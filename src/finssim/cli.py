@@ -43,8 +43,8 @@ COMMANDS: dict[str, str | Experiment] = {
     "experiment localization": Experiment(
         "finssim.experiments.localization_experiment:localization_experiment", "print_table"
     ),
-    "experiment t1": Experiment("finssim.experiments.transfer_tables:t1", "print_transfer"),
-    "experiment t2": Experiment("finssim.experiments.transfer_tables:t2", "print_transfer"),
+    "experiment t1": Experiment("finssim.experiments.transfer:t1", "print_transfer"),
+    "experiment t2": Experiment("finssim.experiments.transfer:t2", "print_transfer"),
     "experiment ablation": Experiment("finssim.experiments.ablation:ablation", "print_ablation"),
     "experiment open-water": Experiment("finssim.experiments.open_water:open_water", "print_open_water"),
     "experiment all": Experiment("finssim.experiments.ablation:everything", "print_everything"),

@@ -13,8 +13,8 @@ from finssim.calibration.excitation.programmes import Programme, programmes
 from finssim.calibration.regression.regress import regress
 from finssim.calibration.trials.trial_files import load_trials
 from finssim.cli import app
+from finssim.experiments.demo import step_responses
 from finssim.experiments.excitation import PoolRun, play_programme, pool_trials
-from finssim.experiments.programmes import step_responses
 from finssim.pool import draw_plant
 from finssim.vehicles import load_vehicle
 

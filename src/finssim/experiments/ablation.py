@@ -14,8 +14,7 @@ from finssim.experiments import localization_experiment as localization
 from finssim.experiments import replay_experiment as replay
 from finssim.experiments.campaign import Say, write_json
 from finssim.experiments.tables import Shown, figure_text, html_of, html_row, markdown_of, print_shown
-from finssim.experiments.transfer import MEASURES, Spec, transfer_experiment
-from finssim.experiments.transfer_tables import T1, T2, played_in
+from finssim.experiments.transfer import MEASURES, T1, T2, Spec, played_in, transfer_experiment
 from finssim.files import atomic_write
 from finssim.page import html_page, html_picture, html_table
 from finssim.provenance import provenance

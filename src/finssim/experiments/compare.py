@@ -94,7 +94,9 @@ def groups_of(words: Sequence[str]) -> list[Group]:
         folder = Path(place)
         if not given:
             name = SEED_AT_END.sub("", folder.resolve().name) or folder.resolve().name
-        named.setdefault(name, []).append(_load(folder))
+        named.setdefault(name, []).append(
+            Run(folder, Policy.load(folder).description, _curves(folder / CURVES_FILE))
+        )
     tasks = {run.description.task for runs in named.values() for run in runs}
     if len(tasks) > 1:
         raise CompareError(f"runs were trained for {', '.join(sorted(tasks))}: compare those of one task")
@@ -107,10 +109,6 @@ def groups_of(words: Sequence[str]) -> list[Group]:
     for name, runs in named.items():
         _check(name, runs)
     return [Group(name, tuple(sorted(runs, key=lambda run: run.seed))) for name, runs in named.items()]
-
-
-def _load(folder: Path) -> Run:
-    return Run(folder, Policy.load(folder).description, _curves(folder / CURVES_FILE))
 
 
 def _curves(path: Path) -> dict[str, NDArray[np.float64]]:
@@ -130,7 +128,8 @@ def _curves(path: Path) -> dict[str, NDArray[np.float64]]:
 def _check(name: str, runs: Sequence[Run]) -> None:
     first = runs[0]
     for run in runs[1:]:
-        different = _difference(first.description, run.description)
+        ours, theirs = _settings(first.description), _settings(run.description)
+        different = next((key for key in {**ours, **theirs} if ours.get(key) != theirs.get(key)), "")
         if different:
             raise CompareError(
                 f"{first.place} and {run.place} are both '{name}', but differ in {different}: "
@@ -140,15 +139,6 @@ def _check(name: str, runs: Sequence[Run]) -> None:
     for seed in seeds:
         if seeds.count(seed) > 1:
             raise CompareError(f"'{name}' has two runs with seed {seed}: give each training once")
-
-
-def _difference(a: PolicyDescription, b: PolicyDescription) -> str:
-    """The first setting in which two trainings differ; empty if none."""
-    left, right = (_settings(description) for description in (a, b))
-    for key in {**left, **right}:
-        if left.get(key) != right.get(key):
-            return key
-    return ""
 
 
 def _settings(description: PolicyDescription) -> dict[str, Any]:

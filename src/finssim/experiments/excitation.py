@@ -45,7 +45,7 @@ from finssim.robot.runtime import Runtime
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.defaults import room
 
-__all__ = ["excite", "excite_in_pool", "excite_on_robot", "pool_trials", "trials_on_robot"]
+__all__ = ["excite", "excite_on_robot", "pool_trials", "trials_on_robot"]
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Lower and upper corner of the water that a vehicle may be in, world frame [m]."""
@@ -418,10 +418,20 @@ def excite(
     if robot is not None:
         folders = excite_on_robot(axes, vehicle=vehicle, out=out, robot=robot, seed=seed, room=room, **plan)
     elif pool is not None:
-        folders = excite_in_pool(
-            axes, vehicle=vehicle, out=out, plant=pool, pool_vehicle=pool_vehicle,
-            severity=severity or "realistic", seed=seed, **plan,
-        )  # fmt: skip
+        body, pool_vehicle = load_vehicle(vehicle), pool_vehicle or vehicle
+        played, severity = programmes(axes, body, seed=seed, **plan), severity or "realistic"
+        with atomic_directory(out, replaces=PLAN_FILE) as folder, progress_bar("playing programmes") as say:
+            pool_trials(
+                {"fit": played}, folder, vehicle=vehicle, pool_vehicle=pool_vehicle, plant=pool,
+                severity=severity, seed=seed, say=say,
+            )  # fmt: skip
+            for made in (folder / "fit").iterdir():
+                made.rename(folder / made.name)
+            (folder / "fit").rmdir()
+            about = {"vehicle": load_vehicle(pool_vehicle).name, "plant": pool, "severity": severity}
+            text = _about(body, played, seed, plan, {"pool": about})
+            (folder / PLAN_FILE).write_text(text, encoding="utf-8")
+        folders = [Path(out) / programme.name for programme in played]
     else:
         folders = write_programmes(
             axes, vehicle=vehicle, out=out, simulate=simulate, rate=rate, noise=noise, seed=seed, room=room,
@@ -446,54 +456,6 @@ def _levels(words: Sequence[str]) -> dict[str, list[float]] | list[float] | None
     if "" in named and len(named) > 1:
         raise CalibrationError("levels are given for every axis and for single ones: give one of the two")
     return named.get("", named) or None
-
-
-def excite_in_pool(
-    axes: str,
-    *,
-    vehicle: str,
-    out: Path,
-    plant: int,
-    pool_vehicle: str | None = None,
-    severity: str = "realistic",
-    seed: int = 0,
-    processes: int | None = None,
-    **plan: Any,
-) -> list[Path]:
-    """Play programmes in a virtual pool, each from its start at rest, over several processes.
-
-    Args:
-        axes: As for `programmes`; so are seed and plan (kind, levels, repeats, coast, duration).
-        vehicle: Name or file of the vehicle as the robot knows it.
-        out: Folder to make: a trial for each programme, `records/NAME.mcap`, and `programmes.yaml`.
-        plant: Seed of the pool.
-        pool_vehicle: Name or file of the vehicle around which the pool's own is drawn; `vehicle` if None.
-        severity: nominal, realistic or hard.
-        processes: As many as there are processors if None.
-
-    Returns:
-        The folders of the trials.
-
-    Raises:
-        CalibrationError, PlantSpecError, VehicleError, OutputError: As they say.
-    """
-    start_warp()
-    body, pool_vehicle = load_vehicle(vehicle), pool_vehicle or vehicle
-    played = programmes(axes, body, seed=seed, **plan)
-    with (
-        atomic_directory(out, replaces=PLAN_FILE) as folder,
-        progress_bar("playing programmes") as say,
-    ):
-        pool_trials(
-            {"fit": played}, folder, vehicle=vehicle, pool_vehicle=pool_vehicle, plant=plant,
-            severity=severity, seed=seed, processes=processes, say=say,
-        )  # fmt: skip
-        for made in (folder / "fit").iterdir():
-            made.rename(folder / made.name)
-        (folder / "fit").rmdir()
-        pool = {"vehicle": load_vehicle(pool_vehicle).name, "plant": plant, "severity": severity}
-        (folder / PLAN_FILE).write_text(_about(body, played, seed, plan, {"pool": pool}), encoding="utf-8")
-    return [Path(out) / programme.name for programme in played]
 
 
 def excite_on_robot(

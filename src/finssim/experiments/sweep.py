@@ -22,16 +22,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
-from finssim.experiments.campaign import spread, write_json
+from finssim.experiments.campaign import progress_bar, spread, write_json
 from finssim.experiments.compare import MEASURES
 from finssim.experiments.evaluate import evaluate_controller
 from finssim.experiments.plants import load_plant
@@ -303,19 +295,11 @@ def sweep(
     }
     missing = [job for job in jobs if job.key not in rows]
     screen = Console(stderr=True)
-    columns = (
-        TextColumn("sweep"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
     played = _here(missing, processes) if address is None else _on_cluster(missing, address)
-    with closing(played), Progress(*columns, console=screen, disable=not screen.is_terminal) as bar:
-        task = bar.add_task("sweep", total=len(jobs), completed=len(rows))
+    with closing(played), progress_bar("sweep") as say:
         for job, outcome in played if missing else ():
             rows[job.key] = row = _keep(job, outcome, runs)
-            bar.advance(task)
+            say(len(rows) / len(jobs), f"{len(rows)} of {len(jobs)} trainings")
             if not screen.is_terminal:
                 error = f": {row['error']}" if "error" in row else ""
                 screen.print(f"{len(rows)} of {len(jobs)}: {job.key}{error}", highlight=False)
