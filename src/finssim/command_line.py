@@ -173,9 +173,9 @@ def read(place: str) -> Definition:
             options.append(Option(argument, kind, many, positional, value, notes, metavar, words))
     rest = node.args.kwarg.arg if isinstance(node, ast.FunctionDef) and node.args.kwarg else ""
     reference = re.match(r"As of ([\w.]+)\.(\w+)", helps.get(rest, (None, ""))[1])
-    if reference is not None:
+    if isinstance(node, ast.FunctionDef) and reference is not None:
         further = read(f"finssim.{reference[1]}:{reference[2]}")
-        names = {option.name for option in options}
+        names = {argument.arg for argument in node.args.args + node.args.kwonlyargs}
         options += [option for option in further.options if option.name not in names]
         made |= further.made
     shown = re.split(r"\n(?:Args|Returns|Raises|Note):\n", about)[0].replace("`", "")

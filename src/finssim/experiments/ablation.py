@@ -126,14 +126,11 @@ def _table(spec: Spec, result: Mapping[str, Any]) -> Shown:
 def everything(
     *,
     out: Path,
-    plants: Annotated[int, (1, 1000)] = 3,
     seeds: Annotated[int, (1, 1000)] = 3,
     seed: int = 1,
-    severity: str = "realistic",
-    camera: str = "corners",
-    steps: Annotated[int | None, (1, None)] = None,
-    processes: Annotated[int | None, (1, None)] = None,
+    vehicle: Annotated[str, "python"] = "finsrov",
     say: Say = lambda part, what: None,
+    **options: Any,
 ) -> dict[str, Any]:
     """Run localization, replay, t1, t2 and ablation, and write one report with the paper's figures beside ours.
 
@@ -141,20 +138,16 @@ def everything(
 
     Args:
         out (DIR): Directory for JSON, Markdown, figures, policies and trials; one that was interrupted goes on.
-        plants: Virtual pools, each with its own vehicle, water and camera.
         seeds: Trainings of each policy, each tried with its own noise.
         seed: Seed of every random number; equal seeds give equal results.
-        severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
-        camera (MODE): corners (projected through the rippling water, with noise), or pictures (drawn, and searched for
-            tags: several times slower).
-        steps: Control steps to learn from, all worlds together; what the task needs if not given.
-        processes: Trials at once; as many as processors if not given.
+        vehicle: Of station keeping and tracking: the other two are of the published one.
         say: Told the share that is done and what comes next.
+        options: As of `experiments.ablation.ablation`.
 
     Returns:
         Experiment -> what its JSON file holds, without single trials; `report`: its path.
     """
-    options = {name: value for name, value in locals().items() if name not in ("out", "say")}
+    options |= {"seeds": seeds, "seed": seed, "vehicle": vehicle}
     out = Path(out)
 
     def once(name: str, file: str, work: Callable[..., Any], begun: float) -> dict[str, Any]:

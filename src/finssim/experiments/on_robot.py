@@ -382,24 +382,20 @@ class _Screen:
             self._status.update(text)
 
 
+@dataclass(frozen=True)
 class Session:
     """An open robot; made by `session`."""
 
-    def __init__(
-        self,
-        robot: OnRobot,
-        vehicle: Vehicle,
-        site: Pool,
-        drive: Drive,
-        attendant: Attendant | None,
-        console: Console,
-    ) -> None:
-        self.robot, self.vehicle, self.site = robot, vehicle, site
-        self._drive, self._attendant, self._console = drive, attendant, console
+    robot: OnRobot
+    vehicle: Vehicle
+    site: Pool
+    drive: Drive
+    attendant: Attendant | None
+    console: Console
 
     def say(self, text: str) -> None:
         """Tell whoever watches."""
-        self._console.print(text, highlight=False, markup=False)
+        self.console.print(text, highlight=False, markup=False)
 
     def trial(
         self,
@@ -435,7 +431,7 @@ class Session:
             trial = make()
             x, y, z = start.position
             self.say(f"{trial.name}: from {x:.2f}, {y:.2f}, {z:.2f} m, {math.degrees(start.yaw):.0f}°")
-            placing = Placing(start=start, by_hand=self.robot.by_hand, exact=exact, attendant=self._attendant)
+            placing = Placing(start=start, by_hand=self.robot.by_hand, exact=exact, attendant=self.attendant)
             outcome, partial = self._attempt(trial, placing, record, perception, about or {})
             stopped_by_hand = outcome.fault == "stopped by the operator"
             done = outcome.ended == "over" or (
@@ -451,7 +447,7 @@ class Session:
                 return None
             if outcome.ended == "interrupted":
                 raise KeyboardInterrupt
-            if self._attendant is None:
+            if self.attendant is None:
                 raise RobotError(
                     f"{trial.name}: {outcome.fault}: look at the vehicle, then give the command again: it goes on here"
                 )
@@ -482,7 +478,7 @@ class Session:
         with Recorder(partial, self.vehicle, meta, pictures="none", epoch=epoch, files=files) as recorder:
             outcome = play_trial(
                 trial,
-                self._drive,
+                self.drive,
                 self.vehicle,
                 self.site,
                 perception=perception and perception(),
