@@ -123,7 +123,8 @@ def calibrate_hydrodynamics(
         out (FILE): Vehicle file to write (.yaml).
         axes (AXES): Axes to fit, of surge,sway,heave,roll,pitch,yaw; those that the trials excite if not given.
         method (METHOD): regression: each axis by its equation of motion; simulation: what simulates the trials best;
-            auto: the regression, or the simulation where that replays the trials better.
+            auto: the regression where it replays the trials very well, else the simulation unless that replays them
+            worse.
         full: Also couplings between axes (simulation method).
         estimate (NAMES): Also fit, of thrust_scale,thrust_lag,thrust_delay,current,buoyancy_excess,k (simulation
             method); or parameters of the vehicle's terms, such as lift.coefficient (either method).
