@@ -1,4 +1,4 @@
-"""The `finssim` command. Each handler imports what it runs, so that `finssim --help` answers at once."""
+"""The `finssim` command: what each of its words does. Options and help are those of the functions named here."""
 
 from __future__ import annotations
 
@@ -8,94 +8,92 @@ from typing import Annotated
 
 import typer
 
-from finssim import (
-    __version__,
-    boundary,
-    cli_calibrate,
-    cli_experiments,
-    cli_imitation,
-    cli_learn,
-    cli_localization,
-    cli_pool,
-    cli_randomize,
-    cli_record,
-    cli_robot,
-    cli_ros2,
-    cli_study,
-    cli_tasks,
-    cli_trials,
-    cli_view,
-    cli_vision,
-)
-from finssim.cli_options import (
-    Arm,
-    Bind,
-    ByHand,
-    Device,
-    Hydrodynamics,
-    Json,
-    Lockstep,
-    Pictures,
-    Robot,
-    RobotPool,
-    Seed,
-    Steps,
-    Unattended,
-    Vehicle,
-)
-from finssim.quiet import start_warp
+from finssim import __version__, boundary
+from finssim.command_line import Experiment, command_app
 
 __all__ = ["app", "main"]
 
-app = typer.Typer(
-    name="finssim",
-    help="Identify and locate underwater vehicles, simulate them, train controllers, and check all of it.",
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
-)
-vehicles_app = typer.Typer(invoke_without_command=True, rich_markup_mode=None, add_completion=False)
-app.add_typer(vehicles_app, name="vehicles")
-app.command()(cli_learn.train)
-app.command()(cli_learn.evaluate)
-app.add_typer(cli_tasks.tasks_app, name="tasks")
-app.command()(cli_imitation.collect)
-app.command()(cli_imitation.datasets)
-app.command()(cli_study.compare)
-app.command()(cli_study.sweep)
-app.add_typer(cli_trials.trials_app, name="trials")
-app.command()(cli_trials.excite)
-app.add_typer(cli_calibrate.calibrate_app, name="calibrate")
-app.command()(cli_calibrate.replay)
-app.add_typer(cli_calibrate.experiment_app, name="experiment")
-cli_calibrate.calibrate_app.command()(cli_vision.camera)
-cli_calibrate.calibrate_app.command()(cli_vision.pool)
-cli_calibrate.calibrate_app.command()(cli_vision.mounts)
-cli_calibrate.experiment_app.command("localization")(cli_vision.experiment_localization)
-cli_calibrate.experiment_app.command()(cli_experiments.t1)
-cli_calibrate.experiment_app.command()(cli_experiments.t2)
-cli_calibrate.experiment_app.command()(cli_experiments.ablation)
-cli_calibrate.experiment_app.command("open-water")(cli_experiments.open_water)
-cli_calibrate.experiment_app.command("all")(cli_experiments.everything)
-cli_calibrate.experiment_app.command()(cli_experiments.faults)
-cli_calibrate.experiment_app.command()(cli_experiments.soak)
-cli_calibrate.experiment_app.command()(cli_experiments.timing)
-cli_calibrate.experiment_app.command()(cli_experiments.stack)
-app.command()(cli_localization.localize)
-app.command()(cli_localization.fuse)
-app.command()(cli_localization.project)
-app.command()(cli_localization.backproject)
-app.add_typer(cli_randomize.randomize_app, name="randomize")
-app.add_typer(cli_record.record_app, name="record")
-app.command()(cli_record.play)
-app.command()(cli_record.teleop)
-app.command()(cli_robot.run)
-app.command()(cli_pool.pool)
-app.command()(cli_view.view)
-app.add_typer(cli_ros2.ros2_app, name="ros2")
+COMMANDS: dict[str, str | Experiment] = {
+    "demo": "finssim.experiments.demo:demo",
+    "simulate": "finssim.experiments.simulate:simulate",
+    "vehicles": "finssim.cli:vehicles",
+    "vehicles show": "finssim.cli:show_vehicle",
+    "validate": "finssim.experiments.validate:validate",
+    "bench": "finssim.experiments.bench:bench",
+    "doctor": "finssim.doctor:doctor",
+    "train": "finssim.learning.train:train",
+    "evaluate": "finssim.experiments.evaluate:evaluate",
+    "tasks": "finssim.experiments.tasks_show:tasks_list",
+    "tasks show": "finssim.experiments.tasks_show:tasks_show",
+    "collect": "finssim.experiments.driven:collect",
+    "datasets": "finssim.experiments.driven:datasets",
+    "compare": Experiment("finssim.experiments.compare:compare", "print_comparison"),
+    "sweep": "finssim.experiments.sweep:sweep",
+    "trials check": "finssim.calibration.check.check:check",
+    "trials import": "finssim.calibration.importers.dispatch:import_logs",
+    "excite": "finssim.experiments.excitation:excite",
+    "calibrate thruster": "finssim.calibration.output.commands:calibrate_thruster",
+    "calibrate motor": "finssim.calibration.output.commands:calibrate_motor",
+    "calibrate hydrodynamics": "finssim.calibration.output.commands:calibrate_hydrodynamics",
+    "calibrate camera": "finssim.calibration.vision.camera_command:run",
+    "calibrate pool": "finssim.calibration.vision.pool_command:run",
+    "calibrate mounts": "finssim.calibration.vision.mounts_command:run",
+    "replay": "finssim.calibration.replay.replay:run_replay",
+    "experiment replay": Experiment("finssim.experiments.replay_experiment:replay_experiment", "print_table"),
+    "experiment localization": Experiment(
+        "finssim.experiments.localization_experiment:localization_experiment", "print_table"
+    ),
+    "experiment t1": Experiment("finssim.experiments.transfer:t1", "print_transfer"),
+    "experiment t2": Experiment("finssim.experiments.transfer:t2", "print_transfer"),
+    "experiment ablation": Experiment("finssim.experiments.ablation:ablation", "print_ablation"),
+    "experiment open-water": Experiment("finssim.experiments.open_water:open_water", "print_open_water"),
+    "experiment all": Experiment("finssim.experiments.ablation:everything", "print_everything"),
+    "experiment faults": Experiment("finssim.experiments.faults:faults_experiment", "print_faults"),
+    "experiment soak": Experiment("finssim.experiments.soak:soak", "print_soak"),
+    "experiment timing": Experiment("finssim.experiments.timing:timing", "print_timing"),
+    "experiment stack": "finssim.experiments.stack:play",
+    "localize": "finssim.localization.locate.localize:run",
+    "fuse": "finssim.localization.fusion.fuse:run",
+    "project": "finssim.localization.locate.points:run_project",
+    "backproject": "finssim.localization.locate.points:run_backproject",
+    "randomize show": "finssim.experiments.randomize_show:randomize_show",
+    "randomize fit": "finssim.calibration.output.correlated_ranges:fit_ranges",
+    "record info": "finssim.robot.record_show:info",
+    "record repair": "finssim.robot.record_repair:repair",
+    "play": "finssim.robot.record_show:play_record",
+    "teleop": "finssim.robot.teleop_run:run",
+    "run": "finssim.robot.run:run",
+    "pool": "finssim.pool.run:run",
+    "view": "finssim.viewer.run:run",
+    "ros2 node": "finssim.ros2.graphs:run_node",
+    "ros2 up": "finssim.ros2.up:up",
+}
+"""Words -> what they do."""
+
+GROUPS = {
+    "trials": "Look at logs of trials, and make trials of foreign logs.\n\nExample: finssim trials check trials",
+    "calibrate": "Fit a vehicle's numbers to measurements and write a vehicle file with their 95 % intervals.\n\n"
+    "Example: finssim calibrate hydrodynamics --help",
+    "experiment": "Reproduce a table of the paper in simulation, beside the paper's own numbers.\n\n"
+    "Example: finssim experiment replay --help",
+    "randomize": "Ranges that vehicle, water and sensors are drawn from in every episode of a training.\n\n"
+    "Example: finssim randomize show --help",
+    "record": "Look at records of runs, and mend those that were cut off.\n\nExample: finssim record info run.mcap",
+    "ros2": "Be ROS 2 nodes on this machine's ROS domain; those of a sourced ROS 2 see them and are seen.\n\n"
+    "Example: finssim ros2 up pool",
+}
+"""Help of what only has commands below it."""
 
 PICTURES = (".png", ".svg", ".pdf")
+
+app = command_app(
+    COMMANDS,
+    GROUPS,
+    name="finssim",
+    help="Identify and locate underwater vehicles, simulate them, train controllers, and check all of it.",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+)
 
 
 def main() -> None:
@@ -118,105 +116,30 @@ def _finssim(
     """Units are SI and radians unless an option's name says otherwise; z is up, and 0 on the still water surface."""
 
 
-@app.command()
-def demo(
-    out: Annotated[
-        Path, typer.Option(help="Directory of trials, vehicle, policy, results and report.")
-    ] = Path("demo"),
-    vehicle: Vehicle = "finsrov",
-    seed: Seed = 1,
-    steps: Steps = None,
-    robot: Robot = None,
-    pool_file: RobotPool = None,
-    bind: Bind = "127.0.0.1:54321",
-    pictures: Pictures = None,
-    lockstep: Lockstep = False,
-    arm: Arm = False,
-    by_hand: ByHand = False,
-    unattended: Unattended = False,
-) -> None:
-    """Identify a vehicle in the virtual pool or on a robot, train in it, deploy there beside two PIDs, write a report.
-
-    Example: finssim demo --vehicle bluerov2_heavy --out demo
-
-    Example: finssim demo --robot udp://10.0.0.2:58766 --pool-file pool.yaml --arm --out demo
-    """
-    start_warp()
-    from finssim.experiments.demo import demo as run
-
-    where = cli_robot.robot_or_none(
-        robot, bind=bind, pictures=pictures, lockstep=lockstep, pool_file=pool_file, arm=arm, by_hand=by_hand,
-        unattended=unattended,
-    )  # fmt: skip
-    run(out, vehicle=vehicle, seed=seed, steps=steps, robot=where)
-
-
-@app.command()
-def simulate(
-    vehicle: Vehicle,
-    command: Annotated[
-        str,
-        typer.Option(
-            help='Constant wrench: "surge=10 yaw=1". surge sway heave in N, roll pitch yaw in N m; the rest is 0.',
-            metavar="WRENCH",
-        ),
-    ],
-    duration: Annotated[float, typer.Option(help="Simulated time [s].")],
-    out: Annotated[
-        Path,
-        typer.Option(
-            help="Table to write, one row per control step of 0.1 s: a .csv file. OUT.json tells its origin."
-        ),
-    ],
-    hydrodynamics: Hydrodynamics = "calibrated",
-    depth: Annotated[float, typer.Option(help="Depth of the body origin at the start [m].")] = 5.0,
-    device: Device = "cpu",
-) -> None:
-    """Simulate a vehicle from rest under a constant wrench and record its motion.
-
-    Example: finssim simulate --vehicle finsrov --command "surge=10 yaw=1" --duration 10 --out run.csv
-    """
-    start_warp()
-    from finssim.experiments.simulate import simulate as run
-
-    run(
-        vehicle=vehicle,
-        command=command,
-        duration=duration,
-        hydrodynamics=hydrodynamics,
-        depth=depth,
-        device=device,
-        out=out,
-    )
-
-
-@vehicles_app.callback()
-def _vehicles(context: typer.Context) -> None:
+def vehicles() -> None:
     """List the vehicles of the catalogue; `show NAME` prints one in full.
 
     Example: finssim vehicles
     """
-    if context.invoked_subcommand is None:
-        from rich.console import Console
+    from rich.console import Console
 
-        from finssim.vehicles.show import print_catalogue
+    from finssim.vehicles.show import print_catalogue
 
-        print_catalogue(Console())
+    print_catalogue(Console())
 
 
-@vehicles_app.command("show")
-def _show(
-    name: Annotated[
-        str,
-        typer.Argument(help="Vehicle of the catalogue, or the path of a vehicle file.", metavar="NAME|FILE"),
-    ],
-    picture: Annotated[
-        Path | None, typer.Option(help="Also draw the thruster layout into this file (.png, .svg).")
-    ] = None,
+def show_vehicle(
+    name: str,
+    *,
+    picture: Path | None = None,
 ) -> None:
     """Print mass [kg], trim, terminal speeds, wrench capability [N, N m], time constants [s] and thrusters.
 
     Example: finssim vehicles show finsrov --picture finsrov.png
+
+    Args:
+        name (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        picture: Also draw the thruster layout into this file (.png, .svg).
     """
     from rich.console import Console
 
@@ -224,9 +147,7 @@ def _show(
     from finssim.vehicles.show import print_vehicle
 
     if picture is not None and picture.suffix not in PICTURES:
-        raise typer.BadParameter(
-            f"{picture} ends in '{picture.suffix}', expected one of {' '.join(PICTURES)}"
-        )
+        raise ValueError(f"{picture} ends in '{picture.suffix}', expected one of {' '.join(PICTURES)}")
     vehicle = load_vehicle(name)
     print_vehicle(vehicle, Console(), None)
     if picture is not None:
@@ -236,43 +157,3 @@ def _show(
         with atomic_write(picture) as temporary:
             draw_vehicle(vehicle, temporary)
         typer.echo(f"thruster layout: {picture}")
-
-
-@app.command()
-def validate(
-    name: Annotated[str, typer.Argument(help="Vehicle with published responses: finsrov.", metavar="NAME")],
-    hydrodynamics: Hydrodynamics = "calibrated",
-    as_json: Json = False,
-) -> None:
-    """Print simulated beside published pool responses, and say where they disagree.
-
-    Example: finssim validate finsrov
-    """
-    start_warp()
-    from finssim.experiments.validate import validate as run
-
-    run(name, as_json=as_json, hydrodynamics=hydrodynamics)
-
-
-@app.command()
-def bench(device: Device = "cpu", as_json: Json = False) -> None:
-    """Measure this machine's speed: physics steps/s, environment steps/s, mesh faces/s.
-
-    Example: finssim bench --json > bench.json
-    """
-    start_warp()
-    from finssim.experiments.bench import bench as run
-
-    run(as_json=as_json, device=device)
-
-
-@app.command()
-def doctor(as_json: Json = False) -> None:
-    """Say what is installed, which devices compute, and what each missing extra would enable.
-
-    Example: finssim doctor
-    """
-    from finssim.doctor import doctor as run
-
-    if not run(json=as_json):
-        raise typer.Exit(1)

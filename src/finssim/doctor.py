@@ -1,7 +1,7 @@
 """`finssim doctor`: what is installed, which devices compute, what each missing extra would enable."""
 
 # No postponed annotations here: Warp reads those of its kernels.
-import json as json_module
+import json
 import os
 import platform
 from dataclasses import dataclass
@@ -90,21 +90,19 @@ EXTRA_OF_MODULE = {
 """Module that Python could not import -> extra that installs it."""
 
 
-def doctor(*, json: bool = False) -> bool:
-    """Print the examination.
+def doctor(*, as_json: bool = False) -> int:
+    """Say what is installed, which devices compute, and what each missing extra would enable.
 
-    Args:
-        json: Print one JSON object instead of text.
+    Exit status 1: of what everything needs, the core packages and a processor that computes, something is not there.
 
-    Returns:
-        Whether what everything needs is there: the core packages, and a processor that computes.
+    Example: finssim doctor
     """
     found = examine()
-    if json:
-        print(json_module.dumps(found, indent=2))
+    if as_json:
+        print(json.dumps(found, indent=2))
     else:
         _print(found)
-    return bool(found["healthy"])
+    return 0 if found["healthy"] else 1
 
 
 def examine() -> dict[str, Any]:

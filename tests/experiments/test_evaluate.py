@@ -121,7 +121,7 @@ def test_seeds_decide_what_is_drawn(monkeypatch):
 
 def test_json_is_one_object_with_the_agreed_keys(capsys, policy):
     """Nothing else is on standard output, and every trial has its setpoint and measures."""
-    evaluate(policy, trials=9, json=True)
+    evaluate(policy, trials=9, as_json=True)
     printed = json.loads(capsys.readouterr().out)
     assert printed.keys() >= KEYS | {"provenance", "vehicle", "plant", "seed"}
     assert printed["trials"] == len(printed["per_trial"]) == 9
@@ -142,7 +142,7 @@ def test_the_table_has_a_row_per_setpoint_all_and_the_papers(capsys):
 def test_a_directory_holds_result_figure_and_trajectories(tmp_path, capsys):
     """All open, agree with each other, and may be replaced by the next evaluation."""
     for _ in range(2):
-        (evaluation,) = evaluate("pid", out=tmp_path / "e", json=True)
+        (evaluation,) = evaluate("pid", out=tmp_path / "e", as_json=True)
     stored = json.loads((tmp_path / "e" / "evaluation.json").read_text(encoding="utf-8"))
     assert stored == json.loads(capsys.readouterr().out.splitlines()[-1]) == evaluation.result
     assert (tmp_path / "e" / "error_envelope.png").read_bytes().startswith(b"\x89PNG")
@@ -164,7 +164,7 @@ def test_several_plants_are_one_table_one_object_and_one_directory(tmp_path, cap
     assert len(read_run(tmp_path / "e" / "trajectories" / "simplified")) > 0
     assert (tmp_path / "e" / "error_envelope.png").stat().st_size > 0
 
-    evaluate("pid", plant=plants, json=True)
+    evaluate("pid", plant=plants, as_json=True)
     printed = json.loads(capsys.readouterr().out)
     assert printed == json.loads((tmp_path / "e" / "evaluation.json").read_text(encoding="utf-8"))
     assert list(printed) == ["plants"]

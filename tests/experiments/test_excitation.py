@@ -7,13 +7,14 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+from finssim import boundary
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation.programmes import Programme, programmes
 from finssim.calibration.regression.regress import regress
 from finssim.calibration.trials.trial_files import load_trials
 from finssim.cli import app
+from finssim.experiments.demo import step_responses
 from finssim.experiments.excitation import PoolRun, play_programme, pool_trials
-from finssim.experiments.programmes import step_responses
 from finssim.pool import draw_plant
 from finssim.vehicles import load_vehicle
 
@@ -130,12 +131,12 @@ def test_excite_in_a_pool_by_command(tmp_path):
 def test_a_pool_goes_with_no_other_simulation(tmp_path):
     command = ["excite", "roll", "--vehicle", "finsrov", "--out", str(tmp_path / "t"), "--pool", "1"]
     for other in (["--simulate"], ["--room", "2"]):
-        assert CliRunner().invoke(app, [*command, *other]).exit_code == 2
+        assert boundary.run(app, [*command, *other]) == 2
 
 
 @pytest.mark.parametrize("option", [["--severity", "hard"], ["--pool-vehicle", "bluerov2"]])
-def test_what_tells_of_a_pool_needs_one(tmp_path, option):
+def test_what_tells_of_a_pool_needs_one(tmp_path, option, capsys):
     """Refused, not left unheeded."""
     command = ["excite", "roll", "--vehicle", "finsrov", "--out", str(tmp_path / "t"), *option]
-    done = CliRunner().invoke(app, command)
-    assert done.exit_code == 2 and "--pool SEED" in done.output and not (tmp_path / "t").exists()
+    assert boundary.run(app, command) == 2 and not (tmp_path / "t").exists()
+    assert "--pool SEED" in capsys.readouterr().err

@@ -3,14 +3,12 @@
 import json
 
 import pytest
-from rich.console import Console
 
 from finssim import boundary
 from finssim.cli import app
 from finssim.experiments.on_robot import OnRobot, RobotError
 from finssim.experiments.recorded import read_record
-from finssim.experiments.transfer import run
-from finssim.experiments.transfer_tables import T1, T2
+from finssim.experiments.transfer import T1, T2, transfer_experiment
 from finssim.robot.record_reader import open_record
 from finssim.vehicles import load_vehicle
 from reference.pools import Person, lockstep_pool
@@ -23,7 +21,7 @@ T1_ROWS = {"rows": ("pid",), "targets": ("P02", "P03"), "seeds": 1}
 
 def experiment(spec, out, wiring, person=None, **options):
     robot = OnRobot(wiring=wiring, pool_file=out.parent / "pool.yaml", arm=True, unattended=person is None)
-    return run(spec, out=out, console=Console(quiet=True), robot=robot, attendant=person, **options)
+    return transfer_experiment(spec, out=out, robot=robot, attendant=person, **options)
 
 
 @pytest.fixture(scope="module")

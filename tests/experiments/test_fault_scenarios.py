@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.experiments.fault_scenarios import FaultyWire
+from finssim.experiments.faults import FaultyWire
 from finssim.pool.draw_plant import draw_plant
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.quiet import start_warp

@@ -2,8 +2,7 @@
 
 import pytest
 
-from finssim.experiments.fault_scenarios import SCENARIOS
-from finssim.experiments.faults import FaultJob, play
+from finssim.experiments.faults import SCENARIOS, FaultJob, play
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.experiments.localization_campaign import (
+from finssim.experiments.localization_experiment import (
     CONDITIONS,
     IMAGES,
     LOCATIONS,

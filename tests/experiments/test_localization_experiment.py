@@ -11,8 +11,13 @@ from finssim import boundary
 from finssim.cli import app
 from finssim.experiments import localization_experiment as module
 from finssim.experiments import statistics
-from finssim.experiments.localization_campaign import CONDITIONS, Picture
-from finssim.experiments.localization_experiment import METHODS_SHOWN, PAPER_TABLE_2, localization_experiment
+from finssim.experiments.localization_experiment import (
+    CONDITIONS,
+    METHODS_SHOWN,
+    PAPER_TABLE_2,
+    Picture,
+    localization_experiment,
+)
 from finssim.files import OutputError
 from finssim.localization.camera_file import load_camera
 from finssim.localization.detection.detections import read_detections

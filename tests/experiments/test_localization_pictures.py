@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.experiments import localization_campaign as module
-from finssim.experiments.localization_campaign import (
+from finssim.experiments import localization_experiment as module
+from finssim.experiments.localization_experiment import (
     CONDITIONS,
     RENDERERS,
     TAG,

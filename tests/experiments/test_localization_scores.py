@@ -8,9 +8,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from finssim.experiments import localization_campaign, localization_experiment
-from finssim.experiments.localization_campaign import CONDITIONS, draw_campaign, pictures
-from finssim.experiments.localization_experiment import Scores, pooled
+from finssim.experiments import localization_experiment
+from finssim.experiments.localization_experiment import CONDITIONS, Scores, draw_campaign, pictures, pooled
 
 PIXEL_STD = 0.2
 locate = partial(localization_experiment.locate, pixel_std=PIXEL_STD)
@@ -34,7 +33,7 @@ def published():
 def exact():
     """No error at all."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(localization_campaign, "CORNER_NOISE", 0.0)
+        patch.setattr(localization_experiment, "CORNER_NOISE", 0.0)
         return seen_by_geometry("quiet")
 
 

@@ -5,8 +5,13 @@ import io
 import pytest
 from rich.console import Console
 
-from finssim.experiments.localization_campaign import CONDITIONS
-from finssim.experiments.localization_experiment import METHODS_SHOWN, PAPER_TABLE_2, markdown, print_table
+from finssim.experiments.localization_experiment import (
+    CONDITIONS,
+    METHODS_SHOWN,
+    PAPER_TABLE_2,
+    markdown,
+    print_table,
+)
 
 
 def figures(rmse, located=10):

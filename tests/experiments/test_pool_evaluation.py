@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.experiments.demo_report import camera_view
+from finssim.experiments.demo import camera_view
 from finssim.experiments.metrics import measure_trial
 from finssim.experiments.paper import T1_SETPOINTS
 from finssim.experiments.pool_trial import pool_evaluation, pool_jobs, write_series
@@ -51,7 +51,7 @@ def test_a_trial_that_ended_early_has_no_motion_afterwards(tmp_path, jobs):
 def test_the_camera_view_shows_the_tags_of_the_vehicle(tmp_path, jobs, monkeypatch):
     """FinsROV's two tags are found where it is, and the answer is a PNG."""
     held(tmp_path, jobs[0])
-    from finssim.experiments import demo_report as module
+    from finssim.experiments import demo as module
 
     seen, draw = [], module._drawn
     monkeypatch.setattr(module, "_drawn", lambda image, found: seen.extend(found) or draw(image, found))

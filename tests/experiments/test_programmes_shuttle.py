@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from finssim.calibration.excitation.travel import travel
+from finssim.experiments.demo import PERIODS, shuttles
 from finssim.experiments.excitation import box_of, place_of
-from finssim.experiments.programmes import PERIODS, shuttles
 from finssim.pool.plant_spec import Basin
 from finssim.vehicles import AXES, load_vehicle
 

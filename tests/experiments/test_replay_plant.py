@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from finssim.calibration.excitation.programmes import programmes
 from finssim.engine import Simulator
 from finssim.experiments.plants import PlantError
-from finssim.experiments.replay_plant import load_replay_plant
+from finssim.experiments.replay_experiment import load_replay_plant
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")

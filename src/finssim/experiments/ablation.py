@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Mapping
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from rich.console import Console
 
@@ -14,8 +14,7 @@ from finssim.experiments import localization_experiment as localization
 from finssim.experiments import replay_experiment as replay
 from finssim.experiments.campaign import Say, write_json
 from finssim.experiments.tables import Shown, figure_text, html_of, html_row, markdown_of, print_shown
-from finssim.experiments.transfer import MEASURES, Spec, transfer_experiment
-from finssim.experiments.transfer_tables import T1, T2, played_in
+from finssim.experiments.transfer import MEASURES, T1, T2, Spec, played_in, transfer_experiment
 from finssim.files import atomic_write
 from finssim.page import html_page, html_picture, html_table
 from finssim.provenance import provenance
@@ -44,17 +43,40 @@ FIGURES = {
 REPORT_FILE = "report.html"
 
 
-def ablation(*, out: Path, say: Say = lambda part, what: None, **options: Any) -> dict[str, Any]:
-    """Play both experiments, or go on with them where their folders lie in `out`, and compare their rows.
+def ablation(
+    *,
+    out: Path,
+    plants: Annotated[int, (1, 1000)] = 3,
+    seeds: Annotated[int, (1, 1000)] = 3,
+    seed: int = 1,
+    severity: str = "realistic",
+    camera: str = "corners",
+    vehicle: str = "finsrov",
+    steps: Annotated[int | None, (1, None)] = None,
+    processes: Annotated[int | None, (1, None)] = None,
+    say: Say = lambda part, what: None,
+) -> dict[str, Any]:
+    """What each module is worth: differences of paired trials with intervals, and a sentence that they support.
+
+    Example: finssim experiment ablation --seeds 3 --out ablation
 
     Args:
-        out: Directory for `ablation.json`, `ablation.md` and the folders `t1` and `t2`.
+        out (DIR): Directory for JSON, Markdown, figures, policies and trials; one that was interrupted goes on.
+        plants: Virtual pools, each with its own vehicle, water and camera.
+        seeds: Trainings of each policy, each tried with its own noise.
+        seed: Seed of every random number; equal seeds give equal results.
+        severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
+        camera (MODE): corners (projected through the rippling water, with noise), or pictures (drawn, and searched for
+            tags: several times slower).
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        steps: Control steps to learn from, all worlds together; what the task needs if not given.
+        processes: Trials at once; as many as processors if not given.
         say: Told the share that is done and what comes next.
-        options: As of `transfer_experiment`.
 
     Returns:
         Experiment -> its result, without the single trials.
     """
+    options = {name: value for name, value in locals().items() if name not in ("out", "say")}
     results = {}
     for k, (name, spec) in enumerate(SPECS.items()):
         result = transfer_experiment(
@@ -102,20 +124,30 @@ def _table(spec: Spec, result: Mapping[str, Any]) -> Shown:
 
 
 def everything(
-    *, out: Path, seeds: int = 3, seed: int = 1, say: Say = lambda part, what: None, **options: Any
+    *,
+    out: Path,
+    seeds: Annotated[int, (1, 1000)] = 3,
+    seed: int = 1,
+    vehicle: Annotated[str, "python"] = "finsrov",
+    say: Say = lambda part, what: None,
+    **options: Any,
 ) -> dict[str, Any]:
-    """Run every experiment that has no result in `out` yet, and write the report.
+    """Run localization, replay, t1, t2 and ablation, and write one report with the paper's figures beside ours.
+
+    Example: finssim experiment all --seeds 1 --plants 1 --out everything
 
     Args:
-        out: Directory for `report.html` and a folder for each experiment.
-        seeds: Of each.
-        seed: The first.
+        out (DIR): Directory for JSON, Markdown, figures, policies and trials; one that was interrupted goes on.
+        seeds: Trainings of each policy, each tried with its own noise.
+        seed: Seed of every random number; equal seeds give equal results.
+        vehicle: Of station keeping and tracking: the other two are of the published one.
         say: Told the share that is done and what comes next.
-        options: As of `ablation`.
+        options: As of `experiments.ablation.ablation`.
 
     Returns:
         Experiment -> what its JSON file holds, without single trials; `report`: its path.
     """
+    options |= {"seeds": seeds, "seed": seed, "vehicle": vehicle}
     out = Path(out)
 
     def once(name: str, file: str, work: Callable[..., Any], begun: float) -> dict[str, Any]:
@@ -136,9 +168,7 @@ def everything(
             "localization", localization.RESULT_FILE, localization.localization_experiment, 0.0
         ),
         "replay": once("replay", replay.RESULT_FILE, replay.replay_experiment, 0.1),
-        **ablation(
-            out=out, seeds=seeds, seed=seed, say=lambda part, what: say(0.2 + 0.8 * part, what), **options
-        ),
+        **ablation(out=out, say=lambda part, what: say(0.2 + 0.8 * part, what), **options),
     }
     with atomic_write(out / REPORT_FILE) as temporary:
         temporary.write_text(_report(results, out), encoding="utf-8")

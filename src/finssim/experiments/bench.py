@@ -16,10 +16,10 @@ import numpy as np
 import warp as wp
 from rich.console import Console
 from rich.progress import Progress
-from rich.table import Table
 
 from finssim.engine import Simulator
 from finssim.engine.launch import default_threads
+from finssim.experiments.tables import console_table
 from finssim.provenance import provenance
 from finssim.tasks import Environment, StationKeeping
 
@@ -191,8 +191,19 @@ def measure(device: str = "cpu", progress: Callable[[str], None] = lambda _: Non
     }
 
 
-def bench(as_json: bool = False, device: str = "cpu") -> None:
-    """Measure and print; one JSON object if asked for."""
+def bench(
+    *,
+    device: str = "cpu",
+    as_json: bool = False,
+) -> None:
+    """Measure this machine's speed: physics steps/s, environment steps/s, mesh faces/s.
+
+    Example: finssim bench --json > bench.json
+
+    Args:
+        device (DEVICE): Where to compute: cpu or cuda.
+        as_json: Print one JSON object instead of tables.
+    """
     console = Console(stderr=True)
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task("", total=len(MODELS) * len(WORLDS) + len(ACTIONS) * len(WORLDS) + 4)
@@ -200,18 +211,15 @@ def bench(as_json: bool = False, device: str = "cpu") -> None:
     if as_json:
         print(json.dumps(figures, indent=2))
         return
-    table = Table(title="steps per second", box=None, pad_edge=False)
-    table.add_column("")
-    table.add_column("per second", justify="right")
-    for name, rate in figures["physics_steps_per_s"].items():
-        table.add_row(f"physics, {name}", f"{rate:,.0f}")
-    for name, rate in figures["env_steps_per_s"].items():
-        table.add_row(f"T1, {name}", f"{rate:,.0f}")
-    table.add_row("hull triangles, one core", f"{figures['faces_per_s']:,.0f}")
-    if figures["mujoco_steps_per_s"]:
-        table.add_row("MuJoCo, one free body", f"{figures['mujoco_steps_per_s']:,.0f}")
+    rates = {
+        **{f"physics, {name}": rate for name, rate in figures["physics_steps_per_s"].items()},
+        **{f"T1, {name}": rate for name, rate in figures["env_steps_per_s"].items()},
+        "hull triangles, one core": figures["faces_per_s"],
+        "MuJoCo, one free body": figures["mujoco_steps_per_s"],
+    }
+    rows = [[name, f"{rate:,.0f}"] for name, rate in rates.items() if rate]
     out = Console()
-    out.print(table)
+    out.print(console_table(["", "per second"], rows, title="steps per second"))
     ratio = figures["physics_substeps_over_mujoco_steps"]
     if ratio:
         out.print(f"batched physics substeps over MuJoCo steps: {ratio:.0f}", highlight=False)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,7 +94,9 @@ def groups_of(words: Sequence[str]) -> list[Group]:
         folder = Path(place)
         if not given:
             name = SEED_AT_END.sub("", folder.resolve().name) or folder.resolve().name
-        named.setdefault(name, []).append(_load(folder))
+        named.setdefault(name, []).append(
+            Run(folder, Policy.load(folder).description, _curves(folder / CURVES_FILE))
+        )
     tasks = {run.description.task for runs in named.values() for run in runs}
     if len(tasks) > 1:
         raise CompareError(f"runs were trained for {', '.join(sorted(tasks))}: compare those of one task")
@@ -107,10 +109,6 @@ def groups_of(words: Sequence[str]) -> list[Group]:
     for name, runs in named.items():
         _check(name, runs)
     return [Group(name, tuple(sorted(runs, key=lambda run: run.seed))) for name, runs in named.items()]
-
-
-def _load(folder: Path) -> Run:
-    return Run(folder, Policy.load(folder).description, _curves(folder / CURVES_FILE))
 
 
 def _curves(path: Path) -> dict[str, NDArray[np.float64]]:
@@ -130,7 +128,8 @@ def _curves(path: Path) -> dict[str, NDArray[np.float64]]:
 def _check(name: str, runs: Sequence[Run]) -> None:
     first = runs[0]
     for run in runs[1:]:
-        different = _difference(first.description, run.description)
+        ours, theirs = _settings(first.description), _settings(run.description)
+        different = next((key for key in {**ours, **theirs} if ours.get(key) != theirs.get(key)), "")
         if different:
             raise CompareError(
                 f"{first.place} and {run.place} are both '{name}', but differ in {different}: "
@@ -140,15 +139,6 @@ def _check(name: str, runs: Sequence[Run]) -> None:
     for seed in seeds:
         if seeds.count(seed) > 1:
             raise CompareError(f"'{name}' has two runs with seed {seed}: give each training once")
-
-
-def _difference(a: PolicyDescription, b: PolicyDescription) -> str:
-    """The first setting in which two trainings differ; empty if none."""
-    left, right = (_settings(description) for description in (a, b))
-    for key in {**left, **right}:
-        if left.get(key) != right.get(key):
-            return key
-    return ""
 
 
 def _settings(description: PolicyDescription) -> dict[str, Any]:
@@ -425,26 +415,28 @@ FEWEST = 3
 
 
 def compare(
-    *,
     runs: Sequence[str],
+    *,
     out: Path,
+    measures: Annotated[Sequence[str], "--measure"] = (),
     vehicle: str = "finsrov",
     plant: str = "nominal",
-    trials: int | None = None,
-    measures: Sequence[str] = (),
+    trials: Annotated[int | None, (1, None)] = None,
     seed: int = 42,
     say: Say = lambda part, what: None,
 ) -> dict[str, Any]:
-    """Evaluate every run on the same trials, and write `compare.json`, `compare.md` and `compare.png`.
+    """Compare trainings over seeds: interquartile means with intervals, who is likely better, learning curves.
+
+    Example: finssim compare runs/hold-seed1 runs/hold-seed2 runs/hold-seed3 sac=runs/sac-1 --out compared
 
     Args:
-        runs: Policy directories, each DIR or NAME=DIR; those of one name differ in the seed alone.
-        out: Directory; evaluations that are there already are not made again.
-        vehicle: Name or file that all are evaluated with.
-        plant: Name or file.
-        trials: Of each run; the task's own number if None.
-        measures: Which to compare; the task's own if none.
-        seed: Of what the plant draws.
+        runs (RUN...): Policy directories, each DIR or NAME=DIR; those of one name differ in the seed alone.
+        out (DIR): Directory for table, figure and evaluations.
+        measures: What to compare; the task's own measures if not given. May be given several times.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        plant (FILE|NAME): What differs from the vehicle file, as for evaluate.
+        trials: Trials of each run; as many as evaluate makes if not given.
+        seed: Seed of every random number; equal seeds give equal results.
         say: Told the share that is done and what comes next.
 
     Raises:

@@ -8,16 +8,20 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from rich.console import Console
 
 from finssim.control.guidance import Guide, Station
 from finssim.control.modes import AXES, Thruster8, Wrench6, action_mode
 from finssim.control.trajectories import PUBLISHED_NAMES, TRAJECTORIES, load_trajectory
+from finssim.experiments.campaign import progress_bar
+from finssim.experiments.tables import console_table
 from finssim.geometry.rotations import quat_yaw
-from finssim.learning.demonstrations import Episode, save
+from finssim.learning.collect import collect as collect_episodes
+from finssim.learning.demonstrations import Episode, about, found_in, save
 from finssim.provenance import provenance
 from finssim.robot.goals import station_of
 from finssim.robot.record_messages import STATES
@@ -25,7 +29,17 @@ from finssim.robot.record_reader import Record, open_record
 from finssim.tasks.observer import Observer
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["Drive", "DriveError", "SAME_GOAL", "collect_records", "read_drive", "station_at", "trajectory_of"]
+__all__ = [
+    "Drive",
+    "DriveError",
+    "SAME_GOAL",
+    "collect",
+    "collect_records",
+    "datasets",
+    "read_drive",
+    "station_at",
+    "trajectory_of",
+]
 
 Array = NDArray[np.float64]
 
@@ -406,6 +420,100 @@ def trajectory_of(drive: Drive, vehicle: Vehicle, name: str | None = None) -> Gu
             "file of what was followed"
         )
     return guide
+
+
+def collect(
+    experts: Sequence[str],
+    *,
+    task: str,
+    out: Path,
+    episodes: Annotated[int | None, (1, None)] = None,
+    vehicle: str = "finsrov",
+    hydrodynamics: str = "calibrated",
+    action: str | None = None,
+    randomize: str | None = None,
+    observe: str = "training",
+    disturb: float = 0.0,
+    goal: str | None = None,
+    seed: int = 42,
+    as_json: bool = False,
+) -> None:
+    """Keep episodes of a task as a Minari data set: let an expert do it, or take what was done with a vehicle.
+
+    Example: finssim collect pid --task t1 --episodes 200 --out demonstrations/hold
+
+    Args:
+        experts (DIR|NAME|RECORD...): A policy's directory or a baseline of the task; or records of driven vehicles
+            (.mcap).
+        task (TASK): Task to be shown; finssim tasks lists them.
+        out (DATASET): Folder of the data set.
+        episodes: How many; each agent's is one of its own. Not of records.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
+        action: What is commanded: wrench6, wrench4 or thruster8; the task's own if not given.
+        randomize (FILE): Ranges that vehicle and water are drawn from, by name or file.
+        observe (FILE|NAME): What is seen: training (the task's noise), sensors (the vehicle's own and position fixes,
+            through a filter), a file of other fixes, estimator (about what localization is off by) or truth.
+        disturb: Noise on what is done, not on what is written, in parts of full action: shows recoveries.
+        goal (GOAL): Of records: where to, in place of what they say: x,y,z,yaw_deg [m, deg], or end: where each stretch
+            ended; of t2 the trajectory.
+        seed: Seed of every random number; equal seeds give equal results.
+        as_json: Print one JSON object instead of tables.
+    """
+    records = [Path(word) for word in experts if word.endswith(".mcap")]
+    if records and (len(records) < len(experts) or episodes or randomize or disturb):
+        raise DriveError(
+            "records are taken as they are, and by themselves: leave out other experts, --episodes, --randomize and "
+            "--disturb"
+        )
+    if records:
+        told = collect_records(records, task, out=out, vehicle=vehicle, action=action, goal=goal)
+    elif len(experts) > 1 or episodes is None or goal is not None:
+        raise DriveError("give one expert and --episodes, and no --goal, which is of records")
+    else:
+        with progress_bar("collecting") as show:
+            told = collect_episodes(
+                experts[0], task, episodes=episodes, out=out, vehicle=vehicle, hydrodynamics=hydrodynamics,
+                action=action, randomize=randomize, observe=observe, disturb=disturb, seed=seed, show=show,
+            )  # fmt: skip
+    if as_json:
+        print(json.dumps(told, allow_nan=False))
+        return
+    measures = ", ".join(
+        f"{name} {value:.4g}" for name, value in told.get("metrics", {}).items() if value is not None
+    )
+    print(f"{told['episodes']} episodes, {told['steps']:,} steps{'; means: ' * bool(measures)}{measures}")
+    for source in told.get("records", ()):
+        print(
+            f"{source['file']}: {source['driver']}, {source['episodes']} episodes, {source['steps']:,} steps"
+        )
+    print(f"written: {out}")
+
+
+def datasets(
+    places: Sequence[Path],
+    *,
+    as_json: bool = False,
+) -> None:
+    """List demonstrations: task, vehicle, expert, episodes, steps.
+
+    Example: finssim datasets demonstrations
+
+    Args:
+        places (PATH...): Data sets, or folders that hold some.
+        as_json: Print one JSON object instead of tables.
+    """
+    rows = {str(path): about(path) for place in places for path in found_in(place)}
+    if as_json:
+        print(json.dumps(rows))
+        return
+    cells = [
+        [name, row["task"], row["vehicle"]["name"], row["expert"], row["observe"], str(row["episodes"]),
+         f"{row['steps']:,}"]
+        for name, row in rows.items()
+    ]  # fmt: skip
+    heads = ("data set", "task", "vehicle", "expert", "observes", "episodes", "steps")
+    Console().print(console_table(heads, cells, left=range(5)))
 
 
 def collect_records(

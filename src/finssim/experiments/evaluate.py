@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json as json_module
+import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -290,33 +290,53 @@ class Evaluation:
 
 
 def evaluate(
-    controller: str | Path | Sequence[Path],
+    controller: Sequence[str | Path] | str | Path,
     *,
     task: str = "t1",
     vehicle: str | Vehicle = "finsrov",
-    plant: str | Path | Sequence[str | Path] = "nominal",
+    hydrodynamics: str = "calibrated",
+    plant: Sequence[str | Path] | str | Path = ("nominal",),
     observe: str | None = None,
-    trajectories: Sequence[str | Path] = (),
+    trajectories: Annotated[Sequence[str | Path], "--trajectory"] = (),
+    trials: Annotated[int | None, (1, None)] = None,
+    trim: bool = False,
     truth: Path | None = None,
+    seed: int = 42,
     out: Path | None = None,
-    json: bool = False,
+    as_json: bool = False,
     console: Console | None = None,
-    **options: Any,
 ) -> list[Evaluation]:
-    """Run the trials in every plant, print the table (or one JSON object) and write the directory.
+    """Try a controller: success, errors [m, deg], time to settle [s]; or errors along trajectories [m].
+
+    Example: finssim evaluate runs/hold --plant current --trials 64 --out runs/hold-current
+
+    Example: finssim evaluate runs/hold --observe sensors
+
+    Example: finssim evaluate runs/track --task t2 --trajectory ellipse --trajectory my-way.csv
+
+    Example: finssim evaluate run.mcap --task t1 --truth mocap.csv
 
     Args:
-        controller: A policy directory, pid or pid-paper; or records of one, which are measured as they are.
-        task: Key of `TASKS`, or FILE.py:CLASS of one's own; of records a task of one vehicle.
-        vehicle: A vehicle, a catalogue name or a file.
-        plant: Name or file, or several.
-        observe: What is seen in every plant: truth, estimator or sensors; what the plant says if None.
-        trajectories: Names or files of what is followed in T2, in turn; the published four if none.
-        truth: Truth file or table of motion capture by which records are measured; their own estimate if None.
-        out: Directory for `evaluation.json`, the figure and the trajectories; an earlier evaluation is replaced.
-        json: Print the result in place of the table.
+        controller (DIR|pid|pid-paper|RECORD): A policy's directory, or pid, or pid-paper; or records of one controller
+            on a robot (.mcap).
+        task (TASK): Task to be tried on; finssim tasks lists them. One's own: FILE.py:CLASS. Of records a task of one
+            vehicle.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
+        plant (FILE|NAME): What differs from the vehicle file: nominal (nothing), current, lag, mesh, noise, randomised,
+            sensors, simplified, waves, or a file. May be given several times.
+        observe (FILE|NAME): What is seen in every plant: truth, estimator, sensors or a file of fixes; what the plant
+            says if not given.
+        trajectories (FILE|NAME): What t2 follows: straight, broken, ellipse, lemniscate (all four if not given),
+            circle, figure_eight, helix, or a YAML or CSV file. May be given several times.
+        trials: Trials in each plant; if not given, t1's eight setpoints for 60 s, or each trajectory, once.
+        trim: Put the integral of the position error in front of a policy.
+        truth (TABLE): By which records are measured, in place of the robot's own estimate: a table (.csv, .parquet) of
+            motion capture, t [s], x, y, z [m] and qx, qy, qz, qw or yaw [rad], or the truth file of finssim pool.
+        seed: Seed of every random number; equal seeds give equal results.
+        out: Directory for evaluation.json, the figure and trajectories.
+        json: Print one JSON object instead of tables.
         console: Where the table goes; standard output if None.
-        options: Of `evaluate_controller`: hydrodynamics, trials, trim, seed.
 
     Returns:
         One evaluation for each plant, in their order.
@@ -324,32 +344,46 @@ def evaluate(
     Raises:
         EvaluationError, PolicyError, ControlError, PlantError, VehicleError, OutputError: As they say.
     """
-    form = _form(task)
-    records = None if isinstance(controller, str | Path) else controller
-    plants = [] if records is not None else _plants([plant] if isinstance(plant, str | Path) else plant)
+    form, names = _form(task), [controller] if isinstance(controller, str | Path) else controller
+    records = [Path(name) for name in names if str(name).endswith(".mcap")]
+    if len(names) > 1 and len(records) < len(names):
+        raise EvaluationError(
+            "one controller at a time, or records of one: give a single name, or .mcap files"
+        )
+    simulated = {"--observe": observe, "--trials": trials, "--trim": trim or None}
+    unheeded = [name for name, value in simulated.items() if value is not None]
+    unheeded += ["--plant"] if tuple(plant) != ("nominal",) and plant != "nominal" else []
+    if records and unheeded:
+        raise EvaluationError(f"a record was made once and for all: leave {', '.join(unheeded)} out")
+    if truth is not None and not records:
+        raise EvaluationError("--truth tells of records: a simulation knows its own")
+    plants = [] if records else _plants([plant] if isinstance(plant, str | Path) else plant)
     plants = plants if observe is None else [one.seen(observe) for one in plants]
     with atomic_directory(out, replaces=EVALUATION_FILE) if out is not None else nullcontext() as folder:
-        evaluations = [_recorded(records, task, vehicle, trajectories, truth)] if records is not None else []
+        evaluations = [_recorded(records, task, vehicle, trajectories, truth)] if records else []
         for one in plants:
             place = folder and folder / TRAJECTORIES / (one.name if plants[1:] else "")
             evaluations.append(
                 evaluate_controller(
-                    controller,
+                    names[0],
                     one,
                     task=task,
                     vehicle=vehicle,
                     trajectories=trajectories,
                     record=place,
-                    **options,
-                )  # type: ignore[arg-type]
+                    hydrodynamics=hydrodynamics,
+                    trials=trials,
+                    trim=trim,
+                    seed=seed,
+                )
             )
         results = [evaluation.result for evaluation in evaluations]
         document = results[0] if len(results) == 1 else {"plants": results}
         if folder is not None:
             write_json(folder / EVALUATION_FILE, document)
             form.draw(evaluations, folder, results[0]["plant"].get("title", "") if len(results) == 1 else "")
-    if json:
-        print(json_module.dumps(document, allow_nan=False))
+    if as_json:
+        print(json.dumps(document, allow_nan=False))
         return evaluations
     console = console or Console()
     form.show(results, console)

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import yaml
@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.excitation.excite import excite as write_programmes
 from finssim.calibration.excitation.programmes import Programme, programmes
-from finssim.calibration.importers.dispatch import read_trials
+from finssim.calibration.importers.dispatch import print_folders, read_trials
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import load_trial, load_trials, write_trial
 from finssim.control.guidance import Station
@@ -44,7 +45,7 @@ from finssim.robot.runtime import Runtime
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.defaults import room
 
-__all__ = ["excite_in_pool", "excite_on_robot", "pool_trials", "trials_on_robot"]
+__all__ = ["excite", "excite_on_robot", "pool_trials", "trials_on_robot"]
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Lower and upper corner of the water that a vehicle may be in, world frame [m]."""
@@ -343,52 +344,118 @@ def pool_trials(
     return trials
 
 
-def excite_in_pool(
+def excite(
     axes: str,
     *,
     vehicle: str,
     out: Path,
-    plant: int,
+    kind: str = "published",
+    levels: Sequence[str] | None = None,
+    repeats: Annotated[int, (1, 100)] = 1,
+    simulate: bool = False,
+    pool: Annotated[int | None, (0, None)] = None,
+    severity: str | None = None,
     pool_vehicle: str | None = None,
-    severity: str = "realistic",
+    hydrodynamics: str = "calibrated",
+    noise: str = "sensors",
+    inputs: Annotated[Sequence[str], ","] = ("rpm", "wrench"),
+    rate: float = 50.0,
+    coast: float = 30.0,
+    duration: float = 60.0,
+    room: float | None = None,
+    robot: OnRobot | None = None,
     seed: int = 0,
-    processes: int | None = None,
-    **plan: Any,
+    as_json: bool = False,
 ) -> list[Path]:
-    """Play programmes in a virtual pool, each from its start at rest, over several processes.
+    """Write excitation programmes (wrench [N, N m] and thrust [N] at 50 Hz) for a robot, or run them in a simulation.
+
+    Example: finssim excite surge,yaw --vehicle finsrov --pool 1 --out trials
+
+    Example: finssim excite all --vehicle finsrov --robot udp://10.0.0.2:58766 --pool-file pool.yaml --arm --out trials
 
     Args:
-        axes: As for `programmes`; so are seed and plan (kind, levels, repeats, coast, duration).
-        vehicle: Name or file of the vehicle as the robot knows it.
-        out: Folder to make: a trial for each programme, `records/NAME.mcap`, and `programmes.yaml`.
-        plant: Seed of the pool.
-        pool_vehicle: Name or file of the vehicle around which the pool's own is drawn; `vehicle` if None.
-        severity: nominal, realistic or hard.
-        processes: As many as there are processors if None.
+        axes (AXES): all, or of surge,sway,heave,roll,pitch,yaw separated by commas.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        out (DIR): Directory of the programmes or trials.
+        kind (KIND): published (steps, dive-and-coast, pulses), validation, or multisine.
+        levels (LEVELS): Magnitudes [N, N m]: "5,10" for every axis or "surge=5,10"; may be given several times.
+        repeats: How often every programme comes.
+        simulate: Run them in the simulator and write the trials they make.
+        pool (SEED): Seed of a virtual pool: the robot's whole software plays them there, records, and makes trials.
+        severity (NAME): Of that pool: nominal, realistic or hard; realistic if not given.
+        pool_vehicle (NAME|FILE): Vehicle around which that pool's own is drawn; the robot's if not given.
+        hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
+        noise (NAME): Noise of simulated trials: sensors, published or none.
+        inputs (NAMES): Inputs that simulated trials log, of wrench,rpm,force,pwm,command.
+        rate: Rows of a simulated trial per second [Hz].
+        coast: Longest coast after a dive [s].
+        duration: Of a multi-sine [s].
+        room: Longest way along a linear axis [m]: lowers the levels to fit a pool.
+        robot: The robot that plays them, in place of a simulation.
+        seed: Seed of every random number; equal seeds give equal results.
+        as_json: Print one JSON object instead of tables.
 
     Returns:
-        The folders of the trials.
+        The folders of the trials or programmes.
 
     Raises:
-        CalibrationError, PlantSpecError, VehicleError, OutputError: As they say.
+        CalibrationError, RobotError, VehicleError, OutputError: As they say.
     """
-    start_warp()
-    body, pool_vehicle = load_vehicle(vehicle), pool_vehicle or vehicle
-    played = programmes(axes, body, seed=seed, **plan)
-    with (
-        atomic_directory(out, replaces=PLAN_FILE) as folder,
-        progress_bar("playing programmes") as say,
-    ):
-        pool_trials(
-            {"fit": played}, folder, vehicle=vehicle, pool_vehicle=pool_vehicle, plant=plant,
-            severity=severity, seed=seed, processes=processes, say=say,
+    plan: dict[str, Any] = {
+        "kind": kind, "levels": _levels(levels or ()), "repeats": repeats, "coast": coast, "duration": duration,
+    }  # fmt: skip
+    of_pool = severity is not None or pool_vehicle is not None
+    if robot is not None and (simulate or pool is not None or of_pool):
+        raise CalibrationError(
+            "--robot is where it is done: leave --simulate, --pool and what tells of it out"
+        )
+    if pool is not None and (simulate or room is not None):
+        raise CalibrationError("--pool goes with neither --simulate nor --room: a pool has its own room")
+    if pool is None and of_pool:
+        raise CalibrationError(
+            "--severity and --pool-vehicle tell of a virtual pool: name one with --pool SEED"
+        )
+    if robot is not None:
+        folders = excite_on_robot(axes, vehicle=vehicle, out=out, robot=robot, seed=seed, room=room, **plan)
+    elif pool is not None:
+        body, pool_vehicle = load_vehicle(vehicle), pool_vehicle or vehicle
+        played, severity = programmes(axes, body, seed=seed, **plan), severity or "realistic"
+        with atomic_directory(out, replaces=PLAN_FILE) as folder, progress_bar("playing programmes") as say:
+            pool_trials(
+                {"fit": played}, folder, vehicle=vehicle, pool_vehicle=pool_vehicle, plant=pool,
+                severity=severity, seed=seed, say=say,
+            )  # fmt: skip
+            for made in (folder / "fit").iterdir():
+                made.rename(folder / made.name)
+            (folder / "fit").rmdir()
+            about = {"vehicle": load_vehicle(pool_vehicle).name, "plant": pool, "severity": severity}
+            text = _about(body, played, seed, plan, {"pool": about})
+            (folder / PLAN_FILE).write_text(text, encoding="utf-8")
+        folders = [Path(out) / programme.name for programme in played]
+    else:
+        folders = write_programmes(
+            axes, vehicle=vehicle, out=out, simulate=simulate, rate=rate, noise=noise, seed=seed, room=room,
+            hydrodynamics=hydrodynamics, inputs=inputs, **plan,
         )  # fmt: skip
-        for made in (folder / "fit").iterdir():
-            made.rename(folder / made.name)
-        (folder / "fit").rmdir()
-        pool = {"vehicle": load_vehicle(pool_vehicle).name, "plant": plant, "severity": severity}
-        (folder / PLAN_FILE).write_text(_about(body, played, seed, plan, {"pool": pool}), encoding="utf-8")
-    return [Path(out) / programme.name for programme in played]
+    print_folders(folders, as_json)
+    return folders
+
+
+def _levels(words: Sequence[str]) -> dict[str, list[float]] | list[float] | None:
+    """Levels by axis from `surge=5,10`, or for every axis from `5,10`."""
+    named: dict[str, list[float]] = {}
+    for word in words:
+        axis, _, numbers = word.rpartition("=")
+        try:
+            values = [float(number) for number in numbers.split(",")]
+        except ValueError:
+            values = [math.nan]
+        if not all(map(math.isfinite, values)):
+            raise CalibrationError(f"levels are '{word}', expected numbers such as 5,10 or surge=5,10")
+        named.setdefault(axis.strip(), []).extend(values)
+    if "" in named and len(named) > 1:
+        raise CalibrationError("levels are given for every axis and for single ones: give one of the two")
+    return named.get("", named) or None
 
 
 def excite_on_robot(

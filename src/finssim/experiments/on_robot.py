@@ -40,6 +40,7 @@ __all__ = [
     "Session",
     "check_starts",
     "kept_folder",
+    "robot_or_none",
     "session",
 ]
 
@@ -323,6 +324,48 @@ class OnRobot:
         return shlex.join([*words, *(["--lockstep"] if wiring.lockstep else [])])
 
 
+def robot_or_none(
+    *,
+    robot: str | None = None,
+    pool_file: Path | None = None,
+    bind: str = "127.0.0.1:54321",
+    pictures: str | None = None,
+    lockstep: bool = False,
+    arm: bool = False,
+    by_hand: bool = False,
+    unattended: bool = False,
+) -> OnRobot | None:
+    """The robot that options name; none where they name none, and nothing tells of one.
+
+    Args:
+        robot (ADDRESS): Robot on which it is done: its motor controller's udp://HOST:PORT or serial:DEVICE, or pool for
+            the virtual pool on this machine. With --lockstep: pool, or HOST:PORT.
+        pool_file (FILE): Of that robot: camera, water plane and frames (.yaml).
+        bind (ADDRESS:PORT): Address and port of this end, for udp; pictures come to the port after it. Loopback unless
+            given.
+        pictures (ADDRESS): Overhead camera: udp://HOST:PORT, shm:NAME or none; the virtual pool's with --robot pool,
+            otherwise none, if not given.
+        lockstep: Take turns with finssim pool --lockstep, as fast as both compute.
+        arm: Let thrusters turn, as soon as the state is known. Without it they never do.
+        by_hand: Somebody carries the vehicle to where each trial starts; the tuned PID steers it there if not given.
+        unattended: Nobody presses enter before each trial; a fault ends the session, and nothing is armed after it.
+
+    Raises:
+        RobotError: Something tells of a robot and none is named, or it has no pool file.
+    """
+    if robot is None:
+        if arm or by_hand or unattended or lockstep or pool_file is not None or pictures is not None:
+            raise RobotError(
+                "--arm, --by-hand, --unattended, --lockstep, --pool-file and --pictures tell of a robot: name one "
+                "with --robot"
+            )
+        return None
+    if pool_file is None:
+        raise RobotError("a robot knows where it is by its pool file: give --pool-file")
+    wiring = Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep)
+    return OnRobot(wiring=wiring, pool_file=pool_file, arm=arm, by_hand=by_hand, unattended=unattended)
+
+
 class _Screen:
     """A terminal: one line that changes, and keys."""
 
@@ -339,24 +382,20 @@ class _Screen:
             self._status.update(text)
 
 
+@dataclass(frozen=True)
 class Session:
     """An open robot; made by `session`."""
 
-    def __init__(
-        self,
-        robot: OnRobot,
-        vehicle: Vehicle,
-        site: Pool,
-        drive: Drive,
-        attendant: Attendant | None,
-        console: Console,
-    ) -> None:
-        self.robot, self.vehicle, self.site = robot, vehicle, site
-        self._drive, self._attendant, self._console = drive, attendant, console
+    robot: OnRobot
+    vehicle: Vehicle
+    site: Pool
+    drive: Drive
+    attendant: Attendant | None
+    console: Console
 
     def say(self, text: str) -> None:
         """Tell whoever watches."""
-        self._console.print(text, highlight=False, markup=False)
+        self.console.print(text, highlight=False, markup=False)
 
     def trial(
         self,
@@ -392,7 +431,7 @@ class Session:
             trial = make()
             x, y, z = start.position
             self.say(f"{trial.name}: from {x:.2f}, {y:.2f}, {z:.2f} m, {math.degrees(start.yaw):.0f}°")
-            placing = Placing(start=start, by_hand=self.robot.by_hand, exact=exact, attendant=self._attendant)
+            placing = Placing(start=start, by_hand=self.robot.by_hand, exact=exact, attendant=self.attendant)
             outcome, partial = self._attempt(trial, placing, record, perception, about or {})
             stopped_by_hand = outcome.fault == "stopped by the operator"
             done = outcome.ended == "over" or (
@@ -408,7 +447,7 @@ class Session:
                 return None
             if outcome.ended == "interrupted":
                 raise KeyboardInterrupt
-            if self._attendant is None:
+            if self.attendant is None:
                 raise RobotError(
                     f"{trial.name}: {outcome.fault}: look at the vehicle, then give the command again: it goes on here"
                 )
@@ -439,7 +478,7 @@ class Session:
         with Recorder(partial, self.vehicle, meta, pictures="none", epoch=epoch, files=files) as recorder:
             outcome = play_trial(
                 trial,
-                self._drive,
+                self.drive,
                 self.vehicle,
                 self.site,
                 perception=perception and perception(),

@@ -6,7 +6,7 @@ import math
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -179,27 +179,29 @@ def open_water(
     *,
     out: Path,
     vehicle: str = "bluerov2_heavy",
-    minutes: float = 10.0,
-    speed: float = 0.3,
-    shape: str = "line",
+    minutes: Annotated[float, (0.1, None)] = 10.0,
+    speed: Annotated[float, (0.01, None)] = 0.3,
+    shape: Annotated[str, "--way"] = "line",
     positioning: str = "none",
-    seeds: int = 3,
+    seeds: Annotated[int, (1, 1000)] = 3,
     seed: int = 1,
     severity: str = "realistic",
     say: Say = lambda part, what: None,
 ) -> dict[str, Any]:
-    """Some ways through open water, each with its own plant, water and instruments; writes `open_water.json`.
+    """Drift of Doppler log, depth, IMU and compass in open water [m], and whether the estimator's ellipse holds it.
+
+    Example: finssim experiment open-water --seeds 1 --out drift
 
     Args:
-        out: Directory.
-        vehicle: Name or file.
-        minutes: Of each way.
+        out (DIR): Directory for the result.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        minutes: Of each way [min].
         speed: [m/s]
-        shape: A name of `WAYS`.
-        positioning: none, motion-capture or usbl.
-        seeds: How many.
-        seed: The first.
-        severity: nominal, realistic or hard.
+        shape (WORD): line or square (of 10 m).
+        positioning (NAME): Fixes: none, motion-capture or usbl.
+        seeds: Ways, each with its own water and noise.
+        seed: Seed of every random number; equal seeds give equal results.
+        severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
         say: Told the share that is done and what comes next.
     """
     ours, way = load_vehicle(vehicle), way_of(shape, 60.0 * minutes, speed)

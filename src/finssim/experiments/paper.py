@@ -21,12 +21,8 @@ T1_PUBLISHED = MappingProxyType(
         "P03": (-1.0, -0.5, -0.3, 90.0),
         "P04": (-1.0, -0.5, 0.3, 180.0),
         "P05": (1.0, -0.8, 0.3, 0.0),
-        "P06": (
-            1.0,
-            -0.8,
-            -0.3,
-            0.0,
-        ),  # yaw as in the hardware trials; the published simulation list says -90
+        # Yaw as in the hardware trials; the published simulation list says -90.
+        "P06": (1.0, -0.8, -0.3, 0.0),
         "P07": (-1.0, -0.8, -0.3, 90.0),
         "P08": (-1.0, -0.8, 0.3, 180.0),
     }

@@ -25,7 +25,6 @@ from finssim.control.trim import Trim
 from finssim.experiments import campaign
 from finssim.experiments.evaluate import Evaluation
 from finssim.experiments.metrics import summarize
-from finssim.experiments.motion import PERIOD, Motion, localization_errors, measure, on_grid
 from finssim.experiments.on_robot import (
     Attendant,
     OnRobot,
@@ -38,7 +37,15 @@ from finssim.experiments.on_robot import (
     session,
 )
 from finssim.experiments.paper import T1_SETPOINTS, T1_START, in_room
-from finssim.experiments.recorded import RecordedError, read_record
+from finssim.experiments.recorded import (
+    PERIOD,
+    Motion,
+    RecordedError,
+    localization_errors,
+    measure,
+    on_grid,
+    read_record,
+)
 from finssim.experiments.trials import DURATION, Trials
 from finssim.files import atomic_write
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import warp as wp
@@ -203,22 +203,25 @@ def randomize_show(
     vehicle: str,
     out: Path,
     hydrodynamics: str = "calibrated",
-    samples: int = 200,
+    samples: Annotated[int, (2, 100000)] = 200,
     seed: int = 0,
     as_json: bool = False,
 ) -> dict[str, Any]:
-    """Draw vehicles, let each answer to a step of half its wrench limit on four axes, and write what came out.
+    """Tell what ranges mean for a vehicle: its numbers in SI, and how far its step responses spread.
 
     The directory takes `spread.png`, `entries.csv` and `show.json`.
 
+    Example: finssim randomize show pool --vehicle finsrov --out ranges/pool
+
     Args:
-        ranges: Name or file.
-        vehicle: Name or file.
-        out: Directory to write.
-        hydrodynamics: calibrated, mesh or simplified.
+        ranges (FILE): Ranges: a file, or hold_for_position, fossen_learn_to_swim, equivalent_box, pool,
+            no_thruster_dynamics.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        out: Directory for spread.png, entries.csv and show.json.
+        hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
         samples: Vehicles to draw.
-        seed: Of the draws.
-        as_json: Print the record in place of the tables.
+        seed: Seed of every random number; equal seeds give equal results.
+        as_json: Print one JSON object instead of tables.
 
     Returns:
         The record.

@@ -80,21 +80,31 @@ LONGEST = 86400.0
 
 
 def simulate(
-    *, vehicle: str, command: str, duration: float, hydrodynamics: str, depth: float, device: str, out: Path
+    *,
+    vehicle: str,
+    command: str,
+    duration: float,
+    out: Path,
+    hydrodynamics: str = "calibrated",
+    depth: float = 5.0,
+    device: str = "cpu",
 ) -> None:
-    """Simulate a vehicle in still, open water and write one row per control step.
+    """Simulate a vehicle from rest under a constant wrench and record its motion.
 
     Columns: t [s], the state as `finssim.engine.recorder` names it, and the delivered thrust of every thruster [N].
     Beside the table goes `OUT.json` with the vehicle's hash, the command and where the run came from.
 
+    Example: finssim simulate --vehicle finsrov --command "surge=10 yaw=1" --duration 10 --out run.csv
+
     Args:
-        vehicle: Name or file.
-        command: Constant wrench in words, see `parse_wrench`; allocated to the thrusters once.
-        duration: [s]
-        hydrodynamics: Key of `HYDRODYNAMICS`.
-        depth: Of the body origin at the start [m].
-        device: Warp device.
-        out: Table to write, ending in .csv.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        command (WRENCH): Constant wrench: "surge=10 yaw=1". surge sway heave in N, roll pitch yaw in N m; the rest is
+            0.
+        duration: Simulated time [s].
+        out: Table to write, one row per control step of 0.1 s: a .csv file. OUT.json tells its origin.
+        hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
+        depth: Depth of the body origin at the start [m].
+        device (DEVICE): Where to compute: cpu or cuda.
 
     Raises:
         CommandError: The command, a time or the file's name cannot be used, or the motion did not stay finite.

@@ -8,7 +8,7 @@ import re
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,20 +41,24 @@ HEADS = ("vehicle_s", "wall_s", "memory_mib", "error_m", "state")
 def soak(
     *,
     out: Path,
-    hours: float = 20.0,
+    hours: Annotated[float, (0.001, None)] = 20.0,
     seed: int = 1,
     severity: str = "realistic",
     vehicle: str = "finsrov",
     say: Say = lambda part, what: None,
 ) -> dict[str, Any]:
-    """Keep a station in lock-step with a virtual pool, and sample the memory of this process.
+    """Keep a station for hours in lock-step and watch the memory [MiB]. Ctrl-C ends it with what is known until then.
+
+    Exit status 3: the memory grew, or the bridge stopped the vehicle.
+
+    Example: finssim experiment soak --hours 20 --out soak
 
     Args:
-        out: Directory for `soak.json` and `soak.csv`, which grows as the run does.
-        hours: Vehicle time [h]; Ctrl-C ends it before, and what was done until then counts.
-        seed: Of the pool.
-        severity: Of the pool: nominal, realistic or hard.
-        vehicle: Name or file.
+        out (DIR): Directory for the result and the samples.
+        hours: Vehicle time to keep a station [h].
+        seed: Seed of every random number; equal seeds give equal results.
+        severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         say: Told the share that is done and how it goes.
 
     Returns:
@@ -89,6 +93,7 @@ def soak(
         "seed": seed,
         "provenance": provenance(),
     }
+    result["ok"] = result["verdict"] != "grows" and not result["faults"]
     write_json(folder / "soak.json", result)
     return result
 

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from finssim.control.guidance import Guide
 from finssim.control.trajectories import TRAJECTORIES
-from finssim.experiments.motion import follows
-from finssim.experiments.trials import summarize_episodes
+from finssim.experiments.plants import load_plant
+from finssim.experiments.recorded import follows
+from finssim.experiments.tables import console_table, figure_text
+from finssim.experiments.trials import EpisodeError, run_episodes, summarize_episodes
 from finssim.files import atomic_write
 from finssim.pool.camera import PoolCamera
 from finssim.pool.draw_plant import draw_plant
@@ -25,11 +26,9 @@ from finssim.pool.site import camera_of
 from finssim.pool.sites import site_of as plant_at
 from finssim.pool.task_site import TaskSite
 from finssim.robot.pilots import make_pilot
-from finssim.tasks import Environment, Task
-from finssim.tasks.agents import NOWHERE
+from finssim.tasks import Task
 from finssim.tasks.communication import Communication
 from finssim.tasks.observer import fitted_task
-from finssim.tasks.rollout import rollout
 from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["BATCH", "play", "site_of"]
@@ -94,31 +93,36 @@ def site_of(
 
 def play(
     task: str,
-    who: str,
     *,
+    policy: str,
+    episodes: Annotated[int, (1, 10000)] = 20,
     vehicle: str = "finsrov",
-    episodes: int = 20,
-    plant: int = 0,
+    plant: Annotated[int, (0, None)] = 0,
     severity: Severity = "nominal",
     seed: int = 1,
     out: Path | None = None,
     records: bool = False,
     as_json: bool = False,
-    show: Callable[[str], None] = lambda line: None,
+    show: Callable[[str], None] = lambda line: print(line, file=sys.stderr),
 ) -> dict[str, Any]:
-    """Play episodes through the stack and print how they went, beside the same controller in the batch.
+    """Play any task through the deployed software, all its vehicles in lock-step; print it beside the batch.
+
+    Every vehicle has its plant, motor controller, bridge and pilot; robots tell each other where they are, and the task
+    itself scores what is true. In the pool the overhead camera locates vehicles, in open water motion capture does.
+
+    Example: finssim experiment stack team-pursuit --policy runs/team --episodes 20 --out runs/team-stack
 
     Args:
-        task: Its name, or FILE.py:CLASS of one's own.
-        who: A policy's directory, or a baseline of the task.
-        vehicle: Name or file, for every place.
+        task (TASK): Task, or FILE.py:CLASS of one's own.
+        policy (DIR|NAME): A policy's directory, or a baseline of the task.
         episodes: How many.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         plant: Seed of every vehicle's plant.
-        severity: How far the plants are from the vehicle file.
-        seed: Of the first episode; the others follow.
-        out: Folder that keeps each episode as it ends; what is there already is not played again.
-        records: Also keep what every agent recorded, and the truth, in a folder of `out` for each episode.
-        as_json: Print one JSON object.
+        severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
+        seed: Seed of every random number; equal seeds give equal results.
+        out (DIR): Directory that keeps every episode; one that was interrupted goes on.
+        records: Keep in --out what every agent recorded (.mcap), and its truth (.truth).
+        as_json: Print one JSON object instead of tables.
         show: Called with a line after each episode.
 
     Returns:
@@ -127,11 +131,13 @@ def play(
     Raises:
         PolicyError, ControlError, BaselineError, VehicleError, OutputError: As they say.
     """
+    if records and out is None:
+        raise EpisodeError("--records are kept in a directory: give --out")
     body = load_vehicle(vehicle)
     fitted = fitted_task(task, body)
     vehicles = [body] * len(fitted.vehicles)
     about = {
-        "task": fitted.name, "controller": who, "vehicle": body.sha256,
+        "task": fitted.name, "controller": policy, "vehicle": body.sha256,
         "plant": plant, "severity": severity, "seed": seed,
     }  # fmt: skip
     rows = _kept(out, about)
@@ -141,7 +147,7 @@ def play(
         if record is not None:
             shutil.rmtree(record, ignore_errors=True)  # of an episode that was interrupted
         site = site_of(
-            task, who, vehicles, seed=seed + k, plant=plant, severity=severity, guide=guide, record=record
+            task, policy, vehicles, seed=seed + k, plant=plant, severity=severity, guide=guide, record=record
         )
         measured = site.run()
         rows.append({"trial": k, **{name: x if np.isfinite(x) else None for name, x in measured.items()}})
@@ -150,7 +156,10 @@ def play(
             with atomic_write(out / ROWS) as path:
                 path.write_text(json.dumps({**about, "episodes": rows}, indent=1) + "\n", encoding="utf-8")
         show(f"episode {k + 1} of {episodes}: success {measured.get('success', float('nan')):g}")
-    batch = _batch(task, who, vehicles, seed)
+    agent, nominal = make_pilot(policy, body, task=task).agent, load_plant("nominal")
+    batch = run_episodes(
+        agent, fitted_task(task, vehicles), body, nominal, trials=BATCH, seed=seed
+    ).measures()
     told = {**about, "stack": summarize_episodes(rows[:episodes]), "batch": summarize_episodes(batch)}
     if as_json:
         print(json.dumps(told, allow_nan=False))
@@ -167,42 +176,15 @@ def _kept(out: Path | None, about: Mapping[str, Any]) -> list[dict[str, Any]]:
     return list(data["episodes"]) if {**about, "episodes": data.get("episodes")} == data else []
 
 
-def _batch(task: str, who: str, vehicles: Sequence[Vehicle], seed: int) -> list[dict[str, Any]]:
-    """The first episode of every world of the batch, of the vehicle file's own model, with exact states."""
-    pilot = make_pilot(who, vehicles[0], task=task)
-    fitted, agent = fitted_task(task, vehicles), pilot.agent
-    scale = agent.wrench_scale
-    env = Environment(fitted, vehicles, worlds=BATCH, action=agent.action, wrench_scale=scale, seed=seed)
-    rows: dict[int, dict[str, Any]] = {}
-    steps = round(fitted.time_limit / fitted.control_step) + 1
-    for _, step in rollout(agent, env, steps, lambda t: NOWHERE):
-        ended = np.flatnonzero(step.terminated | step.truncated) if step is not None else ()
-        metrics = fitted.metrics(env.arrays) if len(ended) else {}
-        for w in ended:
-            values = {name: float(column[w]) for name, column in metrics.items()}
-            told = {name: x if np.isfinite(x) else None for name, x in values.items()}
-            rows.setdefault(int(w), {"trial": int(w), **told})
-        if len(rows) == BATCH:
-            break
-    return [rows[w] for w in range(BATCH)]
-
-
 def _print(told: Mapping[str, Any]) -> None:
     stack, batch = told["stack"], told["batch"]
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for head in (
+    heads = [
         f"{told['task']}, {told['controller']}",
         f"stack, {stack['trials']}",
         f"batch, {batch['trials']}",
-    ):
-        table.add_column(head, overflow="fold")
-    for name in stack["metrics"]:
-        table.add_row(name, *(_value(one["metrics"].get(name)) for one in (stack, batch)))
-    Console().print(table)
-
-
-def _value(one: Mapping[str, Any] | None) -> str:
-    if one is None or one["value"] is None:
-        return ""
-    low, high = one["ci95"]
-    return f"{one['value']:.3g} [{low:.3g}, {high:.3g}]"
+    ]
+    rows = [
+        [name, *(figure_text(one["metrics"].get(name), ".3g") for one in (stack, batch))]
+        for name in stack["metrics"]
+    ]
+    Console().print(console_table(heads, rows, left=(0, 1, 2)))

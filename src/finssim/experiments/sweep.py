@@ -18,20 +18,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
-from finssim.experiments.campaign import spread, write_json
+from finssim.experiments.campaign import progress_bar, spread, write_json
 from finssim.experiments.compare import MEASURES
 from finssim.experiments.evaluate import evaluate_controller
 from finssim.experiments.plants import load_plant
@@ -271,18 +263,22 @@ def sweep(
     *,
     out: Path,
     address: str | None = None,
-    processes: int | None = None,
+    processes: Annotated[int | None, (1, None)] = None,
     as_json: bool = False,
     console: Console | None = None,
 ) -> dict[str, Any]:
-    """Train and evaluate every setting with every seed; what is in the directory already is not done again.
+    """Train every setting with every seed on one machine or many, and evaluate each policy; goes on where it was.
+
+    Exit status 3: a training failed, which the table tells.
+
+    Example: finssim sweep sweep.yaml --out swept
 
     Args:
-        file: What to do (`finssim.experiments.sweep.Sweep`).
-        out: Directory: `runs/` with a policy directory for each job, `sweep.json`, `sweep.md`.
-        address: Of a Ray cluster; processes of this machine if None.
-        processes: Jobs at once on this machine; as many as processors if None.
-        as_json: Print one JSON object in place of the table.
+        file (FILE): What to train: task, seeds, settings (.yaml).
+        out (DIR): Directory of the runs; those that it has are kept.
+        address (ADDRESS): Of a Ray cluster to join, HOST:PORT or auto; this machine alone if not given.
+        processes: Trainings at once on this machine; one a processor if not given.
+        as_json: Print one JSON object instead of tables.
         console: Where the table goes; standard output if None.
 
     Returns:
@@ -299,19 +295,11 @@ def sweep(
     }
     missing = [job for job in jobs if job.key not in rows]
     screen = Console(stderr=True)
-    columns = (
-        TextColumn("sweep"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
     played = _here(missing, processes) if address is None else _on_cluster(missing, address)
-    with closing(played), Progress(*columns, console=screen, disable=not screen.is_terminal) as bar:
-        task = bar.add_task("sweep", total=len(jobs), completed=len(rows))
+    with closing(played), progress_bar("sweep") as say:
         for job, outcome in played if missing else ():
             rows[job.key] = row = _keep(job, outcome, runs)
-            bar.advance(task)
+            say(len(rows) / len(jobs), f"{len(rows)} of {len(jobs)} trainings")
             if not screen.is_terminal:
                 error = f": {row['error']}" if "error" in row else ""
                 screen.print(f"{len(rows)} of {len(jobs)}: {job.key}{error}", highlight=False)

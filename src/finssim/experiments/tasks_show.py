@@ -17,7 +17,10 @@ __all__ = ["tasks_list", "tasks_show"]
 
 
 def tasks_list(*, as_json: bool = False, console: Console | None = None) -> None:
-    """Print every task of the catalogue in a line, or all as one JSON object."""
+    """List the tasks: agents, sizes of observation and action, period and length [s]; `show NAME` tells one in full.
+
+    Example: finssim tasks
+    """
     found = {name: describe_task(name) for name in TASKS}
     if as_json:
         print(json.dumps(found, allow_nan=False))
@@ -41,13 +44,15 @@ def tasks_show(
     as_json: bool = False,
     console: Console | None = None,
 ) -> None:
-    """Print one task as a vehicle does it, or as one JSON object.
+    """Tell all of a task as a vehicle does it: observation, action [N, N m], reward, success, settings.
+
+    Example: finssim tasks show docking --vehicle bluerov2_heavy
 
     Args:
-        task: Key of `TASKS`, or FILE.py:CLASS of one's own.
-        vehicle: Name or file.
-        action: Mode; the task's own if None.
-        as_json: Print data in place of tables.
+        task (NAME|FILE.py:CLASS): Task, or one's own as FILE.py:CLASS.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        action (MODE): wrench6, wrench4 or thruster8; the task's own if not given.
+        as_json: Print one JSON object instead of tables.
         console: Standard output if None.
 
     Raises:

@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from rich.console import Console
 
@@ -41,22 +41,25 @@ PATIENCE = 120.0
 def timing(
     *,
     out: Path,
-    minutes: float = 10.0,
+    minutes: Annotated[float, (0.05, None)] = 10.0,
     camera: str = "pictures",
     policy: str = "pid",
     seed: int = 1,
     vehicle: str = "finsrov",
     say: Say = lambda part, what: None,
 ) -> dict[str, Any]:
-    """Run `finssim pool` and `finssim run` as processes in real time, then the same in lock-step.
+    """Time the robot beside its pool on this machine: decisions missed, picture to command [ms], lock-step speed.
+
+    Example: finssim experiment timing --minutes 10 --out timing
 
     Args:
-        out: Directory for `timing.json`.
+        out (DIR): Directory for the result.
         minutes: Of the run in real time [min].
-        camera: Of the run in real time: pictures or corners.
-        policy: Who steers: a policy's directory, or the name of a PID.
-        seed: Of the pool.
-        vehicle: Name or file.
+        camera (MODE): corners (projected through the rippling water, with noise), or pictures (drawn, and searched for
+            tags: several times slower).
+        policy (DIR|pid|pid-paper): A policy's directory, or pid, or pid-paper.
+        seed: Seed of every random number; equal seeds give equal results.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         say: Told the share that is done and what comes next.
 
     Returns:

@@ -124,13 +124,20 @@ def steady_speeds(vehicle: Vehicle, hydrodynamics: str, thrust: NDArray[np.float
     return total / (steps - 3 * steps // 4)
 
 
-def validate(name: str, as_json: bool = False, hydrodynamics: str = "calibrated") -> None:
-    """Print simulated beside published steady speeds.
+def validate(
+    name: str,
+    *,
+    hydrodynamics: str = "calibrated",
+    as_json: bool = False,
+) -> None:
+    """Print simulated beside published pool responses, and say where they disagree.
+
+    Example: finssim validate finsrov
 
     Args:
-        name: Vehicle name or file.
-        as_json: Print one JSON object instead of a table.
-        hydrodynamics: The model.
+        name (NAME): Vehicle with published responses: finsrov.
+        hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
+        as_json: Print one JSON object instead of tables.
 
     Raises:
         ValidationError: nothing is published of this vehicle.

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from rich.console import Console
 
@@ -46,38 +46,49 @@ def train(
     randomize: str | Path | None = None,
     observe: str = "training",
     seed: int = 42,
-    worlds: int | None = None,
-    steps: int | None = None,
+    worlds: Annotated[int | None, (1, None)] = None,
+    steps: Annotated[int | None, (1, None)] = None,
     until: float | None = None,
-    settings: Mapping[str, Any] | None = None,
-    device: str = "cpu",
+    settings: Annotated[Mapping[str, Any] | Sequence[str], "--set"] = (),
     resume: bool = False,
+    device: str = "cpu",
     console: Console | None = None,
-    shown: Path | None = None,
-    interrupted: Path | None = None,
+    shown: Annotated[Path | None, "python"] = None,
+    interrupted: Annotated[Path | None, "python"] = None,
 ) -> Path:
-    """Train a policy and write its directory.
+    """Train a policy and write it to a directory that runs without the learner.
 
     The folder `OUT-training` beside it takes the TensorBoard log and the last two checkpoints: policy directories from
     which a killed training goes on to the same result.
 
+    Example: finssim train t1 --vehicle finsrov --seed 1 --out runs/hold
+
+    Example: finssim train docking --until 0.95 --out runs/dock
+
+    Example: finssim train t2 --learner rsl-rl --randomize hold_for_position --set epochs=8 --out runs/track
+
     Args:
-        task: Key of `TASKS`, FILE.py:CLASS of one's own, or a task.
-        out: Policy directory to write; an earlier policy there is replaced.
-        learner: Key of `LEARNERS`.
-        vehicle: A vehicle, a catalogue name or a file.
-        hydrodynamics: calibrated, mesh or simplified.
-        action: wrench6, wrench4 or thruster8; the task's own if None.
-        randomize: Name or file of ranges that vehicle and water are drawn from in every episode.
-        observe: What the policy sees: training (the task's noise), sensors, estimator or truth; see `finssim.make`.
-        seed: Of everything random.
-        worlds: Worlds at once; the settings' own if None.
-        steps: Control steps of all worlds together; the settings' own if None.
-        until: Share of successes among the held episodes, in (0, 1], at which the training is done before its steps
-            are: reached in two evaluations one after the other.
-        settings: Changes of the learner's settings by name.
-        device: cpu or cuda.
-        resume: Go on from the last checkpoint of a training that was started with the same arguments.
+        task (TASK): Task to learn: t1 (station keeping), t2 (trajectory tracking), t3 (moving target), docking,
+            pursuit, team-pursuit or formation; or one's own, FILE.py:CLASS.
+        out: Directory of the policy; an earlier policy there is replaced when done.
+        learner (NAME): Who learns: ppo (FinsSim's own), sb3-ppo, sb3-sac, sb3-recurrent-ppo or rsl-rl; one agent also
+            torchrl-ppo, several torchrl-ippo or torchrl-mappo; from demonstrations bc, dagger or gail.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
+        action (MODE): What the policy commands: wrench6, wrench4 or thruster8; the task's own if not given.
+        randomize (FILE): Ranges that vehicle and water are drawn from: hold_for_position, fossen_learn_to_swim,
+            equivalent_box, pool, no_thruster_dynamics, or a file.
+        observe (FILE|NAME): What is seen: training (the task's noise), sensors (the vehicle's own and position fixes,
+            through a filter), a file of other fixes, estimator (about what localization is off by) or truth.
+        seed: Seed of every random number; equal seeds give equal results.
+        worlds: Worlds simulated at once.
+        steps: Control steps to learn from, all worlds together; what the task needs if not given.
+        until (SHARE): Share of successes, such as 0.95, at which the training is done before its steps are: of the held
+            episodes, in two evaluations one after the other.
+        settings (NAME=VALUE): Change of a setting of the learner, such as learning_rate=1e-3 or hidden=128,128. May be
+            given several times.
+        resume: Go on from the last checkpoint of a training that was killed.
+        device (DEVICE): Where to compute: cpu or cuda.
         console: Where progress is shown; standard error if None.
         shown: Name of the directory in messages, where `out` is a temporary one.
         interrupted: Where the policy so far goes after Ctrl-C; if None, `out`, or `OUT-training/interrupted` where
@@ -117,8 +128,8 @@ def train(
 
     checkpoint = last_checkpoint(side) if resume else None
     randomized = randomization is not None
-    plan, settings = _level_plan(settings or {})
-    values = kind.settings(the_task, randomized=randomized, worlds=worlds, steps=steps, changes=settings)
+    plan, changes = _level_plan(settings if isinstance(settings, Mapping) else settings_of_words(settings))
+    values = kind.settings(the_task, randomized=randomized, worlds=worlds, steps=steps, changes=changes)
 
     def worlds_of(count: int, ranges: Randomization | None, its_seed: int, **more: Any) -> Environment:
         return make(

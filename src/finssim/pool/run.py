@@ -11,10 +11,9 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-import typer
 
 from finssim.control.guidance import Station
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
@@ -40,7 +39,7 @@ from finssim.tasks.observer import fitted_task
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
 
-__all__ = ["MCU_PORT", "PoolPlan", "make_plan", "run", "run_team", "swimming"]
+__all__ = ["MCU_PORT", "PoolPlan", "make_plan", "run", "swimming"]
 
 MCU_PORT = 58766
 """Of the motor controller; pictures come from the next port, lock-step is the one after."""
@@ -124,27 +123,80 @@ def make_plan(
 
 
 def run(
-    vehicle: str,
     *,
-    plant: str,
-    severity: Severity,
-    lockstep: bool,
-    camera: Literal["pictures", "corners", "none"],
-    pictures: str,
-    port: int,
-    bind: str,
-    robot: str,
-    pool_file: Path | None,
-    truth: Path | None,
-    start: str | None,
-    duration: float | None,
-    seed: int,
+    vehicle: str = "finsrov",
+    plant: str = "1",
+    severity: Severity = "realistic",
+    lockstep: bool = False,
+    camera: Literal["pictures", "corners", "none"] | None = None,
+    pictures: str = "udp",
+    port: int = MCU_PORT,
+    bind: str = "127.0.0.1",
+    robot: str = "127.0.0.1:54321",
+    pool_file: Path | None = None,
+    truth: Path | None = None,
+    start: str | None = None,
+    task: str | None = None,
+    team: str | None = None,
     site: str = "pool",
     positioning: str = "none",
+    duration: Annotated[float | None, (0.0, None)] = None,
+    seed: int = 0,
 ) -> None:
-    """Run a virtual pool; arguments as of the command."""
+    """Be the vehicle and its pool for a robot on this machine, until Ctrl-C.
+
+    Example: finssim pool --plant 1 --severity realistic --pool-file pool.yaml --truth truth.fst
+
+    Args:
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        plant (SEED|FILE): Plant in the water: a seed to draw it from, or a plant file.
+        severity (NAME): How far a drawn plant and its camera are from what is known: nominal, realistic or hard.
+        lockstep: Time goes as fast as one robot asks, instead of in real time.
+        camera (KIND): What the camera sends: pictures, corners (of the tags) or none. If not given: pictures, over a
+            team corners, in open water and of a task none.
+        pictures (WAY): How pictures travel in real time: udp, or shm:NAME (shared memory; shm alone: pool, and
+            pool-PORT on another port than the default).
+        port: UDP port of the motor controller; pictures leave from the next, lock-step (TCP) is the one after.
+        bind (ADDRESS): Address of this end: this machine alone unless given.
+        robot (HOST:PORT): The only robot that may command in real time; its pictures go to the port after this.
+        pool_file (FILE): Pool file to write: the camera as its calibration has it (.yaml).
+        truth (FILE): File to write what truly happened into, for scoring; of a team a folder.
+        start (X,Y,Z,YAW): Where the vehicle starts, world frame: x,y,z [m], yaw [deg]; in the middle if not given.
+        task (TASK): The site of a task in open water, in real time, with ports as of --team; messages between the
+            robots go to the port five after --port. What the task commands is commanded here; the task scores what is
+            true.
+        team (NAME,NAME): Several vehicles in one water, in real time: names or files with commas between, the agents of
+            --task, or side by side without. Each has a motor controller, at --port, ten ports on, and so on, for a
+            robot at --robot, ten ports on, and so on. A camera sees them all; each has tags of its own ids.
+        site (NAME): Where: pool, tank or open-water (current, waves, 20 m of water).
+        positioning (NAME): Fixes on the robot's wire: none, motion-capture or usbl.
+        duration: When to end, pool's clock [s]; never if not given.
+        seed: Seed of every random number; equal seeds give equal results.
+
+    Raises:
+        PlantSpecError, LinkError, GoalError, VehicleError, OutputError: What cannot be used.
+    """
     logging.basicConfig(level=logging.WARNING, format="finssim: %(message)s", stream=sys.stderr)
     positioning_of(positioning, seed)  # refuses what is none
+    if task is not None or team is not None:
+        files = task is not None and (pool_file is not None or truth is not None)
+        if not plant.isdecimal() or lockstep or start is not None or files:
+            raise PlantSpecError(
+                "--team and --task draw their plants, their time is real and their starts are their own: give a seed "
+                "for --plant, leave --lockstep and --start out, and of a task --pool-file and --truth"
+            )
+        bodies = [load_vehicle(name.strip()) for name in (team or vehicle).split(",")]
+        calibrated = None
+        if task is None:
+            made, calibrated = swimming(
+                bodies, int(plant), severity, camera or ("none" if site == "open-water" else "corners"), site,
+                positioning, truth=truth, seed=seed,
+            )  # fmt: skip
+        else:
+            made = _playing(task, bodies, int(plant), severity, positioning, seed)
+        _serve_team(made, calibrated, (bind, port), host_port(robot, "--robot"), pool_file, duration)
+        return
+    camera = camera or ("none" if site == "open-water" else "pictures")
     plan = make_plan(vehicle, plant, severity, camera=camera, seed=seed, site=site)
     plan = replace(plan, positioning=positioning)
     start = start or f"0,0,{-0.5 * plan.spec.basin.depth:g},0"
@@ -174,46 +226,19 @@ def run(
         _realtime(plan, make_world, (bind, port), host_port(robot, "--robot"), wire, longest)
 
 
-def run_team(
-    team: Sequence[str],
-    *,
-    task: str | None,
-    plant: int,
-    severity: Severity,
-    camera: Literal["pictures", "corners", "none"],
-    site: str,
-    positioning: str,
-    port: int,
-    bind: str,
-    robot: str,
+def _serve_team(
+    made: Fleet,
+    calibrated: Pool | None,
+    ours: tuple[str, int],
+    theirs: tuple[str, int],
     pool_file: Path | None,
-    truth: Path | None,
     duration: float | None,
-    seed: int,
 ) -> None:
-    """Run a site of several vehicles, or of a task, with a robot for each; arguments as of the command.
-
-    Args:
-        team: Vehicles, by place; one for all of a task.
-        task: That is played in open water and scored; None: the vehicles swim side by side.
-        truth: Folder that takes NAME.truth of each, without a task.
-    """
-    logging.basicConfig(level=logging.WARNING, format="finssim: %(message)s", stream=sys.stderr)
-    positioning_of(positioning, seed)  # refuses what is none
-    bodies = [load_vehicle(name) for name in team]
-    made: Fleet
-    calibrated = None
-    if task is None:
-        made, calibrated = swimming(
-            bodies, plant, severity, camera, site, positioning, truth=truth, seed=seed
-        )
-        names = tuple(made.worlds)
-    else:
-        made = _playing(task, bodies, plant, severity, positioning, seed)
-        names = made.task.agents
+    """Serve several vehicles, each to a robot of its own, from their first addresses on ten ports apart."""
+    (bind, port), (host, first) = ours, theirs
+    names = made.task.agents if isinstance(made, TaskSite) else tuple(made.worlds)
     if not 0 < port <= 65535 - 10 * len(names):
         raise LinkError(f"port {port}: expected room for ten ports to each of {len(names)} vehicles after it")
-    host, theirs = host_port(robot, "--robot")
     with _stoppable() as asked, ExitStack() as stack:
         stack.callback(made.close)
         messages, sinks = None, []
@@ -222,11 +247,11 @@ def run_team(
             stack.callback(messages.close)
         transports = {}
         for i, name in enumerate(names):
-            transports[name] = UdpTransport((bind, port + 10 * i), (host, theirs + 10 * i))
+            transports[name] = UdpTransport((bind, port + 10 * i), (host, first + 10 * i))
             stack.callback(transports[name].close)
             _say(f"{name}: {_name(transports[name].address)}, for {_name(transports[name].peer)} alone")
             if calibrated is not None:
-                sinks.append(UdpSender((bind, port + 10 * i + 1), (host, theirs + 10 * i + 1)))
+                sinks.append(UdpSender((bind, port + 10 * i + 1), (host, first + 10 * i + 1)))
                 stack.callback(sinks[-1].close)
         if calibrated is not None and pool_file is not None:
             write_pool(calibrated, pool_file)
@@ -481,5 +506,5 @@ def _name(address: tuple[str, int]) -> str:
 
 
 def _say(line: str) -> None:
-    typer.echo(line)
+    print(line, flush=True)
     sys.stdout.flush()

@@ -12,6 +12,25 @@ from finssim.robot.record_types import RecordError
 __all__ = ["refuse_foreign", "repair_record", "write_whole"]
 
 
+def repair(
+    file: Path,
+    *,
+    out: Path | None = None,
+) -> None:
+    """Write a whole record of all that can be read of a cut or damaged one; FILE itself stays as it is.
+
+    Example: finssim record repair run.mcap --out whole.mcap
+
+    Args:
+        file (FILE): Record of a run (.mcap).
+        out (FILE): File to write; FILE-repaired.mcap if not given.
+    """
+    target = out or file.with_name(f"{file.stem}-repaired.mcap")
+    for note in repair_record(file, target) or ["nothing is damaged"]:
+        print(note)
+    print(f"wrote {target}")
+
+
 def repair_record(path: Path, out: Path) -> list[str]:
     """Write a whole record of all that can be read of a cut or damaged one.
 

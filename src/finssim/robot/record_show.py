@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
-from collections.abc import Collection
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from finssim.robot.record_info import describe_record
 from finssim.robot.record_play import as_json as json_line
@@ -19,8 +20,18 @@ __all__ = ["info", "play_record"]
 EVENTS_SHOWN = 20
 
 
-def info(path: Path, *, as_json: bool) -> None:
-    """Print what a record holds.
+def info(
+    path: Path,
+    *,
+    as_json: bool = False,
+) -> None:
+    """Tell what a record holds: vehicle, duration [s], topics with rates [Hz] and gaps [s], events, damage.
+
+    Example: finssim record info run.mcap
+
+    Args:
+        path (FILE): Record of a run (.mcap).
+        as_json: Print one JSON object instead of tables.
 
     Raises:
         RecordError: Not a record.
@@ -35,9 +46,25 @@ def info(path: Path, *, as_json: bool) -> None:
 
 
 def play_record(
-    path: Path, *, speed: float, topics: Collection[str] | None, start: float, as_json: bool
+    path: Path,
+    *,
+    speed: float = 1.0,
+    fast: bool = False,
+    topics: Annotated[Sequence[str] | None, ","] = None,
+    start: Annotated[float, (0.0, None)] = 0.0,
+    as_json: bool = False,
 ) -> None:
-    """Print the messages of a record in their time.
+    """Print the messages of a record as they came, a line each [s, SI units]; pictures by their size.
+
+    Example: finssim play run.mcap --topics odom,events --speed 4
+
+    Args:
+        path (FILE): Record of a run (.mcap).
+        speed (FACTOR): Times as fast as it was recorded.
+        fast: Without waiting.
+        topics (NAMES): Only these, with commas between: odom,thruster_cmd.
+        start: Begin so long after the start of the record [s].
+        as_json: Print one JSON object a line instead of text.
 
     Raises:
         RecordError: Not a record, no such topic, or a speed that is not above zero.
@@ -46,7 +73,8 @@ def play_record(
         for note in record.notes:
             print(note, file=sys.stderr)
         first = next((at for at, _, _ in record.sizes()), 0.0) + start if start else None
-        played = play(record, speed=speed, clock=time.monotonic, wait=time.sleep, topics=topics, start=first)
+        pace = math.inf if fast else speed
+        played = play(record, speed=pace, clock=time.monotonic, wait=time.sleep, topics=topics, start=first)
         for entry in played:
             print(json_line(entry) if as_json else as_line(entry), flush=True)
 

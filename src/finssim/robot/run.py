@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from rich.console import Console
 
@@ -18,6 +18,7 @@ from finssim.control.guidance import Station
 from finssim.control.trim import Trim
 from finssim.localization.pool import load_pool
 from finssim.robot.goals import check_reachable, guide_of
+from finssim.robot.interrupt import follow_parent
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import Pilot, make_pilot
 from finssim.robot.recorder import Recorder
@@ -43,49 +44,105 @@ MUTE = 3.0
 
 
 def run(
-    policy: str,
     *,
-    goal: str | None,
-    trajectory: str | None,
-    pool_file: Path | None,
-    vehicle: str | Vehicle = "finsrov",
-    site: str = "pool",
-    number: int = 0,
+    policy: str | None = None,
     task: str | None = None,
     agent: str | None = None,
-    wiring: Wiring | None = None,
-    record: Path | None = None,
-    duration: float | None = None,
-    mode: str = "constant-velocity",
+    goal: str | None = None,
+    trajectory: str | None = None,
+    robot: str = "pool",
+    bind: str = "127.0.0.1:54321",
+    pictures: str | None = None,
+    pool_file: str | None = None,
+    site: str | None = None,
+    team: str | None = None,
+    messages: str = "",
+    number: Annotated[int, (0, None)] = 0,
+    vehicle: str = "finsrov",
     trim: bool = False,
+    mode: str = "constant-velocity",
+    record: Path | None = None,
+    duration: Annotated[float | None, (0.0, None)] = None,
+    lockstep: bool = False,
     arm: bool = False,
     as_json: bool = False,
 ) -> int:
-    """Run a robot and print how it went.
+    """Run a controller on a vehicle: estimate, decide, command; print how it went. Ctrl-C stops the thrusters.
+
+    Exit status 3: the run ended in a fault of the vehicle; 4: the vehicle said nothing.
+
+    Example: finssim run --policy runs/hold --goal 0.5,0,-0.5,90 --pool-file pool.yaml --duration 60 --arm
+
+    Example: finssim run --team runs/team --duration 60 --arm
 
     Args:
-        policy: A policy's directory, or the name of a PID.
-        goal: "x,y,z,yaw_deg" or a file.
-        trajectory: Name or file, in place of a goal.
-        pool_file: Camera, water and frames; None: no camera looks, and the pool frame is the world's.
-        vehicle: A vehicle, its name or file, for which a policy must have been trained.
-        site: Where it is, by which it is equipped: pool, tank or open-water.
-        number: Among several under one camera, by which its tags have other ids.
-        task: That the policy must have been trained for, or whose baseline acts.
-        agent: Place of this vehicle in a task of several.
-        wiring: How the robot is connected; to the virtual pool of this machine if None.
-        record: File that takes down everything.
-        duration: When to end [s]; at the end of a trajectory, or when interrupted, if None.
-        mode: Of the estimator.
-        trim: Put an integral in front of a policy.
-        arm: Let thrusters turn.
-        as_json: Print one JSON object.
+        policy (DIR|NAME): A policy's directory, or pid, or pid-paper, or with --task one of the task's baselines.
+        task (TASK): Task that the policy must have been trained for, by name (see finssim tasks) or as FILE.py:CLASS of
+            one's own; the policy's if not given.
+        agent (NAME): This vehicle's place in a task of several; its first if not given.
+        goal (X,Y,Z,YAW|FILE): Station to keep: x,y,z [m] in the world frame (z = 0 on the water, negative below) and
+            heading [deg], or a file with goal: [x, y, z, yaw_deg].
+        trajectory (NAME|FILE): Trajectory to follow in place of a goal: straight, broken, ellipse, lemniscate, circle,
+            helix, or a file.
+        robot (ADDRESS): Motor controller: udp://HOST:PORT, serial:DEVICE, or pool for the virtual pool on this machine.
+            With --lockstep: pool, or HOST:PORT.
+        bind (ADDRESS:PORT): Address and port of this end, for udp; pictures come to the port after it. Loopback unless
+            given.
+        pictures (ADDRESS): Overhead camera: udp://HOST:PORT, shm:NAME or none; the virtual pool's with --robot pool,
+            otherwise none, if not given.
+        pool_file (FILE|none): Pool file: camera, water plane and frames (.yaml); none where no camera looks. If not
+            given: pool.yaml, of --team none.
+        site (NAME): Where: pool, tank or open-water. The workspace, and in open water Doppler log and compass, are then
+            those of finssim pool --site. If not given: pool, of --team open-water.
+        team (DIR|NAME): In place of --policy: who steers all agents of a task, each with a stack in a process of its
+            own. Their motor controllers and own ends are those of --robot and --bind, ten ports on, and so on. An
+            address is taken for that of --messages.
+        messages (ADDRESS): What carries messages between vehicles, such as finssim pool --task: HOST:PORT. Of --team
+            the port five after --robot if not given.
+        number: This vehicle's number among several under one camera: its tags' ids go on after those of the one before.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        trim: Put an integral in front of a policy, against a steady current or weight.
+        mode (MODE): Estimator: constant-velocity or error-state.
+        record (FILE): Record everything into this file (.mcap); of --team a folder with a file for each.
+        duration: End after this time [s]; at the end of the trajectory, or with Ctrl-C, if not given.
+        lockstep: Take turns with finssim pool --lockstep, as fast as both compute.
+        arm: Let thrusters turn, as soon as the state is known. Without it they never do.
+        as_json: Print one JSON object instead of tables.
 
-    Returns:
-        Exit status: 0, `FAULT` or `UNHEARD`.
+    Raises:
+        ControlError, PolicyError, GoalError, VehicleError, LinkError, OutputError: What cannot be used.
     """
-    wiring, console = wiring or Wiring(), Console(stderr=True)
-    filed = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
+    follow_parent()
+    if team is not None and _is_address(team):
+        team, messages = None, team
+    if (policy is None) == (team is None):
+        raise ControlError("who steers? give --policy for this vehicle, or --team for all of a task")
+    if team is not None:
+        if agent is not None or trajectory is not None or lockstep or number:
+            raise ControlError(
+                "--team has every agent in its place: leave --agent, --trajectory, --lockstep and --number out"
+            )
+        from finssim.robot.team_run import run_team
+
+        site, camera = site or "open-water", pool_file or "none"
+        options = {
+            "--site": site,
+            "--pool-file": camera,
+            "--goal": goal,
+            "--mode": mode,
+            "--duration": duration,
+        }
+        words = [word for name, x in options.items() if x is not None for word in (name, str(x))]
+        words += [name for name, on in (("--trim", trim), ("--arm", arm)) if on]
+        return run_team(
+            team, words, task=task, vehicle=vehicle, robot=robot, bind=bind, messages=messages, record=record,
+            as_json=as_json,
+        )  # fmt: skip
+    assert policy is not None
+    wiring = Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep, team=messages)
+    console, site = Console(stderr=True), site or "pool"
+    file = None if pool_file == "none" else Path(pool_file or "pool.yaml")
+    filed = load_vehicle(vehicle)
     ours = numbered(vehicle_at(site, filed), number)
     guide = _GO if wiring.team and goal is None and trajectory is None else guide_of(goal, trajectory)
     if guide is not _GO:
@@ -97,7 +154,7 @@ def run(
             highlight=False,
         )
     pilot = _pilot(policy, filed, task, trim, agent=agent, follows=trajectory is not None)
-    pool = None if pool_file is None else load_pool(pool_file)
+    pool = None if file is None else load_pool(file)
     perception = Perception(ours, pool, mode=mode)
     meta = {
         "command": "finssim run",
@@ -106,14 +163,8 @@ def run(
         "guide": guide.name,
         "armed": arm,
     }
-    record_with = (
-        record,
-        filed,
-        {**meta, **({"pool_sha256": pool.sha256} if pool else {})},
-        pool_file,
-        wiring,
-    )
-    with _opened(connected(wiring, ours, pool), *record_with) as (drive, recorder):
+    meta |= {"pool_sha256": pool.sha256} if pool else {}
+    with _opened(connected(wiring, ours, pool), record, filed, meta, file, wiring) as (drive, recorder):
         if not arm:
             console.print("dry run: thrusters will not turn without --arm")
         runtime = Runtime(
@@ -144,6 +195,12 @@ def run(
     if watch.state == "fault":
         return FAULT
     return UNHEARD if runtime.counters.steps and not runtime.counters.telemetry else 0
+
+
+def _is_address(text: str) -> bool:
+    """Whether that is HOST:PORT."""
+    host, _, port = text.rpartition(":")
+    return bool(host) and port.isdecimal()
 
 
 def _pilot(

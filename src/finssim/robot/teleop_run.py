@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Annotated
 
 from finssim.control.guidance import Guide, Station
 from finssim.localization.pool import Pool, load_pool
@@ -110,21 +111,39 @@ def _crew(
 
 
 def run(
-    vehicle: str,
     *,
-    device: str,
-    robot: str,
-    bind: str,
-    pool_file: Path | None,
-    pictures: str | None,
-    policy: str | None,
-    goal: str | None,
-    record: Path | None,
-    key_hold: float,
-    rate: float,
-    duration: float | None,
+    vehicle: str = "finsrov",
+    device: str = "gamepad",
+    robot: str = "pool",
+    bind: str = "127.0.0.1:54321",
+    pool_file: Path | None = None,
+    pictures: str | None = None,
+    policy: str | None = None,
+    goal: str | None = None,
+    record: Path | None = None,
+    key_hold: float = 0.6,
+    rate: Annotated[float, (20.0, 200.0)] = 60.0,
+    duration: Annotated[float | None, (0.0, None)] = None,
 ) -> None:
-    """Open everything, drive, and put everything back.
+    """Drive by hand. Starts disarmed; START or enter arms; without a hand on LB or the keys there is no thrust.
+
+    Example: finssim teleop --device keyboard --robot pool --record drive.mcap
+
+    Args:
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        device (NAME): What is in the hands: gamepad or keyboard.
+        robot (WIRE): Wire to the motor controller: udp://HOST:PORT, serial:DEVICE, dry-run, or pool (the virtual pool
+            on this machine).
+        bind (ADDRESS:PORT): This end of the wire, for UDP.
+        pool_file (FILE): Pool file: camera, water plane and frames (.yaml); without it nobody knows the position.
+        pictures (ADDRESS): Overhead camera: udp://HOST:PORT, shm:NAME or none; the virtual pool's with --robot pool,
+            otherwise none, if not given. Needs --pool-file.
+        policy (DIR|pid): Whom SELECT or m hands over to: pid, or a policy's directory. Needs --pool-file and --goal.
+        goal (X,Y,Z,YAW): Where the policy steers to, in m and deg.
+        record (FILE): Record of the run to write (.mcap).
+        key_hold (S): A key counts as held so long after its last press [s].
+        rate: Turns of the loop a second [Hz].
+        duration: End after so long [s]; with Ctrl-C if not given.
 
     Raises:
         TeleopError, LinkError, VehicleError, LocalizationError, PolicyError, OutputError: What cannot be used.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -80,14 +81,25 @@ class Plan:
         path.write_text(yaml.dump(tree, Dumper=_Quoting, sort_keys=False), encoding="utf-8")
 
 
-def run_node(name: str) -> int:
-    """Run a node in this process, its parameters from the command line; the exit status.
+def run_node(name: str, *words: str) -> int:
+    """Run one node in this process, until Ctrl-C; its parameters come after --ros-args, or from a file there.
+
+    Example: finssim ros2 node state_estimation
+
+    Args:
+        name (NAME): camera, controller, hardware_bridge, localizer, recorder, sim, state_estimation, teleop or
+            virtual_pool; after it --ros-args as for any ROS 2 node.
+        words: What follows it on the command line.
+
+    Returns:
+        The exit status.
 
     Raises:
         Ros2Error: There is no such node.
     """
     from finssim.quiet import start_warp
 
+    sys.argv = [name, *words]
     if name not in NODES:
         raise Ros2Error(f"unknown node '{name}'; available: {', '.join(NODES)}")
     start_warp()

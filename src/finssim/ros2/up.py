@@ -8,12 +8,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from finssim.robot.goals import check_reachable, guide_of
 from finssim.robot.interrupt import interruptible
+from finssim.ros2.backend import activate
 from finssim.ros2.errors import Ros2Error
-from finssim.ros2.graphs import MCU_PORT, Plan, topics_of
+from finssim.ros2.graphs import Plan, topics_of
 from finssim.ros2.supervisor import Supervisor
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import vehicle_at
@@ -33,31 +34,59 @@ STARTING = 180.0
 class Options:
     """What a person may choose."""
 
-    vehicle: str = "finsrov"
-    namespace: str | None = None
-    site: str = "pool"
-    positioning: str = "none"
     policy: str = "pid"
+    """(DIR|pid|pid-paper) A policy's directory, or pid, or pid-paper."""
     task: str | None = None
+    """Task that the policy must have been trained for; its own if not given."""
     trim: bool = False
+    """Put an integral in front of a policy, against a steady current or weight."""
+    vehicle: str = "finsrov"
+    """(NAME|FILE) Vehicle of the catalogue, or the path of a vehicle file."""
+    namespace: str | None = None
+    """(NAME) What the vehicle's topics stand below and its own frames begin with, such as robot_1: one for each of
+    several vehicles in a graph. The vehicle's name, and no prefix, if not given."""
+    site: str = "pool"
+    """(NAME) Where: pool, tank or open-water, where no camera looks and Doppler log and compass are aboard."""
+    positioning: str = "none"
+    """(NAME) Fixes on the wire of a virtual pool: none, motion-capture or usbl."""
     goal: str | None = None
+    """(X,Y,Z,YAW|FILE) Station to keep: x,y,z [m] in the map (z = 0 on the water) and heading [deg], or a file; the
+    place where it is armed if not given. The topic goal changes it."""
     trajectory: str | None = None
+    """(NAME|FILE) Trajectory to follow in place of a goal: a name or a file."""
     arm: bool = False
+    """Arm once, as soon as the state is known; otherwise the topic arm does."""
     robot: str = "pool"
+    """(ADDRESS) Motor controller of a robot: udp://HOST:PORT, serial:DEVICE, dry-run, or pool for a finssim pool on
+    this machine."""
     bind: str = "127.0.0.1:54321"
+    """(ADDRESS:PORT) Own end for udp; pictures are taken at the port after it."""
     pictures: str | None = None
+    """(ADDRESS) Overhead camera of a robot: udp://HOST:PORT, shm:NAME or none; the pool's with --robot pool."""
     pool_file: Path | None = None
+    """(FILE|none) Pool file: read by a robot, written by a virtual pool (.yaml); none where no camera looks."""
     plant: str = "1"
+    """(SEED|FILE) Plant of a virtual pool: a seed, or a file."""
     severity: str = "realistic"
+    """(NAME) Of a drawn plant: nominal, realistic or hard."""
     camera: str = "pictures"
-    port: int = MCU_PORT
+    """(KIND) What a virtual pool's camera sends: pictures, corners (of the tags) or none."""
+    port: int = 58766
+    """UDP port of a virtual pool; its pictures leave from the next."""
     truth: Path | None = None
+    """(FILE) File for what truly happened in a virtual pool."""
     start: str | None = None
+    """(X,Y,Z,YAW) Where the vehicle starts in sim and pool: x,y,z [m], yaw [deg]."""
     hydrodynamics: str | None = None
+    """(MODEL) Model of sim: calibrated, mesh or simplified."""
     record: Path | None = None
+    """(FILE) Record all topics into this file (.mcap)."""
     teleop: str | None = None
-    duration: float | None = None
+    """(DEVICE) Also drive by hand: joy (topic), gamepad or keyboard. The bridge then arms without localization."""
+    duration: Annotated[float | None, (0.0, None)] = None
+    """End so long after the start [s]; with Ctrl-C if not given."""
     seed: int = 0
+    """Seed of every random number; equal seeds give equal results."""
 
 
 def plan_of(graph: str, options: Options, pool_file: Path) -> Plan:
@@ -118,11 +147,15 @@ def _wire(plan: Plan, o: Options) -> None:
     plan.set("camera", pictures=camera, pictures_bind=f"{host}:{int(port) + 1}")
 
 
-def up(graph: str, options: Options, say: Callable[[str], None]) -> int:
-    """Run a graph until its time is over, all nodes have died, or Ctrl-C.
+def up(graph: str, *, options: Options, say: Callable[[str], None] = print) -> int:
+    """Start a graph of nodes as processes, print its topics and what happens, and end it with Ctrl-C.
+
+    Exit status 1: a node died. 3: the bridge ended in a fault.
+
+    Example: finssim ros2 up pool --policy pid --goal 0.5,0,-0.5,90 --arm --duration 60
 
     Args:
-        graph: sim, pool or robot.
+        graph (sim|pool|robot): sim (a vehicle of the engine), pool (the virtual pool and a robot in it) or robot.
         options: As the person chose.
         say: Takes a sentence.
 
@@ -132,6 +165,7 @@ def up(graph: str, options: Options, say: Callable[[str], None]) -> int:
     Raises:
         TwinError: Another graph of the same namespace is on the wire.
     """
+    activate()
     import rclpy
 
     from finssim.ros2.watcher import Watcher

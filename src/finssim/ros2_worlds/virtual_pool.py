@@ -38,7 +38,7 @@ class VirtualPoolNode(RobotNode):
     def spin(self) -> None:
         """Be the pool until SIGINT or SIGTERM."""
         where = {"bind": "127.0.0.1", "site": self._site, **self.plan}
-        serve(self._vehicle_name, lockstep=False, duration=None, **where)
+        serve(vehicle=self._vehicle_name, **where)
 
 
 def _path(text: str) -> Path | None:

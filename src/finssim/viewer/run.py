@@ -8,9 +8,7 @@ import time
 import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import typer
+from typing import Annotated, Any
 
 from finssim.robot.interrupt import interruptible
 from finssim.vehicles import load_vehicle
@@ -32,23 +30,41 @@ HEEDED = {
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
-    """What a person wants to look at; fields as the options of the command."""
+    """What a person wants to look at."""
 
-    source: str = "pool"
+    source: Annotated[str, "argument"] = "pool"
+    """(pool|sim|FILE|FOLDER) What to look at: pool (the virtual pool with a robot in it), sim (the simulator), a record
+    (.mcap), or a folder that the engine's recorder wrote."""
     vehicle: str | None = None
+    """(NAME|FILE) Vehicle of the catalogue, or the path of a vehicle file; finsrov, or that of the record, if not
+    given."""
     policy: str = "pid"
+    """(DIR|pid|pid-paper) Who steers in pool and sim: a policy's directory, or pid, or pid-paper."""
     task: str | None = None
+    """(TASK) Task that the policy must have been trained for: t1 or t2; t2 also follows a trajectory if none is
+    named."""
     goal: str | None = None
+    """(X,Y,Z,YAW|FILE) Station to keep in pool and sim: x,y,z [m] in the world frame and heading [deg], or a file."""
     trajectory: str | None = None
+    """(NAME|FILE) Trajectory to follow in place of a goal: a name or a file."""
     plant: str = "1"
+    """(SEED|FILE) Plant in the pool: a seed to draw it from, or a plant file."""
     severity: str = "realistic"
+    """(NAME) How hard a drawn plant is: nominal, realistic or hard."""
     camera: str = "corners"
+    """(KIND) What the pool's camera sends: pictures, or corners (of the tags)."""
     hydrodynamics: str = "calibrated"
+    """(MODEL) Hydrodynamic model: calibrated, simplified or mesh."""
     truth: Path | None = None
+    """(FILE) Truth file of the pool that a record was made in, to show beside it."""
     truth_offset: float | None = None
+    """Robot's clock when the pool's showed 0 [s]; found by comparing both motions if not given."""
     basin: str | None = None
-    world: int | None = None
+    """(L,W,D) Pool to draw around a record: length,width,depth [m]; the vehicle's workspace if not given."""
+    world: Annotated[int | None, (0, None)] = None
+    """World of a folder's run; the first that it has if not given."""
     seed: int = 0
+    """Seed of every random number; equal seeds give equal results."""
 
 
 def open_source(choice: Choice) -> Source:
@@ -84,15 +100,34 @@ def open_source(choice: Choice) -> Source:
 
 
 def run(
-    choice: Choice, *, speed: float, port: int, bind: str, browser: bool, duration: float | None = None
+    choice: Choice,
+    *,
+    speed: Annotated[float, (0.01, 100.0)] = 1.0,
+    port: Annotated[int, (1, 65535)] = 8080,
+    bind: str = "127.0.0.1",
+    no_browser: bool = False,
+    duration: Annotated[float | None, (0.0, None)] = None,
 ) -> None:
-    """Show a source until Ctrl-C; arguments as of the command."""
+    """Look at a vehicle in the browser, live or recorded: poses, goal, forces, camera, health, errors [m, deg].
+
+    Example: finssim view run.mcap --truth truth.fst --basin 4,2,1
+
+    Example: finssim view pool --policy pid --trajectory ellipse --severity hard --camera pictures
+
+    Args:
+        choice: What to look at.
+        speed: Times as fast as real.
+        port: Port of the page; the next free one if it is taken.
+        bind (ADDRESS): Address to serve at: this machine alone unless given.
+        no_browser: Print the page's address, and do not open it.
+        duration: When to end [s] after the page is up; with Ctrl-C if not given.
+    """
     from finssim.viewer.app import View
 
     view = View(open_source(choice), bind=bind, port=port, speed=speed)
-    typer.echo(f"{view.source.stage.title}\nview: {view.url}   (Ctrl-C ends)")
+    print(f"{view.source.stage.title}\nview: {view.url}   (Ctrl-C ends)")
     sys.stdout.flush()
-    if browser:
+    if not no_browser:
         webbrowser.open(view.url)
     end = time.monotonic() + (math.inf if duration is None else duration)
     try:

@@ -444,13 +444,20 @@ LATE = 0.03
 """Offset between streams that a fit must know of [s]."""
 
 
-def check(paths: Sequence[Path], *, vehicle: str | None = None, as_json: bool = False) -> None:
-    """Check trials and print what was found.
+def check(
+    paths: Sequence[Path],
+    *,
+    vehicle: str | None = None,
+    as_json: bool = False,
+) -> None:
+    """Say what trials can and cannot identify: rates [Hz], gaps [s], clock jumps, saturation, excitation.
+
+    Example: finssim trials check trials --vehicle bluerov2
 
     Args:
-        paths: Each a trial, or a folder that holds trials.
-        vehicle: Name or file; before those that the trials name.
-        as_json: One JSON object instead of tables.
+        paths (TRIAL): Trial folders, folders of them, or bare .csv or .parquet tables.
+        vehicle (NAME|FILE): Vehicle that made them, where their headers name none.
+        as_json: Print one JSON object instead of tables.
 
     Raises:
         CalibrationError: There is no trial at a path.

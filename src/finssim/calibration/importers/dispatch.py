@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 
@@ -31,7 +33,7 @@ from finssim.mcap_repair import whole_mcap
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.part import did_you_mean
 
-__all__ = ["FORMATS", "Format", "import_trials", "read_trials"]
+__all__ = ["FORMATS", "Format", "import_logs", "import_trials", "print_folders", "read_trials"]
 
 # ROS 2 bags, sqlite3 or MCAP, and ROS 1 bags, without ROS: topics as streams.
 
@@ -356,6 +358,42 @@ FORMATS: tuple[Format, ...] = get_args(Format)
 Group = tuple[str, list[Stream], dict[str, Any]]
 
 ARDUPILOT = (".bin", ".tlog")
+
+
+def import_logs(
+    logs: Sequence[Path],
+    *,
+    out: Path,
+    column_map: Annotated[Path | None, "--map"] = None,
+    format: Format = "auto",
+    vehicle: str | None = None,
+    split: str | None = None,
+    as_json: bool = False,
+) -> None:
+    """Make trial folders of logs, in SI units and the body frame x forward, y left, z up.
+
+    Example: finssim trials import dive.BIN --vehicle bluerov2 --split arming --out trials
+
+    Args:
+        logs (LOG): Tables (.csv, .parquet), ArduSub logs (.BIN, .tlog), ROS 2 bags (.mcap, .db3, folder).
+        out (DIR): Folder in which the trial folders are made.
+        column_map (FILE): Map of the log's columns or topics, with units and frames (.yaml).
+        format (FORMAT): auto (by suffix), csv, ardupilot or rosbag.
+        vehicle (NAME|FILE): Vehicle that made the logs.
+        split (RULE): Several trials of one log: by phase, gaps, gaps=SECONDS, arming or column.
+        as_json: Print one JSON object instead of tables.
+    """
+    folders = import_trials(
+        logs, out=out, column_map=column_map, format=format, vehicle=vehicle, split=split,
+        say=lambda note: print(note, file=sys.stderr),
+    )  # fmt: skip
+    print_folders(folders, as_json)
+
+
+def print_folders(folders: Sequence[Path], as_json: bool) -> None:
+    """Print where trials were written, a line each or as one JSON object."""
+    names = [str(folder) for folder in folders]
+    print(json.dumps({"trials": names}) if as_json else "\n".join(names))
 
 
 def import_trials(

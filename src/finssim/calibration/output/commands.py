@@ -39,12 +39,20 @@ def calibrate_thruster(
     seed: int = 0,
     as_json: bool = False,
 ) -> Vehicle:
-    """Fit thrust curves to tables of a bench and write the vehicle; arguments as `calibrate_hydrodynamics`.
+    """Fit thrust curves: c+ and c- [N s²/rad²], dead zones [rpm], limits [N], pulse width to speed.
+
+    Example: finssim calibrate thruster T200-16V.csv --vehicle bluerov2 --out mine.yaml
 
     Args:
-        group: Propeller group that all tables speak about.
-        voltage: At which the numbers shall hold [V].
-        pool_voltages: Fit all voltages together.
+        tables (TABLE): Tables of force against rpm or pulse width (.csv), or trials.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        out (FILE): Vehicle file to write (.yaml).
+        group (NAME): Propeller group that all tables speak about.
+        voltage: Battery voltage at which the numbers shall hold [V], where tables have several.
+        pool_voltages: Fit all voltages together instead of checking one on the others.
+        report (DIR): Directory for report.html, report.md, pictures and fit.json.
+        seed: Seed of every random number; equal seeds give equal results.
+        as_json: Print one JSON object instead of tables.
     """
     places = _Places(out, report)
     options = {"group": group, "voltage": voltage, "pool_voltages": pool_voltages}
@@ -67,7 +75,18 @@ def calibrate_motor(
     seed: int = 0,
     as_json: bool = False,
 ) -> Vehicle:
-    """Fit the motors' response to step logs and write the vehicle; arguments as `calibrate_hydrodynamics`."""
+    """Fit the motors' response to steps: delay and lag [s], dead zone, and tune the speed loop.
+
+    Example: finssim calibrate motor steps --vehicle mine.yaml --out mine.yaml
+
+    Args:
+        trials (TRIAL): Trial folders, folders of them, or bare .csv or .parquet tables.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        out (FILE): Vehicle file to write (.yaml).
+        report (DIR): Directory for report.html, report.md, pictures and fit.json.
+        seed: Seed of every random number; equal seeds give equal results.
+        as_json: Print one JSON object instead of tables.
+    """
     places = _Places(out, report)
     command = _command("motor", trials, vehicle=vehicle, out=out, report=report, seed=seed)
     body = load_vehicle(vehicle)
@@ -94,23 +113,28 @@ def calibrate_hydrodynamics(
     seed: int = 0,
     as_json: bool = False,
 ) -> Vehicle:
-    """Fit added mass and damping to trials, write the vehicle and what else is asked for.
+    """Fit added mass [kg, kg m²] and damping [N s/m, N s²/m², ...] to trials, axis by axis or by simulation.
+
+    Example: finssim calibrate hydrodynamics trials/fit --vehicle mine.yaml --out fitted.yaml --report report
 
     Args:
-        trials: Trial folders, folders of them, or tables. Held-out trials among them are left out, which is said.
-        vehicle: Name or file.
-        out: Vehicle file to write.
-        axes: Separated by commas; those that the trials excite if None.
-        method: `auto`, `regression` or `simulation`.
-        full: Also couplings.
-        estimate: Further parameters, separated by commas.
-        damping: auto, linear, quadratic or both.
-        fix: Effective inertias M_RB + M_A that are known, `yaw.m=0.6,surge.m=24` [kg, kg m²].
-        horizon: Longest stretch that is simulated without a restart [s].
-        report: Directory of the report, or None.
-        ranges: Ranges file for training, or None.
-        seed: Of everything random.
-        as_json: Print one JSON object in place of the table.
+        trials (TRIAL): Trial folders, folders of them, or bare .csv or .parquet tables.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        out (FILE): Vehicle file to write (.yaml).
+        axes (AXES): Axes to fit, of surge,sway,heave,roll,pitch,yaw; those that the trials excite if not given.
+        method (METHOD): regression: each axis by its equation of motion; simulation: what simulates the trials best;
+            auto: the regression where it replays the trials very well, else the simulation unless that replays them
+            worse.
+        full: Also couplings between axes (simulation method).
+        estimate (NAMES): Also fit, of thrust_scale,thrust_lag,thrust_delay,current,buoyancy_excess,k (simulation
+            method); or parameters of the vehicle's terms, such as lift.coefficient (either method).
+        damping (KIND): Drag: linear, quadratic, both, or auto to choose.
+        fix (AXIS.m=N): Inertias that are known, added mass included [kg, kg m²]: yaw.m=0.6,surge.m=24 (regression).
+        horizon: Longest stretch simulated without a restart [s] (simulation method).
+        report (DIR): Directory for report.html, report.md, pictures and fit.json.
+        ranges (FILE): Ranges file to write from the 95 % intervals, for `finssim train --randomize`.
+        seed: Seed of every random number; equal seeds give equal results.
+        as_json: Print one JSON object instead of tables.
 
     Returns:
         The calibrated vehicle.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from finssim.calibration.errors import CalibrationError
 from finssim.engine.ranges_file import load_ranges
 from finssim.files import atomic_write
-from finssim.vehicles import AXES, HydrodynamicSet, Vehicle
+from finssim.vehicles import AXES, HydrodynamicSet, Vehicle, load_vehicle
 
 __all__ = ["Normal", "correlated_normals", "write_correlated_ranges"]
 
@@ -95,6 +95,25 @@ def correlated_normals(
     if not normals:
         raise CalibrationError("the fit tells no added mass, damping or thrust that could be drawn")
     return normals, untold, _correlation(of, correlation)
+
+
+def fit_ranges(
+    report: Path,
+    *,
+    vehicle: str,
+    out: Path,
+) -> None:
+    """Write ranges with the standard errors of a calibration, correlated as its errors are.
+
+    Example: finssim randomize fit report/fit.json --vehicle mine.yaml --out mine-ranges.yaml
+
+    Args:
+        report (FIT): fit.json of a calibration's report.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        out (FILE): Ranges file to write (.yaml).
+    """
+    write_correlated_ranges(report, load_vehicle(vehicle), out)
+    print(f"written: {out}")
 
 
 def write_correlated_ranges(fit: Path, vehicle: Vehicle, out: Path) -> None:

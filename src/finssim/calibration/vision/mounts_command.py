@@ -383,6 +383,17 @@ def _curves(found: MountFit) -> tuple[Curve, ...]:
     return tuple(curves)
 
 
+def _three(text: str) -> tuple[float, ...]:
+    """A point from `x,y,z`."""
+    try:
+        numbers = tuple(float(word) for word in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
+        raise CalibrationError(f"--turns-about is '{text}', expected three lengths such as 0,0,-0.08")
+    return numbers
+
+
 def run(
     log: Path,
     *,
@@ -390,23 +401,25 @@ def run(
     vehicle: str,
     out: Path,
     estimate: str = "tags",
-    turns_about: Sequence[float] | None = None,
+    turns_about: str | Sequence[float] | None = None,
     report: Path | None = None,
     seed: int = 0,
     as_json: bool = False,
 ) -> Vehicle:
-    """Find mounts in a recording and write the vehicle.
+    """Find where tags, IMU and pressure port sit on the vehicle, from its motion: poses [m, deg], depth offset [m].
+
+    Example: finssim calibrate mounts log --pool pool.yaml --vehicle mine.yaml --out mine.yaml
 
     Args:
-        log: Folder with detections.csv, imu.csv, depth.csv.
-        pool: Pool file.
-        vehicle: Name or file.
-        out: Vehicle file to write, .yaml.
-        estimate: `tags` (sensors are right in the file) or `sensors` (the tag seen most is).
-        turns_about: Body point that stays in place while the vehicle turns on the spot [m], (3,).
-        report: Directory of the report, or None.
-        seed: Recorded.
-        as_json: Print one JSON object in place of the table.
+        log (LOG): Folder with detections.csv, imu.csv and depth.csv.
+        pool (FILE): Pool file: camera, water plane and frames (.yaml).
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        out (FILE): Vehicle file to write (.yaml).
+        estimate (WHAT): tags: the sensors are right in the vehicle file; sensors: the tag seen most is.
+        turns_about (X,Y,Z): Body point that stays in place while the vehicle turns on the spot: x,y,z [m].
+        report (DIR): Directory for the report and its pictures.
+        seed: Seed of every random number; equal seeds give equal results.
+        as_json: Print one JSON object instead of tables.
 
     Returns:
         The vehicle written.
@@ -414,6 +427,8 @@ def run(
     Raises:
         CalibrationError, LocalizationError, VehicleError, OutputError: As they say; nothing is written then.
     """
+    if isinstance(turns_about, str):
+        turns_about = _three(turns_about)
     refuse_unwritable(atomic_write(check_vehicle_path(out)))
     if report is not None:
         refuse_unwritable(atomic_directory(report, replaces=FIT_FILE))

@@ -275,41 +275,44 @@ def run(
     edge: float | None = None,
     family: str | None = None,
     latency: float = 0.0,
-    folds: int = 5,
+    folds: Annotated[int, (2, None)] = 5,
     seed: int = 0,
     as_json: bool = False,
 ) -> PoolFit:
-    """Calibrate a camera and the plane it looks through, and write the pool file.
+    """Find camera pose [m, deg] and water plane (height [m], tilt [deg], index) from surveyed points in the water.
+
+    Example: finssim calibrate pool points.csv --surveyed survey.csv --camera camera.yaml --out pool.yaml
 
     Args:
-        inputs: Detections CSV, pixel CSV (`[image,]id,u,v`), combined CSV (`u,v,x,y,z`), or pictures with tags.
-        camera: Camera file with the lens.
-        out: Pool file to write, .yaml.
-        surveyed: Survey; None where the inputs hold the points themselves.
-        report: Directory of the report, or None.
-        interface: `surface`, `wall` or `auto`.
-        plane: Surveyed plane `n_x,n_y,n_z,b` [m] with n . X + b = 0, such as `0,1,0,0` for a wall at y = 0.
-        window: Layers `THICKNESS:INDEX` [m], the first one next to the camera, such as `0.010:1.52`.
-        water_height: z of the water's surface in the survey's frame, measured with a tape [m].
-        water_depth: Distance from the surveyed points' plane to the surface [m], in place of it.
-        water_height_sigma: Standard error of either or of the plane's place [m]; 5 mm if None.
+        inputs (INPUT): Detections (.csv), pixels (id,u,v), pixels with points (u,v,x,y,z), or pictures of tags.
+        camera (FILE): Camera file: ours, or one of OpenCV, ROS or Kalibr.
+        out (FILE): Pool file to write (.yaml).
+        surveyed (FILE): Survey (.csv): id,x,y,z of points, or tag,x,y,z,yaw_deg,edge of tags, or
+            image,x,y,z,yaw_deg,edge of one tag that was moved; not needed where the inputs hold the points.
+        report (DIR): Directory for the report and its pictures.
+        interface (KIND): What the camera looks through: surface, wall, or auto to try.
+        plane (PLANE): The surveyed plane itself, n_x,n_y,n_z,b with n . X + b = 0 [m].
+        window (LAYER): Solid layer THICKNESS:INDEX, such as 0.010:1.52 for 10 mm of glass; several from the camera on.
+        water_height: z of the surface in the survey's frame, by a tape [m].
+        water_depth: In place of it: from the surveyed points to the surface [m].
+        water_height_sigma: Error of either, or of the plane's place [m]; 0.005 if not given.
         index: Refractive index of the water.
-        index_sigma: Standard error of that; 0.003 if None and the index is not given, else it is held.
-        tilt_sigma: Standard error of the plane's direction [degrees]; see `Settings`.
-        fit: What is fitted, separated by commas, of pose, height, tilt, index, focal, center, distortion.
-        focal_sigma: Relative standard error of the camera file's focal length; the file's own if None.
-        center_sigma: Standard error of its optical centre [px]; the file's own if None.
-        pixel_sigma: Standard error of a pixel [px]; from the residuals if None.
-        survey_sigma: Standard error of a surveyed coordinate [m].
-        survey_yaw_sigma: Of a tag's direction [degrees].
-        unit: Of lengths in tables that do not say: m, cm, mm, in, ft.
+        index_sigma: Error of that; 0.003 if neither is given, 0 (held) if only --index is.
+        tilt_sigma: How far the plane may lean [deg]; 0.2 for a surface, 0.5 for --plane, free for a wall.
+        fit (NAMES): What is fitted, of pose,height,tilt,index,focal,center,distortion; chosen if not given.
+        focal_sigma: Relative error of the camera file's focal length; what the file says if not given.
+        center_sigma: Error of its optical centre [px]; what the file says if not given.
+        pixel_sigma: Error of a pixel [px]; from the residuals if not given.
+        survey_sigma: Error of a surveyed coordinate [m].
+        survey_yaw_sigma: Error of a tag's direction [deg].
+        unit (UNIT): Of lengths in tables that do not say: m, cm, mm, in, ft.
         z: Height of points whose table has no such column [m].
         edge: Of tags whose survey has no such column [m].
-        family: Of the tags in pictures.
-        latency: Kept in the pool file [s].
+        family (NAME): Of tags in pictures.
+        latency: Time stamps of pictures minus their exposure [s], kept in the file.
         folds: Parts that are held out in turn.
-        seed: Of everything random.
-        as_json: Print one JSON object in place of the table.
+        seed: Seed of every random number; equal seeds give equal results.
+        as_json: Print one JSON object instead of tables.
 
     Returns:
         The calibration.

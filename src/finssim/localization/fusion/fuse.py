@@ -223,20 +223,23 @@ def run(
     imu_axes: str | None = None,
     as_json: bool = False,
 ) -> Run:
-    """Fuse a log, write the table and print the summary.
+    """Fuse vision, depth and IMU in the order of arrival: position [m], velocity [m/s], yaw [rad], health.
+
+    Example: finssim fuse log --pool pool.yaml --vehicle finsrov --out fused.csv
 
     Args:
-        log: Folder of tables or one table, see `load_log`.
-        pool: Pool file.
-        vehicle: Name or file.
-        out: Table to write (.csv).
-        rate: Of its rows [Hz].
-        mode: `constant-velocity` or `error-state`.
-        profile: `default` or `published` settings.
-        method: How fixes are made of detections.
-        pixel_std: Standard deviation of a detected corner [px]; None: what the pool file says.
-        imu_axes: `body`, `sensor`, or None for what the columns' names say.
-        as_json: Print one JSON object in place of the summary.
+        log (LOG): Folder of imu.csv, depth.csv and vision.csv or detections.csv, or one table.
+        pool (FILE): Pool file: camera, water plane and frames (.yaml).
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        out (FILE): Table to write (.csv).
+        rate: Rows a second [Hz].
+        mode (MODE): constant-velocity (paper, eq. 14-15) or error-state (uses IMU acceleration).
+        profile (NAME): Noise of the filter: default, or published as in the paper.
+        method (METHOD): How detections become fixes: refractive, refractive-weighted, refractive-6dof, pinhole-depth or
+            pinhole.
+        pixel_std: Error of a detected corner, per axis [px]; what the pool's calibration found, else 0.5, if not given.
+        imu_axes (AXES): Axes of the IMU's columns: body or sensor; told by their names if not given.
+        as_json: Print one JSON object instead of tables.
 
     Raises:
         LocalizationError: The log, pool or a word cannot be used.

@@ -417,7 +417,6 @@ def run(
     depth: str | float | Path | None = None,
     imu: str | Path | None = None,
     method: str = "refractive",
-    as_json: bool = False,
     family: str | None = None,
     library: str | None = None,
     refine: str = "fit",
@@ -429,29 +428,32 @@ def run(
     tilt_std_deg: float | None = None,
     longest_gap: float = 1.0,
     truth: str | Path | None = None,
+    as_json: bool = False,
 ) -> Run:
-    """Measure where the vehicle was in each picture, write the table and print the summary.
+    """Measure position and yaw in every picture: x, y, z [m], yaw [rad], pool frame, with standard deviations.
+
+    Example: finssim localize video.mp4 --pool pool.yaml --vehicle finsrov --depth depth.csv --out poses.csv
 
     Args:
-        inputs: Pictures, folders of them, videos or detection files (.csv).
-        pool: Pool file.
-        vehicle: Name or file, with a section `tags`.
-        out: Table to write (.csv); columns in `localize_output.COLUMNS`.
-        depth: File with columns t, depth, or the depth of the pressure port [m], positive down.
-        imu: File with columns t and roll, pitch [rad] or qx, qy, qz, qw; level without it.
-        method: A name of `METHODS`.
-        as_json: Print one JSON object in place of the summary.
-        family: Of the tags; None: that of the vehicle file.
-        library: `apriltag` or `opencv`, for pictures.
-        refine: How corners are placed, see `detector`.
-        gamma: Encoding of the pictures, see `detector`.
-        times: File with columns image, time [s], for pictures whose names hold no time.
-        pixel_std: Standard deviation of a corner, per axis [px]; None: what the pool file says.
-        shared_pixel_std: Error that all corners of a picture share, per axis [px].
-        depth_std: Of the depth [m]; None: that of the vehicle file.
-        tilt_std_deg: Of roll and pitch [degrees]; None: 0.5 with an IMU, 2 without.
-        longest_gap: Depth and tilt are not interpolated between samples further apart [s].
-        truth: File with columns image or t, x, y and perhaps yaw, to compare with.
+        inputs (INPUT): Pictures, folders of them, videos, or detection files (.csv).
+        pool (FILE): Pool file: camera, water plane and frames (.yaml).
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        out (FILE): Table to write (.csv), one row a picture.
+        depth (FILE|Z): Table with columns t, depth, or one depth of the pressure port below the surface [m].
+        imu (FILE): Table with columns t and roll, pitch [rad] or qx, qy, qz, qw; level if not given.
+        method (METHOD): refractive, refractive-weighted, refractive-6dof, pinhole-depth or pinhole.
+        family (NAME): Family of the tags; that of the vehicle file if not given.
+        library (NAME): Detector: apriltag or opencv.
+        refine (WAY): How corners are placed: fit, or a way of the library.
+        gamma: Encoding of the pictures: 1 linear, 2.2 video.
+        times (FILE): Table with columns image, time [s], where names of pictures hold none.
+        pixel_std: Error of a detected corner, per axis [px]; what the pool's calibration found, else 0.5, if not given.
+        shared_pixel_std: Error that all corners of a picture share, per axis [px]: waves.
+        depth_std: Error of the depth [m]; that of the vehicle file if not given.
+        tilt_std_deg: Error of roll and pitch [deg]; 0.5 with --imu, 2 without, if not given.
+        longest_gap: Depth and tilt are not interpolated over longer gaps [s].
+        truth (FILE): Table with columns image or t, x, y, to compare with.
+        as_json: Print one JSON object instead of tables.
 
     Raises:
         LocalizationError: An input cannot be used, or the method needs a depth that is not given.

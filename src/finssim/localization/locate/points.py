@@ -182,14 +182,22 @@ _REASONS = {
 }
 
 
-def run_project(points: Path, *, pool: Path, out: Path | None = None, as_json: bool = False) -> None:
-    """Write the pixels at which points appear.
+def run_project(
+    points: Path,
+    *,
+    pool: Path,
+    out: Path | None = None,
+    as_json: bool = False,
+) -> None:
+    """Pixels [px] at which points in the water appear.
+
+    Example: finssim project points.csv --pool pool.yaml
 
     Args:
-        points: Table with columns x, y, z, pool frame [m]; others are carried along. `-` is the standard input.
-        pool: The pool file.
-        out: Table to write, the columns of `points` with u, v [px] and status; the standard output if none.
-        as_json: Print a summary as JSON (with the points in it, if there is no `out`).
+        points (POINTS): Table with columns x, y, z, pool frame [m]; - for standard input.
+        pool (FILE): Pool file: camera, water plane and frames (.yaml).
+        out (FILE): Table to write; standard output if not given.
+        as_json: Print one JSON object instead of tables.
 
     Raises:
         LocalizationError: A file that cannot be used; wrong rows are named.
@@ -218,17 +226,18 @@ def run_backproject(
     out: Path | None = None,
     as_json: bool = False,
 ) -> None:
-    """Write the points that pixels see on a horizontal plane, or on any other.
+    """Points [m] in the water that pixels see, on a plane.
+
+    Example: finssim backproject pixels.csv --pool pool.yaml --z 0
 
     Args:
-        pixels: Table with columns u, v [px] and perhaps z [m], which goes before the argument `z`; others are carried
-            along. `-` is the standard input.
-        pool: The pool file.
-        z: Height of the points, pool frame [m].
-        plane: "a,b,c,d" of a plane a x + b y + c z + d = 0 instead, pool frame.
-        pixel_std: Standard error of u and of v [px], for columns sigma_x, sigma_y, sigma_z [m] of the point.
-        out: Table to write, the columns of `pixels` with x, y, z [m] and status; the standard output if none.
-        as_json: Print a summary as JSON (with the points in it, if there is no `out`).
+        pixels (PIXELS): Table with columns u, v [px]; - for standard input.
+        pool (FILE): Pool file: camera, water plane and frames (.yaml).
+        z: Height of the points, pool frame [m]; a column z goes before it.
+        plane: Plane of the points in place of --z: a,b,c,d with a x + b y + c z + d = 0 [m].
+        pixel_std: Error of a pixel [px]; adds columns with the error of the points [m].
+        out (FILE): Table to write; standard output if not given.
+        as_json: Print one JSON object instead of tables.
 
     Raises:
         LocalizationError: A file that cannot be used (wrong rows are named), no plane or two, or numbers that make no

@@ -1,0 +1,332 @@
+"""A Python function as a command: its signature is the list of options, its docstring their help.
+
+There is no other list. A function is read from its source, without being imported, so that help and refusals answer at
+once:
+
+    def simulate(*, duration: Annotated[float, (0.0, None)], out: Path, device: str = "cpu") -> None:
+        \"\"\"Simulate a vehicle from rest.
+
+        Example: finssim simulate --duration 10 --out run.csv
+
+        Args:
+            duration: Simulated time [s].
+            out (FILE): Table to write.
+            device (DEVICE): Where to compute: cpu or cuda.
+        \"\"\"
+
+What comes before `*` is typed by its place, the rest as `--name`; a bool is a flag, a `Sequence` may be given several
+times. `Annotated` adds bounds as `(low, high)`, another `"--name"`, or `","` where one option holds several words. What
+is no text, number, flag or path, or is annotated "python", is no option and keeps its default, but for the types of
+`MAKERS`. `**options`, "As of `module.function`.", are those of that function. What is returned is the exit status, or a
+result, whose `ok` makes it 0 or 3.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+__all__ = ["Experiment", "command_app", "read"]
+
+ROOT = Path(__file__).parents[1]
+KINDS: Mapping[str, Any] = {
+    "str": str, "int": int, "float": float, "bool": bool, "Path": Path, "Literal": str, "Severity": str, "Format": str
+}  # fmt: skip
+"""Name of an annotation -> what the command line makes of a word."""
+MAKERS = {
+    "OnRobot": "finssim.experiments.on_robot:robot_or_none",
+    "Choice": "finssim.viewer.run:Choice",
+    "Options": "finssim.ros2.up:Options",
+}
+"""Name of an annotation -> function or dataclass that makes it; its options stand in place of the parameter."""
+SEEDS = (0, 2**31 - 1)
+SETTINGS: dict[str, Any] = {"rich_markup_mode": None, "add_completion": False}
+JSON = "Print one JSON object instead of tables."
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A command whose work takes `out` and `say` and returns a result, which `show` prints."""
+
+    work: str
+    """module:function"""
+    show: str
+    """Function of that module."""
+
+
+Work = str | Experiment
+"""What a command does: module:function, or an experiment."""
+
+
+@dataclass(frozen=True)
+class Option:
+    """A parameter of a function as the command line takes it."""
+
+    name: str
+    kind: Any
+    many: bool
+    """May be given several times."""
+    positional: bool
+    default: Any
+    """`inspect.Parameter.empty` where it must be given."""
+    notes: tuple[Any, ...]
+    """Of `Annotated`: bounds, names, or ","."""
+    metavar: str | None
+    help: str
+
+    def parameter(self) -> inspect.Parameter:
+        """As Typer reads it."""
+        low, high = next((n for n in self.notes if isinstance(n, tuple)), (None, None))
+        if self.name == "seed" and self.kind is int:
+            low, high = SEEDS
+        kind, default = (list[self.kind] if self.many else self.kind), self.default  # type: ignore[name-defined]
+        if isinstance(default, tuple) and not self.many:
+            default = ",".join(default)
+        if default is None or (self.many and default is not inspect.Parameter.empty):
+            kind, default = kind | None, None
+        about: dict[str, Any] = {"help": self.help, "metavar": self.metavar, "min": low, "max": high}
+        named = [n for n in self.notes if isinstance(n, str) and n.startswith("--")]
+        if (self.positional and not named) or "argument" in self.notes:
+            info: Any = typer.Argument(**about)
+        else:
+            flag = "--json" if self.name == "as_json" else f"--{self.name.replace('_', '-')}"
+            info = typer.Option(*(named or [flag]), **about)
+        where = inspect.Parameter.KEYWORD_ONLY
+        return inspect.Parameter(self.name, where, default=default, annotation=Annotated[kind, info])
+
+    def value(self, given: Any) -> Any:
+        """What the function is called with."""
+        if given is None:
+            return self.default
+        return tuple(word.strip() for word in given.split(",")) if "," in self.notes else given
+
+
+@dataclass(frozen=True)
+class Definition:
+    """A function as its source tells it."""
+
+    place: str
+    help: str
+    options: tuple[Option, ...]
+    made: Mapping[str, Definition]
+    """Parameter -> the function that makes its value of options."""
+    extra: bool
+    """Takes whatever words follow, as `*words`."""
+
+    def all_options(self) -> Iterator[Option]:
+        """Those of the makers too, in the order of the help."""
+        yield from self.options
+        for maker in self.made.values():
+            yield from maker.options
+
+    def call(self, given: Mapping[str, Any], *words: str, **fixed: Any) -> Any:
+        """Call it with what was typed."""
+        values = {option.name: option.value(given[option.name]) for option in self.options}
+        values |= {name: maker.call(given) for name, maker in self.made.items()}
+        positional = [values.pop(option.name) for option in self.options if option.positional]
+        return loaded(self.place)(*positional, *words, **values | fixed)
+
+
+def loaded(place: str) -> Callable[..., Any]:
+    """The function; Warp starts silently where its module needs it."""
+    module, _, name = place.partition(":")
+    function: Callable[..., Any] = getattr(import_module(module), name)
+    if "warp" in sys.modules:
+        from finssim.quiet import start_warp
+
+        start_warp()
+    return function
+
+
+@cache
+def read(place: str) -> Definition:
+    """Read a function, or a dataclass of settings, from its source."""
+    module, _, name = place.partition(":")
+    source = (ROOT / (module.replace(".", "/") + ".py")).read_text(encoding="utf-8")
+    start = re.search(rf"^(def {name}\(|class {name}[(:])", source, re.MULTILINE)
+    assert start is not None, place
+    text = re.split(r"\n(?=[^\s)#])", source[start.start() :], maxsplit=1)[0]
+    (node,) = ast.parse(text).body
+    assert isinstance(node, ast.FunctionDef | ast.ClassDef)
+    about = inspect.cleandoc(ast.get_docstring(node) or "")
+    helps = _helps(about)
+    taken = _fields(node) if isinstance(node, ast.ClassDef) else _arguments(node, helps)
+    options, made = [], {}
+    for argument, annotation, default, positional, (metavar, words) in taken:
+        kind, many, notes = _kind(annotation)
+        if kind in MAKERS:
+            made[argument] = read(MAKERS[kind])
+        elif kind is not None and "python" not in notes:
+            value = inspect.Parameter.empty if default is None else _literal(default, source)
+            words = words or (JSON if argument == "as_json" else "")
+            options.append(Option(argument, kind, many, positional, value, notes, metavar, words))
+    rest = node.args.kwarg.arg if isinstance(node, ast.FunctionDef) and node.args.kwarg else ""
+    reference = re.match(r"As of ([\w.]+)\.(\w+)", helps.get(rest, (None, ""))[1])
+    if isinstance(node, ast.FunctionDef) and reference is not None:
+        further = read(f"finssim.{reference[1]}:{reference[2]}")
+        names = {argument.arg for argument in node.args.args + node.args.kwonlyargs}
+        options += [option for option in further.options if option.name not in names]
+        made |= further.made
+    shown = re.split(r"\n(?:Args|Returns|Raises|Note):\n", about)[0].replace("`", "")
+    extra = isinstance(node, ast.FunctionDef) and node.args.vararg is not None
+    return Definition(place, shown, tuple(options), made, extra)
+
+
+Help = tuple[str | None, str]
+"""METAVAR, and words."""
+Taken = Iterator[tuple[str, ast.expr | None, ast.expr | None, bool, Help]]
+"""Name, annotation, default, whether it is known by its place, and help."""
+
+
+def _arguments(function: ast.FunctionDef, helps: Mapping[str, Help]) -> Taken:
+    taken = function.args
+    defaults = [*[None] * (len(taken.args) - len(taken.defaults)), *taken.defaults, *taken.kw_defaults]
+    for k, (a, default) in enumerate(zip([*taken.args, *taken.kwonlyargs], defaults, strict=True)):
+        yield a.arg, a.annotation, default, k < len(taken.args), helps.get(a.arg, (None, ""))
+
+
+def _fields(settings: ast.ClassDef) -> Taken:
+    """Fields, each with the text below it as help."""
+    for field, below in pairwise([*settings.body, ast.Pass()]):
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+            text = ast.literal_eval(below.value) if isinstance(below, ast.Expr) else ""
+            match = re.match(r"(?:\((.*?)\) )?(.*)", text, re.DOTALL)
+            assert match is not None
+            words = " ".join(match[2].replace("`", "").split())
+            yield field.target.id, field.annotation, field.value, False, (match[1], words)
+
+
+def _helps(about: str) -> dict[str, Help]:
+    """Argument -> its METAVAR, if it has one, and its words."""
+    section = re.search(r"^Args:\n((?: .*\n?|\n(?= ))*)", about, re.MULTILINE)
+    entries = re.split(r"^ {4}(?=\w)", section[1], flags=re.MULTILINE)[1:] if section else []
+    found = {}
+    for entry in entries:
+        match = re.match(r"(\w+)(?: \((.*?)\))?:\s+(.*)", entry, re.DOTALL)
+        assert match is not None, entry
+        found[match[1]] = (match[2], " ".join(match[3].replace("`", "").split()))
+    return found
+
+
+def _kind(annotation: ast.expr | None) -> tuple[Any, bool, tuple[Any, ...]]:
+    """What is made of a word, whether of several, and the notes of `Annotated`; None where it is no option."""
+    if isinstance(annotation, ast.BinOp):
+        sides = (_kind(annotation.left), _kind(annotation.right))
+        return next((side for side in sides if side[0] is not None), sides[0])
+    if isinstance(annotation, ast.Subscript):
+        head = ast.unparse(annotation.value)
+        if head == "Annotated" and isinstance(annotation.slice, ast.Tuple):
+            first, *others = annotation.slice.elts
+            kind, many, _ = _kind(first)
+            notes = tuple(map(ast.literal_eval, others))
+            return kind, many and "," not in notes, notes
+        if head in ("Sequence", "list"):
+            return _kind(annotation.slice)[0], True, ()
+        return KINDS.get(head), False, ()
+    name = annotation.id if isinstance(annotation, ast.Name) else ""
+    return KINDS.get(name, name if name in MAKERS else None), False, ()
+
+
+def _literal(default: ast.expr, source: str) -> Any:
+    """A default; a name stands for a constant of the module."""
+    if isinstance(default, ast.Call) and ast.unparse(default.func) == "Path":
+        return Path(ast.literal_eval(default.args[0]))
+    if isinstance(default, ast.Name):
+        constant = re.search(rf"^{default.id}(?:: .*)? = (.+?)(?:  #.*)?$", source, re.MULTILINE)
+        assert constant is not None, default.id
+        return ast.literal_eval(constant[1])
+    return ast.literal_eval(default)
+
+
+def command_app(commands: Mapping[str, Work], groups: Mapping[str, str], **settings: Any) -> typer.Typer:
+    """The whole command line.
+
+    Args:
+        commands: Words after the program's name -> what is done. One of a group's own name is what the group does when
+            nothing follows it; other groups then print their help.
+        groups: Word -> help of a group that does nothing itself.
+        settings: Of the outermost `typer.Typer`.
+    """
+    app = typer.Typer(**SETTINGS, **settings)
+    apps: dict[str, typer.Typer] = {}
+    for words, what in commands.items():
+        first, _, last = words.partition(" ")
+        is_group = any(other.startswith(f"{words} ") for other in commands)
+        if is_group or (last and first not in apps):
+            apps[first] = typer.Typer(**SETTINGS, invoke_without_command=True)
+            app.add_typer(apps[first], name=first)
+            handler = _handler(words, what, group=True) if is_group else _group(groups[first])
+            apps[first].callback()(handler)
+        if not is_group:
+            handler = _handler(words, what)
+            extra = getattr(handler, "definition").extra  # noqa: B009
+            options = {"allow_extra_args": True, "ignore_unknown_options": True} if extra else None
+            (apps[first] if last else app).command(last or first, context_settings=options)(handler)
+    return app
+
+
+def _group(words: str) -> Callable[..., None]:
+    def show(context: typer.Context) -> None:
+        if context.invoked_subcommand is None:
+            typer.echo(context.get_help())
+
+    show.__doc__ = words
+    show.__annotations__ = {"context": typer.Context, "return": None}
+    return show
+
+
+def _handler(words: str, what: Work, *, group: bool = False) -> Callable[..., Any]:
+    """A function with the signature that Typer reads, which calls the one that is meant."""
+    experiment = what if isinstance(what, Experiment) else None
+    definition = read(experiment.work if experiment else str(what))
+    options = list(definition.all_options())
+    if experiment is not None:
+        options.append(Option("as_json", bool, False, False, False, (), None, JSON))
+
+    def handle(context: typer.Context, **given: Any) -> Any:
+        if group and context.invoked_subcommand is not None:
+            return None
+        if experiment is not None:
+            return _experiment(words, definition, experiment.show, given)
+        return _status(definition.call(given, *(context.args if definition.extra else ())))
+
+    context = inspect.Parameter("context", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)
+    parameters = [context, *(option.parameter() for option in options)]
+    handle.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    handle.__annotations__ = {p.name: p.annotation for p in parameters}
+    handle.__doc__ = definition.help
+    handle.definition = definition  # type: ignore[attr-defined]
+    return handle
+
+
+def _experiment(words: str, definition: Definition, show: str, given: Mapping[str, Any]) -> int:
+    from finssim.experiments.campaign import run_experiment
+
+    module = definition.place.partition(":")[0]
+
+    def work(**said: Any) -> Any:
+        return definition.call(given, **said)
+
+    result = run_experiment(
+        words, work, loaded(f"{module}:{show}"), out=given["out"], as_json=given["as_json"],
+        bar=given.get("robot") is None,
+    )  # fmt: skip
+    return _status(result)
+
+
+def _status(result: Any) -> int:
+    """Exit status: a number is it; a result that is not `ok` has 3."""
+    if isinstance(result, Mapping):
+        return 0 if result.get("ok", True) else 3
+    return result if type(result) is int else 0

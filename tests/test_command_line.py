@@ -1,0 +1,146 @@
+"""A command is a function: its signature is the options, its docstring the help."""
+
+import inspect
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import typer
+from typer.main import get_command
+
+from finssim import boundary, command_line
+from finssim.cli import COMMANDS
+from finssim.command_line import Experiment, command_app, read
+
+SOURCE = '''
+from __future__ import annotations
+
+from pathlib import Path
+
+CALLS = []
+RATE = 5.0  # [Hz]
+
+
+def work(
+    names: Sequence[Path],
+    *,
+    rate: Annotated[float, (0.0, 9.0)] = RATE,
+    axes: Annotated[Sequence[str], ","] = ("surge", "yaw"),
+    changes: Annotated[Sequence[str], "--set"] = (),
+    deep: bool = False,
+    out: Path | None = None,
+    quiet: Annotated[bool, "python"] = True,
+    console: Console | None = None,
+    seed: int = 3,
+) -> dict[str, object]:
+    """Do a thing.
+
+    Example: work a.csv --rate 2
+
+    Args:
+        names (TABLE): Tables.
+        rate: Of the work [Hz], which is
+            a number.
+        axes (AXES): Which.
+    """
+    CALLS.append(locals())
+    return {"ok": deep}
+'''
+
+
+@pytest.fixture
+def work(tmp_path, monkeypatch):
+    """A command made of the source above, and what its function was called with."""
+    (tmp_path / "thing.py").write_text(SOURCE)
+    monkeypatch.setattr(command_line, "ROOT", tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    app = command_app({"work": "thing:work", "other": "thing:work"}, {})
+    import thing
+
+    yield lambda *words: boundary.run(app, ["work", *words]), thing.CALLS
+    del sys.modules["thing"]
+    read.cache_clear()
+
+
+def test_a_function_is_called_with_what_was_typed(work):
+    """Positions, numbers, lists and flags reach the function as its types say; what is no option keeps its default."""
+    run, calls = work
+    words = [
+        "a.csv",
+        "b.csv",
+        "--rate",
+        "2",
+        "--axes",
+        "heave, roll",
+        "--set",
+        "x=1",
+        "--set",
+        "y=2",
+        "--deep",
+    ]
+    assert run(*words, "--deep") == 0
+    (given,) = calls
+    assert given["names"] == [Path("a.csv"), Path("b.csv")] and given["rate"] == 2.0
+    assert given["axes"] == ("heave", "roll") and given["changes"] == ["x=1", "y=2"]
+    assert given["deep"] is True and given["out"] is None and given["quiet"] is True
+    assert given["console"] is None and given["seed"] == 3
+
+
+def test_defaults_are_those_of_the_function(work):
+    """What is not typed is as a call from Python would have it; a result that is not ok has status 3."""
+    run, calls = work
+    assert run("a.csv") == 3
+    assert calls[0]["rate"] == 5.0 and calls[0]["axes"] == ("surge", "yaw") and calls[0]["changes"] == ()
+
+
+@pytest.mark.parametrize(
+    "words", [["--rate", "10"], ["--rate", "x"], ["--seed", "-1"], ["--quiet"], ["--changes", "x"]]
+)
+def test_what_is_not_of_the_signature_is_refused(work, capsys, words):
+    """A number out of its bounds, a word for a number, and a name that is no option."""
+    run, calls = work
+    assert run("a.csv", *words) == 2 and not calls
+    assert words[0] in capsys.readouterr().err
+
+
+def test_help_is_the_docstring(work, capsys):
+    """The text, each argument with its unit, its metavar, bounds and default."""
+    run, _ = work
+    assert run("--help") == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "Do a thing. Example: work a.csv --rate 2" in text
+    assert "Of the work [Hz], which is a number. [default: 5.0; 0.0<=x<=9.0]" in text
+    assert "TABLE" in text and "--axes AXES Which. [default: surge,yaw]" in text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", COMMANDS)
+def test_what_the_source_says_is_what_python_has(words):
+    """Each command's options, as read from its source, are parameters of its function with the same defaults."""
+    what = COMMANDS[words]
+    definition = read(what.work if isinstance(what, Experiment) else what)
+    module, _, name = definition.place.partition(":")
+    found = inspect.signature(getattr(import_module(module), name)).parameters
+    extra = any(p.kind is p.VAR_KEYWORD for p in found.values())
+    for option in definition.options:
+        assert option.name in found or extra
+        if option.name in found:
+            assert found[option.name].default == option.default
+    assert set(definition.made) <= found.keys() or extra
+
+
+def test_every_option_has_help():
+    """No command has an option that its docstring leaves out."""
+
+    def walk(command, words):
+        for parameter in command.params:
+            if parameter.name not in ("help", "context"):
+                assert parameter.help, f"finssim {' '.join(words)}: {parameter.name}"
+        for name, below in getattr(command, "commands", {}).items():
+            walk(below, [*words, name])
+
+    from finssim.cli import app
+
+    assert isinstance(app, typer.Typer)
+    walk(get_command(app), [])
