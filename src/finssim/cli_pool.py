@@ -35,7 +35,7 @@ def pool(
         str | None,
         typer.Option(
             help="What the camera sends: pictures, corners (of the tags) or none. If not given: pictures, over a team "
-            "corners, in open water and of a task none.",
+            "or a tank corners, in open water and of a task none.",
             metavar="KIND",
         ),
     ] = None,
@@ -151,7 +151,7 @@ def pool(
         plant=plant,
         severity=severity,  # type: ignore[arg-type]
         lockstep=lockstep,
-        camera=camera or ("none" if site == "open-water" else "pictures"),  # type: ignore[arg-type]
+        camera=camera or {"pool": "pictures", "tank": "corners"}.get(site, "none"),  # type: ignore[arg-type]
         pictures=pictures,
         port=port,
         bind=bind,
