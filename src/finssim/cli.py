@@ -38,6 +38,7 @@ from finssim.cli_options import (
     Pictures,
     Robot,
     RobotPool,
+    RobotSite,
     Seed,
     Steps,
     Unattended,
@@ -128,6 +129,7 @@ def demo(
     steps: Steps = None,
     robot: Robot = None,
     pool_file: RobotPool = None,
+    site: RobotSite = None,
     bind: Bind = "127.0.0.1:54321",
     pictures: Pictures = None,
     lockstep: Lockstep = False,
@@ -145,8 +147,8 @@ def demo(
     from finssim.experiments.demo import demo as run
 
     where = cli_robot.robot_or_none(
-        robot, bind=bind, pictures=pictures, lockstep=lockstep, pool_file=pool_file, arm=arm, by_hand=by_hand,
-        unattended=unattended,
+        robot, bind=bind, pictures=pictures, lockstep=lockstep, pool_file=pool_file, site=site, arm=arm,
+        by_hand=by_hand, unattended=unattended,
     )  # fmt: skip
     run(out, vehicle=vehicle, seed=seed, steps=steps, robot=where)
 

@@ -16,6 +16,7 @@ from finssim.cli_options import (
     Pictures,
     Robot,
     RobotPool,
+    RobotSite,
     Seed,
     Steps,
     Unattended,
@@ -94,6 +95,7 @@ def t1(
     processes: Processes = None,
     robot: Robot = None,
     pool_file: RobotPool = None,
+    site: RobotSite = None,
     bind: Bind = "127.0.0.1:54321",
     pictures: Pictures = None,
     lockstep: Lockstep = False,
@@ -117,7 +119,7 @@ def t1(
         rows, setpoints, plants=plants, seeds=seeds, seed=seed, severity=severity, camera=camera
     )
     options["robot"] = _robot(
-        robot, options, bind=bind, pictures=pictures, lockstep=lockstep, pool_file=pool_file, arm=arm,
+        robot, options, bind=bind, pictures=pictures, lockstep=lockstep, pool_file=pool_file, site=site, arm=arm,
         by_hand=by_hand, unattended=unattended,
     )  # fmt: skip
     run(T1, out=out, vehicle=vehicle, steps=steps, processes=processes, as_json=as_json, **options)
@@ -137,6 +139,7 @@ def t2(
     processes: Processes = None,
     robot: Robot = None,
     pool_file: RobotPool = None,
+    site: RobotSite = None,
     bind: Bind = "127.0.0.1:54321",
     pictures: Pictures = None,
     lockstep: Lockstep = False,
@@ -158,7 +161,7 @@ def t2(
         rows, trajectories, plants=plants, seeds=seeds, seed=seed, severity=severity, camera=camera
     )
     options["robot"] = _robot(
-        robot, options, bind=bind, pictures=pictures, lockstep=lockstep, pool_file=pool_file, arm=arm,
+        robot, options, bind=bind, pictures=pictures, lockstep=lockstep, pool_file=pool_file, site=site, arm=arm,
         by_hand=by_hand, unattended=unattended,
     )  # fmt: skip
     run(T2, out=out, vehicle=vehicle, steps=steps, processes=processes, as_json=as_json, **options)

@@ -20,6 +20,7 @@ __all__ = [
     "Pool",
     "Robot",
     "RobotPool",
+    "RobotSite",
     "Seed",
     "Steps",
     "Unattended",
@@ -63,7 +64,18 @@ Robot = Annotated[
 ]
 RobotPool = Annotated[
     Path | None,
-    typer.Option(help="Of that robot: camera, water plane and frames (.yaml).", metavar="FILE"),
+    typer.Option(
+        help="Of that robot: camera, water plane and frames (.yaml); none where no camera looks and position fixes "
+        "come by wire.",
+        metavar="FILE|none",
+    ),
+]
+RobotSite = Annotated[
+    str | None,
+    typer.Option(
+        help="Where that robot is: pool, tank or open-water, by which it is equipped. If not given: pool.",
+        metavar="NAME",
+    ),
 ]
 Bind = Annotated[
     str,

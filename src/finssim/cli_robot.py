@@ -111,9 +111,22 @@ def run(
             "--trim", help="Put an integral in front of a policy, against a steady current or weight."
         ),
     ] = False,
+    let_in: Annotated[
+        str | None,
+        typer.Option(
+            help="Where the vehicle begins, world frame [m], known to 5 cm: for dead reckoning by Doppler log and "
+            "compass, where no camera and no position fix tells.",
+            metavar="X,Y",
+        ),
+    ] = None,
     mode: Annotated[
-        str, typer.Option(help="Estimator: constant-velocity or error-state.", metavar="MODE")
-    ] = "constant-velocity",
+        str | None,
+        typer.Option(
+            help="Estimator: constant-velocity or error-state. If not given: with --let-in error-state, else "
+            "constant-velocity.",
+            metavar="MODE",
+        ),
+    ] = None,
     record: Annotated[
         Path | None,
         typer.Option(
@@ -150,14 +163,15 @@ def run(
     if (policy is None) == (team is None):
         raise typer.BadParameter("who steers? give --policy for this vehicle, or --team for all of a task")
     if team is not None:
-        if agent is not None or trajectory is not None or lockstep or number:
+        if agent is not None or trajectory is not None or lockstep or number or let_in is not None:
             raise typer.BadParameter(
-                "--team has every agent in its place: leave --agent, --trajectory, --lockstep and --number out"
+                "--team has every agent in its place: leave --agent, --trajectory, --lockstep, --number and --let-in "
+                "out"
             )
         from finssim.robot.team_run import run_team
 
         where = {"--site": site or "open-water", "--pool-file": pool_file or "none", "--goal": goal}
-        options = {**where, "--mode": mode, "--duration": duration}
+        options = {**where, "--mode": mode or "constant-velocity", "--duration": duration}
         given = [word for name, x in options.items() if x is not None for word in (name, str(x))]
         flags = [name for name, on in (("--trim", trim), ("--arm", arm)) if on]
         ends = {"robot": robot, "bind": bind, "messages": messages}
@@ -167,6 +181,7 @@ def run(
             raise typer.Exit(status)
         return
     assert policy is not None
+    from finssim.robot.goals import place_of
     from finssim.robot.run import Wiring
     from finssim.robot.run import run as drive
 
@@ -180,10 +195,11 @@ def run(
         vehicle=vehicle,
         site=site or "pool",
         number=number,
+        let_in=None if let_in is None else place_of(let_in),
         wiring=Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep, team=messages),
         record=record,
         duration=duration,
-        mode=mode,
+        mode=mode or ("constant-velocity" if let_in is None else "error-state"),
         trim=trim,
         arm=arm,
         as_json=as_json,
@@ -205,26 +221,31 @@ def robot_or_none(
     pictures: str | None,
     lockstep: bool,
     pool_file: Path | None,
+    site: str | None,
     arm: bool,
     by_hand: bool,
     unattended: bool,
 ) -> OnRobot | None:
     """The robot that options name; none where they name none, and nothing tells of one."""
     if robot is None:
-        if arm or by_hand or unattended or lockstep or pool_file is not None or pictures is not None:
+        told = (arm, by_hand, unattended, lockstep, pool_file, pictures, site)
+        if any(x is not None and x is not False for x in told):
             raise typer.BadParameter(
-                "--arm, --by-hand, --unattended, --lockstep, --pool-file and --pictures tell of a robot: name one "
-                "with --robot"
+                "--arm, --by-hand, --unattended, --lockstep, --pool-file, --site and --pictures tell of a robot: name "
+                "one with --robot"
             )
         return None
     if pool_file is None:
-        raise typer.BadParameter("a robot knows where it is by its pool file: give --pool-file")
+        raise typer.BadParameter(
+            "a robot knows where it is by its pool file: give --pool-file, or none where position fixes come by wire"
+        )
     from finssim.experiments.on_robot import OnRobot
     from finssim.robot.wiring import Wiring
 
     return OnRobot(
         wiring=Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep),
-        pool_file=pool_file,
+        pool_file=None if str(pool_file) == "none" else pool_file,
+        site=site or "pool",
         arm=arm,
         by_hand=by_hand,
         unattended=unattended,

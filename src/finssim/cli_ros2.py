@@ -92,6 +92,14 @@ def up(
             help="Fixes on the wire of a virtual pool: none, motion-capture or usbl.", metavar="NAME"
         ),
     ] = "none",
+    let_in: Annotated[
+        str | None,
+        typer.Option(
+            help="Where the vehicle begins, in the map [m], for dead reckoning by Doppler log and compass, where no "
+            "camera and no position fix tells.",
+            metavar="X,Y",
+        ),
+    ] = None,
     goal: Annotated[
         str | None,
         typer.Option(
@@ -143,12 +151,13 @@ def up(
         str, typer.Option(help="Of a drawn plant: nominal, realistic or hard.", metavar="NAME")
     ] = "realistic",
     camera: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="What a virtual pool's camera sends: pictures, corners (of the tags) or none.",
+            help="What a virtual pool's camera sends: pictures, corners (of the tags) or none. If not given: pictures, "
+            "over a tank corners.",
             metavar="KIND",
         ),
-    ] = "pictures",
+    ] = None,
     port: Annotated[
         int, typer.Option(help="UDP port of a virtual pool; its pictures leave from the next.")
     ] = 58766,

@@ -18,6 +18,7 @@ from finssim.cli_options import (
     Pictures,
     Robot,
     RobotPool,
+    RobotSite,
     Seed,
     Unattended,
     Vehicle,
@@ -165,6 +166,7 @@ def excite(
     ] = None,
     robot: Robot = None,
     pool_file: RobotPool = None,
+    site: RobotSite = None,
     bind: Bind = "127.0.0.1:54321",
     pictures: Pictures = None,
     lockstep: Lockstep = False,
@@ -207,8 +209,8 @@ def excite(
             "--robot is where it is done: leave --simulate, --pool and what tells of it out"
         )
     where = robot_or_none(
-        robot, bind=bind, pictures=pictures, lockstep=lockstep, pool_file=pool_file, arm=arm, by_hand=by_hand,
-        unattended=unattended,
+        robot, bind=bind, pictures=pictures, lockstep=lockstep, pool_file=pool_file, site=site, arm=arm,
+        by_hand=by_hand, unattended=unattended,
     )  # fmt: skip
     if where is not None:
         from finssim.experiments.excitation import excite_on_robot

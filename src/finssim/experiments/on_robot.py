@@ -30,6 +30,7 @@ from finssim.robot.robot import Reading
 from finssim.robot.runtime import Runtime
 from finssim.robot.wiring import Drive, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
+from finssim.vehicles.defaults import vehicle_at
 
 __all__ = [
     "Attendant",
@@ -112,7 +113,7 @@ def play_trial(
     trial: RobotTrial,
     drive: Drive,
     vehicle: Vehicle,
-    site: Pool,
+    site: Pool | None,
     *,
     perception: Perception | None = None,
     recorder: Recorder | None = None,
@@ -124,7 +125,7 @@ def play_trial(
         trial: What to do.
         drive: Runs the robot's software on its wires, or in lock-step with a world.
         vehicle: As the robot knows it.
-        site: Camera, water and frames, as calibrated.
+        site: Camera, water and frames, as calibrated; None: no camera looks.
         perception: Otherwise than by default.
         recorder: Takes down the trial itself, not the way to its start.
         placing: How the vehicle gets to the start; None: it is there already, at rest, as in a pool that begins.
@@ -299,8 +300,10 @@ class OnRobot:
 
     wiring: Wiring
     """Its wires; a virtual pool in a process of its own is another of them."""
-    pool_file: Path
-    """Camera, water and frames."""
+    pool_file: Path | None
+    """Camera, water and frames; None: no camera looks, position fixes come by wire."""
+    site: str = "pool"
+    """Where it is, by which it is equipped: pool, tank or open-water."""
     arm: bool = False
     """Thrusters may turn; trials are refused without it."""
     by_hand: bool = False
@@ -317,7 +320,8 @@ class OnRobot:
     def options(self) -> str:
         """Words of a command line that name it."""
         wiring = self.wiring
-        words = ["--robot", wiring.robot, "--pool-file", str(self.pool_file)]
+        words = ["--robot", wiring.robot, "--pool-file", str(self.pool_file or "none")]
+        words += ["--site", self.site] if self.site != "pool" else []
         words += ["--bind", wiring.bind] if wiring.bind != DEFAULT_BIND else []
         words += ["--pictures", wiring.pictures] if wiring.pictures else []
         return shlex.join([*words, *(["--lockstep"] if wiring.lockstep else [])])
@@ -346,12 +350,14 @@ class Session:
         self,
         robot: OnRobot,
         vehicle: Vehicle,
-        site: Pool,
+        site: Pool | None,
         drive: Drive,
         attendant: Attendant | None,
         console: Console,
     ) -> None:
         self.robot, self.vehicle, self.site = robot, vehicle, site
+        self.equipped = vehicle_at(robot.site, vehicle)
+        """The vehicle as it is equipped where it is."""
         self._drive, self._attendant, self._console = drive, attendant, console
 
     def say(self, text: str) -> None:
@@ -431,16 +437,17 @@ class Session:
             "guide": trial.guide.name,
             "armed": True,
             "robot": self.robot.wiring.robot,
-            "pool_sha256": self.site.sha256,
+            "site": self.robot.site,
+            **({"pool_sha256": self.site.sha256} if self.site else {}),
             **about,
         }
         epoch = 0.0 if self.robot.wiring.lockstep else time.time() - time.monotonic()
-        files = {"pool.yaml": self.robot.pool_file}
+        files = {"pool.yaml": self.robot.pool_file} if self.robot.pool_file else {}
         with Recorder(partial, self.vehicle, meta, pictures="none", epoch=epoch, files=files) as recorder:
             outcome = play_trial(
                 trial,
                 self._drive,
-                self.vehicle,
+                self.equipped,
                 self.site,
                 perception=perception and perception(),
                 recorder=recorder,
@@ -480,6 +487,7 @@ def session(
     Raises:
         RobotError: It may not be armed, or nobody is there to press keys.
         LinkError, LockstepError, LocalizationError: It cannot be reached, or its pool file cannot be used.
+        VehicleError: There is no such site.
     """
     if not robot.arm:
         raise RobotError("trials turn thrusters: give --arm when the water is clear of people and cables")
@@ -488,9 +496,9 @@ def session(
             "by hand somebody has to press enter at every start: leave --unattended or --by-hand out"
         )
     console = console or Console(stderr=True)
-    site = load_pool(robot.pool_file)
+    site = None if robot.pool_file is None else load_pool(robot.pool_file)
     with ExitStack() as stack:
-        drive = stack.enter_context(connected(robot.wiring, vehicle, site))
+        drive = stack.enter_context(connected(robot.wiring, vehicle_at(robot.site, vehicle), site))
         if attendant is None and not robot.unattended:
             if not sys.stdin.isatty():
                 raise RobotError(

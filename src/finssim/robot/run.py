@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,7 @@ def run(
     number: int = 0,
     task: str | None = None,
     agent: str | None = None,
+    let_in: Sequence[float] | None = None,
     wiring: Wiring | None = None,
     record: Path | None = None,
     duration: float | None = None,
@@ -73,6 +74,7 @@ def run(
         number: Among several under one camera, by which its tags have other ids.
         task: That the policy must have been trained for, or whose baseline acts.
         agent: Place of this vehicle in a task of several.
+        let_in: x, y of where it begins, world frame [m], where nothing else tells; None: something does.
         wiring: How the robot is connected; to the virtual pool of this machine if None.
         record: File that takes down everything.
         duration: When to end [s]; at the end of a trajectory, or when interrupted, if None.
@@ -98,7 +100,7 @@ def run(
         )
     pilot = _pilot(policy, filed, task, trim, agent=agent, follows=trajectory is not None)
     pool = None if pool_file is None else load_pool(pool_file)
-    perception = Perception(ours, pool, mode=mode)
+    perception = Perception(ours, pool, mode=mode, let_in=let_in)
     meta = {
         "command": "finssim run",
         "site": site,

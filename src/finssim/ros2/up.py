@@ -10,7 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from finssim.robot.goals import check_reachable, guide_of
+from finssim.robot.goals import check_reachable, guide_of, place_of
 from finssim.robot.interrupt import interruptible
 from finssim.ros2.errors import Ros2Error
 from finssim.ros2.graphs import MCU_PORT, Plan, topics_of
@@ -37,6 +37,7 @@ class Options:
     namespace: str | None = None
     site: str = "pool"
     positioning: str = "none"
+    let_in: str | None = None
     policy: str = "pid"
     task: str | None = None
     trim: bool = False
@@ -49,7 +50,7 @@ class Options:
     pool_file: Path | None = None
     plant: str = "1"
     severity: str = "realistic"
-    camera: str = "pictures"
+    camera: str | None = None
     port: int = MCU_PORT
     truth: Path | None = None
     start: str | None = None
@@ -87,6 +88,9 @@ def plan_of(graph: str, options: Options, pool_file: Path) -> Plan:
     _wire(plan, o)
     for node in ("camera", "localizer", "state_estimation"):
         plan.set(node, pool_file="none" if blind else str(pool_file))
+    if o.let_in is not None:
+        place_of(o.let_in)  # refuses what is none
+        plan.set("state_estimation", let_in=o.let_in, mode="error-state")
     if o.record is not None:
         located = graph != "sim" and not blind
         plan.set("recorder", record=str(o.record), pool_file=str(pool_file) if located else None)
@@ -96,7 +100,7 @@ def plan_of(graph: str, options: Options, pool_file: Path) -> Plan:
             "virtual_pool",
             plant=o.plant,
             severity=o.severity,
-            camera="none" if blind else o.camera,
+            camera="none" if blind else o.camera or ("corners" if o.site == "tank" else "pictures"),
             port=o.port,
             seed=o.seed,
             positioning=o.positioning,
