@@ -117,7 +117,7 @@ def hydrodynamics(
         str,
         typer.Option(
             help="regression: each axis by its equation of motion; simulation: what simulates the trials best; auto: "
-            "the regression, or the simulation where that replays the trials better.",
+            "the regression where it replays the trials very well, else the simulation unless that replays them worse.",
             metavar="METHOD",
         ),
     ] = "auto",

@@ -1,16 +1,12 @@
 """Intervals hold what they promise, whatever the trials have in common; trade-offs are named."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from finssim.calibration.degeneracy import correlation, degeneracy
-from finssim.calibration.uncertainty import (
-    Evidence,
-    bootstrap,
-    correlated_samples,
-    intervals,
-    trial_covariance,
-)
+from finssim.calibration.uncertainty import Evidence, correlated_samples, intervals, trial_covariance
 
 TRUTH = np.array([3.0, -1.0, 0.5])
 
@@ -68,12 +64,37 @@ def test_local_covariance_is_too_narrow_when_trials_differ_and_trials_are_not():
     assert np.mean(trials, axis=0)[:2] == pytest.approx(truth, rel=0.25)
 
 
-def test_bootstrap_agrees_with_the_sandwich_for_many_trials():
-    """Two ways to read the same disagreement."""
-    theta, evidence = fitted(np.random.default_rng(1), 60, shared=0.5)
-    replicates = bootstrap(evidence, theta, resamples=2000, seed=3)
-    assert replicates.std(axis=0) == pytest.approx(trial_covariance(evidence).std, rel=0.2)
-    assert np.array_equal(replicates, bootstrap(evidence, theta, resamples=2000, seed=3))
+def test_the_sandwich_agrees_with_trials_drawn_anew():
+    """Two ways to read the same disagreement: the formula, and 2000 draws of 60 trials with replacement."""
+    _, evidence = fitted(np.random.default_rng(1), 60, shared=0.5)
+    times = np.random.default_rng(3).multinomial(60, np.full(60, 1.0 / 60), size=2000).astype(float)
+    normal = np.einsum("rg,gij->rij", times, evidence.normal)
+    steps = np.linalg.solve(normal, (times @ evidence.score)[..., None])[..., 0]
+    assert steps.std(axis=0) == pytest.approx(trial_covariance(evidence).std, rel=0.2)
+
+
+@pytest.mark.parametrize("std", [0.01, 0.1, 1.0])
+def test_intervals_with_a_prior_hold_truths_drawn_from_it(std):
+    """Estimates pulled to a prior's mean: 95 % intervals hold the truth, and follow the narrower of the two sources."""
+    rng, hits, width = np.random.default_rng(4), [], []
+    for _ in range(300):
+        theta, evidence = fitted(rng, 8)
+        inverse = np.diag([0.0, std**-2, 0.0])
+        N = evidence.normal.sum(axis=0)
+        mean = TRUTH + [0.0, std * rng.normal(), 0.0]
+        pulled = np.linalg.solve(N + inverse, N @ theta + inverse @ mean)
+        covariance = trial_covariance(
+            replace(
+                evidence,
+                score=evidence.score - evidence.normal @ (pulled - theta),
+                prior=inverse,
+            )
+        )
+        low, high = intervals(pulled, covariance)[1]
+        hits.append(low <= TRUTH[1] <= high)
+        width.append(0.5 * (high - low))
+    assert 0.92 <= np.mean(hits)
+    assert np.median(width) < 1.1 * 1.96 * std
 
 
 def test_one_trial_leaves_the_local_answer():

@@ -174,3 +174,4 @@ def test_a_task_in_torch_sees_its_last_actions_on_a_robot(tmp_path, action):
         assert observer.observe(me, goal, 0.1 * k, done[0])[1] == seen
     observer.restart()
     assert observer.observe(me, goal, 0.0)[1] == 0.0
+    assert env.reset()[0, 1] == 0.0

@@ -24,12 +24,16 @@ from finssim.calibration.trials.inputs import drive
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import AXES, Vehicle
 
-__all__ = ["METHODS", "fit_hydrodynamics"]
+__all__ = ["METHODS", "fit_hydrodynamics", "scaled"]
 
 METHODS = ("auto", "regression", "simulation")
 
-ENOUGH = 0.10
+ENOUGH = 0.03
 """NRMSE of the replay of every fitted axis up to which a regression is not tried to be bettered."""
+
+PREFERRED = 1.1
+"""Factor on the regression's NRMSE up to which simulation error is preferred: it fits what a replay scores, and carries
+further to speeds that no trial had."""
 
 WORSE = 1.05
 """Factor on the vehicle file's NRMSE above which the fit replays an axis worse than the file."""
@@ -107,8 +111,9 @@ def fit_hydrodynamics(
     if known and method == "simulation":
         raise CalibrationError("known inertias need the regression: the simulation method fits every inertia")
 
-    def regression(body: Vehicle, inertias: Mapping[str, float] = known) -> Fit:
-        return regress(trials, body, axes=axes, damping=damping, known=inertias, estimate=estimate, seed=seed)
+    def regression(body: Vehicle, **given: Any) -> Fit:
+        settings = {"known": known} | given
+        return regress(trials, body, axes=axes, damping=damping, estimate=estimate, seed=seed, **settings)
 
     def simulation(body: Vehicle) -> Fit:
         from finssim.calibration.simulation.fit import fit_by_simulation
@@ -120,9 +125,9 @@ def fit_hydrodynamics(
 
     scale, std = 1.0, 0.0
     if "thrust_scale" not in estimate and _unknown_voltage(trials, vehicle):
-        free = _or_none(lambda body: regression(body, {}), vehicle)
+        free = _or_none(lambda body: regression(body, known={}, trust=False), vehicle)
         scale, std = _thrust_scale(free, vehicle, known)
-    body = vehicle.replace(_scaled(vehicle, scale)) if std else vehicle
+    body = vehicle.replace(scaled(vehicle, scale)) if std else vehicle
     before = _scores(vehicle, trials)
     driven = [trial for trial in trials if not trial.header.passive]
     if method == "simulation" or asked:
@@ -150,7 +155,8 @@ def _better(
     trials: Sequence[Trial],
     before: Mapping[str, float],
 ) -> Fit:
-    """The regression where it replays every axis well and better than the file; else whichever replays better."""
+    """The regression where it replays every axis very well and better than the file; else simulation error, unless that
+    replays worse."""
     first = _or_none(regression, body)
     if first is None:
         return simulation(body)
@@ -164,7 +170,7 @@ def _better(
         return first
     other = _scores(calibrated(second), trials)
     means = [_mean(scores, {*after, *other}) for scores in (after, other)]
-    return second if means[1] < means[0] else replace(first, interrupted=second.interrupted)
+    return second if means[1] <= PREFERRED * means[0] else replace(first, interrupted=second.interrupted)
 
 
 def _mean(scores: Mapping[str, float], axes: set[str]) -> float:
@@ -218,7 +224,7 @@ def _unknown_voltage(trials: Sequence[Trial], vehicle: Vehicle) -> bool:
     return sources == {"pwm"} and silent
 
 
-def _scaled(vehicle: Vehicle, scale: float) -> dict[str, Any]:
+def scaled(vehicle: Vehicle, scale: float) -> dict[str, Any]:
     """Changes of the vehicle file that multiply every thrust."""
     return {
         f"thrusters.{name}.{key}": scale * float(getattr(thruster, key))
@@ -277,7 +283,7 @@ def _with_scale(fit: Fit, vehicle: Vehicle, scale: float, std: float, known: Map
         fit,
         vehicle=vehicle,
         estimates=found,
-        changes={**_scaled(vehicle, scale), **fit.changes},
+        changes={**scaled(vehicle, scale), **fit.changes},
         warnings=(warning, *fit.warnings),
     )
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Covariance", "Evidence", "bootstrap", "correlated_samples", "intervals", "trial_covariance"]
+__all__ = ["Covariance", "Evidence", "correlated_samples", "intervals", "trial_covariance"]
 
 Array = NDArray[np.float64]
 
@@ -36,6 +36,14 @@ class Evidence:
     """s_g, (G, P); they add up to zero where no bound is active."""
     unit: str = "trials"
     """What g counts: `trials`, or `blocks` of consecutive samples where there are too few trials."""
+    prior: Array | None = None
+    """Inverse covariance of what was known before any trial, (P, P); None without."""
+
+    @property
+    def information(self) -> Array:
+        """Σ_g N_g and the prior's, (P, P)."""
+        total = np.asarray(self.normal, float).sum(axis=0)
+        return total if self.prior is None else total + self.prior
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +85,9 @@ def _whitener(normal: Array) -> tuple[Array, Array]:
 def trial_covariance(evidence: Evidence) -> Covariance:
     """Local and trial-based covariance of the estimates.
 
-    V = N⁻¹ [Σ_g A_g s_g s_gᵀ A_gᵀ] N⁻¹,  A_g = (1 - N_g N⁻¹)⁻¹                 (CR3; Bell and McCaffrey 2002)
+    V = N⁻¹ [Σ_g A_g s_g s_gᵀ A_gᵀ + N_0] N⁻¹,  A_g = (1 - N_g N⁻¹)⁻¹           (CR3; Bell and McCaffrey 2002)
+
+    with N = Σ_g N_g + N_0 and the information N_0 of a prior, whose variance is taken as stated.
 
     N⁻¹ A_g s_g is what leaving trial g out changes: V is the jackknife over trials. The power -½ would be exact for
     independent errors, and too small where few trials with much weight differ as a whole, as they do. The degrees of
@@ -91,7 +101,7 @@ def trial_covariance(evidence: Evidence) -> Covariance:
     """
     N_g, s_g = np.asarray(evidence.normal, float), np.asarray(evidence.score, float)
     P = len(evidence.names)
-    T, unknown = _whitener(N_g.sum(axis=0))
+    T, unknown = _whitener(evidence.information)
     local = T @ T.T
     local[unknown, unknown] = np.inf
     if len(N_g) < 2 or T.shape[1] == 0:
@@ -109,6 +119,10 @@ def trial_covariance(evidence: Evidence) -> Covariance:
     A = np.einsum("gij,gj,gkj->gik", axes, root, axes)
     errors = np.einsum("pk,gkl,gl->gp", T, A, s_g @ T)
     trials = errors.T @ errors
+    stated = np.zeros((P, P))
+    if evidence.prior is not None:
+        stated = T @ (T.T @ evidence.prior @ T) @ T.T
+        trials = trials + stated
 
     a = np.einsum("pk,gkl->gpl", T, A)  # A_gᵀ N⁻¹ e_p, whitened
     Ba = np.einsum("gkl,gpl->gpk", B, a)
@@ -118,6 +132,8 @@ def trial_covariance(evidence: Evidence) -> Covariance:
     trace = np.trace(gram, axis1=1, axis2=2)
     square = np.einsum("pgh,pgh->p", gram, gram)
     dof = np.where(square > 0.0, trace**2 / np.maximum(square, 1e-300), 1.0)
+    # A stated variance has infinitely many degrees of freedom; Satterthwaite's sum of both.
+    mixed = (1.0 + np.diagonal(stated) / np.maximum(trace, 1e-300)) ** 2
 
     variance = np.maximum(np.diagonal(T @ T.T), 1e-300)
     alone = (np.einsum("pk,gkl,pl->gp", T, B, T) / variance).max(axis=0) > ALONE
@@ -126,7 +142,7 @@ def trial_covariance(evidence: Evidence) -> Covariance:
         names=evidence.names,
         local=local,
         trials=trials,
-        dof=np.where(alone, np.inf, np.clip(dof, 1.0, len(N_g) - 1.0)),
+        dof=np.where(alone, np.inf, np.clip(dof, 1.0, len(N_g) - 1.0) * mixed),
         alone=alone | unknown,
     )
 
@@ -149,37 +165,6 @@ def intervals(theta: Array, covariance: Covariance, *, level: float = 0.95) -> A
     quantile = np.where(finite, t.ppf(p, np.where(finite, covariance.dof, 1.0)), norm.ppf(p))
     half = quantile * covariance.std
     return np.stack([theta - half, theta + half], axis=-1)
-
-
-def bootstrap(evidence: Evidence, theta: Array, *, resamples: int = 2000, seed: int = 0) -> Array:
-    """Estimates from trials drawn with replacement, by one Gauss-Newton step from the solution.
-
-    theta* = theta + (Σ_g n_g N_g)⁻¹ Σ_g n_g s_g,  n ~ multinomial(G, 1/G)
-
-    The step is exact for a linear model. With few trials these replicates spread a little less than the truth (by
-    √(1 - 1/G) and the leverage); `trial_covariance` corrects for it, so intervals come from there.
-
-    Args:
-        evidence: Contributions of G trials.
-        theta: Estimates, (P,).
-        resamples: R.
-        seed: Of the draws.
-
-    Returns:
-        (R, P); rows are NaN where a draw leaves a parameter without information.
-    """
-    N_g, s_g = np.asarray(evidence.normal, float), np.asarray(evidence.score, float)
-    G, P = s_g.shape
-    scale = np.sqrt(np.maximum(np.diagonal(N_g.sum(axis=0)), 1e-300))
-    N_g, s_g = N_g / np.outer(scale, scale), s_g / scale
-    counts = np.random.default_rng(seed).multinomial(G, np.full(G, 1.0 / G), size=resamples).astype(float)
-    normal = np.einsum("rg,gij->rij", counts, N_g)
-    score = counts @ s_g
-    good = np.linalg.eigvalsh(normal)[:, 0] > 1e-9
-    steps = np.full((resamples, P), np.nan)
-    if good.any():
-        steps[good] = np.linalg.solve(normal[good], score[good][..., None])[..., 0]
-    return np.asarray(theta + steps / scale)
 
 
 def correlated_samples(residual: Array, breaks: Sequence[int] = ()) -> float:

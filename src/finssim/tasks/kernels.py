@@ -72,7 +72,7 @@ def kernels_of(task: Task) -> Kernels:
     """
     writer = _Writer(task)
     text = writer.text()
-    key = (type(task), text, tuple(writer.functions.values()))
+    key = (task.settled_by(), text, tuple(writer.functions.values()))
     if key not in _made:
         _made[key] = _compiled(task, text, writer.functions)
     return _made[key]
@@ -303,7 +303,7 @@ _numbers = itertools.count()
 
 def _compiled(task: Task, text: str, functions: Mapping[str, Any]) -> Kernels:
     """Kernels of a source, in a module of Warp's of their own."""
-    kind = type(task)
+    kind = task.settled_by()
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
     name = f"{kind.__module__}.{kind.__qualname__}_{digest}"
     if any(
@@ -339,18 +339,18 @@ def settings_of(task: Task) -> Any:
     Raises:
         EnvironmentSetupError: It is not fitted to vehicles.
     """
-    return _filled(task, f"task '{task.name}'")
+    return _filled(task, task.settled_by(), f"task '{task.name}'")
 
 
-def _filled(one: Any, whose: str) -> Any:
-    kind = _struct(type(one))
+def _filled(one: Any, of: type, whose: str) -> Any:
+    kind = _struct(of)
     out = kind()
-    for name, hint in _numbers_of(type(one)).items():
+    for name, hint in _numbers_of(of).items():
         value = getattr(one, name)
         if is_dataclass(hint):
             if value is None:
                 raise EnvironmentSetupError(f"{whose} is not fitted to vehicles: call fitted([...]) first")
-            value = _filled(value, whose)
+            value = _filled(value, type(value), whose)
         elif isinstance(value, tuple):
             value = kind.vars[name].type(*value)
         setattr(out, name, value)

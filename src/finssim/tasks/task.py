@@ -81,6 +81,10 @@ class Task:
         """Of what the task is made."""
         raise TypeError(f"task '{self.name}' does not say of what it is made: define terms()")
 
+    def settled_by(self) -> type:
+        """The class whose settings its kernels take: tasks of one such class and equal terms share kernels."""
+        return type(self)
+
     @property
     def totals(self) -> tuple[str, ...]:
         """Names of what is counted in an episode, a part of `metrics`: success, the terms' totals, the ends."""

@@ -104,8 +104,10 @@ class Worlds:
 
     @property
     def action(self) -> Tensor:
-        """What the agents did in this step, in [-1, 1]: (worlds, size), or (worlds, agents, size) of several."""
-        return self._by_agent(self._action.clamp(-1.0, 1.0))
+        """What the agents did in this step, in [-1, 1]: (worlds, size), or (worlds, agents, size) of several; zero
+        before the first."""
+        done = self._action.clamp(-1.0, 1.0)
+        return self._by_agent(torch.where(self._steps[:, None] > 0, done, torch.zeros_like(done)))
 
     @property
     def previous_action(self) -> Tensor:
@@ -249,6 +251,10 @@ class TorchTask(Task):
             inside=answered_inside,
             totals=tuple(Total(name, answered_total, index=i) for i, name in enumerate(self.totals)),
         )
+
+    def settled_by(self) -> type:
+        """This class: its kernels only carry what the functions answer, and need not be compiled for every task."""
+        return TorchTask if type(self).terms is TorchTask.terms else type(self)
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """Room for what the functions answer."""

@@ -6,7 +6,8 @@ Two further terms, `delay` and `smoothing`, take up what the recording did to th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,12 +77,15 @@ def moments(X: Array, Z: Array, y: Array, weight: Array, group: NDArray[np.int64
     return Moments(product=product, mean=mean, weight=total)
 
 
-def solve(found: Moments, ratio: float = 0.0) -> tuple[Array, Array, Array, Array]:
+def solve(
+    found: Moments, ratio: float = 0.0, prior: tuple[Array, Array] | None = None
+) -> tuple[Array, Array, Array, Array]:
     """Two-stage least squares, theta = (Zᵀ X)⁻¹ Zᵀ y, and what each group says about it.
 
     Args:
         found: Sums.
         ratio: Variance of the trial offsets over that of a row.
+        prior: What was known before: means, and inverse variances times the variance of a row, (p,) each.
 
     Returns:
         theta (p,); N_g = Z_p,gᵀ Z_p,g of the regressors projected on the instruments (G, p, p); scores
@@ -95,9 +99,11 @@ def solve(found: Moments, ratio: float = 0.0) -> tuple[Array, Array, Array, Arra
     zz = total[z, z] * np.outer(scale, scale)
     project = scale[:, None] * np.linalg.lstsq(zz, scale[:, None] * total[z, x], rcond=1e-11)[0]
     N_g = project.T @ S[:, z, z] @ project
-    N = N_g.sum(axis=0)
+    N, right = N_g.sum(axis=0), project.T @ total[z, y]
+    if prior is not None:
+        N, right = N + np.diag(prior[1]), right + prior[1] * prior[0]
     unit = 1.0 / np.sqrt(np.maximum(np.diagonal(N), 1e-300))
-    theta = unit * np.linalg.lstsq(N * np.outer(unit, unit), unit * (project.T @ total[z, y]), rcond=1e-11)[0]
+    theta = unit * np.linalg.lstsq(N * np.outer(unit, unit), unit * right, rcond=1e-11)[0]
     r = np.concatenate([-theta, np.zeros(p), [1.0]])
     scores = (S[:, z, :] @ r) @ project
     return theta, N_g, scores, np.einsum("i,gij,j->g", r, S, r)
@@ -126,9 +132,11 @@ def offset_ratio(found: Moments, correlated: float) -> float:
     return ratio
 
 
-def evidence(names: tuple[str, ...], N_g: Array, scores: Array, variance: float, unit: str) -> Evidence:
+def evidence(
+    names: tuple[str, ...], N_g: Array, scores: Array, variance: float, unit: str, prior: Array
+) -> Evidence:
     """For `trial_covariance`, in units of the variance of an independent row."""
-    return Evidence(names=names, normal=N_g / variance, score=scores / variance, unit=unit)
+    return Evidence(names=names, normal=N_g / variance, score=scores / variance, unit=unit, prior=prior)
 
 
 Array = NDArray[np.float64]
@@ -161,6 +169,8 @@ class AxisData:
     inertia: float | None = None
     """Effective inertia where it is known [kg, kg m²]; fitted if None."""
 
+    prior: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """What was known of some of `TERMS` before any trial: mean and standard deviation."""
     estimated: tuple[str, ...] = ()
     """Paths of the parameters of the vehicle's terms that are fitted too."""
     lowest: tuple[float, ...] = ()
@@ -178,6 +188,14 @@ class AxisData:
     def restoring(self) -> bool:
         """Roll and pitch have a stiffness."""
         return self.axis in (3, 4)
+
+    def known_before(self) -> tuple[Array, Array]:
+        """Means and inverse variances of all terms, (7 + k,) each; zero where nothing was known."""
+        mean, inverse = np.zeros((2, len(TERMS) + len(self.estimated)))
+        for name, (value, std) in self.prior.items():
+            mean[TERMS.index(name)], inverse[TERMS.index(name)] = value, std**-2
+        mean[TERMS.index("delay")] -= self.shift
+        return mean, inverse
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,12 +251,14 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
     weight, Z, instrumental = np.ones(inside.sum()), X, False
     simulated: list[Array] = []
     ratio, theta = 0.0, np.zeros(p)
+    mean, inverse = (column[kept] for column in data.known_before())
+    before = (mean, np.zeros_like(inverse))
     pieces = [_cut(data, found, rows) for found, rows in zip(data.signals, data.rows, strict=True)]
     for round_ in range(iterations + 1):
         sums = moments(X[inside], Z[inside], y[inside], weight, group).of(kept)
         previous = theta
         theta = np.zeros(p)
-        theta[kept] = solve(sums, ratio)[0]
+        theta[kept] = solve(sums, ratio, before)[0]
         residual = y[inside] - X[inside] @ theta
         centred = residual - _group_means(residual, weight, group)
         weight = huber_weights(centred)
@@ -247,6 +267,10 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
         )
         if round_ < FREE_ROUNDS:
             ratio = offset_ratio(sums, correlated) / correlated
+            variance = float(weight @ centred**2) / max(float(weight.sum()) - kept.sum(), 1.0) * correlated
+            before = (mean, variance * inverse)
+        if not round_:
+            theta[kept] = solve(sums, ratio, before)[0]
         runs = _simulate(data, theta + known, pieces)
         if runs is None:
             break
@@ -256,9 +280,11 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
     if instrumental:
         sums = moments(X[inside], Z[inside], y[inside], weight, group).of(kept)
     free = np.zeros(p)
-    free[kept], N_g, scores, rss = solve(sums, ratio)
+    free[kept], N_g, scores, rss = solve(sums, ratio, before)
     lower = np.array([0.0, 0.0, 0.0, -np.inf, -np.inf, -np.inf, 0.0, *data.lowest])[kept]
-    held, active_kept = bounded(N_g.sum(axis=0) + 1e-12 * np.eye(kept.sum()), free[kept], lower)
+    held, active_kept = bounded(
+        N_g.sum(axis=0) + np.diag(before[1]) + 1e-12 * np.eye(kept.sum()), free[kept], lower
+    )
     theta, active = np.zeros(p), np.zeros(p, bool)
     theta[kept], active[kept] = held, active_kept
     variance = float(rss.sum()) / max(float(sums.weight.sum()) - kept.sum(), 1.0) * correlated
@@ -266,10 +292,10 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
     if len(data.rows) < FEWEST_TRIALS:
         blocks = _blocks(group, correlated)
         cut = moments(X[inside], Z[inside], y[inside], weight, blocks).of(kept)
-        _, N_g, scores, _ = solve(cut)
+        _, N_g, scores, _ = solve(cut, 0.0, before)
         unit = "blocks"
     names = tuple(name for name, on in zip((*TERMS, *data.estimated), kept, strict=True) if on)
-    found = evidence(names, N_g, scores, variance, unit)
+    found = evidence(names, N_g, scores, variance, unit, np.diag(inverse))
     ends = np.cumsum([len(rows.y) for rows in data.rows])[:-1]
     return AxisFit(
         terms=kept,

@@ -366,6 +366,16 @@ LARGEST_SHIFT = 0.5
 TILTS_INTO = {0: {1, 2}, 1: {0, 2}, 2: {0, 1}, 5: {0, 1}}
 """Axes whose coefficients decide an axis' motion at large tilt: what surge turns over sways too."""
 
+INERTIA_PRIOR = (0.7, 0.3, 0.5)
+"""Standard deviation of what the file expects: of added mass, as a part of it (a factor of two); of an effective mass
+at least, as a part of it; of an effective moment of inertia, as a part of it."""
+
+DRAG_PRIOR = 1.0
+"""The same of its drag at the highest speed of the trials, for either of the two terms alone."""
+
+DELAY_STD = 0.15
+"""Of the time by which motion lags or leads the wrench [s]: motors, filters and two clocks."""
+
 SETTLED = 2e-3
 """Change of the left side, as a part of it, below which another round is not needed."""
 
@@ -378,6 +388,7 @@ def regress(
     damping: str = "auto",
     estimate: Sequence[str] = (),
     known: Mapping[str, float] | None = None,
+    trust: bool = True,
     seed: int = 0,
 ) -> Fit:
     """Effective mass, damping, bias and, in roll and pitch, stiffness of every axis that the trials excite.
@@ -395,6 +406,7 @@ def regress(
         estimate: Parameters of the vehicle's terms to fit too, such as `lift.coefficient`, in which their wrench is
             linear; each from all axes on which it acts.
         known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²].
+        trust: Whether the inertia and drag of the vehicle file count as a prior, within a factor of two or so.
         seed: Kept with the fit; nothing here is random.
 
     Raises:
@@ -408,7 +420,7 @@ def regress(
     driven = [trial for trial in trials if not trial.header.passive]
     prepared, warnings = prepare(driven, vehicle)
     chosen, plant, more = _fit_axes(
-        prepared, vehicle, wanted, axes is not None, damping, known or {}, estimate
+        prepared, vehicle, wanted, axes is not None, damping, known or {}, estimate, trust
     )
     warnings += more
     file = matrices(vehicle)
@@ -488,9 +500,11 @@ def _fit_axes(
     damping: str,
     known: Mapping[str, float],
     estimate: Sequence[str],
+    trust: bool,
 ) -> tuple[dict[int, tuple[AxisData, Selection]], Matrices, list[str]]:
     """Data and model of every axis that can be fitted; couplings between axes use the estimates of the round before."""
-    plant, warnings = matrices(vehicle, estimate=estimate), list[str]()
+    file = plant = matrices(vehicle, estimate=estimate)
+    warnings = list[str]()
     waters = [matrices(vehicle, one.trial.header.water.density, estimate=estimate) for one in prepared]
     active = excited(prepared, vehicle) if prepared else np.zeros((0, 6), bool)
     fitted = {i for i in wanted if active[:, i].any()}
@@ -509,7 +523,7 @@ def _fit_axes(
                 if asked and not len(those):
                     warnings.append(f"{AXES[i]}: no trial excites it; the vehicle file keeps its numbers")
                 continue
-            data = replace(data, inertia=known.get(AXES[i]))
+            data = replace(data, inertia=known.get(AXES[i]), prior=prior(data, file, trust))
             if i in former and former[i][0].shift:
                 data = later(data, former[i][0].shift)
             if round_ and i in former and _same(former[i][0], data):
@@ -529,6 +543,29 @@ def _fit_axes(
                 plant = plant.with_axis(i, m - plant.M_RB[i, i], max(d1, 0.0), max(d2, 0.0))
                 waters = [w.with_axis(i, m - w.M_RB[i, i], max(d1, 0.0), max(d2, 0.0)) for w in waters]
     return chosen, plant, warnings
+
+
+def prior(data: AxisData, file: Matrices, trust: bool) -> dict[str, tuple[float, float]]:
+    """What is known of an axis before any trial: mean and standard deviation by term.
+
+    Args:
+        data: Its trials.
+        file: The vehicle as its file has it.
+        trust: Whether that counts; a delay is expected to be short in any case.
+    """
+    out, i = {"delay": (0.0, DELAY_STD)}, data.axis
+    if not trust:
+        return out
+    m = float(file.M_RB[i, i] + file.M_A[i, i])
+    added, least, turning = INERTIA_PRIOR
+    std = turning * m if i > 2 else max(added * float(file.M_A[i, i]), least * m)
+    top = float(np.percentile(np.concatenate([np.abs(rows.X[:, 1]) for rows in data.rows]), 95.0))
+    d1, d2 = float(file.D1[i, i]), float(file.D2[i, i])
+    drag = d1 * top + d2 * top**2
+    out |= {"m_eff": (m, std)} if std > 0.0 else {}
+    if drag > 0.0:
+        out |= {"d1": (d1, DRAG_PRIOR * drag / top), "d2": (d2, DRAG_PRIOR * drag / top**2)}
+    return out
 
 
 def _same(before: AxisData, now: AxisData) -> bool:
