@@ -254,11 +254,12 @@ def test_the_command_runs_the_seeds_and_the_renderer_that_it_is_given(tiny, tmp_
     out, err = capfd.readouterr()
     assert "renderer geometry" in out and "refractive" in out and f"written: {tmp_path / 'a'}" in out
     assert err == ""
-    assert finssim(*COMMAND, "--seeds", "2", "--seed", "5", "--out", tmp_path / "b", "--json") == 0
+    assert finssim(*COMMAND, "--seeds", "1", "--seed", "5", "--out", tmp_path / "b", "--json") == 0
     result = json.loads(capfd.readouterr().out)
-    assert result["seeds"] == [5, 6] and result["renderer"] == "geometry"
-    assert result["results"]["published"]["refractive"]["visits"] == 12
-    assert result["calibration"][0] != result["calibration"][1]
+    assert result["seeds"] == [5] and result["renderer"] == "geometry"
+    assert result["results"]["published"]["refractive"]["visits"] == 6
+    other = json.loads((tmp_path / "a" / "localization.json").read_text())
+    assert result["calibration"] != other["calibration"] and other["seeds"] == [1]
     assert json.loads((tmp_path / "b" / "localization.json").read_text()) == result
 
 

@@ -90,7 +90,7 @@ def test_a_trajectory_is_followed_from_its_own_start(played):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["bluerov2", "bluerov2_heavy", "rexrov", "warpauv"])
+@pytest.mark.parametrize("name", ["bluerov2_heavy", "rexrov"])
 def test_other_vehicles_hold_a_setpoint_of_their_own_pool(played, name):
     """Defaults of tags, mcu and safety, a pool and a place as large as the vehicle, and a PID made for it: 5 cm."""
     vehicle = load_vehicle(name)

@@ -197,7 +197,7 @@ def die_in_the_sixth_update(out, learner, options):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
-@pytest.mark.parametrize("learner", ["ppo", "sb3-ppo", "sb3-sac", "rsl-rl", "torchrl-ppo"])
+@pytest.mark.parametrize("learner", ["ppo", "sb3-sac"])
 def test_a_killed_training_goes_on_to_the_same_policy(tmp_path, learner):
     """kill -9 in the sixth of eight updates, then --resume: network and curves as if nothing had been."""
     options = dict(SMALL)

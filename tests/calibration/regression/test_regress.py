@@ -53,14 +53,14 @@ def test_identifiable_parameters_come_back(name, axes):
 
 @pytest.mark.slow
 def test_intervals_cover_the_truth():
-    """Over 24 noise draws of six trials, 95 % intervals of mass and damping hold the truth in at least 19."""
+    """Over 12 noise draws of six trials, 95 % intervals of mass and damping hold the truth in at least 9."""
     names = ("surge.m_eff", "surge.d1", "surge.d2")
     hits = np.zeros(3)
-    for seed in range(24):
+    for seed in range(12):
         vehicle, some = trials("bluerov2_heavy", "surge", seed=seed)
         fit, expected = regress(some, vehicle), truth(vehicle)
         hits += [fit.estimates[n].ci95[0] <= expected[n] <= fit.estimates[n].ci95[1] for n in names]
-    assert (hits >= 19).all()  # 22.8 expected
+    assert (hits >= 9).all()  # 11.4 expected; 1 in 460 has fewer
 
 
 @pytest.mark.slow

@@ -62,7 +62,7 @@ CASES = {
     "bluerov2, commanded thrusters": ("bluerov2", ("sway", "yaw"), {"inputs": ("command",)}, 0.08),
     "bluerov2_heavy, gyro and attitude": (
         "bluerov2_heavy",
-        ("roll", "yaw"),
+        ("roll",),
         {"columns": ("p", "q", "r", "qx", "qy", "qz", "qw")},
         0.10,
     ),

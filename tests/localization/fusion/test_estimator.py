@@ -250,7 +250,6 @@ def test_dropouts_of_three_seconds_are_survived(mode):
     assert np.abs(e[:, 3]).max() < math.radians(2.5)  # the gyro carries the heading through
 
 
-@pytest.mark.slow
 def flipped(samples, start, end, turn):
     """Every yaw of a time turned."""
     return [
@@ -260,7 +259,7 @@ def flipped(samples, start, end, turn):
 
 @pytest.mark.slow
 @both
-@pytest.mark.parametrize("lasts, turn", [(1.5, 0.47), (4.0, 0.47), (4.0, np.pi / 2)])
+@pytest.mark.parametrize("lasts, turn", [(1.5, 0.47), (4.0, np.pi / 2)])
 def test_a_flip_that_lasts_is_not_believed_surely(mode, lasts, turn):
     """The camera's yaw is wrong by 27 or 90 degrees for seconds: the gyro carries the right one, or the doubt is told,
     and when the camera is right again the heading is back at once."""

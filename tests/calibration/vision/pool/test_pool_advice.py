@@ -157,8 +157,7 @@ def test_marks_above_the_water_are_told_from_wrong_rows():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("height", [1.05, 1.3])
-@pytest.mark.parametrize("asked", [FIT, None], ids=["lens held", "lens free"])
+@pytest.mark.parametrize(("height", "asked"), [(1.05, FIT), (1.3, None)], ids=["lens held", "lens free"])
 def test_marks_over_which_the_water_was_put_are_noticed(height, asked):
     """The same marks where nobody measured the water: it is found above some, or the lens is bent, and that is said."""
     wet = survey(overhead(), WATER, FLOOR, 40)

@@ -66,9 +66,9 @@ def test_published_geometry_with_a_tape():
 
 @pytest.mark.slow
 def test_intervals_hold_the_truth():
-    """19 of 20 intervals hold it: of 12 surveys x 4 numbers, 40 or more do (binomial, 1 in 200 has fewer than 41)."""
+    """19 of 20 intervals hold it: of 6 surveys x 4 numbers, 20 or more do (binomial, 1 in 170 has fewer)."""
     inside = 0
-    for seed in range(12):
+    for seed in range(6):
         rng = np.random.default_rng([5, seed])
         index, tilts = 1.333 + 0.003 * rng.standard_normal(), np.radians(0.2) * rng.standard_normal(2)
         camera = overhead()
@@ -77,7 +77,7 @@ def test_intervals_hold_the_truth():
         table = calibrate_pool(seen, PLUMB_BOB, Settings(fit=FIT, interface="surface", seed=seed)).estimates
         truth = {"camera_x": 0.03, "camera_z": 2.2, "index": index, "camera_height": clearance(camera, water)}
         inside += sum(table[n].ci95[0] < value < table[n].ci95[1] for n, value in truth.items())
-    assert inside >= 40
+    assert inside >= 20
 
 
 def test_z_down_is_a_frame_like_any_other():
