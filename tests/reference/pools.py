@@ -11,9 +11,11 @@ from finssim.pool.camera import PoolCamera
 from finssim.pool.draw_plant import draw_plant
 from finssim.pool.server import LockstepServer
 from finssim.pool.site import camera_of
+from finssim.pool.sites import positioning_of, site_of
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.quiet import start_warp
 from finssim.robot.wiring import Wiring
+from finssim.vehicles.defaults import vehicle_at
 
 
 class Silent(VirtualPool):
@@ -38,20 +40,28 @@ def lockstep_pool(
     truth=None,
     silent_from=math.inf,
     sessions=1,
+    site="pool",
+    positioning="none",
 ):
-    """The wiring to a pool that lives for as long as the block; its pool file is written.
+    """The wiring to a pool that lives for as long as the block; its pool file is written; None: no camera looks.
 
     A pool ends when its robot leaves: with several `sessions` another one then begins on the same port.
     """
     start_warp()
-    true_site, known_site, settings = camera_of(vehicle, plant, severity)
-    write_pool(known_site, pool_file)
+    vehicle, spec = vehicle_at(site, vehicle), site_of(site, draw_plant(vehicle, plant, severity))
+    if pool_file is not None:
+        true_site, known_site, settings = camera_of(vehicle, plant, severity, basin=spec.basin)
+        write_pool(known_site, pool_file)
 
     def world():
+        seen = pool_file is not None
         made = Silent(
             vehicle,
-            draw_plant(vehicle, plant, severity),
-            camera=PoolCamera(vehicle, true_site, mode="corners", settings=settings, seed=1),
+            spec,
+            camera=PoolCamera(vehicle, true_site, mode="corners", settings=settings, seed=1)
+            if seen
+            else None,
+            positioning=positioning_of(positioning, 1),
             start=(position, quat_from_yaw(yaw)),
             seed=1,
             truth=truth,

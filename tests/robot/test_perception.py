@@ -111,6 +111,13 @@ def test_before_the_first_fix_the_position_is_unknown_and_says_so():
     assert np.isnan(readings[-1].position[:2]).all()
 
 
+def test_without_a_camera_a_fix_is_what_is_missing():
+    """Nobody looks for a camera that there is not."""
+    perception = Perception(VEHICLE, None)
+    readings = run(Rounds(overhead(), VEHICLE), perception, 0.5, picture=lambda t, x: None)
+    assert readings[-1].reason == "no position fix yet"
+
+
 def test_three_seconds_without_vision_end_readiness_and_it_comes_back():
     """Coast, hold and lost in turn; ready again after the pictures are back."""
     world = Rounds(overhead(), VEHICLE)

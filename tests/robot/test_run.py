@@ -10,6 +10,7 @@ import pytest
 from finssim import boundary
 from finssim.cli import app
 from finssim.localization.pool import write_pool
+from finssim.pool import read_truth
 from finssim.robot.link.decoder import MCU, Decoder
 from finssim.robot.link.frames import encode_telemetry
 from finssim.robot.lockstep_codec import decode_request, encode_delivery, receive
@@ -18,6 +19,7 @@ from finssim.robot.record_reader import open_record
 from finssim.tasks import task_named
 from finssim.vehicles import load_vehicle
 from reference.policies import linear, written
+from reference.pools import lockstep_pool
 from reference.rounds import Rounds, overhead, without_latency
 
 POOL = overhead()
@@ -118,6 +120,25 @@ def test_the_error_state_estimator_can_be_chosen(capsys, pool_file):
     assert status == 0 and summary["fixes"] > 20
     assert finssim(*words, "--robot", world.address, "--mode", "psychic") == 2
     assert "unknown mode 'psychic'" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_dead_reckoning_begins_where_the_vehicle_was_let_in(capsys, tmp_path):
+    """Log, compass, gauge and IMU in open water: without the place it is never armed, with it goes where it should."""
+    heavy, truth = load_vehicle("bluerov2_heavy"), tmp_path / "truth"
+    words = ("--policy", "pid", "--vehicle", "bluerov2_heavy", "--site", "open-water", "--pool-file", "none")
+    words += ("--goal", "3.6,-2,-5,0", "--lockstep", "--arm")
+    how = {"site": "open-water", "severity": "realistic", "position": (3.0, -2.0, -5.0), "truth": truth}
+    with lockstep_pool(heavy, None, **how) as wiring:
+        status, summary = told(capsys, *words, "--robot", wiring.robot, "--duration", "1")
+    assert status == 0 and summary["reason"] == "no position fix yet"
+    with lockstep_pool(heavy, None, **how) as wiring:
+        place = ("--let-in", "3,-2")
+        status, summary = told(capsys, *words, *place, "--robot", wiring.robot, "--duration", "20")
+    assert status == 0 and summary["state"] == "armed" and summary["faults"] == []
+    assert np.linalg.norm(read_truth(truth).position[-1] - (3.6, -2.0, -5.0)) < 0.1
+    assert finssim(*words, "--let-in", "3", "--robot", "127.0.0.1:9") == 2
+    assert "expected two numbers x,y" in capsys.readouterr().err
 
 
 @pytest.mark.slow

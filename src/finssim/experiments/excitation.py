@@ -524,7 +524,7 @@ def robot_trials(
                 record,
                 counts=False,
                 exact=False,
-                perception=lambda: Perception(vehicle, opened.site, mode=ESTIMATOR),
+                perception=lambda: Perception(opened.equipped, opened.site, mode=ESTIMATOR),
                 about={"command": "finssim excite", **about_programme(programme, opened.robot.title)},
             )
             if outcome is None:

@@ -30,6 +30,7 @@ from finssim.robot.robot import Reading
 from finssim.robot.runtime import Runtime
 from finssim.robot.wiring import Drive, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
+from finssim.vehicles.defaults import vehicle_at
 
 __all__ = [
     "Attendant",
@@ -113,7 +114,7 @@ def play_trial(
     trial: RobotTrial,
     drive: Drive,
     vehicle: Vehicle,
-    site: Pool,
+    site: Pool | None,
     *,
     perception: Perception | None = None,
     recorder: Recorder | None = None,
@@ -125,7 +126,7 @@ def play_trial(
         trial: What to do.
         drive: Runs the robot's software on its wires, or in lock-step with a world.
         vehicle: As the robot knows it.
-        site: Camera, water and frames, as calibrated.
+        site: Camera, water and frames, as calibrated; None: no camera looks.
         perception: Otherwise than by default.
         recorder: Takes down the trial itself, not the way to its start.
         placing: How the vehicle gets to the start; None: it is there already, at rest, as in a pool that begins.
@@ -300,8 +301,10 @@ class OnRobot:
 
     wiring: Wiring
     """Its wires; a virtual pool in a process of its own is another of them."""
-    pool_file: Path
-    """Camera, water and frames."""
+    pool_file: Path | None
+    """Camera, water and frames; None: no camera looks, position fixes come by wire."""
+    site: str = "pool"
+    """Where it is, by which it is equipped: pool, tank or open-water."""
     arm: bool = False
     """Thrusters may turn; trials are refused without it."""
     by_hand: bool = False
@@ -318,7 +321,8 @@ class OnRobot:
     def options(self) -> str:
         """Words of a command line that name it."""
         wiring = self.wiring
-        words = ["--robot", wiring.robot, "--pool-file", str(self.pool_file)]
+        words = ["--robot", wiring.robot, "--pool-file", str(self.pool_file or "none")]
+        words += ["--site", self.site] if self.site != "pool" else []
         words += ["--bind", wiring.bind] if wiring.bind != DEFAULT_BIND else []
         words += ["--pictures", wiring.pictures] if wiring.pictures else []
         return shlex.join([*words, *(["--lockstep"] if wiring.lockstep else [])])
@@ -327,7 +331,8 @@ class OnRobot:
 def robot_or_none(
     *,
     robot: str | None = None,
-    pool_file: Path | None = None,
+    pool_file: str | None = None,
+    site: str | None = None,
     bind: str = "127.0.0.1:54321",
     pictures: str | None = None,
     lockstep: bool = False,
@@ -340,7 +345,9 @@ def robot_or_none(
     Args:
         robot (ADDRESS): Robot on which it is done: its motor controller's udp://HOST:PORT or serial:DEVICE, or pool for
             the virtual pool on this machine. With --lockstep: pool, or HOST:PORT.
-        pool_file (FILE): Of that robot: camera, water plane and frames (.yaml).
+        pool_file (FILE|none): Of that robot: camera, water plane and frames (.yaml); none where no camera looks and
+            position fixes come by wire.
+        site (NAME): Where that robot is: pool, tank or open-water, by which it is equipped. If not given: pool.
         bind (ADDRESS:PORT): Address and port of this end, for udp; pictures come to the port after it. Loopback unless
             given.
         pictures (ADDRESS): Overhead camera: udp://HOST:PORT, shm:NAME or none; the virtual pool's with --robot pool,
@@ -354,16 +361,22 @@ def robot_or_none(
         RobotError: Something tells of a robot and none is named, or it has no pool file.
     """
     if robot is None:
-        if arm or by_hand or unattended or lockstep or pool_file is not None or pictures is not None:
+        told = (arm, by_hand, unattended, lockstep, pool_file, pictures, site)
+        if any(x is not None and x is not False for x in told):
             raise RobotError(
-                "--arm, --by-hand, --unattended, --lockstep, --pool-file and --pictures tell of a robot: name one "
-                "with --robot"
+                "--arm, --by-hand, --unattended, --lockstep, --pool-file, --site and --pictures tell of a robot: name "
+                "one with --robot"
             )
         return None
     if pool_file is None:
-        raise RobotError("a robot knows where it is by its pool file: give --pool-file")
+        raise RobotError(
+            "a robot knows where it is by its pool file: give --pool-file, or none where position fixes come by wire"
+        )
     wiring = Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep)
-    return OnRobot(wiring=wiring, pool_file=pool_file, arm=arm, by_hand=by_hand, unattended=unattended)
+    file = None if pool_file == "none" else Path(pool_file)
+    return OnRobot(
+        wiring=wiring, pool_file=file, site=site or "pool", arm=arm, by_hand=by_hand, unattended=unattended
+    )
 
 
 class _Screen:
@@ -388,10 +401,15 @@ class Session:
 
     robot: OnRobot
     vehicle: Vehicle
-    site: Pool
+    site: Pool | None
     drive: Drive
     attendant: Attendant | None
     console: Console
+
+    @property
+    def equipped(self) -> Vehicle:
+        """The vehicle as it is equipped where it is."""
+        return vehicle_at(self.robot.site, self.vehicle)
 
     def say(self, text: str) -> None:
         """Tell whoever watches."""
@@ -470,16 +488,17 @@ class Session:
             "guide": trial.guide.name,
             "armed": True,
             "robot": self.robot.wiring.robot,
-            "pool_sha256": self.site.sha256,
+            "site": self.robot.site,
+            **({"pool_sha256": self.site.sha256} if self.site else {}),
             **about,
         }
         epoch = 0.0 if self.robot.wiring.lockstep else time.time() - time.monotonic()
-        files = {"pool.yaml": self.robot.pool_file}
+        files = {"pool.yaml": self.robot.pool_file} if self.robot.pool_file else {}
         with Recorder(partial, self.vehicle, meta, pictures="none", epoch=epoch, files=files) as recorder:
             outcome = play_trial(
                 trial,
                 self.drive,
-                self.vehicle,
+                self.equipped,
                 self.site,
                 perception=perception and perception(),
                 recorder=recorder,
@@ -519,6 +538,7 @@ def session(
     Raises:
         RobotError: It may not be armed, or nobody is there to press keys.
         LinkError, LockstepError, LocalizationError: It cannot be reached, or its pool file cannot be used.
+        VehicleError: There is no such site.
     """
     if not robot.arm:
         raise RobotError("trials turn thrusters: give --arm when the water is clear of people and cables")
@@ -527,9 +547,9 @@ def session(
             "by hand somebody has to press enter at every start: leave --unattended or --by-hand out"
         )
     console = console or Console(stderr=True)
-    site = load_pool(robot.pool_file)
+    site = None if robot.pool_file is None else load_pool(robot.pool_file)
     with ExitStack() as stack:
-        drive = stack.enter_context(connected(robot.wiring, vehicle, site))
+        drive = stack.enter_context(connected(robot.wiring, vehicle_at(robot.site, vehicle), site))
         if attendant is None and not robot.unattended:
             if not sys.stdin.isatty():
                 raise RobotError(

@@ -21,8 +21,7 @@ from finssim.pool.sites import positioning_of, site_of
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.robot.lockstep import run_lockstep
-from finssim.robot.messages import POSITION, NavigationAid
-from finssim.robot.perception import Perception
+from finssim.robot.perception import LET_IN_STD, Perception
 from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import Vehicle, load_vehicle
@@ -40,8 +39,6 @@ GETTING_READY = 10.0
 """Longest time until the estimator knows where the vehicle is [s]."""
 PERIOD = 0.5
 """Between compared estimates [s]."""
-START_STD = 0.05
-"""Standard deviation of the place where the vehicle is let in, per axis [m]."""
 INSIDE = 5.991
 """95 % of squared Mahalanobis distances in the plane are smaller."""
 WAYS = ("line", "square")
@@ -76,22 +73,16 @@ def way_of(shape: str, duration: float, speed: float) -> Trajectory:
 
 
 class _Watch:
-    """Tells the estimator once where the vehicle was let in, and keeps what it says of itself."""
+    """Keeps what the estimator says of itself."""
 
-    def __init__(self, perception: Perception, seed: int) -> None:
+    def __init__(self, perception: Perception) -> None:
         self.rows: list[tuple[float, ...]] = []
-        self._perception, self._placed = perception, False
-        self._start = np.random.default_rng([seed, 0x57A]).normal(0.0, START_STD, 2)
+        self._perception = perception
 
     def __call__(self, runtime: Runtime) -> None:
         reading = runtime.reading
         if reading is None:
             return
-        if not self._placed and reading.time > 0.5:
-            x, y = self._start.tolist()
-            aid = NavigationAid(0, POSITION, 0.1, (x, y, DEPTH), (START_STD, 0.0))
-            self._perception.aid(reading.time, aid)
-            self._placed = True
         if math.isnan(runtime.t) or (self.rows and reading.time < self.rows[-1][0] + PERIOD - 1e-6):
             return
         found = self._perception.estimator.estimate(reading.time)
@@ -128,8 +119,9 @@ def swim(
     """
     start_warp()
     equipped = vehicle_at("open-water", vehicle)
-    perception = Perception(equipped, None, mode="error-state")
-    watch = _Watch(perception, seed)
+    start = np.random.default_rng([seed, 0x57A]).normal(0.0, LET_IN_STD, 2).tolist()
+    perception = Perception(equipped, None, mode="error-state", let_in=start)
+    watch = _Watch(perception)
     pilot = make_pilot(controller, equipped, task="t2")
     runtime = Runtime(equipped, None, pilot, way, arm=True, perception=perception)
     with tempfile.TemporaryDirectory() as folder:

@@ -388,12 +388,13 @@ def _play_on_robot(job: Job, path: Path, opened: Session) -> dict[str, Any] | No
     """One job; PATH.mcap takes the record, PATH.npz the series of the estimate. None if it was skipped."""
     began, vehicle, record = time.perf_counter(), opened.vehicle, path.with_name(f"{path.name}.mcap")
     trial, start = job_trial(job, vehicle, seed=job.seed)
+    mode = "constant-velocity" if opened.site is not None else "error-state"  # which takes all of slow fixes
     outcome = opened.trial(
         lambda: job_trial(job, vehicle, seed=job.seed)[0],
         start,
         record,
         counts=True,
-        perception=lambda: Perception(vehicle, opened.site, fusion=job.fusion),
+        perception=lambda: Perception(opened.equipped, opened.site, mode=mode, fusion=job.fusion),
         about={"command": f"finssim experiment {job.task}", "row": job.row},
     )
     if outcome is None:

@@ -153,7 +153,7 @@ def run(
         severity (NAME): How far a drawn plant and its camera are from what is known: nominal, realistic or hard.
         lockstep: Time goes as fast as one robot asks, instead of in real time.
         camera (KIND): What the camera sends: pictures, corners (of the tags) or none. If not given: pictures, over a
-            team corners, in open water and of a task none.
+            team or a tank corners, in open water and of a task none.
         pictures (WAY): How pictures travel in real time: udp, or shm:NAME (shared memory; shm alone: pool, and
             pool-PORT on another port than the default).
         port: UDP port of the motor controller; pictures leave from the next, lock-step (TCP) is the one after.
@@ -196,7 +196,7 @@ def run(
             made = _playing(task, bodies, int(plant), severity, positioning, seed)
         _serve_team(made, calibrated, (bind, port), host_port(robot, "--robot"), pool_file, duration)
         return
-    camera = camera or ("none" if site == "open-water" else "pictures")
+    camera = camera or {"pool": "pictures", "tank": "corners"}.get(site, "none")  # type: ignore[assignment]
     plan = make_plan(vehicle, plant, severity, camera=camera, seed=seed, site=site)
     plan = replace(plan, positioning=positioning)
     start = start or f"0,0,{-0.5 * plan.spec.basin.depth:g},0"

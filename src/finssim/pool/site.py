@@ -100,21 +100,22 @@ ERRORS: Mapping[str, _Errors] = {
 """Severity -> errors."""
 
 
-def paper_lens() -> Lens:
-    """The lens of the published pool: 1280 x 720 pixels, 100° across."""
+def paper_lens(finer: float = 1.0) -> Lens:
+    """The lens of the published pool, 100° across, before 1280 x 720 pixels or `finer` times as many each way."""
     distortion = (0.02944176, -0.05975546, 0.00088098, 0.00179148, 0.01256862)
-    return Lens(1280, 720, 540.9305, 540.9305, 682.2341, 348.6136, "plumb_bob", distortion)
+    f, cx, cy = finer * 540.9305, finer * (682.2341 + 0.5) - 0.5, finer * (348.6136 + 0.5) - 0.5
+    return Lens(round(1280 * finer), round(720 * finer), f, f, cx, cy, "plumb_bob", distortion)
 
 
-def true_site(basin: Basin | None = None) -> Pool:
+def true_site(basin: Basin | None = None, *, finer: float = 1.0) -> Pool:
     """The camera above the middle of a pool. Pool frame: x and y as the world's, z = 0 on the floor.
 
     Args:
         basin: 4 m x 2 m, 1 m deep if not given; the camera hangs higher over a larger one.
+        finer: How many times as many pixels as the paper's it has each way.
     """
     basin = basin or Basin()
-    lens = paper_lens()
-    height = HEIGHT * max(basin.length / PAPER_POOL[0], basin.width / PAPER_POOL[1])
+    lens, height = paper_lens(finer), _height(basin)
     # So far beside the middle that both ends of the pool are as far from the edges of the picture.
     middle = 0.5 * (lens.width - 1), 0.5 * (lens.height - 1)
     edges = [[0.0, middle[1]], [2.0 * middle[0], middle[1]], [middle[0], 0.0], [middle[0], 2.0 * middle[1]]]
@@ -126,6 +127,11 @@ def true_site(basin: Basin | None = None) -> Pool:
     return Pool(camera, Interface.water(basin.depth), LATENCY)
 
 
+def _height(basin: Basin) -> float:
+    """Of the camera above the water, from where it sees all of a pool [m]."""
+    return HEIGHT * max(basin.length / PAPER_POOL[0], basin.width / PAPER_POOL[1])
+
+
 def camera_of(
     vehicle: Vehicle, seed: int, severity: Severity = "realistic", *, basin: Basin | None = None
 ) -> tuple[Pool, Pool, CameraSettings]:
@@ -135,7 +141,8 @@ def camera_of(
         vehicle: Has tags.
         seed: Of all errors; equal seeds give equal cameras.
         severity: How large they are: nominal has none.
-        basin: Of the plant; that of plants drawn around the vehicle if None.
+        basin: Of the plant; that of plants drawn around the vehicle if None. Over a larger one the camera has as many
+            more pixels as it hangs higher, so that it finds the vehicle's tags there too.
 
     Returns:
         The pool as it is, the pool as its calibration has it, and the settings for `PoolCamera`.
@@ -148,7 +155,8 @@ def camera_of(
     if vehicle.tags is None:
         raise PlantSpecError(f"vehicle {vehicle.name} has no tags: a camera cannot find it, run without one")
     errors, random = ERRORS[severity], np.random.default_rng([seed, 0x517E])
-    true = true_site(basin or basin_of(vehicle))
+    own = basin_of(vehicle)
+    true = true_site(basin or own, finer=max(_height(basin or own) / _height(own), 1.0))
     late = float(random.normal(0.0, errors.latency))
     settings = CameraSettings(
         latency=max(LATENCY + late, 0.01),

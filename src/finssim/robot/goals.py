@@ -11,7 +11,7 @@ import yaml
 from finssim.control.guidance import Guide, Station
 from finssim.vehicles import Vehicle
 
-__all__ = ["GoalError", "check_reachable", "guide_of", "station_of"]
+__all__ = ["GoalError", "check_reachable", "guide_of", "place_of", "station_of"]
 
 
 class GoalError(ValueError):
@@ -27,6 +27,21 @@ def station_of(text: str) -> Station:
     if text.endswith((".yaml", ".yml")):
         return _numbers(text, _goal_in(Path(text)))
     return _numbers(f"goal '{text}'", text.split(","))
+
+
+def place_of(text: str) -> tuple[float, float]:
+    """A place in the plane from "x,y", world frame [m].
+
+    Raises:
+        GoalError: It is no such thing.
+    """
+    try:
+        x, y = map(float, text.split(","))
+    except ValueError:
+        x = y = math.nan
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise GoalError(f"place '{text}': expected two numbers x,y: metres in the world frame")
+    return x, y
 
 
 def guide_of(goal: str | None, trajectory: str | None) -> Guide:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +22,7 @@ from finssim.localization.fusion.streams import DepthSample, HeadingSample, ImuS
 from finssim.localization.pool import Pool
 from finssim.localization.poses.measurement import axes_of_up
 from finssim.robot.aboard import Aboard, Stuck
-from finssim.robot.messages import NavigationAid, Picture, Telemetry
+from finssim.robot.messages import POSITION, NavigationAid, Picture, Telemetry
 from finssim.robot.robot import Reading
 from finssim.robot.unfused import Unfused
 from finssim.vehicles import Vehicle
@@ -32,6 +33,11 @@ Array = npt.NDArray[np.float64]
 
 PICTURE_STUCK = 0.4
 """Corners that stay the same to the last digit for this long are one picture sent again and again [s]."""
+
+LET_IN_STD = 0.05
+"""Standard deviation of the place where a vehicle is let in, per axis [m]."""
+LET_IN_AFTER = 0.5
+"""From the first state that is asked for until it is told: by then there is inertial data to carry it on [s]."""
 
 JUMP = 1.0
 """Data that is older than the newest by more than this comes from a clock that was set back [s]."""
@@ -51,6 +57,7 @@ class Perception:
         fusion: bool = True,
         settings: Settings | None = None,
         library: str | None = None,
+        let_in: Sequence[float] | None = None,
     ) -> None:
         """
         Args:
@@ -61,6 +68,8 @@ class Perception:
             fusion: False: no filter, for the ablation "without EKF" (`robot.unfused`).
             settings: Of the estimator; the vehicle file's noises if None.
             library: That finds tags in pictures: apriltag or opencv; apriltag if None.
+            let_in: x, y of where the vehicle begins, world frame [m]: the one fix that dead reckoning starts from.
+                None: something else tells where it is.
 
         Raises:
             LocalizationError: Unknown method, mode or library; a vehicle without tags; a pool whose z is not up.
@@ -76,6 +85,7 @@ class Perception:
         self._rate = math.nan
         self._pictures = Stuck(PICTURE_STUCK)
         self._last_picture = -math.inf
+        self._let_in, self._asked_since = let_in, math.nan
 
     def telemetry(self, now: float, telemetry: Telemetry, time: float) -> None:
         """Take in what the vehicle sent.
@@ -147,6 +157,7 @@ class Perception:
         """The state at a time [s], in world and body axes."""
         estimate = self._estimate(now)
         health = self._health_of(estimate)
+        self._tell_let_in(now)
         position, quaternion, velocity = self._frame.state(estimate)
         return Reading(
             time=now,
@@ -155,13 +166,23 @@ class Perception:
             nu=np.concatenate([velocity, self._turning(estimate)]),
             ready=health.ready,
             mode=health.vision_mode,
-            reason="" if health.ready else _why(health),
+            reason="" if health.ready else _why(health, self.pool is not None),
             std=self._frame.std(estimate),
         )
 
     def health(self) -> Health:
         """The estimator's condition at the time of its newest sample, with what it refused and why."""
         return self.estimator.health(self.estimator.estimate())
+
+    def _tell_let_in(self, now: float) -> None:
+        """Once, where the vehicle was let in."""
+        if self._let_in is None:
+            return
+        self._asked_since = now if math.isnan(self._asked_since) else self._asked_since
+        if now - self._asked_since >= LET_IN_AFTER - 1e-6:
+            x, y = self._let_in
+            self._let_in = None
+            self.aid(now, NavigationAid(0, POSITION, 0.1, (x, y, 0.0), (LET_IN_STD, 0.0)))
 
     def _estimate(self, now: float) -> Estimate:
         estimate = self.estimator.estimate(now)
@@ -281,14 +302,15 @@ def _product(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, 
     )
 
 
-def _why(health: Health) -> str:
-    """In words why a state is not ready."""
+def _why(health: Health, camera: bool) -> str:
+    """In words why a state is not ready, to somebody who has a camera or not."""
     if math.isnan(health.age_imu) or not health.imu_fresh:
         return "no inertial data"
     if math.isnan(health.age_depth) or not health.depth_fresh:
         return "no depth"
     if health.vision_mode == "uninitialized":
-        return "not seen by the camera yet"
+        return "not seen by the camera yet" if camera else "no position fix yet"
     if health.vision_mode in ("hold", "lost"):
-        return f"not seen by the camera for {health.age_vision:.1f} s"
+        what = "not seen by the camera" if camera else "no position fix or velocity"
+        return f"{what} for {health.age_vision:.1f} s"
     return "position or heading too uncertain"

@@ -17,7 +17,7 @@ from finssim.control.errors import ControlError
 from finssim.control.guidance import Station
 from finssim.control.trim import Trim
 from finssim.localization.pool import load_pool
-from finssim.robot.goals import check_reachable, guide_of
+from finssim.robot.goals import check_reachable, guide_of, place_of
 from finssim.robot.interrupt import follow_parent
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import Pilot, make_pilot
@@ -60,7 +60,8 @@ def run(
     number: Annotated[int, (0, None)] = 0,
     vehicle: str = "finsrov",
     trim: bool = False,
-    mode: str = "constant-velocity",
+    let_in: str | None = None,
+    mode: str | None = None,
     record: Path | None = None,
     duration: Annotated[float | None, (0.0, None)] = None,
     lockstep: bool = False,
@@ -102,7 +103,10 @@ def run(
         number: This vehicle's number among several under one camera: its tags' ids go on after those of the one before.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         trim: Put an integral in front of a policy, against a steady current or weight.
-        mode (MODE): Estimator: constant-velocity or error-state.
+        let_in (X,Y): Where the vehicle begins, world frame [m], known to 5 cm: for dead reckoning by Doppler log and
+            compass, where no camera and no position fix tells.
+        mode (MODE): Estimator: constant-velocity or error-state. If not given: with --let-in error-state, else
+            constant-velocity.
         record (FILE): Record everything into this file (.mcap); of --team a folder with a file for each.
         duration: End after this time [s]; at the end of the trajectory, or with Ctrl-C, if not given.
         lockstep: Take turns with finssim pool --lockstep, as fast as both compute.
@@ -118,9 +122,10 @@ def run(
     if (policy is None) == (team is None):
         raise ControlError("who steers? give --policy for this vehicle, or --team for all of a task")
     if team is not None:
-        if agent is not None or trajectory is not None or lockstep or number:
+        if agent is not None or trajectory is not None or lockstep or number or let_in is not None:
             raise ControlError(
-                "--team has every agent in its place: leave --agent, --trajectory, --lockstep and --number out"
+                "--team has every agent in its place: leave --agent, --trajectory, --lockstep, --number and --let-in "
+                "out"
             )
         from finssim.robot.team_run import run_team
 
@@ -129,7 +134,7 @@ def run(
             "--site": site,
             "--pool-file": camera,
             "--goal": goal,
-            "--mode": mode,
+            "--mode": mode or "constant-velocity",
             "--duration": duration,
         }
         words = [word for name, x in options.items() if x is not None for word in (name, str(x))]
@@ -155,7 +160,8 @@ def run(
         )
     pilot = _pilot(policy, filed, task, trim, agent=agent, follows=trajectory is not None)
     pool = None if file is None else load_pool(file)
-    perception = Perception(ours, pool, mode=mode)
+    mode = mode or ("constant-velocity" if let_in is None else "error-state")
+    perception = Perception(ours, pool, mode=mode, let_in=None if let_in is None else place_of(let_in))
     meta = {
         "command": "finssim run",
         "site": site,

@@ -10,7 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
-from finssim.robot.goals import check_reachable, guide_of
+from finssim.robot.goals import check_reachable, guide_of, place_of
 from finssim.robot.interrupt import interruptible
 from finssim.ros2.backend import activate
 from finssim.ros2.errors import Ros2Error
@@ -49,6 +49,9 @@ class Options:
     """(NAME) Where: pool, tank or open-water, where no camera looks and Doppler log and compass are aboard."""
     positioning: str = "none"
     """(NAME) Fixes on the wire of a virtual pool: none, motion-capture or usbl."""
+    let_in: str | None = None
+    """(X,Y) Where the vehicle begins, in the map [m], for dead reckoning by Doppler log and compass, where no camera
+    and no position fix tells."""
     goal: str | None = None
     """(X,Y,Z,YAW|FILE) Station to keep: x,y,z [m] in the map (z = 0 on the water) and heading [deg], or a file; the
     place where it is armed if not given. The topic goal changes it."""
@@ -69,8 +72,9 @@ class Options:
     """(SEED|FILE) Plant of a virtual pool: a seed, or a file."""
     severity: str = "realistic"
     """(NAME) Of a drawn plant: nominal, realistic or hard."""
-    camera: str = "pictures"
-    """(KIND) What a virtual pool's camera sends: pictures, corners (of the tags) or none."""
+    camera: str | None = None
+    """(KIND) What a virtual pool's camera sends: pictures, corners (of the tags) or none. If not given: pictures, over
+    a tank corners."""
     port: int = 58766
     """UDP port of a virtual pool; its pictures leave from the next."""
     truth: Path | None = None
@@ -116,6 +120,9 @@ def plan_of(graph: str, options: Options, pool_file: Path) -> Plan:
     _wire(plan, o)
     for node in ("camera", "localizer", "state_estimation"):
         plan.set(node, pool_file="none" if blind else str(pool_file))
+    if o.let_in is not None:
+        place_of(o.let_in)  # refuses what is none
+        plan.set("state_estimation", let_in=o.let_in, mode="error-state")
     if o.record is not None:
         located = graph != "sim" and not blind
         plan.set("recorder", record=str(o.record), pool_file=str(pool_file) if located else None)
@@ -125,7 +132,7 @@ def plan_of(graph: str, options: Options, pool_file: Path) -> Plan:
             "virtual_pool",
             plant=o.plant,
             severity=o.severity,
-            camera="none" if blind else o.camera,
+            camera="none" if blind else o.camera or ("corners" if o.site == "tank" else "pictures"),
             port=o.port,
             seed=o.seed,
             positioning=o.positioning,

@@ -24,6 +24,9 @@ OWN = "finssim_msgs/msg/"
 TAKEN = ("odom", "imu", "joint_states", "thruster_state", "thruster_cmd", "telemetry", "pressure")
 """Last parts of the topics that a trial is made of; the wanted wrench and the goal say nothing about what happened."""
 
+COMPASS = "/compass/imu"
+"""An Imu that tells a heading alone, without rates and specific force."""
+
 ARMING = {"armed": "armed", "disarmed": "disarmed", "fault": "disarmed"}
 """Kind of an event -> whether thrusters may turn from then on; while it holds, an armed bridge stays armed."""
 
@@ -43,7 +46,11 @@ def own_topics(known: Mapping[str, str]) -> dict[str, SourceMap]:
     """
     if not any(kind.startswith(OWN) for kind in known.values()):
         return {}
-    return {topic: SourceMap() for topic in sorted(known) if topic.rsplit("/", 1)[-1] in TAKEN}
+    return {
+        topic: SourceMap()
+        for topic in sorted(known)
+        if topic.rsplit("/", 1)[-1] in TAKEN and not topic.endswith(COMPASS)
+    }
 
 
 def thruster_columns(kind: str, message: Any) -> dict[str, ColumnSource]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from finssim.localization.fusion.health import Health
 from finssim.localization.pool import load_pool
+from finssim.robot.goals import place_of
 from finssim.robot.intake import USED
 from finssim.robot.perception import Perception
 from finssim.ros2.nodes.conversions import aid_of, telemetry_of
@@ -29,7 +30,8 @@ class StateEstimation(RobotNode):
         file = self.parameter("pool_file", "pool.yaml")
         pool = None if file == "none" else load_pool(file)
         mode = self.parameter("mode", "constant-velocity")
-        self.perception = Perception(self.vehicle, pool, mode=mode)
+        place = self.parameter("let_in", "")
+        self.perception = Perception(self.vehicle, pool, mode=mode, let_in=place_of(place) if place else None)
         self.sends("odometry", "estimator", "diagnostics", "event")
         self.frames = Frames(self, pool)
         self.hears("telemetry", self._on_telemetry)
