@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from finssim.control.guidance import Station
-from finssim.experiments.on_robot import Placing, RobotTrial, Stages
+from finssim.experiments.on_robot import Placing, RobotTrial, Stages, start_bounds
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.robot.pilots import WrenchPilot
 from finssim.robot.robot import Reading
@@ -16,11 +16,11 @@ FINSROV = load_vehicle("finsrov")
 START = Station((0.5, -0.2, -0.5), 0.3)
 
 
-def begins(exact, off, turn_deg, speed, rate_deg):
+def begins(exact, off, turn_deg, speed, rate_deg, site="pool"):
     """When a vehicle that circles its start, so far off and so fast, may begin [s]; None within 20 s."""
     pilot = WrenchPilot(lambda: np.zeros(6), FINSROV, name="idle")
     trial = RobotTrial(name="x", pilot=pilot, guide=START, duration=1.0, over=lambda runtime: False)
-    stages = Stages(trial, FINSROV, None, Placing(start=START, exact=exact))
+    stages = Stages(trial, FINSROV, None, Placing(start=START, bounds=start_bounds(site, exact)))
     for now in np.arange(0.0, 20.0, 0.1):
         reading = Reading(
             time=now,
@@ -50,3 +50,10 @@ def test_one_that_circles_its_start_begins_where_it_need_not_be_exact():
 def test_one_that_is_farther_off_never_begins(far):
     """Beyond 15 cm, 20° or 10 cm/s."""
     assert begins(False, *far) is None
+
+
+def test_in_waves_nothing_is_at_rest():
+    """In open water 30 cm, 20° and 0.4 m/s are near enough, at whatever rate; farther off they are not."""
+    assert begins(True, 0.25, 15.0, 0.3, 30.0, site="open-water") == pytest.approx(2.0)
+    assert begins(True, 0.35, 15.0, 0.3, 30.0, site="open-water") is None
+    assert begins(True, 0.25, 15.0, 0.3, 30.0, site="tank") is None

@@ -52,8 +52,17 @@ EXACTLY = (NEAR, TURNED, 0.05, math.radians(5.0), 2.0)
 """A vehicle is at its start within this of it [m, rad] and no faster than this [m/s, rad/s] for so long [s]."""
 ROUGHLY = (0.15, math.radians(20.0), 0.1, math.inf, 10.0)
 """The same where the start need not be exact: a PID tuned from guesses may circle its goal for ever."""
+AFLOAT = (0.30, math.radians(20.0), 0.4, math.inf, 2.0)
+"""The same in open water, where waves leave nothing at rest."""
 APPROACH = 60.0
 """Longest way to a start [s]."""
+
+
+def start_bounds(site: str, exact: bool) -> tuple[tuple[float, ...], ...]:
+    """How near to its start is near enough, any of them: `EXACTLY`, in open water `AFLOAT`; `ROUGHLY` unless exact."""
+    near = AFLOAT if site == "open-water" else EXACTLY
+    return (near,) if exact else (near, ROUGHLY)
+
 
 Ended = Literal["over", "fault", "skipped", "interrupted", "not there"]
 """How a trial ended: by itself, by the bridge, at the operator's wish, by Ctrl-C, or the start was never reached."""
@@ -91,8 +100,8 @@ class Placing:
     start: Station
     by_hand: bool = False
     """Somebody carries it there, and presses enter. False: the tuned PID steers it there."""
-    exact: bool = True
-    """Whether the trial is worth nothing from elsewhere; an excitation is."""
+    bounds: tuple[tuple[float, ...], ...] = (EXACTLY,)
+    """Any of which is near enough."""
     attendant: Attendant | None = None
     """Nobody is asked if None: the way to the start begins as soon as the state is known."""
 
@@ -269,7 +278,7 @@ class Stages:
             float(np.linalg.norm(reading.nu[:3])),
             float(np.linalg.norm(reading.nu[3:])),
         )
-        for bounds in (EXACTLY,) if self._placing.exact else (EXACTLY, ROUGHLY):
+        for bounds in self._placing.bounds:
             if not reading.ready or any(x > limit for x, limit in zip(off, bounds[:4], strict=True)):
                 self._near_since.pop(bounds, None)
             elif now - self._near_since.setdefault(bounds, now) >= bounds[4]:
@@ -434,7 +443,8 @@ class Session:
             record: File of its record, made once it is done; records of attempts that do not count go to `aborted/`.
             counts: Whether a trial that the bridge stopped counts as it is; it is played again if not. One that the
                 operator stopped never counts.
-            exact: Whether the vehicle must be at its start to the centimetre and at rest, however long that takes.
+            exact: Whether the vehicle must be at its start and at rest, however long that takes: to 10 cm, in open
+                water to 30 cm and at a speed of waves.
             perception: Otherwise than by default, made anew for every attempt.
             about: Metadata of the record.
 
@@ -449,7 +459,12 @@ class Session:
             trial = make()
             x, y, z = start.position
             self.say(f"{trial.name}: from {x:.2f}, {y:.2f}, {z:.2f} m, {math.degrees(start.yaw):.0f}°")
-            placing = Placing(start=start, by_hand=self.robot.by_hand, exact=exact, attendant=self.attendant)
+            placing = Placing(
+                start=start,
+                by_hand=self.robot.by_hand,
+                bounds=start_bounds(self.robot.site, exact),
+                attendant=self.attendant,
+            )
             outcome, partial = self._attempt(trial, placing, record, perception, about or {})
             stopped_by_hand = outcome.fault == "stopped by the operator"
             done = outcome.ended == "over" or (
