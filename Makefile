@@ -26,10 +26,11 @@ test: check  ## check, then run every test
 quick: $(STAMP)  ## the tests that take little time and start no process
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow" -q
 
-check: $(STAMP)  ## lint, format and types
+check: $(STAMP)  ## lint, format, types and docstrings
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy --strict $(STRICT)
+	$(BIN)/python tools/check_docstrings.py
 
 format: $(STAMP)  ## put the source into the common form
 	$(BIN)/ruff check --fix-only .
