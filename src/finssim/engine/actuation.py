@@ -27,7 +27,7 @@ def lag_target(plant: wp.array2d(dtype=VehicleParameters), w: int, v: int, force
         plant: Parameters.
         w: World.
         v: Vehicle.
-        force: Command, along each thruster's own axis [N].
+        force: Command, along the thrusters' axes [N].
 
     Returns:
         In lag units: force [N], or propeller speed [rad/s].

@@ -76,7 +76,7 @@ def thrust_table(force: ArrayLike, vehicles: Sequence[Vehicle], worlds: int) -> 
     """Thruster forces for every world and vehicle, zero for the thrusters that a vehicle does not have.
 
     Args:
-        force: Along each thruster's own axis [N], shape broadcastable to (worlds, vehicles, n), n thrusters of the
+        force: Along the thrusters' axes [N], shape broadcastable to (worlds, vehicles, n), n thrusters of the
             vehicle that has most.
         vehicles: In their order.
         worlds: How many.

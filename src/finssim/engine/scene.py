@@ -234,7 +234,7 @@ class Scene:
         """Command thruster forces.
 
         Args:
-            force: Along each thruster's own axis [N], shape broadcastable to (1, vehicles, n); see
+            force: Along the thrusters' axes [N], shape broadcastable to (1, vehicles, n); see
                 `Simulator.set_thrust`.
         """
         self._simulator.set_thrust(force)

@@ -279,7 +279,7 @@ class Simulator:
         """Command thruster forces.
 
         Args:
-            force: Along each thruster's own axis [N], shape broadcastable to (worlds, vehicles, n), n thrusters in the
+            force: Along the thrusters' axes [N], shape broadcastable to (worlds, vehicles, n), n thrusters in the
                 vehicle's order; vehicles with fewer thrusters leave the last numbers unused.
 
         Raises:

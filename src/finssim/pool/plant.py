@@ -89,7 +89,7 @@ def drive(
         quaternion: Body to world, xyzw, (worlds, vehicles).
         velocity: Twist, body frame [m/s, rad/s], (worlds, vehicles).
         steps: Physics steps so far, (worlds,).
-        thrust: Written: along each thruster's own axis [N], (worlds, vehicles).
+        thrust: Written: along the thrusters' axes [N], (worlds, vehicles).
         disturbance: Written: wrench about the body origin, body frame [N, N m], (worlds, vehicles).
         current: Written: velocity of the water at the body origin, world frame [m/s], (worlds,).
         motors: Motors and speed loops.

@@ -72,7 +72,7 @@ class Thruster(Part):
         """Shaft speed [rad/s] whose steady thrust is `force`: the inverse of `thrust`.
 
         Args:
-            force: Along the thruster's own `axis` [N], (...,).
+            force: Along `axis`, body frame [N], (...,).
         """
         wanted = np.asarray(force, dtype=np.float64)
         c = np.where(wanted >= 0.0, self.c_plus, self.c_minus)
