@@ -15,10 +15,10 @@ import check_docstrings
     ("signature", "entry", "lacking"),
     [
         ("position: Array", "Body origin, world frame [m], (n, 3).", []),
-        ("position: Array", "Body origin.", ["position: unit", "position: shape", "position: frame"]),
+        ("position: Array", "Where it is.", ["position: unit", "position: shape", "position: frame"]),
         ("position: Array", "Body origin, world frame [m].", ["position: shape"]),
         ("start_position: wp.vec3", "Body origin, world frame [m].", []),
-        ("start_position: wp.vec3", "Body origin [m].", ["start_position: frame"]),
+        ("start_position: wp.vec3", "Where it is [m].", ["start_position: frame"]),
         ("duration: float", "How long.", ["duration: unit"]),
         ("duration: float", "How long [s].", []),
         ("quaternion: Array", "Body to world, xyzw, (4,).", []),

@@ -36,7 +36,7 @@ NUMBERS = re.compile(r"\b(float|vec\d*|quat|mat\d*)\b")
 VECTORS = re.compile(r"\b(vec\d*|quat|mat\d*)\b")
 UNIT = re.compile(r"\[[^\]\n]*\]")
 SHAPE = re.compile(r"\((?:[A-Za-z0-9_.+* -]+,)+[A-Za-z0-9_.+* ,-]*\)")
-FRAME = re.compile(r"\b(frame|axes|body|world|pool|camera|optical|map|reference|own|any)\b", re.IGNORECASE)
+FRAME = re.compile(r"\b(frame|axes|body|world|pool|camera|optical|map|reference)\b", re.IGNORECASE)
 
 
 def functions(tree: ast.Module) -> Iterator[tuple[str, ast.FunctionDef]]:

@@ -152,7 +152,7 @@ def resample(t: ArrayLike, position: ArrayLike, yaw: ArrayLike) -> tuple[Array, 
 
     Args:
         t: Time since the start of the hold [s], increasing, shape (T,).
-        position: [m], shape (T, 3).
+        position: World frame [m], shape (T, 3).
         yaw: [rad], wrapped or not, shape (T,).
 
     Returns:
