@@ -21,7 +21,17 @@ def delivered_thrust(plant: wp.array2d(dtype=VehicleParameters), w: int, v: int,
 
 @wp.func
 def lag_target(plant: wp.array2d(dtype=VehicleParameters), w: int, v: int, force: vec8) -> vec8:
-    """What the lag tends to for a force command: the force itself, or the propeller speed that gives it."""
+    """What the lag tends to for a force command: the force itself, or the propeller speed that gives it.
+
+    Args:
+        plant: Parameters.
+        w: World.
+        v: Vehicle.
+        force: Command, along the thrusters' axes [N].
+
+    Returns:
+        In lag units: force [N], or propeller speed [rad/s].
+    """
     target = force
     if plant[w, v].speed_lag != 0:
         c_plus = plant[w, v].c_plus

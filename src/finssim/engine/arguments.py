@@ -73,7 +73,20 @@ def placed_at(name: str, value: ArrayLike, shape: tuple[int, int]) -> NDArray[np
 
 
 def thrust_table(force: ArrayLike, vehicles: Sequence[Vehicle], worlds: int) -> NDArray[np.float32]:
-    """Thruster forces [N] for every world and vehicle, zero for the thrusters that a vehicle does not have."""
+    """Thruster forces for every world and vehicle, zero for the thrusters that a vehicle does not have.
+
+    Args:
+        force: Along the thrusters' axes [N], shape broadcastable to (worlds, vehicles, n), n thrusters of the
+            vehicle that has most.
+        vehicles: In their order.
+        worlds: How many.
+
+    Returns:
+        [N], (worlds, vehicles, `MAX_THRUSTERS`).
+
+    Raises:
+        SimulatorError: The shape is wrong or a number is not finite.
+    """
     f = np.asarray(force, dtype=np.float32)
     n = max(len(v.thrusters) for v in vehicles)
     if f.ndim == 0 or f.shape[-1] != n:

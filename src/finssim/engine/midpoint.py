@@ -66,14 +66,14 @@ class Touch:
 
 @wp.func
 def lead_of(nu: vec6, h: float) -> float:
-    """Part e of a substep h [s] by which the twist nu is extrapolated: 1/2 + (h |ω|)²/4."""
+    """Part e of a substep h [s] by which the twist nu, body frame [m/s, rad/s], is extrapolated: 1/2 + (h |ω|)²/4."""
     omega = angular(nu)
     return 0.5 + 0.25 * h * h * wp.dot(omega, omega)
 
 
 @wp.func
 def relaxation_of(plant: wp.array2d(dtype=VehicleParameters), w: int, v: int, nu_r: vec6) -> vec6:
-    """θ of each axis at the twist nu_r relative to the water [m/s, rad/s]; `refresh_plant` has its factors."""
+    """θ [-] of each axis at the twist nu_r relative to the water, body frame [m/s, rad/s]; see `refresh_plant`."""
     nu_h = wp.abs(twist_at(nu_r, plant[w, v].r_m))
     theta = plant[w, v].relax_1 + wp.cw_mul(plant[w, v].relax_2, nu_h)
     return theta + (nu_h[0] + nu_h[1] + nu_h[2]) * plant[w, v].relax_v
@@ -81,7 +81,17 @@ def relaxation_of(plant: wp.array2d(dtype=VehicleParameters), w: int, v: int, nu
 
 @wp.func
 def relaxed(nu_dot: vec6, guess: vec6, theta: vec6, r: wp.vec3) -> vec6:
-    """(nu_dot + θ guess) / (1 + θ) on each axis of the point r, where inertia and damping are nearly diagonal."""
+    """(nu_dot + θ guess) / (1 + θ) on each axis of the point r, where inertia and damping are nearly diagonal.
+
+    Args:
+        nu_dot: Derivative of the twist in the middle of the substep, body frame [m/s², rad/s²].
+        guess: The same as extrapolated, g of this module's head.
+        theta: θ of each axis at r [-].
+        r: The point, body frame [m].
+
+    Returns:
+        Derivative of the twist over the substep, body frame [m/s², rad/s²].
+    """
     change = twist_at(nu_dot - guess, r)
     return guess + twist_at(wp.cw_div(change, theta + vec6(1.0, 1.0, 1.0, 1.0, 1.0, 1.0)), -r)
 

@@ -231,7 +231,12 @@ class Scene:
         return self._simulator.numpy(name)
 
     def set_thrust(self, force: ArrayLike) -> None:
-        """Command thruster forces [N]; see `Simulator.set_thrust`."""
+        """Command thruster forces.
+
+        Args:
+            force: Along the thrusters' axes [N], shape broadcastable to (1, vehicles, n); see
+                `Simulator.set_thrust`.
+        """
         self._simulator.set_thrust(force)
 
     def contact_wrench(self) -> Array:

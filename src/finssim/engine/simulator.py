@@ -279,8 +279,8 @@ class Simulator:
         """Command thruster forces.
 
         Args:
-            force: [N], shape broadcastable to (worlds, vehicles, n), n thrusters in the vehicle's order; vehicles with
-                fewer thrusters leave the last numbers unused.
+            force: Along the thrusters' axes [N], shape broadcastable to (worlds, vehicles, n), n thrusters in the
+                vehicle's order; vehicles with fewer thrusters leave the last numbers unused.
 
         Raises:
             SimulatorError: the shape is wrong or a number is not finite.

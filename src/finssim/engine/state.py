@@ -91,7 +91,13 @@ def clear_actuators(state: State, mask: wp.array(dtype=int), world_offset: int):
 
 @wp.func
 def is_finite(position: wp.vec3, q: wp.quat, nu: vec6) -> bool:
-    """Whether every number of a state is finite."""
+    """Whether every number of a state is finite.
+
+    Args:
+        position: Body origin, world frame [m].
+        q: Attitude, body to world.
+        nu: Twist, body frame [m/s, rad/s]; or any other six numbers, such as a wrench.
+    """
     return (
         wp.isfinite(wp.dot(position, position))
         and wp.isfinite(q[0] + q[1] + q[2] + q[3])
@@ -101,5 +107,11 @@ def is_finite(position: wp.vec3, q: wp.quat, nu: vec6) -> bool:
 
 @wp.func
 def snapshot(p: wp.vec3, q: wp.quat, nu: vec6) -> vec13:
-    """A row of the history: position, quaternion, velocity."""
+    """A row of the history: position, quaternion, velocity.
+
+    Args:
+        p: Body origin, world frame [m].
+        q: Attitude, body to world.
+        nu: Twist, body frame [m/s, rad/s].
+    """
     return vec13(p[0], p[1], p[2], q[0], q[1], q[2], q[3], nu[0], nu[1], nu[2], nu[3], nu[4], nu[5])

@@ -78,7 +78,15 @@ class Water:
     def arrays(
         self, worlds: int, density: float, gravity: float, device: wp.Device, max_waves: int = 0
     ) -> WaterArrays:
-        """The same water for every world, as Warp arrays; and room for max_waves more waves."""
+        """The same water for every world, as Warp arrays; and room for max_waves more waves.
+
+        Args:
+            worlds: How many.
+            density: Of the water [kg/m³].
+            gravity: [m/s²].
+            device: Of the arrays.
+            max_waves: How many more.
+        """
 
         def full(value: object, dtype: object) -> wp.array:
             return wp.full(worlds, value=value, dtype=dtype, device=device)

@@ -220,7 +220,7 @@ def actions_of(force: ArrayLike, mode: Thruster8 | Wrench6, vehicle: Vehicle) ->
     """Actions that ask for what was commanded, in [-1, 1], (N, size).
 
     Args:
-        force: Commanded thrusts, canonical order [N], (N, n).
+        force: Commanded thrusts, along the thrusters' axes, canonical order [N], (N, n).
         mode: Action mode of that vehicle.
         vehicle: Its control matrix makes a wrench of thrusts.
 

@@ -121,7 +121,12 @@ class Campaign:
 
 
 def published_pool(*, tilt_x: float = 0.0, tilt_y: float = 0.0) -> Pool:
-    """Camera of the FinsROV pool, 1.17 m above 1 m of water; the floor is z = 0."""
+    """Camera of the FinsROV pool, 1.17 m above 1 m of water; the floor is z = 0.
+
+    Args:
+        tilt_x: How far the normal of the water surface leans towards the pool's +x [rad].
+        tilt_y: How far it leans towards +y [rad].
+    """
     lens = Lens(
         width=1280,
         height=720,

@@ -135,11 +135,11 @@ def pose_error(position: Array, yaw: Array, goal: Array) -> tuple[Array, Array]:
 
     Args:
         position: World frame [m], shape (..., 3).
-        yaw: [rad], shape (...).
+        yaw: [rad], shape (...,).
         goal: [x, y, z [m], yaw [rad]], world frame, shape (..., 4).
 
     Returns:
-        position - goal, world frame [m], shape (..., 3), and yaw - goal yaw in [-pi, pi) [rad], shape (...).
+        position - goal, world frame [m], shape (..., 3), and yaw - goal yaw in [-pi, pi) [rad], shape (...,).
     """
     return position - goal[..., :3], (yaw - goal[..., 3] + math.pi) % (2.0 * math.pi) - math.pi
 
@@ -298,6 +298,14 @@ def projected_times(t: Array, position: Array, guide: Guide) -> Array:
 
     Both matter where a way crosses or repeats itself. The reference is searched at 50 Hz from the last projection to
     2 s after it, but not to more than 2 s after the sample's own time. Who stops is projected where he stopped.
+
+    Args:
+        t: Times since the start of the reference [s], increasing, (T,).
+        position: Body origin, world frame [m], (T, 3).
+        guide: The reference.
+
+    Returns:
+        Times since the start of the reference [s], (T,).
     """
     times = np.arange(math.floor(guide.duration * DENSE_RATE + 1e-6) + 1) / DENSE_RATE
     way = guide.at(times).position

@@ -65,7 +65,18 @@ def render_with_mitsuba(
 def radiance_by_mitsuba(
     scene: Scene, region: Rectangle, *, time: float = 0.0, seed: int = 0, rays: int = 16
 ) -> NDArray[np.float32]:
-    """Radiance of the pixels of a rectangle, (rows, columns, 3). Arguments as of `render_with_mitsuba`."""
+    """Radiance of the pixels of a rectangle, (rows, columns, 3).
+
+    Args:
+        scene: What is seen, as of `render_with_mitsuba`.
+        region: The rectangle [px].
+        time: Middle of the exposure [s].
+        seed: Of Mitsuba.
+        rays: Per pixel of Mitsuba's picture, which has 4 for one of ours.
+
+    Raises:
+        SensorError: Something in the scene moves.
+    """
     import mitsuba as mi
 
     mi.set_variant("scalar_rgb")

@@ -111,7 +111,16 @@ def simulate_responses(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> l
 
 
 def steady_speeds(vehicle: Vehicle, hydrodynamics: str, thrust: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean nu over the last quarter of a run from rest under constant thrust, (cases, 6)."""
+    """Mean nu over the last quarter of a run from rest under constant thrust.
+
+    Args:
+        vehicle: The vehicle.
+        hydrodynamics: The model.
+        thrust: Of each thruster, in the vehicle's order [N], (cases, n).
+
+    Returns:
+        Twist, body frame [m/s, rad/s], (cases, 6).
+    """
     simulator = Simulator(vehicle, worlds=len(thrust), hydrodynamics=hydrodynamics, control_step=0.1)
     simulator.place(position=(0.0, 0.0, -100.0))
     simulator.set_thrust(thrust[:, None, :])

@@ -103,7 +103,7 @@ class Axes:
         return np.concatenate([self.axial(q[..., :3]), q[..., 3:]], axis=-1)
 
     def yaw(self, yaw: npt.ArrayLike) -> Array:
-        """Heading [rad], (...): left-positive in ours, right-positive in Fossen's and the controller's frames."""
+        """Heading [rad], (...,): left-positive in ours, right-positive in Fossen's and the controller's frames."""
         return np.asarray(np.asarray(yaw, float) * np.sum(self.axial([0.0, 0.0, 1.0])))
 
     def covariance(self, S: npt.ArrayLike) -> Array:
@@ -151,7 +151,15 @@ def xyzw_from_wxyz(q: npt.ArrayLike) -> Array:
 
 
 def mujoco_velocity(nu: npt.ArrayLike, quaternion: npt.ArrayLike) -> Array:
-    """A free joint's qvel: linear velocity in the world, angular in the body, from `nu` in the body, (..., 6)."""
+    """A free joint's qvel: linear velocity in the world, angular in the body, from `nu` in the body.
+
+    Args:
+        nu: Twist, body frame [m/s, rad/s], (..., 6).
+        quaternion: Body to world, xyzw, (..., 4).
+
+    Returns:
+        qvel [m/s, rad/s], (..., 6).
+    """
     nu = np.asarray(nu, float)
     return np.concatenate([quat_rotate(quaternion, nu[..., :3]), nu[..., 3:]], axis=-1)
 
@@ -163,12 +171,30 @@ def velocity_from_mujoco(qvel: npt.ArrayLike, quaternion: npt.ArrayLike) -> Arra
 
 
 def mujoco_acceleration(nu_dot: npt.ArrayLike, nu: npt.ArrayLike, quaternion: npt.ArrayLike) -> Array:
-    """A free joint's qacc from `nu_dot`, (..., 6): d(R v)/dt = R (v_dot + omega x v), and omega_dot as it is."""
+    """A free joint's qacc from `nu_dot`: d(R v)/dt = R (v_dot + omega x v), and omega_dot as it is.
+
+    Args:
+        nu_dot: Derivative of `nu`, body frame [m/s², rad/s²], (..., 6).
+        nu: Twist, body frame [m/s, rad/s], (..., 6).
+        quaternion: Body to world, xyzw, (..., 4).
+
+    Returns:
+        qacc, linear in the world, angular in the body [m/s², rad/s²], (..., 6).
+    """
     return mujoco_velocity(np.asarray(nu_dot, float) + _turning(nu), quaternion)
 
 
 def acceleration_from_mujoco(qacc: npt.ArrayLike, nu: npt.ArrayLike, quaternion: npt.ArrayLike) -> Array:
-    """`nu_dot` in the body frame from a free joint's qacc, (..., 6)."""
+    """`nu_dot` from a free joint's qacc: the inverse of `mujoco_acceleration`.
+
+    Args:
+        qacc: Linear in the world, angular in the body [m/s², rad/s²], (..., 6).
+        nu: Twist, body frame [m/s, rad/s], (..., 6).
+        quaternion: Body to world, xyzw, (..., 4).
+
+    Returns:
+        Derivative of `nu`, body frame [m/s², rad/s²], (..., 6).
+    """
     return np.asarray(velocity_from_mujoco(qacc, quaternion) - _turning(nu))
 
 

@@ -53,7 +53,7 @@ def _vector(*components: Any) -> Array:
 
 
 def wrap_angle(angle: npt.ArrayLike) -> Array:
-    """The same angle in [-pi, pi) [rad], (...)."""
+    """The same angle in [-pi, pi) [rad], (...,)."""
     return np.asarray(np.remainder(np.asarray(angle, float) + np.pi, 2.0 * np.pi) - np.pi)
 
 

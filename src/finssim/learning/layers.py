@@ -328,7 +328,7 @@ class Adam:
         self.count = 0
 
     def step(self, rate: float, b1: float = 0.9, b2: float = 0.999, epsilon: float = 1e-5) -> None:
-        """One step down the gradient."""
+        """One step down the gradient, of a learning rate [-]."""
         g = self.parameters.gradient
         norm = self.xp.sqrt((g * g).sum())
         g *= self.largest / self.xp.clip(norm, self.largest, None)

@@ -32,7 +32,7 @@ def admissible(command: vec8, lower: vec8, upper: vec8, dead_minus: vec8, dead_p
 
 @wp.func
 def steps_ago(age: float, rate: float) -> int:
-    """How many control steps ago, at `rate` steps a second, the command that is `age` seconds old was issued."""
+    """How many control steps ago, at `rate` [1/s], the command that is `age` [s] old was issued."""
     return wp.max(int(wp.ceil(age * rate - 1.0e-4)), 0)
 
 

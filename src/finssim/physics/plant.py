@@ -60,7 +60,17 @@ class VehicleCommand:
 
 @wp.func
 def mass_matrix(mass: float, r_g: wp.vec3, inertia: wp.mat33, M_A: mat66) -> mat66:
-    """M_RB + M_A about the body origin, with inertia about the body origin (Fossen 2021, eq. 3.49)."""
+    """M_RB + M_A about the body origin                                          (Fossen 2021, eq. 3.49)
+
+    Args:
+        mass: [kg].
+        r_g: Centre of gravity, body frame [m].
+        inertia: About the body origin, body axes [kg m²].
+        M_A: Added mass about the body origin, body axes [kg, kg m, kg m²].
+
+    Returns:
+        Body axes [kg, kg m, kg m²].
+    """
     M = mat66()
     S = mass * wp.skew(r_g)
     for i in range(3):

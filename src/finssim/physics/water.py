@@ -61,7 +61,7 @@ def wave_number(frequency: ArrayLike, depth: float, gravity: float = 9.81) -> ND
     """Wave number that solves the dispersion relation ω² = g k tanh(k h), by Newton's method.
 
     Args:
-        frequency: ω [rad/s], positive, any shape.
+        frequency: ω [rad/s], positive, of any shape (...,).
         depth: Still water depth h [m].
         gravity: [m/s²].
 

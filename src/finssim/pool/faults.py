@@ -86,7 +86,7 @@ class Faults:
         )
 
     def arrivals(self, time: float, frame: bytes) -> list[tuple[float, bytes]]:
-        """When and how a frame that should arrive at a time does so: lost, twice, late, with wrong bits."""
+        """When [s] and how a frame that should arrive at a time [s] does so: lost, twice, late, with wrong bits."""
         if self.lost():
             return []
         if self._happens(self.corrupt):

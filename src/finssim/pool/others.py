@@ -32,7 +32,13 @@ class TrueState:
         self.vehicle, self._world = world.vehicle, world
 
     def telemetry(self, now: float, telemetry: Any, time: float) -> None:
-        """Nothing that is not known already."""
+        """Nothing that is not known already.
+
+        Args:
+            now: When it came [s].
+            telemetry: Not used.
+            time: When it was measured [s].
+        """
 
     def picture(self, now: float, picture: Any) -> str:
         """Nothing that is not known already."""

@@ -82,7 +82,26 @@ def drive(
     seed: int,
     world_offset: int,
 ):
-    """Before a physics step: turn the motors through it, and write thrusts, wrench and current for the engine."""
+    """Before a physics step: turn the motors through it, and write thrusts, wrench and current for the engine.
+
+    Args:
+        position: Body origin, world frame [m], (worlds, vehicles); as the other arrays, it has one of each.
+        quaternion: Body to world, xyzw, (worlds, vehicles).
+        velocity: Twist, body frame [m/s, rad/s], (worlds, vehicles).
+        steps: Physics steps so far, (worlds,).
+        thrust: Written: along the thrusters' axes [N], (worlds, vehicles).
+        disturbance: Written: wrench about the body origin, body frame [N, N m], (worlds, vehicles).
+        current: Written: velocity of the water at the body origin, world frame [m/s], (worlds,).
+        motors: Motors and speed loops.
+        propellers: What makes thrust of their speeds.
+        hidden: What acts on the body besides.
+        circulation: Of the water.
+        line: The slack tether.
+        step: Physics step [s].
+        motor_steps: Steps of the motors in it.
+        seed: Of the speed measurements' noise.
+        world_offset: First world of this launch; not used.
+    """
     count = steps[0]
     t = float(count) * step
     dt = step / float(motor_steps)

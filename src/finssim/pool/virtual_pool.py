@@ -138,7 +138,14 @@ class VirtualPool:
         return Delivery(until, tuple(frames), tuple(pictures))
 
     def pose_at(self, time: float) -> tuple[Array, Array]:
-        """Position and quaternion at a time of the last second, between physics steps; the nearest beyond them."""
+        """Where the vehicle is at a time of the last second, between physics steps; the nearest beyond them.
+
+        Args:
+            time: Robot's clock [s].
+
+        Returns:
+            Body origin, world frame [m], (3,), and quaternion, body to world, xyzw, (4,).
+        """
         poses = self._poses
         i = bisect_right(poses, time, key=lambda pose: pose[0])
         if i == 0 or i == len(poses):

@@ -96,7 +96,7 @@ def add_action(
         command: Of the simulated ones.
         arrays: Holds the actions.
         agents: How many of the vehicles are agents: the first ones.
-        wrench_scale: Part of each wrench limit that action 1 of an agent stands for, (6,).
+        wrench_scale: Part of each wrench limit that action 1 of an agent stands for [-], body axes, (6,).
 
     Returns:
         A function that appends the stage to a pipeline.

@@ -42,7 +42,12 @@ class Communication:
 
 
 def most_under_way(c: Communication, period: float, reach: float) -> int:
-    """Messages of one agent that can be under way at once, sent every `period` seconds over up to `reach` metres.
+    """Messages of one agent that can be under way at once.
+
+    Args:
+        c: How messages travel.
+        period: Between two of them [s].
+        reach: Longest way [m].
 
     Raises:
         EnvironmentSetupError: There is no room for as many.

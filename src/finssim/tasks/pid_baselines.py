@@ -199,15 +199,30 @@ def attitude_from(up: Array, heading: Array) -> Array:
 
 
 def heading_rate(up: Array, nu: Array) -> Array:
-    """(q sin φ + r cos φ) / cos θ, with up = [-sin θ, cos θ sin φ, cos θ cos φ] [rad/s], (n,)."""
+    """(q sin φ + r cos φ) / cos θ, with up = [-sin θ, cos θ sin φ, cos θ cos φ].
+
+    Args:
+        up: World's up in the body frame [-], (n, 3).
+        nu: Twist, body frame [m/s, rad/s], (n, 6).
+
+    Returns:
+        [rad/s], (n,).
+    """
     level = np.maximum(up[..., 1] ** 2 + up[..., 2] ** 2, 1e-6)
     return np.asarray((nu[..., 4] * up[..., 1] + nu[..., 5] * up[..., 2]) / level)
 
 
 def acceleration_ahead(offsets: list[Array], velocity: Array) -> Array:
-    """Acceleration of a reference from where it is now, one and two `LOOK_AHEAD` later, and its velocity, (n, 3).
+    """Acceleration of a reference from where it is now, one and two `LOOK_AHEAD` later, and its velocity.
 
     p(k) - p(0) = v k + a k²/2 + j k³/6; of k and 2k together the jerk j falls out.
+
+    Args:
+        offsets: Way to the reference at the three times, in one frame [m], (n, 3) each.
+        velocity: Of the reference, same frame [m/s], (n, 3).
+
+    Returns:
+        Same frame [m/s²], (n, 3).
     """
     near, far = offsets[1] - offsets[0], offsets[2] - offsets[0]
     return np.asarray((8.0 * near - far - 6.0 * LOOK_AHEAD * velocity) / (2.0 * LOOK_AHEAD**2))

@@ -140,13 +140,21 @@ def tilted(roll: float, pitch: float, yaw: float) -> wp.quat:
 
 @wp.func
 def level_direction(angle: float) -> wp.vec3:
-    """Unit vector at an angle from the world's x axis."""
+    """Unit vector at an angle [rad] from the world's x axis, counter-clockwise from above, world frame."""
     return wp.vec3(wp.cos(angle), wp.sin(angle), 0.0)
 
 
 @wp.func
 def place_at_rest(state: State, w: int, v: int, x: wp.vec3, yaw: float):
-    """Put a vehicle somewhere, level and at rest."""
+    """Put a vehicle somewhere, level and at rest.
+
+    Args:
+        state: Written.
+        w: World.
+        v: Vehicle.
+        x: Body origin, world frame [m].
+        yaw: [rad].
+    """
     state.position[w, v] = x
     state.quaternion[w, v] = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw)
     state.velocity[w, v] = vec6()

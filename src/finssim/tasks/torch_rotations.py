@@ -94,5 +94,5 @@ def arctangent(y: Tensor, x: Tensor) -> Tensor:
 
 
 def wrapped(angle: Tensor) -> Tensor:
-    """An angle brought to [-π, π] [rad]."""
+    """An angle brought to [-π, π] [rad], (...,)."""
     return angle - 2.0 * math.pi * torch.round(angle / (2.0 * math.pi))

@@ -96,11 +96,11 @@ class Esc(Part):
         """Steady shaft speed.
 
         Args:
-            pulse_us: Pulse widths [µs], (...); those beyond the ends act as the ends, 0 (no signal) stops the motor.
-            voltage: Of the battery [V], broadcast with the pulses; `self.voltage` where not given.
+            pulse_us: Pulse widths [µs], (...,); those beyond the ends act as the ends, 0 (no signal) stops the motor.
+            voltage: Of the battery [V], (...,), broadcast with the other; `self.voltage` where not given.
 
         Returns:
-            [rad/s], (...), of the same sign as pulse - neutral.
+            [rad/s], (...,), of the same sign as pulse - neutral.
         """
         pulse = np.asarray(pulse_us, dtype=np.float64)
         volts = self._volts(voltage, pulse.shape)
@@ -114,12 +114,12 @@ class Esc(Part):
         """Pulse width that makes a steady shaft speed; the inverse of `shaft_speed`.
 
         Args:
-            shaft_speed: [rad/s], (...); speeds slower than `slowest` give the neutral pulse, speeds that the voltage
+            shaft_speed: [rad/s], (...,); speeds slower than `slowest` give the neutral pulse, speeds that the voltage
                 cannot reach the end of the range.
-            voltage: Of the battery [V], broadcast with the speeds; `self.voltage` where not given.
+            voltage: Of the battery [V], (...,), broadcast with the other; `self.voltage` where not given.
 
         Returns:
-            [µs], (...).
+            [µs], (...,).
         """
         omega = np.asarray(shaft_speed, dtype=np.float64)
         found = self._inverse(omega, self._volts(voltage, omega.shape))

@@ -60,16 +60,20 @@ class Thruster(Part):
         """Steady thrust T = c± ω|ω| [N] (paper, eq. 16), positive along `axis`.
 
         Args:
-            shaft_speed: ω [rad/s], (...).
+            shaft_speed: ω [rad/s], (...,).
 
         Returns:
-            (...); force and speed limits and the dead zone do not enter.
+            (...,); force and speed limits and the dead zone do not enter.
         """
         omega = np.asarray(shaft_speed, dtype=np.float64)
         return np.where(omega >= 0.0, self.c_plus, self.c_minus) * omega * np.abs(omega)
 
     def speed(self, force: ArrayLike) -> Array:
-        """Shaft speed [rad/s] whose steady thrust is `force` [N], (...): the inverse of `thrust`."""
+        """Shaft speed [rad/s] whose steady thrust is `force`: the inverse of `thrust`.
+
+        Args:
+            force: Along `axis`, body frame [N], (...,).
+        """
         wanted = np.asarray(force, dtype=np.float64)
         c = np.where(wanted >= 0.0, self.c_plus, self.c_minus)
         return np.sign(wanted) * np.sqrt(np.abs(wanted) / c)
@@ -78,11 +82,11 @@ class Thruster(Part):
         """Steady shaft speed at a pulse width; where `motor_sign` is -1, small pulses are positive thrust.
 
         Args:
-            pulse_us: [µs], (...).
-            voltage: Of the battery [V], broadcast with the pulses; that of the ESC's numbers where not given.
+            pulse_us: [µs], (...,).
+            voltage: Of the battery [V], (...,), broadcast with the other; that of the ESC's numbers where not given.
 
         Returns:
-            [rad/s], (...), positive for positive thrust.
+            [rad/s], (...,), positive for positive thrust.
 
         Raises:
             VehicleError: The vehicle file gives this thruster no `esc`.
@@ -93,7 +97,11 @@ class Thruster(Part):
         return esc.shaft_speed(mirrored if self.motor_sign == -1 else pulse, voltage)
 
     def pulse(self, shaft_speed: ArrayLike, voltage: ArrayLike | None = None) -> Array:
-        """Pulse width [µs] that makes a steady shaft speed [rad/s]: the inverse of `shaft_speed`.
+        """Pulse width [µs] that makes a steady shaft speed: the inverse of `shaft_speed`.
+
+        Args:
+            shaft_speed: [rad/s], (...,), positive for positive thrust.
+            voltage: Of the battery [V], (...,), broadcast with the other; that of the ESC's numbers where not given.
 
         Raises:
             VehicleError: The vehicle file gives this thruster no `esc`.

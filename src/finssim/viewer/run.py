@@ -116,7 +116,7 @@ def run(
 
     Args:
         choice: What to look at.
-        speed: Times as fast as real.
+        speed: Times as fast as real [-].
         port: Port of the page; the next free one if it is taken.
         bind (ADDRESS): Address to serve at: this machine alone unless given.
         no_browser: Print the page's address, and do not open it.

@@ -47,7 +47,7 @@ class Mesh(NamedTuple):
 
 
 def wxyz(quaternion: npt.ArrayLike) -> tuple[float, float, float, float]:
-    """A quaternion xyzw in the order that the browser takes."""
+    """A quaternion xyzw, body to world, (4,), in the order that the browser takes."""
     x, y, z, w = np.asarray(quaternion, float).tolist()
     return w, x, y, z
 

@@ -53,7 +53,7 @@ class WaterRays:
         """Where the rays meet a plane normal . X + offset = 0.
 
         Args:
-            normal: Of any length, pool frame, (3,) or (..., 3).
+            normal: Of any length [-], pool frame, (3,) or (..., 3).
             offset: [m], times the length of the normal, scalar or (...).
 
         Returns:

@@ -102,7 +102,18 @@ class Interface:
         index_far: float = 1.333,
         window: tuple[Layer, ...] = (),
     ) -> Interface:
-        """The plane through a point [m], with a normal of any length that points into the camera's side."""
+        """The plane through a point, with a normal.
+
+        Args:
+            point: Of the plane, pool frame [m], (3,).
+            normal: Of any length [-], into the camera's side, pool frame, (3,).
+            index_near: Refractive index on the camera's side.
+            index_far: Refractive index on the side of the points.
+            window: Layers between the two, the first one next to the camera.
+
+        Raises:
+            OpticsError: The normal is zero or not finite.
+        """
         n, length = np.asarray(normal, float), float(np.linalg.norm(normal))
         if not (math.isfinite(length) and length > 0.0):
             raise OpticsError(f"interface normal is {n}, expected a direction")

@@ -133,7 +133,7 @@ def plane_jacobian(
 
     Args:
         points_p: Points on the plane, as back-projection found them, pool frame [m], (..., 3).
-        normal: Of the plane, of any length, pool frame, (3,).
+        normal: Of the plane, of any length [-], pool frame, (3,).
 
     Returns:
         dX/d(u, v, shift), (..., 3, 3) [m/px, m/px, m/m]: the shift moves the plane along its normal; NaN where the

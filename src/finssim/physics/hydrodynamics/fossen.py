@@ -44,7 +44,7 @@ def fossen_wrench(
         q: Attitude, body to world.
         up: World z axis in the body frame.
         nu: Twist, body frame [m/s, rad/s].
-        nu_r: The same relative to the water.
+        nu_r: The same relative to the water, body frame [m/s, rad/s].
         flow: Water at the body origin.
 
     Returns:

@@ -151,7 +151,7 @@ def wet_part(corners: wp.mat33, surface_normal: wp.vec3, surface_height: float) 
 
     Args:
         corners: Corners a, b, c, a row each, body frame [m].
-        surface_normal: Upward unit normal of the surface, body frame.
+        surface_normal: Upward unit normal of the surface [-], body frame.
         surface_height: Height of the body origin above the surface [m].
 
     Returns:
@@ -190,7 +190,7 @@ def face_drag(v: wp.vec3, normal: wp.vec3, form: float, skin: float) -> wp.vec3:
 
     Args:
         v: Velocity of the water relative to the face, body frame [m/s].
-        normal: Outward unit normal of the face, body frame.
+        normal: Outward unit normal of the face [-], body frame.
         form: ½ ρ C_form [kg/m³].
         skin: ½ ρ C_skin [kg/m³].
 
@@ -229,7 +229,7 @@ def mesh_drag(
         density: ρ [kg/m³].
         form_drag: C_form [-].
         skin_drag: C_skin [-].
-        surface_normal: Upward unit normal of the water surface, body frame.
+        surface_normal: Upward unit normal of the water surface [-], body frame.
         surface_height: Height of the body origin above the surface along that normal, negative below [m].
 
     Returns:
@@ -273,7 +273,7 @@ def mesh_displacement(hull: HullMesh, kind: int, surface_normal: wp.vec3, surfac
     Args:
         hull: The hulls.
         kind: Which of them.
-        surface_normal: Upward unit normal of the water surface, body frame.
+        surface_normal: Upward unit normal of the water surface [-], body frame.
         surface_height: Height of the body origin above the surface along that normal, negative below [m].
 
     Returns:
@@ -317,7 +317,7 @@ def mesh_inflow(
         hull: The hulls.
         kind: Which of them.
         nu_r: Twist of the body at its origin relative to the water, body frame [m/s, rad/s].
-        surface_normal: Upward unit normal of the water surface, body frame.
+        surface_normal: Upward unit normal of the water surface [-], body frame.
         surface_height: Height of the body origin above the surface along that normal, negative below [m].
 
     Returns:

@@ -31,7 +31,21 @@ def simplified_wrench(
     Added mass, its Coriolis terms and moving water are left out on purpose: a current does not act on this model, and
     accelerating water does not either (no water counts as displaced).
 
-    Args and returns are those of `fossen_wrench`.
+    Args:
+        plant: Parameters.
+        hull: Not used here.
+        water: Density and gravity.
+        w: World.
+        v: Vehicle.
+        position: Body origin, world frame [m].
+        q: Attitude, body to world.
+        up: World z axis in the body frame.
+        nu: Twist, body frame [m/s, rad/s].
+        nu_r: The same relative to the water, body frame [m/s, rad/s]; not used here.
+        flow: Water at the body origin; of its velocity only the vertical part counts here.
+
+    Returns:
+        As of `fossen_wrench`, with no water displaced.
     """
     out = fossen_wrench(plant, hull, water, w, v, position, q, up, nu, nu, flow)
     out.displaced = 0.0

@@ -22,7 +22,7 @@ def surge_coupled_wrench(nu_r: vec6, surge_damping: mat66) -> vec6:
 
     Args:
         nu_r: Velocity of the reference point relative to the water, body frame [m/s, rad/s].
-        surge_damping: Du [N s²/m², N m s²/rad²].
+        surge_damping: Du, of whose diagonal the units are [N s²/m², N s²/rad].
 
     Returns:
         Wrench about the same point, body frame [N, N m].
@@ -32,7 +32,15 @@ def surge_coupled_wrench(nu_r: vec6, surge_damping: mat66) -> vec6:
 
 @wp.func
 def surge_coupled_slope(nu_r: vec6, surge_damping: mat66) -> vec6:
-    """Diagonal of Du times the sum of the linear speeds, which is never less than |u_r|; in surge twice that."""
+    """Diagonal of Du times the sum of the linear speeds, which is never less than |u_r|; in surge twice that.
+
+    Args:
+        nu_r: Velocity of the reference point relative to the water, body frame [m/s, rad/s].
+        surge_damping: Du, of whose diagonal the units are [N s²/m², N s²/rad].
+
+    Returns:
+        Slope of the damping on each axis, body frame [N s/m, N m s/rad].
+    """
     d = wp.get_diag(surge_damping)
     d[0] = 2.0 * d[0]
     speeds = wp.abs(linear(nu_r))

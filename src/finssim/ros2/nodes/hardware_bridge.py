@@ -45,7 +45,13 @@ class HardwareBridge(RobotNode):
         self.event("start", self.transport.describe())
 
     def telemetry(self, now: float, telemetry: Telemetry, time: float) -> None:
-        """Publish a snapshot, as `robot.intake` gives it to a recorder; stamps are of the measurement."""
+        """Publish a snapshot, as `robot.intake` gives it to a recorder; stamps are of the measurement.
+
+        Args:
+            now: When it came [s].
+            telemetry: The snapshot.
+            time: When it was measured [s].
+        """
         stamp, received = self.ns(time), self.ns(now)
         self.send("telemetry", self.make.telemetry(stamp, received, telemetry))
         if self.heard("imu"):

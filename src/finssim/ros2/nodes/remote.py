@@ -84,7 +84,13 @@ class RemoteState:
         return self._newest
 
     def telemetry(self, now: float, telemetry: Telemetry, time: float) -> None:
-        """None comes here."""
+        """None comes here.
+
+        Args:
+            now: When it would have come [s].
+            telemetry: Not used.
+            time: When it would have been measured [s].
+        """
 
     def _take(self, reading: Reading) -> None:
         self._newest = reading
@@ -133,7 +139,7 @@ class RemoteBridge:
         self._node.send("acknowledge", ros_type("std_msgs/msg/Empty")())
 
     def command(self, now: float, force: npt.ArrayLike, source: str, stamp: float | None = None) -> Array:
-        """Ask for thrusts, canonical order [N], (n,)."""
+        """Ask for thrusts along the thrusters' axes, canonical order [N], (n,)."""
         wanted, source = np.asarray(force, float), source if self._source is None else self._source()
         self._node.send("command", self._node.make.command(self._node.ns(now), wanted, source))
         return wanted

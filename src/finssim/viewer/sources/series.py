@@ -37,7 +37,7 @@ class Series:
         self.values = values
 
     def at(self, time: float) -> Any:
-        """The newest value that is not later than a time; None before the first."""
+        """The newest value that is not later than a time [s]; None before the first."""
         i = int(np.searchsorted(self.time, time, side="right")) - 1
         return None if i < 0 else self.values[i]
 
@@ -54,12 +54,12 @@ class PoseSeries:
         return len(self.time)
 
     def at(self, time: float) -> Pose | None:
-        """The newest pose that is not later than a time; None before the first."""
+        """The newest pose that is not later than a time [s]; None before the first."""
         i = int(np.searchsorted(self.time, time, side="right")) - 1
         return None if i < 0 else Pose(self.position[i], self.quaternion[i])
 
     def trail(self, time: float) -> Array:
-        """Where it was in the last half minute, (k, 3)."""
+        """Where it was in the half minute before a time [s], world frame [m], (k, 3)."""
         first, last = np.searchsorted(self.time, (time - TRAIL, time))
         return self.position[first:last][:: max(1, (last - first) // TRAIL_POINTS)] if last else nowhere()
 
@@ -86,7 +86,7 @@ class Errors:
         self._trail: deque[Array] = deque(maxlen=round(TRAIL / SAMPLE))
 
     def add(self, time: float, true: Pose | None, estimate: Pose | None, goal: Pose | None) -> None:
-        """Keep a moment, if the last one that was kept is old enough."""
+        """Keep a moment, its time in [s], if the last one that was kept is old enough."""
         if self._rows and time < self._rows[-1][0] + SAMPLE - 1e-9:
             return
         seen = true or estimate
