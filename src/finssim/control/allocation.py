@@ -82,7 +82,13 @@ def clip(f: vec8, lower: vec8, upper: vec8) -> vec8:
 
 @wp.func
 def unconstrained(tau: vec6, vehicle: int, data: AllocationData) -> vec8:
-    """Optimum without limits, f0 = H^-1 B' W^2 tau [N]."""
+    """Optimum without limits, f0 = H^-1 B' W^2 tau [N].
+
+    Args:
+        tau: Wanted wrench about the point that B was computed for, body frame [N, N m].
+        vehicle: Vehicle type, first index into `data`.
+        data: From `allocation_data`.
+    """
     f0 = vec8()
     for j in range(6):
         f0 += data.gain[vehicle, j] * tau[j]
@@ -185,7 +191,14 @@ def allocate(tau: vec6, vehicle: int, data: AllocationData) -> vec8:
 
 @wp.func
 def allocation_residual(f: vec8, tau: vec6, vehicle: int, data: AllocationData) -> float:
-    """Distance of `f` from optimality, max_i |f - clip(f - H (f - f0) / h)| [N]: zero only there."""
+    """Distance of `f` from optimality, max_i |f - clip(f - H (f - f0) / h)| [N]: zero only there.
+
+    Args:
+        f: Thrusts in the canonical order [N].
+        tau: Wanted wrench about the point that B was computed for, body frame [N, N m].
+        vehicle: Vehicle type, first index into `data`.
+        data: From `allocation_data`.
+    """
     error = f - unconstrained(tau, vehicle, data)
     gradient = vec8()
     for j in range(MAX_THRUSTERS):
@@ -198,7 +211,14 @@ def allocation_residual(f: vec8, tau: vec6, vehicle: int, data: AllocationData) 
 def allocate_kernel(
     tau: wp.array(dtype=vec6), vehicle: wp.array(dtype=int), data: AllocationData, f: wp.array(dtype=vec8)
 ):
-    """`allocate` for every world: wanted wrenches (worlds,) and vehicle types (worlds,) in, thrusts (worlds,) out."""
+    """`allocate` for every world.
+
+    Args:
+        tau: Wanted wrenches as of `allocate`, body frame [N, N m], (worlds,).
+        vehicle: Vehicle types, (worlds,).
+        data: From `allocation_data`.
+        f: Thrusts out [N], (worlds,).
+    """
     world = wp.tid()
     f[world] = allocate(tau[world], vehicle[world], data)
 

@@ -115,7 +115,11 @@ class _Launch:
 
 
 def axis_weights(wrench_limits: npt.ArrayLike) -> Array:
-    """Diagonal of W [1/N, 1/(N m)], (6,): one over each wrench limit, and zero on an axis with no authority."""
+    """Diagonal of W [1/N, 1/(N m)], (6,): one over each wrench limit, and zero on an axis with no authority.
+
+    Args:
+        wrench_limits: Largest wrench on each axis alone, body axes [N, N m], (6,).
+    """
     limits = np.asarray(wrench_limits, float)
     weights: Array = np.divide(1.0, limits, out=np.zeros_like(limits), where=limits > 0.0)
     return weights

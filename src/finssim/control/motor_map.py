@@ -106,7 +106,11 @@ class MotorMap:
         return (AT_REST,) * self.thrusters
 
     def limited(self, force: npt.ArrayLike) -> Array:
-        """Thrusts within force, shaft speed and full-scale limits, canonical order [N], (..., n)."""
+        """Thrusts within force, shaft speed and full-scale limits, canonical order [N], (..., n).
+
+        Args:
+            force: Thrusts along the thrusters' axes, canonical order [N], (..., n).
+        """
         limited: Array = np.minimum(np.maximum(np.asarray(force, float), self.lower), self.upper)
         return limited
 
@@ -125,7 +129,7 @@ class MotorMap:
         """What to tell the controller until the next call.
 
         Args:
-            force: Thrusts asked for, canonical order [N], (n,); finite.
+            force: Thrusts asked for, along the thrusters' axes, canonical order [N], (n,); finite.
             memory: From the call before, or `reset()`.
             dt: How long the command will stand; the time since the call before will do [s].
 

@@ -112,6 +112,12 @@ class PaperPid:
     ) -> PaperPid:
         """Controller of a vehicle; the published gains do not depend on its hydrodynamics.
 
+        Args:
+            vehicle: The vehicle.
+            hydrodynamics: Not used.
+            period: Time between two commands [s].
+            profile: Published numbers.
+
         Raises:
             ControlError: The period is not positive.
         """

@@ -37,13 +37,20 @@ class AxisModel:
     """k of roll and pitch about level, zero elsewhere [N m/rad], (6,)."""
 
     def damping(self, nu: npt.ArrayLike) -> Array:
-        """d1 + d2 |nu| [N s/m, N m s], (..., 6)."""
+        """d1 + d2 |nu| [N s/m, N m s], (..., 6).
+
+        Args:
+            nu: Velocity of the wrench reference, body frame [m/s, rad/s], (..., 6).
+        """
         return np.asarray(self.linear_damping + self.quadratic_damping * np.abs(np.asarray(nu, float)))
 
     def coriolis(self, nu: npt.ArrayLike) -> Array:
         """C(nu) nu of the diagonal inertia, Munk moment included [N, N m], (..., 6).
 
         omega x (m v), and omega x (I omega) + v x (m v)                                        (Fossen 2021, eq. 6.43)
+
+        Args:
+            nu: Velocity of the wrench reference, body frame [m/s, rad/s], (..., 6).
         """
         nu = np.asarray(nu, float)
         v, omega, momentum = nu[..., :3], nu[..., 3:], self.inertia * nu

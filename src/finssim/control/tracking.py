@@ -138,6 +138,11 @@ def tracking_error(measured: Measured, goal: Goal, point: npt.ArrayLike) -> Trac
 
 
 def velocity_at(nu: npt.ArrayLike, point: npt.ArrayLike) -> Array:
-    """Twist of the body at a body point: v + omega x r and omega, body frame, (..., 6)."""
+    """Twist of the body at a body point: v + omega x r and omega, body frame [m/s, rad/s], (..., 6).
+
+    Args:
+        nu: Twist of the body origin, body frame [m/s, rad/s], (..., 6).
+        point: r from the body origin, body frame [m], (3,).
+    """
     nu = np.asarray(nu, float)
     return np.concatenate([nu[..., :3] + cross(nu[..., 3:], np.asarray(point, float)), nu[..., 3:]], axis=-1)

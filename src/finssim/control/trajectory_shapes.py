@@ -56,7 +56,14 @@ def polyline(points: Sequence[Sequence[float]], durations: Sequence[float]) -> M
 
 
 def circle(radius: float, turns: float, duration: float, depth: float = DEPTH) -> Motion:
-    """Circles about the pool's middle at constant speed, counter-clockwise from (radius, 0)."""
+    """Circles about the pool's middle at constant speed, counter-clockwise from (radius, 0).
+
+    Args:
+        radius: [m]
+        turns: Number of circles.
+        duration: Time for all of them [s].
+        depth: Height of their plane, world frame [m]: negative under water.
+    """
     _positive(radius=radius, turns=turns, duration=duration)
     return helix(radius, turns, duration, depth, depth)
 
@@ -75,7 +82,14 @@ def helix(radius: float, turns: float, duration: float, bottom: float, top: floa
 
 
 def gerono(a: float, b: float, duration: float, depth: float = DEPTH) -> Motion:
-    """A figure of eight at constant phase rate: x = a sin θ, y = b sin θ cos θ (Gerono's lemniscate)."""
+    """A figure of eight at constant phase rate: x = a sin θ, y = b sin θ cos θ (Gerono's lemniscate).
+
+    Args:
+        a: Half its length along world x [m].
+        b: Its width along world y [m].
+        duration: Time for one figure [s].
+        depth: Height of its plane, world frame [m]: negative under water.
+    """
     _positive(a=a, b=b, duration=duration)
     rate = 2.0 * math.pi / duration
 
@@ -93,6 +107,12 @@ def ellipse(a: float, b: float, duration: float, depth: float = DEPTH) -> Motion
 
     The speed along the arc follows 0.5 + 0.5 sin² 2θ, and time itself runs by s = 3u² - 2u³. That reading of what is
     published gives the published peak: 0.1031 m/s for half axes of 1.0 and 0.4 m in 92.70 s.
+
+    Args:
+        a: Half axis along world x [m].
+        b: Half axis along world y [m].
+        duration: Time for the turn [s].
+        depth: Height of its plane, world frame [m]: negative under water.
     """
     _positive(a=a, b=b, duration=duration)
     theta = np.linspace(0.0, 2.0 * math.pi, TABLE_SIZE + 1)

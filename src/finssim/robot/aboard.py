@@ -44,7 +44,12 @@ class Stuck:
         self._since = math.nan
 
     def look(self, value: Hashable, time: float) -> bool:
-        """Whether the source has frozen, now that it says this."""
+        """Whether the source has frozen, now that it says this.
+
+        Args:
+            value: What it says.
+            time: When it said so [s].
+        """
         if value != self._value or time < self._since:
             self._value, self._since = value, time
         return time - self._since > self.longest
@@ -89,7 +94,13 @@ class Aboard:
         return ImuSample(time - self._imu_latency, omega, force, self.tilt(telemetry), arrival)
 
     def depth(self, telemetry: Telemetry, time: float, arrival: float) -> DepthSample | str:
-        """The depth, once each time that it was measured: telemetry repeats it until there is a new one."""
+        """The depth, once each time that it was measured: telemetry repeats it until there is a new one.
+
+        Args:
+            telemetry: As it came.
+            time: When it was sent, robot's clock [s].
+            arrival: When it came [s].
+        """
         depth = telemetry.depth
         if not abs(depth) <= DEEPEST:
             return "implausible"

@@ -109,7 +109,7 @@ class Bridge:
 
         Args:
             now: When it came [s].
-            force: Thrusts in canonical order [N], (n,).
+            force: Thrusts along the thrusters' axes, canonical order [N], (n,).
             source: Who sent it; two at a time are a fault.
             stamp: Time of what its sender knew, robot's clock [s].
 

@@ -49,7 +49,14 @@ class Commander:
         return [name for name, time in self._heard.items() if now - time <= self._timeout]
 
     def accept(self, now: float, force: npt.ArrayLike, source: str, stamp: float | None) -> str:
-        """Takes a command if it is fit to be used; otherwise says why not and keeps the one before."""
+        """Takes a command if it is fit to be used; otherwise says why not and keeps the one before.
+
+        Args:
+            now: When it came [s].
+            force: Thrusts along the thrusters' axes, canonical order [N], (n,).
+            source: Who sent it.
+            stamp: Time of what its sender knew, robot's clock [s]; None: it does not tell.
+        """
         try:
             wanted = np.array(force, float)
         except (TypeError, ValueError):

@@ -33,12 +33,24 @@ class EventLog:
         self._last: dict[str, float] = {}
 
     def add(self, time: float, kind: str, text: str) -> None:
-        """Notes an event, always."""
+        """Notes an event, always.
+
+        Args:
+            time: Robot's clock [s].
+            kind: One or two words.
+            text: One sentence.
+        """
         self.counts[kind] += 1
         self.events.append(Event(time, kind, text))
 
     def repeat(self, time: float, kind: str, text: str) -> None:
-        """Counts an event that may come with every message, and notes it if none of its kind was noted just now."""
+        """Counts an event that may come with every message, and notes it if none of its kind was noted just now.
+
+        Args:
+            time: Robot's clock [s].
+            kind: One or two words.
+            text: One sentence.
+        """
         last = self._last.get(kind)
         if last is not None and 0.0 <= time - last < REPEAT:
             self.counts[kind] += 1

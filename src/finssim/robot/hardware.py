@@ -85,7 +85,10 @@ class HardwareRobot:
         return reading
 
     def send(self, force: npt.ArrayLike) -> Array:
-        """Command thrusts in canonical order [N], (n,); returns them as limited (zeros while not armed)."""
+        """Command thrusts along the thrusters' axes in canonical order [N], (n,).
+
+        Returns them as limited (zeros while not armed).
+        """
         now = self._clock()
         limited = self.bridge.command(now, force, "script", stamp=now)
         self._tick(now)

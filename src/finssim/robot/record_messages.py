@@ -219,7 +219,13 @@ class Messages:
         )
 
     def goal(self, stamp: int, position: Any, yaw: float) -> Any:
-        """A level pose in the map."""
+        """A level pose in the map.
+
+        Args:
+            stamp: [ns]
+            position: Map frame [m], (3,).
+            yaw: About the map's z, left positive [rad].
+        """
         pose = self.pose(position, quat_from_yaw(yaw))
         return self._of["geometry_msgs/msg/PoseStamped"](self.header(stamp, MAP), pose)
 

@@ -31,7 +31,7 @@ def play(
 
     Args:
         record: An open one.
-        speed: Times as fast as recorded; infinite: at once.
+        speed: Times as fast as recorded [-]; infinite: at once.
         clock: [s], monotonic.
         wait: Waits so long [s].
         topics: Only these.

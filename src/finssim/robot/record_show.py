@@ -60,7 +60,7 @@ def play_record(
 
     Args:
         path (FILE): Record of a run (.mcap).
-        speed (FACTOR): Times as fast as it was recorded.
+        speed (FACTOR): Times as fast as it was recorded [-].
         fast: Without waiting.
         topics (NAMES): Only these, with commas between: odom,thruster_cmd.
         start: Begin so long after the start of the record [s].

@@ -130,7 +130,14 @@ class Recorder:
             self._put("transform", at, make.transform(stamp, reading))
 
     def command(self, now: float, force: npt.ArrayLike, source: str = "", wrench: Any = None) -> None:
-        """Thrusts that a controller asks for, canonical order [N], and the wrench behind them, (6,) [N, N m]."""
+        """Thrusts that a controller asks for, and the wrench behind them.
+
+        Args:
+            now: [s]
+            force: Along the thrusters' axes, canonical order [N], (n,).
+            source: Who asks.
+            wrench: Body axes [N, N m], (6,); None where there is none.
+        """
         at = self._ns(now)
         self._put("command", at, self._messages.command(at, force, source))
         if wrench is not None:

@@ -52,4 +52,7 @@ class Robot(Protocol):
         """The newest state."""
 
     def send(self, force: npt.ArrayLike) -> Array:
-        """Command thrusts in canonical order [N], (n,); returns them as limited (zeros while not armed)."""
+        """Command thrusts along the thrusters' axes in canonical order [N], (n,).
+
+        Returns them as limited (zeros while not armed).
+        """

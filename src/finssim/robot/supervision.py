@@ -136,7 +136,12 @@ class Supervision:
         return ""
 
     def limited(self, now: float, force: Array) -> Array:
-        """Thrusts within the limits, canonical order [N], (n,), without what pushes out of the workspace."""
+        """Thrusts without what pushes out of the workspace, canonical order [N], (n,).
+
+        Args:
+            now: [s]
+            force: Along the thrusters' axes, canonical order, within the limits [N], (n,).
+        """
         pose = self.state.pose(now)
         return force if pose is None else self.workspace.inward_only(force, *pose)
 

@@ -59,7 +59,13 @@ class Unfused:
             self._z = self._z.after(np.array([z]), time)
 
     def fix(self, position: tuple[float, float], yaw: float | None, time: float) -> None:
-        """Take in a fix; the first with a yaw says where the attitude filter's zero points."""
+        """Take in a fix; the first with a yaw says where the attitude filter's zero points.
+
+        Args:
+            position: x, y of the body origin, pool frame [m].
+            yaw: Left positive, pool frame [rad]; None where it is not known.
+            time: Middle of the exposure [s].
+        """
         self._xy = self._xy.after(np.array(position), time)
         if math.isnan(self._offset) and yaw is not None:
             self._offset = yaw - self._heading

@@ -26,7 +26,13 @@ class Unlocated:
         self._nu = np.full(6, np.nan)
 
     def telemetry(self, now: float, telemetry: Telemetry, time: float) -> None:
-        """Take attitude and rates; what is not finite is passed over."""
+        """Take attitude and rates; what is not finite is passed over.
+
+        Args:
+            now: When it came [s].
+            telemetry: As it was decoded.
+            time: When it was measured, the vehicle's clock mapped to ours [s].
+        """
         q, gyro = np.array(telemetry.quaternion), self._R_body_imu @ telemetry.gyro
         if np.isfinite(q).all() and np.isfinite(gyro).all():
             self._quaternion = quat_multiply(q, quat_conjugate(self._q_body_imu))

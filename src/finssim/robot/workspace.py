@@ -44,7 +44,11 @@ class Workspace:
         return ""
 
     def outward(self, position: Array) -> Array:
-        """Direction out of the box on each axis where the vehicle is near a face, else 0: -1, 0 or 1, (3,)."""
+        """Direction out of the box on each axis where the vehicle is near a face, else 0: -1, 0 or 1, (3,).
+
+        Args:
+            position: World frame [m], (3,).
+        """
         return (position > self._inner[1]).astype(float) - (position < self._inner[0])
 
     def inward_only(self, force: Array, position: Array, quaternion: Array) -> Array:

@@ -64,6 +64,20 @@ def sample_compass(
     seed: int,
     world_offset: int,
 ):
+    """One update of every compass.
+
+    Args:
+        quaternion: Attitude, body to world, xyzw, (W, V).
+        steps: Control steps since the world's reset, (W,).
+        episode: Resets of the world so far, (W,).
+        parameters: Errors of each compass, (W, V).
+        compass: Readings and memory.
+        sampling: When each samples.
+        mask: Worlds to look at, (W,).
+        restarting: Whether these worlds have just been reset.
+        seed: Of all random numbers.
+        world_offset: World of the first thread.
+    """
     i, v = wp.tid()
     w = world_offset + i
     if mask[w] == 0:
@@ -111,8 +125,8 @@ class CompassBatch(SensorBatch):
         Args:
             vehicle: Index.
             entry: `vehicle.sensors.compass`.
-            gravity: Not used.
-            density: Not used.
+            gravity: Not used [m/s²].
+            density: Not used [kg/m³].
         """
         self.set(
             vehicle,

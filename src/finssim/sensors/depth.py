@@ -89,6 +89,21 @@ def sample_depth(
     seed: int,
     world_offset: int,
 ):
+    """One update of every gauge.
+
+    Args:
+        position: Body origin, world frame [m], (W, V).
+        quaternion: Attitude, body to world, xyzw, (W, V).
+        steps: Control steps since the world's reset, (W,).
+        episode: Resets of the world so far, (W,).
+        parameters: Mount and errors of each gauge, (W, V).
+        gauge: Readings and memory.
+        sampling: When each samples.
+        mask: Worlds to look at, (W,).
+        restarting: Whether these worlds have just been reset.
+        seed: Of all random numbers.
+        world_offset: World of the first thread.
+    """
     i, v = wp.tid()
     w = world_offset + i
     if mask[w] == 0:

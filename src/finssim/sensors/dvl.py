@@ -99,7 +99,7 @@ def has_echo(
         q_wb: Attitude, body to world, xyzw.
         r: Sensor from the body origin, body frame [m].
         floor_depth: Depth of the flat floor [m].
-        tilt_cosine: Least cosine between the body's z axis and the vertical.
+        tilt_cosine: Least cosine between the body's z axis and the vertical [-].
         altitude_min: Least height of the sensor above the floor [m].
         altitude_max: Greatest height of the sensor above the floor [m].
     """
@@ -126,6 +126,24 @@ def sample_dvl(
     seed: int,
     world_offset: int,
 ):
+    """One update of every DVL.
+
+    Args:
+        position: Body origin, world frame [m], (W, V).
+        quaternion: Attitude, body to world, xyzw, (W, V).
+        velocity: nu at the body origin, body frame [m/s, rad/s], (W, V).
+        water_velocity: Of the water, world frame [m/s], (W, V): water track; empty for bottom track.
+        floor_depth: Depth of the flat floor [m].
+        steps: Control steps since the world's reset, (W,).
+        episode: Resets of the world so far, (W,).
+        parameters: Mount and errors of each DVL, (W, V).
+        dvl: Readings and memory.
+        sampling: When each samples.
+        mask: Worlds to look at, (W,).
+        restarting: Whether these worlds have just been reset.
+        seed: Of all random numbers.
+        world_offset: World of the first thread.
+    """
     i, v = wp.tid()
     w = world_offset + i
     if mask[w] == 0:
@@ -190,8 +208,8 @@ class DvlBatch(SensorBatch):
         Args:
             vehicle: Index.
             entry: `vehicle.sensors.dvl`.
-            gravity: Not used.
-            density: Not used.
+            gravity: Not used [m/s²].
+            density: Not used [kg/m³].
         """
         knows_floor = math.isfinite(self.floor_depth)
         self.set(

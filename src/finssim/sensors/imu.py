@@ -116,6 +116,22 @@ def sample_imu(
     seed: int,
     world_offset: int,
 ):
+    """One update of every IMU.
+
+    Args:
+        quaternion: Attitude, body to world, xyzw, (W, V).
+        velocity: nu at the body origin, body frame [m/s, rad/s], (W, V).
+        acceleration: nu_dot, rate of the components of nu, body frame [m/s², rad/s²], (W, V).
+        steps: Control steps since the world's reset, (W,).
+        episode: Resets of the world so far, (W,).
+        parameters: Mount and errors of each IMU, (W, V).
+        imu: Readings and memory.
+        sampling: When each samples.
+        mask: Worlds to look at, (W,).
+        restarting: Whether these worlds have just been reset.
+        seed: Of all random numbers.
+        world_offset: World of the first thread.
+    """
     i, v = wp.tid()
     w = world_offset + i
     if mask[w] == 0:
@@ -179,7 +195,7 @@ class ImuBatch(SensorBatch):
             vehicle: Index.
             entry: `vehicle.sensors.imu`.
             gravity: [m/s²]
-            density: Not used.
+            density: Not used [kg/m³].
         """
         # White noise of density σ has the standard deviation σ √rate in each of `rate` samples a second.
         root_rate = math.sqrt(entry.rate)

@@ -97,15 +97,28 @@ def cut_steps(
     return records
 
 
-def unit_response(t: Array, delay: Array | float, tau: Array | float) -> Array:
-    """Unit response of first order plus dead time."""
+def unit_response(t: Array, delay: Array | float, time_constant: Array | float) -> Array:
+    """Unit response of first order plus dead time, (n,).
+
+    Args:
+        t: Time since the step [s], (n,).
+        delay: Dead time [s], a number or (n,).
+        time_constant: Of the first order [s], a number or (n,).
+    """
     since = np.maximum(t - delay, 0.0)
-    return 1.0 - np.exp(-since / tau)
+    return 1.0 - np.exp(-since / time_constant)
 
 
-def step_fit(record: StepRecord, delay: float, tau: float, *, moved: bool) -> StepFit:
-    """Levels, error, overshoot and rise of one step under the common response."""
-    r = unit_response(record.t, delay, tau)
+def step_fit(record: StepRecord, delay: float, time_constant: float, *, moved: bool) -> StepFit:
+    """Levels, error, overshoot and rise of one step under the common response.
+
+    Args:
+        record: The step.
+        delay: Dead time [s].
+        time_constant: Of the first order [s].
+        moved: Whether the response followed the command.
+    """
+    r = unit_response(record.t, delay, time_constant)
     rows = np.column_stack([np.ones_like(r), r])
     (a, b), *_ = np.linalg.lstsq(rows, record.y, rcond=None)
     error = record.y - rows @ np.array([a, b])

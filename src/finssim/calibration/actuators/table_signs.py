@@ -35,6 +35,15 @@ def without_offset(full: dict[str, Array], speed_known: bool, neutral: float, no
 
 
 def check_pulses(pulse: Array, shown: str) -> None:
+    """Refuse pulses that are no microseconds.
+
+    Args:
+        pulse: Of the motor controller [µs], (n,); NaN and 0 are passed over.
+        shown: Name of the table, for messages.
+
+    Raises:
+        CalibrationError: A pulse is outside 500 to 2500 µs.
+    """
     known = pulse[np.isfinite(pulse) & (pulse != 0.0)]
     if known.size and (known.min() < 500.0 or known.max() > 2500.0):
         raise CalibrationError(

@@ -125,7 +125,13 @@ Array = NDArray[np.float64]
 
 
 def predicted_thrust(result: Bench, before: Thruster, speed: Array) -> Array:
-    """T = c± ω|ω| with the fitted c±, those of the vehicle file where there is none [N]."""
+    """T = c± ω|ω| with the fitted c±, those of the vehicle file where there is none [N], (n,).
+
+    Args:
+        result: The fit.
+        before: The thruster of the vehicle file.
+        speed: Of the shaft, positive for positive thrust [rad/s], (n,).
+    """
     c = {
         name: result.sides[name].c if name in result.sides else getattr(before, f"c_{name}")
         for name, _ in SIDES

@@ -20,7 +20,7 @@ def travel(force: Array, rate: float, axis: Axis, vehicle: Vehicle) -> float:
     m v_dot = force - (d1 + d2 |v|) v, of the set `calibrated` or else the first; without damping where that is a mesh.
 
     Args:
-        force: Held over each row [N], (n,).
+        force: Along the axis, body frame, held over each row [N], (n,).
         rate: Of the rows [Hz].
         axis: surge, sway or heave.
         vehicle: Whose mass and damping count.
@@ -42,7 +42,15 @@ def travel(force: Array, rate: float, axis: Axis, vehicle: Vehicle) -> float:
 
 
 def within(room: float, force: Array, rate: float, axis: Axis, vehicle: Vehicle) -> float:
-    """Factor up to 1 on a force that keeps the way along one axis within `room` [m]; arguments as for `travel`."""
+    """Factor up to 1 on a force that keeps the way along one axis within a room.
+
+    Args:
+        room: Longest way [m].
+        force: Along the axis, body frame, held over each row [N], (n,).
+        rate: Of the rows [Hz].
+        axis: surge, sway or heave.
+        vehicle: Whose mass and damping count.
+    """
     low, high = 0.0, 1.0
     if travel(force, rate, axis, vehicle) <= room:
         return high

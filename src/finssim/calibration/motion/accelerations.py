@@ -104,6 +104,10 @@ def holds_gravity(trial: Trial, gravity: float) -> bool:
 
     Vehicles under water accelerate far less than gravity: what is about as large as gravity holds it. With only ax or
     ay there is nothing to tell it by, and an accelerometer is assumed.
+
+    Args:
+        trial: Its header and its columns ax, ay, az.
+        gravity: [m/s²]
     """
     if trial.header.acceleration != "auto":
         return trial.header.acceleration == "specific_force"

@@ -105,7 +105,12 @@ def velocities(
 
 
 def arm_velocity(omega: Array, arm: Array) -> Array:
-    """omega × r, with unknown rates taken as 0, (m, 3)."""
+    """omega × r, with unknown rates taken as 0, body frame [m/s], (m, 3).
+
+    Args:
+        omega: Angular velocity, body frame [rad/s], (m, 3).
+        arm: r from the body origin, body frame [m], (3,).
+    """
     return np.cross(np.nan_to_num(omega), arm)
 
 

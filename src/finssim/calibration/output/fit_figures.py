@@ -164,7 +164,13 @@ def _draw(figure: Figure, cell: SubplotSpec, curve: Curve) -> None:
 
 
 def new_figure(width: float, height: float, constrained: bool = True) -> Figure:
-    """An empty figure, its size in inches."""
+    """An empty figure.
+
+    Args:
+        width: [inch]
+        height: [inch]
+        constrained: Whether the layout makes room for labels.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -56,7 +56,11 @@ class Piece:
     s: float
 
     def run(self, wrench: Array) -> Run:
-        """With the trial's tau without bias and known terms, (n,)."""
+        """The run under the trial's force or moment on the axis.
+
+        Args:
+            wrench: Without bias and known terms, body axes [N or N m], (n,).
+        """
         q = self.every
         steps = -(-(self.last - 1 - self.start) // q)
         inside = wrench[self.start : self.start + steps * q + 1]
@@ -71,7 +75,8 @@ def cut(rate: float, spans: Sequence[tuple[int, int]], nu: Array, sine: Array | 
     Args:
         rate: [Hz]
         spans: Stretches of consecutive good samples, [begin, end).
-        nu: Measured velocity, (n,); the state is the median of a tenth of a second.
+        nu: Measured velocity of the axis, body frame [m/s or rad/s], (n,); the state is the median of a tenth of a
+            second.
         sine: Of the angle, (n,); None without stiffness.
     """
     q = max(1, int(rate / RATE + 1e-9))

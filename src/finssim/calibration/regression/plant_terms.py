@@ -50,7 +50,14 @@ class Matrices:
     """Of the layer in which buoyancy fades at the surface [m]."""
 
     def with_axis(self, axis: int, added_mass: float, d1: float, d2: float) -> Matrices:
-        """With the diagonal entries of one axis replaced."""
+        """With the diagonal entries of one axis replaced.
+
+        Args:
+            axis: 0 surge to 5 yaw.
+            added_mass: [kg or kg m²]
+            d1: Linear damping [N s/m or N m s].
+            d2: Quadratic damping [N s²/m² or N m s²].
+        """
         new = {name: getattr(self, name).copy() for name in ("M_A", "D1", "D2")}
         for name, value in zip(new, (added_mass, d1, d2), strict=True):
             new[name][axis, axis] = value
@@ -129,7 +136,7 @@ def known_wrench(nu: Array, up: Array, depth: Array, rate: float, plant: Matrice
     Fitted, hence not taken off, are the buoyancy excess in heave and the restoring moments of roll and pitch.
 
     Args:
-        nu: About the reference point, zero where unknown, (n, 6).
+        nu: About the reference point, body frame, zero where unknown [m/s, rad/s], (n, 6).
         up: World z in the body frame, (n, 3).
         depth: Of the body origin [m], zero where unknown, (n,).
         rate: [Hz]
@@ -161,7 +168,13 @@ def known_wrench(nu: Array, up: Array, depth: Array, rate: float, plant: Matrice
 
 
 def unit_wrenches(nu: Array, up: Array, depth: Array, plant: Matrices) -> Array:
-    """What the estimated parameters of terms add to the wrench, each by its unit; arguments as for `known_wrench`.
+    """What the estimated parameters of terms add to the wrench, each by its unit.
+
+    Args:
+        nu: About the reference point, body frame, zero where unknown [m/s, rad/s], (n, 6).
+        up: World z in the body frame, (n, 3).
+        depth: Of the body origin [m], zero where unknown, (n,).
+        plant: The vehicle.
 
     Returns:
         (n, 6, k) [N, N m by the units of the parameters]

@@ -60,13 +60,13 @@ def huber_weights(residual: Array, *, reject: float = 8.0) -> Array:
     return np.where(size > reject, 0.0, np.minimum(1.0, HUBER / np.maximum(size, 1e-12)))
 
 
-def bounded(normal: Array, theta: Array, lower: Array) -> tuple[Array, NDArray[np.bool_]]:
+def bounded(N: Array, theta: Array, lower: Array) -> tuple[Array, NDArray[np.bool_]]:
     """The point within bounds nearest to the free optimum, in the metric of the normal matrix.
 
     min (x - theta)ᵀ N (x - theta) with x >= lower, by enumeration of the active sets; exact for the few bounds here.
 
     Args:
-        normal: N, positive definite, (P, P).
+        N: Normal matrix, positive definite, (P, P).
         theta: Free optimum, (P,).
         lower: Bounds, -inf where there is none, (P,).
 
@@ -81,12 +81,12 @@ def bounded(normal: Array, theta: Array, lower: Array) -> tuple[Array, NDArray[n
         x = theta.copy()
         x[fixed] = lower[fixed]
         if fixed.any() and not fixed.all():
-            pull = normal[np.ix_(~fixed, fixed)] @ (x - theta)[fixed]
-            x[~fixed] = theta[~fixed] - np.linalg.solve(normal[np.ix_(~fixed, ~fixed)], pull)
+            pull = N[np.ix_(~fixed, fixed)] @ (x - theta)[fixed]
+            x[~fixed] = theta[~fixed] - np.linalg.solve(N[np.ix_(~fixed, ~fixed)], pull)
         if (x < lower - 1e-12).any():
             continue
         step = x - theta
-        value = float(step @ normal @ step)
+        value = float(step @ N @ step)
         if value < cost:
             best, chosen, cost = x, fixed, value
         if not active:

@@ -219,7 +219,14 @@ def axis_rows(found: Signals, axis: int, kernels: Kernel) -> Rows | None:
 
 
 def simulated_columns(nu: Array, sine: Array | None, rows: Rows, kernels: Kernel) -> Array:
-    """The columns of `axis_rows` from simulated signals of the whole trial, filtered in the same way."""
+    """The columns of `axis_rows` from simulated signals of the whole trial, filtered in the same way.
+
+    Args:
+        nu: Simulated velocity of the axis, body frame [m/s or rad/s], (n,).
+        sine: Of the simulated angle, (n,); None without stiffness.
+        rows: Of the same trial and axis, as measured.
+        kernels: For the trial's rate.
+    """
     moving = np.concatenate(
         [_columns(nu[b:e], None if sine is None else sine[b:e], kernels) for b, e in rows.spans]
     )

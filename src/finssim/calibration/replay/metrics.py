@@ -219,7 +219,7 @@ def error_ahead(
         ahead: Times since the start [s], (T,).
         measured: (T, S), NaN where there is no measurement.
         simulated: (T, S).
-        width: Span that `nrmse` is relative to, of all or for each prediction, (S,).
+        width: Span that `nrmse` is relative to [unit of the response], of all or for each prediction, (S,).
         seconds: Times of interest [s], (H,); the nearest of `ahead` is taken.
     """
     wanted = np.asarray(seconds, dtype=np.float64)

@@ -96,14 +96,14 @@ def eliminate(blocks: Blocks) -> tuple[Array, Array, Array]:
 
 
 def scatter(
-    normal: Array, right: Array, groups: NDArray[np.int64], shape: tuple[int, int, int]
+    matrices: Array, right: Array, groups: NDArray[np.int64], shape: tuple[int, int, int]
 ) -> tuple[Array, Array]:
     """One dense system in (theta, phi_1, ..., phi_G) from the segments' in (theta, phi of their trial).
 
     Args:
-        normal: (S, P + b, P + b)
-        right: (S, P + b)
-        groups: (S,)
+        matrices: Normal matrices of the segments, (S, P + b, P + b).
+        right: Their right-hand sides, (S, P + b).
+        groups: Trial of each segment, (S,).
         shape: P, G, b.
 
     Returns:
@@ -113,7 +113,7 @@ def scatter(
     A, g = np.zeros((P + G * b, P + G * b)), np.zeros(P + G * b)
     for s, group in enumerate(groups):
         at = np.concatenate([np.arange(P), P + group * b + np.arange(b)])
-        A[np.ix_(at, at)] += normal[s]
+        A[np.ix_(at, at)] += matrices[s]
         g[at] += right[s]
     return A, g
 

@@ -71,7 +71,7 @@ class Residuals:
         Args:
             response: Of the candidates.
             late: By how much each sample lags what it shows [s], (N, C) or (N, 1).
-            current: As for `channel`.
+            current: World frame [m/s], in place of the segments' own, (C, S, 3).
 
         Returns:
             (N, C) each [unit of the channel, and the same per second]; NaN where a candidate diverged. Before a
@@ -257,7 +257,11 @@ class SensorErrors:
         return out
 
     def slopes(self, rate: Array) -> tuple[Array, Array]:
-        """Derivatives of the readings by lag (N, streams) and by offset (N, k), for rates (N,)."""
+        """Derivatives of the readings by lag (N, streams) and by offset (N, k).
+
+        Args:
+            rate: Of change of the predicted readings [unit of the channel/s], (N,).
+        """
         late = np.where(self._stream[:, None] == np.arange(len(self.streams)), -rate[:, None], 0.0)
         return late, self._offset
 

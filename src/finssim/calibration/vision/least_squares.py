@@ -158,6 +158,10 @@ def arrow_step(blocks: Sequence[Block], damping: float) -> tuple[Array, list[Arr
     """One damped Gauss-Newton step (Marquardt), (P,) and (Q,) each.
 
     A shared direction that nothing tells gets no step.
+
+    Args:
+        blocks: Normal equations of the groups.
+        damping: What the diagonals grow by, as a part of themselves [-].
     """
     solved = [_eliminated(block, damping) for block in blocks]
     total = np.sum([reduced for reduced, _, _ in solved], axis=0)

@@ -45,7 +45,11 @@ class Stream:
     """(m, c)"""
 
     def at(self, time: float) -> Array | None:
-        """Linear between samples, (c,); None where there is none or the next two are too far apart."""
+        """Linear between samples, (c,); None where there is none or the next two are too far apart.
+
+        Args:
+            time: On the clock of `t` [s].
+        """
         k = int(np.searchsorted(self.t, time, side="right"))
         if not 0 < k < len(self.t) or self.t[k] - self.t[k - 1] > LONGEST_AGE:
             return None

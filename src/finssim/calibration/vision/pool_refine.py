@@ -362,7 +362,7 @@ def held_out(fit: Refined, seen: Observations, folds: int, seed: int, normal: Ar
         seen: All rows.
         folds: Parts, at most one for each location.
         seed: Of the parts.
-        normal: Of the planes, one through each point, on which pixels are back-projected, (3,).
+        normal: Of the planes, one through each point, on which pixels are back-projected: unit, pool frame [-], (3,).
     """
     used = np.flatnonzero(fit.used)
     place = seen.location if len(np.unique(seen.location[used])) >= FEW else np.arange(len(seen))
@@ -391,7 +391,13 @@ def held_out(fit: Refined, seen: Observations, folds: int, seed: int, normal: Ar
 
 
 def error_vectors(model: PoolModel, seen: Observations, normal: Array) -> Array:
-    """Where each pixel's ray meets the plane through its point, minus the point [m], (N, 3); NaN where it does not."""
+    """Where each pixel's ray meets the plane through its point, minus the point [m], (N, 3); NaN where it does not.
+
+    Args:
+        model: Camera and water.
+        seen: Pixels and points.
+        normal: Unit normal of the planes, pool frame [-], (3,).
+    """
     rays, ok = model.camera.lens.rays(seen.pixels)
     origin = np.broadcast_to(np.asarray(model.camera.position), seen.points.shape).copy()
     direction = np.where(ok[:, None], rays, np.nan) @ np.asarray(model.camera.R_pc).T

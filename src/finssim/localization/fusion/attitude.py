@@ -65,7 +65,7 @@ def in_body_axes(vector_s: npt.ArrayLike, orientation: npt.ArrayLike) -> Array:
 
 
 def up_of(roll: npt.ArrayLike, pitch: npt.ArrayLike) -> Array:
-    """Unit vector upwards in the body frame, (..., 3): the last row of R_y(θ) R_x(φ)."""
+    """Unit vector upwards in the body frame from roll φ and pitch θ [rad], (..., 3): the last row of R_y(θ) R_x(φ)."""
     roll, pitch = np.asarray(roll, float), np.asarray(pitch, float)
     return np.stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)], axis=-1)
 

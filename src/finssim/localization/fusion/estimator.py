@@ -209,7 +209,7 @@ class ErrorState:
         return self._kept(track), (Outcome("heading", verdict, float(distance), 1),)
 
     def estimate(self, track: InertialTrack, time: float) -> Estimate:
-        """The state at a time, not before its own."""
+        """The state at a time [s], not before its own."""
         if track.inertial is None:
             return self._before.estimate(track.before, time)
         track = self._until(track, time)
@@ -398,7 +398,8 @@ class Model(Protocol[S]):
     def vision(self, track: S, sample: VisionSample) -> tuple[S, tuple[Outcome, ...]]: ...
     def velocity(self, track: S, sample: VelocitySample) -> tuple[S, tuple[Outcome, ...]]: ...
     def heading(self, track: S, sample: HeadingSample) -> tuple[S, tuple[Outcome, ...]]: ...
-    def estimate(self, track: S, time: float) -> Estimate: ...
+    def estimate(self, track: S, time: float) -> Estimate:
+        """The state at a time [s]."""
 
 
 MODELS: dict[str, Any] = {"constant-velocity": ConstantVelocity, "error-state": ErrorState}
@@ -484,8 +485,9 @@ class Estimator:
         return health_of(estimate, self.settings, self.site, self._latest, self._reason, self._counts)
 
     def at(self, time: float) -> Surroundings:
-        """Roll, pitch and depth at the time of an exposure, for the fit of its pose: between samples in a straight
-        line, else from one within the freshness of its stream."""
+        """Roll, pitch and depth at the time of an exposure [s], for the fit of its pose: between samples in a straight
+        line, else from one within the freshness of its stream.
+        """
         s = self.settings
         roll, pitch = self._timeline.tilt_at(time, s.imu_fresh, lambda track: (track.roll, track.pitch))
         return Surroundings(roll, pitch, self._timeline.depth_at(time, s.depth_fresh))

@@ -277,7 +277,7 @@ def fuse(
     method: str = "refractive",
     pixel_std: float = 0.5,
 ) -> Run:
-    """Fuse a log; arguments as `run`. A row at time t rests on what had arrived by t.
+    """Fuse a log at a rate of rows [Hz]; arguments as `run`. A row at time t rests on what had arrived by t.
 
     Raises:
         LocalizationError: A word is unknown, the rate is out of range, or the error-state mode finds no acceleration.

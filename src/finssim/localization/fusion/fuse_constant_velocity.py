@@ -181,7 +181,7 @@ class ConstantVelocity:
         return changed(track, compass=track.compass or turned.used), (replace(turned, stream="heading"),)
 
     def estimate(self, track: Track, time: float) -> Estimate:
-        """The state at a time, not before its own; what is not known yet is NaN."""
+        """The state at a time [s], not before its own; what is not known yet is NaN."""
         position, yaw = self._positioned(track, time).position, self._yaw_at(track, time)
         x, P = position.x.copy(), position.P.copy()
         unknown = ([0, 1, 3, 4] if track.vision_time is None else []) + (

@@ -162,7 +162,7 @@ def judge(
         time: Of the measurement [s].
         value: What is compared among refused measurements, (n,).
         covariance: Of `value`, (n, n).
-        distance: Squared Mahalanobis distance of the measurement from its prediction.
+        distance: Squared Mahalanobis distance of the measurement from its prediction [-].
         drift: How fast `value` may change [units/s].
 
     Returns:
@@ -202,7 +202,7 @@ def judge_carried(
         time: Of the measurement [s].
         residual: Measurement less prediction [units].
         variance: Of the measurement [units²].
-        distance: Squared Mahalanobis distance of the measurement from its prediction.
+        distance: Squared Mahalanobis distance of the measurement from its prediction [-].
         drift: How fast residuals that agree may change [units/s].
         carried: Whether that other sensor speaks; `judge` has to do where it does not.
     """

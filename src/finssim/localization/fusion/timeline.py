@@ -62,7 +62,7 @@ class Timeline(Generic[S]):
         return self._states[-1] if self._states else self._before
 
     def state_at(self, time: float) -> S:
-        """State after the last sample not later than `time`, of those remembered."""
+        """State after the last sample not later than `time` [s], of those remembered."""
         k = bisect.bisect_right(self._keys, (time + SAME, len(_RANK)))
         return self._states[k - 1] if k else self._before
 

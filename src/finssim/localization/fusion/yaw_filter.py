@@ -139,7 +139,14 @@ def correct(state: YawState, found: YawInnovation, variance: Number) -> YawState
 
 
 def restarted(state: YawState, yaw: float, variance: float, bias_std: float) -> YawState:
-    """Start yaw at a measurement; the bias is kept, with at least the doubt it had at power-on if `bias_std` > 0."""
+    """Start yaw at a measurement; the bias is kept, with at least the doubt it had at power-on if `bias_std` > 0.
+
+    Args:
+        state: Before.
+        yaw: Measured [rad].
+        variance: Of `yaw` [rad²].
+        bias_std: Of the gyro's bias at power-on [rad/s].
+    """
     return YawState(_wrapped(yaw), state.bias, variance, 0.0, max(state.bias_variance, bias_std**2))
 
 

@@ -28,7 +28,7 @@ class Series:
     """Nothing is interpolated between samples further apart than this [s]."""
 
     def at(self, time: float) -> Array | str:
-        """The values at a time, in a straight line between two samples, (k,); or why they are not known there."""
+        """The values at a time [s], in a straight line between two samples, (k,); or why they are not known there."""
         if not np.isfinite(time):
             return f"no {self.what} at the exposure: the picture has no time stamp"
         first, last = float(self.t[0]), float(self.t[-1])

@@ -123,7 +123,7 @@ def refused(
 
 
 def tilt_matrix(roll: float, pitch: float) -> Array:
-    """R_y(pitch) R_x(roll), (3, 3)."""
+    """R_y(pitch) R_x(roll) of angles [rad], (3, 3)."""
     cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
     return np.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
 

@@ -48,7 +48,7 @@ def mirrored(R_pb: Array, sight_p: Array, normal_b: Array) -> Array:
     Args:
         R_pb: The one, (3, 3).
         sight_p: Unit vector along the line of sight, pool frame, (3,).
-        normal_b: Unit normal of the flat thing, body frame, (3,).
+        normal_b: Unit normal of the flat thing, body frame [-], (3,).
     """
     return (
         (np.eye(3) - 2.0 * np.outer(sight_p, sight_p))

@@ -122,7 +122,14 @@ def printed(cells: wp.array(dtype=wp.uint8), tag: TagData, x: float, y: float, s
 
 @wp.func
 def near_ray(origin: wp.vec3, ray: wp.vec3, centre: wp.vec3, radius: float) -> bool:
-    """Whether a ray passes a sphere."""
+    """Whether a ray passes a sphere.
+
+    Args:
+        origin: Of the ray, surface frame [m].
+        ray: Its unit direction.
+        centre: Of the sphere, surface frame [m].
+        radius: Of the sphere [m].
+    """
     to = centre - origin
     along = wp.dot(to, ray)
     return wp.dot(to, to) - along * along < radius * radius and along > -radius

@@ -44,7 +44,17 @@ def put_things(
     time: float,
     device: Any,
 ) -> None:
-    """Put tags, bodies and the waves of a moment into a packed scene."""
+    """Put tags, bodies and the waves of a moment into a packed scene.
+
+    Args:
+        data: From `pack_scene`.
+        frame: The surface frame.
+        tags: In the scene.
+        bodies: In the scene.
+        waves: The surface; None for a flat one.
+        time: Middle of the exposure [s].
+        device: Warp device.
+    """
     data.tags = on_device(_tags(tags, frame), TagData, device)
     cells = [np.asarray(tag.bitmap, np.uint8).ravel() for tag in tags]
     data.cells = on_device(np.concatenate([*cells, np.zeros(0, np.uint8)]), wp.uint8, device)

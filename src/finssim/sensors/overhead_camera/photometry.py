@@ -26,8 +26,8 @@ def refracted(ray: wp.vec3, normal: wp.vec3, ratio: float) -> wp.vec3:
     """Direction after refraction (paper, eq. 9), or zero for total reflection.
 
     Args:
-        ray: Unit direction of the incident ray.
-        normal: Unit normal against it.
+        ray: Unit direction of the incident ray, any frame.
+        normal: Unit normal against it, same frame [-].
         ratio: Index on its side over the index on the other, η.
     """
     c = -wp.dot(normal, ray)
@@ -110,7 +110,12 @@ def digitise(
 
 
 def noise_key(seed: int, time: float) -> int:
-    """A 31-bit key of a picture's noise, from the seed and the time to the microsecond."""
+    """A 31-bit key of a picture's noise.
+
+    Args:
+        seed: Of the noise.
+        time: Of the picture [s]; it counts to the microsecond.
+    """
     mixed = (seed * 0x9E3779B97F4A7C15 + round(time * 1e6) * 0xC2B2AE3D27D4EB4F + 0x165667B19E3779F9) % 2**64
     for shift in (30, 27):
         mixed = (mixed ^ (mixed >> shift)) * 0xBF58476D1CE4E5B9 % 2**64

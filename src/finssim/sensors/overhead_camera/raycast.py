@@ -45,7 +45,16 @@ class Refraction:
 def meet_things(
     scene: SceneData, origin: wp.vec3, ray: wp.vec3, t: float, angle: float, travelled: float
 ) -> Surfel:
-    """The first tag or body on a ray. Arguments as of `meet_tag`."""
+    """The first tag or body on a ray.
+
+    Args:
+        scene: Holds tags and bodies.
+        origin: Of the ray, surface frame [m].
+        ray: Its unit direction.
+        t: Time as a fraction of the exposure, 0 to 1.
+        angle: Width of the ray's share of the pixel per distance travelled [rad].
+        travelled: Distance before the origin that counts for that width [m].
+    """
     first = Surfel()
     first.distance = NOTHING
     for i in range(scene.tags.shape[0]):
@@ -65,9 +74,9 @@ def enter_water(scene: SceneData, origin: wp.vec3, ray: wp.vec3, normal: wp.vec3
 
     Args:
         scene: Holds indices and layers.
-        origin: On the near face [m].
+        origin: On the near face, surface frame [m].
         ray: Unit direction in air.
-        normal: Unit normal of the face towards the camera.
+        normal: Unit normal of the face towards the camera, surface frame [-].
     """
     out = Refraction()
     out.origin = origin
@@ -95,7 +104,14 @@ def enter_water(scene: SceneData, origin: wp.vec3, ray: wp.vec3, normal: wp.vec3
 
 @wp.func
 def mirrored(scene: SceneData, origin: wp.vec3, ray: wp.vec3, normal: wp.vec3) -> float:
-    """Radiance of sky or lamp in the direction in which the surface reflects a ray."""
+    """Radiance of sky or lamp in the direction in which the surface reflects a ray.
+
+    Args:
+        scene: Holds sky and lamps.
+        origin: Where the ray meets the surface, surface frame [m].
+        ray: Its unit direction.
+        normal: Unit normal towards the camera, surface frame [-].
+    """
     up = ray - 2.0 * wp.dot(ray, normal) * normal
     for i in range(scene.lamps.shape[0]):
         lamp = scene.lamps[i]
