@@ -1,25 +1,21 @@
 """Do public functions say in which unit, frame and shape they take and give physical quantities?
 
-    python tools/check_docstrings.py            what is missing, and not on the list; exit status 1 where there is any
-    python tools/check_docstrings.py --update   writes the list anew
+    python tools/check_docstrings.py    what is missing; exit status 1 where there is any
 
 A parameter is physical by its name (`QUANTITIES`) and its type: a number or an array. Its entry under `Args:`, or the
 docstring's other text where it names none, must hold a unit in brackets, such as [m/s] or [-] for none; of an array
-a shape, such as (n, 3); and of a quantity with a direction a frame. `docstrings_allowed.txt` lists the functions that
-are not there yet: it may shrink and never grow, and one that has become right must leave it.
+a shape, such as (n, 3); and of a quantity with a direction a frame.
 """
 
 from __future__ import annotations
 
-import argparse
 import ast
 import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
-SOURCE, ALLOWED = ROOT / "src", Path(__file__).with_name("docstrings_allowed.txt")
+SOURCE = Path(__file__).resolve().parents[1] / "src"
 
 DIRECTED = set(
     "position velocity acceleration force moment torque wrench tau nu twist omega quaternion normal gravity current "
@@ -87,23 +83,11 @@ def found() -> dict[str, list[str]]:
 
 
 def main() -> int:
-    """Exit status 1 where something is missing or the list holds what is not."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--update", action="store_true", help="write the list anew")
-    now = found()
-    if parser.parse_args().update:
-        ALLOWED.write_text("".join(f"{name}\n" for name in sorted(now)), encoding="utf-8")
-        print(f"{len(now)} functions on the list")
-        return 0
-    allowed = set(ALLOWED.read_text(encoding="utf-8").split())
-    for name in sorted(now.keys() - allowed):
-        print(f"{name}: its docstring does not say: {', '.join(now[name])}")
-    for name in sorted(allowed - now.keys()):
-        print(f"{name}: says all of it now, or is gone: take it off {ALLOWED.name}")
-    print(f"docstrings: {len(now.keys() & allowed)} functions still on {ALLOWED.name}")
-    return int(bool(now.keys() ^ allowed))
+    """Exit status 1 where something is missing."""
+    lacking = found()
+    for name, what in lacking.items():
+        print(f"{name}: its docstring does not say: {', '.join(what)}")
+    return int(bool(lacking))
 
 
 if __name__ == "__main__":

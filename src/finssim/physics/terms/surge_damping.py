@@ -61,7 +61,7 @@ SURGE_DAMPING = add_term(
     Term(
         name="surge_damping",
         schema=Matrix6,
-        units={"surge_damping": "N s²/m², N m s²"},
+        units={"surge_damping": "N s²/m², N s²/rad"},
         wrench=surge_coupled_wrench,
         slope=surge_coupled_slope,
         absent=zeros(6, 6),
