@@ -152,14 +152,15 @@ def process_of(team, name, record):
 
 
 @pytest.mark.slow
-def test_a_pursuer_in_another_process_is_told_of_the_prey_and_follows_it():
-    """Located by motion capture on its wire; it decides ten times a second and comes nearer."""
+@pytest.mark.parametrize(("task", "policy"), [("pursuit", "lead"), ("t3", "pid")])
+def test_who_pursues_in_another_process_is_told_of_the_prey_and_follows_it(task, policy):
+    """Of the prey or the goal that moves; located by motion capture on its wire, it decides ten times a second."""
     port = free_port()
     finssim = [sys.executable, "-m", "finssim"]
     words = [
         "pool",
         "--task",
-        "pursuit",
+        task,
         "--plant",
         "0",
         "--severity",
@@ -175,9 +176,9 @@ def test_a_pursuer_in_another_process_is_told_of_the_prey_and_follows_it():
             words = [
                 "run",
                 "--policy",
-                "lead",
+                policy,
                 "--task",
-                "pursuit",
+                task,
                 "--site",
                 "open-water",
                 "--pool-file",
@@ -194,3 +195,4 @@ def test_a_pursuer_in_another_process_is_told_of_the_prey_and_follows_it():
     told = json.loads(run.stdout)
     assert run.returncode == 0 and told["state"] != "fault" and told["decisions"] > 30
     assert "episode: not ended after" in said or "captured 1" in said
+    assert task != "t3" or (told["goal"] == "target" and told["position_rms_m"] < 2.0)

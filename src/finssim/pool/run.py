@@ -277,11 +277,6 @@ def _playing(
             f"--team names {len(bodies)} vehicles, but task '{fitted.name}' has {len(fitted.agents)} agents: "
             f"{', '.join(fitted.agents)}"
         )
-    if fitted.moving and len(fitted.vehicles) == 1:
-        raise PlantSpecError(
-            f"task '{fitted.name}' moves its goal, of which a robot elsewhere is not told: take finssim experiment "
-            "stack, or a task of several vehicles"
-        )
     agents = list(bodies) * (len(fitted.agents) // len(bodies))
     return TaskSite(
         task,

@@ -23,7 +23,7 @@ from finssim.control.modes import action_mode
 from finssim.control.tracking import Track
 from finssim.engine.launch import Pipeline
 from finssim.engine.state import State
-from finssim.geometry.rotations import quat_from_yaw, quat_yaw
+from finssim.geometry.rotations import quat_from_yaw, quat_inverse_rotate, quat_yaw
 from finssim.localization.pool import Pool
 from finssim.pool.fleet import Fleet
 from finssim.pool.medium import Medium
@@ -258,7 +258,8 @@ class TaskSite(Fleet):
         self.referee = referee = Referee(task, vehicles, seed=seed, guide=guide, action_size=size)
         if guide is None and referee.arrays.reference.position is not None:
             raise ControlError(
-                f"task '{referee.task.name}' follows a reference that is known ahead: give a trajectory"
+                f"task '{referee.task.name}' follows a reference that is known ahead: give a trajectory, in a pool "
+                "without --task"
             )
         self.task, goal = referee.task, guide or _Goal(referee)
         names = self.task.vehicles
@@ -274,6 +275,7 @@ class TaskSite(Fleet):
             )
             for i, (name, vehicle, place) in enumerate(zip(names, vehicles, referee.places(), strict=True))
         }
+        self._goal_is_told = pilots is None and self.task.moving and len(names) == 1
         site = (SITE,) if self._target() is not None else ()
         super().__init__(worlds)
         self.carrier = self.medium = Medium(self._positions, communication, seed)
@@ -368,8 +370,12 @@ class TaskSite(Fleet):
         }
 
     def _target(self) -> Track | None:
-        """What drifts in the water, of a task with such a thing."""
-        net = self.referee.arrays.net
+        """What drifts in the water, of a task with such a thing; for a robot elsewhere also a goal that moves."""
+        a, net = self.referee.arrays, self.referee.arrays.net
+        if self._goal_is_told:
+            q = a.goal_quaternion.numpy()[0].astype(float)
+            v = quat_inverse_rotate(q, a.target.velocity.numpy()[0].astype(float))
+            return Track(a.goal_position.numpy()[0].astype(float), q, np.array([*v, 0.0, 0.0, 0.0]))
         if net.target is None:
             return None
         level = np.array([0.0, 0.0, 0.0, 1.0])

@@ -3,19 +3,54 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import yaml
 
-from finssim.control.guidance import Guide, Station
+from finssim.control.guidance import Guide, Reference, Station
+from finssim.control.tracking import Track
+from finssim.geometry.rotations import quat_rotate, quat_yaw
 from finssim.vehicles import Vehicle
 
-__all__ = ["GoalError", "check_reachable", "guide_of", "place_of", "station_of"]
+__all__ = ["GoalError", "HeardGoal", "check_reachable", "guide_of", "place_of", "station_of"]
 
 
 class GoalError(ValueError):
     """A goal that cannot be read or that the vehicle may not go to."""
+
+
+class HeardGoal:
+    """A goal that moves, from the messages that tell of it: it goes on as it went when it was last heard of.
+
+    Attributes:
+        started: When the guide's time began, on the clock of the tracks [s].
+    """
+
+    name, duration = "target", math.inf
+
+    def __init__(self, tracks: Mapping[str, Track]) -> None:
+        """
+        Args:
+            tracks: What is heard of others, `target` among them as soon as it is.
+        """
+        self._tracks, self.started = tracks, math.nan
+
+    def at(self, t: npt.ArrayLike) -> Reference:
+        """Where it is at times since the start [s], (...); at the world's origin before it was heard of."""
+        track = self._tracks.get(self.name) or Track(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(6))
+        velocity = quat_rotate(track.quaternion, track.nu[:3])
+        since = np.asarray(t, float) + self.started - track.time
+        since = np.where(np.isfinite(since), since, 0.0)
+        shape = since.shape
+        return Reference(
+            track.position + since[..., None] * velocity,
+            np.broadcast_to(velocity, (*shape, 3)).copy(),
+            np.full(shape, float(quat_yaw(track.quaternion))),
+            np.zeros(shape),
+        )
 
 
 def station_of(text: str) -> Station:

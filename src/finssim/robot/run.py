@@ -17,7 +17,7 @@ from finssim.control.errors import ControlError
 from finssim.control.guidance import Station
 from finssim.control.trim import Trim
 from finssim.localization.pool import load_pool
-from finssim.robot.goals import check_reachable, guide_of, place_of
+from finssim.robot.goals import HeardGoal, check_reachable, guide_of, place_of
 from finssim.robot.interrupt import follow_parent
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import Pilot, make_pilot
@@ -170,6 +170,8 @@ def run(
         "armed": arm,
     }
     meta |= {"pool_sha256": pool.sha256} if pool else {}
+    team = _team(pilot, wiring)
+    heard = HeardGoal(team.tracks) if team is not None and guide is _GO and _alone(pilot) else None
     with _opened(connected(wiring, ours, pool), record, filed, meta, file, wiring) as (drive, recorder):
         if not arm:
             console.print("dry run: thrusters will not turn without --arm")
@@ -177,16 +179,18 @@ def run(
             ours,
             pool,
             pilot,
-            guide,
+            heard or guide,
             arm=arm,
             perception=perception,
             recorder=recorder,
-            team=_team(pilot, wiring),
+            team=team,
         )
         watch, summary = _Watch(runtime, duration, wiring.robot, console), Summary()
         with _progress(console) as say:
 
             def look(runtime: Runtime) -> None:
+                if heard is not None:
+                    heard.started = runtime.started
                 watch.look(runtime)
                 summary.look(runtime)
                 say(runtime, summary)
@@ -224,6 +228,12 @@ def _pilot(
     return make_pilot(policy, vehicle, task=task, agent=agent, trim=Trim() if trim else None)
 
 
+def _alone(pilot: Pilot) -> bool:
+    """Whether it does a task of one vehicle."""
+    observer = getattr(pilot, "observer", None)
+    return observer is not None and len(observer.task.vehicles) == 1
+
+
 def _team(pilot: Pilot, wiring: Wiring) -> Team | None:
     """This vehicle's end of the team's wire; None where it is alone.
 
@@ -234,13 +244,15 @@ def _team(pilot: Pilot, wiring: Wiring) -> Team | None:
     names = observer.task.vehicles if observer is not None else ()
     if not wiring.team:
         return None
-    if len(names) < 2:
+    if observer is None or (_alone(pilot) and not observer.task.moving):
         raise ControlError(
-            "--messages is for a policy or baseline of a task of several vehicles: give it with --task"
+            "--messages is for a policy or baseline of a task of several vehicles, or whose goal moves: give it with "
+            "--task"
         )
     talk = getattr(observer.task, "communication", None)
     period = observer.task.control_step if talk is None else talk.period
     others = (*(name for name in names if name != observer.agent), *observer.targets)
+    others = ("target",) if _alone(pilot) else others
     return Team(observer.agent, others, period=period, turn=period * names.index(observer.agent) / len(names))
 
 

@@ -1,0 +1,23 @@
+"""A goal that messages tell of goes on as it went."""
+
+import numpy as np
+
+from finssim.control.tracking import Track
+from finssim.geometry.rotations import quat_from_yaw
+from finssim.robot.goals import HeardGoal
+
+
+def test_a_goal_goes_on_as_it_was_last_heard_to_go():
+    """Heard at 12 s of a guide begun at 10 s: straight on along its own surge; at several times too."""
+    tracks = {}
+    goal = HeardGoal(tracks)
+    np.testing.assert_array_equal(goal.at(0.0).position, np.zeros(3))  # nothing heard yet
+    goal.started = 10.0
+    surge = np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
+    tracks["target"] = Track(np.array([1.0, 2.0, -3.0]), quat_from_yaw(np.pi / 2), surge, 12.0)
+    now = goal.at(2.0)
+    np.testing.assert_allclose(now.position, [1.0, 2.0, -3.0])
+    np.testing.assert_allclose(now.velocity, [0.0, 0.2, 0.0], atol=1e-12)
+    np.testing.assert_allclose(now.yaw, np.pi / 2)
+    later = goal.at(np.array([2.0, 7.0]))
+    np.testing.assert_allclose(later.position, [[1.0, 2.0, -3.0], [1.0, 3.0, -3.0]], atol=1e-12)
