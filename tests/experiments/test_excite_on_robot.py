@@ -80,31 +80,20 @@ def test_a_robot_trial_is_taken_by_the_calibration_as_it_is(tmp_path, robot):
 
 
 def test_a_robot_that_no_camera_sees_is_excited_by_its_position_fixes(tmp_path):
-    """Motion capture in a tank: the trial is the plant's as far as the camera's; no pool file is in the record."""
-    out = tmp_path / "trials"
-    with lockstep_pool(FINSROV, None, site="tank", positioning="motion-capture") as wiring:
-        robot = OnRobot(wiring=wiring, pool_file=None, site="tank", arm=True, unattended=True)
-        assert robot.options.endswith("--pool-file none --site tank --lockstep")
-        (made,) = excite(out, robot, "heave", levels=[9.0])[:1]
-    (trial,) = load_trials([made])
-    x, z = trial.channels["x"], trial.channels["z"]
-    assert np.abs(x[np.isfinite(x)]).max() < 0.3 and np.ptp(z[np.isfinite(z)]) > 0.15
-    with open_record(out / "records" / f"{made.name}.mcap") as record:
-        assert record.metadata["site"] == "tank" and "pool_sha256" not in record.metadata
-        assert record.metadata["vehicle_sha256"] == FINSROV.sha256
-
-
-def test_a_trial_is_made_of_a_record_with_log_and_compass(tmp_path):
-    """In open water, found by its fixes: rates are the IMU's, and nobody asks which Imu is meant."""
+    """In open water, with log and compass aboard: rates are the IMU's, and no pool file is in the record."""
     heavy, out = load_vehicle("bluerov2_heavy"), tmp_path / "trials"
     how = {"site": "open-water", "positioning": "motion-capture", "position": (0.0, 0.0, -0.75)}
     with lockstep_pool(heavy, None, **how) as wiring:
         robot = OnRobot(wiring=wiring, pool_file=None, site="open-water", arm=True, unattended=True)
+        assert robot.options.endswith("--pool-file none --site open-water --lockstep")
         made = excite_on_robot(
             "heave", vehicle="bluerov2_heavy", out=out, robot=robot, console=QUIET, levels=[15.0]
         )
     for trial in load_trials(made):
         assert np.isfinite(trial.channels["p"]).any() and np.nanmax(np.abs(trial.channels["w"])) > 0.1
+    with open_record(out / "records" / f"{made[0].name}.mcap") as record:
+        assert record.metadata["site"] == "open-water" and "pool_sha256" not in record.metadata
+        assert record.metadata["vehicle_sha256"] == heavy.sha256
 
 
 def test_the_operator_stops_a_trial_which_is_put_away_and_played_again_or_skipped(tmp_path, robot):

@@ -141,9 +141,9 @@ def test_a_turned_imu_is_found_where_the_tag_is_right(mount):
 
 @pytest.mark.slow
 def test_intervals_hold_the_truth():
-    """Six recordings, all that is told; at least 85 % where 95 % are meant."""
+    """Three recordings, all that is told; at least 85 % where 95 % are meant."""
     inside = []
-    for seed in range(6):
+    for seed in range(3):
         seen = moments(motion(tilt=0.2, seconds=20.0), np.random.default_rng(100 + seed))
         fit = fit_mounts(RIG, FILE, seen)
         inside += [abs(error) < fit.half_width(name) for name, error in errors(fit, fit.free).items()]
