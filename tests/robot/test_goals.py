@@ -19,5 +19,13 @@ def test_a_goal_goes_on_as_it_was_last_heard_to_go():
     np.testing.assert_allclose(now.position, [1.0, 2.0, -3.0])
     np.testing.assert_allclose(now.velocity, [0.0, 0.2, 0.0], atol=1e-12)
     np.testing.assert_allclose(now.yaw, np.pi / 2)
-    later = goal.at(np.array([2.0, 7.0]))
-    np.testing.assert_allclose(later.position, [[1.0, 2.0, -3.0], [1.0, 3.0, -3.0]], atol=1e-12)
+    later = goal.at(np.array([2.0, 3.5]))
+    np.testing.assert_allclose(later.position, [[1.0, 2.0, -3.0], [1.0, 2.3, -3.0]], atol=1e-12)
+
+
+def test_a_goal_that_is_no_longer_heard_of_stands_still():
+    """After 2 s: nobody is led away by a message that was lost."""
+    surge = np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
+    goal = HeardGoal({"target": Track(np.zeros(3), quat_from_yaw(0.0), surge, 12.0)})
+    goal.started = 10.0
+    np.testing.assert_allclose(goal.at(60.0).position, [2.0 * 0.2, 0.0, 0.0])

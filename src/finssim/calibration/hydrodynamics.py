@@ -125,7 +125,7 @@ def fit_hydrodynamics(
 
     scale, std = 1.0, 0.0
     if "thrust_scale" not in estimate and _unknown_voltage(trials, vehicle):
-        free = _or_none(lambda body: regression(body, known={}, trust=False), vehicle)
+        free = _or_none(lambda body: regression(body, known={}, file_prior=False), vehicle)
         scale, std = _thrust_scale(free, vehicle, known)
     body = vehicle.replace(scaled(vehicle, scale)) if std else vehicle
     before = _scores(vehicle, trials)

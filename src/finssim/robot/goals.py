@@ -22,8 +22,12 @@ class GoalError(ValueError):
     """A goal that cannot be read or that the vehicle may not go to."""
 
 
+AHEAD = 2.0
+"""So long a goal that is no longer heard of goes on as it went, and then stands still [s]."""
+
+
 class HeardGoal:
-    """A goal that moves, from the messages that tell of it: it goes on as it went when it was last heard of.
+    """A goal that moves, from the messages that tell of it: between them it goes on as it went, for `AHEAD` at most.
 
     Attributes:
         started: When the guide's time began, on the clock of the tracks [s].
@@ -43,7 +47,7 @@ class HeardGoal:
         track = self._tracks.get(self.name) or Track(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(6))
         velocity = quat_rotate(track.quaternion, track.nu[:3])
         since = np.asarray(t, float) + self.started - track.time
-        since = np.where(np.isfinite(since), since, 0.0)
+        since = np.clip(np.where(np.isfinite(since), since, 0.0), 0.0, AHEAD)
         shape = since.shape
         return Reference(
             track.position + since[..., None] * velocity,

@@ -127,21 +127,9 @@ def run(
                 "--team has every agent in its place: leave --agent, --trajectory, --lockstep, --number and --let-in "
                 "out"
             )
-        from finssim.robot.team_run import run_team
-
-        site, camera = site or "open-water", pool_file or "none"
-        options = {
-            "--site": site,
-            "--pool-file": camera,
-            "--goal": goal,
-            "--mode": mode or "constant-velocity",
-            "--duration": duration,
-        }
-        words = [word for name, x in options.items() if x is not None for word in (name, str(x))]
-        words += [name for name, on in (("--trim", trim), ("--arm", arm)) if on]
-        return run_team(
-            team, words, task=task, vehicle=vehicle, robot=robot, bind=bind, messages=messages, record=record,
-            as_json=as_json,
+        return _run_team(
+            team, site=site, pool_file=pool_file, goal=goal, mode=mode, duration=duration, trim=trim, arm=arm,
+            task=task, vehicle=vehicle, robot=robot, bind=bind, messages=messages, record=record, as_json=as_json,
         )  # fmt: skip
     assert policy is not None
     wiring = Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep, team=messages)
@@ -162,6 +150,9 @@ def run(
     pool = None if file is None else load_pool(file)
     mode = mode or ("constant-velocity" if let_in is None else "error-state")
     perception = Perception(ours, pool, mode=mode, let_in=None if let_in is None else place_of(let_in))
+    team = _team(pilot, wiring)
+    heard = HeardGoal(team.tracks) if team is not None and guide is _GO and _alone(pilot) else None
+    guide = heard or guide
     meta = {
         "command": "finssim run",
         "site": site,
@@ -170,8 +161,6 @@ def run(
         "armed": arm,
     }
     meta |= {"pool_sha256": pool.sha256} if pool else {}
-    team = _team(pilot, wiring)
-    heard = HeardGoal(team.tracks) if team is not None and guide is _GO and _alone(pilot) else None
     with _opened(connected(wiring, ours, pool), record, filed, meta, file, wiring) as (drive, recorder):
         if not arm:
             console.print("dry run: thrusters will not turn without --arm")
@@ -179,7 +168,7 @@ def run(
             ours,
             pool,
             pilot,
-            heard or guide,
+            guide,
             arm=arm,
             perception=perception,
             recorder=recorder,
@@ -205,6 +194,33 @@ def run(
     if watch.state == "fault":
         return FAULT
     return UNHEARD if runtime.counters.steps and not runtime.counters.telemetry else 0
+
+
+def _run_team(
+    team: str,
+    *,
+    site: str | None,
+    pool_file: str | None,
+    goal: str | None,
+    mode: str | None,
+    duration: float | None,
+    trim: bool,
+    arm: bool,
+    **rest: Any,
+) -> int:
+    """Run every agent of a task, each with these options, in a process of its own."""
+    from finssim.robot.team_run import run_team
+
+    options = {
+        "--site": site or "open-water",
+        "--pool-file": pool_file or "none",
+        "--goal": goal,
+        "--mode": mode or "constant-velocity",
+        "--duration": duration,
+    }
+    words = [word for name, x in options.items() if x is not None for word in (name, str(x))]
+    words += [name for name, on in (("--trim", trim), ("--arm", arm)) if on]
+    return run_team(team, words, **rest)
 
 
 def _is_address(text: str) -> bool:

@@ -72,7 +72,7 @@ def kernels_of(task: Task) -> Kernels:
     """
     writer = _Writer(task)
     text = writer.text()
-    key = (task.settled_by(), text, tuple(writer.functions.values()))
+    key = (task.settings_class(), text, tuple(writer.functions.values()))
     if key not in _made:
         _made[key] = _compiled(task, text, writer.functions)
     return _made[key]
@@ -303,7 +303,7 @@ _numbers = itertools.count()
 
 def _compiled(task: Task, text: str, functions: Mapping[str, Any]) -> Kernels:
     """Kernels of a source, in a module of Warp's of their own."""
-    kind = task.settled_by()
+    kind = task.settings_class()
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
     name = f"{kind.__module__}.{kind.__qualname__}_{digest}"
     if any(
@@ -339,7 +339,7 @@ def settings_of(task: Task) -> Any:
     Raises:
         EnvironmentSetupError: It is not fitted to vehicles.
     """
-    return _filled(task, task.settled_by(), f"task '{task.name}'")
+    return _filled(task, task.settings_class(), f"task '{task.name}'")
 
 
 def _filled(one: Any, of: type, whose: str) -> Any:

@@ -81,7 +81,7 @@ class Task:
         """Of what the task is made."""
         raise TypeError(f"task '{self.name}' does not say of what it is made: define terms()")
 
-    def settled_by(self) -> type:
+    def settings_class(self) -> type:
         """The class whose settings its kernels take: tasks of one such class and equal terms share kernels."""
         return type(self)
 

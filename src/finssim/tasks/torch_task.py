@@ -252,7 +252,7 @@ class TorchTask(Task):
             totals=tuple(Total(name, answered_total, index=i) for i, name in enumerate(self.totals)),
         )
 
-    def settled_by(self) -> type:
+    def settings_class(self) -> type:
         """This class: its kernels only carry what the functions answer, and need not be compiled for every task."""
         return TorchTask if type(self).terms is TorchTask.terms else type(self)
 

@@ -189,7 +189,7 @@ class AxisData:
         """Roll and pitch have a stiffness."""
         return self.axis in (3, 4)
 
-    def known_before(self) -> tuple[Array, Array]:
+    def prior_moments(self) -> tuple[Array, Array]:
         """Means and inverse variances of all terms, (7 + k,) each; zero where nothing was known."""
         mean, inverse = np.zeros((2, len(TERMS) + len(self.estimated)))
         for name, (value, std) in self.prior.items():
@@ -251,7 +251,7 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
     weight, Z, instrumental = np.ones(inside.sum()), X, False
     simulated: list[Array] = []
     ratio, theta = 0.0, np.zeros(p)
-    mean, inverse = (column[kept] for column in data.known_before())
+    mean, inverse = (column[kept] for column in data.prior_moments())
     before = (mean, np.zeros_like(inverse))
     pieces = [_cut(data, found, rows) for found, rows in zip(data.signals, data.rows, strict=True)]
     for round_ in range(iterations + 1):

@@ -388,7 +388,7 @@ def regress(
     damping: str = "auto",
     estimate: Sequence[str] = (),
     known: Mapping[str, float] | None = None,
-    trust: bool = True,
+    file_prior: bool = True,
     seed: int = 0,
 ) -> Fit:
     """Effective mass, damping, bias and, in roll and pitch, stiffness of every axis that the trials excite.
@@ -406,7 +406,7 @@ def regress(
         estimate: Parameters of the vehicle's terms to fit too, such as `lift.coefficient`, in which their wrench is
             linear; each from all axes on which it acts.
         known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²].
-        trust: Whether the inertia and drag of the vehicle file count as a prior, within a factor of two or so.
+        file_prior: Whether the inertia and drag of the vehicle file count as a prior, within a factor of two or so.
         seed: Kept with the fit; nothing here is random.
 
     Raises:
@@ -420,7 +420,7 @@ def regress(
     driven = [trial for trial in trials if not trial.header.passive]
     prepared, warnings = prepare(driven, vehicle)
     chosen, plant, more = _fit_axes(
-        prepared, vehicle, wanted, axes is not None, damping, known or {}, estimate, trust
+        prepared, vehicle, wanted, axes is not None, damping, known or {}, estimate, file_prior
     )
     warnings += more
     file = matrices(vehicle)
@@ -500,7 +500,7 @@ def _fit_axes(
     damping: str,
     known: Mapping[str, float],
     estimate: Sequence[str],
-    trust: bool,
+    file_prior: bool,
 ) -> tuple[dict[int, tuple[AxisData, Selection]], Matrices, list[str]]:
     """Data and model of every axis that can be fitted; couplings between axes use the estimates of the round before."""
     file = plant = matrices(vehicle, estimate=estimate)
@@ -523,7 +523,7 @@ def _fit_axes(
                 if asked and not len(those):
                     warnings.append(f"{AXES[i]}: no trial excites it; the vehicle file keeps its numbers")
                 continue
-            data = replace(data, inertia=known.get(AXES[i]), prior=prior(data, file, trust))
+            data = replace(data, inertia=known.get(AXES[i]), prior=prior(data, file, file_prior))
             if i in former and former[i][0].shift:
                 data = later(data, former[i][0].shift)
             if round_ and i in former and _same(former[i][0], data):
@@ -545,16 +545,16 @@ def _fit_axes(
     return chosen, plant, warnings
 
 
-def prior(data: AxisData, file: Matrices, trust: bool) -> dict[str, tuple[float, float]]:
+def prior(data: AxisData, file: Matrices, file_prior: bool) -> dict[str, tuple[float, float]]:
     """What is known of an axis before any trial: mean and standard deviation by term.
 
     Args:
         data: Its trials.
         file: The vehicle as its file has it.
-        trust: Whether that counts; a delay is expected to be short in any case.
+        file_prior: Whether that counts; a delay is expected to be short in any case.
     """
     out, i = {"delay": (0.0, DELAY_STD)}, data.axis
-    if not trust:
+    if not file_prior:
         return out
     m = float(file.M_RB[i, i] + file.M_A[i, i])
     added, least, turning = INERTIA_PRIOR
