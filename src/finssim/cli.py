@@ -59,7 +59,7 @@ COMMANDS: dict[str, str | Experiment] = {
     "randomize show": "finssim.experiments.randomize_show:randomize_show",
     "randomize fit": "finssim.calibration.output.correlated_ranges:fit_ranges",
     "record info": "finssim.robot.record_show:info",
-    "record repair": "finssim.robot.record_repair:repair",
+    "record repair": "finssim.robot.record_reader:repair",
     "play": "finssim.robot.record_show:play_record",
     "teleop": "finssim.robot.teleop_run:run",
     "run": "finssim.robot.run:run",

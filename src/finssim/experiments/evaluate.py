@@ -47,9 +47,9 @@ from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = [
     "CAPTION",
+    "T1_COLUMNS",
     "Evaluation",
     "EvaluationError",
-    "T1_COLUMNS",
     "TrackingRun",
     "by_setpoint",
     "cells",

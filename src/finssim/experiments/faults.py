@@ -31,11 +31,9 @@ from finssim.experiments.tables import Shown, markdown_of, print_shown
 from finssim.pool import VirtualPool, read_truth
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
-from finssim.robot.bridge import Bridge
-from finssim.robot.bridge_settings import BridgeSettings
+from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.goals import station_of
-from finssim.robot.link.decoder import MCU, Decoder
-from finssim.robot.link.frames import encode_telemetry
+from finssim.robot.link.frames import MCU, Decoder, encode_telemetry
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.messages import Delivery, Picture, Telemetry
 from finssim.robot.pilots import make_pilot

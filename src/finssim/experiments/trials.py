@@ -27,8 +27,8 @@ from finssim.vehicles import Vehicle
 __all__ = [
     "DURATION",
     "EPISODES",
-    "EpisodeError",
     "T2_TRAJECTORIES",
+    "EpisodeError",
     "TrackingTrials",
     "Trials",
     "run_episodes",

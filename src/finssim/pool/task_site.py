@@ -31,8 +31,7 @@ from finssim.pool.others import ScriptedPilot, TrueState, truth_of
 from finssim.pool.plant_spec import Basin, PlantSpec
 from finssim.pool.sites import positioning_of
 from finssim.pool.virtual_pool import VirtualPool
-from finssim.robot.bridge import Bridge
-from finssim.robot.bridge_settings import BridgeSettings
+from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.lockstep import run_together
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import AgentPilot, Pilot

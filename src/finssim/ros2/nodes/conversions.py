@@ -25,8 +25,8 @@ from finssim.robot.messages import (
     TagCorners,
     Telemetry,
 )
+from finssim.robot.pictures import picture_of
 from finssim.robot.record_messages import FIRST_TIME, LAST_TIME, UNKNOWN
-from finssim.robot.record_pictures import picture_of
 from finssim.robot.robot import Reading
 
 __all__ = [
