@@ -26,7 +26,7 @@ from rich.console import Console
 
 from finssim.experiments.campaign import Job, Say, choice, run_in_turn, run_jobs, write_json
 from finssim.experiments.pool_trial import noise_seed, stand_in_pool
-from finssim.experiments.processes import Pair, ReliabilityError, await_flush, await_thrust, pair
+from finssim.experiments.reliability import Pair, ReliabilityError, await_flush, await_thrust, pair
 from finssim.experiments.tables import Shown, markdown_of, print_shown
 from finssim.pool import VirtualPool, read_truth
 from finssim.provenance import provenance

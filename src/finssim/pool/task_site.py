@@ -17,10 +17,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.control.errors import ControlError
-from finssim.control.guidance import Guide, Reference
+from finssim.control import ControlError
+from finssim.control.guidance import Guide, Reference, Track
 from finssim.control.modes import action_mode
-from finssim.control.tracking import Track
 from finssim.engine.launch import Pipeline
 from finssim.engine.state import State
 from finssim.geometry.rotations import quat_from_yaw, quat_inverse_rotate, quat_yaw

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from finssim.control.allocator import Allocator
+from finssim.control.allocation import Allocator
 from finssim.control.motor_map import MotorMap
 from finssim.geometry.rotations import quat_inverse_rotate, quat_to_matrix
 from finssim.robot.link.frames import StatusFlag

@@ -19,9 +19,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from finssim.control.controllers import CONTROLLERS
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
 from finssim.control.guidance import Station
+from finssim.control.pid import CONTROLLERS
 from finssim.control.policy_description import read_description
 from finssim.control.trim import Trim
 from finssim.geometry.rotations import quat_yaw, wrap_angle

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from finssim.control.tracking import Track
+from finssim.control.guidance import Track
 from finssim.robot.robot import Reading
 from finssim.robot.runtime import Ticks
 

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
 from finssim.control.guidance import Station
-from finssim.control.trajectories import Trajectory
-from finssim.control.trajectory_file import through_points
+from finssim.control.trajectories import Trajectory, through_points
 from finssim.geometry.rotations import quat_yaw
 from finssim.robot.messages import (
     HEADING,
