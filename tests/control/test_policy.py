@@ -15,8 +15,7 @@ import pytest
 import yaml
 from onnx import TensorProto, helper, numpy_helper
 
-from finssim.control.policy import Policy
-from finssim.control.policy_description import PolicyError
+from finssim.control.policy import Policy, PolicyError
 
 GAIN = np.array([[0.5, 0.0, 0.0], [0.0, -0.25, 1.0]], dtype=np.float32)
 MODE = {"mode": "wrench2", "size": 2, "limits": [18.6, 6.9], "scale": [1.0, 0.5]}

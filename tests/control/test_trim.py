@@ -7,7 +7,7 @@ import pytest
 from tests.reference.observed import published_t2
 
 from finssim.control import ControlError
-from finssim.control.policy_description import ObservationEntry, ObservationSchema
+from finssim.control.policy import ObservationEntry, ObservationSchema
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.control.trim import Trim
 from finssim.geometry.rotations import quat_from_euler

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from finssim.control.modes import action_mode
-from finssim.control.policy_description import PolicyDescription, VehicleIdentity
+from finssim.control.policy import PolicyDescription, VehicleIdentity
 from finssim.experiments.compare import (
     CompareError,
     comparison,

@@ -11,7 +11,7 @@ from torch import nn
 
 from finssim.control import ControlError
 from finssim.control.modes import action_mode
-from finssim.control.policy_description import PolicyDescription, PolicyError, VehicleIdentity
+from finssim.control.policy import PolicyDescription, PolicyError, VehicleIdentity
 from finssim.engine import read_run
 from finssim.experiments import trials as trials_module
 from finssim.experiments.evaluate import EvaluationError, evaluate, evaluate_controller

@@ -11,7 +11,7 @@ from torch import nn
 from finssim.control import ControlError
 from finssim.control.modes import action_mode
 from finssim.control.pid import PAPER_PROFILE, TRAJECTORY_PROFILE, controller_for
-from finssim.control.policy_description import PolicyDescription, VehicleIdentity
+from finssim.control.policy import PolicyDescription, VehicleIdentity
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.experiments.evaluate import (
     EvaluationError,

@@ -13,10 +13,10 @@ import torch
 import yaml
 from torch import nn
 
-from finssim.control.policy import Policy
-from finssim.control.policy_description import (
+from finssim.control.policy import (
     ObservationEntry,
     ObservationSchema,
+    Policy,
     PolicyDescription,
     VehicleIdentity,
 )

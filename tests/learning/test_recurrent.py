@@ -12,8 +12,7 @@ from torch import nn
 import finssim
 from finssim.control.guidance import Station
 from finssim.control.modes import action_mode
-from finssim.control.policy import Policy
-from finssim.control.policy_description import PolicyError
+from finssim.control.policy import Policy, PolicyError
 from finssim.learning.export import ExportError
 from finssim.learning.held_evaluation import HeldEvaluation
 from finssim.learning.learners import learner_named

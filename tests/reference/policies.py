@@ -1,7 +1,7 @@
 """Policy directories of networks that tests make."""
 
 from finssim.control.modes import action_mode
-from finssim.control.policy_description import PolicyDescription, VehicleIdentity
+from finssim.control.policy import PolicyDescription, VehicleIdentity
 from finssim.learning.export import export_policy
 from finssim.vehicles import load_vehicle
 

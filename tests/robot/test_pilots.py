@@ -12,7 +12,7 @@ from finssim.control import ControlError
 from finssim.control.guidance import Station, goal_at
 from finssim.control.modes import Wrench4, Wrench6
 from finssim.control.pid import controller
-from finssim.control.policy_description import PolicyError
+from finssim.control.policy import PolicyError
 from finssim.control.trim import Trim
 from finssim.experiments.pool_trial import NoisyInput
 from finssim.geometry.rotations import quat_from_euler

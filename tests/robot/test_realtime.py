@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from finssim.control.guidance import Station
-from finssim.robot.hardware import HardwareRobot
 from finssim.robot.link.frames import MCU, Decoder, encode_telemetry
 from finssim.robot.link.transports import memory_pair
 from finssim.robot.messages import Picture
 from finssim.robot.pictures import TagFinder
 from finssim.robot.pilots import make_pilot
-from finssim.robot.runtime import Runtime
+from finssim.robot.runtime import HardwareRobot, Runtime
 from finssim.robot.wiring import run_realtime
 from finssim.vehicles import load_vehicle
 from reference.rounds import Rounds, overhead, without_latency

@@ -14,6 +14,7 @@ search for the right set is principal pivoting: change every thruster that break
 (Judice and Pires, 1994), and one at a time (Murty's rule, which cannot cycle) when that stops making progress.
 The entries of the tables stay of order one however small lambda is, which is what lets float32 solve the problem.
 """
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,valid-type,misc,untyped-decorator"
 
 from __future__ import annotations
 
@@ -137,9 +138,6 @@ def _toward_zero(limits: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
     beyond = np.abs(nearest.astype(float)) > np.abs(limits)
     rounded[: len(limits)] = np.where(beyond, np.nextafter(nearest, np.float32(0.0)), nearest)
     return rounded
-
-
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,valid-type,misc,untyped-decorator"
 
 
 BLOCK_PATIENCE = wp.constant(3)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -12,35 +12,11 @@ import numpy.typing as npt
 from finssim.control import ControlError
 from finssim.control.allocation import Allocator
 
-__all__ = ["MODES", "ActionMode", "Thruster8", "Wrench4", "Wrench6", "action_mode", "mode_from_dict"]
+__all__ = ["MODES", "Thruster8", "Wrench4", "Wrench6", "action_mode", "mode_from_dict"]
 
 Array = npt.NDArray[np.float64]
 
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
-
-
-class ActionMode(Protocol):
-    """How an action becomes thrusts."""
-
-    name: ClassVar[str]
-
-    @property
-    def size(self) -> int:
-        """Components of an action."""
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """What each component drives."""
-
-    def to_thrusters(self, action: npt.ArrayLike) -> Array:
-        """Thrusts in canonical order [N], (..., n), for actions (..., size); components beyond +-1 saturate.
-
-        Raises:
-            ControlError: The action has another length, or holds NaN.
-        """
-
-    def describe(self) -> dict[str, Any]:
-        """Everything that defines the mode, as plain data; see `mode_from_dict`."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from finssim.control import ControlError
 from finssim.control.guidance import Measured
-from finssim.control.policy_description import ObservationSchema
+from finssim.control.policy import ObservationSchema
 from finssim.geometry.rotations import quat_inverse_rotate
 
 __all__ = ["Trim"]

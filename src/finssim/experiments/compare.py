@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from finssim.control.policy import Policy
-from finssim.control.policy_description import PolicyDescription
+from finssim.control.policy import Policy, PolicyDescription
 from finssim.experiments.campaign import Say, write_json
 from finssim.experiments.evaluate import evaluate_controller
 from finssim.experiments.figures import COLORS, clean, new_figure, save_figure

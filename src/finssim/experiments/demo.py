@@ -27,8 +27,7 @@ from finssim.calibration.output.fit_output import interval_text, number_text, st
 from finssim.calibration.trials.trial import Trial
 from finssim.control.allocation import Allocator
 from finssim.control.pid import AxisModel, axis_model
-from finssim.control.policy import Policy
-from finssim.control.policy_description import DESCRIPTION_FILE
+from finssim.control.policy import DESCRIPTION_FILE, Policy
 from finssim.engine import Pool
 from finssim.experiments.campaign import Say, run_jobs, write_json
 from finssim.experiments.evaluate import CAPTION, T1_COLUMNS, Evaluation, by_setpoint, cells, print_comparison

@@ -19,7 +19,7 @@ from rich.console import Console
 
 from finssim.control.guidance import Guide, Measured, Station
 from finssim.control.pid import CONTROLLERS
-from finssim.control.policy_description import DESCRIPTION_FILE, NETWORK_FILE
+from finssim.control.policy import DESCRIPTION_FILE, NETWORK_FILE
 from finssim.control.trajectories import load_trajectory
 from finssim.control.trim import Trim
 from finssim.experiments import campaign

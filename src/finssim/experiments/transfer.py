@@ -12,8 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from finssim.calibration.output.calibrated_ranges import write_ranges
-from finssim.control.policy import Policy
-from finssim.control.policy_description import PolicyError
+from finssim.control.policy import Policy, PolicyError
 from finssim.control.trajectories import TRAJECTORIES, load_trajectory
 from finssim.experiments.campaign import Say, choice, run_jobs, write_json
 from finssim.experiments.evaluate import T1_COLUMNS, TrackingRun, cells, draw_tracking

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.control.modes import action_mode
-from finssim.control.policy_description import plain_data
+from finssim.control.policy import plain_data
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.learning.demonstrations import DATASET_FILE, DatasetError, Episode, save
 from finssim.provenance import provenance

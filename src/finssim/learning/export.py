@@ -18,8 +18,7 @@ import yaml
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from finssim.control.policy import Policy
-from finssim.control.policy_description import DESCRIPTION_FILE, NETWORK_FILE, PolicyDescription
+from finssim.control.policy import DESCRIPTION_FILE, NETWORK_FILE, Policy, PolicyDescription
 from finssim.files import atomic_directory
 from finssim.learning.network import Activation, Cell, Linear, Network, asked, first_memory
 from finssim.provenance import provenance

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from rich.console import Console
 
 from finssim.control.modes import action_mode
-from finssim.control.policy_description import (
+from finssim.control.policy import (
     DESCRIPTION_FILE,
     PolicyDescription,
     VehicleIdentity,

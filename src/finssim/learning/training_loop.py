@@ -15,7 +15,7 @@ from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
-from finssim.control.policy_description import DESCRIPTION_FILE, PolicyDescription
+from finssim.control.policy import DESCRIPTION_FILE, PolicyDescription
 from finssim.learning.export import export_policy
 from finssim.learning.learners import Learner, LearningError
 from finssim.learning.resume import RESUME_FILE, ResumeError, read_state, write_state

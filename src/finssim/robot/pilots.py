@@ -13,7 +13,7 @@ from finssim.control import ControlError
 from finssim.control.guidance import Goal, Guide, Known, Measured, goal_at
 from finssim.control.modes import Wrench6, action_mode, mode_from_dict
 from finssim.control.pid import CONTROLLERS
-from finssim.control.policy_description import PolicyError, read_description
+from finssim.control.policy import PolicyError, read_description
 from finssim.control.trim import Trim
 from finssim.vehicles import Vehicle
 

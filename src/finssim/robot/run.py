@@ -22,7 +22,7 @@ from rich.table import Table
 from finssim.control import ControlError
 from finssim.control.guidance import Station
 from finssim.control.pid import CONTROLLERS
-from finssim.control.policy_description import read_description
+from finssim.control.policy import read_description
 from finssim.control.trim import Trim
 from finssim.geometry.rotations import quat_yaw, wrap_angle
 from finssim.localization.pool import load_pool

@@ -1,4 +1,5 @@
 """When a sensor samples, how late a sample arrives, and the arrays that remember both."""
+# mypy: disable-error-code="no-any-return,valid-type,misc,index,no-untyped-def,untyped-decorator,attr-defined"
 
 from collections.abc import Sequence
 from typing import Any, Protocol
@@ -7,9 +8,6 @@ import numpy as np
 import warp as wp
 
 # Imperfections shared by all sensors: random streams, white noise, wandering bias, quantisation and saturation.
-
-
-# mypy: disable-error-code="no-any-return"
 
 
 # The independent random streams of one sample.
@@ -85,9 +83,6 @@ def digitised3(x: wp.vec3, quantum: float, limit: float) -> wp.vec3:
     return wp.vec3(
         digitised(x[0], quantum, limit), digitised(x[1], quantum, limit), digitised(x[2], quantum, limit)
     )
-
-
-# mypy: disable-error-code="valid-type,misc,index,no-any-return,no-untyped-def,untyped-decorator,attr-defined"
 
 
 class SensedState(Protocol):

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from finssim.control.guidance import Controller, Goal, Known
 from finssim.control.modes import mode_from_dict
 from finssim.control.pid import CONTROLLERS, controller_for
-from finssim.control.policy import Policy
-from finssim.control.policy_description import DESCRIPTION_FILE
+from finssim.control.policy import DESCRIPTION_FILE, Policy
 from finssim.control.trim import Trim
 from finssim.engine import Recorder
 from finssim.tasks.baselines import BASELINES, baseline

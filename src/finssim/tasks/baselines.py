@@ -90,13 +90,13 @@ class WrenchPid:
 
 
 @dataclass(frozen=True)
-class StationPid:
-    """PID of T1. The goal is level, so its own axes have z up: the vehicle's pose in them is all that matters."""
+class _PidBaseline:
+    """What every baseline with a PID is made of."""
 
     controller: WrenchPid
 
     @classmethod
-    def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD) -> StationPid:
+    def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD) -> Baseline:
         """For a vehicle, and the time between two actions [s]."""
         return cls(WrenchPid.for_vehicle(vehicle, period))
 
@@ -105,9 +105,13 @@ class StationPid:
         """Time between two actions [s]."""
         return self.controller.pid.period
 
-    def reset(self, n: int) -> PidMemory:
+    def reset(self, n: int) -> Any:
         """Empty integrals."""
         return self.controller.pid.reset(n)
+
+
+class StationPid(_PidBaseline):
+    """PID of T1. The goal is level, so its own axes have z up: the vehicle's pose in them is all that matters."""
 
     def act(
         self, memory: PidMemory, observation: NDArray[np.float32]
@@ -137,24 +141,11 @@ class TrackingMemory(NamedTuple):
     pid: PidMemory
 
 
-@dataclass(frozen=True)
-class TrackingPid:
+class TrackingPid(_PidBaseline):
     """PID of T2. The observation has no heading, and none is asked for: the vehicle keeps the one it starts with.
 
     The axes are level, with the vehicle at the origin and x where it pointed at the start, as its yaw rate tells.
     """
-
-    controller: WrenchPid
-
-    @classmethod
-    def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD) -> TrackingPid:
-        """For a vehicle, and the time between two actions [s]."""
-        return cls(WrenchPid.for_vehicle(vehicle, period))
-
-    @property
-    def period(self) -> float:
-        """Time between two actions [s]."""
-        return self.controller.pid.period
 
     def reset(self, n: int) -> TrackingMemory:
         """Heading zero, empty integrals."""
@@ -178,28 +169,11 @@ class TrackingPid:
         return action, TrackingMemory(memory.heading + self.period * heading_rate(up, nu), pid)
 
 
-@dataclass(frozen=True)
-class TargetPid:
+class TargetPid(TrackingPid):
     """PID of T3 with the target's velocity fed forward. The observation has no attitude: it is taken to be level.
 
     The heading is the one at the start, as the yaw rate tells; roll and pitch are left to the water and their rates.
     """
-
-    controller: WrenchPid
-
-    @classmethod
-    def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD) -> TargetPid:
-        """For a vehicle, and the time between two actions [s]."""
-        return cls(WrenchPid.for_vehicle(vehicle, period))
-
-    @property
-    def period(self) -> float:
-        """Time between two actions [s]."""
-        return self.controller.pid.period
-
-    def reset(self, n: int) -> TrackingMemory:
-        """Heading zero, empty integrals."""
-        return TrackingMemory(np.zeros(n), self.controller.pid.reset(n))
 
     def act(
         self, memory: TrackingMemory, observation: NDArray[np.float32]
@@ -257,14 +231,29 @@ def acceleration_ahead(offsets: list[Array], velocity: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class LeadPursuit:
+class _DriveBaseline:
+    """What every baseline that steers by a vehicle's thrust and drag is made of; it remembers nothing."""
+
+    drive: DriveNumbers
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle) -> Baseline:
+        """With the numbers of a vehicle."""
+        return cls(DriveNumbers.of(vehicle))
+
+    def reset(self, n: int) -> None:
+        """It remembers nothing."""
+        return None
+
+
+@dataclass(frozen=True)
+class LeadPursuit(_DriveBaseline):
     """Point at where the prey will be, turn first while that is far to the side, then come up and keep its speed.
 
     The point aimed at lies `lead` seconds ahead of the prey. Closing in, the speed wanted is the prey's plus
     `approach` times the way that is left to `stand_off`, so that the relative speed vanishes there.
     """
 
-    drive: DriveNumbers
     lead: float = 0.30
     """[s]"""
     turn_first: float = math.radians(15.0)
@@ -274,15 +263,6 @@ class LeadPursuit:
     stand_off: float = 0.5
     """Distance that is gone to [m]."""
     period: float = PERIOD
-
-    @classmethod
-    def for_vehicle(cls, vehicle: Vehicle) -> LeadPursuit:
-        """With the numbers of a vehicle."""
-        return cls(DriveNumbers.of(vehicle))
-
-    def reset(self, n: int) -> None:
-        """It remembers nothing."""
-        return None
 
     def act(self, memory: None, observation: NDArray[np.float32]) -> tuple[NDArray[np.float32], None]:
         """Actions wrench4 for observations of pursuit, (n, 14)."""
@@ -304,7 +284,7 @@ class LeadPursuit:
 
 
 @dataclass(frozen=True)
-class ConsensusFormation:
+class ConsensusFormation(_DriveBaseline):
     """Each agent pulls its edges to equal sides and its height to the others', and adds what the state asks for.
 
     gather, while an edge is off by more than `loose`: the shape alone. approach: the net's middle goes to the target.
@@ -312,7 +292,6 @@ class ConsensusFormation:
     from the observation alone, so that all three agree without a word, as far as they see the same.
     """
 
-    drive: DriveNumbers
     side: float
     """Of the net [m]."""
     reach: float
@@ -332,10 +311,6 @@ class ConsensusFormation:
         """With the numbers of a vehicle, for the net that three of them carry by the task's default settings."""
         task = Formation().fitted([vehicle])
         return cls(DriveNumbers.of(vehicle), task.side, task.reach)
-
-    def reset(self, n: int) -> None:
-        """It remembers nothing."""
-        return None
 
     def act(self, memory: None, observation: NDArray[np.float32]) -> tuple[NDArray[np.float32], None]:
         """Actions wrench4 for observations of formation, (n, 34)."""
@@ -377,7 +352,7 @@ def level_unit(x: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class FormationPursuit:
+class FormationPursuit(_DriveBaseline):
     """Each agent goes to its place relative to the prey, from its own observation and with the prey's velocity added.
 
     The way ahead leads from the herder through the prey. Netters stand `forward` ahead of the prey and half of
@@ -385,22 +360,12 @@ class FormationPursuit:
     and 3 m for vehicles twelve times as fast; here 0.4 times that.
     """
 
-    drive: DriveNumbers
     spacing: float = 2.4
     forward: float = 0.8
     behind: float = 1.2
     gain: float = 0.6
     """Speed per distance to one's place [1/s]."""
     period: float = PERIOD
-
-    @classmethod
-    def for_vehicle(cls, vehicle: Vehicle) -> FormationPursuit:
-        """With the numbers of a vehicle."""
-        return cls(DriveNumbers.of(vehicle))
-
-    def reset(self, n: int) -> None:
-        """It remembers nothing."""
-        return None
 
     def places(self, observation: Array) -> Array:
         """Where each agent should be, from itself, body frame [m], (n, 3); one row per agent."""
@@ -438,14 +403,13 @@ class FormationPursuit:
 
 
 @dataclass(frozen=True)
-class DockingPid:
+class DockingPid(_PidBaseline):
     """A PID whose goal runs ahead of the nose, along the dock's axis, while nose and heading are right.
 
     In dock axes. Beside the axis, or turned away, the goal is the waiting place before the mouth; there is no switch
     between the two: the goal moves with how right it is.
     """
 
-    controller: WrenchPid
     nose: float
     """Of the vehicle, from its origin [m]."""
     berth: float
@@ -474,15 +438,6 @@ class DockingPid:
             slope=0.5 * np.tan(task.cone),
             lead=0.25 * hull.length,
         )
-
-    @property
-    def period(self) -> float:
-        """Time between two actions [s]."""
-        return self.controller.pid.period
-
-    def reset(self, n: int) -> PidMemory:
-        """Empty integrals."""
-        return self.controller.pid.reset(n)
 
     def act(
         self, memory: PidMemory, observation: NDArray[np.float32]

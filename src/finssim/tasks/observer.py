@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from finssim.control import ControlError
 from finssim.control.guidance import Guide, Measured, Reference, Track
-from finssim.control.policy_description import ObservationSchema
+from finssim.control.policy import ObservationSchema
 from finssim.engine.launch import Pipeline
 from finssim.engine.state import State
 from finssim.geometry.rotations import quat_from_yaw, quat_inverse_rotate, quat_rotate

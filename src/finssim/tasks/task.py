@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.control.policy_description import ObservationEntry, ObservationSchema
+from finssim.control.policy import ObservationEntry, ObservationSchema
 from finssim.engine import Dock, Pool
 from finssim.engine.launch import Pipeline
 from finssim.engine.state import State

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from finssim.control import ControlError
 from finssim.control.guidance import Guide, Measured
 from finssim.control.pid import CONTROLLERS
-from finssim.control.policy_description import NETWORK_FILE
+from finssim.control.policy import NETWORK_FILE
 from finssim.control.trim import Trim
 from finssim.robot.pilots import AgentPilot, ModeSwitch, WrenchPilot, make_pilot
 from finssim.robot.runtime import Runtime

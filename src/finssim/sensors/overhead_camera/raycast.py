@@ -3,6 +3,7 @@
 Everything is in the surface frame, in single precision: with the camera's foot as origin, coordinates of a few metres
 keep 0.001 px.
 """
+# mypy: ignore-errors
 
 import warp as wp
 
@@ -19,9 +20,6 @@ from finssim.sensors.overhead_camera.surface import (
 # What light meets in and around the pool: printed tags, matt boxes, and the tiled basin, each for one ray.
 #
 # Texture is averaged over the ray's share of the pixel, a square of a given width, in closed form.
-
-
-# mypy: ignore-errors
 
 
 NOTHING = wp.constant(1.0e9)
@@ -303,9 +301,6 @@ def meet_basin(basin: BasinData, p: wp.vec3, d: wp.vec3, angle: float, travelled
 # A scene as the ray caster reads it.
 
 
-# mypy: ignore-errors
-
-
 @wp.struct
 class LampData:
     """A bright rectangle parallel to the surface."""
@@ -336,9 +331,6 @@ class SceneData:
     bodies: wp.array(dtype=BodyData)
     shutter: float  # [s]
     spot: float  # [px]
-
-
-# mypy: ignore-errors
 
 
 ON_TOP = wp.constant(1.0e-3)

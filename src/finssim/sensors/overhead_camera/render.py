@@ -1,4 +1,5 @@
 """The overhead camera: pictures of a scene, whole or around the tags alone."""
+# mypy: disable-error-code="attr-defined,call-overload,no-untyped-call,index"
 
 from __future__ import annotations
 
@@ -137,9 +138,6 @@ def _ripple_shift(
 # A scene as the structs that the ray caster reads, on one device.
 
 
-# mypy: disable-error-code="attr-defined,call-overload,no-untyped-call,index"
-
-
 def pack_scene(scene: Scene, frame: SurfaceFrame, device: Any) -> SceneData:
     """Everything but tags, bodies and waves, which change from picture to picture."""
     data = SceneData()
@@ -247,9 +245,6 @@ def _basin(basin: Basin, frame: SurfaceFrame, device: Any) -> BasinData:
     data.lane_axis, data.lane_width = basin.lane_axis, basin.lane_width
     data.lane_colour, data.deck_colour = wp.vec3(*basin.lane_colour), wp.vec3(*basin.deck_colour)
     return data
-
-
-# mypy: disable-error-code="no-untyped-call"
 
 
 Image = NDArray[np.uint8]
