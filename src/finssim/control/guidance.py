@@ -61,14 +61,14 @@ class Measured(Protocol):
 
 @dataclass(frozen=True)
 class Track:
-    """What is known of another vehicle, or of anything else that moves; it is a `Measured`."""
+    """The state of something that moves, or of n of them, such as another vehicle; it is a `Measured`."""
 
     position: Array
-    """Its origin, world frame [m], (3,)."""
+    """Its origin, world frame [m], (..., 3)."""
     quaternion: Array
-    """Body to world, xyzw, (4,)."""
+    """Body to world, xyzw, (..., 4)."""
     nu: Array
-    """Body frame [m/s, rad/s], (6,)."""
+    """Body frame [m/s, rad/s], (..., 6)."""
     time: float = math.nan
     """When that was measured [s]; NaN where it is not told."""
 

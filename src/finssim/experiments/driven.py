@@ -8,13 +8,13 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from rich.console import Console
 
-from finssim.control.guidance import Guide, Station
+from finssim.control.guidance import Guide, Station, Track
 from finssim.control.modes import AXES, Thruster8, Wrench6, action_mode
 from finssim.control.trajectories import PUBLISHED_NAMES, TRAJECTORIES, load_trajectory
 from finssim.experiments.campaign import progress_bar
@@ -266,14 +266,6 @@ SAME_GOAL = 1.0e-3
 """Recorded goals that differ by no more are one, or lie on the trajectory [m, rad]."""
 
 
-class _Seen(NamedTuple):
-    """The estimate at one decision."""
-
-    position: Array
-    quaternion: Array
-    nu: Array
-
-
 def episodes_of(
     drive: Drive, observer: Observer, mode: Thruster8 | Wrench6, vehicle: Vehicle, *,
     goal: Station | str | None = None,
@@ -311,7 +303,7 @@ def episodes_of(
     for rows in stretches:
         guide = guide_of(rows)
         observer.restart()
-        seen = [_Seen(drive.position[i], drive.quaternion[i], drive.nu[i]) for i in rows]
+        seen = [Track(drive.position[i], drive.quaternion[i], drive.nu[i]) for i in rows]
         times = np.nan_to_num(drive.since[rows])
         observation = [observer.observe(s, guide, float(t)) for s, t in zip(seen, times, strict=True)]
         found.append(

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from finssim.control.guidance import Guide, Measured, Station
+from finssim.control.guidance import Guide, Measured, Station, Track
 from finssim.control.pid import CONTROLLERS
 from finssim.control.policy import DESCRIPTION_FILE, NETWORK_FILE
 from finssim.control.trajectories import load_trajectory
@@ -86,15 +86,6 @@ __all__ = [
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """The state as the pilot sees it."""
-
-    position: Array
-    quaternion: Array
-    nu: Array
-
-
 class NoisyInput:
     """A pilot that sees its position and heading with independent errors, drawn anew for every decision.
 
@@ -151,7 +142,7 @@ class NoisyInput:
         position_std, yaw_std = self._stds
         moved = np.asarray(reading.position, float) + self._random.normal(0.0, position_std, 3)
         turned = quat_multiply(quat_from_yaw(self._random.normal(0.0, yaw_std)), reading.quaternion)
-        return self._pilot.act(_Seen(moved, turned, np.asarray(reading.nu, float)), guide, t)
+        return self._pilot.act(Track(moved, turned, np.asarray(reading.nu, float)), guide, t)
 
 
 HARDWARE = "hardware"

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.control.guidance import Goal
+from finssim.control.guidance import Goal, Measured, Track
 from finssim.control.pid import Pid, PidMemory
 from finssim.geometry.rotations import (
     cross,
@@ -40,7 +40,6 @@ __all__ = [
     "ConsensusFormation",
     "FormationPursuit",
     "LeadPursuit",
-    "Seen",
     "StationPid",
     "TargetPid",
     "TrackingPid",
@@ -59,17 +58,6 @@ PERIOD = 0.1
 """Control step of every task [s]."""
 
 
-class Seen(NamedTuple):
-    """A vehicle's state as `Pid` takes it, in axes that the observation can tell: z up, the rest as said there."""
-
-    position: Array
-    """Body origin [m], (n, 3)."""
-    quaternion: Array
-    """Body to those axes, xyzw, (n, 4)."""
-    nu: Array
-    """Body frame [m/s, rad/s], (n, 6)."""
-
-
 @dataclass(frozen=True)
 class WrenchPid:
     """The full-wrench PID of `control.pid`, whose wrench is given as a part of each axis' limit."""
@@ -81,7 +69,7 @@ class WrenchPid:
         """Gains by pole placement for a vehicle and the time between two actions [s]; a batch shows it the present."""
         return cls(Pid.from_vehicle(vehicle, coefficients_of(vehicle), period, least_lag=0.0))
 
-    def command(self, memory: PidMemory, seen: Seen, goal: Goal) -> tuple[NDArray[np.float32], PidMemory]:
+    def command(self, memory: PidMemory, seen: Measured, goal: Goal) -> tuple[NDArray[np.float32], PidMemory]:
         """Actions (n, 6), limited to ±1, and the memory after."""
         tau, memory = self.pid.command(memory, seen, goal)
         limits = self.pid.wrench_limits
@@ -124,13 +112,13 @@ class StationPid(_PidBaseline):
         return self.controller.command(memory, seen, here)
 
 
-def seen_from_goal(observation: NDArray[np.float32]) -> Seen:
+def seen_from_goal(observation: NDArray[np.float32]) -> Track:
     """The vehicle in the axes of its goal, from the first 15 numbers of T1's observation."""
     o = np.asarray(observation, float)
     x, y = o[..., 3:6], o[..., 6:9]
     # The columns of R_b' R*: the goal's axes in the body. Together with their cross product they are the rotation.
     q = quat_conjugate(matrix_to_quat(np.stack([x, y, cross(x, y)], axis=-1)))
-    return Seen(-quat_rotate(q, STATION_SCALE * o[..., :3]), q, o[..., 9:15])
+    return Track(-quat_rotate(q, STATION_SCALE * o[..., :3]), q, o[..., 9:15])
 
 
 class TrackingMemory(NamedTuple):
@@ -165,7 +153,7 @@ class TrackingPid(_PidBaseline):
             quat_rotate(q, o[..., 12:15]),
             quat_rotate(q, acceleration_ahead(offsets, o[..., 12:15])),
         )
-        action, pid = self.controller.command(memory.pid, Seen(np.zeros_like(up), q, nu), goal)
+        action, pid = self.controller.command(memory.pid, Track(np.zeros_like(up), q, nu), goal)
         return action, TrackingMemory(memory.heading + self.period * heading_rate(up, nu), pid)
 
 
@@ -186,7 +174,7 @@ class TargetPid(TrackingPid):
             quat_from_yaw(np.zeros(len(o))),
             quat_rotate(q, TARGET_SCALE * o[..., 3:6]),
         )
-        action, pid = self.controller.command(memory.pid, Seen(np.zeros((len(o), 3)), q, nu), goal)
+        action, pid = self.controller.command(memory.pid, Track(np.zeros((len(o), 3)), q, nu), goal)
         return action, TrackingMemory(memory.heading + self.period * nu[..., 5], pid)
 
 
@@ -451,7 +439,7 @@ class DockingPid(_PidBaseline):
         place = np.zeros_like(nose)
         place[..., 0] = self._ahead(nose, quat_rotate(q, [1.0, 0.0, 0.0]))
         level = np.broadcast_to([0.0, 0.0, 0.0, 1.0], q.shape)
-        seen = Seen(nose - quat_rotate(q, arm), q, o[..., 9:15])
+        seen = Track(nose - quat_rotate(q, arm), q, o[..., 9:15])
         return self.controller.command(memory, seen, Goal(place - arm, level))
 
     def _ahead(self, nose: Array, forward: Array) -> Array:
