@@ -24,7 +24,7 @@ from finssim.robot.goals import check_reachable
 from finssim.robot.link.transports import DEFAULT_BIND
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import Pilot, WrenchPilot, make_pilot
-from finssim.robot.recorder import Recorder
+from finssim.robot.recorder import Recorder, recording
 from finssim.robot.robot import Reading
 from finssim.robot.runtime import Runtime
 from finssim.robot.teleop_devices import Keyboard
@@ -507,9 +507,11 @@ class Session:
             **({"pool_sha256": self.site.sha256} if self.site else {}),
             **about,
         }
-        epoch = 0.0 if self.robot.wiring.lockstep else time.time() - time.monotonic()
-        files = {"pool.yaml": self.robot.pool_file} if self.robot.pool_file else {}
-        with Recorder(partial, self.vehicle, meta, pictures="none", epoch=epoch, files=files) as recorder:
+        kept = recording(
+            partial, self.vehicle, meta, pool_file=self.robot.pool_file,
+            lockstep=self.robot.wiring.lockstep, pictures="none",
+        )  # fmt: skip
+        with kept as recorder:
             outcome = play_trial(
                 trial,
                 self.drive,
@@ -519,7 +521,7 @@ class Session:
                 recorder=recorder,
                 placing=placing,
             )
-        if recorder.problem and outcome.ended == "over":
+        if recorder is not None and recorder.problem and outcome.ended == "over":
             raise RobotError(f"{record}: {recorder.problem}")
         return outcome, partial
 

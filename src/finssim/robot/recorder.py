@@ -8,9 +8,11 @@ import math
 import os
 import struct
 import threading
+import time
 import zlib
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Protocol
@@ -27,7 +29,7 @@ from finssim.robot.record_messages import METADATA, TOPICS, Messages, definition
 from finssim.robot.robot import Reading
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["McapWriter", "RawFile", "RecordSink", "Recorder"]
+__all__ = ["McapWriter", "RawFile", "RecordSink", "Recorder", "recording"]
 
 
 # MCAP files whose chunks close when their writer says so, so that little is lost when the process dies.
@@ -587,6 +589,35 @@ class Recorder:
     def _ns(self, seconds: float) -> int:
         # An MCAP has no time before 0: a clock that was set back further is recorded as standing there.
         return max(self._epoch + (round(seconds * 1e9) if math.isfinite(seconds) else 0), 0)
+
+
+@contextmanager
+def recording(
+    path: Path | None,
+    vehicle: Vehicle,
+    meta: Mapping[str, Any],
+    *,
+    pool_file: Path | None = None,
+    lockstep: bool = False,
+    pictures: Literal["jpeg", "none"] = "jpeg",
+) -> Iterator[Recorder | None]:
+    """A record for as long as a run lasts, with the pool's file in it; none where there is no path.
+
+    Args:
+        path: As of `Recorder`; nothing is recorded if None.
+        vehicle: As of `Recorder`.
+        meta: As of `Recorder`.
+        pool_file: Kept in the record as `pool.yaml`.
+        lockstep: Whether the robot's clock starts at 0; else it is this machine's, and the record's that of 1970.
+        pictures: As of `Recorder`.
+    """
+    if path is None:
+        yield None
+        return
+    epoch = 0.0 if lockstep else time.time() - time.monotonic()
+    files = {"pool.yaml": pool_file} if pool_file else {}
+    with Recorder(path, vehicle, meta, pictures=pictures, epoch=epoch, files=files) as recorder:
+        yield recorder
 
 
 def _vehicle_file(vehicle: Vehicle) -> dict[str, bytes]:

@@ -31,7 +31,7 @@ from finssim.robot.interrupt import PARENT, follow_parent, interruptible
 from finssim.robot.link.transports import host_port
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import Pilot, make_pilot
-from finssim.robot.recorder import Recorder
+from finssim.robot.recorder import Recorder, recording
 from finssim.robot.runtime import Runtime
 from finssim.robot.team import Team
 from finssim.robot.wiring import POOL_ADDRESS, Drive, Wiring, connected
@@ -365,7 +365,8 @@ def run(
         "armed": arm,
     }
     meta |= {"pool_sha256": pool.sha256} if pool else {}
-    with _opened(connected(wiring, ours, pool), record, filed, meta, file, wiring) as (drive, recorder):
+    kept = recording(record, filed, meta, pool_file=file, lockstep=lockstep)
+    with _opened(connected(wiring, ours, pool), kept) as (drive, recorder):
         if not arm:
             console.print("dry run: thrusters will not turn without --arm")
         runtime = Runtime(
@@ -477,11 +478,11 @@ def _team(pilot: Pilot, wiring: Wiring) -> Team | None:
 
 @contextmanager
 def _opened(
-    link: AbstractContextManager[Drive], path: Path | None, *about: Any
+    link: AbstractContextManager[Drive], record: AbstractContextManager[Recorder | None]
 ) -> Iterator[tuple[Drive, Recorder | None]]:
     """What the robot is connected to, and a record; none is left of a run that could not be connected."""
     with ExitStack() as stack:
-        recorder = stack.enter_context(_recording(path, *about))
+        recorder = stack.enter_context(record)
         try:
             drive = stack.enter_context(link)
         except ValueError:
@@ -517,21 +518,6 @@ class _Watch:
 
     def over(self, runtime: Runtime) -> bool:
         return self.state == "fault" or runtime.t > self._end
-
-
-@contextmanager
-def _recording(
-    path: Path | None, vehicle: Any, meta: dict[str, Any], pool_file: Path | None, wiring: Wiring
-) -> Iterator[Recorder | None]:
-    """A recorder for as long as the run lasts, or none."""
-    if path is None:
-        yield None
-        return
-    epoch = 0.0 if wiring.lockstep else time.time() - time.monotonic()
-    with Recorder(
-        path, vehicle, meta, epoch=epoch, files={"pool.yaml": pool_file} if pool_file else {}
-    ) as recorder:
-        yield recorder
 
 
 @contextmanager

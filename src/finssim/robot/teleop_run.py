@@ -18,7 +18,7 @@ from finssim.robot.link.transports import Transport, open_transport
 from finssim.robot.perception import Perception, Unlocated
 from finssim.robot.pictures import PictureSource
 from finssim.robot.pilots import ModeSwitch, Pilot, WrenchPilot, make_pilot
-from finssim.robot.recorder import Recorder
+from finssim.robot.recorder import Recorder, recording
 from finssim.robot.runtime import Runtime
 from finssim.robot.teleop import Device, Operator, TeleopError
 from finssim.robot.teleop_devices import GAMEPAD_HELP, KEYBOARD_HELP, Gamepad, Keyboard
@@ -158,7 +158,8 @@ def run(
         source = None if pool is None else open_camera(wiring, body, pool)
         if source is not None:
             stack.callback(source.close)
-        recorder = _recorder(record, body, pool_file, robot, stack)
+        meta = {"command": "finssim teleop", "robot": robot}
+        recorder = stack.enter_context(recording(record, body, meta, pool_file=pool_file))
         print(keys, file=sys.stderr)
         longest = math.inf if duration is None else duration
         told = {"recorder": recorder, "other": other, "guide": guide, "show": _Line()}
@@ -190,17 +191,6 @@ def _open_device(name: str, key_hold: float, stack: ExitStack) -> tuple[Device, 
     if name == "gamepad":
         return stack.enter_context(Gamepad()), GAMEPAD_HELP
     raise TeleopError(f"unknown device '{name}': expected gamepad or keyboard")
-
-
-def _recorder(
-    path: Path | None, vehicle: Vehicle, pool_file: Path | None, robot: str, stack: ExitStack
-) -> Recorder | None:
-    if path is None:
-        return None
-    files = {"pool.yaml": pool_file} if pool_file is not None else {}
-    epoch = time.time() - time.monotonic()
-    meta = {"command": "finssim teleop", "robot": robot}
-    return stack.enter_context(Recorder(path, vehicle, meta, epoch=epoch, files=files))
 
 
 class _Line:
