@@ -19,8 +19,8 @@ from finssim.geometry.rotations import quat_to_matrix
 from finssim.sensors.batch import SensorError
 from finssim.sensors.overhead_camera import Body, Pose, Rectangle, Scene, TagInScene
 from finssim.sensors.overhead_camera.photometry import digitise, noise_key
+from finssim.sensors.overhead_camera.scene import SurfaceFrame, surface_frame
 from finssim.sensors.overhead_camera.surface import waves_of
-from finssim.sensors.overhead_camera.view import SurfaceFrame, surface_frame
 
 __all__ = ["radiance_by_mitsuba", "render_with_mitsuba"]
 

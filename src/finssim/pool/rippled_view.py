@@ -7,8 +7,8 @@ import numpy.typing as npt
 
 from finssim.geometry.optics import Camera, Interface
 from finssim.sensors.overhead_camera import Ripples
+from finssim.sensors.overhead_camera.scene import surface_frame
 from finssim.sensors.overhead_camera.surface import waves_of
-from finssim.sensors.overhead_camera.view import surface_frame
 
 __all__ = ["RippledView"]
 

@@ -16,9 +16,18 @@ from finssim.geometry.rotations import quat_rotate, quat_to_matrix
 from finssim.sensors.batch import SensorError
 from finssim.sensors.overhead_camera.photometry import digitise, noise_key
 from finssim.sensors.overhead_camera.raycast import BasinData, BodyData, LampData, SceneData, TagData, cast
-from finssim.sensors.overhead_camera.scene import Basin, Body, Light, Pose, Scene, TagInScene
+from finssim.sensors.overhead_camera.scene import (
+    Basin,
+    Body,
+    Light,
+    Pose,
+    Scene,
+    SurfaceFrame,
+    TagInScene,
+    corner_rays_s,
+    surface_frame,
+)
 from finssim.sensors.overhead_camera.surface import Wave, Waves, layout_of, pack_waves, waves_of
-from finssim.sensors.overhead_camera.view import SurfaceFrame, corner_rays_s, surface_frame
 
 # Which pixels tags and bodies may touch: rectangles of the image, with room for ripples and motion.
 
