@@ -414,7 +414,7 @@ def _fit(one: SeedResult) -> dict[str, Any]:
         "method": one.fit.method,
         "vehicle_sha256": one.vehicle.sha256,
         "parameters": {name: e.as_json() for name, e in one.fit.estimates.items()},
-        "warnings": list(one.fit.warnings),
+        "findings": [finding.as_json() for finding in one.fit.findings],
         "trials": dict(one.fit.trials),
         "held_out": {p.name: p.sha256 for p in one.same_levels.pairs},
     }

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.actuators.steps import Step, find_steps
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles.thruster import Thruster
 
@@ -39,7 +40,7 @@ class Motor:
     """Column of the response."""
     same_unit: bool
     """Whether command and response are the same quantity; pulses without an ESC's law are not."""
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 def thrusters_of(trial: Trial) -> list[str]:
@@ -67,24 +68,24 @@ def motor_of(trial: Trial, name: str, thruster: Thruster, domain: str) -> Motor 
     if columns is None:
         return None
     asked, measured = columns
-    notes = []
+    findings: list[Finding] = []
     command_times, raw = trial.series(asked)
     same_unit, held = True, raw
     if asked.startswith("pwm_") and thruster.esc is None:
         command, same_unit = raw - 1500.0, False
-        notes.append("pulses were taken as they are, for the vehicle file has no 'esc' of this thruster")
+        findings.append(finding("pulses_raw"))
     elif asked.startswith("pwm_"):
         command = _as(domain, thruster.shaft_speed(raw, _voltage(trial, command_times)), thruster, "speed")
     elif asked.startswith("rpm_"):
         command = _as(domain, raw * RPM, thruster, "speed")
     else:
         command, held = _as(domain, raw, thruster, "force"), thruster.speed(raw)
-    t, raw = _without_spikes(*trial.series(measured), notes, measured)
+    t, raw = _without_spikes(*trial.series(measured), findings, measured)
     if np.min(command) < 0.0 < np.max(raw) and np.min(raw) > -0.02 * np.max(raw):
         sign = _last_sign(command)
         latest = np.clip(np.searchsorted(command_times, t, side="right") - 1, 0, len(sign) - 1)
         raw = np.abs(raw) * sign[latest]
-        notes.append(f"{measured} has no sign, that of the command was taken")
+        findings.append(finding("sign_of_command", column=measured))
     from_unit = "speed" if measured.startswith("rpm_") else "force"
     response = _as(domain, raw * RPM if from_unit == "speed" else raw, thruster, from_unit)
     return Motor(
@@ -97,7 +98,7 @@ def motor_of(trial: Trial, name: str, thruster: Thruster, domain: str) -> Motor 
         asked=asked,
         measured=measured,
         same_unit=same_unit,
-        notes=tuple(notes),
+        findings=tuple(findings),
     )
 
 
@@ -110,7 +111,7 @@ def _columns(trial: Trial, name: str) -> tuple[str, str] | None:
     return (commands[0], responses[0]) if commands and responses else None
 
 
-def _without_spikes(t: Array, y: Array, notes: list[str], column: str) -> tuple[Array, Array]:
+def _without_spikes(t: Array, y: Array, findings: list[Finding], column: str) -> tuple[Array, Array]:
     """Samples that stand alone, far from both neighbours, left out: a lost telegram, a zero in between."""
     if len(y) < 5:
         return t, y
@@ -119,9 +120,7 @@ def _without_spikes(t: Array, y: Array, notes: list[str], column: str) -> tuple[
     scatter = 1.4826 * float(np.median(np.abs(np.diff(y))))
     stray = np.r_[False, jump > max(10.0 * scatter, 0.2 * float(np.ptp(y))), False]
     if np.any(stray):
-        notes.append(
-            f"{np.count_nonzero(stray)} samples of {column} stand alone far from their neighbours, left out"
-        )
+        findings.append(finding("spikes", samples=np.count_nonzero(stray), column=column))
     return t[~stray], y[~stray]
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from finssim.calibration.actuators.table_columns import Source
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 
 __all__ = ["STANDING", "check_pulses", "signed", "without_offset"]
 
@@ -18,7 +19,9 @@ STANDING = 0.01
 """Share of the fastest speed below which a shaft counts as standing."""
 
 
-def without_offset(full: dict[str, Array], speed_known: bool, neutral: float, notes: list[str]) -> Array:
+def without_offset(
+    full: dict[str, Array], speed_known: bool, neutral: float, findings: list[Finding]
+) -> Array:
     """Forces less the median reading at standstill."""
     force = full["force"]
     if speed_known:
@@ -30,7 +33,7 @@ def without_offset(full: dict[str, Array], speed_known: bool, neutral: float, no
     offset = float(np.median(force[standing]))
     if abs(offset) < 1e-3 * np.max(np.abs(force)):
         return force
-    notes.append(f"the load cell reads {offset:.3g} N at standstill, taken off")
+    findings.append(finding("load_cell_offset", offset=offset))
     return force - offset
 
 
@@ -58,7 +61,7 @@ def signed(
     neutral: float,
     sources: Mapping[str, Source],
     shown: str,
-    notes: list[str],
+    findings: list[Finding],
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Speed and force with the sign of rotation, and the rows whose sign is known."""
     speed, force, pulse = full["speed"], full["force"], full["pulse"]
@@ -66,7 +69,7 @@ def signed(
     sign_pulse = np.sign(pulse - neutral) if np.any(np.isfinite(pulse)) else np.zeros_like(force)
     force_signed = bool(np.any(force > small) and np.any(force < -small))
     if sign_pulse.any() and np.nanmin(sign_pulse) < 0 < np.nanmax(sign_pulse) and not force_signed:
-        notes.append("forces have no sign in the table, taken from the pulse")
+        findings.append(finding("force_sign", source="pulse"))
         force, force_signed = np.abs(force) * np.nan_to_num(sign_pulse), True
     if not speed_known:
         _same_way(sign_pulse, force, small, ("pulse", "force"), sources, shown)
@@ -75,7 +78,7 @@ def signed(
     turning = np.abs(speed) > STANDING * fastest
     if np.any(speed < -STANDING * fastest) and np.any(speed > STANDING * fastest):
         if not force_signed and not sign_pulse.any():
-            notes.append("forces have no sign in the table, taken from the speed")
+            findings.append(finding("force_sign", source="speed"))
             force = np.abs(force) * np.sign(speed)
         _same_way(np.sign(speed) * turning, force, small, ("speed", "force"), sources, shown)
         return speed, force, np.ones(force.shape, bool)
@@ -83,14 +86,12 @@ def signed(
         np.isfinite(sign_pulse) & (sign_pulse != 0.0), sign_pulse, np.sign(force) * (np.abs(force) > small)
     )
     if np.any(sign < 0.0):
-        notes.append("speeds have no sign in the table, taken from the pulse or the force")
+        findings.append(finding("speed_sign"))
     if sign_pulse.any():
         _same_way(sign_pulse, force, small, ("pulse", "force"), sources, shown)
     keep = ~turning | (sign != 0.0)
     if not keep.all():
-        notes.append(
-            f"{np.count_nonzero(~keep)} rows left out: their force is too small to tell the speed's sign"
-        )
+        findings.append(finding("rows_unsigned", rows=np.count_nonzero(~keep)))
     return np.abs(speed) * np.where(turning, sign, 1.0), force, keep
 
 

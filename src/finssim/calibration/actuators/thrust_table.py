@@ -8,7 +8,7 @@ import io
 import math
 import os
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from finssim.calibration.actuators.steps import last_parts
 from finssim.calibration.actuators.table_columns import Source, find_columns
 from finssim.calibration.actuators.table_signs import check_pulses, signed, without_offset
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding
 from finssim.calibration.trials.trial import Trial
 
 __all__ = ["ThrustTable", "read_table", "tables_of_trial"]
@@ -43,8 +44,8 @@ class ThrustTable:
     """Name of the thruster, where the data say it."""
     sha256: str = ""
     """Digest of the numbers."""
-    notes: tuple[str, ...] = field(default=())
-    """What was taken off, turned or left out, one sentence each."""
+    findings: tuple[Finding, ...] = ()
+    """What was taken off, turned or left out."""
 
     def at(self, rows: NDArray[np.bool_]) -> ThrustTable:
         """The same table with some of its rows."""
@@ -140,10 +141,10 @@ def _table(
     neutral: float,
 ) -> ThrustTable:
     """Steady rows, with signs and without the load cell's offset."""
-    notes: list[str] = []
+    findings: list[Finding] = []
     if "time" in values:
         values, kept = last_parts(values)
-        notes.append(kept)
+        findings.append(kept)
     count = len(values["force"])
     full = {key: values.get(key, np.full(count, np.nan)) for key in ("speed", "force", "pulse", "voltage")}
     speed_known = "speed" in values
@@ -151,9 +152,9 @@ def _table(
     if np.count_nonzero(good) < 3:
         raise CalibrationError(f"{shown}: {np.count_nonzero(good)} rows hold numbers, expected at least 3")
     full = {key: value[good] for key, value in full.items()}
-    full["force"] = without_offset(full, speed_known, neutral, notes)
+    full["force"] = without_offset(full, speed_known, neutral, findings)
     check_pulses(full["pulse"], shown)
-    full["speed"], full["force"], keep = signed(full, speed_known, neutral, sources, shown, notes)
+    full["speed"], full["force"], keep = signed(full, speed_known, neutral, sources, shown, findings)
     full = {key: value[keep] for key, value in full.items()}
     digest = hashlib.sha256(b"".join(np.ascontiguousarray(full[key] + 0.0).tobytes() for key in sorted(full)))
     return ThrustTable(
@@ -163,7 +164,7 @@ def _table(
         pulse=full["pulse"],
         voltage=full["voltage"],
         sha256=digest.hexdigest(),
-        notes=tuple(notes),
+        findings=tuple(findings),
     )
 
 

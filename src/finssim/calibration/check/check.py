@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from finssim.calibration.check.inputs import input_findings
-from finssim.calibration.check.report import AxisReport, Finding, TrialReport
+from finssim.calibration.check.report import AxisReport, TrialReport
 from finssim.calibration.check.streams import stream_reports
 from finssim.calibration.check.tells import with_tells
 from finssim.calibration.check.together import together
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.motion.accelerations import holds_gravity
 from finssim.calibration.motion.attitude_signal import (
     AttitudeSignal,
@@ -81,10 +82,7 @@ def unit_findings(trial: Trial) -> list[Finding]:
 
 
 def _degrees(name: str, value: float, unit: str) -> Finding:
-    return Finding(
-        "refused",
-        f"{name} reaches {value:.3g} {unit}: degrees? give 'convert: {{scale: {{{name}: 0.0174533}}}}'",
-    )
+    return finding("degrees", column=name, value=value, unit=unit)
 
 
 def frame_findings(trial: Trial, vehicle: Vehicle, offsets: dict[str, Offset]) -> list[Finding]:
@@ -126,17 +124,11 @@ def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list
         (100.0 * g, "cm/s²", 0.01),
     ):
         if abs(mean / size - 1.0) < 0.15:
-            scales = ", ".join(f"{name}: {scale:g}" for name in ("ax", "ay", "az"))
-            return [
-                Finding(
-                    "refused",
-                    f"ax, ay, az are {mean:.4g} at rest: in {unit}? give 'convert: {{scale: {{{scales}}}}}'",
-                )
-            ]
+            return [finding("acceleration_unit", value=mean, unit=unit, factor=scale)]
     if not holds_gravity(trial, g):
         if abs(mean / g - 1.0) < 0.2:
             return [_upside_down(f.mean(axis=0))]
-        return [Finding("note", "ax, ay, az hold no gravity")] if mean < 0.3 * g else []
+        return [finding("no_gravity")] if mean < 0.3 * g else []
     up = up_in_body(attitude.quaternion) if attitude.tilt else np.tile([0.0, 0.0, 1.0], (len(t), 1))
     f, _ = _on(trial, ("ax", "ay", "az"), t)
     good = np.isfinite(f).all(axis=1) & np.isfinite(up).all(axis=1)
@@ -151,29 +143,16 @@ def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list
     if cosine < np.cos(np.radians(15.0)):
         against = "the attitude" if attitude.tilt else "level"
         angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        found.append(
-            Finding(
-                "care", f"the accelerometer's gravity is {angle:.0f}° from {against}: is it mounted turned?"
-            )
-        )
+        found.append(finding("accelerometer_turned", angle=angle, reference=against))
     for i, angle_name in ((0, "pitch"), (1, "roll")):
         swing = g * np.std(up[:, i])
         if swing > 0.4 and _correlation(f[:, i], up[:, i]) < AGAINST:
-            found.append(
-                Finding(
-                    "refused",
-                    f"a{'xy'[i]} runs against the {angle_name} of the attitude: one of them has the other sign",
-                )
-            )
+            found.append(finding("acceleration_sign", column=f"a{'xy'[i]}", angle=angle_name))
     return found
 
 
 def _upside_down(felt: Array) -> Finding:
-    return Finding(
-        "refused",
-        f"the accelerometer feels gravity the wrong way (az about {felt[2]:.3g} m/s², expected +9.81 when level): "
-        "axes forward-right-down? give 'convert: {body: FRD}'",
-    )
+    return finding("gravity_wrong_way", az=felt[2])
 
 
 def _rates(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
@@ -191,12 +170,7 @@ def _rates(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
         x, y = derived[moving], gyro[moving, i] - bias
         correlation, ratio = float(_cosine(x, y)), float(np.sum(x * y) / np.sum(x * x))
         if correlation < AGAINST:
-            found.append(
-                Finding(
-                    "refused",
-                    f"{rate} runs against the change of {angle}: one of them has the other sign (convert.body?)",
-                )
-            )
+            found.append(finding("rate_sign", column=rate, other=angle))
         elif correlation > WITH and 0.6 * DEGREES < ratio < 1.6 * DEGREES:
             found.append(_degrees(rate, float(np.abs(gyro[:, i][moving]).max()), "rad/s"))
         elif correlation > WITH and 0.6 < ratio * DEGREES < 1.6:
@@ -232,14 +206,7 @@ def _heading(trial: Trial, late: float) -> list[Finding]:
     if wander < DRIFTS and abs(bias) < GYRO_BIAS:
         return []
     drift = float(np.ptp(apart)) - noise
-    return [
-        Finding(
-            "care",
-            f"the heading drifts by {drift:.2g} rad against the integrated gyro: a compass disturbed by the motors, or "
-            "a gyro with a bias? Fits of yaw go by the gyro; velocities from x, y are turned by the heading, and are "
-            "wrong where it is",
-        )
-    ]
+    return [finding("heading_drift", drift=drift)]
 
 
 def _vertical(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
@@ -251,7 +218,7 @@ def _vertical(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]
         and np.std(up[both, 0]) > 0.01
         and _correlation(up[both, 0], up[both, 1]) > -AGAINST
     ):
-        found.append(Finding("refused", "z grows with depth: positive down? give 'convert: {world: NED}'"))
+        found.append(finding("z_down"))
         return found
     rising = np.where(np.isfinite(up[:, 0]), up[:, 0], -up[:, 1])
     through = _through_world(trial, t, attitude)[:, 2]
@@ -260,12 +227,7 @@ def _vertical(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]
         correlation = _correlation(rising[good], through[good])
         what = "z" if trial.has("z") else "depth"
         if correlation < AGAINST:
-            found.append(
-                Finding(
-                    "refused",
-                    f"w runs against the change of {what}: one of them has the other sign (convert.body?)",
-                )
-            )
+            found.append(finding("rate_sign", column="w", other=what))
     return found
 
 
@@ -282,22 +244,12 @@ def _horizontal(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Findin
     turned, mirrored = np.vdot(a, b) / size, np.vdot(a.conj(), b) / size
     if abs(turned) > WITH and abs(np.angle(turned)) > np.radians(15.0):
         angle = float(np.degrees(np.angle(turned)))
-        return [
-            Finding(
-                "care",
-                f"x, y and the heading disagree by {angle:.0f}°: u, v come out turned if derived from x, y",
-            )
-        ]
+        return [finding("heading_disagrees", angle=angle)]
     if abs(mirrored) > WITH > abs(turned) + 0.3:
-        return [
-            Finding(
-                "refused",
-                "u, v turned by the yaw run mirrored to x, y: the sign of v, y or yaw is the other one",
-            )
-        ]
+        return [finding("mirrored")]
     ratio = float(np.linalg.norm(b) / np.linalg.norm(a))
     if abs(turned) > WITH and not 0.6 < ratio < 1.6:
-        return [Finding("care", f"x, y change {ratio:.3g} times as fast as u, v say: a wrong unit?")]
+        return [finding("speed_ratio", ratio=ratio)]
     return []
 
 
@@ -431,10 +383,13 @@ def work_findings(reports: list[AxisReport], motion: Motion, named: tuple[str, .
             held = np.abs(motion.tau[both, i]) > QUIET * report.strongest
             sure = report.axis in named or (not named and held.sum() / motion.rate > LONG_PUSH)
             found.append(
-                Finding(
-                    "refused" if sure and ratio < -0.6 and report.axis != "heave" else "care",
-                    f"the inputs take {-report.work:.3g} J out of {report.axis}: {TAU[i]} runs against {NU[i]}: one "
-                    "has the wrong sign, or something else drove the vehicle",
+                finding(
+                    "energy_taken",
+                    severity="refused" if sure and ratio < -0.6 and report.axis != "heave" else "care",
+                    work=-report.work,
+                    axis=str(report.axis),
+                    wrench=TAU[i],
+                    velocity=NU[i],
                 )
             )
     return found
@@ -471,7 +426,7 @@ def check(
         except CalibrationError as error:
             if len(paths) == 1 and place == Path(paths[0]):
                 raise
-            trials.append(_refused(place.name, None, str(error)))
+            trials.append(_refused(place.name, str(error)))
     reports = _checked(trials, given)
     common = together(reports)
     if as_json:
@@ -498,7 +453,7 @@ def as_object(reports: Sequence[TrialReport], common: Sequence[Finding]) -> dict
     """What `--json` prints."""
     return {
         "trials": [report.as_json() for report in reports],
-        "together": [{"level": finding.level, "text": finding.text} for finding in common],
+        "together": [one.as_json() for one in common],
     }
 
 
@@ -508,17 +463,17 @@ def _checked(trials: Sequence[Trial | TrialReport], vehicle: Vehicle | None) -> 
     for trial in trials:
         report = trial if isinstance(trial, TrialReport) else _one(trial, vehicle)
         if report.sha256 and report.sha256 in seen:
-            twice = f"holds the same numbers as {seen[report.sha256]}, which would count twice: leave one out"
-            report = replace(report, findings=(*report.findings, Finding("refused", twice)))
+            twice = finding("duplicate", other=seen[report.sha256])
+            report = replace(report, findings=(*report.findings, twice))
         seen.setdefault(report.sha256, report.name)
         reports.append(report)
     return reports
 
 
-def _refused(name: str, vehicle: str | None, reason: str) -> TrialReport:
+def _refused(name: str, reason: str) -> TrialReport:
     return TrialReport(
         name=name,
-        vehicle=vehicle,
+        vehicle=None,
         role=None,
         duration=0.0,
         rows=0,
@@ -526,7 +481,7 @@ def _refused(name: str, vehicle: str | None, reason: str) -> TrialReport:
         streams=(),
         axes=(),
         offsets={},
-        findings=(Finding("refused", reason),),
+        findings=(finding("unusable", reason=reason),),
     )
 
 
@@ -566,19 +521,14 @@ def _one(trial: Trial, given: Vehicle | None) -> TrialReport:
 def _own_vehicle(trial: Trial, findings: list[Finding]) -> Vehicle | None:
     """The vehicle that the header names; findings say why there is none."""
     if trial.header.vehicle is None:
-        findings.append(
-            Finding(
-                "refused",
-                "no vehicle: give --vehicle, or 'vehicle: NAME' in trial.yaml; only the sampling was checked",
-            )
-        )
+        findings.append(finding("no_vehicle"))
         return None
     named = trial.header.vehicle
     beside = Path(trial.path or ".") / named
     try:
         return load_vehicle(beside if beside.is_file() else named)
     except VehicleError as error:
-        findings.append(Finding("refused", f"trial.yaml: vehicle: {error}"))
+        findings.append(finding("vehicle_refused", reason=str(error)))
         return None
 
 
@@ -587,7 +537,7 @@ def _motion_of(trial: Trial, vehicle: Vehicle, findings: list[Finding]) -> tuple
     try:
         inputs = drive(trial, vehicle)
     except CalibrationError as error:
-        findings.append(Finding("refused", str(error).removeprefix(f"{trial.name}: ")))
+        findings.append(finding("unusable", reason=error.reason))
         # The motion can be looked at without its cause.
         trial = replace(trial, header=trial.header.model_copy(update={"passive": True}))
         seen = motion(trial, vehicle)
@@ -597,33 +547,29 @@ def _motion_of(trial: Trial, vehicle: Vehicle, findings: list[Finding]) -> tuple
         return "", unknown
     findings += input_findings(trial, vehicle, inputs)
     seen = motion(trial, vehicle)
-    known = {finding.text for finding in findings}
-    findings += [Finding("note", note) for note in seen.notes if note not in known]
+    findings += [one for one in seen.findings if one not in findings]
     axes = [with_tells(axis, seen, inputs, vehicle) for axis in axis_reports(seen, inputs, vehicle)]
     findings += work_findings(axes, seen, trial.header.axis)
     if not any(told.can for axis in axes for told in axis.tells.values()):
-        moved = ", ".join(axis.axis for axis in axes if axis.source)
-        findings.append(
-            Finding(
-                "refused",
-                "no axis is excited: nothing can be identified"
-                if moved
-                else "no velocity, rate, attitude or depth to go by",
-            )
-        )
+        moved = any(axis.source for axis in axes)
+        findings.append(finding("nothing_excited") if moved else finding("nothing_measured"))
     for named in trial.header.axis:
         axis = next(axis for axis in axes if axis.axis == named)
         if not axis.excited:
-            findings.append(Finding("care", f"trial.yaml says {named}, and {named} is not excited"))
+            findings.append(finding("axis_still", axis=str(named)))
     return inputs.source, axes
 
 
 def _offset(group: str, offset: Offset) -> Finding:
     # Slow motion looks alike at several offsets: a single trial is believed if the streams agree very well.
     sure = abs(offset.seconds) > 6.0 * offset.std and offset.correlation > 0.95
-    return Finding(
-        "care" if sure else "note",
-        f"{group} comes {abs(offset.seconds):.3f} s {'early' if offset.seconds > 0.0 else 'late'} against "
-        f"{offset.reference} (± {2.0 * offset.std:.3f} s): "
-        f"give 'convert: {{time_offset: {{{group}: {offset.seconds:.3f}}}}}'",
+    return finding(
+        "stream_offset",
+        severity="care" if sure else "note",
+        group=group,
+        offset=abs(offset.seconds),
+        sense="early" if offset.seconds > 0.0 else "late",
+        reference=offset.reference,
+        half=2.0 * offset.std,
+        seconds=offset.seconds,
     )

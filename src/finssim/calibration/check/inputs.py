@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from finssim.calibration.check.report import Finding
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.trials.inputs import Drive
 from finssim.calibration.trials.trial import Array, Trial
 from finssim.vehicles import AXES, Vehicle
@@ -17,30 +17,17 @@ OFTEN = 0.05
 
 def input_findings(trial: Trial, vehicle: Vehicle, inputs: Drive) -> list[Finding]:
     """What was assumed of the inputs, time at the limits, in the dead zones and beyond what the thrusters can give."""
-    found = [Finding("note", note) for note in inputs.notes]
+    found = list(inputs.findings)
     if inputs.source == "passive":
         return found
     if not np.any(inputs.force):
-        reason = "the inputs are zero throughout: write 'passive: true' if the thrusters were off"
-        if inputs.source == "pwm":
-            reason = "no pulse leaves the dead band of its speed controller"
-        return [*found, Finding("refused", reason)]
+        return [*found, finding("pulses_dead") if inputs.source == "pwm" else finding("inputs_zero")]
     found += _wrench_beyond(vehicle, inputs) if not inputs.thrusters else _thrusters(trial, vehicle, inputs)
     if inputs.end is not None:
         rest = trial.t[-1] - inputs.end
-        found.append(
-            Finding(
-                "care",
-                f"the inputs end {rest:.3g} s before the recording, at {inputs.end - trial.t[0]:.4g} s: what follows "
-                "is left out; write 'inputs_after: zero' in trial.yaml if the thrusters stopped there, as on disarming",
-            )
-        )
+        found.append(finding("inputs_end", rest=rest, end=inputs.end - trial.t[0]))
     if inputs.source == "pwm" and not trial.has("voltage") and trial.header.voltage is None:
-        found.append(
-            Finding(
-                "care", "no battery voltage: thrust from pulses takes that of the speed controller's table"
-            )
-        )
+        found.append(finding("voltage_missing"))
     return found
 
 
@@ -52,18 +39,18 @@ def _wrench_beyond(vehicle: Vehicle, inputs: Drive) -> list[Finding]:
             continue
         beyond = float((tau > 1.05 * limit).sum() / (tau > 0.0).sum())
         if beyond > OFTEN:
-            unit = "N" if i < 3 else "N m"
-            what = (
-                "what was asked for cannot have acted"
-                if inputs.commanded
-                else f"is it in {unit}, and this vehicle?"
-            )
+            fields = {
+                "column": inputs.names[i],
+                "limit": float(limit),
+                "unit": "N" if i < 3 else "N m",
+                "vehicle": vehicle.name,
+                "share": beyond,
+                "axis": str(axis),
+            }
             found.append(
-                Finding(
-                    "care",
-                    f"{inputs.names[i]} is beyond the {limit:.3g} {unit} that {vehicle.name} can give in {beyond:.0%} "
-                    f"of its time ({axis}): {what}",
-                )
+                finding("command_beyond", **fields)
+                if inputs.commanded
+                else finding("wrench_beyond", **fields)
             )
     return found
 
@@ -91,21 +78,11 @@ def _thrusters(trial: Trial, vehicle: Vehicle, inputs: Drive) -> list[Finding]:
         if asked and _in_dead_zone(rpm, thruster.dead_rpm_minus, thruster.dead_rpm_plus) > 0.2:
             slow.append(name)
     if at_limit:
-        found.append(
-            Finding(
-                "care",
-                f"{', '.join(at_limit)} at the limit in more than {OFTEN:.0%} of the time: the excitation saturates",
-            )
-        )
+        found.append(finding("saturated", thrusters=tuple(at_limit), share=OFTEN))
     if slow:
-        found.append(
-            Finding(
-                "care",
-                f"{', '.join(slow)} inside the dead zone for more than a fifth of the time: thrust uncertain",
-            )
-        )
+        found.append(finding("in_dead_zone", thrusters=tuple(slow)))
     if still:
-        found.append(Finding("note", f"{', '.join(still)} never pushed"))
+        found.append(finding("never_pushed", thrusters=tuple(still)))
     return found
 
 

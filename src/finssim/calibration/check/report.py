@@ -6,24 +6,17 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-__all__ = ["PARAMETERS", "AxisReport", "Finding", "Level", "StreamReport", "Told", "TrialReport", "Verdict"]
+from finssim.calibration.findings import Finding
 
-Level = Literal["refused", "care", "note"]
-"""What a finding makes of a trial: nothing can rest on it; something may not; worth knowing."""
+__all__ = ["PARAMETERS", "THRUST", "AxisReport", "StreamReport", "Told", "TrialReport", "Verdict"]
 
 Verdict = Literal["usable", "usable with care", "refused"]
 
 PARAMETERS = ("m_eff", "d1", "d2", "bias", "k", "thrust_scale", "thrust_lag", "buoyancy")
 """What a trial may tell of an axis; k of roll and pitch, buoyancy of heave."""
 
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing that was found."""
-
-    level: Level
-    text: str
-    """One sentence: what, and what to do."""
+THRUST = ("bias", "k", "thrust_scale", "thrust_lag", "buoyancy")
+"""Of these, what a passive trial does not tell because no thrust is known."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +98,7 @@ class TrialReport:
     @property
     def verdict(self) -> Verdict:
         """By the worst finding."""
-        levels = {finding.level for finding in self.findings}
+        levels = {finding.severity for finding in self.findings}
         return "refused" if "refused" in levels else "usable with care" if "care" in levels else "usable"
 
     def as_json(self) -> dict[str, Any]:
@@ -118,7 +111,7 @@ class TrialReport:
             "duration": _plain(self.duration),
             "rows": self.rows,
             "inputs": self.inputs,
-            "findings": [{"level": finding.level, "text": finding.text} for finding in self.findings],
+            "findings": [finding.as_json() for finding in self.findings],
             "streams": [
                 {**vars(stream), "columns": list(stream.columns), **_numbers(stream)}
                 for stream in self.streams

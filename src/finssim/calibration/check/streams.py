@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from finssim.calibration.check.report import Finding, Level, StreamReport
+from finssim.calibration.check.report import StreamReport
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.trials.columns import COLUMNS, column_of
 from finssim.calibration.trials.trial import Array, Trial
 
@@ -41,23 +42,21 @@ def stream_reports(trial: Trial) -> tuple[list[StreamReport], list[Finding]]:
             shared.setdefault(key, []).append(name)
     reports, findings = [], []
     if trial.duration < SHORTEST_TRIAL:
-        findings.append(
-            Finding("refused", f"lasts {trial.duration:.2g} s, expected at least {SHORTEST_TRIAL:g} s")
-        )
-    said: dict[tuple[Level, str], list[str]] = {}
+        findings.append(finding("too_short", duration=trial.duration, least=SHORTEST_TRIAL))
+    of: dict[Finding, list[str]] = {}
     for names in shared.values():
         report = _report(trial, tuple(names))
         reports.append(report)
-        for what in _sampling(report):
-            said.setdefault(what, []).extend(names)
+        for one in _sampling(report):
+            of.setdefault(one, []).extend(names)
         for name in names:
-            for what in _values(trial, name):
-                said.setdefault(what, []).append(name)
-    findings += [Finding(level, f"{_shown(columns)}: {text}") for (level, text), columns in said.items()]
+            for one in _values(trial, name):
+                of.setdefault(one, []).append(name)
+    findings += [one.about(_shown(columns)) for one, columns in of.items()]
     few = [name for name in trial.channels if not trial.has(name)]
     if few:
-        findings.append(Finding("note", f"{', '.join(few)} hold fewer than two samples and are not used"))
-    findings += [Finding("care" if "clock jumps" in note else "note", note) for note in trial.notes]
+        findings.append(finding("few_samples", columns=tuple(few)))
+    findings += trial.findings
     return sorted(reports, key=lambda r: (r.group != "command", r.group)), findings
 
 
@@ -81,22 +80,21 @@ def _report(trial: Trial, names: tuple[str, ...]) -> StreamReport:
     )
 
 
-def _sampling(report: StreamReport) -> list[tuple[Level, str]]:
-    """What is wrong with the times of a stream: what is said after its columns."""
-    found: list[tuple[Level, str]] = []
+def _sampling(report: StreamReport) -> list[Finding]:
+    """What is wrong with the times of a stream."""
+    found = []
+    much = report.missing > LONGEST_MISSING
     if report.gaps == 1:
-        gaps = f"a gap of {report.longest_gap:.3g} s, which no fit bridges"
-    else:
-        gaps = f"{report.gaps} gaps, the longest of {report.longest_gap:.3g} s, which no fit bridges"
-    if report.gaps:
-        found.append(("care" if report.missing > LONGEST_MISSING else "note", gaps))
-    elif report.missing > LONGEST_MISSING:
-        found.append(("care", f"missing in {report.missing:.0%} of the trial, at its ends"))
+        found.append(finding("gap", severity="care" if much else "note", longest=report.longest_gap))
+    elif report.gaps:
+        severity = "care" if much else None
+        found.append(finding("gaps", severity=severity, gaps=report.gaps, longest=report.longest_gap))
+    elif much:
+        found.append(finding("ends_missing", share=report.missing))
     if report.jitter > 0.5:
-        found.append(("note", f"the time between samples varies by {report.jitter:.0%}: stamps of receipt?"))
+        found.append(finding("jitter", share=report.jitter))
     if report.rate < FEW_HERTZ and report.group in ("velocity", "rates"):
-        slow = f"{report.rate:.2g} Hz is slow for a vehicle: only the simulation method can use it"
-        found.append(("care", slow))
+        found.append(finding("slow", rate=report.rate))
     return found
 
 
@@ -104,8 +102,8 @@ def _shown(columns: list[str]) -> str:
     return ", ".join(columns[:4]) + (f" and {len(columns) - 4} more" if len(columns) > 4 else "")
 
 
-def _values(trial: Trial, name: str) -> list[tuple[Level, str]]:
-    """Stuck, held and clipped values of a measurement: what is said after the column's name."""
+def _values(trial: Trial, name: str) -> list[Finding]:
+    """Stuck, held and clipped values of a measurement."""
     column = COLUMNS.get(name)
     if column is None or column.group == "command":
         return []
@@ -113,41 +111,34 @@ def _values(trial: Trial, name: str) -> list[tuple[Level, str]]:
     if len(y) < 20:
         return []
     if np.ptp(y) == 0.0:
-        return [("note", f"{y[0]:g} throughout")]
+        return [finding("constant", value=y[0])]
     if _coarse(y):
         return []
-    found: list[tuple[Level, str]] = []
+    found = []
     if name in ("z", "depth") and (above := float(np.percentile(y if name == "z" else -y, 99.0))) > FLYING:
-        sign = "positive up ('convert: {scale: {depth: -1}}'), or " if name == "depth" else ""
         found.append(
-            (
-                "care",
-                f"says {above:.2g} m above the surface: {sign}another zero ('convert: {{offset: {{{name}: ...}}}}')? "
-                "Models count the vehicle as submerged",
-            )
+            finding("above_surface", height=above, column=name)
+            if name == "z"
+            else finding("depth_above_surface", height=above)
         )
     begins = np.flatnonzero(np.concatenate([[True], np.diff(y) != 0.0]))
     lengths = np.diff(np.concatenate([begins, [len(y)]]))
     usual = float(np.median(lengths))
     rate = 1.0 / float(np.median(np.diff(t)))
     if usual >= 2.0:
-        found.append(
-            (
-                "note",
-                f"each value stays for {usual:g} rows: it comes at {rate / usual:.3g} Hz, not {rate:.3g} Hz",
-            )
-        )
+        found.append(finding("values_held", rows=usual, rate=rate / usual, row_rate=rate))
     longest = int(np.argmax(lengths))
     span = float(t[min(begins[longest] + lengths[longest], len(t) - 1)] - t[begins[longest]])
     if span > STUCK and lengths[longest] > 10.0 * usual:
         at = begins[longest]
-        found.append(("care", f"stands at {y[at]:.4g} for {span:.2g} s from {t[at]:.4g} s: stuck?"))
-    for extreme, word in ((y.max(), "above"), (y.min(), "below")):
+        found.append(finding("stuck", value=y[at], span=span, start=t[at]))
+    for extreme, highest in ((y.max(), True), (y.min(), False)):
         # A signal that passes through its extreme touches it once.
         runs = lengths[y[begins] == extreme]
         if runs.sum() >= max(10.0, 0.02 * len(y)) and runs.max() >= 4.0 * usual:
+            at_limit = {"value": extreme, "samples": runs.sum()}
             found.append(
-                ("care", f"never {word} {extreme:.4g}, where it stays for {runs.sum()} samples: clipped?")
+                finding("clipped_above", **at_limit) if highest else finding("clipped_below", **at_limit)
             )
     return found
 

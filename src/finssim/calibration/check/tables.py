@@ -9,8 +9,9 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from finssim.calibration.check.report import PARAMETERS, AxisReport, Finding, StreamReport, TrialReport
+from finssim.calibration.check.report import PARAMETERS, THRUST, AxisReport, StreamReport, TrialReport
 from finssim.calibration.check.together import told_by
+from finssim.calibration.findings import SEVERITIES, Finding
 from finssim.vehicles import AXES
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ def print_reports(reports: Sequence[TrialReport], console: Console, common: Sequ
     if len(reports) > 1:
         _print_overview(reports, console)
     for finding in common:
-        console.print(f"{MARKS[finding.level]} {escape(finding.text)}")
+        console.print(f"{MARKS[finding.severity]} {escape(str(finding))}")
 
 
 def _print_trial(report: TrialReport, console: Console, *, brief: bool) -> None:
@@ -49,9 +50,9 @@ def _print_trial(report: TrialReport, console: Console, *, brief: bool) -> None:
         f"{', ' + escape(report.vehicle) if report.vehicle else ''}: [{colour}]{report.verdict}[/{colour}]"
     )
     grid = Table.grid(padding=(0, 1))
-    for finding in sorted(report.findings, key=lambda f: ("refused", "care", "note").index(f.level)):
-        if not (brief and finding.level == "note"):
-            grid.add_row("", MARKS[finding.level], escape(finding.text))
+    for finding in sorted(report.findings, key=lambda f: SEVERITIES.index(f.severity)):
+        if not (brief and finding.severity == "note"):
+            grid.add_row("", MARKS[finding.severity], escape(str(finding)))
     if grid.row_count:
         console.print(grid, highlight=False)
     if brief:
@@ -130,9 +131,7 @@ def _tells(axes: Sequence[AxisReport], passive: bool) -> Table:
     grid = Table.grid(padding=(0, 1))
     for a in axes:
         # Of a passive trial it goes without saying that nothing is known of thrust.
-        shown = {
-            n: t for n, t in a.tells.items() if not (passive and not t.can and t.why.startswith("passive:"))
-        }
+        shown = {n: t for n, t in a.tells.items() if t.can or not (passive and n in THRUST)}
         by_reason: dict[tuple[bool, str], list[str]] = {}
         for name, told in shown.items():
             by_reason.setdefault((told.can, told.why), []).append(name)

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from finssim.calibration.check.report import PARAMETERS, Finding, TrialReport
+from finssim.calibration.check.report import PARAMETERS, TrialReport
+from finssim.calibration.findings import Finding, finding
 from finssim.vehicles import AXES
 
 __all__ = ["told_by", "together"]
@@ -35,32 +36,27 @@ def together(reports: Sequence[TrialReport]) -> list[Finding]:
     found = []
     vehicles = {report.vehicle for report in reports if report.vehicle}
     if len(vehicles) > 1:
-        found.append(
-            Finding("care", f"trials of several vehicles: {', '.join(sorted(vehicles))}: fit them one by one")
-        )
+        found.append(finding("several_vehicles", vehicles=tuple(sorted(vehicles))))
     names = [report.name for report in reports]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        found.append(Finding("note", f"several trials are called {', '.join(twice)}"))
+        found.append(finding("equal_names", names=tuple(twice)))
     good = [report for report in reports if report.verdict != "refused"]
     if reports and not good:
-        found.append(Finding("refused", "no trial can be used"))
+        found.append(finding("none_usable"))
         return found
     held_out = [report.name for report in good if report.role == "held-out"]
     if held_out and len(held_out) == len(good):
-        found.append(Finding("refused", "every usable trial is held out: nothing is left to fit"))
+        found.append(finding("all_held_out"))
     elif not held_out and len(good) > 1:
-        found.append(
-            Finding("note", "no trial is held out: 'role: held-out' in trial.yaml keeps one for replay")
-        )
+        found.append(finding("none_held_out"))
     fitting = len(good) - len(held_out)
     if 0 < fitting < 5:
-        few = f"{fitting} trial{'s' if fitting > 1 else ''} to fit"
-        found.append(Finding("note", f"{few}: intervals from so few are wide and rest on assumptions"))
+        found.append(finding("few_trials", trials=fitting))
     found += _late(good)
     nothing = [a for a in AXES if not any(told_by(reports, a, parameter) for parameter in PARAMETERS)]
     if nothing and len(nothing) < len(AXES):
-        found.append(Finding("note", f"no trial tells anything of {', '.join(nothing)}"))
+        found.append(finding("axes_untold", axes=tuple(map(str, nothing))))
     return found
 
 
@@ -79,11 +75,14 @@ def _late(reports: Sequence[TrialReport]) -> list[Finding]:
             and np.mean(seconds * middle > 0.0) > 0.8
         ):
             found.append(
-                Finding(
-                    "care",
-                    f"{group} comes {abs(middle):.3f} s {'early' if middle > 0.0 else 'late'} against "
-                    f"{offsets[0]['reference']} in {len(seconds)} trials: "
-                    f"give 'convert: {{time_offset: {{{group}: {middle:.3f}}}}}'",
+                finding(
+                    "stream_offset_common",
+                    group=group,
+                    offset=abs(middle),
+                    sense="early" if middle > 0.0 else "late",
+                    reference=offsets[0]["reference"],
+                    trials=len(seconds),
+                    seconds=middle,
                 )
             )
     return found

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.importers.source_map import ColumnSource, SourceMap
 from finssim.calibration.importers.streams import Stream
 from finssim.files import plain_name
@@ -93,8 +94,8 @@ def spoken_events(topic: str, said: Iterable[tuple[float, str]], start: float) -
     return Stream(source=topic, t=np.array(times), words=spoken) if spoken else None
 
 
-def recorded_header(path: Path) -> tuple[dict[str, Any], list[str]]:
-    """What a record says for `trial.yaml`, and what is to be noted about it; nothing of a foreign file.
+def recorded_header(path: Path) -> tuple[dict[str, Any], list[Finding]]:
+    """What a record says for `trial.yaml`, and findings about it; nothing of a foreign file.
 
     Raises:
         CalibrationError: The record's own words for the header are broken.
@@ -113,8 +114,7 @@ def recorded_header(path: Path) -> tuple[dict[str, Any], list[str]]:
     try:
         vehicle = catalogue_vehicle(str(name), path.name)
     except VehicleError:
-        note = f"recorded with vehicle {name}, which is not in the catalogue: give --vehicle FILE"
-        return told, [f"{path.name}: {note}"]
+        return told, [finding("vehicle_unknown", path.name, vehicle=name)]
     changed = name == about.get("vehicle") and vehicle.sha256 != about.get("vehicle_sha256")
-    note = f"{path.name}: recorded with another state of {name}'s file, which the record keeps"
-    return {"vehicle": name, **told}, [note] if changed else []
+    remarks = [finding("vehicle_changed", path.name, vehicle=name)] if changed else []
+    return {"vehicle": name, **told}, remarks

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import finding
 from finssim.calibration.importers.column_map import SplitRule
 from finssim.calibration.importers.streams import Table
 
@@ -51,7 +52,7 @@ def _part(table: Table, rows: Rows) -> Table:
         t=np.round(t - t[0], 6),
         channels={column: values[rows] for column, values in table.channels.items()},
         words={column: spoken[rows] for column, spoken in table.words.items()},
-        notes=(*table.notes, f"cut from {t[0]:.3f} to {t[-1]:.3f} s of the log"),
+        findings=(*table.findings, finding("log_cut", start=t[0], end=t[-1])),
     )
 
 

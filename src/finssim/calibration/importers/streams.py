@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.trials.time_base import SAME_ROW, merged, ordered
 from finssim.calibration.trials.trial import Array
 
@@ -29,8 +30,8 @@ class Stream:
     """Canonical or extra column -> values, (n,) each."""
     words: dict[str, Words] = field(default_factory=dict)
     """`phase`, `split` or `arming` -> a word for every sample, (n,) each; a word holds until the next."""
-    notes: tuple[str, ...] = ()
-    """What was repaired or left out, one sentence each."""
+    findings: tuple[Finding, ...] = ()
+    """What was repaired or left out."""
 
     def taken(self, rows: NDArray[np.intp] | NDArray[np.bool_], t: Array | None = None) -> Stream:
         """Some of the samples, in that order; at times `t` where given."""
@@ -41,9 +42,9 @@ class Stream:
             words={name: values[rows] for name, values in self.words.items()},
         )
 
-    def noting(self, *notes: str) -> Stream:
-        """The same with more notes."""
-        return replace(self, notes=(*self.notes, *notes))
+    def noting(self, *findings: Finding) -> Stream:
+        """The same with more findings."""
+        return replace(self, findings=(*self.findings, *findings))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +59,7 @@ class Table:
     """NaN where a stream has no sample, (n,) each."""
     words: dict[str, Words]
     """(n,) each."""
-    notes: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def in_order(stream: Stream, *, alone: bool) -> Stream:
@@ -72,26 +73,29 @@ def in_order(stream: Stream, *, alone: bool) -> Stream:
         CalibrationError: No samples, or a clock set back in one of several streams, which cannot be aligned again.
     """
     timed = np.isfinite(stream.t)
-    notes = [] if timed.all() else [f"{stream.source}: {(~timed).sum()} samples without a time left out"]
+    untimed = [] if timed.all() else [finding("samples_untimed", samples=(~timed).sum())]
     stream = stream.taken(timed)
     if len(stream.t) < 2:
         raise CalibrationError(f"{stream.source}: {len(stream.t)} samples, expected at least two")
     t, rows, repaired = ordered(stream.t, stream.channels)
-    if not alone and any("clock" in note for note in repaired):
+    jumps = [one.values for one in repaired if one.code == "clock_jump"]
+    if not alone and jumps:
         raise CalibrationError(
-            f"{stream.source}: {repaired[0].split(':')[0]}, so its samples cannot be placed among those of the other "
-            "sources: import the parts on their own, or cut the log there"
+            f"the clock jumps back from {jumps[0]['before']:.6g} s to {jumps[0]['after']:.6g} s at row "
+            f"{jumps[0]['row']}, so its samples cannot be placed among those of the other sources: import the parts on "
+            "their own, or cut the log there",
+            stream.source,
         )
     stream = stream.taken(rows, t)
     first = np.concatenate([[True], np.diff(t) > SAME_ROW])
     if not first.all():
-        repaired = [*repaired, f"{(~first).sum()} samples repeat the time before and were left out"]
+        repaired = [*repaired, finding("samples_repeat", samples=(~first).sum())]
         stream = stream.taken(first)
     if len(stream.t) < 2:
         raise CalibrationError(
             f"{stream.source}: the time never increases: name the column that holds the time"
         )
-    return stream.noting(*notes, *(f"{stream.source}: {note}" for note in repaired))
+    return stream.noting(*(one.about(stream.source) for one in (*untimed, *repaired)))
 
 
 def merge(streams: Sequence[Stream]) -> Table:
@@ -113,10 +117,10 @@ def merge(streams: Sequence[Stream]) -> Table:
     for name, (times, said) in spoken.items():
         held = np.searchsorted(times, t, side="right") - 1
         words[name] = np.where(held >= 0, said[np.maximum(held, 0)], "")
-    notes = [note for stream in each for note in stream.notes]
+    findings = [one for stream in each for one in stream.findings]
     if start > 1e8:
-        notes.append(f"t = 0 is {start:.6f} s of the log's clock")
-    return Table(start=start, t=t, channels=channels, words=words, notes=tuple(dict.fromkeys(notes)))
+        findings.append(finding("clock_origin", start=start))
+    return Table(start=start, t=t, channels=channels, words=words, findings=tuple(dict.fromkeys(findings)))
 
 
 def _refuse_doubles(streams: Sequence[Stream]) -> None:

@@ -39,7 +39,7 @@ def read_table(path: Path, source: SourceMap | None) -> Stream:
     """
     shown = path.name
     table = _rows(path, source or SourceMap())
-    notes = [f"{shown}: {note}" for note in table.notes]
+    findings = tuple(one.about(shown) for one in table.findings)
     if source is None:
         source = _by_names(table, shown)
     if source.time is None:
@@ -58,7 +58,7 @@ def read_table(path: Path, source: SourceMap | None) -> Stream:
         words["phase"] = spoken(_text(table, source.phase.column, shown), source.phase)
     if source.split is not None:
         words["split"] = np.array(_text(table, source.split, shown), dtype=np.str_)
-    stream = Stream(source=shown, t=t, channels=channels, words=words, notes=tuple(notes))
+    stream = Stream(source=shown, t=t, channels=channels, words=words, findings=findings)
     return in_our_axes(stream, source.frame)
 
 

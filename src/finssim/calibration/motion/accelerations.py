@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.motion.attitude_signal import AttitudeSignal, up_in_body
 from finssim.calibration.motion.smoothing import smooth
 from finssim.calibration.motion.velocities import Velocities
@@ -29,7 +30,7 @@ def accelerations(
     attitude: AttitudeSignal,
     found: Velocities,
     max_gap: float | None = None,
-) -> tuple[Array, tuple[str, ...], tuple[str, ...]]:
+) -> tuple[Array, tuple[str, ...], tuple[Finding, ...]]:
     """Rates of the components of nu.
 
     An accelerometer at body point P reads f = a_P - g in body axes, and
@@ -41,7 +42,7 @@ def accelerations(
     slowly than the velocity, or tells less than its slope by the errors that smoothing estimates of both, is not used.
 
     Returns:
-        nu_dot (m, 6), its source by axis, and notes.
+        nu_dot (m, 6), its source by axis, and findings.
     """
     nu_dot = slopes(at, found.nu)
     source = ["smoothed velocity" if np.isfinite(column).any() else "" for column in nu_dot.T]
@@ -58,11 +59,7 @@ def accelerations(
     gravity = vehicle.water.gravity
     if holds_gravity(trial, gravity):
         if not attitude.tilt:
-            return (
-                nu_dot,
-                tuple(source),
-                ("ax, ay, az hold gravity, and roll and pitch are not measured: they were not used",),
-            )
+            return nu_dot, tuple(source), (finding("accelerations_unused"),)
         f = f - gravity * up_in_body(attitude.quaternion)
     r = accelerometer_place(trial, vehicle)
     nu = np.nan_to_num(found.nu)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.motion.attitude_signal import AttitudeSignal
 from finssim.calibration.motion.smoothing import longest_step, smooth
 from finssim.calibration.trials.columns import NU
@@ -37,7 +38,7 @@ class Velocities:
     """Standard deviation of the slope of `nu` [m/s², rad/s²], (6,)."""
     position: Array
     """World frame [m], (m, 3)."""
-    notes: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 @dataclass
@@ -64,7 +65,7 @@ def velocities(
         attitude: At these times.
         max_gap: As for `smooth`.
     """
-    header, notes = trial.header, list[str]()
+    header, findings = trial.header, list[Finding]()
     measured = [_column(trial, name, at, 2, max_gap) for name in NU]
     nu = np.stack([c.value for c in measured], axis=-1)
     raw = np.stack([c.raw for c in measured], axis=-1)
@@ -79,9 +80,7 @@ def velocities(
     arm = np.asarray(header.velocity_at, float)
     if arm.any():
         if _lacks(omega, arm) and any(source[:3]):
-            notes.append(
-                "velocity_at is not the body origin, but the angular rates are not all known: unknown ones were 0"
-            )
+            findings.append(finding("rates_unknown"))
         nu[:, :3] -= arm_velocity(omega, arm)
         raw[:, :3] -= arm_velocity(omega, arm)
     if header.velocity == "water" and header.water.current is not None:
@@ -89,7 +88,7 @@ def velocities(
         nu[:, :3] += drift
         raw[:, :3] += drift
     position, flow, stds = _origin(trial, vehicle, at, attitude, omega, max_gap)
-    for i, (column, name) in enumerate(_derived(nu, source, flow, attitude, trial, notes)):
+    for i, (column, name) in enumerate(_derived(nu, source, flow, attitude, trial, findings)):
         if name:
             nu[:, i], source[i] = column, name
             noise[i], slope_std[i] = stds[2] if i == 2 else stds[:2].mean(axis=0)
@@ -100,7 +99,7 @@ def velocities(
         noise_std=noise,
         slope_std=slope_std,
         position=position,
-        notes=tuple(notes),
+        findings=tuple(findings),
     )
 
 
@@ -172,7 +171,7 @@ def _depth_at(trial: Trial, vehicle: Vehicle) -> Array:
 
 
 def _derived(
-    nu: Array, source: list[str], flow: Array, attitude: AttitudeSignal, trial: Trial, notes: list[str]
+    nu: Array, source: list[str], flow: Array, attitude: AttitudeSignal, trial: Trial, findings: list[Finding]
 ) -> list[tuple[Array, str]]:
     """u, v, w from the world velocity of the origin, and the names of their sources; no name where it tells nothing."""
     known = np.asarray(np.isfinite(attitude.turn).all(axis=1))
@@ -181,9 +180,7 @@ def _derived(
     vertical = bool(np.isfinite(flow[:, 2]).any())
     wanted = [not source[i] and (vertical if i == 2 else horizontal) for i in range(3)]
     if any(wanted) and not attitude.tilt:
-        notes.append(
-            "roll and pitch are not measured: velocities from position or depth take the vehicle as level"
-        )
+        findings.append(finding("taken_level"))
     if horizontal:
         world = flow if vertical else np.concatenate([flow[:, :2], np.zeros((len(flow), 1))], axis=1)
         body = quat_inverse_rotate(turn, world)

@@ -14,8 +14,9 @@ from typing import Any
 from rich.console import Console
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.fit import Fit
-from finssim.calibration.output.calibrate import calibrated, doubts, kept
+from finssim.calibration.output.calibrate import all_findings, calibrated, kept
 from finssim.calibration.output.fit_output import fit_json, print_fit
 from finssim.calibration.output.vehicle_file import check_vehicle_path, write_vehicle
 from finssim.calibration.trials.trial import Trial
@@ -209,18 +210,14 @@ class _Places:
             refuse_unwritable(atomic_directory(report, replaces=FIT_FILE))
 
 
-def usable(trials: Sequence[Trial]) -> tuple[list[Trial], list[str]]:
-    """The trials that a fit may use, and a sentence on each of the others.
+def usable(trials: Sequence[Trial]) -> tuple[list[Trial], list[Finding]]:
+    """The trials that a fit may use, and a finding on each of the others.
 
     Raises:
         CalibrationError: None is left.
     """
     used = [trial for trial in trials if trial.header.role != "held-out"]
-    left = [
-        f"{trial.name}: left out: its header says that it is held out, for replay"
-        for trial in trials
-        if trial.header.role == "held-out"
-    ]
+    left = [finding("held_out", trial.name) for trial in trials if trial.header.role == "held-out"]
     if not used:
         raise CalibrationError("every trial is marked held-out: a fit needs trials of role 'fit' or of none")
     return used, left
@@ -232,10 +229,8 @@ def _trials(paths: Sequence[Path]) -> list[Trial]:
 
     used, left = usable(load_trials(paths))
     screen = Console(stderr=True)
-    for trial in used:
-        if trial.notes:
-            left.append(f"{trial.name}: {'; '.join(trial.notes)}")
-    for sentence in left:
+    left += [one.about(trial.name) for trial in used for one in trial.findings]
+    for sentence in sentences(left):
         screen.print(sentence, highlight=False, markup=False, soft_wrap=True)
     return used
 
@@ -288,22 +283,22 @@ def _progress() -> Iterator[Callable[..., None]]:
 def _finish(fit: Fit, places: _Places, command: str, as_json: bool) -> Vehicle:
     """Write and show; ends with KeyboardInterrupt where the fit was interrupted."""
     vehicle = calibrated(fit)
-    warnings = doubts(fit, vehicle)
+    findings = all_findings(fit, vehicle)
     write_vehicle(vehicle, places.out)
     if places.report is not None:
         from finssim.calibration.output.report import write_report
 
-        write_report(fit, places.report, vehicle, command=command, warnings=warnings, out=places.out)
+        write_report(fit, places.report, vehicle, command=command, findings=findings, out=places.out)
     if places.ranges is not None:
         from finssim.calibration.output.calibrated_ranges import write_ranges
 
         write_ranges(fit, places.ranges, vehicle)
     if as_json:
-        document = fit_json(fit, vehicle, out=places.out, warnings=warnings)
+        document = fit_json(fit, vehicle, out=places.out, findings=findings)
         print(json.dumps(document, allow_nan=False))
     else:
         console = Console() if sys.stdout.isatty() else Console(width=100)
-        print_fit(fit, vehicle, console, warnings)
+        print_fit(fit, vehicle, console, findings)
         _print_places(fit, vehicle, places, console)
     if fit.interrupted:
         raise KeyboardInterrupt

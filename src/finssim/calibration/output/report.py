@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
+from finssim.calibration.findings import Finding, sentences
 from finssim.calibration.fit import Fit
 from finssim.calibration.output.calibrate import kept
 from finssim.calibration.output.fit_figures import MOST_CURVES, fit_pictures
@@ -42,7 +43,7 @@ def write_report(
     vehicle: Vehicle,
     *,
     command: str = "",
-    warnings: Sequence[str] = (),
+    findings: Sequence[Finding] = (),
     out: Path | None = None,
 ) -> None:
     """Write `report.html`, `report.md`, its PNG pictures and `fit.json`.
@@ -52,7 +53,7 @@ def write_report(
         folder: Directory to make; an earlier report there is replaced.
         vehicle: `calibrated(fit)`.
         command: The command line that makes the fit again.
-        warnings: The fit's and those about the calibrated vehicle.
+        findings: The fit's and those about the calibrated vehicle.
         out: File that the vehicle was written to.
 
     Raises:
@@ -62,9 +63,9 @@ def write_report(
         pictures = fit_pictures(fit)
         for name, (_, data) in pictures.items():
             (temporary / name).write_bytes(data)
-        text = json.dumps(fit_json(fit, vehicle, out=out, warnings=list(warnings)), indent=2, allow_nan=False)
+        text = json.dumps(fit_json(fit, vehicle, out=out, findings=findings), indent=2, allow_nan=False)
         (temporary / FIT_FILE).write_text(text + "\n", encoding="utf-8")
-        body = _Body(fit, vehicle, command, warnings, pictures)
+        body = _Body(fit, vehicle, command, findings, pictures)
         (temporary / REPORT_FILE).write_text(body.html(), encoding="utf-8")
         (temporary / MARKDOWN_FILE).write_text(body.markdown(), encoding="utf-8")
 
@@ -92,11 +93,11 @@ class _Body:
         fit: Fit,
         vehicle: Vehicle,
         command: str,
-        warnings: Sequence[str],
+        findings: Sequence[Finding],
         pictures: dict[str, tuple[str, bytes]],
     ) -> None:
         self.fit, self.vehicle, self.command = fit, vehicle, command
-        self.warnings, self.pictures = list(warnings), pictures
+        self.sentences, self.pictures = sentences(findings), pictures
         record = vehicle.calibrations[-1]
         self.title = f"Calibration of {fit.vehicle.name}: {record.sentence()}"
         told = sum(e.identifiable for e in fit.estimates.values())
@@ -136,9 +137,9 @@ class _Body:
         if self.kept:
             parts.append(f'<p class="note">The vehicle file keeps: {escape(self.kept)}.</p>')
         parts.append(f'<p class="note">{escape(READING.replace("`", ""))}</p>')
-        if self.warnings:
-            items = "".join(f'<li class="warning">{escape(w)}</li>' for w in self.warnings)
-            parts += ["<h2>Warnings</h2>", f"<ul>{items}</ul>"]
+        if self.sentences:
+            items = "".join(f'<li class="warning">{escape(s)}</li>' for s in self.sentences)
+            parts += ["<h2>Findings</h2>", f"<ul>{items}</ul>"]
         if self.fit.quality:
             quality = [
                 f'<tr><td>{escape(what)}</td><td class="words">{escape(quality_text(figures))}</td></tr>'
@@ -173,8 +174,8 @@ class _Body:
         if self.kept:
             lines += ["", f"The vehicle file keeps: {self.kept}."]
         lines += ["", READING]
-        if self.warnings:
-            lines += ["", "## Warnings", "", *(f"- {warning}" for warning in self.warnings)]
+        if self.sentences:
+            lines += ["", "## Findings", "", *(f"- {sentence}" for sentence in self.sentences)]
         if self.fit.quality:
             lines += ["", "## Quality", ""]
             lines += [f"- {what}: {quality_text(figures)}" for what, figures in self.fit.quality.items()]

@@ -1,10 +1,11 @@
-"""How much the regression of one axis is worth: figures of the fit, whether it explains anything, and doubts."""
+"""How much the regression of one axis is worth: figures of the fit, whether it explains anything, and findings."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.regression.axis_fit import TERMS, AxisData
 from finssim.calibration.regression.selection import Selection
 from finssim.vehicles import AXES
@@ -127,41 +128,28 @@ def quality(data: AxisData, chosen: Selection) -> dict[str, float]:
     }
 
 
-def doubts(axis: str, data: AxisData, chosen: Selection) -> list[str]:
-    """Sentences for the report on what may be wrong with the fit of an axis."""
+def doubts(axis: str, data: AxisData, chosen: Selection) -> list[Finding]:
+    """What may be wrong with the fit of an axis."""
     fit, out = chosen.fit, []
     lag, value = chosen.interval[DELAY] + data.shift, fit.theta[DELAY] + data.shift
     if abs(value) > LARGE_DELAY and (lag[0] > 0.0 or lag[1] < 0.0):
-        out.append(
-            f"{axis}: the motion {'lags' if value > 0 else 'leads'} the recorded wrench by "
-            f"{abs(value) * 1e3:.0f} ms [{lag[0] * 1e3:.0f}, {lag[1] * 1e3:.0f}]; the fit allows for it, "
-            "but check the clocks, or the delay and lag of the motors"
-        )
+        sense = "lags" if value > 0 else "leads"
+        out.append(finding("motion_late", axis, sense=sense, lag=abs(value), low=lag[0], high=lag[1]))
     if not fit.instrumental:
-        out.append(
-            f"{axis}: the estimate could not be simulated, so ordinary least squares was used, which noise of the "
-            "velocity biases"
-        )
+        out.append(finding("least_squares", axis))
     if fit.evidence.unit == "blocks":
-        out.append(
-            f"{axis}: {len(data.rows)} trial{'s' if len(data.rows) > 1 else ''}: intervals come from blocks within "
-            "them; what differs from trial to trial is not in them"
-        )
+        out.append(finding("block_intervals", axis, trials=len(data.rows)))
     level = [s.name for s in data.signals if not np.isfinite(s.up).any()]
     if level:
-        out.append(
-            f"{axis}: no attitude in {', '.join(level[:3])}{' and others' if len(level) > 3 else ''}: the vehicle was "
-            "taken as level, so that weight and buoyancy bend the estimates where it was not"
-        )
+        out.append(finding("attitude_missing", axis, trials=tuple(level)))
     unknown = sorted({j for s in data.signals for j in s.unknown})
     if unknown:
-        words = ", ".join(AXES[j] for j in unknown)
-        out.append(f"{axis}: the velocity of {words} is unknown; couplings with it were taken as zero")
+        out.append(finding("velocity_unknown", axis, axes=tuple(str(AXES[j]) for j in unknown)))
     return out
 
 
-def late_velocity(figures: dict[str, dict[str, float]], *, explained: list[str]) -> list[str]:
-    """A sentence where surge, sway and heave lag the wrench by more than roll, pitch and yaw: two streams, two clocks.
+def late_velocity(figures: dict[str, dict[str, float]], *, explained: list[str]) -> list[Finding]:
+    """A finding where surge, sway and heave lag the wrench by more than roll, pitch and yaw: two streams, two clocks.
 
     Args:
         figures: `quality` of every axis.
@@ -173,7 +161,4 @@ def late_velocity(figures: dict[str, dict[str, float]], *, explained: list[str])
     difference = float(np.median(lags[0]) - np.median(lags[1]))
     if difference < SEPARATE:
         return []
-    return [
-        f"the velocity seems to be logged {difference:.2f} s later than the gyro: look with `finssim trials check`, "
-        f"and give 'convert: {{time_offset: {{velocity: {-difference:.2f}}}}}'; the inertias become surer by it"
-    ]
+    return [finding("velocity_late", late=difference)]

@@ -1,4 +1,4 @@
-"""From the regression of one axis to estimates, changes of the vehicle file, figures and warnings."""
+"""From the regression of one axis to estimates, changes of the vehicle file, figures and findings."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate
 from finssim.calibration.regression.axis_doubts import damping_known, doubts, quality, speed_range, worthless
 from finssim.calibration.regression.axis_fit import TERMS, AxisData
@@ -54,7 +55,7 @@ class AxisResult:
     estimates: dict[str, Estimate]
     changes: dict[str, Any]
     quality: dict[str, float]
-    warnings: list[str]
+    findings: list[Finding]
     curves: list[Curve] = field(default_factory=list)
     worthless: str = ""
     """Why nothing that was found can be believed; empty where it can."""
@@ -73,7 +74,7 @@ def axis_result(data: AxisData, chosen: Selection, file: Matrices) -> AxisResult
     """
     axis = AXES[data.axis]
     low, high = speed_range(data, chosen)
-    speeds = f"speeds of {low:.2g}-{high:.2g} {'m/s' if data.axis < 3 else 'rad/s'}"
+    speeds = {"low": low, "high": high, "unit": "m/s" if data.axis < 3 else "rad/s"}
     draft = _Draft(data=data, chosen=chosen, file=file)
     draft.inertia()
     draft.added_mass(float(file.M_RB[data.axis, data.axis]))
@@ -82,14 +83,14 @@ def axis_result(data: AxisData, chosen: Selection, file: Matrices) -> AxisResult
         draft.add("k", K, "N m/rad", "body.center_of_buoyancy.2")
     draft.bias()
     if 0.0 < low and high < DECADE * low:
-        draft.warnings.append(f"{axis} damping rests on {speeds}, less than a decade")
-    draft.warnings += doubts(axis, data, chosen)
+        draft.findings.append(finding("few_speeds", axis, **speeds))
+    draft.findings += doubts(axis, data, chosen)
     figures = quality(data, chosen)
     reason = worthless(data, figures, chosen)
     if reason:
         draft.believe_nothing(reason)
     return AxisResult(
-        estimates=draft.estimates, changes=draft.changes, quality=figures, warnings=draft.warnings,
+        estimates=draft.estimates, changes=draft.changes, quality=figures, findings=draft.findings,
         curves=_curves(data, chosen), worthless=reason,
     )  # fmt: skip
 
@@ -103,7 +104,7 @@ class _Draft:
     file: Matrices
     estimates: dict[str, Estimate] = field(default_factory=dict)
     changes: dict[str, Any] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
 
     @property
     def axis(self) -> str:
@@ -119,15 +120,13 @@ class _Draft:
         return f"{SET}.{family}.{self.data.axis}.{self.data.axis}"
 
     def add(self, name: str, term: int, unit: str, path: str | None = None) -> Estimate:
-        """Take the estimate of a term, and a warning where it rests on its bound."""
+        """Take the estimate of a term, and a finding where it rests on its bound."""
         fit = self.chosen.fit
         value, (lower, upper) = fit.theta[term], self.chosen.interval[term]
         note, sure = "", bool(np.isfinite([lower, upper]).all())
         if fit.active[term]:
             note, sure = f"held at its bound 0; free, it would be {fit.free[term]:.3g}", False
-            self.warnings.append(
-                f"{self.axis}.{name} rests on its bound: free, it would be {fit.free[term]:.3g} {unit}"
-            )
+            self.findings.append(finding("at_bound", f"{self.axis}.{name}", free=fit.free[term], unit=unit))
         elif sure and 0.5 * (upper - lower) > CERTAIN * abs(value):
             note, sure = f"known to no better than {_percent(upper - lower, value)}", False
         found = Estimate(
@@ -168,10 +167,8 @@ class _Draft:
         if value <= 0.0:
             sure = False
             note = f"m_eff is below the file's rigid {rigid:.4g} {unit}"
-            self.warnings.append(
-                f"{self.axis}: an effective inertia of {whole.estimate:.4g} {unit} is below the rigid {rigid:.4g} "
-                f"{unit} of the vehicle file, so that added mass would be negative: check the thrust and the file's "
-                "mass or inertia"
+            self.findings.append(
+                finding("inertia_too_small", self.axis, effective=whole.estimate, rigid=rigid, unit=unit)
             )
         elif ends[0] <= 0.0:
             sure, note = False, "not distinguishable from zero"
@@ -184,7 +181,7 @@ class _Draft:
             name=name, estimate=value, ci95=_pair(ends), unit=unit, identifiable=sure, note=note, path=path
         )
 
-    def damping(self, speeds: str) -> None:
+    def damping(self, speeds: Mapping[str, Any]) -> None:
         """d1 and d2; both go to the vehicle file or neither."""
         theta = self.chosen.fit.theta
         for name, term, family, unit in (
@@ -195,7 +192,8 @@ class _Draft:
                 whole = f"{self.axis}.{name}"
                 self.estimates[whole] = Estimate(
                     name=whole, estimate=0.0, ci95=_pair(self.chosen.interval[term]), unit=unit, identifiable=False,
-                    note=f"not distinguishable from zero at {speeds}", path=self.path(family),
+                    note="not distinguishable from zero at speeds of {low:.2g}-{high:.2g} {unit}".format(**speeds),
+                    path=self.path(family),
                 )  # fmt: skip
             elif self.chosen.fit.terms[term]:
                 self.add(name, term, unit, self.path(family))
@@ -204,9 +202,7 @@ class _Draft:
             self.changes[self.path("linear_damping")] = max(float(theta[D1]), 0.0)
             self.changes[self.path("quadratic_damping")] = max(float(theta[D2]), 0.0)
         else:
-            self.warnings.append(
-                f"{self.axis}: damping is not determined by {speeds}; the vehicle file keeps its numbers"
-            )
+            self.findings.append(finding("damping_unknown", self.axis, **speeds))
 
     def bias(self) -> None:
         """b, identifiable wherever it has an interval, for it may well be zero."""
@@ -220,12 +216,12 @@ class _Draft:
             name: replace(e, identifiable=False, note=reason) for name, e in self.estimates.items()
         }
         self.changes = {}
-        self.warnings.append(f"{self.axis}: {reason}; the vehicle file keeps its numbers")
+        self.findings.append(finding("axis_refused", self.axis, reason=reason))
 
 
 def term_estimate(
     path: str, chosen: Mapping[int, tuple[AxisData, Selection]]
-) -> tuple[Estimate | None, list[str]]:
+) -> tuple[Estimate | None, list[Finding]]:
     """A parameter of the vehicle's terms from all axes on which it acts, weighted by the squares of their intervals.
 
     Args:
@@ -233,7 +229,7 @@ def term_estimate(
         chosen: Data and model of the axes that can be believed.
 
     Returns:
-        None where it acts on none of them; and a sentence where axes disagree, or none has an interval.
+        None where it acts on none of them; and a finding where axes disagree, or none has an interval.
     """
     values, halves, names = [], [], []
     for i, (data, selection) in chosen.items():
@@ -244,9 +240,7 @@ def term_estimate(
             halves.append(max(high - values[-1], values[-1] - low))
             names.append(AXES[i])
     if not values:
-        return None, [
-            f"{path}: no axis on which it acts has a fit to believe; the vehicle file keeps its number"
-        ]
+        return None, [finding("term_unfitted", path)]
     weight = np.asarray(halves) ** -2.0
     value = float(weight @ values / weight.sum())
     half = float(np.hypot(weight.sum() ** -0.5, FORMED * value))
@@ -255,10 +249,8 @@ def term_estimate(
         note += f"; known to no better than {_percent(2.0 * half, value)}"
     said = []
     if np.any(np.abs(np.asarray(values) - value) > 2.0 * np.hypot(halves, half)):
-        told = ", ".join(
-            f"{name} {x:.4g} ± {h:.2g}" for name, x, h in zip(names, values, halves, strict=True)
-        )
-        said = [f"{path}: axes disagree ({told}); their weighted mean was taken"]
+        told = tuple(f"{name} {x:.4g} ± {h:.2g}" for name, x, h in zip(names, values, halves, strict=True))
+        said = [finding("term_disagrees", path, estimates=told)]
     found = Estimate(
         name=path, estimate=value, ci95=(value - half, value + half), unit=unit_of(path), identifiable=sure, note=note,
         path=f"{SET}.{path}",

@@ -105,7 +105,7 @@ def coast_of(trial: Trial, axis: str, vehicle: Vehicle) -> Coast:
     nu = moved.nu[:, i]
     known = np.isfinite(nu)
     if known.sum() < 20:
-        raise CalibrationError(f"{trial.name}: the velocity of {axis} is unknown")
+        raise CalibrationError(f"the velocity of {axis} is unknown", trial.name)
     t, speed = moved.t[known], np.abs(nu[known])
     noise = float(np.nan_to_num(moved.noise_std[i]))
     begin = int(np.argmax(speed))
@@ -118,7 +118,7 @@ def coast_of(trial: Trial, axis: str, vehicle: Vehicle) -> Coast:
         or speed[end] > FALLS_TO * speed[begin]
         or end - begin < 20
     ):
-        raise CalibrationError(f"{trial.name}: {axis} does not coast to a lower speed")
+        raise CalibrationError(f"{axis} does not coast to a lower speed", trial.name)
     start, stop = float(t[begin]), float(t[end])
     nothing = np.empty(0), np.empty(0)
     rate, angle = nothing, nothing

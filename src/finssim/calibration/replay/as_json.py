@@ -43,7 +43,7 @@ def replay_json(replay: Replay) -> dict[str, Any]:
         "models": models,
         "horizon": replay.horizon,
         "trials": {pair.name: _trial(replay, i, pair) for i, pair in enumerate(replay.pairs)},
-        "left_out": list(replay.left_out),
+        "left_out": [one.as_json() for one in replay.left_out],
         "bootstrap": {"resamples": RESAMPLES, "seed": replay.seed, "unit": "trial"},
         "provenance": provenance(),
     }
@@ -99,7 +99,7 @@ def _trial(replay: Replay, i: int, pair: Pair) -> dict[str, Any]:
         "duration_s": float(pair.t[-1]),
         "source": {r: pair.source.get(r, "") for r in pair.measured},
         "noise_std": {r: x for r, x in pair.noise.items() if r in pair.measured and math.isfinite(x)},
-        "notes": list(pair.notes),
+        "findings": [one.as_json() for one in pair.findings],
         "models": {
             model: {
                 "nrmse": {a: s.value for a, s in replay.scores[model][i].items()},

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.replay.as_json import DEFINITION
 from finssim.calibration.replay.figure import MODEL_LABELS, draw_ahead, draw_overlay, draw_response_envelopes
 from finssim.calibration.replay.gates import classify, gates
@@ -138,30 +139,23 @@ def _ahead_table(replay: Replay) -> tuple[list[str], Rows]:
 
 def _remarks(replay: Replay) -> list[str]:
     """What could not be scored or replayed, what was derived, and why there is no interval; equal ones together."""
-    found: dict[str, list[str]] = {}
-    for pair, scores in zip(replay.pairs, replay.scores[replay.models[0]], strict=True):
-        said = [f"{axis}: {one.why}" for axis, one in scores.items() if one.why]
-        for axis in scores:
-            source = pair.source.get(pair.response(axis), "")
-            if source not in ("", "measured"):
-                said.append(f"{axis}: the velocity was not measured but {source}")
-        if not scores:
-            said.append("no axis is excited and measured")
-        for model, late in pair.late.items():
-            said.append(
-                f"{_label(model)}: the motion {'lags' if late > 0.0 else 'leads'} the recorded commands by "
-                f"{abs(late):.2f} s, which the comparison allows for: two clocks"
-            )
-        for sentence in said:
-            found.setdefault(sentence, []).append(pair.name)
-    out = [*replay.left_out]
+    found: list[Finding] = [*replay.left_out]
     for model in replay.models:
         why = replay.aggregate(model).why
-        out += [f"{_label(model)}: {why}"] if why else []
-    for sentence, names in found.items():
-        shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-        out.append(f"{sentence} ({shown})")
-    return out
+        found += [finding("no_interval", _label(model), reason=why)] if why else []
+    for pair, scores in zip(replay.pairs, replay.scores[replay.models[0]], strict=True):
+        for axis, one in scores.items():
+            if one.why:
+                found.append(finding("not_scored", pair.name, axis=str(axis), reason=one.why))
+            source = pair.source.get(pair.response(axis), "")
+            if source not in ("", "measured"):
+                found.append(finding("velocity_derived", pair.name, axis=str(axis), source=source))
+        if not scores:
+            found.append(finding("no_axis", pair.name))
+        for model, late in pair.late.items():
+            sense = "lags" if late > 0.0 else "leads"
+            found.append(finding("clocks_apart", pair.name, model=_label(model), sense=sense, late=abs(late)))
+    return sentences(found)
 
 
 def _label(model: str) -> str:

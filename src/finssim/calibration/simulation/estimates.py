@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Estimate
 from finssim.calibration.regression.axis_estimates import BIAS_NOTE, CERTAIN
-from finssim.calibration.simulation.evidence import Findings
+from finssim.calibration.simulation.evidence import Confidence
 from finssim.calibration.simulation.parameters import Parameters
 from finssim.vehicles.terms import unit_of
 
@@ -119,7 +120,7 @@ def jacobian(p: Parameters, listed: Sequence[Quantity], x: Array) -> Array:
 
 
 def spread(
-    p: Parameters, listed: Sequence[Quantity], x: Array, found: Findings, own_error: float
+    p: Parameters, listed: Sequence[Quantity], x: Array, found: Confidence, own_error: float
 ) -> tuple[Array, Array, Array]:
     """Values (Q,), intervals (Q, 2) and p-values of being zero (Q,)."""
     from scipy.stats import norm, t
@@ -160,13 +161,13 @@ def spread(
 def estimates(
     p: Parameters,
     x: Array,
-    found: Findings,
+    found: Confidence,
     *,
     axes: Sequence[str],
     own_error: float = 0.0,
     wider: dict[str, tuple[float, float]] | None = None,
     dropped: dict[str, str] | None = None,
-) -> tuple[dict[str, Estimate], dict[str, float]]:
+) -> tuple[dict[str, Estimate], dict[str, float], list[Finding]]:
     """Named estimates.
 
     Args:
@@ -179,13 +180,13 @@ def estimates(
         dropped: Quantity -> why it was left out.
 
     Returns:
-        Estimates by name, and the p-value of each being zero.
+        Estimates by name, the p-value of each being zero, and which rest on a bound.
     """
     listed = quantities(p, axes)
     value, ends, p_value = spread(p, listed, x, found, own_error)
     at_low = {name for name, xi, low in zip(p.names, x, p.low, strict=True) if xi <= low}
     free = dict(zip(p.names, found.free, strict=False))
-    out: dict[str, Estimate] = {}
+    out, bounds = dict[str, Estimate](), list[Finding]()
     for q, quantity in enumerate(listed):
         low, high = float(ends[q, 0]), float(ends[q, 1])
         if wider and quantity.name in wider:
@@ -198,6 +199,7 @@ def estimates(
             sure, note = False, "held at its bound"
             if np.isfinite(low + high):
                 note += f"; free, it would be {free[coordinate]:.3g} {quantity.unit}"
+            bounds.append(finding("at_bound", quantity.name, free=free[coordinate], unit=quantity.unit))
         elif quantity.kind == "added_mass" and sure and value[q] <= 0.0:
             rigid = p.M_RB[quantity.axis, quantity.axis]
             sure, note = False, f"m_eff is below the file's rigid {rigid:.4g} {quantity.unit}"
@@ -210,7 +212,7 @@ def estimates(
             note=note,
             path=quantity.path,
         )
-    return out, {quantity.name: float(p_value[q]) for q, quantity in enumerate(listed)}
+    return out, {quantity.name: float(p_value[q]) for q, quantity in enumerate(listed)}, bounds
 
 
 def _verdict(quantity: Quantity, value: float, low: float, high: float) -> tuple[bool, str]:

@@ -12,7 +12,7 @@ from finssim.calibration.simulation.gauss_newton import Solution
 from finssim.calibration.simulation.shooting import Shooting
 from finssim.calibration.uncertainty import Covariance, Evidence, intervals, trial_covariance
 
-__all__ = ["FEWEST_TRIALS", "Findings", "evidence_of", "findings"]
+__all__ = ["FEWEST_TRIALS", "Confidence", "confidence", "evidence_of"]
 
 Array = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ BLOCKS = 24
 """That many, all trials together."""
 
 
-class Findings(NamedTuple):
+class Confidence(NamedTuple):
     """Uncertainty of theta at a solution."""
 
     evidence: Evidence
@@ -34,7 +34,7 @@ class Findings(NamedTuple):
     """95 %, around `free` and containing theta, (P, 2)."""
 
 
-def findings(problem: Shooting, solution: Solution) -> Findings:
+def confidence(problem: Shooting, solution: Solution) -> Confidence:
     """Evidence of theta, after initial states, offsets and trial biases are eliminated, and what follows from it."""
     evidence = evidence_of(problem, solution)
     covariance = trial_covariance(evidence)
@@ -50,7 +50,7 @@ def findings(problem: Shooting, solution: Solution) -> Findings:
     ends = np.clip(ends, problem.low[:, None], problem.high[:, None])
     unknown = ~np.isfinite(np.diagonal(covariance.local))
     ends[unknown] = [-np.inf, np.inf]
-    return Findings(evidence, covariance, free, ends)
+    return Confidence(evidence, covariance, free, ends)
 
 
 def evidence_of(problem: Shooting, solution: Solution) -> Evidence:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Fit
 from finssim.calibration.regression.selection import AKAIKE, DAMPING
 from finssim.calibration.simulation.estimates import estimates
@@ -65,7 +66,7 @@ def fit_by_simulation(
     """
     _check(trials, vehicle, axes, damping, estimate)
     prepared = [streams(trial, vehicle) for trial in trials]
-    chosen, warnings = _axes(prepared, vehicle, axes)
+    chosen, remarks = _axes(prepared, vehicle, axes)
     say = Clock(progress)
     fit = Stages(
         telling(prepared, vehicle, chosen), vehicle, chosen, tuple(estimate), horizon, start, seed, say
@@ -75,7 +76,7 @@ def fit_by_simulation(
     wider: dict[str, tuple[float, float]] = {}
     dropped: dict[str, str] = {}
     if damping == "auto" and not stage.solution.interrupted:
-        first, p_value = estimates(
+        first, p_value, _ = estimates(
             stage.problem.parameters, stage.x, stage.found, axes=chosen, own_error=fit.own_error
         )
         kinds, dropped = _select(kinds, p_value, prepared)
@@ -84,7 +85,7 @@ def fit_by_simulation(
             stage = fit.next(kinds, stage)
     if full and len(chosen) > 1 and not stage.solution.interrupted:
         stage = fit.next(kinds, stage, full=True)
-    return fit.result(stage, wider, dropped, warnings, full=full, damping=damping)
+    return fit.result(stage, wider, dropped, remarks, full=full, damping=damping)
 
 
 def _check(
@@ -110,7 +111,7 @@ def _check(
 
 def _axes(
     prepared: Sequence[Streams], vehicle: Vehicle, axes: Sequence[str] | None
-) -> tuple[tuple[str, ...], list[str]]:
+) -> tuple[tuple[str, ...], list[Finding]]:
     """Axes to fit, and why some that were asked for are not."""
     moved, seen = excited(prepared, vehicle), observable(prepared)
     if axes is None:
@@ -119,18 +120,12 @@ def _axes(
                 f"no trial excites an axis of {vehicle.name}: name the axes, or give trials with larger inputs"
             )
         return moved, []
-    warnings = [
-        f"{axis}: nothing was measured that tells of it; left out" for axis in axes if axis not in seen
-    ]
-    warnings += [
-        f"{axis}: no trial excites it; expect little of its numbers"
-        for axis in axes
-        if axis in seen and axis not in moved
-    ]
+    remarks = [finding("axis_untold", axis) for axis in axes if axis not in seen]
+    remarks += [finding("axis_doubtful", axis) for axis in axes if axis in seen and axis not in moved]
     chosen = tuple(a for a in AXES if a in axes and a in seen)
     if not chosen:
         raise CalibrationError(f"nothing that tells of {', '.join(axes)} was measured in these trials")
-    return chosen, warnings
+    return chosen, remarks
 
 
 def _select(

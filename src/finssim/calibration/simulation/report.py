@@ -1,4 +1,4 @@
-"""What a simulation-error fit shows besides its estimates: figures by axis, curves, doubts."""
+"""What a simulation-error fit shows besides its estimates: figures by axis, curves, findings."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate
 from finssim.calibration.simulation.bordered import CUT
-from finssim.calibration.simulation.evidence import Findings
+from finssim.calibration.simulation.evidence import Confidence
 from finssim.calibration.simulation.excited import TELL, speeds
 from finssim.calibration.simulation.gauss_newton import Solution
 from finssim.calibration.simulation.segments import Streams
@@ -115,54 +116,37 @@ def _unit(name: str) -> str:
 def doubts(
     problem: Shooting,
     solution: Solution,
-    found: Findings,
+    found: Confidence,
     estimates: dict[str, Estimate],
     used: Sequence[Streams],
-) -> list[str]:
+) -> list[Finding]:
     """What a reader should know before using the numbers."""
     out = []
     if solution.interrupted:
-        out.append("the fit was interrupted; these are the best numbers until then")
+        out.append(finding("interrupted"))
     elif not solution.converged:
-        out.append(
-            f"the fit had not converged after {solution.iterations} iterations: shorter segments or fewer parameters "
-            "may help"
-        )
-    out += [
-        f"{e.name} rests on a bound: {e.note}"
-        for e in estimates.values()
-        if e.note.startswith("held at its bound")
-    ]
+        out.append(finding("not_converged", iterations=solution.iterations))
     p = problem.parameters
     for axis, i in zip(p.axes, p.index, strict=True):
         if f"{axis}.m_eff" not in estimates:
             continue
         whole, added = estimates[f"{axis}.m_eff"], estimates[f"{axis}.added_mass"]
         if added.estimate <= 0.0:
-            out.append(
-                f"{axis}: an effective inertia of {whole.estimate:.4g} {whole.unit} is below the rigid "
-                f"{p.M_RB[i, i]:.4g} {whole.unit} of the vehicle file, so that added mass would be negative: check the "
-                "thrust and the file's mass or inertia"
-            )
+            fields = {"effective": whole.estimate, "rigid": p.M_RB[i, i], "unit": whole.unit}
+            out.append(finding("inertia_too_small", axis, **fields))
         low, high = speeds([s.motion for s in used], axis)
         if 0.0 < low and high < DECADE * low:
             unit = "m/s" if i < 3 else "rad/s"
-            out.append(f"{axis} damping rests on speeds of {low:.2g}-{high:.2g} {unit}, less than a decade")
+            out.append(finding("few_speeds", axis, low=low, high=high, unit=unit))
     P = len(p.names)
     for stream, late, (low, high) in zip(
         problem.errors.streams, solution.point.theta[P:], found.interval[P:], strict=True
     ):
         if abs(late) > LATE and (low > 0.0 or high < 0.0):
-            out.append(
-                f"{stream} {'lags' if late > 0.0 else 'leads'} the inputs by {abs(late) * 1e3:.0f} ms "
-                f"[{low * 1e3:.0f}, {high * 1e3:.0f}]; the fit allows for it, but check the clocks, or the delay and "
-                "lag of the motors"
-            )
+            sense = "lags" if late > 0.0 else "leads"
+            out.append(finding("motion_late", stream, sense=sense, lag=abs(late), low=low, high=high))
     if found.evidence.unit == "blocks":
-        out.append(
-            f"{len(used)} trial{'s' if len(used) > 1 else ''}: intervals come from blocks within them; what differs "
-            "from trial to trial is not in them"
-        )
+        out.append(finding("block_intervals", trials=len(used)))
     return out
 
 

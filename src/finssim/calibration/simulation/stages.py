@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from finssim.calibration.degeneracy import degeneracy
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Estimate, Fit
 from finssim.calibration.regression.axis_estimates import USEFUL, outside, trim
 from finssim.calibration.simulation.bordered import huber
 from finssim.calibration.simulation.estimates import estimates
-from finssim.calibration.simulation.evidence import FEWEST_TRIALS, Findings, findings
+from finssim.calibration.simulation.evidence import FEWEST_TRIALS, Confidence, confidence
 from finssim.calibration.simulation.excited import (
     TELL,
     compared,
@@ -163,7 +164,7 @@ def changes(
     p: Parameters,
     x: Array,
     found: dict[str, Estimate],
-    evidence: Findings,
+    evidence: Confidence,
     axes: Sequence[str],
     speed: dict[str, float],
     scaled: bool,
@@ -234,7 +235,7 @@ def changes(
     return out
 
 
-def _force_known(p: Parameters, x: Array, found: Findings, axis: str, speed: float) -> bool:
+def _force_known(p: Parameters, x: Array, found: Confidence, axis: str, speed: float) -> bool:
     """Whether the damping force of an axis at a speed is known to `USEFUL`, or excludes that of the vehicle file."""
     i = AXES.index(axis)
     unit = 1e-5 * np.maximum(np.abs(x), p.scale)
@@ -285,7 +286,7 @@ class Stage:
 
     problem: Shooting
     solution: Solution
-    found: Findings
+    found: Confidence
 
     @property
     def x(self) -> Array:
@@ -348,7 +349,7 @@ class Stages:
         p, x = problem.parameters, rough.point.theta[: len(problem.parameters.names)]
         if rough.interrupted:
             problem.hold_clocks(False)
-            return Stage(problem, rough, findings(problem, rough))
+            return Stage(problem, rough, confidence(problem, rough))
         self.cut(self.given or horizon(self.base.replace(_matrices(p, x)), self.prepared, self.axes))
         problem = self.problem(kinds, self.base, dict(zip(p.names, x, strict=True)))
         for _ in range(0 if self.given else HALVINGS):
@@ -389,9 +390,9 @@ class Stages:
             problem.hold_clocks(False)
             point = rough.point
             if rough.interrupted:
-                return Stage(problem, rough, findings(problem, rough))
+                return Stage(problem, rough, confidence(problem, rough))
         solution = solve(problem, point, std=std, report=self.report(words, toward))
-        return Stage(problem, solution, findings(problem, solution))
+        return Stage(problem, solution, confidence(problem, solution))
 
     def report(self, words: str, toward: float) -> Callable[[int, float], None]:
         return lambda i, rms: self.say(f"{words}: iteration {i}, residual {rms:.4g} σ", toward)
@@ -475,27 +476,28 @@ class Stages:
         stage: Stage,
         wider: dict[str, tuple[float, float]],
         dropped: dict[str, str],
-        warnings: list[str],
+        remarks: list[Finding],
         *,
         full: bool,
         damping: str,
     ) -> Fit:
         """The finished fit."""
         p, x = stage.problem.parameters, stage.x
-        found, _ = estimates(
+        found, _, bounds = estimates(
             p, x, stage.found, axes=self.axes, own_error=self.own_error, wider=wider, dropped=dropped
         )
         top = {axis: speeds([s.motion for s in self.used], axis)[1] for axis in self.axes}
         sources = {s.drive.source for s in self.used}
         new = changes(p, x, found, stage.found, self.axes, top, scaled=sources <= {"rpm", "pwm"})
         P, local = stage.problem.judged, stage.found.covariance.local
-        correlation, sentences = degeneracy(p.names[:P], local[:P, :P], stage.found.free[:P])
+        correlation, traded = degeneracy(p.names[:P], local[:P, :P], stage.found.free[:P])
         left_out = [one.trial.name for one in self.prepared if one not in self.used]
-        warnings = [
-            *warnings,
-            *(f"{name}: left out: no stretch has both inputs and measurements" for name in left_out),
+        remarks = [
+            *remarks,
+            *(finding("trial_left_out", name) for name in left_out),
             *doubts(stage.problem, stage.solution, stage.found, found, self.used),
-            *sentences,
+            *bounds,
+            *traded,
         ]
         settings: dict[str, Any] = {
             "axes": list(self.axes),
@@ -517,7 +519,7 @@ class Stages:
             changes=new,
             quality=quality(stage.problem, stage.solution, self.axes, self.used),
             correlation=correlation,
-            warnings=tuple(dict.fromkeys(warnings)),
+            findings=tuple(dict.fromkeys(remarks)),
             curves=pictures(stage.problem, stage.solution, self.axes),
             trials={one.trial.name: one.trial.sha256 for one in self.used},
             settings=settings,

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.trials.columns import COLUMNS, INPUT_PREFIXES, column_of
 from finssim.calibration.trials.header import Conversion
 from finssim.calibration.trials.time_base import merged
@@ -123,23 +124,18 @@ def _attitude_of_one_side(channels: Channels, body: bool) -> Channels:
     return result
 
 
-def tidy_quaternions(channels: Channels) -> list[str]:
-    """Give quaternions unit length and a continuous sign, in place; notes on what could not be used."""
+def tidy_quaternions(channels: Channels) -> list[Finding]:
+    """Give quaternions unit length and a continuous sign, in place; findings on what could not be used."""
     given = [name for name in QUATERNION if name in channels]
     if not given:
         return []
     if len(given) < 4:
         for name in given:
             del channels[name]
-        return [f"columns {_some(given)} were left out: an attitude needs qx, qy, qz and qw"]
+        return [finding("quaternion_incomplete", columns=tuple(given))]
     q = np.stack([channels[name] for name in QUATERNION], axis=-1)
     length = np.linalg.norm(q, axis=-1)
-    notes = []
     useless = np.isfinite(length) & (length < 0.5)
-    if useless.any():
-        notes.append(
-            f"{useless.sum()} quaternions have a length below 0.5 (0 means no fix) and count as empty"
-        )
     bad = ~np.isfinite(length) | useless
     q[bad] = np.nan
     stretched = ~bad & (np.abs(length - 1.0) > LENGTH_TOLERANCE)
@@ -149,7 +145,7 @@ def tidy_quaternions(channels: Channels) -> list[str]:
     q[good[1:]] *= np.where(np.cumsum(flips) % 2 == 1, -1.0, 1.0)[:, None]
     for i, name in enumerate(QUATERNION):
         channels[name] = q[:, i]
-    return notes
+    return [finding("quaternion_lengths", samples=useless.sum())] if useless.any() else []
 
 
 def upside_down(channels: Mapping[str, Array]) -> bool:

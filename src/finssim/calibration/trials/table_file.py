@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 
 __all__ = ["Table", "read_table", "write_table"]
 
@@ -36,8 +37,8 @@ class Table:
     """Column -> values, NaN for empty cells and cells that hold no number."""
     words: dict[str, list[str]] = field(default_factory=dict)
     """Column -> text, for columns in which no cell is a number (and for `phase`)."""
-    notes: list[str] = field(default_factory=list)
-    """What was left out or repaired, one sentence each."""
+    findings: list[Finding] = field(default_factory=list)
+    """What was left out or repaired."""
 
     @property
     def columns(self) -> list[str]:
@@ -95,7 +96,7 @@ def _read_csv(path: Path) -> Table:
     whole = raw.split(b"\0", 1)[0]  # a crash leaves zeros where the file system had made room
     text = whole.decode("utf-8-sig", errors="replace")
     if len(whole) < len(raw):
-        table.notes.append("the file ends in zero bytes, as after a crash; it was read up to them")
+        table.findings.append(finding("zero_bytes"))
     cut = not text.endswith(("\n", "\r"))
     lines = (line for line in io.StringIO(text, newline=None) if line.strip() and not line.startswith("#"))
     first = next(lines, "")
@@ -121,7 +122,7 @@ def _read_csv(path: Path) -> Table:
             rows = []
     if cut and rows and last is rows[-1] and last[-1].strip():
         rows[-1] = [*last[:-1], ""]
-        table.notes.append("the last line has no end: its last cell may be cut and was left out")
+        table.findings.append(finding("last_cell_cut"))
     _append(columns, rows, delimiter)
     _tell_ragged(ragged, count, len(names), cut, table, path)
     for name, column in zip(names, columns, strict=True):
@@ -165,16 +166,14 @@ def _number_or_word(cell: str) -> float | str:
 
 def _tell_ragged(ragged: list[int], count: int, width: int, cut: bool, table: Table, path: Path) -> None:
     if ragged == [count] and cut:
-        table.notes.append("the last line is cut short and was left out")
+        table.findings.append(finding("last_line_cut"))
     elif len(ragged) > max(1.0, MOST_RAGGED * count):
         raise CalibrationError(
-            f"{path}: {len(ragged)} of {count} rows have not the {width} cells that the column names announce "
+            f"{path}: {len(ragged)} of {count} rows do not have {width} cells, one for each column name "
             f"(first: row {ragged[0]}): is one table in it, with one separator?"
         )
     elif ragged:
-        table.notes.append(
-            f"{len(ragged)} rows have not {width} cells and were left out (first: row {ragged[0]})"
-        )
+        table.findings.append(finding("ragged_rows", rows=len(ragged), expected=width, first=ragged[0]))
 
 
 def _keep(table: Table, name: str, column: list[Any]) -> None:
@@ -186,9 +185,10 @@ def _keep(table: Table, name: str, column: list[Any]) -> None:
         table.words[name] = [cell if isinstance(cell, str) else "" for cell in column]
         return
     if words:
-        table.notes.append(
-            f"column '{name}': {len(words)} cells hold no number and count as empty "
-            f"(first: '{column[words[0]][:40]}' in row {words[0] + 1})"
+        table.findings.append(
+            finding(
+                "not_numbers", column=name, cells=len(words), cell=column[words[0]][:40], row=words[0] + 1
+            )
         )
         for i in words:
             column[i] = math.nan
@@ -229,5 +229,5 @@ def _read_parquet(path: Path) -> Table:
             cells = ["" if cell is None else str(cell) for cell in column.to_pylist()]
             _keep(table, name, [_number_or_word(cell) for cell in cells])
         else:
-            table.notes.append(f"column '{name}' holds {kind}, not numbers, and was left out")
+            table.findings.append(finding("column_kind", column=name, kind=str(kind)))
     return table

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding
 from finssim.calibration.trials.columns import column_of
 from finssim.calibration.trials.header import Header
 
@@ -40,8 +41,8 @@ class Trial:
     """A word of `PHASES` or "" for every row, (n,); None where the log names no phases."""
     header: Header = field(default_factory=Header)
     """What `trial.yaml` says."""
-    notes: tuple[str, ...] = ()
-    """What was repaired or left out while reading, one sentence each."""
+    findings: tuple[Finding, ...] = ()
+    """What was repaired or left out while reading."""
     path: Path | None = None
     """Folder or file it was read from."""
 

@@ -12,6 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import finding
 from finssim.calibration.fit import Estimate
 from finssim.calibration.output.fit_figures import BLUE, GRAY, ORANGE, new_figure, png
 from finssim.calibration.output.fit_output import interval_text, number_text
@@ -65,7 +66,7 @@ def camera_record(fit: CameraFit) -> dict[str, Any]:
         "held_out_rms_px": plain(fit.held_out_rms, DIGITS),
         "views": len(fit.used),
         "left_out": {view.name: view.left_out for view in fit.views if view.left_out},
-        "advice": list(fit.advice),
+        "findings": [one.as_json() for one in fit.findings],
         "settings": fit.settings,
         "interrupted": fit.interrupted,
         "provenance": provenance(),
@@ -116,8 +117,10 @@ def camera_report(fit: CameraFit) -> Report:
         estimates=list(fit.estimates.values()),
         cells=_cells,
         summary=summary,
-        notes=[f"{view.name} left out: {view.left_out}" for view in fit.views if view.left_out],
-        advice=fit.advice,
+        findings=[
+            *(finding("view_left_out", v.name, reason=v.left_out) for v in fit.views if v.left_out),
+            *fit.findings,
+        ],
         advice_title="What to photograph next",
         reading=READING,
     )
@@ -261,7 +264,7 @@ def run(
         screen.print(f"found a {chosen.words}; --board says otherwise", highlight=False, markup=False)
     views, without = _views(images, chosen, screen)
     for name in without:
-        screen.print(f"{name}: left out: the board is not seen in it", highlight=False, markup=False)
+        screen.print(str(finding("board_unseen", name)), highlight=False, markup=False)
     if not views:
         raise CalibrationError(
             f"none of {len(without)} pictures shows a {chosen.words}: give --board or --charuco"

@@ -11,6 +11,7 @@ from scipy.stats import chi2
 from scipy.stats import t as student
 
 from finssim.calibration.degeneracy import correlation
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Correlation, Estimate
 from finssim.calibration.vision.pool_model import LENS_NAMES, NAMES, PoolModel, Settings
 from finssim.calibration.vision.pool_refine import Refined, surprise
@@ -120,9 +121,6 @@ SAME_PLACE = 0.005
 CERTAIN = 0.999
 """Share of the marks above the water that are taken for such."""
 
-MOST_NAMES = 12
-"""Rows that a sentence names."""
-
 WHOLE_LENS = "--fit pose,height,tilt,index,focal,center,distortion"
 
 
@@ -134,9 +132,9 @@ def advice(
     table: Mapping[str, Estimate],
     minima: Sequence[tuple[float, float]],
     touching: Sequence[str],
-    contradicted: Sequence[str],
-) -> Iterator[str]:
-    """Sentences for the user, the gravest first.
+    contradicted: Sequence[Finding],
+) -> Iterator[Finding]:
+    """Findings for the user, the gravest first.
 
     Args:
         fit: In the frame of `seen`.
@@ -146,15 +144,10 @@ def advice(
         table: Estimates.
         minima: Other places where the search came to rest.
         touching: What the plane came to rest against.
-        contradicted: Sentences on measurements that the pixels contradict.
+        contradicted: On measurements that the pixels contradict.
     """
     if touching:
-        listed = ", ".join(touching[:4]) + (", ..." if len(touching) > 4 else "")
-        yield (
-            f"the plane ends against {listed}, which it cannot pass: where nothing touches it in truth, the pixels "
-            "want it further on than it can be; check the coordinates of what it touches, the thickness of the window, "
-            "the index and the camera file"
-        )
+        yield finding("plane_touches", places=tuple(touching))
     yield from contradicted
     yield from _place(fit, seen, surface, settings, table)
     yield from _conflicts(fit, surface, settings)
@@ -163,15 +156,12 @@ def advice(
     place = table["camera_height" if surface else "camera_distance"]
     close = [at for ratio, at in minima if ratio < 1.1 and abs(at - place.estimate) > SAME_PLACE]
     if close and not place.identifiable:
-        yield (
-            f"another place of the plane fits about as well (camera {close[0]:.2f} m from it instead of "
-            f"{place.estimate:.2f} m): measure it with a tape"
-        )
+        yield finding("other_place", other=close[0], chosen=place.estimate)
 
 
 def _place(
     fit: Refined, seen: Observations, surface: bool, settings: Settings, table: Mapping[str, Estimate]
-) -> Iterator[str]:
+) -> Iterator[Finding]:
     """On camera height, water height and index, which few points cannot separate."""
     model, wet = fit.model, seen.subset(fit.used & ~seen.dry)
     height = table["camera_height" if surface else "camera_distance"]
@@ -190,31 +180,20 @@ def _place(
         else f": {tape if surface else 'measure where the wall is and give --plane'}"
     )
     if steepest < NARROW:
-        yield (
-            f"all points lie within {100 * radius:.0f} cm of the axis through the camera ({np.degrees(steepest):.0f} "
-            f"degrees off it): {what} and index are not separable{tape}, or add points further out"
-        )
+        angle = float(np.degrees(steepest))
+        yield finding("points_narrow", radius=radius, angle=angle, quantities=what, remedy=tape)
     if levels < ONE_DEPTH * whole and half > 0.01 * whole:
-        yield (
-            f"all points are at one depth (within {100 * levels:.0f} cm): {what} are told only by how refraction bends "
-            f"rays far out, here to ±{1000 * half:.0f} mm{tape}, or survey some points at another depth"
-        )
+        yield finding("one_depth", spread=levels, quantities=what, half=1000.0 * half, remedy=tape)
     if not height.identifiable:
-        yield (
-            f"{height.name} is not determined ({height.estimate:.3f} m, 95 % from {height.ci95[0]:.3f} to "
-            f"{height.ci95[1]:.3f}): positions at the depths surveyed are right all the same, at other depths they are "
-            "not to be trusted"
-        )
+        low, high = height.ci95
+        yield finding("height_unknown", height.name, estimate=height.estimate, low=low, high=high)
     focal = table["focal"]
     loose = focal.ci95[1] - focal.ci95[0] > 0.02 * focal.estimate
     if fit.active[NAMES.index("focal")] and loose and levels < 0.05 * whole:
-        yield (
-            "the focal length was fitted to points of one depth: it and the camera's height stand for each other; "
-            "calibrate the camera by itself (finssim calibrate camera)"
-        )
+        yield finding("focal_of_one_depth")
 
 
-def _conflicts(fit: Refined, surface: bool, settings: Settings) -> Iterator[str]:
+def _conflicts(fit: Refined, surface: bool, settings: Settings) -> Iterator[Finding]:
     """Where the pixels pull an estimate far from what was known."""
     prior, model = fit.prior, fit.model
     focal = NAMES.index("focal")
@@ -223,60 +202,45 @@ def _conflicts(fit: Refined, surface: bool, settings: Settings) -> Iterator[str]
     if np.isfinite(prior.index_std):
         pull = (model.interface.index_far - settings.index) / prior.index_std
         if abs(pull) > 3.0:
-            yield (
-                f"the pixels want an index of {model.interface.index_far:.4f} in place of {settings.index:g}, "
-                f"{abs(pull):.1f} times the error given: check the window, the {place} and the camera file{lens}"
+            yield finding(
+                "index_pulled",
+                index=model.interface.index_far,
+                given=settings.index,
+                times=abs(pull),
+                place=place,
+                remedy=lens,
             )
     pull = np.log(model.camera.lens.fx / prior.start.camera.lens.fx) / prior.lens_std[0]
     if fit.active[focal] and abs(pull) > 2.0:
-        yield (
-            f"the focal length came out {100.0 * (np.exp(pull * prior.lens_std[0]) - 1.0):+.0f} % from the camera "
-            f"file's, further than was expected ({100.0 * prior.lens_std[0]:.1f} %): give --focal-sigma 0.3 if "
-            "the file is a guess"
-        )
+        change = float(np.exp(pull * prior.lens_std[0]) - 1.0)
+        yield finding("focal_pulled", change=change, expected=prior.lens_std[0])
     if np.isfinite(prior.tilt_std) and prior.normal is not None:
         lean = float(np.arccos(np.clip(model.interface.normal @ prior.normal, -1.0, 1.0)))
         if lean > 3.0 * prior.tilt_std:
-            yield (
-                f"the pixels want the plane {np.degrees(lean):.2f} degrees tilted: the survey's axis may not be "
-                f"plumb; raise --tilt-sigma or level the survey{lens}"
-            )
+            yield finding("tilt_pulled", lean=float(np.degrees(lean)), remedy=lens)
 
 
-def _numbers(fit: Refined, seen: Observations) -> Iterator[str]:
+def _numbers(fit: Refined, seen: Observations) -> Iterator[Finding]:
     locations = len(np.unique(seen.location[fit.used]))
     if locations < 12:
-        yield (f"{locations} surveyed places: intervals from so few are rough; survey 20 or more")
+        yield finding("few_places", places=locations)
     if fit.noise.pixel > 1.5:
-        yield (
-            f"residuals of {fit.noise.pixel:.1f} px are larger than corners are usually found (0.1 to 0.5 px): check "
-            f"the camera file, or let the lens be fitted ({WHOLE_LENS})"
-        )
+        yield finding("residuals_large", residual=fit.noise.pixel, options=WHOLE_LENS)
     if fit.noise.scale > 2.0:
-        yield (
-            f"the survey seems {fit.noise.scale:.1f} times less exact than said "
-            f"({1000 * fit.noise.survey * fit.noise.scale:.1f} mm): measure again, or give --survey-sigma"
-        )
+        error = 1000.0 * fit.noise.survey * fit.noise.scale
+        yield finding("survey_rough", times=fit.noise.scale, error=error)
 
 
-def _left_out(fit: Refined, seen: Observations, surface: bool) -> Iterator[str]:
+def _left_out(fit: Refined, seen: Observations, surface: bool) -> Iterator[Finding]:
     """Rows that were left out: marks above the water that nobody called dry, and others."""
     above = _above(fit, seen)
     wrong = int((~fit.used & ~above).sum())
     if above.any():
-        names = [seen.names[i] for i in np.flatnonzero(above)]
-        where = "above the water found" if surface else "on the camera's side of the plane found"
-        one = len(names) == 1
-        yield (
-            f"{', '.join(names[:MOST_NAMES])}{', ...' if len(names) > MOST_NAMES else ''} "
-            f"{'lies' if one else 'lie'} {where}, and straight lines meet {'it' if one else 'them'}: mark "
-            f"{'it' if one else 'them'} dry (a column dry with yes), which makes the camera's place surer"
-        )
+        names = tuple(seen.names[i] for i in np.flatnonzero(above))
+        place = "above the water found" if surface else "on the camera's side of the plane found"
+        yield finding("marks_dry", marks=names, place=place)
     if wrong:
-        yield (
-            f"{wrong} {'more ' if above.any() else ''}row{'s were' if wrong > 1 else ' was'} left out as wrong: check "
-            "ids and coordinates"
-        )
+        yield finding("rows_wrong", rows=wrong)
 
 
 def _above(fit: Refined, seen: Observations) -> NDArray[np.bool_]:

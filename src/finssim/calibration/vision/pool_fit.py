@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Correlation, Estimate
 from finssim.calibration.vision.pool_advice import advice, estimates
 from finssim.calibration.vision.pool_model import (
@@ -38,7 +39,7 @@ from finssim.calibration.vision.pool_search import UP, Found, prior_of, search
 from finssim.calibration.vision.survey import Observations
 from finssim.geometry.optics import Lens
 
-__all__ = ["EXACT_LENS", "PoolFit", "calibrate_pool", "doubted"]
+__all__ = ["PoolFit", "calibrate_pool", "doubted"]
 
 Array = NDArray[np.float64]
 
@@ -82,8 +83,8 @@ class PoolFit:
     pinhole_held_out: HeldOut | None
     lens_fitted: tuple[str, ...]
     """Groups of `FITTED` that the lens gave up."""
-    notes: tuple[str, ...]
-    advice: tuple[str, ...]
+    findings: tuple[Finding, ...]
+    """The gravest first, then what is merely worth knowing."""
     minima: tuple[tuple[float, float], ...]
     """Other places where the search came to rest: residual over that of the best, clearance of the camera [m]."""
     touching: tuple[str, ...]
@@ -128,18 +129,15 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
     centre = seen.points[~seen.dry].mean(axis=0)
     here, told = seen.shifted(-centre), shifted_settings(settings, -centre)
     found = search(here, extended_lens(lens), told)
-    notes = list(seen.notes)
+    notes = list(seen.findings)
     fit = _best_lens(here, found, told, notes)
     level = abs(float(fit.model.interface.normal[2])) > np.cos(LEVEL)
     if level and not found.surface and settings.interface == "auto" and settings.plane is None:
-        found, notes = replace(found, surface=True), list(seen.notes)
+        found, notes = replace(found, surface=True), list(seen.findings)
         fit = _best_lens(here, found, told, notes)
     fit = _released(here, told, fit, notes)
     if found.surface and fit.model.interface.normal[2] < 0.0:
-        notes.append(
-            "the camera is on the -z side: the survey's z points down (or a flat survey is left-handed, which its "
-            "points cannot tell); heights and --z of other commands are meant in that frame"
-        )
+        notes.append(finding("camera_below"))
     pinhole = _pinhole(here, found, told, fit)
     normal = UP if found.surface else fit.model.interface.normal
     parts = [held_out(f, here, settings.folds, settings.seed, normal) for f in (fit, pinhole)]
@@ -162,8 +160,10 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
         pinhole_residual=residuals(pinhole.model, here)[0],
         pinhole_held_out=parts[1],
         lens_fitted=_lens_groups(fit.active),
-        notes=tuple(notes),
-        advice=tuple(advice(fit, here, found.surface, told, table, found.minima, touching, contradicted)),
+        findings=(
+            *advice(fit, here, found.surface, told, table, found.minima, touching, contradicted),
+            *notes,
+        ),
         minima=found.minima,
         touching=touching,
     )
@@ -177,7 +177,7 @@ def _refined(
     return refine(model, here, active, prior, noise, pixel_known=told.pixel_sigma is not None)
 
 
-def _best_lens(here: Observations, found: Found, told: Settings, notes: list[str]) -> Refined:
+def _best_lens(here: Observations, found: Found, told: Settings, notes: list[Finding]) -> Refined:
     """The fit as asked; where nobody asked, the lens is fitted as far as held-out points get better by it."""
     start = replace(found.model, interface=replace(found.model.interface, index_far=told.index))
 
@@ -202,10 +202,7 @@ def _best_lens(here: Observations, found: Found, told: Settings, notes: list[str
         if further < BETTER * error:
             best, error = other, further
     if groups := _lens_groups(best.active & ~active_names(told)):
-        notes.append(
-            f"the camera file does not fit these pixels: {', '.join(groups)} of the lens fitted here as well, because "
-            "points held out are met better so; a calibration of the camera by itself is worth more"
-        )
+        notes.append(finding("lens_refitted", groups=groups))
     return best
 
 
@@ -223,7 +220,7 @@ def _lens_groups(active: NDArray[np.bool_]) -> tuple[str, ...]:
     return tuple(group for group, name in named.items() if active[NAMES.index(name)])
 
 
-def _released(here: Observations, told: Settings, fit: Refined, notes: list[str]) -> Refined:
+def _released(here: Observations, told: Settings, fit: Refined, notes: list[Finding]) -> Refined:
     """Let the surface tilt freely where the pixels contradict a level one and nobody set how level it is."""
     if not np.isfinite(fit.prior.tilt_std) or told.tilt_sigma is not None or not fit.active[6]:
         return fit
@@ -232,11 +229,7 @@ def _released(here: Observations, told: Settings, fit: Refined, notes: list[str]
     if free is None or not _leans(free, fit.prior.normal):
         return fit
     lean = float(np.degrees(np.arccos(np.clip(free.model.interface.normal @ fit.prior.normal, -1.0, 1.0))))
-    notes.append(
-        f"the pixels contradict a plane along the survey's axis and want it {lean:.2f} degrees tilted: its "
-        "direction was fitted freely; the survey's z may not be plumb (a sloping floor taken for level), or the camera "
-        "file is off"
-    )
+    notes.append(finding("plane_tilted", lean=lean))
     return free
 
 
@@ -247,19 +240,16 @@ def _leans(free: Refined, normal: Array) -> bool:
     return lean < MOST_LEAN and error < lean / 3.0
 
 
-def _contradicted(here: Observations, told: Settings, fit: Refined) -> list[str]:
-    """A sentence where the pixels by themselves put the plane elsewhere than it was measured."""
+def _contradicted(here: Observations, told: Settings, fit: Refined) -> list[Finding]:
+    """A finding where the pixels by themselves put the plane elsewhere than it was measured."""
     if not told.known_depth or not fit.active[NAMES.index("depth")]:
         return []
     free = _without(here, told, fit, replace(fit.prior, depth_std=np.inf))
     if free is None:
         return []
     by = 1000.0 * (free.model.depth - fit.prior.depth)
-    where = "nearer to" if by > 0.0 else "further from"
-    return [
-        f"the pixels by themselves put the plane {abs(by):.0f} mm {where} the camera than it was measured, "
-        "which its error does not explain: check the tape, the survey's zero, the window and the camera file"
-    ]
+    sense = "nearer to" if by > 0.0 else "further from"
+    return [finding("plane_contradicted", distance=abs(by), sense=sense)]
 
 
 def _without(here: Observations, told: Settings, fit: Refined, loose: Prior) -> Refined | None:
@@ -316,19 +306,9 @@ MOST_ABOVE = 0.4
 MET = 4.0, 3.0
 """Residual of straight lines that meets a mark: so many residuals of the rest, and so many pixels more."""
 
-MOST_NAMES = 12
-"""Marks that a sentence names."""
-
-EXACT_LENS = (
-    "the lens is taken as exact, because neither the camera file nor the options tell its errors: if its focal length "
-    "or centre is off, the intervals of the camera's place are too narrow; a lens that was calibrated is usually known "
-    "to 0.3 % and 4 px, --focal-sigma 0.003 --center-sigma 4"
-)
-"""A note, not an alarm: what the intervals of most camera files rest on."""
-
 
 def doubted(fit: PoolFit, lens: Lens, *, lens_told: bool = True) -> PoolFit:
-    """The calibration with what speaks against it put before its advice.
+    """The calibration with what speaks against it put first.
 
     Args:
         fit: The calibration.
@@ -340,8 +320,8 @@ def doubted(fit: PoolFit, lens: Lens, *, lens_told: bool = True) -> PoolFit:
     """
     _refuse_depth(fit)
     found = [*_touching(fit), *_unmarked(fit, lens), *_handed(fit)]
-    exact = [] if lens_told or "focal" in fit.lens_fitted else [EXACT_LENS]
-    return replace(fit, advice=(*_straight(fit), *found, *fit.advice), notes=(*fit.notes, *exact))
+    exact = [] if lens_told or "focal" in fit.lens_fitted else [finding("lens_exact")]
+    return replace(fit, findings=(*_straight(fit), *found, *fit.findings, *exact))
 
 
 def _refuse_depth(fit: PoolFit) -> None:
@@ -369,7 +349,7 @@ def _told_depth(fit: PoolFit) -> tuple[float, str]:
     return 0.0, ""
 
 
-def _touching(fit: PoolFit) -> list[str]:
+def _touching(fit: PoolFit) -> list[Finding]:
     """Where the camera comes to rest on the plane, which it cannot pass; refused where that is absurd."""
     model, error = fit.model, rms(fit.residual[fit.used])
     if model.clearance >= TOUCHING * (model.clearance + max(model.depth, 0.0)) or error <= ODD:
@@ -380,13 +360,10 @@ def _touching(fit: PoolFit) -> list[str]:
             "the points so; check the unit and sign of the water's height, the window's thickness [m], the index, and "
             "whether there is water between at all; nothing is written"
         )
-    return [
-        f"the camera ends on the plane itself, with residuals of {error:.1f} px: the plane's place, the window, the "
-        "index or the camera file is wrong; do not use this pool file"
-    ]
+    return [finding("camera_on_plane", residual=error)]
 
 
-def _straight(fit: PoolFit) -> list[str]:
+def _straight(fit: PoolFit) -> list[Finding]:
     """Where straight lines foretell points better than refraction."""
     bent, straight = fit.held_out, fit.pinhole_held_out
     if bent is None or straight is None or len(bent.rows) < ENOUGH:
@@ -394,14 +371,10 @@ def _straight(fit: PoolFit) -> list[str]:
     errors = rms(bent.pixels), rms(straight.pixels)
     if not errors[1] < STRAIGHTER * errors[0]:
         return []
-    return [
-        f"straight lines meet held-out points better ({errors[1]:.2f} px) than refraction does ({errors[0]:.2f} px): "
-        "there is probably no water between camera and points, or the index, the window or the place given for the "
-        "plane is wrong; do not use this pool file under water"
-    ]
+    return [finding("straight_better", straight=errors[1], refraction=errors[0])]
 
 
-def _unmarked(fit: PoolFit, lens: Lens) -> list[str]:
+def _unmarked(fit: PoolFit, lens: Lens) -> list[Finding]:
     """Marks above the water that nobody called dry, for which the plane was put over them, or the lens bent."""
     seen, rows = fit.seen, _highest(fit)
     if not rows.any():
@@ -414,11 +387,13 @@ def _unmarked(fit: PoolFit, lens: Lens) -> list[str]:
     above = clearances(other.model, marks.points) + other.model.interface.thickness < 0.0
     if not (above & _met(other, marks)).all():
         return []
-    listed = ", ".join(marks.names[:MOST_NAMES]) + (", ..." if len(marks) > MOST_NAMES else "")
     return [
-        f"without {listed}, the plane is found {other.model.clearance:.2f} m from the camera in place of "
-        f"{fit.model.clearance:.2f} m, beyond them, and straight lines meet them: mark them dry (a column dry with "
-        "yes); do not use this pool file"
+        finding(
+            "marks_unmarked",
+            marks=marks.names,
+            clearance=other.model.clearance,
+            instead=fit.model.clearance,
+        )
     ]
 
 
@@ -445,7 +420,7 @@ def _met(fit: PoolFit, marks: Observations) -> NDArray[np.bool_]:
     return np.asarray(np.linalg.norm(off, axis=1) < times * rms(fit.residual[fit.used]) + more)
 
 
-def _handed(fit: PoolFit) -> list[str]:
+def _handed(fit: PoolFit) -> list[Finding]:
     """A flat survey whose z points down, or is left-handed: the same pixels, unless the water's height is told."""
     settings = fit.settings
     if not fit.surface or fit.model.interface.normal[2] > 0.0:
@@ -455,8 +430,4 @@ def _handed(fit: PoolFit) -> list[str]:
     values = np.linalg.svd(fit.seen.points - fit.seen.points.mean(axis=0), compute_uv=False)
     if values[2] >= FLAT * values[1]:
         return []
-    return [
-        "flat points cannot tell whether the survey's z points down or its x and y are left-handed (seen from the "
-        "camera, y to the right of x): it is taken for the first; if z points up, every height but theirs comes out "
-        "mirrored: negate y in the survey, or give --water-height, which tells the two apart"
-    ]
+    return [finding("handedness_open")]

@@ -20,6 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, sentences
 from finssim.calibration.fit import Correlation, Estimate
 from finssim.calibration.output.fit_figures import BLUE, GRAY, ORANGE
 from finssim.files import atomic_directory, atomic_write, refuse_unwritable
@@ -61,11 +62,20 @@ class Report:
     """Texts of an estimate, in the order of `HEADS`."""
     summary: Sequence[str]
     """The figures that say how good the calibration is, one sentence each."""
-    notes: Sequence[str]
-    advice: Sequence[str]
+    findings: Sequence[Finding]
     advice_title: str = "Advice"
     reading: str
     """What the intervals mean."""
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences worth knowing."""
+        return sentences(one for one in self.findings if one.severity == "note")
+
+    @property
+    def advice(self) -> list[str]:
+        """Sentences on what to do."""
+        return sentences(one for one in self.findings if one.severity != "note")
 
     def show(self, console: Console) -> None:
         """Print estimates, figures and advice; fits 100 columns."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.geometry.rotations import quat_from_euler, quat_rotate
 from finssim.localization.detection.detections import Frame, most_certain, read_detections
 from finssim.localization.detection.tags import corners
@@ -331,7 +332,7 @@ class Survey:
     """Fixed tags by id."""
     locations: dict[str, list[tuple[int | None, Placed]]] = field(default_factory=dict)
     """Image -> tags that lay there (id, or None for whichever was seen)."""
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 def read_survey(
@@ -366,11 +367,11 @@ def read_survey(
         raise CalibrationError(f"{table.path}: no column 'z': add it, or give the height of all points (--z)")
     if not {"id", "tag", "image"} & set(table.columns):
         raise CalibrationError(f"{table.path}: no column names the points: add id, tag or image")
-    notes: list[str] = []
+    findings: list[Finding] = []
     survey, lines, every = Survey(str(path)), {}, []
     for row in table.rows:
         if missing := row.missing("x", "y", *(["z"] if z is None else [])):
-            notes.append(f"{table.path}: line {row.line}: left out: {', '.join(missing)} is missing")
+            findings.append(finding("row_incomplete", table.path, line=row.line, missing=tuple(missing)))
             continue
         name, tag, here = _surveyed(table, row, edge, z)
         every.append(here.points)
@@ -391,7 +392,7 @@ def read_survey(
     if not every:
         raise CalibrationError(f"{path}: no surveyed point in it: give rows of id,x,y,z")
     table.refuse_other_units(np.ptp(np.concatenate(every), axis=0).max())
-    return replace(survey, notes=tuple(notes))
+    return replace(survey, findings=tuple(findings))
 
 
 def _surveyed(table: Table, row: Row, edge: float | None, z: float | None) -> tuple[str, int | None, Placed]:
@@ -432,7 +433,7 @@ class Observations:
     """Displacement of the point by a turn of its location about z [m/rad], (N, 3); zero for single points."""
     dry: NDArray[np.bool_]
     """On the camera's side of the plane, (N,)."""
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     def __len__(self) -> int:
         return len(self.points)
@@ -475,7 +476,9 @@ def observe(inputs: Sequence[Path], survey: Survey, *, family: str | None = None
         (tables if is_table else pictures).append(path)
     for path in tables:
         if _is_detections(path):
-            _match_frames(rows, read_detections(path, rows.notes), survey)
+            remarks: list[str] = []
+            _match_frames(rows, read_detections(path, remarks), survey)
+            rows.findings += [finding("as_read", remark=remark) for remark in remarks]
         else:
             _match_table(rows, read_table(path), survey)
     if pictures:
@@ -508,8 +511,11 @@ def observe_combined(
             new = row.placed(name, row.position(z)[None])
             placed = points.setdefault((name, *new.points[0].tolist()), new)
             rows.add(_Match(row.words.get("image", ""), name, placed, 0, row.pixel))
-        lost = [row.line for row in table.rows if row.missing(*needed)]
-        rows.notes += [f"{path}: line {line}: left out: a number is missing" for line in lost]
+        rows.findings += [
+            finding("row_incomplete", str(path), line=row.line, missing=tuple(missing))
+            for row in table.rows
+            if (missing := row.missing(*needed))
+        ]
     return rows.observations(", ".join(map(str, paths)), None)
 
 
@@ -527,20 +533,19 @@ class _Rows:
     """Matches as they are gathered."""
 
     def __init__(self) -> None:
-        self.notes: list[str] = []
+        self.findings: list[Finding] = []
         self.unknown: dict[str, None] = {}
         self._matches: dict[tuple[object, ...], _Match] = {}
 
     def add(self, match: _Match) -> None:
         key = (match.image, id(match.placed), match.corner, *match.pixel.tolist())
         if key in self._matches:
-            self.notes.append(f"{match.name} is there twice with the same pixel: counted once")
+            self.findings.append(finding("counted_twice", match.name))
         self._matches.setdefault(key, match)
 
     def observations(self, source: str, survey: Survey | None) -> Observations:
         if self.unknown:
-            listed = ", ".join(list(self.unknown)[:8]) + (", ..." if len(self.unknown) > 8 else "")
-            self.notes.append(f"not in the survey, so left out: {listed}")
+            self.findings.append(finding("not_surveyed", names=tuple(self.unknown)))
         matches = list(self._matches.values())
         if not matches:
             known = [] if survey is None else [*survey.points, *map(str, survey.tags), *survey.locations]
@@ -566,7 +571,7 @@ class _Rows:
             sigma=np.array([m.placed.sigma for m in matches]),
             arm=np.stack([m.placed.arm(m.corner) for m in matches]),
             dry=np.array([m.placed.dry for m in matches]),
-            notes=(*(survey.notes if survey else ()), *self.notes),
+            findings=(*(survey.findings if survey else ()), *self.findings),
         )
 
 
@@ -615,7 +620,7 @@ def _match_table(rows: _Rows, table: Table, survey: Survey) -> None:
         if placed is None:
             rows.unknown[name or f"line {row.line}"] = None
         elif row.missing("u", "v"):
-            rows.notes.append(f"{table.path}: line {row.line}: left out: {name} has no pixel")
+            rows.findings.append(finding("pixel_missing", table.path, line=row.line, point=name))
         else:
             rows.add(_Match(row.words.get("image", ""), name, placed, corner, row.pixel))
 
