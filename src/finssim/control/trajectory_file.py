@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy.typing as npt
 from finssim.control.errors import ControlError
 from finssim.control.trajectories import Trajectory
 from finssim.control.trajectory_shapes import SHAPES, Motion, hermite
+from finssim.text_table import read_text_table
 from finssim.yaml_file import read_mapping
 
 __all__ = ["read_trajectory", "through_points"]
@@ -110,15 +110,10 @@ def _number(data: Mapping[str, Any], key: str, otherwise: float) -> float:
 
 
 def _rows_of_table(path: Path) -> list[list[str]]:
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = [row for row in csv.reader(file) if row]
-    except (OSError, UnicodeDecodeError) as error:
-        raise ControlError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    header = tuple(cell.strip() for cell in rows[0]) if rows else ()
-    if header not in (COLUMNS, COLUMNS[:4]):
-        raise ControlError(f"its header is '{','.join(header)}', expected t,x,y,z or t,x,y,z,yaw")
-    return rows[1:]
+    table = read_text_table(path, ControlError)
+    if tuple(table.names) not in (COLUMNS, COLUMNS[:4]):
+        raise ControlError(f"its header is '{','.join(table.names)}', expected t,x,y,z or t,x,y,z,yaw")
+    return table.rows
 
 
 def _checked_points(points: Any) -> Array:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import math
 import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ from finssim.calibration.actuators.table_signs import check_pulses, signed, with
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding
 from finssim.calibration.trials.trial import Trial
+from finssim.text_table import TextTable, read_text_table
 
 __all__ = ["ThrustTable", "read_table", "tables_of_trial"]
 
@@ -170,40 +170,22 @@ def _table(
 
 def _cells(path: Path, shown: str) -> tuple[list[str], Array]:
     """Headers and numbers of a file; a second header line of units is joined to the first."""
-    try:
-        raw = path.read_bytes()
-    except OSError as error:
-        raise CalibrationError(f"{shown}: cannot be read: {error.strerror}") from None
-    try:
-        text = raw.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = raw.decode("latin-1")
-    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    if len(lines) < 2:
+    table = read_text_table(path, CalibrationError)
+    headers, rows = table.names, table.rows
+    if not rows:
         raise CalibrationError(f"{shown}: no rows below a header line: give a CSV table of speeds and forces")
-    separator = max(",;\t", key=lines[0].count)
-    cells = list(csv.reader(io.StringIO("\n".join(lines)), delimiter=separator, skipinitialspace=True))
-    headers, rows = cells[0], cells[1:]
-    if all(math.isfinite(_number(cell, separator)) for cell in headers):
+    if not any(math.isnan(_number(table, cell)) for cell in headers):
         raise CalibrationError(
             f"{shown}: the first line holds numbers, expected a header line that names the columns"
         )
-    if not any(math.isfinite(_number(cell, separator)) for cell in rows[0]):
-        headers = [
-            f"{h} ({u.strip(' ()[]')})" if u.strip() else h for h, u in zip(headers, rows[0], strict=False)
-        ]
-        rows = rows[1:]
+    if all(math.isnan(_number(table, cell)) for cell in rows[0]):
+        units = [unit.strip(" ()[]") for unit in rows.pop(0)][: len(headers)]
+        headers = [f"{h} ({u})" if u else h for h, u in zip_longest(headers, units, fillvalue="")]
     width = len(headers)
-    filled = [(row + [""] * width)[:width] for row in rows]
-    numbers = np.array([[_number(cell, separator) for cell in row] for row in filled], dtype=np.float64)
-    return headers, numbers.reshape(-1, width)
+    numbers = [[_number(table, cell) for cell in (row + [""] * width)[:width]] for row in rows]
+    return headers, np.array(numbers, dtype=np.float64).reshape(-1, width)
 
 
-def _number(cell: str, separator: str) -> float:
-    text = cell.strip().replace("−", "-")
-    if separator != ",":
-        text = text.replace(",", ".")
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
+def _number(table: TextTable, cell: str) -> float:
+    value = table.number(cell)
+    return math.nan if value is None else value

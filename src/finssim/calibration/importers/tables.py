@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +37,8 @@ def read_table(path: Path, source: SourceMap | None) -> Stream:
         CalibrationError: Unreadable, or a column that it has not.
     """
     shown = path.name
-    table = _rows(path, source or SourceMap())
+    how = source or SourceMap()
+    table = table_file.read_table(path, skip=how.skip_rows, names=how.names, spaces=how.spaces)
     findings = tuple(one.about(shown) for one in table.findings)
     if source is None:
         source = _by_names(table, shown)
@@ -71,26 +71,6 @@ def values_of(raw: Array, name: str, spec: ColumnSource) -> Array:
 def spoken(words: Iterable[str], phase: PhaseColumn) -> NDArray[np.str_]:
     """Words of the log as phases."""
     return np.array([phase.words.get(word, "") if phase.words else word for word in words], dtype=np.str_)
-
-
-def _rows(path: Path, source: SourceMap) -> table_file.Table:
-    """The table; a text file that needs it is rewritten with a line of names and commas first."""
-    if not (source.names or source.skip_rows or source.spaces) or path.suffix in (".parquet", ".pq"):
-        return table_file.read_table(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be read: {error.strerror or error}") from None
-    body = text.split("\n", source.skip_rows)[-1]
-    if source.spaces:
-        body = re.sub(r"[^\S\n]+", ",", re.sub(r"(?m)^[^\S\n]+|[^\S\n]+$", "", body))
-    if source.names:
-        separator = max(",;\t", key=body.split("\n", 1)[0].count)
-        body = separator.join(source.names) + "\n" + body
-    with TemporaryDirectory() as folder:
-        rewritten = Path(folder) / path.with_suffix(".csv").name
-        rewritten.write_text(body, encoding="utf-8")
-        return table_file.read_table(rewritten)
 
 
 def _by_names(table: table_file.Table, shown: str) -> SourceMap:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from collections.abc import Sequence
@@ -20,6 +19,8 @@ from finssim.localization.detection.detections import Frame, most_certain, read_
 from finssim.localization.detection.tags import corners
 from finssim.localization.errors import LocalizationError
 from finssim.localization.fields import Fields
+from finssim.text_table import TextTable, read_text, read_text_table, text_table
+from finssim.text_table import number as _number
 from finssim.yaml_file import read_mapping
 
 __all__ = ["Observations", "observe", "observe_combined", "read_survey"]
@@ -59,6 +60,8 @@ _ALIASES = {
 """Standard name of a column -> what people call it, without case, blanks and signs."""
 
 _BY_WORD = {word: name for name, words in _ALIASES.items() for word in words.split()}
+
+COMMENT = ("#", "%", "//")
 
 _UNIT_AT_END = re.compile(r"[\s_]*[\[(]\s*([^\])]*?)\s*[\])]\s*$|_(m|cm|mm|in|inch|ft|deg|rad|px)$")
 _UNIT_COMMENT = re.compile(
@@ -139,45 +142,40 @@ def read_table(path: str | Path, *, unit: str | None = None) -> Table:
     Raises:
         CalibrationError: Unreadable, no header, a cell that must be a number is none; names the line.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
-        raise CalibrationError(f"cannot read {path}: {error.strerror or error}") from error
-    lines = [(i, line.strip()) for i, line in enumerate(text.splitlines(), start=1) if line.strip()]
-    said = next((m[1].lower() for _, line in lines if (m := _UNIT_COMMENT.match(line))), None)
-    comments = [line for _, line in lines if line.startswith(("#", "%", "//"))]
-    lines = [(i, line) for i, line in lines if not line.startswith(("#", "%", "//"))]
-    if lines and comments and _known(lines[0][1]) < 2:  # the header itself may be behind a comment sign
-        head = max((line.lstrip("#%/ ") for line in comments), key=_known)
-        lines = [(0, head), *lines] if _known(head) >= 2 else lines
-    if not lines:
-        what = "holds nothing but comments" if comments else "is empty"
+    text, _ = read_text(path, CalibrationError)
+    table = text_table(text, spaces=None, comment=COMMENT)
+    heads = [text_table(line.lstrip("#%/ "), spaces=None).names for line in table.comments]
+    if heads and table.names and _known(table.names) < 2:  # the header itself may be behind a comment sign
+        head = max(heads, key=_known)
+        if _known(head) >= 2:
+            table = text_table(text, names=head, spaces=None, comment=COMMENT)
+    if not table.names:
+        what = "holds nothing but comments" if table.comments else "is empty"
         raise CalibrationError(
             f"{path}: the file {what}: expected a line of names, such as id,x,y,z, and rows"
         )
-    if _is_numeric(lines[0][1]):
+    if all(_number(cell) is not None for cell in table.names):
         raise CalibrationError(
             f"{path}: the first line is no header: name the columns, such as id,x,y,z or u,v,x,y,z"
         )
-    default = "m" if said and said.startswith("met") else said or unit
-    return _table(str(path), lines, default)
+    said = next((m[1].lower() for line in table.comments if (m := _UNIT_COMMENT.match(line))), None)
+    return _table(str(path), table, "m" if said and said.startswith("met") else said or unit)
 
 
-def _table(path: str, lines: list[tuple[int, str]], default: str | None) -> Table:
-    split = _splitter(lines[0][1])
-    heads = [_column(word) for word in split(lines[0][1])]
+def _table(path: str, text: TextTable, default: str | None) -> Table:
+    heads = [_column(word) for word in text.names]
     names = [name for name, _ in heads]
     twice = sorted({name for name in names if name and names.count(name) > 1})
     if twice:
         raise CalibrationError(f"{path}: two columns mean '{twice[0]}': leave one of them")
     united = default is not None or any(unit in UNITS for _, unit in heads)
-    cells = [(i, split(line)) for i, line in lines[1:]]
+    cells = text.rows
     factors = [
-        _factor(name, unit, default, [c[k] for _, c in cells if k < len(c)])
+        _factor(name, unit, default, [c[k] for c in cells if k < len(c)])
         for k, (name, unit) in enumerate(heads)
     ]
     rows = []
-    for i, words in cells:
+    for i, words in zip(text.lines, cells, strict=True):
         columns = [(n, w, f) for n, w, f in zip(names, words, factors, strict=False) if n and w]
         numbers = {n: x * f for n, w, f in columns if (x := _number(w)) is not None and math.isfinite(x)}
         row = Row(i, {n: w for n, w, _ in columns}, numbers)
@@ -191,7 +189,7 @@ def _check(path: str, row: Row) -> None:
     """Refuse words where numbers belong; an empty cell or NaN is a missing number, which is the reader's affair."""
     for name in ("u", "v", *LENGTHS, *ANGLES):
         word = row.words.get(name, "0")
-        if _number(word) is None and word.lower() not in ("none", "null", "na", "n/a", "-"):
+        if _number(word) is None:
             raise CalibrationError(
                 f"{path}: line {row.line}: {name} is '{word}', expected a number: the whole file is refused; correct "
                 "the cell, or empty it to have the row left out"
@@ -226,27 +224,9 @@ def _factor(name: str, unit: str, default: str | None, words: list[str]) -> floa
     return 1.0
 
 
-def _splitter(head: str):  # type: ignore[no-untyped-def]
-    for mark in ("\t", ";", ","):
-        if mark in head:
-            return lambda line: [cell.strip() for cell in next(csv.reader([line], delimiter=mark))]
-    return str.split
-
-
-def _known(head: str) -> int:
-    """How many columns of a line of names mean something here."""
-    return sum(bool(_column(word)[0]) for word in _splitter(head)(head))
-
-
-def _number(word: str) -> float | None:
-    try:
-        return float(word)
-    except ValueError:
-        return None
-
-
-def _is_numeric(line: str) -> bool:
-    return all(_number(word) is not None for word in re.split(r"[,;\s]+", line.strip()) if word)
+def _known(names: Sequence[str]) -> int:
+    """How many column names mean something here."""
+    return sum(bool(_column(word)[0]) for word in names)
 
 
 # Tags on one board, surveyed as a whole: a YAML file that says where the first lies and how the others follow.
@@ -576,14 +556,8 @@ class _Rows:
 
 
 def _is_detections(path: Path) -> bool:
-    try:
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
-        raise CalibrationError(f"cannot read {path}: {error.strerror or error}") from error
-    head = next(
-        (line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), ""
-    )
-    plain = {re.sub(r"[\s\"']", "", cell).lower() for cell in re.split(r"[,;\t]", head)}
+    names = read_text_table(path, CalibrationError).names
+    plain = {re.sub(r"[\s\"']", "", name).lower() for name in names}
     numbered = [cell for cell in plain if re.search(r"\d", cell) and re.search(r"[uvxy]", cell)]
     return plain >= {"u0", "v0", "u3", "v3"} or len(numbered) >= 8
 
