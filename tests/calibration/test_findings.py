@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import finssim
-from finssim.calibration.findings import SENTENCES, SEVERITIES, finding, sentences
+from finssim.calibration.findings import SEVERITIES, finding, sentences, wordings
 
 SOURCE = Path(finssim.__file__).parent
 
@@ -32,12 +32,12 @@ def producers() -> dict[str, list[tuple[str, set[str] | None]]]:
 
 def fields(code: str) -> set[str]:
     """Names that the sentence of a code fills in."""
-    return {name for _, name, _, _ in string.Formatter().parse(SENTENCES[code][1]) if name}
+    return {name for _, name, _, _ in string.Formatter().parse(wordings()[code][1]) if name}
 
 
 def test_every_code_is_worded_and_used():
-    assert set(producers()) == set(SENTENCES)
-    assert {severity for severity, _ in SENTENCES.values()} == set(SEVERITIES)
+    assert set(producers()) == set(wordings())
+    assert {severity for severity, _ in wordings().values()} == set(SEVERITIES)
 
 
 def test_a_sentence_names_exactly_what_its_producers_give():
