@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 __all__ = [
+    "HEADS",
+    "estimate_rows",
     "file_number",
     "fit_json",
     "interval_text",
@@ -29,6 +31,8 @@ __all__ = [
     "quality_text",
     "state_text",
 ]
+
+HEADS = ("parameter", "estimate", "95 % interval", "unit", "file had", "state")
 
 QUALITY = {
     "r2": "R²",
@@ -92,22 +96,14 @@ def print_fit(fit: Fit, vehicle: Vehicle, console: Console, findings: Sequence[F
     """
     console.print(f"{fit.vehicle.name}: {vehicle.calibrations[-1].sentence()}", highlight=False, markup=False)
     table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("parameter", "estimate", "95 % interval", "unit", "file had", "state"):
+    for heading in HEADS:
         right = heading in ("estimate", "file had")
         table.add_column(heading, justify="right" if right else "left", overflow="fold")
     notes: dict[str, list[str]] = {}
-    for name, estimate in fit.estimates.items():
-        table.add_row(
-            escape(name),
-            number_text(estimate.estimate),
-            interval_text(estimate),
-            escape(estimate.unit),
-            number_text(file_number(estimate, fit.vehicle)),
-            state_text(estimate, fit, vehicle),
-            style="" if estimate.identifiable else "yellow",
-        )
+    for row, estimate in zip(estimate_rows(fit, vehicle), fit.estimates.values(), strict=True):
+        table.add_row(*map(escape, row), style="" if estimate.identifiable else "yellow")
         if estimate.note:
-            notes.setdefault(estimate.note, []).append(name)
+            notes.setdefault(estimate.note, []).append(row[0])
     console.print(table)
     for what, figures in fit.quality.items():
         console.print(f"  {what}: {quality_text(figures, whole=False)}", highlight=False, markup=False)
@@ -115,6 +111,21 @@ def print_fit(fit: Fit, vehicle: Vehicle, console: Console, findings: Sequence[F
         console.print(f"· {', '.join(names)}: {note}", highlight=False, markup=False)
     for sentence in sentences(findings):
         console.print(f"! {sentence}", highlight=False, markup=False, style="yellow")
+
+
+def estimate_rows(fit: Fit, vehicle: Vehicle) -> list[tuple[str, ...]]:
+    """Texts of the table of estimates, in the order of `HEADS`."""
+    return [
+        (
+            name,
+            number_text(e.estimate),
+            interval_text(e),
+            e.unit,
+            number_text(file_number(e, fit.vehicle)),
+            state_text(e, fit, vehicle),
+        )
+        for name, e in fit.estimates.items()
+    ]
 
 
 def number_text(value: float | None) -> str:

@@ -17,11 +17,11 @@ from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.output.calibrate import all_findings, calibrated, kept
 from finssim.calibration.output.fit_output import fit_json, print_fit
-from finssim.calibration.output.report import FIT_FILE, write_report
-from finssim.calibration.output.vehicle_file import check_vehicle_path, write_vehicle
+from finssim.calibration.output.publish import command_line, publish, refuse_places
+from finssim.calibration.output.report import write_report
+from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.calibration.vision.least_squares import Pose
 from finssim.calibration.vision.mount_log import MountLog, read_mount_log
-from finssim.calibration.vision.report import command_line, publish
 from finssim.calibration.vision.sensor_mounts import (
     UNSURE_TURN,
     Attitude,
@@ -41,7 +41,6 @@ from finssim.calibration.vision.tag_mounts import (
     reference_tag,
     residuals,
 )
-from finssim.files import atomic_directory, atomic_write, refuse_unwritable
 from finssim.geometry.rotations import (
     matrix_to_quat,
     quat_conjugate,
@@ -420,9 +419,7 @@ def run(
     """
     if isinstance(turns_about, str):
         turns_about = _three(turns_about)
-    refuse_unwritable(atomic_write(check_vehicle_path(out)))
-    if report is not None:
-        refuse_unwritable(atomic_directory(report, replaces=FIT_FILE))
+    refuse_places(out, report, "vehicle")
     where, body = load_pool(pool), load_vehicle(vehicle)
     recording = read_mount_log(log, where, body)
     fit = calibrate_mounts(

@@ -15,20 +15,18 @@ from numpy.typing import NDArray
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Estimate
 from finssim.calibration.output.fit_figures import BLUE, ORANGE, draw_correlation, new_figure, png
+from finssim.calibration.output.publish import command_line, publish, refuse_places
 from finssim.calibration.vision.pool_fit import PoolFit, calibrate_pool, doubted
 from finssim.calibration.vision.pool_model import Settings
 from finssim.calibration.vision.pool_refine import HeldOut, rms
 from finssim.calibration.vision.report import (
     AS_GIVEN,
     Report,
-    command_line,
     correlation_json,
     draw_arrows,
     picture_axes,
     plain,
     plain_axes,
-    publish,
-    refuse_places,
 )
 from finssim.calibration.vision.survey import Observations, observe, observe_combined, read_survey
 from finssim.geometry.optics import Layer
