@@ -111,7 +111,6 @@ HOMES = {
     "matplotlib": {
         "calibration/output/fit_figures.py",
         "calibration/replay/figure.py",
-        "calibration/actuators/thruster_figure.py",
         "calibration/vision/camera_command.py",
         "calibration/vision/pool_command.py",
         "calibration/vision/report.py",

@@ -21,9 +21,9 @@ from finssim.calibration.fit import Fit
 from finssim.calibration.output.calibrate import calibrated
 from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.calibration.regression.regress import regress
-from finssim.calibration.replay.as_json import DEFINITION
 from finssim.calibration.replay.figure import MODEL_LABELS, draw_response_envelopes
 from finssim.calibration.replay.replay import Replay, replay
+from finssim.calibration.replay.report import DEFINITION
 from finssim.calibration.trials.trial import Trial
 from finssim.engine import Simulator, TetherLine
 from finssim.experiments.campaign import Say, write_json

@@ -7,8 +7,8 @@ import pytest
 
 from calibration.made_steps import RPM, held, lagged, sampled, step_log
 from finssim.calibration.actuators.motor import fit_motor
-from finssim.calibration.actuators.motor_steps import cut_steps
 from finssim.calibration.actuators.motor_study import fit_response
+from finssim.calibration.actuators.motor_trial import cut_steps
 from finssim.calibration.actuators.steps import find_steps, levels
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation.programmes import programmes

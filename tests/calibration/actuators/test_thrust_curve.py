@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from finssim.calibration.actuators.thrust_curve import dead_zone, fit_side
 from finssim.calibration.actuators.thrust_table import read_table
 from finssim.calibration.actuators.thruster import fit_thruster
-from finssim.calibration.actuators.thruster_figure import draw_thruster
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import check_vehicle, load_vehicle
@@ -362,18 +361,6 @@ def test_a_limit_of_the_vehicle_file_stays_where_the_table_does_not_reach_it(tmp
 def test_names_that_the_vehicle_does_not_have_are_refused(arguments, said):
     with pytest.raises(CalibrationError, match=said):
         fit_thruster([AT_16_V], FINSROV, **arguments)
-
-
-def test_the_picture_shows_curve_residual_and_every_voltage(tmp_path):
-    figure = draw_thruster(fit_thruster([ALL_VOLTAGES], BLUEROV2, voltage=16.0))
-    thrust, residual, speed = figure.axes
-    assert max(abs(line.get_ydata()).max() for line in residual.lines) < 1.2, "newtons of misfit at 16 V"
-    assert [text.get_text() for text in speed.get_legend().get_texts()] == [
-        f"{v} V" for v in (10, 12, 14, 16, 18, 20)
-    ]
-    assert thrust.get_ylabel() == "thrust [N]"
-    with pytest.raises(CalibrationError, match="holds no 'T100': it has T200"):
-        draw_thruster(fit_thruster([AT_16_V], BLUEROV2), "T100")
 
 
 def test_the_same_table_twice_is_refused():

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from finssim.calibration.actuators.motor_steps import NRMSE, unit_response
 from finssim.calibration.actuators.motor_study import Study, study
-from finssim.calibration.actuators.motor_trial import thrusters_of
+from finssim.calibration.actuators.motor_trial import NRMSE, thrusters_of, unit_response
 from finssim.calibration.actuators.speed_report import LOOP_RATE, loop_of
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding

@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.actuators.motor_steps import OVERSHOOT
 from finssim.calibration.actuators.motor_study import Study
+from finssim.calibration.actuators.motor_trial import OVERSHOOT
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Estimate
 from finssim.vehicles import Vehicle
 
-__all__ = ["Loop", "LoopPlant", "loop_of", "simulate_step", "tune"]
+__all__ = ["Loop", "LoopPlant", "loop_of", "simulate_step", "tune", "LOOP_RATE"]
 
 # A motor controller's speed loop, feed-forward plus PID, tuned from an identified response and tried on it.
 #

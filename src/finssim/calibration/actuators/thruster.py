@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.actuators.table_signs import STANDING
-from finssim.calibration.actuators.thrust_table import ThrustTable, read_table, tables_of_trial
+from finssim.calibration.actuators.thrust_table import STANDING, ThrustTable, read_table, tables_of_trial
 from finssim.calibration.actuators.thruster_bench import SIDES, Bench, bench
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding

@@ -10,7 +10,6 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.actuators.table_signs import STANDING
 from finssim.calibration.actuators.thrust_curve import (
     DeadZone,
     Side,
@@ -19,7 +18,7 @@ from finssim.calibration.actuators.thrust_curve import (
     jackknife,
     t_quantile,
 )
-from finssim.calibration.actuators.thrust_table import ThrustTable
+from finssim.calibration.actuators.thrust_table import STANDING, ThrustTable
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding, sentences
 from finssim.vehicles import Esc

@@ -10,10 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from finssim.calibration.check.inputs import input_findings
-from finssim.calibration.check.report import AxisReport, TrialReport
-from finssim.calibration.check.streams import stream_reports
-from finssim.calibration.check.tells import with_tells
+from finssim.calibration.check.report import AxisReport, StreamReport, Told, TrialReport
 from finssim.calibration.check.together import together
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
@@ -27,14 +24,391 @@ from finssim.calibration.motion.attitude_signal import (
 from finssim.calibration.motion.signals import Motion, motion
 from finssim.calibration.motion.smoothing import longest_step, smooth
 from finssim.calibration.motion.synchronisation import Offset, stream_offsets
-from finssim.calibration.trials.columns import NU, TAU
 from finssim.calibration.trials.inputs import Drive, drive
-from finssim.calibration.trials.trial import Array, Trial
+from finssim.calibration.trials.trial import COLUMNS, NU, TAU, Array, Trial, column_of
 from finssim.calibration.trials.trial_files import load_trial, trials_at
 from finssim.geometry.rotations import quat_rotate, quat_to_euler
 from finssim.vehicles import AXES, Vehicle, VehicleError, load_vehicle
 
 __all__ = ["check", "check_trials"]
+
+# Sampling of a trial's columns: rates, gaps, jitter, values that stick, hold or clip.
+
+LONGEST_MISSING = 0.2
+"""Part of a trial without a stream above which care is needed."""
+
+SHORTEST_TRIAL = 1.0
+"""[s]"""
+
+STUCK = 1.0
+"""Time of equal values of a moving sensor that is suspicious [s]."""
+
+FLYING = 0.3
+"""Height above the surface that no vehicle reaches [m]: the log has another zero."""
+
+COARSE = 50.0
+"""Steps of resolution that a signal must span for equal values to mean something."""
+
+FEW_HERTZ = 4.0
+"""Rate below which the motion between samples is not seen [Hz]."""
+
+
+def stream_reports(trial: Trial) -> tuple[list[StreamReport], list[Finding]]:
+    """Columns by the times they share, and what is wrong with their sampling."""
+    shared: dict[bytes, list[str]] = {}
+    for name in trial.channels:
+        if trial.has(name):
+            column = column_of(name)
+            group = column.group if column else ""
+            kind = f"{group} {name.split('_')[0]}" if group == "command" else group
+            key = np.isfinite(trial.channels[name]).tobytes() + kind.encode()
+            shared.setdefault(key, []).append(name)
+    reports, findings = [], []
+    if trial.duration < SHORTEST_TRIAL:
+        findings.append(finding("too_short", duration=trial.duration, least=SHORTEST_TRIAL))
+    of: dict[Finding, list[str]] = {}
+    for names in shared.values():
+        report = _report(trial, tuple(names))
+        reports.append(report)
+        for one in _sampling(report):
+            of.setdefault(one, []).extend(names)
+        for name in names:
+            for one in _values(trial, name):
+                of.setdefault(one, []).append(name)
+    findings += [one.about(_shown(columns)) for one, columns in of.items()]
+    few = [name for name in trial.channels if not trial.has(name)]
+    if few:
+        findings.append(finding("few_samples", columns=tuple(few)))
+    findings += trial.findings
+    return sorted(reports, key=lambda r: (r.group != "command", r.group)), findings
+
+
+def _report(trial: Trial, names: tuple[str, ...]) -> StreamReport:
+    t, _ = trial.series(names[0])
+    steps = np.diff(t)
+    usual = float(np.median(steps))
+    longest = max(0.5, 4.0 * usual)
+    within = steps[steps <= longest]  # half of them at least
+    column = column_of(names[0])
+    silent = float(steps[steps > longest].sum()) + (t[0] - trial.t[0]) + (trial.t[-1] - t[-1])
+    return StreamReport(
+        columns=names,
+        group=column.group if column else "",
+        samples=len(t),
+        rate=float(1.0 / within.mean()),
+        jitter=float(np.std(within) / within.mean()),
+        gaps=int((steps > longest).sum()),
+        longest_gap=float(steps.max()),
+        missing=float(silent / trial.duration) if trial.duration > 0.0 else 0.0,
+    )
+
+
+def _sampling(report: StreamReport) -> list[Finding]:
+    """What is wrong with the times of a stream."""
+    found = []
+    much = report.missing > LONGEST_MISSING
+    if report.gaps == 1:
+        found.append(finding("gap", severity="care" if much else "note", longest=report.longest_gap))
+    elif report.gaps:
+        severity = "care" if much else None
+        found.append(finding("gaps", severity=severity, gaps=report.gaps, longest=report.longest_gap))
+    elif much:
+        found.append(finding("ends_missing", share=report.missing))
+    if report.jitter > 0.5:
+        found.append(finding("jitter", share=report.jitter))
+    if report.rate < FEW_HERTZ and report.group in ("velocity", "rates"):
+        found.append(finding("slow", rate=report.rate))
+    return found
+
+
+def _shown(columns: list[str]) -> str:
+    return ", ".join(columns[:4]) + (f" and {len(columns) - 4} more" if len(columns) > 4 else "")
+
+
+def _values(trial: Trial, name: str) -> list[Finding]:
+    """Stuck, held and clipped values of a measurement."""
+    column = COLUMNS.get(name)
+    if column is None or column.group == "command":
+        return []
+    t, y = trial.series(name)
+    if len(y) < 20:
+        return []
+    if np.ptp(y) == 0.0:
+        return [finding("constant", value=y[0])]
+    if _coarse(y):
+        return []
+    found = []
+    if name in ("z", "depth") and (above := float(np.percentile(y if name == "z" else -y, 99.0))) > FLYING:
+        found.append(
+            finding("above_surface", height=above, column=name)
+            if name == "z"
+            else finding("depth_above_surface", height=above)
+        )
+    begins = np.flatnonzero(np.concatenate([[True], np.diff(y) != 0.0]))
+    lengths = np.diff(np.concatenate([begins, [len(y)]]))
+    usual = float(np.median(lengths))
+    rate = 1.0 / float(np.median(np.diff(t)))
+    if usual >= 2.0:
+        found.append(finding("values_held", rows=usual, rate=rate / usual, row_rate=rate))
+    longest = int(np.argmax(lengths))
+    span = float(t[min(begins[longest] + lengths[longest], len(t) - 1)] - t[begins[longest]])
+    if span > STUCK and lengths[longest] > 10.0 * usual:
+        at = begins[longest]
+        found.append(finding("stuck", value=y[at], span=span, start=t[at]))
+    for extreme, highest in ((y.max(), True), (y.min(), False)):
+        # A signal that passes through its extreme touches it once.
+        runs = lengths[y[begins] == extreme]
+        if runs.sum() >= max(10.0, 0.02 * len(y)) and runs.max() >= 4.0 * usual:
+            at_limit = {"value": extreme, "samples": runs.sum()}
+            found.append(
+                finding("clipped_above", **at_limit) if highest else finding("clipped_below", **at_limit)
+            )
+    return found
+
+
+def _coarse(y: Array) -> bool:
+    """Whether a signal moves over so few steps of its resolution that it repeats values by itself."""
+    steps = np.abs(np.diff(np.unique(y)))
+    return bool(np.ptp(y) < COARSE * steps.min())
+
+
+# Inputs of a trial against the limits of its vehicle.
+
+OFTEN = 0.05
+"""Part of the driven time at a limit above which care is needed."""
+
+
+def input_findings(trial: Trial, vehicle: Vehicle, inputs: Drive) -> list[Finding]:
+    """What was assumed of the inputs, time at the limits, in the dead zones and beyond what the thrusters can give."""
+    found = list(inputs.findings)
+    if inputs.source == "passive":
+        return found
+    if not np.any(inputs.force):
+        return [*found, finding("pulses_dead") if inputs.source == "pwm" else finding("inputs_zero")]
+    found += _wrench_beyond(vehicle, inputs) if not inputs.thrusters else _thrusters(trial, vehicle, inputs)
+    if inputs.end is not None:
+        rest = trial.t[-1] - inputs.end
+        found.append(finding("inputs_end", rest=rest, end=inputs.end - trial.t[0]))
+    if inputs.source == "pwm" and not trial.has("voltage") and trial.header.voltage is None:
+        found.append(finding("voltage_missing"))
+    return found
+
+
+def _wrench_beyond(vehicle: Vehicle, inputs: Drive) -> list[Finding]:
+    found = []
+    for i, (axis, limit) in enumerate(zip(AXES, vehicle.wrench_limits, strict=True)):
+        tau = np.abs(inputs.force[:, i])
+        if not tau.any() or limit == 0.0:
+            continue
+        beyond = float((tau > 1.05 * limit).sum() / (tau > 0.0).sum())
+        if beyond > OFTEN:
+            fields = {
+                "column": inputs.names[i],
+                "limit": float(limit),
+                "unit": "N" if i < 3 else "N m",
+                "vehicle": vehicle.name,
+                "share": beyond,
+                "axis": str(axis),
+            }
+            found.append(
+                finding("command_beyond", **fields)
+                if inputs.commanded
+                else finding("wrench_beyond", **fields)
+            )
+    return found
+
+
+def _thrusters(trial: Trial, vehicle: Vehicle, inputs: Drive) -> list[Finding]:
+    found = []
+    at_limit: list[str] = []
+    slow: list[str] = []
+    still: list[str] = []
+    asked = inputs.commanded and inputs.source != "pwm"
+    for name, force in zip(inputs.names, inputs.force.T, strict=True):
+        thruster = vehicle.thrusters[name]
+        driven = np.abs(force) > 0.0
+        if not driven.any():
+            still.append(name)
+            continue
+        beyond = (force > 0.99 * thruster.force_max) | (force < 0.99 * thruster.force_min)
+        if inputs.source == "rpm":
+            _, rpm = trial.series(f"rpm_{name}")
+            beyond = (rpm > 0.99 * thruster.rpm_max) | (rpm < 0.99 * thruster.rpm_min)
+        if beyond.mean() > OFTEN * driven.mean():
+            at_limit.append(name)
+        # Of measured speeds and of pulses the thrust is known down to nothing.
+        rpm = thruster.speed(force) * 30.0 / np.pi
+        if asked and _in_dead_zone(rpm, thruster.dead_rpm_minus, thruster.dead_rpm_plus) > 0.2:
+            slow.append(name)
+    if at_limit:
+        found.append(finding("saturated", thrusters=tuple(at_limit), share=OFTEN))
+    if slow:
+        found.append(finding("in_dead_zone", thrusters=tuple(slow)))
+    if still:
+        found.append(finding("never_pushed", thrusters=tuple(still)))
+    return found
+
+
+def _in_dead_zone(rpm: Array, lowest: float, highest: float) -> float:
+    """Part of the driven time in which a shaft would stand still."""
+    driven = np.abs(rpm) > 1.0
+    inside = (rpm > 0.95 * lowest) & (rpm < 0.95 * highest) & driven
+    return float(inside.sum() / max(1, driven.sum()))
+
+
+# What a trial tells of an axis, parameter by parameter, and why not.
+
+SEPARATE = 0.6
+"""Decades of speed that linear and quadratic damping need to be told apart."""
+
+LEAST_TILT = np.radians(1.0)
+"""Standard deviation of an angle that its restoring moment needs [rad]."""
+
+SHORT = 0.5
+"""Time over which a change of speed is looked for [s]."""
+
+LEAST_INERTIA = 0.05
+"""Part of the strongest wrench that went into a change of speed, for the effective mass to be seen."""
+
+SLOW = 8.0
+"""Rate below which a motor's lag lies between two samples [Hz]."""
+
+
+def with_tells(report: AxisReport, motion: Motion, inputs: Drive, vehicle: Vehicle) -> AxisReport:
+    """The report with what the axis tells."""
+    wanted = ["m_eff", "d1", "d2", "bias"]
+    wanted += ["k"] if report.axis in ("roll", "pitch") else []
+    wanted += ["thrust_scale", "thrust_lag"]
+    wanted += ["buoyancy"] if report.axis == "heave" else []
+    blocked = _blocked(report, inputs)
+    if blocked:
+        return replace(report, tells={name: Told(can=False, why=blocked) for name in wanted})
+    by_name = {
+        "m_eff": _m_eff(report, motion, inputs, vehicle),
+        **_damping(report, inputs),
+        "bias": _bias(report, inputs),
+        "k": _k(report, motion, inputs),
+        "thrust_scale": _thrust_scale(report, inputs),
+        "thrust_lag": _thrust_lag(inputs),
+        "buoyancy": _buoyancy(report, inputs),
+    }
+    return replace(report, tells={name: by_name[name] for name in wanted})
+
+
+def _blocked(report: AxisReport, inputs: Drive) -> str:
+    """Why the axis tells nothing at all, or nothing."""
+    if not report.source:
+        return _no_velocity(report.axis)
+    if not np.isfinite(report.fastest):
+        return "velocity and input are never known together"
+    if report.excited and inputs.source != "passive" and report.coasts > 10.0 * report.driven:
+        return f"driven for {report.driven:.1f} s and moving for {report.coasts:.0f} s without: something else moves it"
+    if report.excited:
+        return ""
+    if inputs.source != "passive" and report.strongest < 1e-6:
+        return "not driven"
+    if report.fastest <= max(3.0 * report.noise, 0.005):
+        return f"no motion above the noise: speeds up to {report.fastest:.2g}, noise {report.noise:.2g}"
+    return f"moves, but is hardly driven: wrench up to {report.strongest:.2g}"
+
+
+def _no_velocity(axis: str) -> str:
+    column = dict(zip(map(str, AXES), NU, strict=True))[axis]
+    other = {
+        "surge": " nor x, y with a heading",
+        "sway": " nor x, y with a heading",
+        "heave": ", z or depth",
+        "roll": " nor an attitude",
+        "pitch": " nor an attitude",
+        "yaw": " nor a heading",
+    }[axis]
+    return (
+        f"no velocity: neither {column}{other}"
+        if not other.startswith(",")
+        else f"no velocity: no {column}{other}"
+    )
+
+
+def _m_eff(report: AxisReport, motion: Motion, inputs: Drive, vehicle: Vehicle) -> Told:
+    i = AXES.index(report.axis)
+    if inputs.source == "passive":
+        return _relative(report.axis)
+    n = max(1, round(SHORT * motion.rate))
+    change = np.abs(motion.nu[n:, i] - motion.nu[:-n, i])
+    fastest = float(np.nanmax(change)) if np.isfinite(change).any() else 0.0
+    impulse = float(vehicle.rigid_body_mass_matrix()[i, i]) * fastest
+    if impulse < LEAST_INERTIA * report.strongest * SHORT or fastest < 3.0 * report.noise:
+        return Told(can=False, why="speeds hardly change: steps, pulses or coasts are missing")
+    return Told(can=True, why=f"acceleration from {motion.nu_dot_source[i] or 'the velocity'}")
+
+
+def _relative(axis: str) -> Told:
+    if axis in ("roll", "pitch"):
+        return Told(can=True, why="passive: relative to the vehicle file's restoring moment")
+    if axis == "heave":
+        return Told(can=True, why="passive: relative to the vehicle file's buoyancy excess")
+    return Told(can=False, why="passive, and no force along this axis is known: d1/m_eff and d2/m_eff alone")
+
+
+def _damping(report: AxisReport, inputs: Drive) -> dict[str, Told]:
+    decades = f"{report.decades:.1f} decades of speed up to {report.fastest:.2g}"
+    if report.decades < SEPARATE:
+        one = f"{decades}: only their sum at that speed; more levels or a coast would part them"
+        return {"d1": Told(can=False, why=one), "d2": Told(can=False, why=one)}
+    short = "" if report.decades >= 1.0 else ", less than one: intervals will be wide"
+    return {"d1": Told(can=True, why=decades + short), "d2": Told(can=True, why=decades + short)}
+
+
+def _bias(report: AxisReport, inputs: Drive) -> Told:
+    if inputs.source == "passive":
+        return Told(can=False, why="passive: goes with the force that moves it")
+    if report.both_directions:
+        return Told(can=True, why="driven both ways")
+    if report.rests >= 1.0:
+        return Told(can=True, why=f"{report.rests:.1f} s of rest")
+    return Told(can=False, why="one direction and no rest: goes with d1")
+
+
+def _k(report: AxisReport, motion: Motion, inputs: Drive) -> Told:
+    if inputs.source == "passive":
+        return Told(can=False, why="passive: sets the scale of the others")
+    q = motion.quaternion
+    known = np.isfinite(q).all(axis=1)
+    if known.sum() < 10:
+        return Told(can=False, why="no roll and pitch")
+    spread = float(np.std(2.0 * q[known, 0 if report.axis == "roll" else 1]))  # small angles about the mean
+    if spread < LEAST_TILT:
+        return Told(can=False, why=f"{report.axis} angle varies by {np.degrees(spread):.2g}° only")
+    return Told(can=True, why=f"{report.axis} angle varies by {np.degrees(spread):.2g}°")
+
+
+def _thrust_scale(report: AxisReport, inputs: Drive) -> Told:
+    if inputs.source == "passive":
+        return Told(can=False, why="passive: no thrust")
+    if report.axis in ("heave", "roll", "pitch"):
+        return Told(can=True, why="against the weight and centres of the vehicle file, if those are right")
+    return Told(can=False, why="goes with m_eff, d1, d2: doubling all of them changes nothing")
+
+
+def _thrust_lag(inputs: Drive) -> Told:
+    if inputs.source == "passive":
+        return Told(can=False, why="passive: no thrust")
+    if not inputs.commanded:
+        return Told(can=False, why="the inputs are what acted, after the lag")
+    rate = 1.0 / float(np.median(np.diff(inputs.t)))
+    if rate < SLOW:
+        return Told(can=False, why=f"inputs at {rate:.2g} Hz: a lag lies between two samples")
+    return Told(can=True, why=f"commands at {rate:.3g} Hz, by simulation")
+
+
+def _buoyancy(report: AxisReport, inputs: Drive) -> Told:
+    if inputs.source == "passive":
+        return Told(can=False, why="passive: sets the scale of the others")
+    if report.coasts >= 1.0 or report.rests >= 1.0 or report.both_directions:
+        what = f"{report.coasts:.1f} s of coasting" if report.coasts >= 1.0 else "driven both ways or at rest"
+        return Told(can=True, why=what)
+    return Told(can=False, why="one direction and no coast: goes with d1; dive and coast")
+
 
 # Whether a trial's numbers agree with each other: units, signs, axes.
 

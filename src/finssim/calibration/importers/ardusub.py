@@ -20,8 +20,8 @@ from finssim.calibration.importers.assemble import in_our_axes
 from finssim.calibration.importers.column_map import ArduSubMap
 from finssim.calibration.importers.source_map import Frame
 from finssim.calibration.importers.streams import Stream
-from finssim.calibration.importers.units import GRAVITY
 from finssim.calibration.trials.trial import Array
+from finssim.calibration.trials.units import GRAVITY
 from finssim.geometry.rotations import wrap_angle
 from finssim.vehicles import Vehicle
 

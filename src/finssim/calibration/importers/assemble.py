@@ -12,11 +12,10 @@ from finssim.calibration.importers.ardusub_outputs import FRAMES, NEUTRAL, STICK
 from finssim.calibration.importers.column_map import ArduSubMap, ColumnMap
 from finssim.calibration.importers.source_map import Frame
 from finssim.calibration.importers.streams import Stream, Table
-from finssim.calibration.importers.units import GRAVITY
-from finssim.calibration.trials.columns import NU
 from finssim.calibration.trials.conversion import in_our_frames, tidy_quaternions
 from finssim.calibration.trials.header import Conversion, Header
-from finssim.calibration.trials.trial import PHASES, Array, Trial
+from finssim.calibration.trials.trial import NU, PHASES, Array, Trial
+from finssim.calibration.trials.units import GRAVITY
 from finssim.geometry.frames import FROM_FOSSEN
 from finssim.geometry.rotations import quat_from_euler, quat_inverse_rotate
 from finssim.vehicles import load_vehicle

@@ -25,8 +25,7 @@ from finssim.calibration.importers.finssim_record import (
     thruster_columns,
 )
 from finssim.calibration.importers.source_map import ColumnSource, SourceMap
-from finssim.calibration.importers.split import split_table
-from finssim.calibration.importers.streams import Stream, merge
+from finssim.calibration.importers.streams import Stream, merge, split_table
 from finssim.calibration.importers.tables import TABLES, read_table, spoken, values_of
 from finssim.calibration.trials.trial import Trial
 from finssim.files import plain_name

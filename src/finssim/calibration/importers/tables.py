@@ -13,10 +13,9 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.importers.assemble import in_our_axes
 from finssim.calibration.importers.source_map import ColumnSource, PhaseColumn, SourceMap, TimeColumn
 from finssim.calibration.importers.streams import Stream
-from finssim.calibration.importers.units import TIME_UNITS, factor
 from finssim.calibration.trials import table_file
-from finssim.calibration.trials.columns import column_of
-from finssim.calibration.trials.trial import Array
+from finssim.calibration.trials.trial import Array, column_of
+from finssim.calibration.trials.units import TIME_UNITS, factor
 from finssim.vehicles.part import did_you_mean
 
 __all__ = ["TABLES", "read_table", "spoken", "values_of"]

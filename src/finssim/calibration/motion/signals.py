@@ -16,9 +16,8 @@ from finssim.calibration.findings import Finding
 from finssim.calibration.motion.accelerations import accelerations
 from finssim.calibration.motion.attitude_signal import attitude_signal
 from finssim.calibration.motion.velocities import Velocities, velocities
-from finssim.calibration.trials.columns import COLUMNS, NU
 from finssim.calibration.trials.inputs import Drive, applied_wrench, drive
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial import COLUMNS, NU, Trial
 from finssim.vehicles import Vehicle
 
 __all__ = ["Motion", "grid_rate", "motion"]

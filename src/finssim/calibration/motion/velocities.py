@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.motion.attitude_signal import AttitudeSignal
 from finssim.calibration.motion.smoothing import longest_step, smooth
-from finssim.calibration.trials.columns import NU
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial import NU, Trial
 from finssim.geometry.rotations import quat_inverse_rotate, quat_rotate
 from finssim.vehicles import Vehicle
 

@@ -23,8 +23,7 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Curve, Estimate
 from finssim.calibration.motion.signals import motion
 from finssim.calibration.regression.plant_terms import Matrices
-from finssim.calibration.trials.columns import NU
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial import NU, Trial
 from finssim.calibration.uncertainty import Evidence, correlated_samples, intervals, trial_covariance
 from finssim.vehicles import AXES, Vehicle
 

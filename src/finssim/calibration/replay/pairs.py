@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.findings import Finding
-from finssim.calibration.trials.columns import NU
-from finssim.calibration.trials.trial import Array
+from finssim.calibration.trials.trial import NU, Array
 from finssim.vehicles.vehicle import AXES, Axis
 
 __all__ = ["RESPONSES", "UNITS", "Pair", "excited_axes", "find_phases", "models_of", "onset", "resampled"]

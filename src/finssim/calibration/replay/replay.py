@@ -26,8 +26,7 @@ from finssim.calibration.replay.metrics import (
 from finssim.calibration.replay.pairs import Pair, excited_axes, find_phases, resampled
 from finssim.calibration.simulation.rollout import Response, Rollouts
 from finssim.calibration.simulation.segments import Segment, Streams, segments, streams
-from finssim.calibration.trials.columns import NU
-from finssim.calibration.trials.trial import Array, Trial
+from finssim.calibration.trials.trial import NU, Array, Trial
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.geometry.rotations import quat_rotate, quat_to_euler
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
@@ -423,7 +422,7 @@ class Replay:
 
     def as_json(self) -> dict[str, Any]:
         """What `--json` prints."""
-        from finssim.calibration.replay.as_json import replay_json
+        from finssim.calibration.replay.report import replay_json
 
         return replay_json(self)
 

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
-from finssim.calibration.trials.columns import COLUMNS, INPUT_PREFIXES, column_of
 from finssim.calibration.trials.header import Conversion
 from finssim.calibration.trials.time_base import merged
+from finssim.calibration.trials.trial import COLUMNS, INPUT_PREFIXES, column_of
 from finssim.geometry.frames import FROM_FOSSEN
 from finssim.geometry.rotations import (
     matrix_to_quat,

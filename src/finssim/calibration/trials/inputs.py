@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
-from finssim.calibration.trials.columns import INPUT_PREFIXES, TAU
 from finssim.calibration.trials.header import Header
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial import INPUT_PREFIXES, TAU, Trial
 from finssim.geometry.rotations import skew
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.vehicles import Vehicle

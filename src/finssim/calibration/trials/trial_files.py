@@ -16,7 +16,6 @@ from pydantic import BaseModel, ValidationError
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
-from finssim.calibration.trials.columns import COLUMNS, INPUT_PREFIXES, column_of
 from finssim.calibration.trials.conversion import (
     factor_and_offset,
     in_our_frames,
@@ -28,7 +27,7 @@ from finssim.calibration.trials.conversion import (
 from finssim.calibration.trials.header import Conversion, Header, TrialWater
 from finssim.calibration.trials.table_file import Table, read_table, write_table
 from finssim.calibration.trials.time_base import ordered, sampled
-from finssim.calibration.trials.trial import PHASES, Trial
+from finssim.calibration.trials.trial import COLUMNS, INPUT_PREFIXES, PHASES, Trial, column_of
 from finssim.files import OutputError, atomic_directory
 from finssim.vehicles.part import did_you_mean
 from finssim.yaml_file import read_mapping

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
+from finssim.calibration.trials.units import UNITS
 from finssim.geometry.rotations import quat_from_euler, quat_rotate
 from finssim.localization.detection.detections import Frame, most_certain, read_detections
 from finssim.localization.detection.tags import corners
@@ -27,7 +28,7 @@ __all__ = ["Observations", "observe", "observe_combined", "read_survey"]
 
 Array = NDArray[np.float64]
 
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
+METRES = {**UNITS["length"], "inch": 0.0254}
 """Metres in one of each."""
 
 LENGTHS, ANGLES = ("x", "y", "z", "sigma", "edge"), ("yaw", "roll", "pitch")
@@ -168,7 +169,7 @@ def _table(path: str, text: TextTable, default: str | None) -> Table:
     twice = sorted({name for name in names if name and names.count(name) > 1})
     if twice:
         raise CalibrationError(f"{path}: two columns mean '{twice[0]}': leave one of them")
-    united = default is not None or any(unit in UNITS for _, unit in heads)
+    united = default is not None or any(unit in METRES for _, unit in heads)
     cells = text.rows
     factors = [
         _factor(name, unit, default, [c[k] for c in cells if k < len(c)])
@@ -212,9 +213,9 @@ def _column(word: str) -> tuple[str, str]:
 def _factor(name: str, unit: str, default: str | None, words: list[str]) -> float:
     if name in LENGTHS:
         unit = unit or default or "m"
-        if unit not in UNITS:
-            raise CalibrationError(f"unknown unit '{unit}'; available: {', '.join(UNITS)}")
-        return UNITS[unit]
+        if unit not in METRES:
+            raise CalibrationError(f"unknown unit '{unit}'; available: {', '.join(METRES)}")
+        return METRES[unit]
     if name in ANGLES:
         if unit == "deg":
             return math.pi / 180.0
