@@ -10,7 +10,7 @@ from finssim.calibration.check.report import PARAMETERS, TrialReport
 from finssim.calibration.findings import Finding, finding
 from finssim.vehicles import AXES
 
-__all__ = ["told_by", "together"]
+__all__ = ["together", "told_by"]
 
 
 LATE = 0.03
