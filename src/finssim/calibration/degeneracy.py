@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,30 +82,17 @@ def degeneracy(
     return found, findings
 
 
-REMEDIES: Mapping[str, str] = {
-    "damping": "trials at other speeds would separate them, or keep one kind of damping only",
-    "lag": "a step log of one motor would separate them",
-    "restoring": "fix one, for instance the stiffness from weight and the distance of the centres",
-    "inertia": "the motion gives only their ratios: fix one of them, for instance by weighing, or excite the axis "
-    "with a known wrench",
-    "other": "fix one of them, or add trials in which they act differently",
-}
-
-
 def _traded(group: list[str], ratio: float) -> Finding:
     kinds = {name.rpartition(".")[2] for name in group}
     axes = {name.rpartition(".")[0] for name in group if "." in name}
     masses = {"m_eff", "added_mass"}
     if "thrust_scale" in kinds:
         return finding("thrust_traded", parameters=tuple(name for name in group if name != "thrust_scale"))
+    fields = {"parameters": tuple(group), "ratio": ratio}
     if kinds <= {"thrust_lag", "thrust_delay"}:
-        remedy = "lag"
-    elif kinds <= {"d1", "d2"} and len(axes) == 1:
-        remedy = "damping"
-    elif kinds & masses and kinds & {"d1", "d2", "k"} and len(axes) == 1:
-        remedy = "inertia"
-    elif "k" in kinds:
-        remedy = "restoring"
-    else:
-        remedy = "other"
-    return finding("traded", parameters=tuple(group), ratio=ratio, remedy=REMEDIES[remedy])
+        return finding("lag_traded", **fields)
+    if kinds <= {"d1", "d2"} and len(axes) == 1:
+        return finding("damping_traded", **fields)
+    if kinds & masses and kinds & {"d1", "d2", "k"} and len(axes) == 1:
+        return finding("inertia_traded", **fields)
+    return finding("stiffness_traded", **fields) if "k" in kinds else finding("traded", **fields)

@@ -6,14 +6,15 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from rich import box
+from rich.markup import escape
+from rich.table import Table
 
-from finssim.calibration.check.report import AxisReport, StreamReport, Told, TrialReport
-from finssim.calibration.check.together import together
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding
+from finssim.calibration.findings import SEVERITIES, Finding, finding
 from finssim.calibration.motion.accelerations import holds_gravity
 from finssim.calibration.motion.attitude_signal import (
     AttitudeSignal,
@@ -30,7 +31,360 @@ from finssim.calibration.trials.trial_files import load_trial, trials_at
 from finssim.geometry.rotations import quat_rotate, quat_to_euler
 from finssim.vehicles import AXES, Vehicle, VehicleError, load_vehicle
 
+if TYPE_CHECKING:
+    from rich.console import Console
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
 __all__ = ["check", "check_trials"]
+
+# What holds between the trials of a set: vehicles, roles, names, what all of them tell together.
+
+AGREE = 0.7
+"""Correlation of two streams below which their offset is not counted."""
+
+
+def told_by(reports: Sequence[TrialReport], axis: str, parameter: str) -> list[str]:
+    """Names of the trials that tell a parameter of an axis; held-out and refused ones do not count."""
+    return [
+        report.name
+        for report in reports
+        if report.verdict != "refused" and report.role != "held-out"
+        for found in report.axes
+        if found.axis == axis and parameter in found.tells and found.tells[parameter].can
+    ]
+
+
+def together(reports: Sequence[TrialReport]) -> list[Finding]:
+    """Findings about the set."""
+    found = []
+    vehicles = {report.vehicle for report in reports if report.vehicle}
+    if len(vehicles) > 1:
+        found.append(finding("several_vehicles", vehicles=tuple(sorted(vehicles))))
+    names = [report.name for report in reports]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        found.append(finding("equal_names", names=tuple(twice)))
+    good = [report for report in reports if report.verdict != "refused"]
+    if reports and not good:
+        found.append(finding("none_usable"))
+        return found
+    held_out = [report.name for report in good if report.role == "held-out"]
+    if held_out and len(held_out) == len(good):
+        found.append(finding("all_held_out"))
+    elif not held_out and len(good) > 1:
+        found.append(finding("none_held_out"))
+    fitting = len(good) - len(held_out)
+    if 0 < fitting < 5:
+        found.append(finding("few_trials", trials=fitting))
+    found += _late(good)
+    nothing = [a for a in AXES if not any(told_by(reports, a, parameter) for parameter in PARAMETERS)]
+    if nothing and len(nothing) < len(AXES):
+        found.append(finding("axes_untold", axes=tuple(map(str, nothing))))
+    return found
+
+
+def _late(reports: Sequence[TrialReport]) -> list[Finding]:
+    """Streams that are late or early by the same time in three trials or more."""
+    found = []
+    for group in dict.fromkeys(group for report in reports for group in report.offsets):
+        offsets = [report.offsets[group] for report in reports if group in report.offsets]
+        seconds = np.array([offset["seconds"] for offset in offsets if offset["correlation"] > AGREE])
+        if len(seconds) < 3:
+            continue
+        middle = float(np.median(seconds))
+        spread = 1.4826 * float(np.median(np.abs(seconds - middle)))
+        if (
+            abs(middle) > max(LATE, 3.0 * spread / np.sqrt(len(seconds)))
+            and np.mean(seconds * middle > 0.0) > 0.8
+        ):
+            found.append(
+                finding(
+                    "stream_offset_common",
+                    group=group,
+                    offset=abs(middle),
+                    sense="early" if middle > 0.0 else "late",
+                    reference=offsets[0]["reference"],
+                    trials=len(seconds),
+                    seconds=middle,
+                )
+            )
+    return found
+
+
+# What a check of trials says, as data.
+
+Verdict = Literal["usable", "usable with care", "refused"]
+
+PARAMETERS = ("m_eff", "d1", "d2", "bias", "k", "thrust_scale", "thrust_lag", "buoyancy")
+"""What a trial may tell of an axis; k of roll and pitch, buoyancy of heave."""
+
+THRUST = ("bias", "k", "thrust_scale", "thrust_lag", "buoyancy")
+"""Of these, what a passive trial does not tell because no thrust is known."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamReport:
+    """Columns that are sampled together."""
+
+    columns: tuple[str, ...]
+    group: str
+    samples: int
+    rate: float
+    """Samples per second while there are any [Hz]."""
+    jitter: float
+    """Standard deviation of the time between samples, gaps aside, over its mean."""
+    gaps: int
+    longest_gap: float
+    """[s]"""
+    missing: float
+    """Part of the trial's time without this stream."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Told:
+    """Whether a trial tells a parameter."""
+
+    can: bool
+    why: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxisReport:
+    """Excitation of one axis and what follows from it."""
+
+    axis: str
+    source: str
+    """Of the velocity: measured, derived from ..., or nothing."""
+    fastest: float
+    """95th percentile of the speed [m/s, rad/s]."""
+    noise: float
+    """Of one velocity sample [m/s, rad/s]."""
+    decades: float
+    """log10 of the fastest over the slowest speed that stands out of the noise."""
+    strongest: float
+    """95th percentile of the wrench [N, N m]."""
+    levels: tuple[float, ...]
+    """Wrenches that were held for half a second or more [N, N m]."""
+    work: float
+    """Done by the inputs along this axis [J]; of a passive trial 0."""
+    both_directions: bool
+    driven: float
+    """Time of input [s]."""
+    coasts: float
+    """Time of motion without input [s]."""
+    rests: float
+    """Time without input and motion [s]."""
+    excited: bool
+    tells: dict[str, Told] = field(default_factory=dict)
+    """By parameter."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialReport:
+    """One trial."""
+
+    name: str
+    vehicle: str | None
+    role: str | None
+    duration: float
+    """[s]"""
+    rows: int
+    inputs: str
+    """What drove it: rpm, force, tau, pwm, command, passive, or nothing."""
+    streams: tuple[StreamReport, ...]
+    axes: tuple[AxisReport, ...]
+    offsets: dict[str, dict[str, Any]]
+    """Group of columns -> reference, seconds, std and correlation."""
+    findings: tuple[Finding, ...]
+    sha256: str = ""
+
+    @property
+    def verdict(self) -> Verdict:
+        """By the worst finding."""
+        levels = {one.severity for one in self.findings}
+        return "refused" if "refused" in levels else "usable with care" if "care" in levels else "usable"
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values; numbers that are not finite become None."""
+        return {
+            "name": self.name,
+            "verdict": self.verdict,
+            "vehicle": self.vehicle,
+            "role": self.role,
+            "duration": _plain(self.duration),
+            "rows": self.rows,
+            "inputs": self.inputs,
+            "findings": [one.as_json() for one in self.findings],
+            "streams": [
+                {**vars(stream), "columns": list(stream.columns), **_numbers(stream)}
+                for stream in self.streams
+            ],
+            "axes": {
+                axis.axis: {
+                    **{key: value for key, value in vars(axis).items() if key not in ("axis", "tells")},
+                    **_numbers(axis),
+                    "levels": list(axis.levels),
+                    "tells": {name: {"can": told.can, "why": told.why} for name, told in axis.tells.items()},
+                }
+                for axis in self.axes
+            },
+            "offsets": self.offsets,
+            "sha256": self.sha256,
+        }
+
+
+def _plain(x: float) -> float | None:
+    return float(x) if math.isfinite(x) else None
+
+
+def _numbers(part: Any) -> dict[str, float | None]:
+    return {key: _plain(value) for key, value in vars(part).items() if isinstance(value, float)}
+
+
+# Reports of checked trials as tables for people, readable at a hundred columns.
+
+COLOURS = {"usable": "green", "usable with care": "yellow", "refused": "red"}
+MARKS = {"refused": "[red]✗[/red]", "care": "[yellow]![/yellow]", "note": "[dim]·[/dim]"}
+MANY = 4
+"""More trials than this are printed without the tables of each."""
+
+
+def print_reports(reports: Sequence[TrialReport], console: Console, common: Sequence[Finding] = ()) -> None:
+    """Print what was found.
+
+    Args:
+        reports: By trial.
+        console: Where to.
+        common: Findings about all of them together.
+    """
+    for report in reports:
+        _print_trial(report, console, brief=len(reports) > MANY)
+    if len(reports) > 1:
+        _print_overview(reports, console)
+    for one in common:
+        console.print(f"{MARKS[one.severity]} {escape(str(one))}")
+
+
+def _print_trial(report: TrialReport, console: Console, *, brief: bool) -> None:
+    colour = COLOURS[report.verdict]
+    driven = f", {report.inputs}" if report.inputs else ""
+    role = f", {report.role}" if report.role else ""
+    console.print(
+        f"[bold]{escape(report.name)}[/bold]  {report.duration:.1f} s, {report.rows} rows{driven}{role}"
+        f"{', ' + escape(report.vehicle) if report.vehicle else ''}: [{colour}]{report.verdict}[/{colour}]"
+    )
+    grid = Table.grid(padding=(0, 1))
+    for one in sorted(report.findings, key=lambda f: SEVERITIES.index(f.severity)):
+        if not (brief and one.severity == "note"):
+            grid.add_row("", MARKS[one.severity], escape(str(one)))
+    if grid.row_count:
+        console.print(grid, highlight=False)
+    if brief:
+        return
+    if report.streams:
+        console.print(_streams(report.streams))
+    if report.axes:
+        console.print(_axes(report.axes))
+        console.print(_tells(report.axes, report.inputs == "passive"), highlight=False)
+    console.print()
+
+
+def _streams(streams: Sequence[StreamReport]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for name in ("columns", "samples", "rate", "jitter", "gaps", "longest", "missing"):
+        table.add_column(name, justify="left" if name == "columns" else "right", overflow="fold")
+    for s in streams:
+        table.add_row(
+            _short(s.columns),
+            str(s.samples),
+            f"{s.rate:.3g} Hz",
+            f"{s.jitter:.0%}",
+            str(s.gaps),
+            f"{s.longest_gap:.2g} s",
+            f"{s.missing:.0%}",
+        )
+    return table
+
+
+def _short(columns: Sequence[str]) -> str:
+    """Names with what they begin with in common said once: `pwm_T1 T2 T3`."""
+    head = columns[0].split("_")[0] + "_"
+    if len(columns) > 2 and all(column.startswith(head) for column in columns):
+        return " ".join([columns[0], *(column.removeprefix(head) for column in columns[1:])])
+    return " ".join(columns)
+
+
+def _axes(axes: Sequence[AxisReport]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for name in (
+        "axis",
+        "velocity",
+        "up to",
+        "noise",
+        "decades",
+        "input",
+        "levels",
+        "both ways",
+        "coast",
+        "rest",
+    ):
+        table.add_column(name, justify="left" if name in ("axis", "velocity") else "right")
+    for a in axes:
+        if not a.source or a.fastest != a.fastest:
+            table.add_row(a.axis, a.source.removeprefix("derived ") or "[dim]unknown[/dim]", *[""] * 8)
+            continue
+        style = "" if a.excited else "dim"
+        table.add_row(
+            a.axis,
+            a.source.removeprefix("derived "),
+            f"{a.fastest:.2g}",
+            f"{a.noise:.1g}",
+            f"{a.decades:.1f}",
+            f"{a.strongest:.3g}" if a.strongest > 1e-6 else "-",
+            str(len(a.levels)) if a.levels else "-",
+            "yes" if a.both_directions else "no",
+            f"{a.coasts:.1f} s",
+            f"{a.rests:.1f} s",
+            style=style,
+        )
+    return table
+
+
+def _tells(axes: Sequence[AxisReport], passive: bool) -> Table:
+    """What each axis tells, and why not the rest; reasons that several share are said once."""
+    grid = Table.grid(padding=(0, 1))
+    for a in axes:
+        # Of a passive trial it goes without saying that nothing is known of thrust.
+        shown = {n: t for n, t in a.tells.items() if t.can or not (passive and n in THRUST)}
+        by_reason: dict[tuple[bool, str], list[str]] = {}
+        for name, told in shown.items():
+            by_reason.setdefault((told.can, told.why), []).append(name)
+        if len(by_reason) == 1 and not next(iter(by_reason))[0]:
+            grid.add_row("", a.axis, f"[red]nothing[/red]: {escape(next(iter(by_reason))[1])}")
+        elif by_reason:
+            parts = [
+                f"[green]{', '.join(names)}[/green] ({escape(why)})"
+                if can
+                else f"not {', '.join(names)} ({escape(why)})"
+                for (can, why), names in sorted(by_reason.items(), key=lambda item: not item[0][0])
+            ]
+            grid.add_row("", a.axis, "; ".join(parts))
+    return grid
+
+
+def _print_overview(reports: Sequence[TrialReport], console: Console) -> None:
+    """Trials that tell each parameter of each axis, together."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title="trials that tell", title_justify="left")
+    table.add_column("axis")
+    for parameter in PARAMETERS:
+        table.add_column(parameter, justify="right")
+    for axis in AXES:
+        counts = [len(told_by(reports, axis, parameter)) for parameter in PARAMETERS]
+        table.add_row(axis, *(str(count) if count else "[dim]-[/dim]" for count in counts))
+    console.print(table)
+
 
 # Sampling of a trial's columns: rates, gaps, jitter, values that stick, hold or clip.
 
@@ -807,8 +1161,6 @@ def check(
         print(json.dumps(as_object(reports, common), indent=2, ensure_ascii=False))
         return
     from rich.console import Console
-
-    from finssim.calibration.check.tables import print_reports
 
     print_reports(reports, Console(), common)
 

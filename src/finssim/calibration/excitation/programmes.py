@@ -10,15 +10,65 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.excitation.travel import within
-from finssim.control.allocator import Allocator
+from finssim.control.allocation import Allocator
 from finssim.quiet import start_warp
 from finssim.vehicles import AXES, Vehicle
+from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.vehicle import Axis
 
-__all__ = ["KINDS", "Programme", "programmes", "which_axes", "RATE", "multisine"]
+__all__ = ["KINDS", "Programme", "RATE", "multisine", "programmes", "which_axes"]
 
 Array = NDArray[np.float64]
+
+# How far a programme takes a vehicle along one axis, by the damping of its file.
+
+
+def travel(force: Array, rate: float, axis: Axis, vehicle: Vehicle) -> float:
+    """Way from the nearest to the farthest point along one axis alone, from rest [m].
+
+    m v_dot = force - (d1 + d2 |v|) v, of the set `calibrated` or else the first; without damping where that is a mesh.
+
+    Args:
+        force: Along the axis, body frame, held over each row [N], (n,).
+        rate: Of the rows [Hz].
+        axis: surge, sway or heave.
+        vehicle: Whose mass and damping count.
+    """
+    i = AXES.index(axis)
+    name = "calibrated" if "calibrated" in vehicle.hydrodynamics else next(iter(vehicle.hydrodynamics))
+    chosen = vehicle.hydrodynamics[name]
+    m, h = float(vehicle.mass_matrix(name)[i, i]), 1.0 / rate
+    d1 = d2 = 0.0
+    if isinstance(chosen, HydrodynamicSet):
+        d1, d2 = float(chosen.linear_damping[i, i]), float(chosen.quadratic_damping[i, i])
+    v = x = near = far = 0.0
+    for f in force:
+        # Implicit in the damping, so that a light and draggy vehicle does not ring.
+        v = (v + h * f / m) / (1.0 + h * (d1 + d2 * abs(v)) / m)
+        x += h * v
+        near, far = min(near, x), max(far, x)
+    return float(far - near)
+
+
+def within(room: float, force: Array, rate: float, axis: Axis, vehicle: Vehicle) -> float:
+    """Factor up to 1 on a force that keeps the way along one axis within a room.
+
+    Args:
+        room: Longest way [m].
+        force: Along the axis, body frame, held over each row [N], (n,).
+        rate: Of the rows [Hz].
+        axis: surge, sway or heave.
+        vehicle: Whose mass and damping count.
+    """
+    low, high = 0.0, 1.0
+    if travel(force, rate, axis, vehicle) <= room:
+        return high
+    for _ in range(8):
+        middle = 0.5 * (low + high)
+        fits = travel(middle * force, rate, axis, vehicle) <= room
+        low, high = (middle, high) if fits else (low, middle)
+    return low
+
 
 # Multi-sines: all axes at once, each with frequencies of its own, for fits of coupled dynamics.
 
@@ -253,8 +303,6 @@ def programmes(
         raise CalibrationError(f"room is {room:g} m, expected a length above 0 m")
     by_axis = {axis: _levels(axis, vehicle, levels, kind) for axis in chosen}
     if kind == "multisine":
-        from finssim.calibration.excitation.programmes import multisine
-
         peaks = {axis: values[-1] for axis, values in by_axis.items()}
         return [
             multisine(peaks, vehicle, index=r + 1, seed=seed + r, duration=duration, band=band, room=room)
@@ -307,8 +355,6 @@ def _in_room(
     room: float, levels: tuple[float, ...], given: bool, axis: Axis, vehicle: Vehicle
 ) -> tuple[float, ...]:
     """Levels of a linear axis that stay within `room`; given ones are refused rather than changed."""
-    from finssim.calibration.excitation.travel import travel, within
-
     hold, after = (np.full(round(seconds * RATE), x) for seconds, x in ((9.0, levels[-1]), (3.0, 0.0)))
     force = np.concatenate([hold, after])
     if not given:

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding
-from finssim.calibration.motion.accelerations import accelerations
+from finssim.calibration.motion.accelerations import Velocities, accelerations, velocities
 from finssim.calibration.motion.attitude_signal import attitude_signal
-from finssim.calibration.motion.velocities import Velocities, velocities
 from finssim.calibration.trials.inputs import Drive, applied_wrench, drive
 from finssim.calibration.trials.trial import COLUMNS, NU, Trial
 from finssim.vehicles import Vehicle

@@ -15,20 +15,22 @@ from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.fit import Correlation, Estimate, Fit
 from finssim.calibration.motion.attitude_signal import attitude_samples
 from finssim.calibration.motion.signals import Motion, motion
-from finssim.calibration.regression.axis_doubts import LARGE_DELAY, late_velocity, quality, worthless
 from finssim.calibration.regression.axis_estimates import (
+    LARGE_DELAY,
     AxisResult,
     axis_result,
+    late_velocity,
     outside,
+    quality,
     term_estimate,
     trim,
+    worthless,
 )
 from finssim.calibration.regression.axis_fit import TERMS, AxisData, informative
 from finssim.calibration.regression.plant_terms import Matrices, matrices
 from finssim.calibration.regression.rows import Signals, axis_rows, kernel, signals
 from finssim.calibration.regression.selection import DAMPING, Selection, select
-from finssim.calibration.trials.fittable import require_axes, require_fittable
-from finssim.calibration.trials.inputs import drive
+from finssim.calibration.trials.inputs import drive, require_axes, require_fittable
 from finssim.calibration.trials.trial import Trial
 from finssim.geometry.rotations import quat_inverse_rotate
 from finssim.vehicles import AXES, Vehicle

@@ -14,33 +14,158 @@ from finssim.calibration.degeneracy import degeneracy
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
+from finssim.calibration.motion.signals import Motion
 from finssim.calibration.regression.axis_estimates import USEFUL, outside, trim
 from finssim.calibration.regression.selection import AKAIKE, DAMPING
 from finssim.calibration.simulation.bordered import CUT, huber
-from finssim.calibration.simulation.estimates import estimates
-from finssim.calibration.simulation.evidence import FEWEST_TRIALS, Confidence, confidence
-from finssim.calibration.simulation.excited import (
-    TELL,
-    compared,
-    excited,
-    excites,
-    horizon,
-    observable,
-    sampling,
-    speeds,
-    telling,
-)
+from finssim.calibration.simulation.estimates import FEWEST_TRIALS, Confidence, confidence, estimates
 from finssim.calibration.simulation.gauss_newton import Point, Solution, solve
 from finssim.calibration.simulation.parameters import EXTRAS, Parameters
 from finssim.calibration.simulation.segments import Segment, Streams, segments, streams
 from finssim.calibration.simulation.shooting import Shooting
-from finssim.calibration.trials.fittable import require_axes, require_fittable
+from finssim.calibration.trials.inputs import require_axes, require_fittable
 from finssim.calibration.trials.trial import Trial
-from finssim.vehicles import AXES, HydrodynamicSet, Vehicle
+from finssim.engine.plant_arrays import twist_shift
+from finssim.vehicles import AXES, HydrodynamicSet, Vehicle, VehicleError
 
 __all__ = ["ESTIMATE", "fit_by_simulation"]
 
 Array = NDArray[np.float64]
+
+# What trials show: which axes they excite, which measurements tell of an axis, how fast the vehicle answers.
+
+TELL = {
+    "surge": ("u", "x", "y"),
+    "sway": ("v", "x", "y"),
+    "heave": ("w", "z", "depth"),
+    "roll": ("p", "roll"),
+    "pitch": ("q", "pitch"),
+    "yaw": ("r", "yaw"),
+}
+"""Measured columns that tell of an axis, the most direct first."""
+
+DRIFTING = {"x": "u", "y": "v", "yaw": "r"}
+"""Integrals without a restoring force: where the rate is measured they add drift, not knowledge."""
+
+SEEN = 0.9
+"""Part of a segment for which a velocity has to be known to be imposed."""
+
+PUSH = 0.03
+"""Range of a wrench, as part of the vehicle's limit, below which an axis is not driven."""
+
+SWING = 0.2
+"""Range of the rate of roll or pitch that tells of it though no thruster is meant for it [rad/s]."""
+
+ANSWER = (0.02, 0.02, 0.02, 0.04, 0.04, 0.04)
+"""Range of a velocity below which an axis does not answer [m/s, rad/s]."""
+
+
+def compared(segment: Segment, motion: Motion, axes: Sequence[str]) -> Segment:
+    """The segment as a fit of some axes uses it.
+
+    Axes that are not fitted move as they were seen to, where they were seen: their numbers in the vehicle file may be
+    wrong, and couplings would carry that into the others. They are not compared, nor are integrals that add drift.
+    """
+    held = np.full((segment.steps + 1, 6), np.nan)
+    t = segment.t0 + segment.step * np.arange(segment.steps + 1)
+    drop = {column for column, rate in DRIFTING.items() if rate in segment.measured}
+    inside = (motion.t >= t[0] - 0.1) & (motion.t <= t[-1] + 0.1)
+    for i, axis in enumerate(AXES):
+        good = inside & np.isfinite(motion.nu[:, i])
+        if axis not in axes and good.sum() >= max(2.0, SEEN * inside.sum()):
+            held[:, i] = np.interp(t, motion.t[good], motion.nu[good, i])
+            drop |= {TELL[axis][0]}
+    if not np.isnan(held[:, 3:5]).any():
+        drop |= {"roll", "pitch"}
+    measured = {c: pair for c, pair in segment.measured.items() if c not in drop}
+    return replace(segment, measured=measured, held=held)
+
+
+def observable(trials: Sequence[Streams]) -> tuple[str, ...]:
+    """Axes that some trial measures anything of."""
+    columns = {c for s in trials for c in s.measured}
+    return tuple(a for a in AXES if columns & set(TELL[a]))
+
+
+def excited(trials: Sequence[Streams], vehicle: Vehicle) -> tuple[str, ...]:
+    """Axes that the trials excite: those their headers name, else those that were driven, or moved while passive, and
+    answered."""
+    found = {axis for s in trials for axis in excites(s, vehicle)}
+    return tuple(a for a in AXES if a in found and a in observable(trials))
+
+
+def telling(trials: Sequence[Streams], vehicle: Vehicle, axes: Sequence[str]) -> list[Streams]:
+    """Trials that excite one of some axes; all of them where none does.
+
+    In the others the vehicle moves on axes that are not fitted, maybe not even measured, and couplings carry that over.
+    """
+    return [s for s in trials if set(excites(s, vehicle)) & set(axes)] or list(trials)
+
+
+def excites(s: Streams, vehicle: Vehicle) -> set[str]:
+    """Axes that one trial excites: those its header names, else those that were driven, or moved while passive."""
+    return set(s.trial.header.axis) or _moved(s, vehicle)
+
+
+def _moved(s: Streams, vehicle: Vehicle) -> set[str]:
+    try:
+        limits = vehicle.wrench_limits
+    except VehicleError:
+        limits = np.zeros(6)
+    tau = s.motion.tau @ np.linalg.inv(twist_shift(list(vehicle.wrench_reference)))
+    out: set[str] = set()
+    for i, axis in enumerate(AXES):
+        nu = s.motion.nu[:, i]
+        noise = s.motion.noise_std[i]
+        answers = _range(nu) > max(ANSWER[i], 4.0 * noise if np.isfinite(noise) else 0.0)
+        pushed = limits[i] > 0.0 and _range(tau[:, i]) > PUSH * limits[i]
+        # Weight rights roll and pitch again: a swing tells of them whatever began it.
+        swings = i in (3, 4) and _range(nu) > max(SWING, 10.0 * np.nan_to_num(noise))
+        if answers and (pushed or swings or s.drive.source == "passive"):
+            out.add(axis)
+    return out
+
+
+def _range(values: Array) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.ptp(np.percentile(finite, [2.0, 98.0]))) if len(finite) else 0.0
+
+
+def speeds(motions: Sequence[Motion], axis: str) -> tuple[float, float]:
+    """Range of speeds at which an axis was seen moving, from the 20th to the 99th percentile [m/s or rad/s]."""
+    i = AXES.index(axis)
+    values = np.concatenate([np.abs(m.nu[:, i]) for m in motions] or [np.empty(0)])
+    values = values[np.isfinite(values)]
+    moving = values[values > max(0.02 * values.max(initial=0.0), 1e-9)]
+    return (
+        (float(np.percentile(moving, 20.0)), float(np.percentile(moving, 99.0)))
+        if len(moving)
+        else (0.0, 0.0)
+    )
+
+
+def horizon(
+    vehicle: Vehicle, trials: Sequence[Streams], axes: Sequence[str], hydrodynamics: str = "calibrated"
+) -> float:
+    """Length of segments that shows steady motion and yet forgets what no model knows [s]: five of the slowest time
+    constant, at least forty samples, between 5 and 12 s."""
+    chosen = vehicle.hydrodynamic_set(hydrodynamics)
+    M = np.diag(vehicle.mass_matrix(hydrodynamics))
+    slowest = 0.5
+    if isinstance(chosen, HydrodynamicSet):
+        for axis in axes:
+            i = AXES.index(axis)
+            top = speeds([s.motion for s in trials], axis)[1]
+            drag = chosen.linear_damping[i, i] + chosen.quadratic_damping[i, i] * top
+            slowest = max(slowest, float(M[i] / drag) if drag > 0.0 else 3.0)
+    return float(np.clip(max(5.0 * slowest, 40.0 * sampling(trials)), 5.0, 12.0))
+
+
+def sampling(trials: Sequence[Streams]) -> float:
+    """Usual time between the samples of a channel [s]."""
+    steps = [float(np.median(np.diff(t))) for s in trials for t, _ in s.measured.values() if len(t) > 2]
+    return float(np.median(steps or [0.02]))
+
 
 # What a simulation-error fit shows besides its estimates: figures by axis, curves, findings.
 
@@ -136,7 +261,7 @@ def _unit(name: str) -> str:
     return "rad/s" if name in ("p", "q", "r") else "rad" if name in ("roll", "pitch", "yaw") else "m"
 
 
-def doubts(
+def fit_findings(
     problem: Shooting,
     solution: Solution,
     found: Confidence,
@@ -647,7 +772,7 @@ class Stages:
         remarks = [
             *remarks,
             *(finding("trial_left_out", name) for name in left_out),
-            *doubts(stage.problem, stage.solution, stage.found, found, self.used),
+            *fit_findings(stage.problem, stage.solution, stage.found, found, self.used),
             *bounds,
             *traded,
         ]

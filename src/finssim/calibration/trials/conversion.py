@@ -49,18 +49,20 @@ def new_names(columns: Iterable[str], convert: Conversion) -> dict[str, str]:
     for old, new in convert.rename.items():
         if old not in columns:
             raise CalibrationError(
-                f"convert.rename: the log has no column '{old}'{did_you_mean(old, columns)} it has {_some(columns)}"
+                f"the log has no column '{old}'{did_you_mean(old, columns)} it has {_some(columns)}",
+                "convert.rename",
             )
         if new not in ("t", "phase") and column_of(new) is None:
             raise CalibrationError(
-                f"convert.rename: '{new}' is not a column of a trial{did_you_mean(new, ['t', 'phase', *COLUMNS])} "
-                f"columns are t, phase, {', '.join(COLUMNS)} and {', '.join(f'{p}NAME' for p in INPUT_PREFIXES)}"
+                f"'{new}' is not a column of a trial{did_you_mean(new, ['t', 'phase', *COLUMNS])} "
+                f"columns are t, phase, {', '.join(COLUMNS)} and {', '.join(f'{p}NAME' for p in INPUT_PREFIXES)}",
+                "convert.rename",
             )
     names = {name: convert.rename.get(name, name) for name in columns}
     for new in convert.rename.values():
         twice = [old for old, name in names.items() if name == new]
         if len(twice) > 1:
-            raise CalibrationError(f"convert.rename: columns {_some(twice)} would all be '{new}'")
+            raise CalibrationError(f"columns {_some(twice)} would all be '{new}'", "convert.rename")
     return names
 
 
@@ -171,8 +173,9 @@ def shifted(t: Array, channels: Channels, convert: Conversion) -> tuple[Array, C
     for key in asked:
         if key not in GROUPS and key not in channels:
             raise CalibrationError(
-                f"convert.time_offset: '{key}' is neither a group nor a column of this log"
-                f"{did_you_mean(key, [*GROUPS, *channels])} groups are {', '.join(GROUPS)}"
+                f"'{key}' is neither a group nor a column of this log"
+                f"{did_you_mean(key, [*GROUPS, *channels])} groups are {', '.join(GROUPS)}",
+                "convert.time_offset",
             )
     streams, moved = {}, False
     for name, values in channels.items():
@@ -188,7 +191,8 @@ def _named(key: str, columns: list[str], where: str) -> list[str]:
     found = [name for name in columns if name == key or (key.endswith("*") and name.startswith(key[:-1]))]
     if not found:
         raise CalibrationError(
-            f"convert.{where}: this log has no column '{key}'{did_you_mean(key, columns)} it has {_some(columns)}"
+            f"this log has no column '{key}'{did_you_mean(key, columns)} it has {_some(columns)}",
+            f"convert.{where}",
         )
     return found
 

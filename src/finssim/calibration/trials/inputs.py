@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +15,43 @@ from finssim.calibration.trials.header import Header
 from finssim.calibration.trials.trial import INPUT_PREFIXES, TAU, Trial
 from finssim.geometry.rotations import skew
 from finssim.physics.types import MAX_THRUSTERS
-from finssim.vehicles import Vehicle
+from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.part import did_you_mean
 
 __all__ = ["Drive", "applied_wrench", "delivered", "drive", "thruster_motors", "widest_step", "wrench_motors"]
+
+# What every fit asks of the trials and axes that it is given.
+
+
+def require_fittable(trials: Sequence[Trial]) -> None:
+    """Refuse trials that no fit may use.
+
+    Raises:
+        CalibrationError: There are none, two share a name, or one is held out.
+    """
+    if not trials:
+        raise CalibrationError("no trials were given, expected at least one to fit")
+    names = [trial.name for trial in trials]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise CalibrationError(f"two trials are called '{min(twice)}', expected a name for each: rename one")
+    for trial in trials:
+        if trial.header.role == "held-out":
+            raise CalibrationError(
+                f"{trial.name}: its header says that it is held out: fit on other trials and replay this one"
+            )
+
+
+def require_axes(axes: Sequence[str] | None) -> None:
+    """Refuse words that name no axis.
+
+    Raises:
+        CalibrationError: It says which there are.
+    """
+    for axis in axes or ():
+        if axis not in AXES:
+            raise CalibrationError(f"unknown axis '{axis}'; available: {', '.join(AXES)}")
+
 
 # What the motors of a vehicle make of commanded forces: the engine's actuation in NumPy, exact in time.
 

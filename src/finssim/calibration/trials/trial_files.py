@@ -352,7 +352,7 @@ def load_trial(path: str | os.PathLike[str]) -> Trial:
     try:
         return trial_from_table(name, table, header, path)
     except CalibrationError as error:
-        shown = header_path if header_path and str(error).startswith("convert") else data
+        shown = header_path if header_path and error.subject else data
         raise CalibrationError(f"{shown}: {error}") from None
 
 
