@@ -174,7 +174,7 @@ def coverage(
         "repetitions": repetitions,
         "seconds": time.perf_counter() - start,
         "parameters": collect(fits, truth(vehicle)),
-        "warnings": sorted({w for fit in fits[:1] for w in fit.warnings}),
+        "findings": sorted({str(one) for fit in fits[:1] for one in fit.findings}),
     }
 
 

@@ -72,8 +72,8 @@ def main() -> None:
     fit = passive(trials, load_vehicle("bluerov2_heavy"))
     for e in fit.estimates.values():
         print(f"{e.name:24s} {e.estimate:9.4g} [{e.ci95[0]:.4g}, {e.ci95[1]:.4g}] {e.unit:8s} {e.note}")
-    for warning in fit.warnings:
-        print(warning)
+    for finding in fit.findings:
+        print(finding)
     if given.picture:
         decays = []
         for trial in trials:
@@ -81,7 +81,7 @@ def main() -> None:
                 try:
                     decays.append(free_decay(trial, axis))
                 except CalibrationError:
-                    continue  # said among the warnings
+                    continue  # said among the findings
         draw(decays, given.picture)
 
 

@@ -13,7 +13,7 @@ from finssim.vehicles import load_vehicle
 
 PARAMETER = {"estimate", "ci95", "unit", "identifiable", "note"}
 KEYS = {
-    "kind", "method", "vehicle", "parameters", "quality", "correlation", "warnings", "trials", "out", "provenance",
+    "kind", "method", "vehicle", "parameters", "quality", "correlation", "findings", "trials", "out", "provenance",
 }  # fmt: skip
 
 

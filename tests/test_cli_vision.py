@@ -94,7 +94,7 @@ def test_camera_as_json_and_as_a_file(place, capsys):
     """One object with the keys of the contract; the file holds the same lens, and beside it stands nothing else."""
     found = found_by(capsys, *CAMERA, "--board", "9x6", "--report", "report")
     assert found.keys() >= {
-        *("kind", "parameters", "per_view", "rms_px", "held_out_rms_px", "views", "left_out", "advice"),
+        *("kind", "parameters", "per_view", "rms_px", "held_out_rms_px", "views", "left_out", "findings"),
         *("error95_px", "empty_edges", "correlation", "settings", "interrupted", "out", "provenance"),
     }
     assert found["kind"] == "camera" and found["out"] == "camera.yaml"
@@ -284,7 +284,7 @@ def test_pool_as_json_and_as_a_file(surveyed, plain):
     found, pool = plain
     assert found.keys() >= {
         *("kind", "interface", "parameters", "residual", "held_out", "pinhole", "lens_fitted", "outliers"),
-        *("other_minima", "correlation", "notes", "advice", "settings", "inputs", "out", "provenance"),
+        *("other_minima", "correlation", "findings", "settings", "inputs", "out", "provenance"),
     }
     assert found["kind"] == "pool" and found["interface"] == "surface" and found["out"] == "plain.yaml"
     assert all(parameter.keys() == PARAMETER for parameter in found["parameters"].values())
@@ -507,7 +507,7 @@ def test_mounts_as_json_and_as_a_vehicle(mounting, capsys):
     """The keys of the contract; the tags' heights and distance as they are, in the vehicle file."""
     found = found_by(capsys, *MOUNT, mounting / "v.yaml", "--seed", "9", "--report", mounting / "report")
     assert found.keys() >= {
-        *("kind", "method", "vehicle", "parameters", "quality", "correlation", "warnings", "trials"),
+        *("kind", "method", "vehicle", "parameters", "quality", "correlation", "findings", "trials"),
         *("settings", "out", "provenance"),
     }
     assert (

@@ -30,7 +30,17 @@ ARROWS = {
 }
 """Layer -> the layers right below it. A layer may import everything below."""
 
-FOUNDATION = {"", "files", "mcap_metadata", "mcap_repair", "page", "provenance", "quiet", "yaml_file"}
+FOUNDATION = {
+    "",
+    "files",
+    "mcap_metadata",
+    "mcap_repair",
+    "page",
+    "provenance",
+    "quiet",
+    "text_table",
+    "yaml_file",
+}
 """Modules that every layer may import and that import no layer; "" is the package itself."""
 
 TOP = {
@@ -101,7 +111,6 @@ HOMES = {
     "matplotlib": {
         "calibration/output/fit_figures.py",
         "calibration/replay/figure.py",
-        "calibration/actuators/thruster_figure.py",
         "calibration/vision/camera_command.py",
         "calibration/vision/pool_command.py",
         "calibration/vision/report.py",

@@ -1,12 +1,22 @@
-"""The HTML of reports: one file that holds its pictures and loads nothing."""
+"""Reports: one HTML file that holds its pictures and loads nothing, and the same as Markdown beside its pictures."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+import json
+import os
+from collections.abc import Mapping, Sequence
 from html import escape
+from typing import Any
 
-__all__ = ["html_page", "html_picture", "html_table"]
+from finssim.files import atomic_directory
+
+__all__ = ["RECORD_FILE", "REPORT_FILE", "Page", "Pictures", "html_page", "html_picture", "html_table"]
+
+REPORT_FILE, MARKDOWN_FILE, RECORD_FILE = "report.html", "report.md", "fit.json"
+
+Pictures = Mapping[str, tuple[str, bytes]]
+"""File name -> what the picture shows, and the PNG."""
 
 STYLE = """
 :root { color-scheme: light; }
@@ -46,3 +56,89 @@ def html_table(heads: Sequence[str], rows: Sequence[str]) -> str:
     """A table of rows that are HTML already."""
     cells = "".join(f"<th>{escape(head)}</th>" for head in heads)
     return f"<table><thead><tr>{cells}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+
+
+class Page:
+    """A report that is written once and given out as HTML and as Markdown."""
+
+    def __init__(self, title: str) -> None:
+        """Begin with a title, plain text."""
+        self.title = title
+        self._html = [f"<h1>{escape(title)}</h1>"]
+        self._markdown = [f"# {title}"]
+
+    def _add(self, html: str, markdown: str) -> None:
+        self._html.append(html)
+        self._markdown.append(markdown)
+
+    def heading(self, text: str) -> None:
+        """Of a section."""
+        self._add(f"<h2>{escape(text)}</h2>", f"## {text}")
+
+    def lead(self, text: str) -> None:
+        """A paragraph that says what came out."""
+        self._add(f'<p class="lead">{escape(text)}</p>', text)
+
+    def note(self, text: str) -> None:
+        """A paragraph in small print; nothing for no text."""
+        if text:
+            self._add(f'<p class="note">{escape(text.replace("`", ""))}</p>', text)
+
+    def items(self, heading: str, sentences: Sequence[str]) -> None:
+        """A section of warnings; nothing where there are none."""
+        if sentences:
+            self.heading(heading)
+            items = "".join(f'<li class="warning">{escape(sentence)}</li>' for sentence in sentences)
+            self._add(f"<ul>{items}</ul>", "\n".join(f"- {sentence}" for sentence in sentences))
+
+    def table(
+        self, heads: Sequence[str], rows: Sequence[Sequence[str]], kinds: Sequence[str] = (), last: str = ""
+    ) -> None:
+        """A table; `kinds` are classes of the style for its rows, `last` is that of its last cells."""
+        html = []
+        for k, row in enumerate(rows):
+            cells = "".join(f"<td>{escape(cell)}</td>" for cell in row[:-1])
+            cells += f'<td class="{last}">{escape(row[-1])}</td>'
+            html.append(f'<tr class="{kinds[k] if kinds else ""}">{cells}</tr>')
+        lines = [heads, ["---"] * len(heads), *rows]
+        markdown = "\n".join(
+            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
+        )
+        self._add(html_table(heads, html), markdown)
+
+    def pictures(self, pictures: Pictures) -> None:
+        """Every picture below what it shows."""
+        shown = ""
+        for name, (text, data) in pictures.items():
+            if text != shown:
+                self.heading(text)
+            self._add(html_picture(data, text), f"![{text}]({name})")
+            shown = text
+
+    def code(self, heading: str, lines: Sequence[str]) -> None:
+        """A section of lines as they are."""
+        self.heading(heading)
+        text = "\n".join(lines)
+        self._add(f"<pre>{escape(text)}</pre>", f"```text\n{text}\n```")
+
+    def write(self, folder: str | os.PathLike[str], record: Mapping[str, Any], pictures: Pictures) -> None:
+        """Write `report.html`, `report.md`, the pictures as PNG and `fit.json`.
+
+        Args:
+            folder: Directory to make; an earlier report there is replaced.
+            record: What `fit.json` holds.
+            pictures: Those that the page names.
+
+        Raises:
+            OutputError: The folder holds other files, or cannot be written.
+        """
+        texts = {
+            RECORD_FILE: json.dumps(record, indent=1, allow_nan=False) + "\n",
+            REPORT_FILE: html_page(self.title, self._html),
+            MARKDOWN_FILE: "\n\n".join(self._markdown) + "\n",
+        }
+        with atomic_directory(folder, replaces=RECORD_FILE) as temporary:
+            for name, (_, data) in pictures.items():
+                (temporary / name).write_bytes(data)
+            for name, text in texts.items():
+                (temporary / name).write_text(text, encoding="utf-8")

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from finssim.calibration.findings import finding
 from finssim.calibration.fit import Correlation, Curve, Estimate, Fit
 from finssim.vehicles import Vehicle, load_vehicle
 
@@ -49,7 +50,7 @@ def made_fit(vehicle: Vehicle | None = None, **changes: Any) -> Fit:
             },
             "quality": {"surge": {"r2": 0.998, "rmse": 0.01, "samples": 900.0}},
             "correlation": Correlation(names=tuple(names), matrix=np.eye(len(names))),
-            "warnings": ("yaw.d2 rests on its bound",),
+            "findings": (finding("at_bound", "yaw.d2", free=-1.2, unit="N m s²"),),
             "curves": (
                 Curve(
                     title="surge, trial a",

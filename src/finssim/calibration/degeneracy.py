@@ -1,12 +1,13 @@
-"""Which parameters the data cannot tell apart, said in sentences."""
+"""Which parameters the data cannot tell apart."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Correlation
 
 __all__ = ["correlation", "degeneracy"]
@@ -37,8 +38,8 @@ def correlation(names: Sequence[str], covariance: Array) -> Correlation:
 
 def degeneracy(
     names: Sequence[str], covariance: Array, theta: Array | None = None
-) -> tuple[Correlation, list[str]]:
-    """Correlation of the errors, and a sentence for each group of parameters that trade off.
+) -> tuple[Correlation, list[Finding]]:
+    """Correlation of the errors, and a finding for each group of parameters that trade off.
 
     The groups are the weak directions of the scaled information: eigenvectors of the errors' correlation with large
     eigenvalues. A trade-off among parameters that are all known well is left out.
@@ -53,20 +54,15 @@ def degeneracy(
     """
     found = correlation(names, covariance)
     variance = np.diagonal(covariance)
-    sentences = []
     unknown = [name for name, v in zip(names, variance, strict=True) if not np.isfinite(v)]
-    if unknown:
-        sentences.append(
-            f"the trials say nothing of {_listed(unknown)}: {'it needs' if len(unknown) == 1 else 'they need'} "
-            "trials that excite them, or a value fixed beforehand"
-        )
+    findings = [finding("undetermined", parameters=tuple(unknown))] if unknown else []
     std = np.sqrt(np.where(np.isfinite(variance), np.maximum(variance, 0.0), 0.0))
     loose = np.isfinite(variance) & (variance > 0.0)
     if theta is not None:
         loose &= std > LOOSE * np.abs(theta)
     index = np.flatnonzero(np.isfinite(variance) & (variance > 0.0))
     if len(index) < 2:
-        return found, sentences
+        return found, findings
     R = found.matrix[np.ix_(index, index)]
     values, vectors = np.linalg.eigh(R)
     inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T
@@ -82,43 +78,21 @@ def degeneracy(
         traded &= ~large
         group = [names[i] for i in index[large]]
         ratio = 1.0 / np.sqrt(1.0 - multiple[large].max() ** 2 + 1e-24)
-        sentences.append(_sentence(group, ratio))
-    return found, sentences
+        findings.append(_traded(group, float(ratio)))
+    return found, findings
 
 
-def _listed(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-
-
-REMEDIES: Mapping[str, str] = {
-    "scale": "the motion gives only their ratios: fix one of them, for instance the thrust by a bollard pull "
-    "or a mass by weighing",
-    "damping": "trials at other speeds would separate them, or keep one kind of damping only",
-    "lag": "a step log of one motor would separate them",
-    "restoring": "fix one, for instance the stiffness from weight and the distance of the centres",
-    "inertia": "the motion gives only their ratios: fix one of them, for instance by weighing, or excite the axis "
-    "with a known wrench",
-    "other": "fix one of them, or add trials in which they act differently",
-}
-
-
-def _sentence(group: list[str], ratio: float) -> str:
+def _traded(group: list[str], ratio: float) -> Finding:
     kinds = {name.rpartition(".")[2] for name in group}
     axes = {name.rpartition(".")[0] for name in group if "." in name}
     masses = {"m_eff", "added_mass"}
     if "thrust_scale" in kinds:
-        others = [name for name in group if name != "thrust_scale"]
-        text = others[0] if len(others) == 1 else f"every one of {_listed(others)}"
-        return f"thrust_scale and {text} trade off; {REMEDIES['scale']}"
+        return finding("thrust_traded", parameters=tuple(name for name in group if name != "thrust_scale"))
+    fields = {"parameters": tuple(group), "ratio": ratio}
     if kinds <= {"thrust_lag", "thrust_delay"}:
-        remedy = "lag"
-    elif kinds <= {"d1", "d2"} and len(axes) == 1:
-        remedy = "damping"
-    elif kinds & masses and kinds & {"d1", "d2", "k"} and len(axes) == 1:
-        remedy = "inertia"
-    elif "k" in kinds:
-        remedy = "restoring"
-    else:
-        remedy = "other"
-    times = f"{ratio:.0f} times" if ratio < 1e4 else "far"
-    return f"{_listed(group)} trade off: a combination of them is known {times} better than each; {REMEDIES[remedy]}"
+        return finding("lag_traded", **fields)
+    if kinds <= {"d1", "d2"} and len(axes) == 1:
+        return finding("damping_traded", **fields)
+    if kinds & masses and kinds & {"d1", "d2", "k"} and len(axes) == 1:
+        return finding("inertia_traded", **fields)
+    return finding("stiffness_traded", **fields) if "k" in kinds else finding("traded", **fields)

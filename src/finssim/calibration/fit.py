@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.calibration.findings import Finding
 from finssim.vehicles import Vehicle
 
 __all__ = ["Correlation", "Curve", "Estimate", "Fit"]
@@ -97,8 +98,8 @@ class Fit:
     quality: dict[str, dict[str, float]] = field(default_factory=dict)
     """Axis or thruster -> figures of the fit: r2, rmse, nrmse, samples, rejected, ..."""
     correlation: Correlation | None = None
-    warnings: tuple[str, ...] = ()
-    """One sentence each: bounds, degeneracies, speeds of less than a decade, trials left out."""
+    findings: tuple[Finding, ...] = ()
+    """Bounds, degeneracies, speeds of less than a decade, trials left out."""
     curves: tuple[Curve, ...] = ()
     trials: dict[str, str] = field(default_factory=dict)
     """Name of a trial or table -> SHA-256 of its numbers."""

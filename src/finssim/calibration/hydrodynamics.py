@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Estimate, Fit
 from finssim.calibration.output.calibrate import SCALED, calibrated
 from finssim.calibration.regression.axis_estimates import CERTAIN
@@ -138,7 +139,7 @@ def fit_hydrodynamics(
         fit = _better(regression, simulation, body, trials, before)
     if std:
         fit = _with_scale(fit, vehicle, scale, std, known)
-    return replace(fit, warnings=(*fit.warnings, *_worse(fit, trials, before)))
+    return replace(fit, findings=(*fit.findings, *_worse(fit, trials, before)))
 
 
 def _or_none(fit: Callable[[Vehicle], Fit], vehicle: Vehicle) -> Fit | None:
@@ -196,15 +197,14 @@ def _scores(vehicle: Vehicle, trials: Sequence[Trial]) -> dict[str, float]:
     return {axis: float(np.median(found)) for axis, found in values.items()}
 
 
-def _worse(fit: Fit, trials: Sequence[Trial], before: Mapping[str, float]) -> list[str]:
-    """A sentence for each axis that the calibrated vehicle replays worse than the file it came from."""
+def _worse(fit: Fit, trials: Sequence[Trial], before: Mapping[str, float]) -> list[Finding]:
+    """A finding for each axis that the calibrated vehicle replays worse than the file it came from."""
     if not fit.changes:
         return []
     after = _scores(calibrated(fit), trials)
+    other = "simulation" if fit.method == "regression" else "regression"
     return [
-        f"{axis}: the calibrated vehicle replays these trials worse (NRMSE {value:.2f}) than the vehicle file does "
-        f"({before[axis]:.2f}): do not use it for this axis; try --method "
-        f"{'simulation' if fit.method == 'regression' else 'regression'}, or trials that move it alone"
+        finding("replays_worse", axis, after=value, before=before[axis], method=other)
         for axis, value in after.items()
         if axis in before and value > WORSE * before[axis] + 0.01
     ]
@@ -275,16 +275,12 @@ def _with_scale(fit: Fit, vehicle: Vehicle, scale: float, std: float, known: Map
         note="no battery voltage: from what batteries have and the added mass that the vehicle file expects; it is in "
         "every interval",
     )  # fmt: skip
-    warning = (
-        f"no trial has a battery voltage, so that the thrust is known to {100.0 * (high - 1.0):.0f} % at best, and "
-        "masses and drag with it: give a column 'voltage', or 'voltage:' in trial.yaml or in the map"
-    )
     return replace(
         fit,
         vehicle=vehicle,
         estimates=found,
         changes={**scaled(vehicle, scale), **fit.changes},
-        warnings=(warning, *fit.warnings),
+        findings=(finding("voltage_unknown", percent=100.0 * (high - 1.0)), *fit.findings),
     )
 
 

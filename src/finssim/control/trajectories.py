@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,6 +14,7 @@ import numpy.typing as npt
 from finssim.control import ControlError
 from finssim.control.guidance import Reference
 from finssim.geometry.rotations import quat_from_yaw, quat_inverse_rotate, wrap_angle
+from finssim.text_table import read_text_table
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import room
 from finssim.yaml_file import read_mapping
@@ -500,15 +500,10 @@ def _number(data: Mapping[str, Any], key: str, otherwise: float) -> float:
 
 
 def _rows_of_table(path: Path) -> list[list[str]]:
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = [row for row in csv.reader(file) if row]
-    except (OSError, UnicodeDecodeError) as error:
-        raise ControlError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    header = tuple(cell.strip() for cell in rows[0]) if rows else ()
-    if header not in (COLUMNS, COLUMNS[:4]):
-        raise ControlError(f"its header is '{','.join(header)}', expected t,x,y,z or t,x,y,z,yaw")
-    return rows[1:]
+    table = read_text_table(path, ControlError)
+    if tuple(table.names) not in (COLUMNS, COLUMNS[:4]):
+        raise ControlError(f"its header is '{','.join(table.names)}', expected t,x,y,z or t,x,y,z,yaw")
+    return table.rows
 
 
 def _checked_points(points: Any) -> Array:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from finssim.calibration.excitation.programmes import RATE, Programme, programmes, which_axes
+from finssim.calibration.findings import sentences
 from finssim.calibration.output.calibrate import number_in
 from finssim.calibration.output.fit_output import interval_text, number_text, state_text
 from finssim.calibration.trials.trial import Trial
@@ -448,7 +449,7 @@ def _identification(found: Identification) -> list[str]:
         html_table(HEADS, rows),
         _note(UNSURE + (POOL_VEHICLE if found.steps else "")),
         *_terminal_speeds(found),
-        *map(_note, found.warnings),
+        *map(_note, sentences(found.findings)),
         html_picture(found.picture, "Held-out trials: measured and replayed by the identified vehicle"),
     ]
 

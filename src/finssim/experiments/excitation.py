@@ -419,7 +419,7 @@ def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
         "fault": outcome.fault,
         "duration": 0.0 if math.isnan(t) else t,
         "fastest": fastest(trial),
-        "notes": list(made.notes),
+        "notes": list(map(str, made.findings)),
     }
 
 

@@ -11,8 +11,9 @@ from pathlib import Path
 
 from finssim.calibration.excitation.programmes import programmes
 from finssim.calibration.excitation.synthetic import simulate_programme
+from finssim.calibration.findings import Finding
 from finssim.calibration.fit import Fit
-from finssim.calibration.output.calibrate import calibrated, doubts
+from finssim.calibration.output.calibrate import all_findings, calibrated
 from finssim.calibration.output.report import write_report
 from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.calibration.regression.regress import regress
@@ -51,7 +52,7 @@ class Identification:
     """The vehicle of the catalogue that made the trials, or around which the pool's own was drawn."""
     picture: bytes
     """PNG of the held-out trials, measured and replayed."""
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
     seconds: float
     steps: tuple[dict[str, float | str], ...] = ()
     """Terminal speeds and time constants beside those of a plant, of `programmes.compare_steps`."""
@@ -109,7 +110,7 @@ def identify(
     recorded = (record or simulated_trials(truth))(folder / TRIALS, folder / start_file, seed)
     fit = regress(recorded["fit"], load_vehicle(folder / start_file), seed=seed)
     found = calibrated(fit)
-    warnings = tuple(doubts(fit, found))
+    findings = tuple(all_findings(fit, found))
     found = _named(
         found, f"{name} as identified", "Hydrodynamics from trials where they tell it, else guesses."
     )
@@ -121,7 +122,7 @@ def identify(
         folder / "calibration",
         vehicle,
         command=commands(place, name, seed)[1],
-        warnings=warnings,
+        findings=findings,
         out=place / vehicle_file,
     )
     scored = replay(recorded["held-out"], vehicle, seed=seed)
@@ -131,7 +132,7 @@ def identify(
         replay=scored,
         truth=truth,
         picture=_write_replay(scored, folder),
-        warnings=warnings,
+        findings=findings,
         seconds=time.perf_counter() - began,
     )
 

@@ -21,9 +21,9 @@ from finssim.calibration.fit import Fit
 from finssim.calibration.output.calibrate import calibrated
 from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.calibration.regression.regress import regress
-from finssim.calibration.replay.as_json import DEFINITION
 from finssim.calibration.replay.figure import MODEL_LABELS, draw_response_envelopes
 from finssim.calibration.replay.replay import Replay, replay
+from finssim.calibration.replay.report import DEFINITION
 from finssim.calibration.trials.trial import Trial
 from finssim.engine import Simulator, TetherLine
 from finssim.experiments.campaign import Say, write_json
@@ -414,7 +414,7 @@ def _fit(one: SeedResult) -> dict[str, Any]:
         "method": one.fit.method,
         "vehicle_sha256": one.vehicle.sha256,
         "parameters": {name: e.as_json() for name, e in one.fit.estimates.items()},
-        "warnings": list(one.fit.warnings),
+        "findings": [finding.as_json() for finding in one.fit.findings],
         "trials": dict(one.fit.trials),
         "held_out": {p.name: p.sha256 for p in one.same_levels.pairs},
     }

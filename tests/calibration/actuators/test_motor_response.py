@@ -7,8 +7,8 @@ import pytest
 
 from calibration.made_steps import RPM, held, lagged, sampled, step_log
 from finssim.calibration.actuators.motor import fit_motor
-from finssim.calibration.actuators.motor_steps import cut_steps
 from finssim.calibration.actuators.motor_study import fit_response
+from finssim.calibration.actuators.motor_trial import cut_steps
 from finssim.calibration.actuators.steps import find_steps, levels
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation.programmes import programmes
@@ -123,7 +123,7 @@ def test_the_vehicle_files_domain_is_respected(domain, asked):
 def test_the_wrong_domain_is_told():
     trial = step_log(H_LF, "H_LF", PULSES, domain="speed")
     fit = fit_motor([trial], FINSROV)
-    assert any("a first order of the speed fits better" in warning for warning in fit.warnings)
+    assert [one.values["domain"] for one in fit.findings if one.code == "other_domain"] == ["speed"]
 
 
 def test_the_dead_zone_lies_between_the_commands_that_show_it():
@@ -153,7 +153,7 @@ def test_a_motor_that_does_not_follow_keeps_its_numbers():
     trial = step_log(H_LF, "H_LF", PULSES)
     dead = Trial(name="dead", t=trial.t, channels=trial.channels | {"rpm_H_LF": np.zeros(len(trial.t))})
     fit = fit_motor([dead], FINSROV)
-    assert fit.changes == {} and any("rpm_H_LF does not follow the command" in w for w in fit.warnings)
+    assert fit.changes == {} and "not_followed" in {one.code for one in fit.findings}
 
 
 def test_several_trials_and_thrusters_are_fitted_together():
@@ -163,8 +163,8 @@ def test_several_trials_and_thrusters_are_fitted_together():
     fitted = FINSROV.replace(fit.changes)
     assert fitted.thrusters["H_RB"].time_constant == pytest.approx(0.15, rel=0.03), "the same propeller group"
     assert fitted.thrusters["V_LF"].time_constant == FINSROV.thrusters["V_LF"].time_constant
-    assert any("mean time constant of their group" in w for w in fit.warnings)
-    assert any("keep the vehicle file's time constant" in w for w in fit.warnings)
+    assert "group_mean" in {one.code for one in fit.findings}
+    assert "file_response" in {one.code for one in fit.findings}
     assert set(fit.trials) == {f"steps{seed}" for seed in range(4)}
 
 
@@ -188,8 +188,8 @@ def test_pulses_and_unsigned_speeds_with_lost_samples_and_spikes():
     assert fit.estimates["T2.time_constant"].estimate == pytest.approx(0.15, rel=0.1)
     assert fit.estimates["T2.delay"].estimate == pytest.approx(0.1, abs=0.01)
     assert fit.estimates["T2.gain"].estimate == pytest.approx(1.0, abs=0.03)
-    assert any("rpm_T2 has no sign" in w for w in fit.warnings)
-    assert any("stand alone far from their neighbours" in w for w in fit.warnings)
+    assert "sign_of_command" in {one.code for one in fit.findings}
+    assert "spikes" in {one.code for one in fit.findings}
 
 
 @pytest.mark.slow

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from finssim.calibration.actuators.thrust_curve import dead_zone, fit_side
 from finssim.calibration.actuators.thrust_table import read_table
 from finssim.calibration.actuators.thruster import fit_thruster
-from finssim.calibration.actuators.thruster_figure import draw_thruster
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import check_vehicle, load_vehicle
@@ -152,7 +151,9 @@ def test_a_log_of_held_levels_gives_its_settled_parts(tmp_path):
     assert len(table.speed) == 11
     fit = fit_thruster([table], FINSROV, thrusters=["V_LF"])
     assert fit.estimates["V_LF.c_plus"].estimate == pytest.approx(1.1e-4, rel=5e-3)
-    assert any("load cell reads 0.4 N" in warning for warning in fit.warnings)
+    assert [one.values["offset"] for one in fit.findings if one.code == "load_cell_offset"] == [
+        pytest.approx(0.4, abs=0.005)
+    ]
 
 
 def test_a_slow_sweep_is_used_row_by_row(tmp_path):
@@ -256,7 +257,7 @@ def test_the_fit_at_16_v_predicts_the_other_voltages_with_the_error_it_states():
         figures = fit.quality[f"T200 at {volts} V"]
         assert figures["nrmse_thrust_from_speed"] < 0.017 and figures["r2_thrust_from_speed"] > 0.996
         assert figures["nrmse_speed_from_pulse"] < speed_error
-    assert any("c_plus changes by +0.39 % per volt" in warning for warning in fit.warnings)
+    assert any("c_plus changes by +0.39 % per volt" in one.values.get("trends", ()) for one in fit.findings)
     alone = fit_thruster([AT_16_V], BLUEROV2)
     assert fit.estimates["T200.c_plus"].estimate == pytest.approx(
         alone.estimates["T200.c_plus"].estimate, rel=1e-3
@@ -308,7 +309,9 @@ def test_groups_and_thrusters_are_told_by_file_names(tmp_path):
 
 def test_tables_that_name_no_group_warn_on_a_vehicle_with_several():
     fit = fit_thruster([AT_16_V], FINSROV)
-    assert "all.c_plus" in fit.estimates and any("propeller groups CC, CCW" in w for w in fit.warnings)
+    assert "all.c_plus" in fit.estimates and any(
+        one.values.get("groups") == ("CC", "CCW") for one in fit.findings
+    )
 
 
 def test_a_bench_trial_is_a_table_of_its_thruster():
@@ -330,9 +333,7 @@ def test_force_and_pulse_without_speed_fit_the_speed_controller_alone(tmp_path):
         tmp_path / "a.csv", "PWM (µs),Thrust (N),Voltage (V)", table.pulse, table.force, table.voltage
     )
     fit = fit_thruster([path], BLUEROV2)
-    assert "T200.c_plus" not in fit.estimates and any(
-        "no shaft speeds" in warning for warning in fit.warnings
-    )
+    assert "T200.c_plus" not in fit.estimates and any(one.code == "no_shaft_speeds" for one in fit.findings)
     thruster = BLUEROV2.replace(fit.changes).thrusters["T1"]
     error = thruster.thrust(thruster.shaft_speed(table.pulse, 16.0)) - table.force
     assert np.sqrt(np.mean(error**2)) < 0.02 * 51.4
@@ -360,18 +361,6 @@ def test_a_limit_of_the_vehicle_file_stays_where_the_table_does_not_reach_it(tmp
 def test_names_that_the_vehicle_does_not_have_are_refused(arguments, said):
     with pytest.raises(CalibrationError, match=said):
         fit_thruster([AT_16_V], FINSROV, **arguments)
-
-
-def test_the_picture_shows_curve_residual_and_every_voltage(tmp_path):
-    figure = draw_thruster(fit_thruster([ALL_VOLTAGES], BLUEROV2, voltage=16.0))
-    thrust, residual, speed = figure.axes
-    assert max(abs(line.get_ydata()).max() for line in residual.lines) < 1.2, "newtons of misfit at 16 V"
-    assert [text.get_text() for text in speed.get_legend().get_texts()] == [
-        f"{v} V" for v in (10, 12, 14, 16, 18, 20)
-    ]
-    assert thrust.get_ylabel() == "thrust [N]"
-    with pytest.raises(CalibrationError, match="holds no 'T100': it has T200"):
-        draw_thruster(fit_thruster([AT_16_V], BLUEROV2), "T100")
 
 
 def test_the_same_table_twice_is_refused():

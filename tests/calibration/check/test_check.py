@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from finssim.calibration.check.check import as_object, check, check_trials
-from finssim.calibration.check.tables import print_reports
-from finssim.calibration.check.together import together
+from finssim.calibration.check.check import as_object, check, check_trials, print_reports, together
 from finssim.calibration.excitation.programmes import programmes
 from finssim.calibration.excitation.synthetic import simulate_programme
 from finssim.calibration.trials.trial_files import write_trial
@@ -59,8 +57,13 @@ def axis(trial, name, vehicle=VEHICLE):
     return next(a for a in report(trial, vehicle).axes if a.axis == name)
 
 
-def texts(trial, level=None, vehicle=VEHICLE):
-    return [f.text for f in report(trial, vehicle).findings if level in (None, f.level)]
+def said(findings, code, severity=None):
+    """Values of the findings of a code, and of a severity where it is given."""
+    return [one.values for one in findings if one.code == code and severity in (None, one.severity)]
+
+
+def told(trial, code, severity=None, vehicle=VEHICLE):
+    return said(report(trial, vehicle).findings, code, severity)
 
 
 def negative(x):
@@ -93,17 +96,27 @@ def test_thrust_scale_is_said_to_go_with_the_mass(simulated):
 
 
 WRONG = {
-    "gravity downwards": ("surge", {"ax": negative, "ay": negative, "az": negative}, "gravity the wrong way"),
-    "in g": ("surge", {a: (lambda y: y / 9.80665) for a in ("ax", "ay", "az")}, "in g?"),
-    "pitch rate turned": ("surge", {"q": negative}, "q runs against the change of pitch"),
-    "yaw turned": ("yaw", {"yaw": negative}, "r runs against the change of yaw"),
-    "rate in degrees": ("yaw", {"r": np.degrees}, "convert: {scale: {r: 0.0174533}}"),
-    "roll in degrees": ("roll", {"roll": np.degrees}, "convert: {scale: {roll: 0.0174533}}"),
-    "heave turned": ("heave", {"w": negative}, "w runs against the change of z"),
-    "z downwards": ("heave", {"z": negative}, "z grows with depth"),
-    "force turned": ("surge", {"tau_x": negative}, "tau_x runs against u"),
-    "moment turned": ("yaw", {"tau_n": negative}, "tau_n runs against r"),
-    "roll of the accelerometer turned": ("roll", {"ay": negative}, "ay runs against the roll"),
+    "gravity downwards": ("surge", {"ax": negative, "ay": negative, "az": negative}, "gravity_wrong_way", {}),
+    "in g": (
+        "surge",
+        {a: (lambda y: y / 9.80665) for a in ("ax", "ay", "az")},
+        "acceleration_unit",
+        {"unit": "g"},
+    ),
+    "pitch rate turned": ("surge", {"q": negative}, "rate_sign", {"column": "q", "other": "pitch"}),
+    "yaw turned": ("yaw", {"yaw": negative}, "rate_sign", {"column": "r", "other": "yaw"}),
+    "rate in degrees": ("yaw", {"r": np.degrees}, "degrees", {"column": "r"}),
+    "roll in degrees": ("roll", {"roll": np.degrees}, "degrees", {"column": "roll"}),
+    "heave turned": ("heave", {"w": negative}, "rate_sign", {"column": "w", "other": "z"}),
+    "z downwards": ("heave", {"z": negative}, "z_down", {}),
+    "force turned": ("surge", {"tau_x": negative}, "energy_taken", {"wrench": "tau_x", "velocity": "u"}),
+    "moment turned": ("yaw", {"tau_n": negative}, "energy_taken", {"wrench": "tau_n", "velocity": "r"}),
+    "roll of the accelerometer turned": (
+        "roll",
+        {"ay": negative},
+        "acceleration_sign",
+        {"column": "ay", "angle": "roll"},
+    ),
 }
 
 
@@ -111,16 +124,19 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_wrong_signs_and_units_are_refused(simulated, case):
     """One convention changed in a good trial is found, named, and nothing may rest on it."""
-    name, columns, words = WRONG[case]
+    name, columns, code, values = WRONG[case]
     trial = changed(simulated[name], **columns)
     assert report(trial).verdict == "refused"
-    assert any(words in text for text in texts(trial, "refused")), texts(trial)
+    assert any(values.items() <= given.items() for given in told(trial, code, "refused")), report(
+        trial
+    ).findings
 
 
 def test_a_heading_that_is_turned_against_the_position_is_found(simulated):
     """Motion capture whose x axis is not the compass's: 90 degrees between them."""
     trial = changed(simulated["surge"], yaw=lambda y: y + np.pi / 2)
-    assert any("x, y and the heading disagree by -90°" in text for text in texts(trial, "care")), texts(trial)
+    (disagreement,) = told(trial, "heading_disagrees", "care")
+    assert disagreement["angle"] == pytest.approx(-90.0, abs=2.0)
 
 
 def test_an_offset_between_streams_is_measured(simulated):
@@ -130,7 +146,8 @@ def test_an_offset_between_streams_is_measured(simulated):
     trial = replace(trial, channels={**trial.channels, **late})
     found = report(trial)
     assert found.offsets["attitude"]["seconds"] == pytest.approx(-0.15, abs=0.03)
-    assert any("time_offset: {attitude: -0.1" in text for text in texts(trial, "care"))
+    (offset,) = told(trial, "stream_offset", "care")
+    assert offset["group"] == "attitude" and offset["seconds"] == pytest.approx(-0.15, abs=0.03)
 
 
 def test_five_hertz_with_wrench_and_velocity_only(simulated):
@@ -195,7 +212,7 @@ def test_no_inputs_pulses_without_a_controller_and_strange_thrusters_are_refused
     """Each with the reason, and the motion is looked at all the same."""
     gone = {c: None for c in simulated["surge"].channels if c.startswith("tau")}
     bare = changed(simulated["surge"], **gone)
-    assert any("no input columns" in text for text in texts(bare, "refused"))
+    assert "no input columns" in told(bare, "unusable", "refused")[0]["reason"]
     assert axis(bare, "surge").fastest > 0.3
     for prefix, thrusters, vehicle, words in (
         ("pwm_", VEHICLE.thrusters, VEHICLE.replace({"thrusters.*.esc": None}), "esc"),
@@ -204,14 +221,14 @@ def test_no_inputs_pulses_without_a_controller_and_strange_thrusters_are_refused
     ):
         pulses = {f"{prefix}{name}": np.full(len(bare.t), 1600.0) for name in thrusters}
         trial = replace(bare, channels={**bare.channels, **pulses})
-        assert any(words in text for text in texts(trial, "refused", vehicle)), texts(trial, None, vehicle)
+        assert words in told(trial, "unusable", "refused", vehicle)[0]["reason"]
 
 
 def test_no_vehicle_is_refused_but_the_sampling_is_reported(simulated):
     """Nobody said what it was."""
     found = check_trials([changed(simulated["surge"], header={"vehicle": None})])[0]
     assert found.verdict == "refused" and found.streams and not found.axes
-    assert any("give --vehicle" in f.text for f in found.findings)
+    assert said(found.findings, "no_vehicle", "refused")
 
 
 def test_gaps_rates_and_jitter_are_measured(simulated):
@@ -222,7 +239,8 @@ def test_gaps_rates_and_jitter_are_measured(simulated):
     (velocity,) = [s for s in report(trial).streams if "u" in s.columns]
     assert velocity.gaps == 1 and velocity.longest_gap == pytest.approx(4.0, abs=0.05)
     assert velocity.rate == pytest.approx(50.0) and velocity.missing == pytest.approx(4.0 / 13.98, abs=0.01)
-    assert any("u, v, w: a gap of 4" in text for text in texts(trial, "care"))
+    (gap,) = (one for one in report(trial).findings if one.code == "gap" and one.severity == "care")
+    assert gap.subject == "u, v, w" and gap.values["longest"] == pytest.approx(4.0, abs=0.05)
     jittered = replace(trial, t=trial.t + np.where(np.arange(len(trial.t)) % 2, 0.008, 0.0))
     assert [s for s in report(jittered).streams if "p" in s.columns][0].jitter == pytest.approx(0.4, abs=0.02)
 
@@ -231,9 +249,9 @@ def test_heights_above_the_surface_are_told(simulated):
     """Motion capture counts from the floor, and some logs count depth upwards."""
     trial = simulated["yaw"]
     raised = changed(trial, z=lambda z: z - z.min() + 1.0)
-    assert any(text.startswith("z: says") for text in texts(raised, "care"))
-    assert any("scale: {depth: -1}" in text for text in texts(changed(trial, depth=np.negative), "care"))
-    assert not any("above the surface" in text for text in texts(trial))
+    assert told(raised, "above_surface", "care")[0]["height"] > 1.0
+    assert told(changed(trial, depth=np.negative), "depth_above_surface", "care")
+    assert not told(trial, "above_surface") and not told(trial, "depth_above_surface")
 
 
 def test_stuck_held_and_clipped_sensors_are_found(simulated):
@@ -241,31 +259,32 @@ def test_stuck_held_and_clipped_sensors_are_found(simulated):
     trial = simulated["yaw"]
     i = np.arange(len(trial.t))
     stuck = changed(trial, r=lambda y: np.where((trial.t > 4.0) & (trial.t < 7.0), y[200], y))
-    assert any(text.startswith("r: stands at") for text in texts(stuck, "care"))
+    assert told(stuck, "stuck", "care")[0]["span"] == pytest.approx(3.0, abs=0.1)
     held = changed(trial, u=lambda y: y[5 * (i // 5)])
-    assert any("u: each value stays for 5 rows: it comes at 10 Hz" in text for text in texts(held))
+    assert told(held, "values_held")[0] == {
+        "rows": 5.0,
+        "rate": pytest.approx(10.0),
+        "row_rate": pytest.approx(50.0),
+    }
     clipped = changed(trial, r=lambda y: np.maximum(y, -1.5))
-    assert any("r: never below -1.5" in text for text in texts(clipped, "care"))
+    assert told(clipped, "clipped_below", "care")[0]["value"] == -1.5
 
 
 def test_saturation_is_found(simulated):
     """A commanded wrench that the thrusters cannot give, and thrusters at their limits."""
     commanded = changed(simulated["surge"], header={"inputs": "commanded"}, tau_x=lambda y: 10.0 * y)
-    assert any("tau_x is beyond" in text for text in texts(commanded, "care"))
+    assert told(commanded, "command_beyond", "care")[0]["column"] == "tau_x"
     bare = changed(
         simulated["surge"], **{c: None for c in simulated["surge"].channels if c.startswith("tau")}
     )
     top = {f"rpm_{n}": np.where(bare.t > 3.0, t.rpm_max, 0.0) for n, t in VEHICLE.thrusters.items()}
     saturated = replace(bare, channels={**bare.channels, **top})
-    assert any("at the limit" in text for text in texts(saturated, "care"))
+    assert set(told(saturated, "saturated", "care")[0]["thrusters"]) == set(VEHICLE.thrusters)
 
 
 def test_an_axis_that_the_header_names_but_nothing_drives_is_told(simulated):
     """trial.yaml says sway."""
-    assert any(
-        "sway is not excited" in text
-        for text in texts(changed(simulated["surge"], header={"axis": ("sway",)}))
-    )
+    assert told(changed(simulated["surge"], header={"axis": ("sway",)}), "axis_still") == [{"axis": "sway"}]
 
 
 @pytest.mark.slow
@@ -274,15 +293,15 @@ def test_between_trials(simulated):
     surge, yaw = simulated["surge"], simulated["yaw"]
     twice = check_trials([surge, replace(surge, name="again")], VEHICLE)
     assert [r.verdict for r in twice] == ["usable", "refused"]
-    assert "same numbers as surge" in twice[1].findings[-1].text
+    assert said(twice[1].findings, "duplicate") == [{"other": surge.name}]
     out = [changed(trial, header={"role": "held-out"}) for trial in (surge, yaw)]
-    assert any("nothing is left to fit" in f.text for f in together(check_trials(out, VEHICLE)))
+    assert said(together(check_trials(out, VEHICLE)), "all_held_out")
     mixed = check_trials(
         [changed(surge, header={"vehicle": "bluerov2"}), changed(yaw, header={"vehicle": "finsrov"})]
     )
-    assert any("several vehicles: bluerov2, finsrov" in f.text for f in together(mixed))
+    assert said(together(mixed), "several_vehicles") == [{"vehicles": ("bluerov2", "finsrov")}]
     good = together(check_trials([surge, changed(yaw, header={"role": "held-out"})], VEHICLE))
-    assert any("no trial tells anything of sway" in f.text and "yaw" in f.text for f in good)
+    assert {"sway", "yaw"} <= set(said(good, "axes_untold")[0]["axes"])
 
 
 @pytest.mark.slow
@@ -293,11 +312,10 @@ def test_an_offset_that_several_trials_share_is_told_once(simulated):
         trial = simulated[name]
         moved = {c: np.interp(trial.t - 0.12, trial.t, trial.channels[c]) for c in ("roll", "pitch", "yaw")}
         late.append(replace(trial, channels={**trial.channels, **moved}))
-    found = [f.text for f in together(check_trials(late, VEHICLE)) if f.level == "care"]
-    assert any("attitude comes 0.1" in text and "late against rates in 3 trials" in text for text in found), (
-        found
-    )
-    assert not any("late" in f.text for f in together(check_trials(list(simulated.values()), VEHICLE)))
+    (found,) = said(together(check_trials(late, VEHICLE)), "stream_offset_common", "care")
+    assert (found["group"], found["sense"], found["reference"]) == ("attitude", "late", "rates")
+    assert found["trials"] == 3 and found["seconds"] == pytest.approx(-0.12, abs=0.03)
+    assert not said(together(check_trials(list(simulated.values()), VEHICLE)), "stream_offset_common")
 
 
 @pytest.mark.slow

@@ -78,7 +78,7 @@ def test_rates_and_battery(dataflash):
 def test_an_estimate_without_a_position_sensor_is_no_velocity(dataflash):
     """That filter assumed that the vehicle stands still; the trial says why it has no u v w."""
     assert not dataflash.has("u")
-    assert any("XKF1 is left out" in note for note in dataflash.notes)
+    assert "velocity_left_out" in {one.code for one in dataflash.findings}
 
 
 def test_an_estimate_with_one_is(telemetry):

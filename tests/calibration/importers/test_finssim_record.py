@@ -141,7 +141,7 @@ def test_a_cut_record_is_imported_up_to_the_cut(run, tmp_path):
     cut.write_bytes(run.read_bytes()[: int(0.7 * run.stat().st_size)])
     (trial,) = read_trials([cut])
     assert trial.header.vehicle == "finsrov" and 0.5 < trial.t[-1] < 3.99
-    assert any("cut off" in note for note in trial.notes)
+    assert any("cut off" in str(one) for one in trial.findings)
 
 
 def test_a_vehicle_that_is_not_in_the_catalogue_is_noted(tmp_path):
@@ -149,13 +149,13 @@ def test_a_vehicle_that_is_not_in_the_catalogue_is_noted(tmp_path):
     own = VEHICLE.model_copy(update={"name": "mine"})
     record(tmp_path / "mine.mcap", vehicle=own)
     (trial,) = read_trials([tmp_path / "mine.mcap"])
-    assert trial.header.vehicle is None and any("give --vehicle FILE" in note for note in trial.notes)
+    assert trial.header.vehicle is None and "vehicle_unknown" in {one.code for one in trial.findings}
     (trial,) = read_trials([tmp_path / "mine.mcap"], vehicle="finsrov")
-    assert trial.header.vehicle == "finsrov" and not any("--vehicle" in note for note in trial.notes)
+    assert trial.header.vehicle == "finsrov" and "vehicle_unknown" not in {one.code for one in trial.findings}
     heavy = VEHICLE.replace({"body.mass": 13.0})
     record(tmp_path / "heavy.mcap", vehicle=heavy)
     (trial,) = read_trials([tmp_path / "heavy.mcap"])
-    assert any("another state of finsrov's file" in note for note in trial.notes)
+    assert "vehicle_changed" in {one.code for one in trial.findings}
 
 
 def test_broken_words_for_the_header_are_refused(tmp_path):
@@ -186,4 +186,4 @@ def test_a_vehicle_that_a_record_names_is_of_the_catalogue(tmp_path, monkeypatch
     record(tmp_path / "run.mcap", meta={"trial": {"vehicle": "mine.yaml"}})
     (trial,) = read_trials([tmp_path / "run.mcap"])
     assert trial.header.vehicle is None
-    assert any("vehicle mine.yaml, which is not in the catalogue" in note for note in trial.notes)
+    assert any(one.values == {"vehicle": "mine.yaml"} for one in trial.findings)

@@ -9,8 +9,8 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.importers import import_trials
 from finssim.calibration.importers.column_map import read_map
 from finssim.calibration.importers.dispatch import read_trials
-from finssim.calibration.importers.units import factor
 from finssim.calibration.trials.trial_files import load_trial
+from finssim.calibration.trials.units import factor
 from finssim.files import OutputError
 
 HINSDALE = Path(__file__).parents[2] / "data" / "hinsdale"
@@ -130,7 +130,7 @@ def test_time_units_and_unix_times_start_at_zero(folder, tmp_path, unit, per_sec
         tmp_path,
     )
     np.testing.assert_allclose(trial.t, np.arange(10.0), atol=2e-6)
-    assert any("1700000000" in note for note in trial.notes)
+    assert any(one.code == "clock_origin" and one.values["start"] >= 1.7e9 for one in trial.findings)
 
 
 def test_written_dates_are_times(folder, tmp_path):
@@ -217,7 +217,7 @@ def test_a_cut_table_opens_up_to_the_cut(folder, tmp_path):
     (trial,) = read_trials(folder(log__csv=whole[: len(whole) - 4]))
     values = trial.series("u")[1]
     assert 48 <= len(values) <= 49 and values.min() >= 10.0
-    assert trial.notes
+    assert trial.findings
 
 
 PHASES = ["baseline"] * 10 + ["hold"] * 20 + ["off"] * 10
@@ -324,7 +324,9 @@ def test_a_clock_that_was_set_back_leaves_a_gap_or_is_refused(folder, tmp_path):
     back = "t,u\n" + "".join(f"{0.1 * (i % 40):.1f},{i}\n" for i in range(80))
     (trial,) = read_trials(folder(a__csv=back))
     assert (
-        len(trial.t) == 80 and np.diff(trial.t).max() > 5.0 and any("clock" in note for note in trial.notes)
+        len(trial.t) == 80
+        and np.diff(trial.t).max() > 5.0
+        and "clock_jump" in {one.code for one in trial.findings}
     )
     text = "files:\n  a.csv: {time: t, columns: {u: u}}\n  b.csv: {time: t, columns: {v: v}}"
     with pytest.raises(CalibrationError, match=r"a\.csv: the clock"):

@@ -80,7 +80,7 @@ def test_acceleration_without_gravity_is_recognised():
         assert_close(m.nu_dot, body.nu_dot(m.t), inner(m), 2e-3)
     blind = {name: values for name, values in channels.items() if not name.startswith("q") or name == "q"}
     m = motion(trial(blind), VEHICLE)
-    assert m.nu_dot_source[0] == "smoothed velocity" and "hold gravity" in m.notes[0]
+    assert m.nu_dot_source[0] == "smoothed velocity" and m.findings[0].code == "accelerations_unused"
 
 
 def test_a_velocity_measured_elsewhere_is_moved_to_the_origin():
@@ -152,7 +152,7 @@ def test_a_level_vehicle_needs_only_its_heading():
     assert m.nu_source == ("derived from position",) * 2 + ("",) * 3 + ("derived from attitude",)
     assert_close(m.nu[:, [0, 1, 5]], body.nu(m.t)[:, [0, 1, 5]], inner(m), 2e-3)
     assert np.isnan(m.nu[:, 2:5]).all() and np.isnan(m.quaternion).all()
-    assert "taken" in m.notes[0] or "level" in m.notes[0]
+    assert m.findings[0].code in ("wrench_zero", "taken_level")
 
 
 def test_what_nothing_tells_stays_unknown():

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from calibration.made_fits import SET, made_fit
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.output.calibrate import calibrated, concerns, doubts, kept, number_in
+from finssim.calibration.output.calibrate import all_findings, calibrated, concerns, kept, number_in
 from finssim.calibration.output.fit_output import fit_json, print_fit, state_text
 from finssim.calibration.output.origins import number_origins
 from finssim.calibration.output.vehicle_file import write_vehicle
@@ -117,18 +117,20 @@ def test_an_unphysical_vehicle_is_reported():
         changes={f"{SET}.linear_damping.1.1": -4.0}, quality={"sway": {"r2": -0.5}, "surge": {"r2": 0.9}}
     )
     damping, quality = concerns(fit, calibrated(fit))
-    assert "damping (calibrated)" in damping and "sway" in quality
+    assert (damping.code, damping.values["check"]) == ("check_failed", "damping (calibrated)")
+    assert (quality.code, quality.subject) == ("further_than_mean", "sway")
+    assert all_findings(fit, calibrated(fit)) == [*fit.findings, damping, quality]
     nothing = made_fit(changes={})
-    assert "determine nothing" in " ".join(concerns(nothing, calibrated(nothing)))
+    assert [one.code for one in concerns(nothing, calibrated(nothing))] == ["nothing_determined"]
     assert calibrated(nothing).sha256 == nothing.vehicle.sha256
 
 
 def test_json_has_the_keys_of_the_contract():
     """Every parameter with estimate, ci95, unit, identifiable and note; what is not finite is null."""
     fit = made_fit()
-    found = json.loads(json.dumps(fit_json(fit, calibrated(fit), warnings=fit.warnings), allow_nan=False))
+    found = json.loads(json.dumps(fit_json(fit, calibrated(fit), findings=fit.findings), allow_nan=False))
     assert found.keys() >= {
-        "kind", "method", "vehicle", "parameters", "quality", "correlation", "warnings", "trials", "out", "provenance",
+        "kind", "method", "vehicle", "parameters", "quality", "correlation", "findings", "trials", "out", "provenance",
     }  # fmt: skip
     assert list(found["parameters"]) == list(fit.estimates)
     for parameter in found["parameters"].values():
@@ -142,7 +144,7 @@ def test_the_table_fits_a_hundred_columns():
     """Every parameter, its interval, what the file had and what became of it, on lines of 100 columns at most."""
     fit = made_fit()
     text = io.StringIO()
-    print_fit(fit, calibrated(fit), Console(file=text, width=100), fit.warnings)
+    print_fit(fit, calibrated(fit), Console(file=text, width=100), fit.findings)
     lines = text.getvalue().splitlines()
     assert max(map(len, lines)) <= 100
     (row,) = (line for line in lines if line.strip().startswith("surge.d1"))
@@ -185,22 +187,3 @@ def test_a_part_of_the_drag_is_written_as_unsure():
     assert state_text(fit.estimates["yaw.d2"], fit, after) == "unsure"
     assert after.origin_of(f"{SET}.quadratic_damping.5").note == "95 % interval 0 to 9; rests on its bound"
     assert "yaw.d2" not in kept(fit, after)
-
-
-def test_what_holds_of_several_trials_is_said_once():
-    """Equal sentences about trials become one that names them; others stay as they are."""
-    fit = dataclasses.replace(
-        made_fit(),
-        warnings=(
-            "a: no heading",
-            "b: no heading",
-            "surge: c: left out",
-            "surge: d: left out",
-            "surge: too slow",
-        ),
-    )
-    assert doubts(fit, calibrated(fit))[:3] == [
-        "a, b: no heading",
-        "surge: c, d: left out",
-        "surge: too slow",
-    ]

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from calibration.made_fits import made_fit
+from finssim.calibration.findings import finding
 from finssim.calibration.fit import Curve
 from finssim.calibration.output.calibrate import calibrated
 from finssim.calibration.output.report import write_report
 from finssim.files import OutputError
 
+WEAK = [finding("unusable", reason="surge <alone> is weak")]
 COMMAND = "finssim calibrate hydrodynamics trials --vehicle finsrov --out mine.yaml"
 
 
@@ -21,7 +23,7 @@ def folder(tmp_path_factory):
     """The report of a fit made by hand."""
     fit = made_fit()
     out = tmp_path_factory.mktemp("report") / "report"
-    write_report(fit, out, calibrated(fit), command=COMMAND, warnings=["surge <alone> is weak"])
+    write_report(fit, out, calibrated(fit), command=COMMAND, findings=WEAK)
     return out
 
 
@@ -63,7 +65,7 @@ def test_the_pictures_of_the_markdown_are_there(folder):
 def test_equal_fits_make_equal_reports(folder, tmp_path):
     """No clock time enters, in pictures either."""
     fit = made_fit()
-    write_report(fit, tmp_path / "r", calibrated(fit), command=COMMAND, warnings=["surge <alone> is weak"])
+    write_report(fit, tmp_path / "r", calibrated(fit), command=COMMAND, findings=WEAK)
     assert (tmp_path / "r" / "report.html").read_bytes() == (folder / "report.html").read_bytes()
 
 

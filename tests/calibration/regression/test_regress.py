@@ -110,7 +110,7 @@ def test_late_motion_is_told_from_inertia():
     fit = regress(late, vehicle)
     assert fit.estimates["surge.m_eff"].estimate == pytest.approx(truth(vehicle)["surge.m_eff"], rel=0.03)
     assert fit.quality["surge"]["delay"] == pytest.approx(0.06, abs=0.01)
-    assert any("lags the recorded wrench by" in w for w in fit.warnings)
+    assert "motion_late" in {one.code for one in fit.findings}
 
 
 @pytest.mark.slow
@@ -128,8 +128,8 @@ def test_a_velocity_later_than_the_gyro_is_named():
     low, high = fit.estimates["surge.m_eff"].ci95
     assert low < truth(vehicle)["surge.m_eff"] < high
     assert "lags the file's motors" in fit.estimates["surge.m_eff"].note
-    assert any("velocity seems to be logged 0.1" in w for w in fit.warnings)
-    assert not any("velocity seems" in w for w in regress(some, vehicle).warnings)
+    assert "velocity_late" in {one.code for one in fit.findings}
+    assert "velocity_late" not in {one.code for one in regress(some, vehicle).findings}
 
 
 @pytest.mark.slow
@@ -155,7 +155,7 @@ def test_gyro_without_velocity_gives_the_rates_axes():
     vehicle, some = trials("bluerov2_heavy", "surge", "roll", "yaw")
     fit = regress(without(some, "u", "v", "w", "x", "y", "z", "depth"), vehicle)
     assert {n.partition(".")[0] for n in fit.estimates} == {"roll", "yaw"}
-    assert any(w.startswith("surge: left out") and "no surge velocity" in w for w in fit.warnings)
+    assert any(one.code == "axis_unmeasured" and one.values["axis"] == "surge" for one in fit.findings)
     assert not any("added_mass.0" in path for path in fit.changes)
 
 
@@ -164,7 +164,7 @@ def test_roll_without_attitude_is_left_out_with_the_reason():
     vehicle, some = trials("bluerov2_heavy", "roll", "yaw")
     fit = regress(without(some, "qx", "qy", "qz", "qw"), vehicle)
     assert "roll.m_eff" not in fit.estimates
-    assert any("roll needs the attitude" in w for w in fit.warnings)
+    assert any(one.code == "attitude_needed" and one.values["axis"] == "roll" for one in fit.findings)
 
 
 def test_outliers_and_a_gap_do_little():
@@ -207,7 +207,9 @@ def test_a_file_too_heavy_is_said():
     fit = regress(some, heavy)
     assert not fit.estimates["surge.added_mass"].identifiable
     assert not any("added_mass" in path for path in fit.changes)
-    assert any("below the rigid 25 kg" in w for w in fit.warnings)
+    assert any(
+        one.code == "inertia_too_small" and one.values["rigid"] == pytest.approx(25.0) for one in fit.findings
+    )
 
 
 @pytest.mark.slow
@@ -238,7 +240,7 @@ def test_tilted_samples_are_left_out_unless_the_other_axes_are_fitted():
     added = 0.5 * vehicle.hydrodynamics["calibrated"].added_mass
     wrong = vehicle.replace({"hydrodynamics.calibrated.added_mass": added.tolist()})
     alone = regress(some, wrong, axes=["surge", "yaw"])
-    assert any("surge" in w and "beyond 25°, were left out" in w for w in alone.warnings)
+    assert any((one.code, one.subject) == ("tilted_left_out", "surge") for one in alone.findings)
     assert not alone.estimates["surge.m_eff"].identifiable
     assert not any(".0.0" in path for path in alone.changes)
     assert alone.estimates["yaw.m_eff"].identifiable
@@ -281,7 +283,7 @@ def test_few_trials_are_said():
     """With two trials intervals come from blocks, which is said, and still hold the truth."""
     vehicle, some = trials("bluerov2_heavy", "surge")
     fit, expected = regress(some[-2:], vehicle), truth(vehicle)
-    assert any("blocks" in w for w in fit.warnings)
+    assert "block_intervals" in {one.code for one in fit.findings}
     low, high = fit.estimates["surge.m_eff"].ci95
     assert low - 0.2 < expected["surge.m_eff"] < high + 0.2
 

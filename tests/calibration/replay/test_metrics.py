@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from finssim.calibration.replay.gates import LIMITS, classify, coupling, gates
 from finssim.calibration.replay.metrics import (
     aggregate,
     error_ahead,
@@ -16,6 +15,7 @@ from finssim.calibration.replay.metrics import (
     span,
 )
 from finssim.calibration.replay.pairs import Pair, excited_axes, find_phases, onset
+from finssim.calibration.replay.report import LIMITS, classify, coupling, gates
 
 RATE, HOLD, COAST, LEVEL, DAMPING, MASS = 50.0, 9.0, 4.0, 12.0, 40.0, 27.0
 

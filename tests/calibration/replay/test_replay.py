@@ -227,6 +227,6 @@ def test_a_trial_that_cannot_be_replayed_leaves_the_others(surge):
     )
     result = replay([mute, surge[1]], FINSROV)
     assert [pair.name for pair in result.pairs] == [surge[1].name]
-    assert len(result.left_out) == 1 and "mute" in result.left_out[0]
+    assert len(result.left_out) == 1 and result.left_out[0].subject == "mute"
     with pytest.raises(CalibrationError, match="no trial could be replayed: mute"):
         replay([mute], FINSROV)

@@ -102,7 +102,7 @@ def test_thrust_against_mass_is_said_and_not_picked():
     fit = fit_by_simulation(trials_of(vehicle, "yaw"), vehicle, estimate=("thrust_scale",))
     assert not fit.estimates["thrust_scale"].identifiable
     assert not fit.estimates["yaw.m_eff"].identifiable
-    assert any("thrust_scale" in w and "trade off" in w for w in fit.warnings)
+    assert "thrust_traded" in {one.code for one in fit.findings}
     assert not any(path.startswith(f"{SET}.added_mass") for path in fit.changes)
 
 
@@ -128,7 +128,7 @@ def test_a_late_stream_is_found_and_does_not_bias_the_mass():
         late.append(replace(trial, channels=channels))
     fit = fit_by_simulation(late, wrong(vehicle))
     assert fit.estimates["yaw.m_eff"].estimate == pytest.approx(truth(vehicle, "yaw")["m_eff"], rel=0.03)
-    assert any("rates lags" in w for w in fit.warnings)
+    assert ("motion_late", "rates") in {(one.code, one.subject) for one in fit.findings}
 
 
 @pytest.mark.slow
@@ -149,7 +149,7 @@ def test_one_trial_says_what_its_intervals_rest_on():
     """With a single trial, blocks within it stand for trials, which is said."""
     vehicle = load_vehicle("finsrov")
     fit = fit_by_simulation(trials_of(vehicle, "yaw", count=1), wrong(vehicle))
-    assert any("blocks" in w for w in fit.warnings)
+    assert "block_intervals" in {one.code for one in fit.findings}
     assert np.isfinite(fit.estimates["yaw.m_eff"].ci95).all()
 
 
@@ -163,7 +163,7 @@ def test_an_interrupt_returns_the_best_until_then():
             raise KeyboardInterrupt
 
     fit = fit_by_simulation(trials_of(vehicle, "yaw", count=4), wrong(vehicle), progress=interrupt)
-    assert fit.interrupted and "interrupted" in fit.warnings[0]
+    assert fit.interrupted and fit.findings[0].code == "interrupted"
     assert fit.estimates["yaw.m_eff"].estimate == pytest.approx(truth(vehicle, "yaw")["m_eff"], rel=0.3)
 
 

@@ -84,7 +84,7 @@ def test_axes_of_a_wrench_without_a_column_are_zero_and_it_is_said():
     vehicle = load_vehicle("finsrov")
     found = drive(trial({"tau_x": [1.0, 2.0]}), vehicle)
     np.testing.assert_array_equal(found.force, [[1, 0, 0, 0, 0, 0], [2, 0, 0, 0, 0, 0]])
-    assert "tau_y, tau_z, tau_k, tau_m, tau_n: taken as zero" in found.notes[0]
+    assert found.findings[0].values["columns"] == ("tau_y", "tau_z", "tau_k", "tau_m", "tau_n")
 
 
 def test_what_tells_most_comes_first(vehicle):
@@ -97,7 +97,7 @@ def test_what_tells_most_comes_first(vehicle):
     channels |= {f"rpm_{names[0]}": np.ones(5)}
     found = drive(trial(channels), vehicle)
     assert found.source == ("rpm" if len(names) == 1 else "force")
-    assert len(names) == 1 or "rpm_* is there for some thrusters only" in found.notes[0]
+    assert len(names) == 1 or found.findings[0].values["kind"] == "rpm_"
 
 
 def test_commands_pass_the_motors_and_forces_do_not(vehicle):
@@ -238,7 +238,7 @@ def test_a_wrench_that_jumps_between_exact_levels_was_held(rate):
         channels = {"tau_x": force, "u": np.zeros(len(t))}
         return drive(Trial(name="a", t=t, channels=channels, header=Header(**header)), vehicle)
 
-    assert read(steps).held and any("inputs_between" in note for note in read(steps).notes)
+    assert read(steps).held and "inputs_held" in {one.code for one in read(steps).findings}
     assert not read(lagged).held
     assert not read(noisy).held
     assert not read(steps, inputs_between="linear").held

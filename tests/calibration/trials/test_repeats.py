@@ -47,6 +47,6 @@ def test_repeats_are_emptied_when_a_trial_is_read_and_the_rest_is_left(tmp_path)
     trial = load_trial(tmp_path / "made")
     assert np.isfinite(trial.channels["u"]).sum() == 200 and np.isfinite(trial.channels["v"]).sum() == 200
     assert np.isfinite(trial.channels["r"]).all() and np.isfinite(trial.channels["tau_x"]).all()
-    assert "velocity: every new sample is repeated, 5.0 rows" in trial.notes[0]
+    assert trial.findings[0].values == {"group": "velocity", "rows": pytest.approx(5.0, abs=0.05)}
     write_trial(trial, tmp_path / "again")
     assert load_trial(tmp_path / "again").sha256 == trial.sha256

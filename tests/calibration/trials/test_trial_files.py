@@ -66,7 +66,7 @@ def test_a_written_trial_reads_back_bit_for_bit(tmp_path, format, seed):
     write_trial(trial, tmp_path / "made", format=format)
     back = load_trial(tmp_path / "made")
     assert back.sha256 == trial.sha256
-    assert back.header == trial.header and back.name == "made" and back.notes == ()
+    assert back.header == trial.header and back.name == "made" and back.findings == ()
     np.testing.assert_array_equal(back.t, trial.t)
     np.testing.assert_array_equal(back.phase, trial.phase)
     for name, values in trial.channels.items():
@@ -145,13 +145,13 @@ def test_a_cut_off_file_opens_up_to_the_cut(tmp_path, cut):
         good = np.isfinite(trial.channels[name])
         assert good.sum() >= 18
         np.testing.assert_array_equal(trial.channels[name][good], np.array(truth)[good])
-    assert trial.notes or text[-cut - 1] == ","  # an empty last cell looks whole
+    assert trial.findings or text[-cut - 1] == ","  # an empty last cell looks whole
 
 
 def test_zero_bytes_after_a_crash_are_the_end(tmp_path):
     """A file system leaves zeros where it had made room."""
     trial = load_trial(csv(tmp_path / "cut", "t,u\n" + rows() + "\0" * 300))
-    assert len(trial.t) == 20 and "zero bytes" in trial.notes[0]
+    assert len(trial.t) == 20 and trial.findings[0].code == "zero_bytes"
 
 
 def test_late_rows_are_sorted_and_repeated_times_merged(tmp_path):
@@ -161,7 +161,7 @@ def test_late_rows_are_sorted_and_repeated_times_merged(tmp_path):
     np.testing.assert_array_equal(trial.t, [0.0, 0.1, 0.2, 0.3, 0.4])
     np.testing.assert_array_equal(trial.channels["u"], [1, 2, 3, 4, 5])
     np.testing.assert_array_equal(trial.channels["w"], [np.nan, np.nan, np.nan, 7, 8])
-    assert len(trial.notes) == 2
+    assert len(trial.findings) == 2
 
 
 @pytest.mark.parametrize("order", ["reversed", "shuffled"])
@@ -171,7 +171,7 @@ def test_the_order_of_rows_does_not_matter(tmp_path, order):
     straight = load_trial(csv(tmp_path / "a", "\n".join(["t,u", *lines, ""])))
     mixed = lines[::-1] if order == "reversed" else list(np.random.default_rng(0).permutation(lines))
     again = load_trial(csv(tmp_path / "b", "\n".join(["t,u", *mixed, ""])))
-    assert again.sha256 == straight.sha256 and "sorted" in again.notes[0]
+    assert again.sha256 == straight.sha256 and again.findings[0].code == "times_sorted"
 
 
 def test_a_clock_that_jumps_back_leaves_a_gap_between_two_pieces(tmp_path):
@@ -181,7 +181,9 @@ def test_a_clock_that_jumps_back_leaves_a_gap_between_two_pieces(tmp_path):
     np.testing.assert_array_equal(trial.channels["u"][50:], 100.0 + np.arange(40))
     assert trial.t[50] - trial.t[49] == pytest.approx(10.0)
     np.testing.assert_allclose(np.diff(trial.t[50:]), 0.1)
-    assert "jumps back from 4.9 s to 2 s at row 51" in trial.notes[0]
+    jump = trial.findings[0]
+    assert (jump.code, jump.severity, jump.values["row"]) == ("clock_jump", "care", 51)
+    assert (jump.values["before"], jump.values["after"]) == pytest.approx((4.9, 2.0))
 
 
 def test_blocks_of_different_columns_over_the_same_times_are_no_jump(tmp_path):
@@ -204,7 +206,7 @@ def test_times_since_1970_begin_at_zero(tmp_path):
     for name, (text, header) in stamps.items():
         trial = load_trial(csv(tmp_path / name, "t,u\n" + text, header))
         np.testing.assert_allclose(trial.t, np.arange(10) * 0.25, atol=1e-6)
-        assert any("1970" in note or "dates" in note for note in trial.notes)
+        assert {"epoch", "dates"} & {one.code for one in trial.findings}
 
 
 def test_what_is_no_number_counts_as_empty_and_is_told(tmp_path):
@@ -213,9 +215,9 @@ def test_what_is_no_number_counts_as_empty_and_is_told(tmp_path):
     trial = load_trial(csv(tmp_path / "dirty", text))
     for name in "uw":
         assert np.isfinite(trial.channels[name]).tolist() == [True, False, False, False, True]
-    assert any("'ERR' in row 4" in note for note in trial.notes)
-    assert any("infinite" in note for note in trial.notes)
-    assert len(trial.notes) == 2
+    assert any((one.values.get("cell"), one.values.get("row")) == ("ERR", 4) for one in trial.findings)
+    assert "infinite_numbers" in {one.code for one in trial.findings}
+    assert len(trial.findings) == 2
 
 
 @pytest.mark.parametrize("separator", [";", "\t"])
@@ -231,8 +233,13 @@ def test_unknown_columns_and_phases_are_left_out_with_a_guess(tmp_path):
     """A foreign column costs nothing; a misspelt one gets a hint."""
     trial = load_trial(csv(tmp_path / "x", "t,u,depht,phase\n0,1,2,excite\n1,2,3,Coast\n"))
     assert set(trial.channels) == {"u"} and trial.phase.tolist() == ["", "coast"]
-    assert any("'depht'" in note and "did you mean 'depth'?" in note for note in trial.notes)
-    assert any("'excite'" in note and "did you mean 'excitation'?" in note for note in trial.notes)
+    hints = {
+        one.values.get("column", one.values.get("word")): one.values["hint"]
+        for one in trial.findings
+        if "hint" in one.values
+    }
+    assert hints.get("depht") == ", did you mean 'depth'?"
+    assert hints.get("excite") == ", did you mean 'excitation'?"
 
 
 def test_quaternions_get_unit_length_and_one_sign(tmp_path):
@@ -243,7 +250,7 @@ def test_quaternions_get_unit_length_and_one_sign(tmp_path):
     good = [0, 1, 3]
     np.testing.assert_allclose(np.linalg.norm(q[good], axis=1), 1.0)
     np.testing.assert_allclose(q[good], q[[0, 0, 0]])
-    assert np.isnan(q[2]).all() and "no fix" in trial.notes[0]
+    assert np.isnan(q[2]).all() and trial.findings[0].code == "quaternion_lengths"
 
 
 # -- refusals -----------------------------------------------------------------------------------------------------
@@ -260,7 +267,7 @@ def test_quaternions_get_unit_length_and_one_sign(tmp_path):
         ("0,1\n1,2\n", "begins with numbers"),
         ("t,u,u\n0,1,2\n1,2,3\n", "column 'u' is there twice"),
         ("", "no line of column names"),
-        ("t,u\n" + "1,2,3,4\n" * 10, "have not the 2 cells"),
+        ("t,u\n" + "1,2,3,4\n" * 10, "do not have 2 cells"),
     ],
 )
 def test_a_table_that_is_no_trial_is_refused_with_the_reason(tmp_path, text, said):

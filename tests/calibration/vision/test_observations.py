@@ -22,8 +22,8 @@ def test_pixels_meet_points_by_id(tmp_path):
     seen = observe([pixels], survey)
     np.testing.assert_allclose(seen.points, [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     np.testing.assert_allclose(seen.pixels, [[5.0, 6.0], [7.0, 8.0]])
-    assert any("not in the survey" in note and "9" in note for note in seen.notes)
-    assert any("line 5" in note for note in seen.notes)
+    assert ("9",) in [one.values.get("names") for one in seen.findings]
+    assert 5 in [one.values.get("line") for one in seen.findings]
 
 
 def test_a_point_seen_in_two_pictures_is_one_location(tmp_path):
@@ -35,7 +35,7 @@ def test_a_point_seen_in_two_pictures_is_one_location(tmp_path):
     seen = observe([pixels], survey)
     assert seen.location.tolist() == [0, 0, 1]
     assert seen.names == ("1.png: a", "2.png: a", "1.png: b")
-    assert any("counted once" in note for note in seen.notes)
+    assert "counted_twice" in {one.code for one in seen.findings}
 
 
 def test_detected_tags_meet_fixed_tags(tmp_path):
@@ -49,7 +49,7 @@ def test_detected_tags_meet_fixed_tags(tmp_path):
     np.testing.assert_allclose(seen.points[0], [-0.1, 0.1, 0.0])
     assert seen.location.tolist() == [0, 0, 0, 0]
     assert np.all(np.abs(seen.arm).max(axis=1) > 0.0)
-    assert any("tag 8" in note for note in seen.notes)
+    assert ("tag 8",) in [one.values.get("names") for one in seen.findings]
 
 
 def test_a_moved_tag_is_found_by_its_picture(tmp_path):
@@ -60,7 +60,7 @@ def test_a_moved_tag_is_found_by_its_picture(tmp_path):
     seen = observe([tmp_path / "d.csv"], survey)
     assert seen.locations == ("a.png", "b.png")
     np.testing.assert_allclose(seen.points[4:].mean(axis=0), [1.0, 0.0, 0.0], atol=1e-12)
-    assert any("run/c.png" in note for note in seen.notes)
+    assert ("run/c.png",) in [one.values.get("names") for one in seen.findings]
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,9 @@ def test_one_bad_pixel_refuses_the_file_and_an_empty_one_its_row(tmp_path):
     with pytest.raises(CalibrationError, match="p.csv: line 3: v is 'abc'.*whole file is refused"):
         observe([written(tmp_path, "p.csv", "id,u,v\na,1,2\nb,1,abc\n")], survey)
     seen = observe([written(tmp_path, "q.csv", "id,u,v\na,1,2\nb,1,\n")], survey)
-    assert len(seen) == 1 and any("line 3: left out" in note for note in seen.notes)
+    assert len(seen) == 1 and [
+        one.values["line"] for one in seen.findings if one.code == "pixel_missing"
+    ] == [3]
 
 
 def test_an_empty_file_is_called_so(tmp_path):

@@ -72,7 +72,7 @@ def test_json_holds_what_was_promised(pool, capsys):
         "residual",
         "held_out",
         "pinhole",
-        "advice",
+        "findings",
         "provenance",
         "correlation",
     }
@@ -165,13 +165,13 @@ def test_parts_of_the_picture_are_no_pixels(pool):
     "options", [{}, {"focal_sigma": 0.003}, {"focal_sigma": 0.0}, {"fit": "pose,height,focal"}]
 )
 def test_a_lens_taken_as_exact_is_said(pool, capsys, options):
-    """As a note in the table and among the advice in JSON, unless somebody told its errors or it is fitted."""
+    """As a note in the table and a finding in JSON, unless somebody told its errors or it is fitted."""
     files = {"camera": pool / "camera.yaml", "out": pool / "pool.yaml", "water_height": 1.0}
     run([pool / "points.csv"], **files, **options)
     assert ("- the lens is taken as exact" in capsys.readouterr().out) == (not options)
     run([pool / "points.csv"], **files, **options, as_json=True)
     said = json.loads(capsys.readouterr().out)
-    assert any("--focal-sigma 0.003" in sentence for sentence in said["advice"]) == (not options)
+    assert ("lens_exact" in {one["code"] for one in said["findings"]}) == (not options)
 
 
 def test_the_surveys_part_of_the_held_out_error_is_said(pool, capsys):

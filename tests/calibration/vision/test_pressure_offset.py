@@ -19,7 +19,7 @@ def test_offset_and_scale_come_back(scale):
     assert fit.scale == pytest.approx(scale, abs=0.006)
     assert fit.estimates["depth.scale"].identifiable
     said = {1.0: "", SALT: "fresh water in salt water", 1.0 / SALT: "salt water in fresh water"}[scale]
-    assert (said in " ".join(fit.advice)) if said else not fit.advice
+    assert [one.values for one in fit.findings] == ([{"setting": said}] if said else [])
 
 
 def test_one_depth_tells_the_offset_alone():
@@ -27,7 +27,7 @@ def test_one_depth_tells_the_offset_alone():
     fit = fit_depth(*readings(np.random.default_rng(0), 0.05))
     assert fit.scale == 1.0 and not fit.estimates["depth.scale"].identifiable
     assert fit.offset == pytest.approx(0.03, abs=0.002)
-    assert "dive to two depths" in fit.advice[0]
+    assert fit.findings[0].code == "depths_alike"
 
 
 def test_the_interval_holds_the_truth_and_takes_in_a_common_error():

@@ -102,7 +102,7 @@ def test_what_is_wrong_is_named(tmp_path, text, words):
 def test_rows_without_a_number_are_left_out_and_said(tmp_path):
     survey = read_survey(written(tmp_path, "id,x,y,z\na,1,2,3\nb,,2,3\nc,nan,0,0\n"))
     assert list(survey.points) == ["a"]
-    assert len(survey.notes) == 2 and "line 3" in survey.notes[0]
+    assert [one.values["line"] for one in survey.findings][0] == 3 and len(survey.findings) == 2
 
 
 def test_a_repeated_row_is_no_contradiction(tmp_path):

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from finssim.calibration.actuators.motor_steps import NRMSE, unit_response
 from finssim.calibration.actuators.motor_study import Study, study
-from finssim.calibration.actuators.motor_trial import thrusters_of
+from finssim.calibration.actuators.motor_trial import NRMSE, thrusters_of, unit_response
 from finssim.calibration.actuators.speed_report import LOOP_RATE, loop_of
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import Vehicle
@@ -121,35 +121,24 @@ def quality_of(found: Study) -> dict[str, float]:
     }
 
 
-def warnings_of(found: Study) -> list[str]:
+def findings_of(found: Study) -> list[Finding]:
     """What a reader of the numbers must know."""
-    said = [f"{motor.trial}: {note}" for motor in found.motors for note in motor.notes]
+    said = [one.about(motor.trial) for motor in found.motors for one in motor.findings]
     accepted = sum(step.accepted for step in found.response.steps)
     moved = sum(step.moved for step in found.response.steps)
     if moved == 0:
-        said.append(
-            f"{found.name}: {found.motors[0].measured} does not follow the command, the vehicle file stays"
-        )
+        said.append(finding("not_followed", found.name, column=found.motors[0].measured))
     elif accepted == 0:
-        said.append(
-            f"{found.name}: no step is within {100 * NRMSE:g} % error and overshoot of first order plus dead time "
-            f"(error {100 * found.nrmse:.0f} %), the vehicle file keeps its response"
-        )
+        said.append(finding("steps_refused", found.name, limit=NRMSE, error=found.nrmse))
     elif accepted < moved:
-        said.append(
-            f"{found.name}: {moved - accepted} of {moved} steps left out: error or overshoot beyond 10 %"
-        )
+        said.append(finding("steps_left_out", found.name, steps=moved - accepted, total=moved, limit=NRMSE))
     other = "speed" if found.domain == "force" else "force"
     if found.other_nrmse < 0.5 * found.nrmse and found.nrmse > 0.02:
         said.append(
-            f"{found.name}: a first order of the {other} fits better ({100 * found.other_nrmse:.1f} % against "
-            f"{100 * found.nrmse:.1f} %): consider domain: {other} in the vehicle file"
+            finding("other_domain", found.name, domain=other, other=found.other_nrmse, error=found.nrmse)
         )
     if found.same_unit and len(found.response.used) and abs(found.gain - 1.0) > 0.1 + found.gain_half:
-        said.append(
-            f"{found.name}: the steady response is {found.gain:.2f} of what was asked: the thrust curve or the speed "
-            "loop behind it is off"
-        )
+        said.append(finding("steady_gain", found.name, gain=found.gain))
     return said
 
 
@@ -205,14 +194,14 @@ def fit_motor(
     """
     trials = list(trials)
     names = _names(trials, vehicle, thrusters)
-    studies, warnings = [], []
+    studies, findings = [], list[Finding]()
     for name in names:
         found = study(name, trials, vehicle.thrusters[name])
         if found is None:
-            warnings.append(f"{name}: its command holds no steps, nothing was fitted")
+            findings.append(finding("no_steps", name))
             continue
         studies.append(found)
-        warnings += warnings_of(found)
+        findings += findings_of(found)
     if not studies:
         raise CalibrationError(
             f"{', '.join(trial.name for trial in trials)}: no command holds a level and changes: log steps of at least "
@@ -224,14 +213,14 @@ def fit_motor(
     if sure:
         estimates.insert(0, _common_delay(sure))
         changes["thrusters.*.delay"] = estimates[0].estimate
-        changes |= _untested(sure, vehicle, changes, warnings)
+        changes |= _untested(sure, vehicle, changes, findings)
     quality = {found.name: quality_of(found) for found in studies}
     speeds = [_in_speed(found, trials, vehicle) for found in sure if not found.response.hidden]
     loop = loop_of([found for found in speeds if found is not None], vehicle, loop_rate=loop_rate)
     if loop is not None:
         estimates += loop.estimates
         quality["speed_loop"] = loop.quality
-        warnings += loop.warnings
+        findings += loop.findings
     return Fit(
         kind="motor",
         method="first order plus dead time",
@@ -240,7 +229,7 @@ def fit_motor(
         changes=changes,
         quality=quality,
         curves=tuple(curve_of(found) for found in studies),
-        warnings=tuple(dict.fromkeys(warnings)),
+        findings=tuple(dict.fromkeys(findings)),
         trials={trial.name: trial.sha256 for trial in trials},
         settings={"thrusters": thrusters, "loop_rate": loop_rate, "seed": seed},
     )
@@ -285,7 +274,7 @@ def _common_delay(studies: Sequence[Study]) -> Estimate:
 
 
 def _untested(
-    studies: Sequence[Study], vehicle: Vehicle, changes: dict[str, Any], warnings: list[str]
+    studies: Sequence[Study], vehicle: Vehicle, changes: dict[str, Any], findings: list[Finding]
 ) -> dict[str, float]:
     """Time constants of the thrusters that no trial steps, from those of their group."""
     known: dict[str, list[float]] = {}
@@ -299,11 +288,9 @@ def _untested(
         for name, thruster in vehicle.thrusters.items()
         if name not in tested and thruster.group in known
     }
-    if given:
-        warnings.append(f"{', '.join(given)}: no steps; they get the mean time constant of their group")
+    findings += [finding("group_mean", name) for name in given]
     left = [name for name in vehicle.thrusters if name not in tested and name not in given]
-    if left:
-        warnings.append(f"{', '.join(left)}: no steps; they keep the vehicle file's time constant")
+    findings += [finding("file_response", name) for name in left]
     return {f"thrusters.{name}.time_constant": value for name, value in given.items()}
 
 

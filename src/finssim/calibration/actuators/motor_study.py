@@ -9,8 +9,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.actuators.motor_steps import StepFit, StepRecord, cut_steps, step_fit
-from finssim.calibration.actuators.motor_trial import DOMAINS, Motor, levels_of, motor_of, steps_of
+from finssim.calibration.actuators.motor_trial import (
+    DOMAINS,
+    Motor,
+    StepFit,
+    StepRecord,
+    cut_steps,
+    levels_of,
+    motor_of,
+    step_fit,
+    steps_of,
+)
 from finssim.calibration.actuators.thrust_curve import jackknife, t_quantile
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles.thruster import Thruster

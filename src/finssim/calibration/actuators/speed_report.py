@@ -9,12 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.actuators.motor_steps import OVERSHOOT
 from finssim.calibration.actuators.motor_study import Study
+from finssim.calibration.actuators.motor_trial import OVERSHOOT
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Estimate
 from finssim.vehicles import Vehicle
 
-__all__ = ["Loop", "LoopPlant", "loop_of", "simulate_step", "tune"]
+__all__ = ["Loop", "LoopPlant", "loop_of", "simulate_step", "tune", "LOOP_RATE"]
 
 # A motor controller's speed loop, feed-forward plus PID, tuned from an identified response and tried on it.
 #
@@ -224,7 +225,7 @@ class Loop:
     """`rise`, `overshoot`, `steady_error` of the identified motors; `overshoot_at_ends` with gain, delay and lag at the
     ends of their intervals, the worst of them; a loop that overshoots there by more than 10 % is made slower."""
     steps: tuple[LoopStep, ...]
-    warnings: list[str]
+    findings: list[Finding]
 
 
 def loop_of(studies: Sequence[Study], vehicle: Vehicle, *, loop_rate: float = LOOP_RATE) -> Loop | None:
@@ -270,14 +271,11 @@ def loop_of(studies: Sequence[Study], vehicle: Vehicle, *, loop_rate: float = LO
         "loop_steady_error": max((abs(step.steady_error) for step in steps), default=math.nan),
         "loop_overshoot_at_ends": max((step.overshoot for step in ends), default=math.nan),
     }
-    warnings = []
+    findings = []
     if quality["loop_overshoot_at_ends"] > OVERSHOOT:
-        warnings.append(
-            f"the speed loop overshoots by {100 * quality['loop_overshoot_at_ends']:.0f} % if gain, delay and lag are "
-            "at the ends of their intervals: log more steps"
-        )
+        findings.append(finding("loop_overshoots", overshoot=quality["loop_overshoot_at_ends"]))
     return Loop(
-        gains=gains, estimates=_estimates(gains), quality=quality, steps=tuple(steps), warnings=warnings
+        gains=gains, estimates=_estimates(gains), quality=quality, steps=tuple(steps), findings=findings
     )
 
 

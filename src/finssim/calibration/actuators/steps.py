@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.calibration.findings import Finding, finding
+
 __all__ = ["Step", "find_steps", "last_parts", "levels"]
 
 Array = NDArray[np.float64]
@@ -59,14 +61,14 @@ def levels(x: Array, tolerance: float) -> list[tuple[int, int]]:
     return runs
 
 
-def last_parts(values: dict[str, Array]) -> tuple[dict[str, Array], str]:
+def last_parts(values: dict[str, Array]) -> tuple[dict[str, Array], Finding]:
     """Steady rows of a log over time: the mean over the last 40 % of each level of the pulse or of the speed.
 
     Args:
         values: `time` [s] and any of speed, force, pulse, voltage, (n,) each.
 
     Returns:
-        The same without `time`, one row per level, and a sentence; the rows as they are if the log holds no levels (a
+        The same without `time`, one row per level, and a finding; the rows as they are if the log holds no levels (a
         slow sweep).
     """
     times = values["time"]
@@ -89,9 +91,9 @@ def last_parts(values: dict[str, Array]) -> tuple[dict[str, Array], str]:
             rows.append(settled)
             covered += length
     if len(rows) < 3 or covered < LEAST_COVERED * float(times[good[-1]] - times[good[0]]):
-        return others, f"read as a sweep of {len(times)} rows, for it holds few constant levels"
+        return others, finding("read_as_sweep", rows=len(times))
     steady = {key: np.array([_mean(value[row]) for row in rows]) for key, value in others.items()}
-    return steady, f"read as {len(rows)} levels, of each the last {100 * LAST:g} %"
+    return steady, finding("read_as_levels", levels=len(rows), share=LAST)
 
 
 def _mean(values: Array) -> float:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.actuators.table_signs import STANDING
+from finssim.calibration.actuators.thrust_table import STANDING
 
 __all__ = ["DeadZone", "Side", "dead_zone", "fit_side", "jackknife", "t_quantile"]
 

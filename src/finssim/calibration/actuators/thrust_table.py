@@ -2,27 +2,299 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import math
 import os
+import re
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from itertools import zip_longest
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.actuators.steps import last_parts
-from finssim.calibration.actuators.table_columns import Source, find_columns
-from finssim.calibration.actuators.table_signs import check_pulses, signed, without_offset
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.units import TIME_UNITS, UNITS
+from finssim.text_table import TextTable, read_text_table
 
-__all__ = ["ThrustTable", "read_table", "tables_of_trial"]
+__all__ = ["ThrustTable", "read_table", "tables_of_trial", "STANDING"]
+
+# Which column of a bench table holds what, and in which unit.
+
+_ALIASES = {
+    "rate": {
+        **dict.fromkeys(("1/min", "min-1", "r/min", "rev/min"), "rpm"),
+        **dict.fromkeys(("rads", "radps", "rads-1", "radpers"), "rad/s"),
+        **dict.fromkeys(("rev/s", "1/s"), "rps"),
+    },
+    "force": {
+        **dict.fromkeys(("newton", "newtons"), "N"),
+        **dict.fromkeys(("kg", "kp", "kilogram", "kilograms"), "kgf"),
+        **dict.fromkeys(("g", "gram", "grams", "gr"), "gf"),
+        **dict.fromkeys(("lb", "lbs", "pound", "pounds"), "lbf"),
+        "oz": "ozf",
+    },
+    "pulse": {**dict.fromkeys(("usec", "microsecond", "microseconds"), "us"), "msec": "ms"},
+    "voltage": dict.fromkeys(("volt", "volts"), "V"),
+}
+"""Dimension -> what headers of benches call a unit -> the unit."""
+
+
+def _units(dimension: str, but: tuple[str, ...] = ()) -> dict[str, float]:
+    """Factors of a dimension's units as `_plain` writes them, by their aliases too."""
+    sizes = {unit: size for unit, size in UNITS[dimension].items() if unit not in but}
+    return {u.lower(): size for u, size in sizes.items()} | {
+        alias: sizes[unit] for alias, unit in _ALIASES[dimension].items()
+    }
+
+
+_UNITS: dict[str, dict[str, float]] = {
+    "speed": _units("rate", but=("deg/s", "mrad/s")),
+    "force": _units("force"),
+    "pulse": _units("pulse", but=("µs", "s", "ns")),
+    "voltage": _units("voltage"),
+    "time": {u: TIME_UNITS[u] for u in ("s", "ms", "us", "min")}
+    | dict.fromkeys(("sec", "second", "seconds"), 1.0),
+}
+_SHOWN = {
+    "speed": "rpm, rad/s, rev/s",
+    "force": "N, kgf, gf, lbf",
+    "pulse": "us, ms",
+    "voltage": "V, mV",
+    "time": "s, ms, us",
+}
+_WORDS = {
+    "speed": {"speed", "rpm", "omega", "rotation", "rotational", "shaft", "rev", "revs", "velocity"},
+    "force": {"force", "thrust", "load", "loadcell"},
+    "pulse": {"pwm", "pulse", "pulsewidth", "esc", "throttle", "signal"},
+    "voltage": {"voltage", "battery", "volt", "volts", "supply", "vbat", "v"},
+    "time": {"time", "t", "timestamp"},
+}
+_IMPLIED = {"rpm": ("speed", math.pi / 30.0), "pwm": ("pulse", 1.0)}
+"""Words that say the unit too."""
+
+QUANTITIES = tuple(_UNITS)
+"""speed force pulse voltage time"""
+
+
+class Source(NamedTuple):
+    """Where a quantity is found."""
+
+    column: int
+    header: str
+    factor: float
+    """To rad/s, N, µs, V or s; NaN where the header names no unit."""
+
+
+def find_columns(
+    headers: list[str], used: list[bool], given: Mapping[str, str] | None, shown: str
+) -> dict[str, Source]:
+    """The column of every quantity that the table has.
+
+    Args:
+        headers: The header line's cells.
+        used: Whether a column holds any number but zero; others are passed over.
+        given: Quantity -> `COLUMN`, `COLUMN=UNIT`, or either after a minus sign that turns the values' sign; what it
+            does not name is found from the headers.
+        shown: How messages call the table.
+
+    Raises:
+        CalibrationError: Two columns could be meant, a unit is missing, or `given` names what is not there.
+    """
+    names = [header.strip() for header in headers]
+    found = {quantity: _given(quantity, text, names, shown) for quantity, text in dict(given or {}).items()}
+    candidates: dict[str, list[Source]] = {}
+    for column, header in enumerate(names):
+        guess = _recognised(header)
+        if guess is not None and used[column] and guess[0] not in found:
+            candidates.setdefault(guess[0], []).append(Source(column, header, guess[1]))
+    for quantity, sources in candidates.items():
+        if len(sources) > 1:
+            with_unit = [source for source in sources if not math.isnan(source.factor)]
+            sources = with_unit if len(with_unit) == 1 else sources
+        if len(sources) > 1:
+            listed = " or ".join(f"'{source.header}'" for source in sources)
+            raise CalibrationError(
+                f"{shown}: {quantity} could be {listed}: say which, {quantity}={sources[0].header}"
+            )
+        found[quantity] = sources[0]
+    for quantity, source in found.items():
+        if math.isnan(source.factor):
+            raise CalibrationError(
+                f"{shown}: column '{source.header}' has no unit: write it into the header or say it, "
+                f"{quantity}={source.header}=UNIT with one of {_SHOWN[quantity]}"
+            )
+    return found
+
+
+def _given(quantity: str, text: str, names: list[str], shown: str) -> Source:
+    if quantity not in _UNITS:
+        raise CalibrationError(f"unknown quantity '{quantity}', expected one of {', '.join(QUANTITIES)}")
+    sign = 1.0
+    for name in (text, text[1:] if text.startswith("-") else None):
+        if name is None:
+            continue
+        sign = 1.0 if name == text else -1.0
+        if name.strip() in names:
+            column = names.index(name.strip())
+            guess = _recognised(names[column])
+            factor = guess[1] if guess and guess[0] == quantity else _unit_of(quantity, names[column])
+            return Source(column, names[column], sign * factor)
+        header, _, unit = name.rpartition("=")
+        if header.strip() in names:
+            factor = _UNITS[quantity].get(_plain(unit), math.nan)
+            if math.isnan(factor):
+                raise CalibrationError(
+                    f"{shown}: unknown unit '{unit}' of {quantity}, expected one of {_SHOWN[quantity]}"
+                )
+            return Source(names.index(header.strip()), header.strip(), sign * factor)
+    raise CalibrationError(f"{shown}: no column '{text}' for {quantity}; there are {', '.join(names)}")
+
+
+def _recognised(header: str) -> tuple[str, float] | None:
+    """Quantity and factor that a header names; the factor is NaN where it gives no unit."""
+    label, unit = _split(header)
+    words = set(re.findall(r"[a-z]+", label.lower()))
+    for word, (quantity, factor) in _IMPLIED.items():
+        if word in words and _plain(unit) in ("", word):
+            return quantity, factor
+    matches = [quantity for quantity, known in _WORDS.items() if words & known]
+    if unit:
+        matches = [quantity for quantity in matches if _plain(unit) in _UNITS[quantity]]
+        if not label and not matches:
+            matches = [quantity for quantity in ("speed", "voltage") if _plain(unit) in _UNITS[quantity]]
+        return (matches[0], _UNITS[matches[0]][_plain(unit)]) if len(matches) == 1 else None
+    if len(matches) != 1:
+        return None
+    return matches[0], 1.0 if matches[0] in ("voltage", "time") else math.nan
+
+
+def _unit_of(quantity: str, header: str) -> float:
+    return _UNITS[quantity].get(_plain(_split(header)[1]), math.nan)
+
+
+def _split(header: str) -> tuple[str, str]:
+    """Label and unit: `Force (Kg f)`, `Thrust [N]`, `speed_rpm`, `omega rad/s`, `RPM`."""
+    text = header.strip()
+    brackets = re.fullmatch(r"(.*?)[\s_]*[(\[{](.*)[)\]}]", text)
+    if brackets:
+        return brackets[1], brackets[2]
+    known = {unit for units in _UNITS.values() for unit in units}
+    parts = re.split(r"[\s_]+", text)
+    for start in range(1, len(parts)):
+        tail = "/".join(parts[start:]) if len(parts) - start == 2 else "".join(parts[start:])
+        if _plain(tail) in known:
+            return " ".join(parts[:start]), tail
+    return text, ""
+
+
+def _plain(unit: str) -> str:
+    """Lower case, without spaces, with u for micro and / for per."""
+    text = unit.strip().lower().replace("µ", "u").replace("μ", "u").replace("·", "").replace("^", "")
+    return re.sub(r"\s+|\.", "", text.replace(" per ", "/")).replace("rad_s", "rad/s")
+
 
 Array = NDArray[np.float64]
+
+# The signs of speeds and forces in a table, and the zero of its load cell.
+
+STANDING = 0.01
+"""Share of the fastest speed below which a shaft counts as standing."""
+
+
+def without_offset(
+    full: dict[str, Array], speed_known: bool, neutral: float, findings: list[Finding]
+) -> Array:
+    """Forces less the median reading at standstill."""
+    force = full["force"]
+    if speed_known:
+        standing = np.abs(full["speed"]) <= STANDING * np.nanmax(np.abs(full["speed"]))
+    else:
+        standing = np.abs(full["pulse"] - neutral) <= 0.02 * neutral / 3.0
+    if not np.any(standing):
+        return force
+    offset = float(np.median(force[standing]))
+    if abs(offset) < 1e-3 * np.max(np.abs(force)):
+        return force
+    findings.append(finding("load_cell_offset", offset=offset))
+    return force - offset
+
+
+def check_pulses(pulse: Array, shown: str) -> None:
+    """Refuse pulses that are no microseconds.
+
+    Args:
+        pulse: Of the motor controller [µs], (n,); NaN and 0 are passed over.
+        shown: Name of the table, for messages.
+
+    Raises:
+        CalibrationError: A pulse is outside 500 to 2500 µs.
+    """
+    known = pulse[np.isfinite(pulse) & (pulse != 0.0)]
+    if known.size and (known.min() < 500.0 or known.max() > 2500.0):
+        raise CalibrationError(
+            f"{shown}: pulses run from {known.min():g} to {known.max():g} µs, expected 500 to 2500 µs: give the right "
+            "column or unit, pulse=COLUMN=UNIT"
+        )
+
+
+def signed(
+    full: dict[str, Array],
+    speed_known: bool,
+    neutral: float,
+    sources: Mapping[str, Source],
+    shown: str,
+    findings: list[Finding],
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Speed and force with the sign of rotation, and the rows whose sign is known."""
+    speed, force, pulse = full["speed"], full["force"], full["pulse"]
+    small = STANDING * np.max(np.abs(force))
+    sign_pulse = np.sign(pulse - neutral) if np.any(np.isfinite(pulse)) else np.zeros_like(force)
+    force_signed = bool(np.any(force > small) and np.any(force < -small))
+    if sign_pulse.any() and np.nanmin(sign_pulse) < 0 < np.nanmax(sign_pulse) and not force_signed:
+        findings.append(finding("force_sign", source="pulse"))
+        force, force_signed = np.abs(force) * np.nan_to_num(sign_pulse), True
+    if not speed_known:
+        _same_way(sign_pulse, force, small, ("pulse", "force"), sources, shown)
+        return speed, force, np.ones(force.shape, bool)
+    fastest = np.max(np.abs(speed))
+    turning = np.abs(speed) > STANDING * fastest
+    if np.any(speed < -STANDING * fastest) and np.any(speed > STANDING * fastest):
+        if not force_signed and not sign_pulse.any():
+            findings.append(finding("force_sign", source="speed"))
+            force = np.abs(force) * np.sign(speed)
+        _same_way(np.sign(speed) * turning, force, small, ("speed", "force"), sources, shown)
+        return speed, force, np.ones(force.shape, bool)
+    sign = np.where(
+        np.isfinite(sign_pulse) & (sign_pulse != 0.0), sign_pulse, np.sign(force) * (np.abs(force) > small)
+    )
+    if np.any(sign < 0.0):
+        findings.append(finding("speed_sign"))
+    if sign_pulse.any():
+        _same_way(sign_pulse, force, small, ("pulse", "force"), sources, shown)
+    keep = ~turning | (sign != 0.0)
+    if not keep.all():
+        findings.append(finding("rows_unsigned", rows=np.count_nonzero(~keep)))
+    return np.abs(speed) * np.where(turning, sign, 1.0), force, keep
+
+
+def _same_way(
+    sign: Array, force: Array, small: float, names: tuple[str, str], sources: Mapping[str, Source], shown: str
+) -> None:
+    """Refuse a table in which most forces point against the speed or pulse."""
+    clear = (np.abs(force) > 5.0 * small) & (np.nan_to_num(sign) != 0.0)
+    against = np.count_nonzero(np.sign(force[clear]) != sign[clear])
+    if against > 0.5 * np.count_nonzero(clear):
+        header = sources[names[1]].header if names[1] in sources else names[1]
+        raise CalibrationError(
+            f"{shown}: {names[1]} is negative where {names[0]} is positive: say which of them to turn, such as "
+            f"{names[1]}=-{header}"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,8 +315,8 @@ class ThrustTable:
     """Name of the thruster, where the data say it."""
     sha256: str = ""
     """Digest of the numbers."""
-    notes: tuple[str, ...] = field(default=())
-    """What was taken off, turned or left out, one sentence each."""
+    findings: tuple[Finding, ...] = ()
+    """What was taken off, turned or left out."""
 
     def at(self, rows: NDArray[np.bool_]) -> ThrustTable:
         """The same table with some of its rows."""
@@ -140,10 +412,10 @@ def _table(
     neutral: float,
 ) -> ThrustTable:
     """Steady rows, with signs and without the load cell's offset."""
-    notes: list[str] = []
+    findings: list[Finding] = []
     if "time" in values:
         values, kept = last_parts(values)
-        notes.append(kept)
+        findings.append(kept)
     count = len(values["force"])
     full = {key: values.get(key, np.full(count, np.nan)) for key in ("speed", "force", "pulse", "voltage")}
     speed_known = "speed" in values
@@ -151,9 +423,9 @@ def _table(
     if np.count_nonzero(good) < 3:
         raise CalibrationError(f"{shown}: {np.count_nonzero(good)} rows hold numbers, expected at least 3")
     full = {key: value[good] for key, value in full.items()}
-    full["force"] = without_offset(full, speed_known, neutral, notes)
+    full["force"] = without_offset(full, speed_known, neutral, findings)
     check_pulses(full["pulse"], shown)
-    full["speed"], full["force"], keep = signed(full, speed_known, neutral, sources, shown, notes)
+    full["speed"], full["force"], keep = signed(full, speed_known, neutral, sources, shown, findings)
     full = {key: value[keep] for key, value in full.items()}
     digest = hashlib.sha256(b"".join(np.ascontiguousarray(full[key] + 0.0).tobytes() for key in sorted(full)))
     return ThrustTable(
@@ -163,46 +435,28 @@ def _table(
         pulse=full["pulse"],
         voltage=full["voltage"],
         sha256=digest.hexdigest(),
-        notes=tuple(notes),
+        findings=tuple(findings),
     )
 
 
 def _cells(path: Path, shown: str) -> tuple[list[str], Array]:
     """Headers and numbers of a file; a second header line of units is joined to the first."""
-    try:
-        raw = path.read_bytes()
-    except OSError as error:
-        raise CalibrationError(f"{shown}: cannot be read: {error.strerror}") from None
-    try:
-        text = raw.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = raw.decode("latin-1")
-    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    if len(lines) < 2:
+    table = read_text_table(path, CalibrationError)
+    headers, rows = table.names, table.rows
+    if not rows:
         raise CalibrationError(f"{shown}: no rows below a header line: give a CSV table of speeds and forces")
-    separator = max(",;\t", key=lines[0].count)
-    cells = list(csv.reader(io.StringIO("\n".join(lines)), delimiter=separator, skipinitialspace=True))
-    headers, rows = cells[0], cells[1:]
-    if all(math.isfinite(_number(cell, separator)) for cell in headers):
+    if not any(math.isnan(_number(table, cell)) for cell in headers):
         raise CalibrationError(
             f"{shown}: the first line holds numbers, expected a header line that names the columns"
         )
-    if not any(math.isfinite(_number(cell, separator)) for cell in rows[0]):
-        headers = [
-            f"{h} ({u.strip(' ()[]')})" if u.strip() else h for h, u in zip(headers, rows[0], strict=False)
-        ]
-        rows = rows[1:]
+    if all(math.isnan(_number(table, cell)) for cell in rows[0]):
+        units = [unit.strip(" ()[]") for unit in rows.pop(0)][: len(headers)]
+        headers = [f"{h} ({u})" if u else h for h, u in zip_longest(headers, units, fillvalue="")]
     width = len(headers)
-    filled = [(row + [""] * width)[:width] for row in rows]
-    numbers = np.array([[_number(cell, separator) for cell in row] for row in filled], dtype=np.float64)
-    return headers, numbers.reshape(-1, width)
+    numbers = [[_number(table, cell) for cell in (row + [""] * width)[:width]] for row in rows]
+    return headers, np.array(numbers, dtype=np.float64).reshape(-1, width)
 
 
-def _number(cell: str, separator: str) -> float:
-    text = cell.strip().replace("−", "-")
-    if separator != ",":
-        text = text.replace(",", ".")
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
+def _number(table: TextTable, cell: str) -> float:
+    value = table.number(cell)
+    return math.nan if value is None else value

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.actuators.table_signs import STANDING
-from finssim.calibration.actuators.thrust_table import ThrustTable, read_table, tables_of_trial
+from finssim.calibration.actuators.thrust_table import STANDING, ThrustTable, read_table, tables_of_trial
 from finssim.calibration.actuators.thruster_bench import SIDES, Bench, bench
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import load_trial
@@ -39,8 +39,8 @@ class Target(NamedTuple):
 
 def find_targets(
     tables: Sequence[ThrustTable], vehicle: Vehicle, thrusters: Sequence[str] | None, group: str | None
-) -> tuple[list[Target], list[str]]:
-    """Targets with their tables, and warnings.
+) -> tuple[list[Target], list[Finding]]:
+    """Targets with their tables, and findings.
 
     What the caller names comes first. Otherwise a table speaks about the thruster that its columns name; or about the
     thruster or group whose name is a word of its file's name (`H_LF.csv`, `run2-CCW.csv`); or about all thrusters.
@@ -77,14 +77,11 @@ def find_targets(
             "into the file's name, or fit these by themselves"
         )
     if "" in found:
-        warnings = []
+        unnamed = []
         if len(groups) > 1:
-            warnings.append(
-                f"{vehicle.name} has the propeller groups {', '.join(sorted(groups))}, and the tables name none: all "
-                "thrusters get the same curve; name a group in the file's name to fit it by itself"
-            )
+            unnamed.append(finding("groups_unnamed", vehicle=vehicle.name, groups=tuple(sorted(groups))))
         name = groups.pop() if len(groups) == 1 else "all"
-        return [Target(name, vehicle.thruster_names, tuple(tables))], warnings
+        return [Target(name, vehicle.thruster_names, tuple(tables))], unnamed
     return [
         Target(name, _members(vehicle, name) if name in groups else (name,), tuple(of_name))
         for name, of_name in found.items()
@@ -432,7 +429,7 @@ def fit_thruster(
     if not read:
         raise CalibrationError("no table given: name at least one CSV file of speeds and thrusts")
     _refuse_duplicates(read)
-    found, warnings = find_targets(read, vehicle, thrusters, group)
+    found, findings = find_targets(read, vehicle, thrusters, group)
     estimates: dict[str, Estimate] = {}
     changes: dict[str, Any] = {}
     quality: dict[str, dict[str, float]] = {}
@@ -449,7 +446,7 @@ def fit_thruster(
             changes |= {f"thrusters.{name}.esc": result.esc.esc.values() for name in target.thrusters}
         quality |= quality_of(target.name, result, first)
         curves += curves_of(target.name, result, first)
-        warnings += result.warnings
+        findings += result.findings
     return Fit(
         kind="thruster",
         method="least squares of T = c± ω|ω|",
@@ -458,7 +455,7 @@ def fit_thruster(
         changes=changes,
         quality=quality,
         curves=tuple(curves),
-        warnings=tuple(dict.fromkeys(warnings)),
+        findings=tuple(dict.fromkeys(findings)),
         trials={table.name: table.sha256 for table in read},
         settings={
             "voltage": voltage,

@@ -10,7 +10,6 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.actuators.table_signs import STANDING
 from finssim.calibration.actuators.thrust_curve import (
     DeadZone,
     Side,
@@ -19,8 +18,9 @@ from finssim.calibration.actuators.thrust_curve import (
     jackknife,
     t_quantile,
 )
-from finssim.calibration.actuators.thrust_table import ThrustTable
+from finssim.calibration.actuators.thrust_table import STANDING, ThrustTable
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding, sentences
 from finssim.vehicles import Esc
 from finssim.vehicles.thruster import Thruster
 
@@ -196,7 +196,7 @@ PULSE_RANGE = (1100.0, 1500.0, 1900.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """Findings from the tables of one target."""
+    """What the tables of one target say."""
 
     levels: tuple[tuple[float, ThrustTable], ...]
     """Tables by voltage [V], NaN where it is not known."""
@@ -213,7 +213,7 @@ class Bench:
     esc: EscFit | None
     speeds_measured: bool
     """Whether there are speeds; otherwise they follow from the forces by the vehicle file's curve."""
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def bench(
@@ -237,28 +237,26 @@ def bench(
     Raises:
         CalibrationError: The tables hold no such voltage, or nothing to fit.
     """
-    warnings: list[str] = []
+    findings: list[Finding] = []
     measured = any(np.isfinite(table.speed).any() for table in tables)
     if measured:
         tables = [table for table in tables if np.isfinite(table.speed).any()]
     else:
         tables = [_with_speeds(table, thruster) for table in tables]
-        warnings.append(
-            f"{shown}: the tables hold no shaft speeds: those of the vehicle file's curve were used, c± stay"
-        )
+        findings.append(finding("no_shaft_speeds", shown))
     levels = [level for table in tables for level in split_by_voltage(table)]
     chosen = _reference([volts for volts, _ in levels], thruster, shown, voltage)
     at = [table for volts, table in levels if not abs(volts - chosen) > SAME_VOLTAGE]
-    trend = _trend(levels, shown) if measured else ""
+    trends = _trends(levels) if measured else ()
     others = sorted({round(volts, 1) for volts, table in levels if not any(table is t for t in at)})
-    pooled = pool_voltages or not trend
+    pooled = pool_voltages or not trends
     fitted = [table for _, table in levels] if pooled else at
-    if trend:
-        warnings.append(trend + ("" if pooled else f"; the curve is that of {chosen:g} V"))
+    if trends and pooled:
+        findings.append(finding("voltage_trend", shown, trends=trends))
+    elif trends:
+        findings.append(finding("voltage_chosen", shown, trends=trends, voltage=chosen))
     elif others and measured:
-        warnings.append(
-            f"{shown}: c± do not depend on the voltage as far as the tables tell; all voltages were used"
-        )
+        findings.append(finding("voltage_pooled", shown))
     sides, dead, fastest = {}, {}, {}
     for name, sign in SIDES:
         side = fit_side([turning(table, sign) for table in fitted]) if measured else None
@@ -272,11 +270,11 @@ def bench(
     esc = None
     if any(np.isfinite(table.pulse).any() for table in tables):
         on = [table for _, table in levels] if pool_voltages else at
-        esc = _esc(on, thruster, tables, shown, chosen, measured, warnings)
+        esc = _esc(on, thruster, tables, shown, chosen, measured, findings)
     if not sides and esc is None:
-        said = "; ".join(warnings) or f"{shown}: no row turns the shaft"
+        said = "; ".join(sentences(findings)) or f"{shown}: no row turns the shaft"
         raise CalibrationError(f"{said}: nothing could be fitted")
-    warnings += [f"{table.name}: {note}" for table in tables for note in table.notes]
+    findings += [one.about(table.name) for table in tables for one in table.findings]
     return Bench(
         levels=tuple(levels),
         voltage=chosen,
@@ -286,7 +284,7 @@ def bench(
         fastest=fastest,
         esc=esc,
         speeds_measured=measured,
-        warnings=tuple(dict.fromkeys(warnings)),
+        findings=tuple(dict.fromkeys(findings)),
     )
 
 
@@ -324,8 +322,8 @@ def _reference(volts: Sequence[float], thruster: Thruster, shown: str, asked: fl
     return min(near, key=lambda v: abs(v - asked))
 
 
-def _trend(levels: Sequence[tuple[float, ThrustTable]], shown: str) -> str:
-    """A sentence if c± change with the voltage beyond chance and by more than 2 % over the tables, else ""."""
+def _trends(levels: Sequence[tuple[float, ThrustTable]]) -> tuple[str, ...]:
+    """How c± change with the voltage, where it is beyond chance and by more than 2 % over the tables."""
     found = []
     for name, sign in SIDES:
         pairs = [
@@ -341,7 +339,7 @@ def _trend(levels: Sequence[tuple[float, ThrustTable]], shown: str) -> str:
         error = math.sqrt(float(residual @ residual) / (len(V) - 2) / float(V @ V))
         if abs(slope) > t_quantile(len(V) - 2) * error and abs(slope) * np.ptp(V) > 0.02 * mean:
             found.append(f"c_{name} changes by {100.0 * slope / mean:+.2g} % per volt")
-    return f"{shown}: {' and '.join(found)} over the tables' voltages" if found else ""
+    return tuple(found)
 
 
 def _together(zones: Sequence[DeadZone]) -> DeadZone:
@@ -389,16 +387,14 @@ def _esc(
     shown: str,
     volts: float,
     measured: bool,
-    warnings: list[str],
+    findings: list[Finding],
 ) -> EscFit | None:
-    """The speed controller, or None and a warning that says why not."""
+    """The speed controller, or None and a finding that says why not."""
     pulse, speed, voltage = (
         np.concatenate([getattr(t, key) for t in on]) for key in ("pulse", "speed", "voltage")
     )
     if math.isnan(volts):
-        warnings.append(
-            f"{shown}: the tables give no voltage, so the pulse's law was not fitted: say voltage="
-        )
+        findings.append(finding("law_without_voltage", shown))
         return None
     voltage = np.where(np.isfinite(voltage), voltage, volts)
     good = np.isfinite(pulse) & np.isfinite(speed) & (pulse > 0.0)
@@ -414,5 +410,5 @@ def _esc(
             at=volts,
         )
     except CalibrationError as error:
-        warnings.append(f"{shown}: the pulse's law was not fitted: {error}")
+        findings.append(finding("law_refused", shown, reason=str(error)))
         return None

@@ -6,16 +6,15 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from rich import box
+from rich.markup import escape
+from rich.table import Table
 
-from finssim.calibration.check.inputs import input_findings
-from finssim.calibration.check.report import AxisReport, Finding, TrialReport
-from finssim.calibration.check.streams import stream_reports
-from finssim.calibration.check.tells import with_tells
-from finssim.calibration.check.together import together
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import SEVERITIES, Finding, finding
 from finssim.calibration.motion.accelerations import holds_gravity
 from finssim.calibration.motion.attitude_signal import (
     AttitudeSignal,
@@ -26,14 +25,744 @@ from finssim.calibration.motion.attitude_signal import (
 from finssim.calibration.motion.signals import Motion, motion
 from finssim.calibration.motion.smoothing import longest_step, smooth
 from finssim.calibration.motion.synchronisation import Offset, stream_offsets
-from finssim.calibration.trials.columns import NU, TAU
 from finssim.calibration.trials.inputs import Drive, drive
-from finssim.calibration.trials.trial import Array, Trial
+from finssim.calibration.trials.trial import COLUMNS, NU, TAU, Array, Trial, column_of
 from finssim.calibration.trials.trial_files import load_trial, trials_at
 from finssim.geometry.rotations import quat_rotate, quat_to_euler
 from finssim.vehicles import AXES, Vehicle, VehicleError, load_vehicle
 
+if TYPE_CHECKING:
+    from rich.console import Console
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
 __all__ = ["check", "check_trials"]
+
+# What holds between the trials of a set: vehicles, roles, names, what all of them tell together.
+
+AGREE = 0.7
+"""Correlation of two streams below which their offset is not counted."""
+
+
+def told_by(reports: Sequence[TrialReport], axis: str, parameter: str) -> list[str]:
+    """Names of the trials that tell a parameter of an axis; held-out and refused ones do not count."""
+    return [
+        report.name
+        for report in reports
+        if report.verdict != "refused" and report.role != "held-out"
+        for found in report.axes
+        if found.axis == axis and parameter in found.tells and found.tells[parameter].can
+    ]
+
+
+def together(reports: Sequence[TrialReport]) -> list[Finding]:
+    """Findings about the set."""
+    found = []
+    vehicles = {report.vehicle for report in reports if report.vehicle}
+    if len(vehicles) > 1:
+        found.append(finding("several_vehicles", vehicles=tuple(sorted(vehicles))))
+    names = [report.name for report in reports]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        found.append(finding("equal_names", names=tuple(twice)))
+    good = [report for report in reports if report.verdict != "refused"]
+    if reports and not good:
+        found.append(finding("none_usable"))
+        return found
+    held_out = [report.name for report in good if report.role == "held-out"]
+    if held_out and len(held_out) == len(good):
+        found.append(finding("all_held_out"))
+    elif not held_out and len(good) > 1:
+        found.append(finding("none_held_out"))
+    fitting = len(good) - len(held_out)
+    if 0 < fitting < 5:
+        found.append(finding("few_trials", trials=fitting))
+    found += _late(good)
+    nothing = [a for a in AXES if not any(told_by(reports, a, parameter) for parameter in PARAMETERS)]
+    if nothing and len(nothing) < len(AXES):
+        found.append(finding("axes_untold", axes=tuple(map(str, nothing))))
+    return found
+
+
+def _late(reports: Sequence[TrialReport]) -> list[Finding]:
+    """Streams that are late or early by the same time in three trials or more."""
+    found = []
+    for group in dict.fromkeys(group for report in reports for group in report.offsets):
+        offsets = [report.offsets[group] for report in reports if group in report.offsets]
+        seconds = np.array([offset["seconds"] for offset in offsets if offset["correlation"] > AGREE])
+        if len(seconds) < 3:
+            continue
+        middle = float(np.median(seconds))
+        spread = 1.4826 * float(np.median(np.abs(seconds - middle)))
+        if (
+            abs(middle) > max(LATE, 3.0 * spread / np.sqrt(len(seconds)))
+            and np.mean(seconds * middle > 0.0) > 0.8
+        ):
+            found.append(
+                finding(
+                    "stream_offset_common",
+                    group=group,
+                    offset=abs(middle),
+                    sense="early" if middle > 0.0 else "late",
+                    reference=offsets[0]["reference"],
+                    trials=len(seconds),
+                    seconds=middle,
+                )
+            )
+    return found
+
+
+# What a check of trials says, as data.
+
+Verdict = Literal["usable", "usable with care", "refused"]
+
+PARAMETERS = ("m_eff", "d1", "d2", "bias", "k", "thrust_scale", "thrust_lag", "buoyancy")
+"""What a trial may tell of an axis; k of roll and pitch, buoyancy of heave."""
+
+THRUST = ("bias", "k", "thrust_scale", "thrust_lag", "buoyancy")
+"""Of these, what a passive trial does not tell because no thrust is known."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamReport:
+    """Columns that are sampled together."""
+
+    columns: tuple[str, ...]
+    group: str
+    samples: int
+    rate: float
+    """Samples per second while there are any [Hz]."""
+    jitter: float
+    """Standard deviation of the time between samples, gaps aside, over its mean."""
+    gaps: int
+    longest_gap: float
+    """[s]"""
+    missing: float
+    """Part of the trial's time without this stream."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Told:
+    """Whether a trial tells a parameter."""
+
+    can: bool
+    why: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxisReport:
+    """Excitation of one axis and what follows from it."""
+
+    axis: str
+    source: str
+    """Of the velocity: measured, derived from ..., or nothing."""
+    fastest: float
+    """95th percentile of the speed [m/s, rad/s]."""
+    noise: float
+    """Of one velocity sample [m/s, rad/s]."""
+    decades: float
+    """log10 of the fastest over the slowest speed that stands out of the noise."""
+    strongest: float
+    """95th percentile of the wrench [N, N m]."""
+    levels: tuple[float, ...]
+    """Wrenches that were held for half a second or more [N, N m]."""
+    work: float
+    """Done by the inputs along this axis [J]; of a passive trial 0."""
+    both_directions: bool
+    driven: float
+    """Time of input [s]."""
+    coasts: float
+    """Time of motion without input [s]."""
+    rests: float
+    """Time without input and motion [s]."""
+    excited: bool
+    tells: dict[str, Told] = field(default_factory=dict)
+    """By parameter."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialReport:
+    """One trial."""
+
+    name: str
+    vehicle: str | None
+    role: str | None
+    duration: float
+    """[s]"""
+    rows: int
+    inputs: str
+    """What drove it: rpm, force, tau, pwm, command, passive, or nothing."""
+    streams: tuple[StreamReport, ...]
+    axes: tuple[AxisReport, ...]
+    offsets: dict[str, dict[str, Any]]
+    """Group of columns -> reference, seconds, std and correlation."""
+    findings: tuple[Finding, ...]
+    sha256: str = ""
+
+    @property
+    def verdict(self) -> Verdict:
+        """By the worst finding."""
+        levels = {one.severity for one in self.findings}
+        return "refused" if "refused" in levels else "usable with care" if "care" in levels else "usable"
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values; numbers that are not finite become None."""
+        return {
+            "name": self.name,
+            "verdict": self.verdict,
+            "vehicle": self.vehicle,
+            "role": self.role,
+            "duration": _plain(self.duration),
+            "rows": self.rows,
+            "inputs": self.inputs,
+            "findings": [one.as_json() for one in self.findings],
+            "streams": [
+                {**vars(stream), "columns": list(stream.columns), **_numbers(stream)}
+                for stream in self.streams
+            ],
+            "axes": {
+                axis.axis: {
+                    **{key: value for key, value in vars(axis).items() if key not in ("axis", "tells")},
+                    **_numbers(axis),
+                    "levels": list(axis.levels),
+                    "tells": {name: {"can": told.can, "why": told.why} for name, told in axis.tells.items()},
+                }
+                for axis in self.axes
+            },
+            "offsets": self.offsets,
+            "sha256": self.sha256,
+        }
+
+
+def _plain(x: float) -> float | None:
+    return float(x) if math.isfinite(x) else None
+
+
+def _numbers(part: Any) -> dict[str, float | None]:
+    return {key: _plain(value) for key, value in vars(part).items() if isinstance(value, float)}
+
+
+# Reports of checked trials as tables for people, readable at a hundred columns.
+
+COLOURS = {"usable": "green", "usable with care": "yellow", "refused": "red"}
+MARKS = {"refused": "[red]✗[/red]", "care": "[yellow]![/yellow]", "note": "[dim]·[/dim]"}
+MANY = 4
+"""More trials than this are printed without the tables of each."""
+
+
+def print_reports(reports: Sequence[TrialReport], console: Console, common: Sequence[Finding] = ()) -> None:
+    """Print what was found.
+
+    Args:
+        reports: By trial.
+        console: Where to.
+        common: Findings about all of them together.
+    """
+    for report in reports:
+        _print_trial(report, console, brief=len(reports) > MANY)
+    if len(reports) > 1:
+        _print_overview(reports, console)
+    for one in common:
+        console.print(f"{MARKS[one.severity]} {escape(str(one))}")
+
+
+def _print_trial(report: TrialReport, console: Console, *, brief: bool) -> None:
+    colour = COLOURS[report.verdict]
+    driven = f", {report.inputs}" if report.inputs else ""
+    role = f", {report.role}" if report.role else ""
+    console.print(
+        f"[bold]{escape(report.name)}[/bold]  {report.duration:.1f} s, {report.rows} rows{driven}{role}"
+        f"{', ' + escape(report.vehicle) if report.vehicle else ''}: [{colour}]{report.verdict}[/{colour}]"
+    )
+    grid = Table.grid(padding=(0, 1))
+    for one in sorted(report.findings, key=lambda f: SEVERITIES.index(f.severity)):
+        if not (brief and one.severity == "note"):
+            grid.add_row("", MARKS[one.severity], escape(str(one)))
+    if grid.row_count:
+        console.print(grid, highlight=False)
+    if brief:
+        return
+    if report.streams:
+        console.print(_streams(report.streams))
+    if report.axes:
+        console.print(_axes(report.axes))
+        console.print(_tells(report.axes, report.inputs == "passive"), highlight=False)
+    console.print()
+
+
+def _streams(streams: Sequence[StreamReport]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for name in ("columns", "samples", "rate", "jitter", "gaps", "longest", "missing"):
+        table.add_column(name, justify="left" if name == "columns" else "right", overflow="fold")
+    for s in streams:
+        table.add_row(
+            _short(s.columns),
+            str(s.samples),
+            f"{s.rate:.3g} Hz",
+            f"{s.jitter:.0%}",
+            str(s.gaps),
+            f"{s.longest_gap:.2g} s",
+            f"{s.missing:.0%}",
+        )
+    return table
+
+
+def _short(columns: Sequence[str]) -> str:
+    """Names with what they begin with in common said once: `pwm_T1 T2 T3`."""
+    head = columns[0].split("_")[0] + "_"
+    if len(columns) > 2 and all(column.startswith(head) for column in columns):
+        return " ".join([columns[0], *(column.removeprefix(head) for column in columns[1:])])
+    return " ".join(columns)
+
+
+def _axes(axes: Sequence[AxisReport]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for name in (
+        "axis",
+        "velocity",
+        "up to",
+        "noise",
+        "decades",
+        "input",
+        "levels",
+        "both ways",
+        "coast",
+        "rest",
+    ):
+        table.add_column(name, justify="left" if name in ("axis", "velocity") else "right")
+    for a in axes:
+        if not a.source or a.fastest != a.fastest:
+            table.add_row(a.axis, a.source.removeprefix("derived ") or "[dim]unknown[/dim]", *[""] * 8)
+            continue
+        style = "" if a.excited else "dim"
+        table.add_row(
+            a.axis,
+            a.source.removeprefix("derived "),
+            f"{a.fastest:.2g}",
+            f"{a.noise:.1g}",
+            f"{a.decades:.1f}",
+            f"{a.strongest:.3g}" if a.strongest > 1e-6 else "-",
+            str(len(a.levels)) if a.levels else "-",
+            "yes" if a.both_directions else "no",
+            f"{a.coasts:.1f} s",
+            f"{a.rests:.1f} s",
+            style=style,
+        )
+    return table
+
+
+def _tells(axes: Sequence[AxisReport], passive: bool) -> Table:
+    """What each axis tells, and why not the rest; reasons that several share are said once."""
+    grid = Table.grid(padding=(0, 1))
+    for a in axes:
+        # Of a passive trial it goes without saying that nothing is known of thrust.
+        shown = {n: t for n, t in a.tells.items() if t.can or not (passive and n in THRUST)}
+        by_reason: dict[tuple[bool, str], list[str]] = {}
+        for name, told in shown.items():
+            by_reason.setdefault((told.can, told.why), []).append(name)
+        if len(by_reason) == 1 and not next(iter(by_reason))[0]:
+            grid.add_row("", a.axis, f"[red]nothing[/red]: {escape(next(iter(by_reason))[1])}")
+        elif by_reason:
+            parts = [
+                f"[green]{', '.join(names)}[/green] ({escape(why)})"
+                if can
+                else f"not {', '.join(names)} ({escape(why)})"
+                for (can, why), names in sorted(by_reason.items(), key=lambda item: not item[0][0])
+            ]
+            grid.add_row("", a.axis, "; ".join(parts))
+    return grid
+
+
+def _print_overview(reports: Sequence[TrialReport], console: Console) -> None:
+    """Trials that tell each parameter of each axis, together."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title="trials that tell", title_justify="left")
+    table.add_column("axis")
+    for parameter in PARAMETERS:
+        table.add_column(parameter, justify="right")
+    for axis in AXES:
+        counts = [len(told_by(reports, axis, parameter)) for parameter in PARAMETERS]
+        table.add_row(axis, *(str(count) if count else "[dim]-[/dim]" for count in counts))
+    console.print(table)
+
+
+# Sampling of a trial's columns: rates, gaps, jitter, values that stick, hold or clip.
+
+LONGEST_MISSING = 0.2
+"""Part of a trial without a stream above which care is needed."""
+
+SHORTEST_TRIAL = 1.0
+"""[s]"""
+
+STUCK = 1.0
+"""Time of equal values of a moving sensor that is suspicious [s]."""
+
+FLYING = 0.3
+"""Height above the surface that no vehicle reaches [m]: the log has another zero."""
+
+COARSE = 50.0
+"""Steps of resolution that a signal must span for equal values to mean something."""
+
+FEW_HERTZ = 4.0
+"""Rate below which the motion between samples is not seen [Hz]."""
+
+
+def stream_reports(trial: Trial) -> tuple[list[StreamReport], list[Finding]]:
+    """Columns by the times they share, and what is wrong with their sampling."""
+    shared: dict[bytes, list[str]] = {}
+    for name in trial.channels:
+        if trial.has(name):
+            column = column_of(name)
+            group = column.group if column else ""
+            kind = f"{group} {name.split('_')[0]}" if group == "command" else group
+            key = np.isfinite(trial.channels[name]).tobytes() + kind.encode()
+            shared.setdefault(key, []).append(name)
+    reports, findings = [], []
+    if trial.duration < SHORTEST_TRIAL:
+        findings.append(finding("too_short", duration=trial.duration, least=SHORTEST_TRIAL))
+    of: dict[Finding, list[str]] = {}
+    for names in shared.values():
+        report = _report(trial, tuple(names))
+        reports.append(report)
+        for one in _sampling(report):
+            of.setdefault(one, []).extend(names)
+        for name in names:
+            for one in _values(trial, name):
+                of.setdefault(one, []).append(name)
+    findings += [one.about(_shown(columns)) for one, columns in of.items()]
+    few = [name for name in trial.channels if not trial.has(name)]
+    if few:
+        findings.append(finding("few_samples", columns=tuple(few)))
+    findings += trial.findings
+    return sorted(reports, key=lambda r: (r.group != "command", r.group)), findings
+
+
+def _report(trial: Trial, names: tuple[str, ...]) -> StreamReport:
+    t, _ = trial.series(names[0])
+    steps = np.diff(t)
+    usual = float(np.median(steps))
+    longest = max(0.5, 4.0 * usual)
+    within = steps[steps <= longest]  # half of them at least
+    column = column_of(names[0])
+    silent = float(steps[steps > longest].sum()) + (t[0] - trial.t[0]) + (trial.t[-1] - t[-1])
+    return StreamReport(
+        columns=names,
+        group=column.group if column else "",
+        samples=len(t),
+        rate=float(1.0 / within.mean()),
+        jitter=float(np.std(within) / within.mean()),
+        gaps=int((steps > longest).sum()),
+        longest_gap=float(steps.max()),
+        missing=float(silent / trial.duration) if trial.duration > 0.0 else 0.0,
+    )
+
+
+def _sampling(report: StreamReport) -> list[Finding]:
+    """What is wrong with the times of a stream."""
+    found = []
+    much = report.missing > LONGEST_MISSING
+    if report.gaps == 1:
+        found.append(finding("gap", severity="care" if much else "note", longest=report.longest_gap))
+    elif report.gaps:
+        severity = "care" if much else None
+        found.append(finding("gaps", severity=severity, gaps=report.gaps, longest=report.longest_gap))
+    elif much:
+        found.append(finding("ends_missing", share=report.missing))
+    if report.jitter > 0.5:
+        found.append(finding("jitter", share=report.jitter))
+    if report.rate < FEW_HERTZ and report.group in ("velocity", "rates"):
+        found.append(finding("slow", rate=report.rate))
+    return found
+
+
+def _shown(columns: list[str]) -> str:
+    return ", ".join(columns[:4]) + (f" and {len(columns) - 4} more" if len(columns) > 4 else "")
+
+
+def _values(trial: Trial, name: str) -> list[Finding]:
+    """Stuck, held and clipped values of a measurement."""
+    column = COLUMNS.get(name)
+    if column is None or column.group == "command":
+        return []
+    t, y = trial.series(name)
+    if len(y) < 20:
+        return []
+    if np.ptp(y) == 0.0:
+        return [finding("constant", value=y[0])]
+    if _coarse(y):
+        return []
+    found = []
+    if name in ("z", "depth") and (above := float(np.percentile(y if name == "z" else -y, 99.0))) > FLYING:
+        found.append(
+            finding("above_surface", height=above, column=name)
+            if name == "z"
+            else finding("depth_above_surface", height=above)
+        )
+    begins = np.flatnonzero(np.concatenate([[True], np.diff(y) != 0.0]))
+    lengths = np.diff(np.concatenate([begins, [len(y)]]))
+    usual = float(np.median(lengths))
+    rate = 1.0 / float(np.median(np.diff(t)))
+    if usual >= 2.0:
+        found.append(finding("values_held", rows=usual, rate=rate / usual, row_rate=rate))
+    longest = int(np.argmax(lengths))
+    span = float(t[min(begins[longest] + lengths[longest], len(t) - 1)] - t[begins[longest]])
+    if span > STUCK and lengths[longest] > 10.0 * usual:
+        at = begins[longest]
+        found.append(finding("stuck", value=y[at], span=span, start=t[at]))
+    for extreme, highest in ((y.max(), True), (y.min(), False)):
+        # A signal that passes through its extreme touches it once.
+        runs = lengths[y[begins] == extreme]
+        if runs.sum() >= max(10.0, 0.02 * len(y)) and runs.max() >= 4.0 * usual:
+            at_limit = {"value": extreme, "samples": runs.sum()}
+            found.append(
+                finding("clipped_above", **at_limit) if highest else finding("clipped_below", **at_limit)
+            )
+    return found
+
+
+def _coarse(y: Array) -> bool:
+    """Whether a signal moves over so few steps of its resolution that it repeats values by itself."""
+    steps = np.abs(np.diff(np.unique(y)))
+    return bool(np.ptp(y) < COARSE * steps.min())
+
+
+# Inputs of a trial against the limits of its vehicle.
+
+OFTEN = 0.05
+"""Part of the driven time at a limit above which care is needed."""
+
+
+def input_findings(trial: Trial, vehicle: Vehicle, inputs: Drive) -> list[Finding]:
+    """What was assumed of the inputs, time at the limits, in the dead zones and beyond what the thrusters can give."""
+    found = list(inputs.findings)
+    if inputs.source == "passive":
+        return found
+    if not np.any(inputs.force):
+        return [*found, finding("pulses_dead") if inputs.source == "pwm" else finding("inputs_zero")]
+    found += _wrench_beyond(vehicle, inputs) if not inputs.thrusters else _thrusters(trial, vehicle, inputs)
+    if inputs.end is not None:
+        rest = trial.t[-1] - inputs.end
+        found.append(finding("inputs_end", rest=rest, end=inputs.end - trial.t[0]))
+    if inputs.source == "pwm" and not trial.has("voltage") and trial.header.voltage is None:
+        found.append(finding("voltage_missing"))
+    return found
+
+
+def _wrench_beyond(vehicle: Vehicle, inputs: Drive) -> list[Finding]:
+    found = []
+    for i, (axis, limit) in enumerate(zip(AXES, vehicle.wrench_limits, strict=True)):
+        tau = np.abs(inputs.force[:, i])
+        if not tau.any() or limit == 0.0:
+            continue
+        beyond = float((tau > 1.05 * limit).sum() / (tau > 0.0).sum())
+        if beyond > OFTEN:
+            fields = {
+                "column": inputs.names[i],
+                "limit": float(limit),
+                "unit": "N" if i < 3 else "N m",
+                "vehicle": vehicle.name,
+                "share": beyond,
+                "axis": str(axis),
+            }
+            found.append(
+                finding("command_beyond", **fields)
+                if inputs.commanded
+                else finding("wrench_beyond", **fields)
+            )
+    return found
+
+
+def _thrusters(trial: Trial, vehicle: Vehicle, inputs: Drive) -> list[Finding]:
+    found = []
+    at_limit: list[str] = []
+    slow: list[str] = []
+    still: list[str] = []
+    asked = inputs.commanded and inputs.source != "pwm"
+    for name, force in zip(inputs.names, inputs.force.T, strict=True):
+        thruster = vehicle.thrusters[name]
+        driven = np.abs(force) > 0.0
+        if not driven.any():
+            still.append(name)
+            continue
+        beyond = (force > 0.99 * thruster.force_max) | (force < 0.99 * thruster.force_min)
+        if inputs.source == "rpm":
+            _, rpm = trial.series(f"rpm_{name}")
+            beyond = (rpm > 0.99 * thruster.rpm_max) | (rpm < 0.99 * thruster.rpm_min)
+        if beyond.mean() > OFTEN * driven.mean():
+            at_limit.append(name)
+        # Of measured speeds and of pulses the thrust is known down to nothing.
+        rpm = thruster.speed(force) * 30.0 / np.pi
+        if asked and _in_dead_zone(rpm, thruster.dead_rpm_minus, thruster.dead_rpm_plus) > 0.2:
+            slow.append(name)
+    if at_limit:
+        found.append(finding("saturated", thrusters=tuple(at_limit), share=OFTEN))
+    if slow:
+        found.append(finding("in_dead_zone", thrusters=tuple(slow)))
+    if still:
+        found.append(finding("never_pushed", thrusters=tuple(still)))
+    return found
+
+
+def _in_dead_zone(rpm: Array, lowest: float, highest: float) -> float:
+    """Part of the driven time in which a shaft would stand still."""
+    driven = np.abs(rpm) > 1.0
+    inside = (rpm > 0.95 * lowest) & (rpm < 0.95 * highest) & driven
+    return float(inside.sum() / max(1, driven.sum()))
+
+
+# What a trial tells of an axis, parameter by parameter, and why not.
+
+SEPARATE = 0.6
+"""Decades of speed that linear and quadratic damping need to be told apart."""
+
+LEAST_TILT = np.radians(1.0)
+"""Standard deviation of an angle that its restoring moment needs [rad]."""
+
+SHORT = 0.5
+"""Time over which a change of speed is looked for [s]."""
+
+LEAST_INERTIA = 0.05
+"""Part of the strongest wrench that went into a change of speed, for the effective mass to be seen."""
+
+SLOW = 8.0
+"""Rate below which a motor's lag lies between two samples [Hz]."""
+
+
+def with_tells(report: AxisReport, motion: Motion, inputs: Drive, vehicle: Vehicle) -> AxisReport:
+    """The report with what the axis tells."""
+    wanted = ["m_eff", "d1", "d2", "bias"]
+    wanted += ["k"] if report.axis in ("roll", "pitch") else []
+    wanted += ["thrust_scale", "thrust_lag"]
+    wanted += ["buoyancy"] if report.axis == "heave" else []
+    blocked = _blocked(report, inputs)
+    if blocked:
+        return replace(report, tells={name: Told(can=False, why=blocked) for name in wanted})
+    by_name = {
+        "m_eff": _m_eff(report, motion, inputs, vehicle),
+        **_damping(report, inputs),
+        "bias": _bias(report, inputs),
+        "k": _k(report, motion, inputs),
+        "thrust_scale": _thrust_scale(report, inputs),
+        "thrust_lag": _thrust_lag(inputs),
+        "buoyancy": _buoyancy(report, inputs),
+    }
+    return replace(report, tells={name: by_name[name] for name in wanted})
+
+
+def _blocked(report: AxisReport, inputs: Drive) -> str:
+    """Why the axis tells nothing at all, or nothing."""
+    if not report.source:
+        return _no_velocity(report.axis)
+    if not np.isfinite(report.fastest):
+        return "velocity and input are never known together"
+    if report.excited and inputs.source != "passive" and report.coasts > 10.0 * report.driven:
+        return f"driven for {report.driven:.1f} s and moving for {report.coasts:.0f} s without: something else moves it"
+    if report.excited:
+        return ""
+    if inputs.source != "passive" and report.strongest < 1e-6:
+        return "not driven"
+    if report.fastest <= max(3.0 * report.noise, 0.005):
+        return f"no motion above the noise: speeds up to {report.fastest:.2g}, noise {report.noise:.2g}"
+    return f"moves, but is hardly driven: wrench up to {report.strongest:.2g}"
+
+
+def _no_velocity(axis: str) -> str:
+    column = dict(zip(map(str, AXES), NU, strict=True))[axis]
+    other = {
+        "surge": " nor x, y with a heading",
+        "sway": " nor x, y with a heading",
+        "heave": ", z or depth",
+        "roll": " nor an attitude",
+        "pitch": " nor an attitude",
+        "yaw": " nor a heading",
+    }[axis]
+    return (
+        f"no velocity: neither {column}{other}"
+        if not other.startswith(",")
+        else f"no velocity: no {column}{other}"
+    )
+
+
+def _m_eff(report: AxisReport, motion: Motion, inputs: Drive, vehicle: Vehicle) -> Told:
+    i = AXES.index(report.axis)
+    if inputs.source == "passive":
+        return _relative(report.axis)
+    n = max(1, round(SHORT * motion.rate))
+    change = np.abs(motion.nu[n:, i] - motion.nu[:-n, i])
+    fastest = float(np.nanmax(change)) if np.isfinite(change).any() else 0.0
+    impulse = float(vehicle.rigid_body_mass_matrix()[i, i]) * fastest
+    if impulse < LEAST_INERTIA * report.strongest * SHORT or fastest < 3.0 * report.noise:
+        return Told(can=False, why="speeds hardly change: steps, pulses or coasts are missing")
+    return Told(can=True, why=f"acceleration from {motion.nu_dot_source[i] or 'the velocity'}")
+
+
+def _relative(axis: str) -> Told:
+    if axis in ("roll", "pitch"):
+        return Told(can=True, why="passive: relative to the vehicle file's restoring moment")
+    if axis == "heave":
+        return Told(can=True, why="passive: relative to the vehicle file's buoyancy excess")
+    return Told(can=False, why="passive, and no force along this axis is known: d1/m_eff and d2/m_eff alone")
+
+
+def _damping(report: AxisReport, inputs: Drive) -> dict[str, Told]:
+    decades = f"{report.decades:.1f} decades of speed up to {report.fastest:.2g}"
+    if report.decades < SEPARATE:
+        one = f"{decades}: only their sum at that speed; more levels or a coast would part them"
+        return {"d1": Told(can=False, why=one), "d2": Told(can=False, why=one)}
+    short = "" if report.decades >= 1.0 else ", less than one: intervals will be wide"
+    return {"d1": Told(can=True, why=decades + short), "d2": Told(can=True, why=decades + short)}
+
+
+def _bias(report: AxisReport, inputs: Drive) -> Told:
+    if inputs.source == "passive":
+        return Told(can=False, why="passive: goes with the force that moves it")
+    if report.both_directions:
+        return Told(can=True, why="driven both ways")
+    if report.rests >= 1.0:
+        return Told(can=True, why=f"{report.rests:.1f} s of rest")
+    return Told(can=False, why="one direction and no rest: goes with d1")
+
+
+def _k(report: AxisReport, motion: Motion, inputs: Drive) -> Told:
+    if inputs.source == "passive":
+        return Told(can=False, why="passive: sets the scale of the others")
+    q = motion.quaternion
+    known = np.isfinite(q).all(axis=1)
+    if known.sum() < 10:
+        return Told(can=False, why="no roll and pitch")
+    spread = float(np.std(2.0 * q[known, 0 if report.axis == "roll" else 1]))  # small angles about the mean
+    if spread < LEAST_TILT:
+        return Told(can=False, why=f"{report.axis} angle varies by {np.degrees(spread):.2g}° only")
+    return Told(can=True, why=f"{report.axis} angle varies by {np.degrees(spread):.2g}°")
+
+
+def _thrust_scale(report: AxisReport, inputs: Drive) -> Told:
+    if inputs.source == "passive":
+        return Told(can=False, why="passive: no thrust")
+    if report.axis in ("heave", "roll", "pitch"):
+        return Told(can=True, why="against the weight and centres of the vehicle file, if those are right")
+    return Told(can=False, why="goes with m_eff, d1, d2: doubling all of them changes nothing")
+
+
+def _thrust_lag(inputs: Drive) -> Told:
+    if inputs.source == "passive":
+        return Told(can=False, why="passive: no thrust")
+    if not inputs.commanded:
+        return Told(can=False, why="the inputs are what acted, after the lag")
+    rate = 1.0 / float(np.median(np.diff(inputs.t)))
+    if rate < SLOW:
+        return Told(can=False, why=f"inputs at {rate:.2g} Hz: a lag lies between two samples")
+    return Told(can=True, why=f"commands at {rate:.3g} Hz, by simulation")
+
+
+def _buoyancy(report: AxisReport, inputs: Drive) -> Told:
+    if inputs.source == "passive":
+        return Told(can=False, why="passive: sets the scale of the others")
+    if report.coasts >= 1.0 or report.rests >= 1.0 or report.both_directions:
+        what = f"{report.coasts:.1f} s of coasting" if report.coasts >= 1.0 else "driven both ways or at rest"
+        return Told(can=True, why=what)
+    return Told(can=False, why="one direction and no coast: goes with d1; dive and coast")
+
 
 # Whether a trial's numbers agree with each other: units, signs, axes.
 
@@ -81,10 +810,7 @@ def unit_findings(trial: Trial) -> list[Finding]:
 
 
 def _degrees(name: str, value: float, unit: str) -> Finding:
-    return Finding(
-        "refused",
-        f"{name} reaches {value:.3g} {unit}: degrees? give 'convert: {{scale: {{{name}: 0.0174533}}}}'",
-    )
+    return finding("degrees", column=name, value=value, unit=unit)
 
 
 def frame_findings(trial: Trial, vehicle: Vehicle, offsets: dict[str, Offset]) -> list[Finding]:
@@ -126,17 +852,11 @@ def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list
         (100.0 * g, "cm/s²", 0.01),
     ):
         if abs(mean / size - 1.0) < 0.15:
-            scales = ", ".join(f"{name}: {scale:g}" for name in ("ax", "ay", "az"))
-            return [
-                Finding(
-                    "refused",
-                    f"ax, ay, az are {mean:.4g} at rest: in {unit}? give 'convert: {{scale: {{{scales}}}}}'",
-                )
-            ]
+            return [finding("acceleration_unit", value=mean, unit=unit, factor=scale)]
     if not holds_gravity(trial, g):
         if abs(mean / g - 1.0) < 0.2:
             return [_upside_down(f.mean(axis=0))]
-        return [Finding("note", "ax, ay, az hold no gravity")] if mean < 0.3 * g else []
+        return [finding("no_gravity")] if mean < 0.3 * g else []
     up = up_in_body(attitude.quaternion) if attitude.tilt else np.tile([0.0, 0.0, 1.0], (len(t), 1))
     f, _ = _on(trial, ("ax", "ay", "az"), t)
     good = np.isfinite(f).all(axis=1) & np.isfinite(up).all(axis=1)
@@ -151,29 +871,16 @@ def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list
     if cosine < np.cos(np.radians(15.0)):
         against = "the attitude" if attitude.tilt else "level"
         angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        found.append(
-            Finding(
-                "care", f"the accelerometer's gravity is {angle:.0f}° from {against}: is it mounted turned?"
-            )
-        )
+        found.append(finding("accelerometer_turned", angle=angle, reference=against))
     for i, angle_name in ((0, "pitch"), (1, "roll")):
         swing = g * np.std(up[:, i])
         if swing > 0.4 and _correlation(f[:, i], up[:, i]) < AGAINST:
-            found.append(
-                Finding(
-                    "refused",
-                    f"a{'xy'[i]} runs against the {angle_name} of the attitude: one of them has the other sign",
-                )
-            )
+            found.append(finding("acceleration_sign", column=f"a{'xy'[i]}", angle=angle_name))
     return found
 
 
 def _upside_down(felt: Array) -> Finding:
-    return Finding(
-        "refused",
-        f"the accelerometer feels gravity the wrong way (az about {felt[2]:.3g} m/s², expected +9.81 when level): "
-        "axes forward-right-down? give 'convert: {body: FRD}'",
-    )
+    return finding("gravity_wrong_way", az=felt[2])
 
 
 def _rates(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
@@ -191,12 +898,7 @@ def _rates(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
         x, y = derived[moving], gyro[moving, i] - bias
         correlation, ratio = float(_cosine(x, y)), float(np.sum(x * y) / np.sum(x * x))
         if correlation < AGAINST:
-            found.append(
-                Finding(
-                    "refused",
-                    f"{rate} runs against the change of {angle}: one of them has the other sign (convert.body?)",
-                )
-            )
+            found.append(finding("rate_sign", column=rate, other=angle))
         elif correlation > WITH and 0.6 * DEGREES < ratio < 1.6 * DEGREES:
             found.append(_degrees(rate, float(np.abs(gyro[:, i][moving]).max()), "rad/s"))
         elif correlation > WITH and 0.6 < ratio * DEGREES < 1.6:
@@ -232,14 +934,7 @@ def _heading(trial: Trial, late: float) -> list[Finding]:
     if wander < DRIFTS and abs(bias) < GYRO_BIAS:
         return []
     drift = float(np.ptp(apart)) - noise
-    return [
-        Finding(
-            "care",
-            f"the heading drifts by {drift:.2g} rad against the integrated gyro: a compass disturbed by the motors, or "
-            "a gyro with a bias? Fits of yaw go by the gyro; velocities from x, y are turned by the heading, and are "
-            "wrong where it is",
-        )
-    ]
+    return [finding("heading_drift", drift=drift)]
 
 
 def _vertical(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
@@ -251,7 +946,7 @@ def _vertical(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]
         and np.std(up[both, 0]) > 0.01
         and _correlation(up[both, 0], up[both, 1]) > -AGAINST
     ):
-        found.append(Finding("refused", "z grows with depth: positive down? give 'convert: {world: NED}'"))
+        found.append(finding("z_down"))
         return found
     rising = np.where(np.isfinite(up[:, 0]), up[:, 0], -up[:, 1])
     through = _through_world(trial, t, attitude)[:, 2]
@@ -260,12 +955,7 @@ def _vertical(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]
         correlation = _correlation(rising[good], through[good])
         what = "z" if trial.has("z") else "depth"
         if correlation < AGAINST:
-            found.append(
-                Finding(
-                    "refused",
-                    f"w runs against the change of {what}: one of them has the other sign (convert.body?)",
-                )
-            )
+            found.append(finding("rate_sign", column="w", other=what))
     return found
 
 
@@ -282,22 +972,12 @@ def _horizontal(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Findin
     turned, mirrored = np.vdot(a, b) / size, np.vdot(a.conj(), b) / size
     if abs(turned) > WITH and abs(np.angle(turned)) > np.radians(15.0):
         angle = float(np.degrees(np.angle(turned)))
-        return [
-            Finding(
-                "care",
-                f"x, y and the heading disagree by {angle:.0f}°: u, v come out turned if derived from x, y",
-            )
-        ]
+        return [finding("heading_disagrees", angle=angle)]
     if abs(mirrored) > WITH > abs(turned) + 0.3:
-        return [
-            Finding(
-                "refused",
-                "u, v turned by the yaw run mirrored to x, y: the sign of v, y or yaw is the other one",
-            )
-        ]
+        return [finding("mirrored")]
     ratio = float(np.linalg.norm(b) / np.linalg.norm(a))
     if abs(turned) > WITH and not 0.6 < ratio < 1.6:
-        return [Finding("care", f"x, y change {ratio:.3g} times as fast as u, v say: a wrong unit?")]
+        return [finding("speed_ratio", ratio=ratio)]
     return []
 
 
@@ -431,10 +1111,13 @@ def work_findings(reports: list[AxisReport], motion: Motion, named: tuple[str, .
             held = np.abs(motion.tau[both, i]) > QUIET * report.strongest
             sure = report.axis in named or (not named and held.sum() / motion.rate > LONG_PUSH)
             found.append(
-                Finding(
-                    "refused" if sure and ratio < -0.6 and report.axis != "heave" else "care",
-                    f"the inputs take {-report.work:.3g} J out of {report.axis}: {TAU[i]} runs against {NU[i]}: one "
-                    "has the wrong sign, or something else drove the vehicle",
+                finding(
+                    "energy_taken",
+                    severity="refused" if sure and ratio < -0.6 and report.axis != "heave" else "care",
+                    work=-report.work,
+                    axis=str(report.axis),
+                    wrench=TAU[i],
+                    velocity=NU[i],
                 )
             )
     return found
@@ -471,15 +1154,13 @@ def check(
         except CalibrationError as error:
             if len(paths) == 1 and place == Path(paths[0]):
                 raise
-            trials.append(_refused(place.name, None, str(error)))
+            trials.append(_refused(place.name, str(error)))
     reports = _checked(trials, given)
     common = together(reports)
     if as_json:
         print(json.dumps(as_object(reports, common), indent=2, ensure_ascii=False))
         return
     from rich.console import Console
-
-    from finssim.calibration.check.tables import print_reports
 
     print_reports(reports, Console(), common)
 
@@ -498,7 +1179,7 @@ def as_object(reports: Sequence[TrialReport], common: Sequence[Finding]) -> dict
     """What `--json` prints."""
     return {
         "trials": [report.as_json() for report in reports],
-        "together": [{"level": finding.level, "text": finding.text} for finding in common],
+        "together": [one.as_json() for one in common],
     }
 
 
@@ -508,17 +1189,17 @@ def _checked(trials: Sequence[Trial | TrialReport], vehicle: Vehicle | None) -> 
     for trial in trials:
         report = trial if isinstance(trial, TrialReport) else _one(trial, vehicle)
         if report.sha256 and report.sha256 in seen:
-            twice = f"holds the same numbers as {seen[report.sha256]}, which would count twice: leave one out"
-            report = replace(report, findings=(*report.findings, Finding("refused", twice)))
+            twice = finding("duplicate", other=seen[report.sha256])
+            report = replace(report, findings=(*report.findings, twice))
         seen.setdefault(report.sha256, report.name)
         reports.append(report)
     return reports
 
 
-def _refused(name: str, vehicle: str | None, reason: str) -> TrialReport:
+def _refused(name: str, reason: str) -> TrialReport:
     return TrialReport(
         name=name,
-        vehicle=vehicle,
+        vehicle=None,
         role=None,
         duration=0.0,
         rows=0,
@@ -526,7 +1207,7 @@ def _refused(name: str, vehicle: str | None, reason: str) -> TrialReport:
         streams=(),
         axes=(),
         offsets={},
-        findings=(Finding("refused", reason),),
+        findings=(finding("unusable", reason=reason),),
     )
 
 
@@ -566,19 +1247,14 @@ def _one(trial: Trial, given: Vehicle | None) -> TrialReport:
 def _own_vehicle(trial: Trial, findings: list[Finding]) -> Vehicle | None:
     """The vehicle that the header names; findings say why there is none."""
     if trial.header.vehicle is None:
-        findings.append(
-            Finding(
-                "refused",
-                "no vehicle: give --vehicle, or 'vehicle: NAME' in trial.yaml; only the sampling was checked",
-            )
-        )
+        findings.append(finding("no_vehicle"))
         return None
     named = trial.header.vehicle
     beside = Path(trial.path or ".") / named
     try:
         return load_vehicle(beside if beside.is_file() else named)
     except VehicleError as error:
-        findings.append(Finding("refused", f"trial.yaml: vehicle: {error}"))
+        findings.append(finding("vehicle_refused", reason=str(error)))
         return None
 
 
@@ -587,7 +1263,7 @@ def _motion_of(trial: Trial, vehicle: Vehicle, findings: list[Finding]) -> tuple
     try:
         inputs = drive(trial, vehicle)
     except CalibrationError as error:
-        findings.append(Finding("refused", str(error).removeprefix(f"{trial.name}: ")))
+        findings.append(finding("unusable", reason=error.reason))
         # The motion can be looked at without its cause.
         trial = replace(trial, header=trial.header.model_copy(update={"passive": True}))
         seen = motion(trial, vehicle)
@@ -597,33 +1273,29 @@ def _motion_of(trial: Trial, vehicle: Vehicle, findings: list[Finding]) -> tuple
         return "", unknown
     findings += input_findings(trial, vehicle, inputs)
     seen = motion(trial, vehicle)
-    known = {finding.text for finding in findings}
-    findings += [Finding("note", note) for note in seen.notes if note not in known]
+    findings += [one for one in seen.findings if one not in findings]
     axes = [with_tells(axis, seen, inputs, vehicle) for axis in axis_reports(seen, inputs, vehicle)]
     findings += work_findings(axes, seen, trial.header.axis)
     if not any(told.can for axis in axes for told in axis.tells.values()):
-        moved = ", ".join(axis.axis for axis in axes if axis.source)
-        findings.append(
-            Finding(
-                "refused",
-                "no axis is excited: nothing can be identified"
-                if moved
-                else "no velocity, rate, attitude or depth to go by",
-            )
-        )
+        moved = any(axis.source for axis in axes)
+        findings.append(finding("nothing_excited") if moved else finding("nothing_measured"))
     for named in trial.header.axis:
         axis = next(axis for axis in axes if axis.axis == named)
         if not axis.excited:
-            findings.append(Finding("care", f"trial.yaml says {named}, and {named} is not excited"))
+            findings.append(finding("axis_still", axis=str(named)))
     return inputs.source, axes
 
 
 def _offset(group: str, offset: Offset) -> Finding:
     # Slow motion looks alike at several offsets: a single trial is believed if the streams agree very well.
     sure = abs(offset.seconds) > 6.0 * offset.std and offset.correlation > 0.95
-    return Finding(
-        "care" if sure else "note",
-        f"{group} comes {abs(offset.seconds):.3f} s {'early' if offset.seconds > 0.0 else 'late'} against "
-        f"{offset.reference} (± {2.0 * offset.std:.3f} s): "
-        f"give 'convert: {{time_offset: {{{group}: {offset.seconds:.3f}}}}}'",
+    return finding(
+        "stream_offset",
+        severity="care" if sure else "note",
+        group=group,
+        offset=abs(offset.seconds),
+        sense="early" if offset.seconds > 0.0 else "late",
+        reference=offset.reference,
+        half=2.0 * offset.std,
+        seconds=offset.seconds,
     )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from finssim.calibration.excitation.programmes import Programme, programmes
 from finssim.calibration.excitation.synthetic import simulate_programme
-from finssim.calibration.trials.columns import TAU
+from finssim.calibration.trials.trial import TAU
 from finssim.calibration.trials.trial_files import write_trial
 from finssim.control.allocation import Allocator
 from finssim.files import atomic_directory, atomic_write

@@ -10,12 +10,161 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.control.allocation import Allocator
+from finssim.quiet import start_warp
 from finssim.vehicles import AXES, Vehicle
+from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.vehicle import Axis
 
-__all__ = ["KINDS", "Programme", "programmes", "which_axes"]
+__all__ = ["KINDS", "Programme", "RATE", "multisine", "programmes", "which_axes"]
 
 Array = NDArray[np.float64]
+
+# How far a programme takes a vehicle along one axis, by the damping of its file.
+
+
+def travel(force: Array, rate: float, axis: Axis, vehicle: Vehicle) -> float:
+    """Way from the nearest to the farthest point along one axis alone, from rest [m].
+
+    m v_dot = force - (d1 + d2 |v|) v, of the set `calibrated` or else the first; without damping where that is a mesh.
+
+    Args:
+        force: Along the axis, body frame, held over each row [N], (n,).
+        rate: Of the rows [Hz].
+        axis: surge, sway or heave.
+        vehicle: Whose mass and damping count.
+    """
+    i = AXES.index(axis)
+    name = "calibrated" if "calibrated" in vehicle.hydrodynamics else next(iter(vehicle.hydrodynamics))
+    chosen = vehicle.hydrodynamics[name]
+    m, h = float(vehicle.mass_matrix(name)[i, i]), 1.0 / rate
+    d1 = d2 = 0.0
+    if isinstance(chosen, HydrodynamicSet):
+        d1, d2 = float(chosen.linear_damping[i, i]), float(chosen.quadratic_damping[i, i])
+    v = x = near = far = 0.0
+    for f in force:
+        # Implicit in the damping, so that a light and draggy vehicle does not ring.
+        v = (v + h * f / m) / (1.0 + h * (d1 + d2 * abs(v)) / m)
+        x += h * v
+        near, far = min(near, x), max(far, x)
+    return float(far - near)
+
+
+def within(room: float, force: Array, rate: float, axis: Axis, vehicle: Vehicle) -> float:
+    """Factor up to 1 on a force that keeps the way along one axis within a room.
+
+    Args:
+        room: Longest way [m].
+        force: Along the axis, body frame, held over each row [N], (n,).
+        rate: Of the rows [Hz].
+        axis: surge, sway or heave.
+        vehicle: Whose mass and damping count.
+    """
+    low, high = 0.0, 1.0
+    if travel(force, rate, axis, vehicle) <= room:
+        return high
+    for _ in range(8):
+        middle = 0.5 * (low + high)
+        fits = travel(middle * force, rate, axis, vehicle) <= room
+        low, high = (middle, high) if fits else (low, middle)
+    return low
+
+
+# Multi-sines: all axes at once, each with frequencies of its own, for fits of coupled dynamics.
+
+DRAWS = 30
+"""Random phases tried; those with the lowest peaks are taken."""
+
+
+def multisine(
+    peaks: Mapping[Axis, float],
+    vehicle: Vehicle,
+    *,
+    index: int = 1,
+    seed: int = 0,
+    duration: float = 60.0,
+    band: tuple[float, float] = (0.05, 1.0),
+    room: float | None = None,
+) -> Programme:
+    """One programme that drives several axes with interleaved harmonics of 1/duration.
+
+    tau_i(t) = a_i Σ_k k^(-1/2) cos(2π k t / duration + φ_k),   k = i-th, (i+n)-th, ... harmonic in the band
+
+    No two axes share a frequency, so their responses can be told apart; amplitudes fall with the root of frequency, so
+    that both speeds (damping) and accelerations (mass) are excited. Phases are the random ones, of a few draws, with
+    the lowest peaks.
+
+    Args:
+        peaks: Axis -> largest wrench [N, N m]; all are scaled down together until the thrusters can give the sum.
+        vehicle: Whose thrusters and damping count.
+        index: Number in the name.
+        seed: Of the phases.
+        duration: Of the excitation [s].
+        band: Lowest and highest frequency [Hz].
+        room: Longest way along a linear axis, by the damping of the vehicle's file [m]; no bound if None.
+
+    Raises:
+        CalibrationError: The band is too narrow for so many axes in this time, or too fast for the commands.
+    """
+    low, high = band
+    if not (0.0 < low < high <= 0.2 * RATE):
+        raise CalibrationError(
+            f"band is {low:g} to {high:g} Hz, expected rising, above 0 and up to {0.2 * RATE:g} Hz"
+        )
+    harmonics = np.arange(math.ceil(low * duration - 1e-9), math.floor(high * duration + 1e-9) + 1)
+    if len(harmonics) < 3 * len(peaks):
+        raise CalibrationError(
+            f"{len(harmonics)} frequencies between {low:g} and {high:g} Hz in {duration:g} s are too few for "
+            f"{len(peaks)} axes: give a longer duration or a wider band"
+        )
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(duration * RATE)) / RATE
+    tau = np.zeros((len(t), 6))
+    for i, (axis, peak) in enumerate(peaks.items()):
+        shape = _lowest_peak(harmonics[i :: len(peaks)], t / duration, rng)
+        tau[:, AXES.index(axis)] = peak * shape / np.abs(shape).max()
+        if room is not None and AXES.index(axis) < 3:
+            tau[:, AXES.index(axis)] *= within(room, tau[:, AXES.index(axis)], RATE, axis, vehicle)
+    tau *= _feasible(tau, vehicle)
+    parts = (("rest", 50), ("baseline", 50), ("excitation", len(t)), ("coast", 100), ("rest", 50))
+    phase = np.concatenate([np.full(count, word) for word, count in parts])
+    full = np.zeros((len(phase), 6))
+    full[phase == "excitation"] = tau
+    return Programme(name=f"multisine_{index}", axes=tuple(peaks), rate=RATE, tau_desired=full, phase=phase)
+
+
+def _lowest_peak(harmonics: NDArray[np.int64], turns: Array, rng: np.random.Generator) -> Array:
+    """The sum of cosines whose random phases give the lowest peak."""
+    amplitude = harmonics**-0.5
+    best = None
+    for _ in range(DRAWS):
+        phases = rng.uniform(0.0, 2.0 * math.pi, len(harmonics))
+        wave = np.cos(2.0 * math.pi * turns[:, None] * harmonics + phases) @ amplitude
+        if best is None or np.abs(wave).max() < np.abs(best).max():
+            best = wave
+    assert best is not None
+    return np.asarray(best)
+
+
+def _feasible(tau: Array, vehicle: Vehicle) -> float:
+    """Largest factor up to 1 at which the thrusters give the whole wrench at every time."""
+    start_warp()
+    allocator = Allocator.from_vehicle(vehicle)
+    weights = np.where(vehicle.wrench_limits > 0.0, 1.0 / np.maximum(vehicle.wrench_limits, 1e-9), 0.0)
+
+    def given(factor: float) -> bool:
+        thrust, _ = allocator.allocate(factor * tau)
+        missing = np.abs(allocator.achieved(thrust) - factor * tau) * weights
+        return bool(missing.max() < 2e-3)
+
+    low, high = 0.0, 1.0
+    if given(high):
+        return high
+    for _ in range(10):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if given(middle) else (low, middle)
+    return low
+
 
 KINDS = ("published", "validation", "multisine")
 
@@ -154,8 +303,6 @@ def programmes(
         raise CalibrationError(f"room is {room:g} m, expected a length above 0 m")
     by_axis = {axis: _levels(axis, vehicle, levels, kind) for axis in chosen}
     if kind == "multisine":
-        from finssim.calibration.excitation.multisine import multisine
-
         peaks = {axis: values[-1] for axis, values in by_axis.items()}
         return [
             multisine(peaks, vehicle, index=r + 1, seed=seed + r, duration=duration, band=band, room=room)
@@ -208,8 +355,6 @@ def _in_room(
     room: float, levels: tuple[float, ...], given: bool, axis: Axis, vehicle: Vehicle
 ) -> tuple[float, ...]:
     """Levels of a linear axis that stay within `room`; given ones are refused rather than changed."""
-    from finssim.calibration.excitation.travel import travel, within
-
     hold, after = (np.full(round(seconds * RATE), x) for seconds, x in ((9.0, levels[-1]), (3.0, 0.0)))
     force = np.concatenate([hold, after])
     if not given:

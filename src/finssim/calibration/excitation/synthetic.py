@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation.programmes import Programme
 from finssim.calibration.excitation.recording import Recording, record
-from finssim.calibration.trials.columns import TAU
 from finssim.calibration.trials.header import Header, TrialWater
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial import TAU, Trial
 from finssim.geometry.rotations import (
     quat_from_euler,
     quat_inverse_rotate,

@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import finding
 from finssim.calibration.importers.ardusub_outputs import NEUTRAL, outputs_of
 from finssim.calibration.importers.assemble import in_our_axes
 from finssim.calibration.importers.column_map import ArduSubMap
 from finssim.calibration.importers.source_map import Frame
 from finssim.calibration.importers.streams import Stream
-from finssim.calibration.importers.units import GRAVITY
 from finssim.calibration.trials.trial import Array
+from finssim.calibration.trials.units import GRAVITY
 from finssim.geometry.rotations import wrap_angle
 from finssim.vehicles import Vehicle
 
@@ -269,7 +270,7 @@ def _position_deltas(log: Log) -> Stream | None:
         source=f"{log.shown} {kind}",
         t=log.times[kind] - 0.5 * np.where(good, dt, 0.0),
         channels=dict(zip("uvw", velocity.T, strict=True)),
-        notes=(f"u v w from {kind}, at the sensor: give velocity_at if it is not at the body origin",),
+        findings=(finding("velocity_at_sensor", kind=kind),),
     )
     return in_our_axes(stream, FRD)
 
@@ -284,18 +285,17 @@ def _estimate(log: Log) -> Stream | None:
     moving = (flags & HORIZONTAL_VELOCITY > 0) & (flags & STANDING_STILL == 0)
     source = f"{log.shown} {kind}"
     if moving.mean() < LEAST_USABLE:
-        note = (
-            f"the velocity of {kind} is left out: in {1.0 - moving.mean():.0%} of it the autopilot had no measurement "
-            "of horizontal velocity or position"
-        )
-        return Stream(source=source, t=first_core.times[kind], notes=(note,))
+        unusable = finding("velocity_left_out", kind=kind, share=1.0 - moving.mean())
+        return Stream(source=source, t=first_core.times[kind], findings=(unusable,))
     placed = moving & (flags & (RELATIVE_POSITION | ABSOLUTE_POSITION) > 0)
     values = [first_core.numbers(kind, name) for name in names]
     channels = {c: np.where(moving, v, np.nan) for c, v in zip(("vx", "vy", "vz"), values[:3], strict=True)}
     if placed.any():
         channels |= {c: np.where(placed, v, np.nan) for c, v in zip("xyz", values[3:], strict=True)}
-    note = f"u v w from {kind}, an estimate by the autopilot's filter: smoother and later than a measurement"
-    return in_our_axes(Stream(source=source, t=first_core.times[kind], channels=channels, notes=(note,)), FRD)
+    estimated = (finding("velocity_estimated", kind=kind),)
+    return in_our_axes(
+        Stream(source=source, t=first_core.times[kind], channels=channels, findings=estimated), FRD
+    )
 
 
 def _held(log: Log, kind: str, name: str, t: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -410,9 +410,9 @@ def _depth(log: Log, asked: ArduSubMap) -> Stream | None:
     one = log.some(kind, "I", chosen)
     if not one.has(kind):
         return None
-    note = f"depth from barometer {chosen}, zero where the autopilot calibrated it"
-    depth = -one.numbers(kind, "Alt")
-    return Stream(source=f"{log.shown} {kind}", t=one.times[kind], channels={"depth": depth}, notes=(note,))
+    of = (finding("depth_of_barometer", number=chosen),)
+    channels = {"depth": -one.numbers(kind, "Alt")}
+    return Stream(source=f"{log.shown} {kind}", t=one.times[kind], channels=channels, findings=of)
 
 
 def _depth_from_pressure(log: Log, chosen: int) -> Stream | None:
@@ -426,8 +426,8 @@ def _depth_from_pressure(log: Log, chosen: int) -> Stream | None:
         return Stream(source=f"{log.shown} {kind}", t=log.times[kind], channels={"pressure": pressure})
     # 9800 Pa for a metre of fresh water, as the autopilot reckons.
     depth = (pressure - ground) / (9800.0 * log.parameters.get("BARO_SPEC_GRAV", 1.0))
-    note = f"depth from {kind}, zero at the autopilot's {ground:.0f} Pa"
-    return Stream(source=f"{log.shown} {kind}", t=log.times[kind], channels={"depth": depth}, notes=(note,))
+    of = (finding("depth_of_message", kind=kind, ground=ground),)
+    return Stream(source=f"{log.shown} {kind}", t=log.times[kind], channels={"depth": depth}, findings=of)
 
 
 def _voltage(log: Log) -> Stream | None:
@@ -479,14 +479,14 @@ def _pulses(log: Log, asked: ArduSubMap, vehicle: Vehicle | None) -> list[Stream
         return []
     if vehicle is not None:
         try:
-            outputs, note = outputs_of(vehicle, log.parameters, asked.outputs)
+            outputs, of = outputs_of(vehicle, log.parameters, asked.outputs)
         except CalibrationError as error:
             raise CalibrationError(f"{log.shown}: {error}") from None
     else:
         outputs = {n: (f"C{n}", 1) for n in range(1, 17) if np.any(one.numbers(kind, field.format(n)) > 0.0)}
-        note = "no vehicle is named, so the pulses keep the numbers of the outputs: give --vehicle"
+        of = finding("pulses_unnamed")
     channels = {}
     for output, (name, sign) in outputs.items():
         pulse = one.numbers(kind, field.format(output))
         channels[f"pwm_{name}"] = np.where(pulse > 0.0, NEUTRAL + sign * (pulse - NEUTRAL), np.nan)
-    return [Stream(source=f"{log.shown} {kind}", t=one.times[kind], channels=channels, notes=(note,))]
+    return [Stream(source=f"{log.shown} {kind}", t=one.times[kind], channels=channels, findings=(of,))]

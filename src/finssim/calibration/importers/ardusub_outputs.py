@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.geometry.frames import FROM_FOSSEN
 from finssim.vehicles import Vehicle
 from finssim.vehicles.part import did_you_mean
@@ -111,8 +112,8 @@ def mixed_pulses(frame: str, demands: np.ndarray, directions: Sequence[int] = ()
 
 def outputs_of(
     vehicle: Vehicle, parameters: Mapping[str, float], given: Mapping[str, str]
-) -> tuple[dict[int, tuple[str, int]], str]:
-    """Output (from 1) -> thruster, and -1 where its pulses have to be turned about neutral; and a note.
+) -> tuple[dict[int, tuple[str, int]], Finding]:
+    """Output (from 1) -> thruster, and -1 where its pulses have to be turned about neutral; and what that rests on.
 
     Turned pulses are as the vehicle file has the thruster wired: longer ones push along its axis, or against it where
     its motor_sign is -1.
@@ -139,10 +140,10 @@ def outputs_of(
         output: (name, sign * (vehicle.thrusters[name].motor_sign or 1))
         for output, (name, sign) in found.items()
     }
-    pairs = ", ".join(
+    pairs = tuple(
         f"C{output} {'-' if sign < 0 else ''}{name}" for output, (name, sign) in sorted(found.items())
     )
-    return found, f"outputs drive thrusters {how}: {pairs} (a minus turns the pulse about {NEUTRAL:g} µs)"
+    return found, finding("outputs_mapped", how=how, pairs=pairs, neutral=NEUTRAL)
 
 
 def _given(vehicle: Vehicle, given: Mapping[str, str]) -> dict[int, tuple[str, int]]:

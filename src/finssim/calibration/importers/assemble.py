@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.importers.ardusub_outputs import FRAMES, NEUTRAL, STICKS, mixed_pulses, outputs_of
 from finssim.calibration.importers.column_map import ArduSubMap, ColumnMap
 from finssim.calibration.importers.source_map import Frame
 from finssim.calibration.importers.streams import Stream, Table
-from finssim.calibration.importers.units import GRAVITY
-from finssim.calibration.trials.columns import NU
 from finssim.calibration.trials.conversion import in_our_frames, tidy_quaternions
 from finssim.calibration.trials.header import Conversion, Header
-from finssim.calibration.trials.trial import PHASES, Array, Trial
+from finssim.calibration.trials.trial import NU, PHASES, Array, Trial
+from finssim.calibration.trials.units import GRAVITY
 from finssim.geometry.frames import FROM_FOSSEN
 from finssim.geometry.rotations import quat_from_euler, quat_inverse_rotate
 from finssim.vehicles import load_vehicle
@@ -46,26 +46,26 @@ def trial_of(name: str, table: Table, header: Header, column_map: ColumnMap) -> 
     Raises:
         CalibrationError: World velocities without an attitude, or beside body velocities.
     """
-    channels, notes = dict(table.channels), list(table.notes)
+    channels, findings = dict(table.channels), list(table.findings)
     if any(c in channels for c in WORLD_VELOCITY):
         channels |= _body_velocity(name, table.t, channels)
         channels = {c: v for c, v in channels.items() if c not in WORLD_VELOCITY}
     if "pressure" in channels:
-        depth, note = _depth(name, channels.pop("pressure"), header, column_map)
-        notes += note
+        depth, assumed = _depth(channels.pop("pressure"), header, column_map)
+        findings += assumed
         channels["depth"] = depth
     if any(c in channels for c in STICKS):
-        pulses, note = _pulses(name, channels, header, column_map.ardusub)
+        pulses, mixed = _pulses(name, channels, header, column_map.ardusub)
         channels = {c: v for c, v in channels.items() if c not in STICKS} | pulses
-        notes.append(note)
-    notes += tidy_quaternions(channels)
+        findings += mixed
+    findings += tidy_quaternions(channels)
     for column in [c for c, v in channels.items() if not np.isfinite(v).any()]:
-        notes.append(f"{column} holds no finite number and is left out")
+        findings.append(finding("column_empty", column=column))
         del channels[column]
     if not channels:
         raise CalibrationError(f"{name}: no column of a trial holds a number")
     return Trial(
-        name=name, t=table.t, channels=channels, phase=_phase(table), header=header, notes=tuple(notes)
+        name=name, t=table.t, channels=channels, phase=_phase(table), header=header, findings=tuple(findings)
     )
 
 
@@ -112,8 +112,8 @@ def _body_velocity(name: str, t: Array, channels: dict[str, Array]) -> dict[str,
 
 def _pulses(
     name: str, channels: dict[str, Array], header: Header, asked: ArduSubMap
-) -> tuple[dict[str, Array], str]:
-    """Pulse widths of the vehicle's thrusters [µs] from the sticks, by ArduSub's mixer; and a note."""
+) -> tuple[dict[str, Array], list[Finding]]:
+    """Pulse widths of the vehicle's thrusters [µs] from the sticks, by ArduSub's mixer; and findings."""
     if asked.frame is None or header.vehicle is None:
         raise CalibrationError(
             f"{name}: stick_* columns go through ArduSub's mixer: give its frame in the map, "
@@ -136,23 +136,23 @@ def _pulses(
     vehicle = load_vehicle(header.vehicle)
     config = next(number for number, (frame, _) in FRAMES.items() if frame == asked.frame)
     directions = {f"MOT_{motor + 1}_DIRECTION": 1.0 for motor in range(len(FRAMES[config][1]))}
-    outputs, note = outputs_of(vehicle, {"FRAME_CONFIG": config, **directions}, asked.outputs)
+    outputs, mapped = outputs_of(vehicle, {"FRAME_CONFIG": config, **directions}, asked.outputs)
     mixed = mixed_pulses(asked.frame, asked.gain * demands, asked.motor_directions)
     found = {}
     for output, (thruster, sign) in outputs.items():
         pulse = NEUTRAL + sign * (mixed[:, output - 1] - NEUTRAL)
         found[f"pwm_{thruster}"] = np.where(known, pulse, np.nan)
-    return found, f"sticks went through the mixer of frame {asked.frame}, gain {asked.gain:g}: {note}"
+    return found, [finding("sticks_mixed", frame=asked.frame, gain=asked.gain), mapped]
 
 
-def _depth(name: str, pressure: Array, header: Header, column_map: ColumnMap) -> tuple[Array, list[str]]:
+def _depth(pressure: Array, header: Header, column_map: ColumnMap) -> tuple[Array, list[Finding]]:
     """Depth of the pressure sensor [m]: (p - p_surface) / (rho g)."""
     vehicle = load_vehicle(header.vehicle) if header.vehicle is not None else None
     density = header.water.density or (vehicle.water.density if vehicle else 1000.0)
     gravity = vehicle.water.gravity if vehicle else GRAVITY
     surface = column_map.surface_pressure
-    notes = [f"depth from pressure with {density:g} kg/m³"]
+    findings = [finding("depth_of_pressure", density=density)]
     if surface is None:
         surface = STANDARD_ATMOSPHERE
-        notes = [f"{notes[0]} and 101325 Pa at the surface: give surface_pressure, 1 hPa is 1 cm"]
-    return (pressure - surface) / (density * gravity), notes
+        findings.append(finding("surface_pressure_assumed", pressure=surface))
+    return (pressure - surface) / (density * gravity), findings

@@ -6,7 +6,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -14,26 +14,123 @@ from typing import Annotated, Any, Literal, get_args
 import numpy as np
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.importers.assemble import in_our_axes, trial_of
 from finssim.calibration.importers.column_map import ColumnMap, SplitRule, read_map, split_rule
-from finssim.calibration.importers.finssim_record import (
-    THRUSTERS,
-    own_topics,
-    recorded_header,
-    spoken_events,
-    thruster_columns,
-)
 from finssim.calibration.importers.source_map import ColumnSource, SourceMap
-from finssim.calibration.importers.split import split_table
-from finssim.calibration.importers.streams import Stream, merge
+from finssim.calibration.importers.streams import Stream, merge, split_table
 from finssim.calibration.importers.tables import TABLES, read_table, spoken, values_of
 from finssim.calibration.trials.trial import Trial
 from finssim.files import plain_name
+from finssim.mcap_metadata import mcap_metadata
 from finssim.mcap_repair import whole_mcap
-from finssim.vehicles import load_vehicle
+from finssim.vehicles import VehicleError, catalogue_vehicle, load_vehicle
 from finssim.vehicles.part import did_you_mean
 
 __all__ = ["FORMATS", "Format", "import_logs", "import_trials", "print_folders", "read_trials"]
+
+# What our own records add to a bag: thrusters by name, phases and arming from events, the vehicle they are of.
+
+OWN = "finssim_msgs/msg/"
+"""Types by which a bag of ours is known, whoever wrote the file."""
+
+TAKEN = ("odom", "imu", "joint_states", "thruster_state", "thruster_cmd", "telemetry", "pressure")
+"""Last parts of the topics that a trial is made of; the wanted wrench and the goal say nothing about what happened."""
+
+COMPASS = "/compass/imu"
+"""An Imu that tells a heading alone, without rates and specific force."""
+
+ARMING = {"armed": "armed", "disarmed": "disarmed", "fault": "disarmed"}
+"""Kind of an event -> whether thrusters may turn from then on; while it holds, an armed bridge stays armed."""
+
+THRUSTERS: dict[str, dict[str, tuple[str, str]]] = {
+    "sensor_msgs/msg/JointState": {"rpm_": ("velocity", "rad/s")},
+    "finssim_msgs/msg/ThrusterState": {"rpm_": ("shaft_speed", "rad/s"), "command_": ("force", "N")},
+    "finssim_msgs/msg/ThrusterCommand": {"command_": ("force", "N")},
+}
+"""Type -> prefix of a trial's columns -> list of the message and its unit, one number a thruster."""
+
+
+def own_topics(known: Mapping[str, str]) -> dict[str, SourceMap]:
+    """Topics of ours that make a trial; none of a bag without a type of ours.
+
+    Args:
+        known: Topic -> type, all that the bag has.
+    """
+    if not any(kind.startswith(OWN) for kind in known.values()):
+        return {}
+    return {
+        topic: SourceMap()
+        for topic in sorted(known)
+        if topic.rsplit("/", 1)[-1] in TAKEN and not topic.endswith(COMPASS)
+    }
+
+
+def thruster_columns(kind: str, message: Any) -> dict[str, ColumnSource]:
+    """Columns that a message holds by the names of thrusters; lists that it leaves empty hold none."""
+    names = _names(message)
+    return {
+        f"{prefix}{name}": ColumnSource(column=f"{field}[{name}]", unit=unit)
+        for prefix, (field, unit) in THRUSTERS.get(kind, {}).items()
+        if len(getattr(message, field)) == len(names)
+        for name in names
+    }
+
+
+def _names(message: Any) -> list[str]:
+    return [str(name) for name in getattr(message, "names", getattr(message, "name", ()))]
+
+
+def spoken_events(topic: str, said: Iterable[tuple[float, str]], start: float) -> Stream | None:
+    """Phases and arming that the events of a record tell; None where they tell neither.
+
+    Args:
+        topic: Of the events.
+        said: Time [s] and JSON of each, in order.
+        start: Of the record [s]; before the first event there is no phase, and the vehicle is disarmed.
+    """
+    times, phase, arming = [start], [""], ["disarmed"]
+    for time, text in said:
+        try:
+            event = json.loads(text)
+            kind, word = str(event["kind"]), str(event.get("text", ""))
+        except (ValueError, KeyError, TypeError, AttributeError):
+            continue  # somebody else's words
+        if kind != "phase" and kind not in ARMING:
+            continue
+        times.append(time)
+        phase.append(word if kind == "phase" else phase[-1])
+        arming.append(ARMING.get(kind, arming[-1]))
+    words = {"phase": phase, "arming": arming}
+    spoken = {name: np.array(list_, dtype=np.str_) for name, list_ in words.items() if len(set(list_)) > 1}
+    return Stream(source=topic, t=np.array(times), words=spoken) if spoken else None
+
+
+def recorded_header(path: Path) -> tuple[dict[str, Any], list[Finding]]:
+    """What a record says for `trial.yaml`, and findings about it; nothing of a foreign file.
+
+    Raises:
+        CalibrationError: The record's own words for the header are broken.
+    """
+    about = mcap_metadata(path, "finssim")
+    try:
+        told = dict(json.loads(about.get("trial", "{}")))
+    except (ValueError, TypeError):
+        raise CalibrationError(
+            f"{path.name}: the record's 'trial' is {about['trial']!r}, expected a mapping"
+        ) from None
+    name = told.pop("vehicle", about.get("vehicle"))
+    if name is None:
+        return told, []
+    plain_name(str(name), f"{path.name}: vehicle", CalibrationError)
+    try:
+        vehicle = catalogue_vehicle(str(name), path.name)
+    except VehicleError:
+        return told, [finding("vehicle_unknown", path.name, vehicle=name)]
+    changed = name == about.get("vehicle") and vehicle.sha256 != about.get("vehicle_sha256")
+    remarks = [finding("vehicle_changed", path.name, vehicle=name)] if changed else []
+    return {"vehicle": name, **told}, remarks
+
 
 # ROS 2 bags, sqlite3 or MCAP, and ROS 1 bags, without ROS: topics as streams.
 
@@ -163,7 +260,7 @@ def read_bag(path: Path, topics: Mapping[str, SourceMap]) -> list[Stream]:
         CalibrationError: Not a bag, or topics, types or fields that it has not.
         ModuleNotFoundError: rosbags is not installed.
     """
-    with _opened(path) as (reader, notes):
+    with _opened(path) as (reader, findings):
         known = {c.topic: c.msgtype for c in reader.connections}
         own = {} if topics else own_topics(known)
         topics = topics or own
@@ -180,15 +277,15 @@ def read_bag(path: Path, topics: Mapping[str, SourceMap]) -> list[Stream]:
                     f"{path.name}: no topic '{topic}'{did_you_mean(topic, list(known))} its topics are {_listed(known)}"
                 )
             sources[topic] = _columns(reader, topic, known[topic], source)
-        _choose(sources, known, [topic for topic in topics if not topics[topic].columns], notes)
-        collected = _collect(reader, sources, topics, notes)
+        _choose(sources, known, [topic for topic in topics if not topics[topic].columns], findings)
+        collected = _collect(reader, sources, topics, findings)
         events = _events(reader) if own else []
     streams = [_stream(topic, sources[topic], topics[topic], *collected[topic]) for topic in topics]
     found = [stream for stream in streams if len(stream.t) >= 2 and (stream.channels or stream.words)]
     if not found:
         raise CalibrationError(f"{path.name}: {', '.join(topics)} hold fewer than two messages each")
-    notes += [f"{topic} holds fewer than two messages" for topic in topics if len(collected[topic][0]) < 2]
-    found[0] = found[0].noting(*notes)
+    findings += [finding("topic_short", topic=t) for t in topics if len(collected[t][0]) < 2]
+    found[0] = found[0].noting(*findings)
     return found + events
 
 
@@ -202,17 +299,16 @@ def bag_files(path: Path) -> list[Path]:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, list[str]]]:
+def _opened(path: Path) -> Iterator[tuple[Any, list[Finding]]]:
     from rosbags.highlevel import AnyReader, AnyReaderError
     from rosbags.typesys import Stores, get_typestore
 
-    notes: list[str] = []
+    repairs: list[str] = []
     with ExitStack() as stack:
-        parts = [stack.enter_context(whole_mcap(part, notes)) for part in bag_files(path) or [path]]
+        parts = [stack.enter_context(whole_mcap(part, repairs)) for part in bag_files(path) or [path]]
+        findings = [finding("as_read", remark=repair) for repair in repairs]
         if parts != [path] and path.is_dir():
-            notes.append(
-                f"{path.name} has no metadata.yaml, as after a crash: read from {len(parts)} files in it"
-            )
+            findings.append(finding("no_metadata", bag=path.name, files=len(parts)))
         try:
             reader = AnyReader(parts, default_typestore=get_typestore(Stores.LATEST))
             reader.open()
@@ -221,7 +317,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, list[str]]]:
                 f"{path}: cannot be opened as a bag: {error or 'damaged'}: for a damaged .db3 try sqlite3's .recover"
             ) from None
         try:
-            yield reader, notes
+            yield reader, findings
         finally:
             reader.close()
 
@@ -259,7 +355,10 @@ def _events(reader: Any) -> list[Stream]:
 
 
 def _choose(
-    sources: dict[str, dict[str, ColumnSource]], known: Mapping[str, str], usual: list[str], notes: list[str]
+    sources: dict[str, dict[str, ColumnSource]],
+    known: Mapping[str, str],
+    usual: list[str],
+    findings: list[Finding],
 ) -> None:
     """Leave a column that several topics of usual types hold to the type that comes first; in place.
 
@@ -270,7 +369,7 @@ def _choose(
     if any("depth" in columns for columns in sources.values()):
         for topic in rank:
             if sources[topic].pop("pressure", None) is not None:
-                notes.append(f"pressure of {topic} left out, for the depth is there")
+                findings.append(finding("pressure_left_out", topic=topic))
     for topic in sorted(rank, key=lambda topic: rank[topic], reverse=True):
         better = {
             name: other for other in sources for name in sources[other] if rank.get(other, -1) < rank[topic]
@@ -279,14 +378,16 @@ def _choose(
         for name in left:
             del sources[topic][name]
         if left:
-            notes.append(f"{', '.join(left)} of {topic} left out for those of {better[left[0]]}")
+            findings.append(
+                finding("columns_left_out", columns=tuple(left), topic=topic, better=better[left[0]])
+            )
 
 
 def _collect(
     reader: Any,
     sources: dict[str, dict[str, ColumnSource]],
     topics: Mapping[str, SourceMap],
-    notes: list[str],
+    findings: list[Finding],
 ) -> dict[str, tuple[list[float], dict[str, list[float]], dict[str, list[str]]]]:
     """Per topic: times, numbers by canonical column, and words."""
     collected: dict[str, Any] = {
@@ -315,7 +416,7 @@ def _collect(
     except Exception as error:  # a damaged bag breaks in whatever layer reads it
         if not any(len(times) >= 2 for times, _, _ in collected.values()):
             raise CalibrationError(f"the bag breaks at its first messages: {error}") from None
-        notes.append(f"the bag is damaged and was read up to there: {str(error).splitlines()[0][:120]}")
+        findings.append(finding("bag_damaged", reason=str(error).splitlines()[0][:120]))
     return collected
 
 
@@ -385,7 +486,7 @@ def import_logs(
     """
     folders = import_trials(
         logs, out=out, column_map=column_map, format=format, vehicle=vehicle, split=split,
-        say=lambda note: print(note, file=sys.stderr),
+        say=lambda sentence: print(sentence, file=sys.stderr),
     )  # fmt: skip
     print_folders(folders, as_json)
 
@@ -415,7 +516,7 @@ def import_trials(
         format: Kind of the logs; by their suffix if `auto`.
         vehicle: Name or file of the vehicle; before the map's.
         split: What makes several trials of one log; before the map's.
-        say: Told each note about what was repaired or left out.
+        say: Told each sentence about what was repaired or left out.
 
     Returns:
         The folders, in the order of their trials.
@@ -433,8 +534,8 @@ def import_trials(
         write_trial(trial, folder)
         folders.append(folder)
         if say is not None:
-            for note in trial.notes:
-                say(f"{trial.name}: {note}")
+            for one in trial.findings:
+                say(str(one.about(trial.name)))
     return folders
 
 
@@ -492,10 +593,10 @@ def _groups(
             body = load_vehicle(name) if name else None
             groups.append((path.stem, read_ardusub(path, mapped.ardusub, body, pulses=pulses), {}))
         elif kind == "rosbag":
-            recorded, notes = recorded_header(path)
-            notes = [] if vehicle or mapped.header.get("vehicle") else notes
+            recorded, remarks = recorded_header(path)
+            remarks = [] if vehicle or mapped.header.get("vehicle") else remarks
             first, *others = read_bag(path, mapped.topics)
-            groups.append((path.stem, [first.noting(*notes), *others], recorded))
+            groups.append((path.stem, [first.noting(*remarks), *others], recorded))
         else:
             tables.append(path)
     return groups + _table_groups(tables, mapped, has_map)
@@ -551,11 +652,9 @@ def _table_groups(paths: list[Path], mapped: ColumnMap, has_map: bool) -> list[G
                 )
         missing = [pattern for pattern in mapped.files if pattern not in patterns]
         streams = [read_table(path, source) for _, path, source in sources]
-        streams[0] = streams[0].noting(*(f"no file fits {pattern} of the map" for pattern in missing))
+        streams[0] = streams[0].noting(*(finding("file_missing", pattern=p) for p in missing))
         left_out = [name for name in unread if len(found) == 1 or name.startswith(trial)]
-        streams[0] = streams[0].noting(
-            *(f"{name} is in no pattern of the map and is left out" for name in left_out)
-        )
+        streams[0] = streams[0].noting(*(finding("file_left_out", file=name) for name in left_out))
         groups.append((trial, streams, {}))
     return groups
 

@@ -7,9 +7,8 @@ from typing import Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.importers.units import EXTRA_COLUMNS, TIME_UNITS, factor
-from finssim.calibration.trials.columns import COLUMNS, INPUT_PREFIXES, column_of
-from finssim.calibration.trials.trial import PHASES
+from finssim.calibration.trials.trial import COLUMNS, INPUT_PREFIXES, PHASES, column_of
+from finssim.calibration.trials.units import EXTRA_COLUMNS, TIME_UNITS, factor
 from finssim.vehicles.part import Part, did_you_mean, refuse_section, refuse_value
 
 __all__ = ["ColumnSource", "Frame", "PhaseColumn", "SourceMap", "TimeColumn"]

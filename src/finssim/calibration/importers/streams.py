@@ -9,10 +9,108 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
+from finssim.calibration.importers.column_map import SplitRule
 from finssim.calibration.trials.time_base import SAME_ROW, merged, ordered
 from finssim.calibration.trials.trial import Array
 
-__all__ = ["Stream", "Table", "in_order", "merge"]
+__all__ = ["Stream", "Table", "in_order", "merge", "split_table"]
+
+# One table of a long log into several, one for each trial.
+
+Rows = NDArray[np.bool_]
+
+
+def split_table(name: str, table: Table, rule: SplitRule | None) -> dict[str, Table]:
+    """Name of a trial -> its part of the table, with times from 0; one part of that name without a rule.
+
+    Raises:
+        CalibrationError: The log has not what the rule goes by, or nothing is left.
+    """
+    if rule is None:
+        return {name: table}
+    pieces = {
+        "phase": _by_phase,
+        "gaps": _by_gaps,
+        "arming": _by_arming,
+        "column": _by_column,
+        "windows": _by_windows,
+    }[rule.by](name, table, rule)
+    long_enough = {
+        piece: rows
+        for piece, rows in pieces.items()
+        if rows.sum() >= 2 and np.ptp(table.t[rows]) >= rule.shortest
+    }
+    if not long_enough:
+        raise CalibrationError(
+            f"{name}: splitting by {rule.by} leaves no piece of {rule.shortest:g} s or more"
+        )
+    return {piece: _part(table, rows) for piece, rows in long_enough.items()}
+
+
+def _part(table: Table, rows: Rows) -> Table:
+    t = table.t[rows]
+    return replace(
+        table,
+        start=table.start + float(t[0]),
+        t=np.round(t - t[0], 6),
+        channels={column: values[rows] for column, values in table.channels.items()},
+        words={column: spoken[rows] for column, spoken in table.words.items()},
+        findings=(*table.findings, finding("log_cut", start=t[0], end=t[-1])),
+    )
+
+
+def _words(name: str, table: Table, which: str, what: str) -> NDArray[np.str_]:
+    if which not in table.words:
+        raise CalibrationError(f"{name}: cannot be split by {which}: {what}")
+    return table.words[which]
+
+
+def _runs(labels: NDArray[np.str_]) -> list[tuple[str, Rows]]:
+    """Stretches of equal labels in their order."""
+    number = np.concatenate([[0], np.cumsum(labels[1:] != labels[:-1])])
+    return [(str(labels[number == i][0]), number == i) for i in range(int(number[-1]) + 1)]
+
+
+def _numbered(name: str, pieces: list[Rows]) -> dict[str, Rows]:
+    digits = len(str(len(pieces)))
+    return {f"{name}_{i + 1:0{digits}d}": rows for i, rows in enumerate(pieces)}
+
+
+def _by_phase(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
+    """A trial begins with each baseline; without baselines, with each excitation after something else."""
+    phase = _words(name, table, "phase", "no source of the map names a phase column")
+    opening = "baseline" if (phase == "baseline").any() else "excitation"
+    begins = (phase == opening) & np.concatenate([[True], phase[:-1] != opening])
+    number = np.cumsum(begins)
+    return _numbered(name, [number == i for i in range(1, int(number[-1]) + 1)] if begins.any() else [])
+
+
+def _by_gaps(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
+    number = np.concatenate([[0], np.cumsum(np.diff(table.t) > rule.longest_gap)])
+    return _numbered(name, [number == i for i in range(int(number[-1]) + 1)])
+
+
+def _by_arming(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
+    arming = _words(name, table, "arming", "the log says nothing about arming")
+    return _numbered(name, [rows for word, rows in _runs(arming) if word == "armed"])
+
+
+def _by_column(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
+    labels = _words(name, table, "split", "no source of the map names a split column")
+    runs = [(word, rows) for word, rows in _runs(labels) if word not in ("", "nan", "None")]
+    return _numbered(name, [rows for _, rows in runs])
+
+
+def _by_windows(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
+    pieces = {window: (table.t >= low) & (table.t <= high) for window, (low, high) in rule.windows.items()}
+    empty = [window for window, rows in pieces.items() if not rows.any()]
+    if empty:
+        raise CalibrationError(
+            f"{name}: window {empty[0]} is {list(rule.windows[empty[0]])} s, the log runs to {table.t[-1]:.3f} s"
+        )
+    return pieces
+
 
 Words = NDArray[np.str_]
 
@@ -29,8 +127,8 @@ class Stream:
     """Canonical or extra column -> values, (n,) each."""
     words: dict[str, Words] = field(default_factory=dict)
     """`phase`, `split` or `arming` -> a word for every sample, (n,) each; a word holds until the next."""
-    notes: tuple[str, ...] = ()
-    """What was repaired or left out, one sentence each."""
+    findings: tuple[Finding, ...] = ()
+    """What was repaired or left out."""
 
     def taken(self, rows: NDArray[np.intp] | NDArray[np.bool_], t: Array | None = None) -> Stream:
         """Some of the samples, in that order; at times `t` where given."""
@@ -41,9 +139,9 @@ class Stream:
             words={name: values[rows] for name, values in self.words.items()},
         )
 
-    def noting(self, *notes: str) -> Stream:
-        """The same with more notes."""
-        return replace(self, notes=(*self.notes, *notes))
+    def noting(self, *findings: Finding) -> Stream:
+        """The same with more findings."""
+        return replace(self, findings=(*self.findings, *findings))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +156,7 @@ class Table:
     """NaN where a stream has no sample, (n,) each."""
     words: dict[str, Words]
     """(n,) each."""
-    notes: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def in_order(stream: Stream, *, alone: bool) -> Stream:
@@ -72,26 +170,29 @@ def in_order(stream: Stream, *, alone: bool) -> Stream:
         CalibrationError: No samples, or a clock set back in one of several streams, which cannot be aligned again.
     """
     timed = np.isfinite(stream.t)
-    notes = [] if timed.all() else [f"{stream.source}: {(~timed).sum()} samples without a time left out"]
+    untimed = [] if timed.all() else [finding("samples_untimed", samples=(~timed).sum())]
     stream = stream.taken(timed)
     if len(stream.t) < 2:
         raise CalibrationError(f"{stream.source}: {len(stream.t)} samples, expected at least two")
     t, rows, repaired = ordered(stream.t, stream.channels)
-    if not alone and any("clock" in note for note in repaired):
+    jumps = [one.values for one in repaired if one.code == "clock_jump"]
+    if not alone and jumps:
         raise CalibrationError(
-            f"{stream.source}: {repaired[0].split(':')[0]}, so its samples cannot be placed among those of the other "
-            "sources: import the parts on their own, or cut the log there"
+            f"the clock jumps back from {jumps[0]['before']:.6g} s to {jumps[0]['after']:.6g} s at row "
+            f"{jumps[0]['row']}, so its samples cannot be placed among those of the other sources: import the parts on "
+            "their own, or cut the log there",
+            stream.source,
         )
     stream = stream.taken(rows, t)
     first = np.concatenate([[True], np.diff(t) > SAME_ROW])
     if not first.all():
-        repaired = [*repaired, f"{(~first).sum()} samples repeat the time before and were left out"]
+        repaired = [*repaired, finding("samples_repeat", samples=(~first).sum())]
         stream = stream.taken(first)
     if len(stream.t) < 2:
         raise CalibrationError(
             f"{stream.source}: the time never increases: name the column that holds the time"
         )
-    return stream.noting(*notes, *(f"{stream.source}: {note}" for note in repaired))
+    return stream.noting(*(one.about(stream.source) for one in (*untimed, *repaired)))
 
 
 def merge(streams: Sequence[Stream]) -> Table:
@@ -113,10 +214,10 @@ def merge(streams: Sequence[Stream]) -> Table:
     for name, (times, said) in spoken.items():
         held = np.searchsorted(times, t, side="right") - 1
         words[name] = np.where(held >= 0, said[np.maximum(held, 0)], "")
-    notes = [note for stream in each for note in stream.notes]
+    findings = [one for stream in each for one in stream.findings]
     if start > 1e8:
-        notes.append(f"t = 0 is {start:.6f} s of the log's clock")
-    return Table(start=start, t=t, channels=channels, words=words, notes=tuple(dict.fromkeys(notes)))
+        findings.append(finding("clock_origin", start=start))
+    return Table(start=start, t=t, channels=channels, words=words, findings=tuple(dict.fromkeys(findings)))
 
 
 def _refuse_doubles(streams: Sequence[Stream]) -> None:

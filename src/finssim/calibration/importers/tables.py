@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +13,9 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.importers.assemble import in_our_axes
 from finssim.calibration.importers.source_map import ColumnSource, PhaseColumn, SourceMap, TimeColumn
 from finssim.calibration.importers.streams import Stream
-from finssim.calibration.importers.units import TIME_UNITS, factor
 from finssim.calibration.trials import table_file
-from finssim.calibration.trials.columns import column_of
-from finssim.calibration.trials.trial import Array
+from finssim.calibration.trials.trial import Array, column_of
+from finssim.calibration.trials.units import TIME_UNITS, factor
 from finssim.vehicles.part import did_you_mean
 
 __all__ = ["TABLES", "read_table", "spoken", "values_of"]
@@ -38,8 +36,9 @@ def read_table(path: Path, source: SourceMap | None) -> Stream:
         CalibrationError: Unreadable, or a column that it has not.
     """
     shown = path.name
-    table = _rows(path, source or SourceMap())
-    notes = [f"{shown}: {note}" for note in table.notes]
+    how = source or SourceMap()
+    table = table_file.read_table(path, skip=how.skip_rows, names=how.names, spaces=how.spaces)
+    findings = tuple(one.about(shown) for one in table.findings)
     if source is None:
         source = _by_names(table, shown)
     if source.time is None:
@@ -58,7 +57,7 @@ def read_table(path: Path, source: SourceMap | None) -> Stream:
         words["phase"] = spoken(_text(table, source.phase.column, shown), source.phase)
     if source.split is not None:
         words["split"] = np.array(_text(table, source.split, shown), dtype=np.str_)
-    stream = Stream(source=shown, t=t, channels=channels, words=words, notes=tuple(notes))
+    stream = Stream(source=shown, t=t, channels=channels, words=words, findings=findings)
     return in_our_axes(stream, source.frame)
 
 
@@ -71,26 +70,6 @@ def values_of(raw: Array, name: str, spec: ColumnSource) -> Array:
 def spoken(words: Iterable[str], phase: PhaseColumn) -> NDArray[np.str_]:
     """Words of the log as phases."""
     return np.array([phase.words.get(word, "") if phase.words else word for word in words], dtype=np.str_)
-
-
-def _rows(path: Path, source: SourceMap) -> table_file.Table:
-    """The table; a text file that needs it is rewritten with a line of names and commas first."""
-    if not (source.names or source.skip_rows or source.spaces) or path.suffix in (".parquet", ".pq"):
-        return table_file.read_table(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be read: {error.strerror or error}") from None
-    body = text.split("\n", source.skip_rows)[-1]
-    if source.spaces:
-        body = re.sub(r"[^\S\n]+", ",", re.sub(r"(?m)^[^\S\n]+|[^\S\n]+$", "", body))
-    if source.names:
-        separator = max(",;\t", key=body.split("\n", 1)[0].count)
-        body = separator.join(source.names) + "\n" + body
-    with TemporaryDirectory() as folder:
-        rewritten = Path(folder) / path.with_suffix(".csv").name
-        rewritten.write_text(body, encoding="utf-8")
-        return table_file.read_table(rewritten)
 
 
 def _by_names(table: table_file.Table, shown: str) -> SourceMap:

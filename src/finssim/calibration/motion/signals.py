@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.motion.accelerations import accelerations
+from finssim.calibration.findings import Finding
+from finssim.calibration.motion.accelerations import Velocities, accelerations, velocities
 from finssim.calibration.motion.attitude_signal import attitude_signal
-from finssim.calibration.motion.velocities import Velocities, velocities
-from finssim.calibration.trials.columns import COLUMNS, NU
 from finssim.calibration.trials.inputs import Drive, applied_wrench, drive
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial import COLUMNS, NU, Trial
 from finssim.vehicles import Vehicle
 
 __all__ = ["Motion", "grid_rate", "motion"]
@@ -62,8 +61,8 @@ class Motion:
     """By axis: `imu`, where that tells more than the velocity, `smoothed velocity`, or nothing."""
     noise_std: Array
     """By axis, the standard deviation of one sample of a measured velocity, or of the value of a derived one, (6,)."""
-    notes: tuple[str, ...] = ()
-    """What was assumed, one sentence each."""
+    findings: tuple[Finding, ...] = ()
+    """What was assumed."""
 
 
 def motion(
@@ -82,13 +81,13 @@ def motion(
     """
     for name, value in (("rate", rate), ("max_gap", max_gap)):
         if value is not None and not value > 0.0:
-            raise CalibrationError(f"{trial.name}: {name} is {value}, expected a number above 0")
+            raise CalibrationError(f"{name} is {value}, expected a number above 0", trial.name)
     inputs = drive(trial, vehicle)
     rate = grid_rate(trial, inputs) if rate is None else rate
     t = trial.t[0] + np.arange(int(np.floor(trial.duration * rate + 1e-6)) + 1) / rate
     attitude = attitude_signal(trial, t, max_gap)
     found = velocities(trial, vehicle, t, attitude, max_gap)
-    nu_dot, nu_dot_source, notes = accelerations(trial, vehicle, t, attitude, found, max_gap)
+    nu_dot, nu_dot_source, unused = accelerations(trial, vehicle, t, attitude, found, max_gap)
     tau = applied_wrench(inputs, vehicle, t)
     return Motion(
         t=t,
@@ -104,7 +103,7 @@ def motion(
         nu_source=found.source,
         nu_dot_source=nu_dot_source,
         noise_std=found.noise_std,
-        notes=(*inputs.notes, *found.notes, *notes),
+        findings=(*inputs.findings, *found.findings, *unused),
     )
 
 

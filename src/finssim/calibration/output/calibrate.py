@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Estimate, Fit
 from finssim.calibration.output.origins import Path, file_tree, folded, leaves, numbers
 from finssim.provenance import provenance
-from finssim.vehicles import AXES, CalibrationRecord, Provenance, Vehicle, VehicleError, check_vehicle
+from finssim.vehicles import CalibrationRecord, Provenance, Vehicle, VehicleError, check_vehicle
 
-__all__ = ["calibrated", "concerns", "doubts", "estimate_at", "kept", "number_in"]
+__all__ = ["all_findings", "calibrated", "concerns", "estimate_at", "kept", "number_in"]
 
 
 SCALED = ("c_plus", "c_minus", "force_min", "force_max")
@@ -80,48 +80,34 @@ def kept(fit: Fit, vehicle: Vehicle) -> dict[str, float]:
     return found
 
 
-_OF_A_TRIAL = re.compile(rf"((?:{'|'.join(AXES)}): )?(?!(?:{'|'.join(AXES)}):)([^\s:]+): (.+)", re.DOTALL)
-
-
-def doubts(fit: Fit, vehicle: Vehicle) -> list[str]:
-    """The warnings of a fit and what speaks against its vehicle; what holds of several trials is said once.
+def all_findings(fit: Fit, vehicle: Vehicle) -> list[Finding]:
+    """The findings of a fit and what speaks against its vehicle.
 
     Args:
         fit: The fit.
         vehicle: `calibrated(fit)`.
     """
-    names: dict[str, list[str]] = {}
-    for sentence in fit.warnings:
-        match = _OF_A_TRIAL.fullmatch(sentence)
-        said = f"{match[1] or ''}{{}}: {match[3]}" if match else sentence
-        names.setdefault(said, []).extend([match[2]] if match else [])
-    grouped = []
-    for said, trials in names.items():
-        shown = ", ".join(trials[:3]) + (f" and {len(trials) - 3} more" if len(trials) > 3 else "")
-        grouped.append(said.replace("{}", shown, 1) if trials else said)
-    return [*grouped, *concerns(fit, vehicle)]
+    return [*fit.findings, *concerns(fit, vehicle)]
 
 
-def concerns(fit: Fit, vehicle: Vehicle) -> list[str]:
-    """What speaks against the calibrated vehicle: findings that it fails and its parent did not, and fits without use.
+def concerns(fit: Fit, vehicle: Vehicle) -> list[Finding]:
+    """What speaks against the calibrated vehicle: checks that it fails and its parent did not, and fits without use.
 
     Args:
         fit: The fit.
         vehicle: `calibrated(fit)`.
     """
-    passed = {finding.name for finding in check_vehicle(fit.vehicle) if finding.passed}
-    sentences = [
-        f"the calibrated vehicle fails a check that it passed before, {finding.name}: {finding.sentence}"
-        for finding in check_vehicle(vehicle)
-        if not finding.passed and finding.name in passed
+    passed = {check.name for check in check_vehicle(fit.vehicle) if check.passed}
+    found = [
+        finding("check_failed", check=check.name, sentence=check.sentence)
+        for check in check_vehicle(vehicle)
+        if not check.passed and check.name in passed
     ]
     for what, figures in fit.quality.items():
         r2 = figures.get("r2", math.nan)
         if r2 < 0.0:
-            sentences.append(f"{what}: the fit is further from the data than their mean is (R² {r2:.2f})")
-    if not fit.changes:
-        sentences.append("the data determine nothing that the vehicle file holds: all its numbers stay")
-    return sentences
+            found.append(finding("further_than_mean", what, r2=r2))
+    return found if fit.changes else [*found, finding("nothing_determined")]
 
 
 def number_in(vehicle: Vehicle, path: str) -> float | None:

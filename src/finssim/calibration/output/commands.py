@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import math
-import shlex
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.fit import Fit
-from finssim.calibration.output.calibrate import calibrated, doubts, kept
+from finssim.calibration.output.calibrate import all_findings, calibrated, kept
 from finssim.calibration.output.fit_output import fit_json, print_fit
-from finssim.calibration.output.vehicle_file import check_vehicle_path, write_vehicle
+from finssim.calibration.output.publish import command_line, progress_bar, publish, refuse_places
+from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.calibration.trials.trial import Trial
-from finssim.files import atomic_directory, atomic_write, refuse_unwritable
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
 __all__ = ["calibrate_hydrodynamics", "calibrate_motor", "calibrate_thruster", "usable"]
@@ -54,16 +50,17 @@ def calibrate_thruster(
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
     """
-    places = _Places(out, report)
+    refuse_places(out, report, "vehicle")
     options = {"group": group, "voltage": voltage, "pool_voltages": pool_voltages}
-    command = _command("thruster", tables, vehicle=vehicle, out=out, report=report, seed=seed, **options)
+    given = {"vehicle": vehicle, "out": out, "report": report, "seed": seed, **options}
+    command = command_line("thruster", tables, given)
     body = load_vehicle(vehicle)
     from finssim.calibration.actuators.thruster import fit_thruster
 
     fit = fit_thruster(
         list(tables), body, group=group, voltage=voltage, pool_voltages=pool_voltages, seed=seed
     )
-    return _finish(fit, places, command, as_json)
+    return _finish(fit, command, out, report, as_json)
 
 
 def calibrate_motor(
@@ -87,13 +84,14 @@ def calibrate_motor(
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
     """
-    places = _Places(out, report)
-    command = _command("motor", trials, vehicle=vehicle, out=out, report=report, seed=seed)
+    refuse_places(out, report, "vehicle")
+    given = {"vehicle": vehicle, "out": out, "report": report, "seed": seed}
+    command = command_line("motor", trials, given)
     body = load_vehicle(vehicle)
     from finssim.calibration.actuators.motor import fit_motor
 
     fit = fit_motor(_trials(trials), body, seed=seed)
-    return _finish(fit, places, command, as_json)
+    return _finish(fit, command, out, report, as_json)
 
 
 def calibrate_hydrodynamics(
@@ -143,6 +141,8 @@ def calibrate_hydrodynamics(
         CalibrationError, VehicleError, OutputError: As they say; nothing is written then.
         KeyboardInterrupt: After Ctrl-C, when the best until then, if there is any, has been written.
     """
+    options = {name: value or None for name, value in locals().items() if name not in ("trials", "as_json")}
+    options["seed"] = seed
     further = tuple(name for name in (word.strip() for word in estimate.split(",")) if name)
     if method == "regression":
         from finssim.calibration.simulation.fit import ESTIMATE
@@ -155,28 +155,15 @@ def calibrate_hydrodynamics(
                 )
     chosen = _axes(axes)
     known = _known(fix)
-    places = _Places(out, report, ranges)
-    command = _command(
-        "hydrodynamics",
-        trials,
-        vehicle=vehicle,
-        axes=axes,
-        method=method,
-        full=full,
-        estimate=estimate or None,
-        damping=damping,
-        fix=fix or None,
-        horizon=horizon,
-        out=out,
-        report=report,
-        ranges=ranges,
-        seed=seed,
-    )
+    refuse_places(out, report, "vehicle")
+    if ranges is not None:
+        refuse_places(ranges, None, "ranges")
+    command = command_line("hydrodynamics", trials, options)
     body = load_vehicle(vehicle)
     used = _trials(trials)
     from finssim.calibration.hydrodynamics import fit_hydrodynamics
 
-    with _progress() as progress:
+    with progress_bar() as progress:
         fit = fit_hydrodynamics(
             used,
             body,
@@ -190,37 +177,17 @@ def calibrate_hydrodynamics(
             seed=seed,
             progress=progress,
         )
-    return _finish(fit, places, command, as_json)
+    return _finish(fit, command, out, report, as_json, ranges)
 
 
-class _Places:
-    """Where the outputs go; a place that cannot be written is refused before the work, not after it."""
-
-    def __init__(self, out: Path, report: Path | None = None, ranges: Path | None = None) -> None:
-        self.out, self.report, self.ranges = Path(out), report, ranges
-        refuse_unwritable(atomic_write(check_vehicle_path(out)))
-        if ranges is not None:
-            if Path(ranges).suffix not in (".yaml", ".yml"):
-                raise CalibrationError(f"{ranges} ends in '{Path(ranges).suffix}', expected .yaml")
-            refuse_unwritable(atomic_write(ranges))
-        if report is not None:
-            from finssim.calibration.output.report import FIT_FILE
-
-            refuse_unwritable(atomic_directory(report, replaces=FIT_FILE))
-
-
-def usable(trials: Sequence[Trial]) -> tuple[list[Trial], list[str]]:
-    """The trials that a fit may use, and a sentence on each of the others.
+def usable(trials: Sequence[Trial]) -> tuple[list[Trial], list[Finding]]:
+    """The trials that a fit may use, and a finding on each of the others.
 
     Raises:
         CalibrationError: None is left.
     """
     used = [trial for trial in trials if trial.header.role != "held-out"]
-    left = [
-        f"{trial.name}: left out: its header says that it is held out, for replay"
-        for trial in trials
-        if trial.header.role == "held-out"
-    ]
+    left = [finding("held_out", trial.name) for trial in trials if trial.header.role == "held-out"]
     if not used:
         raise CalibrationError("every trial is marked held-out: a fit needs trials of role 'fit' or of none")
     return used, left
@@ -232,10 +199,8 @@ def _trials(paths: Sequence[Path]) -> list[Trial]:
 
     used, left = usable(load_trials(paths))
     screen = Console(stderr=True)
-    for trial in used:
-        if trial.notes:
-            left.append(f"{trial.name}: {'; '.join(trial.notes)}")
-    for sentence in left:
+    left += [one.about(trial.name) for trial in used for one in trial.findings]
+    for sentence in sentences(left):
         screen.print(sentence, highlight=False, markup=False, soft_wrap=True)
     return used
 
@@ -269,64 +234,30 @@ def _known(words: str) -> dict[str, float]:
     return found
 
 
-@contextmanager
-def _progress() -> Iterator[Callable[..., None]]:
-    """A bar on standard error, fed with the part done and a few words."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    screen = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as bars:
-        bar = bars.add_task("fit", total=1.0)
-
-        def show(part: float, words: str = "fit") -> None:
-            bars.update(bar, completed=part, description=words)
-
-        yield show
-
-
-def _finish(fit: Fit, places: _Places, command: str, as_json: bool) -> Vehicle:
+def _finish(
+    fit: Fit, command: str, out: Path, report: Path | None, as_json: bool, ranges: Path | None = None
+) -> Vehicle:
     """Write and show; ends with KeyboardInterrupt where the fit was interrupted."""
     vehicle = calibrated(fit)
-    warnings = doubts(fit, vehicle)
-    write_vehicle(vehicle, places.out)
-    if places.report is not None:
+    findings = all_findings(fit, vehicle)
+    write_vehicle(vehicle, out)
+    if report is not None:
         from finssim.calibration.output.report import write_report
 
-        write_report(fit, places.report, vehicle, command=command, warnings=warnings, out=places.out)
-    if places.ranges is not None:
+        write_report(fit, report, vehicle, command=command, findings=findings, out=out)
+    if ranges is not None:
         from finssim.calibration.output.calibrated_ranges import write_ranges
 
-        write_ranges(fit, places.ranges, vehicle)
-    if as_json:
-        document = fit_json(fit, vehicle, out=places.out, warnings=warnings)
-        print(json.dumps(document, allow_nan=False))
-    else:
-        console = Console() if sys.stdout.isatty() else Console(width=100)
-        print_fit(fit, vehicle, console, warnings)
-        _print_places(fit, vehicle, places, console)
+        write_ranges(fit, ranges, vehicle)
+
+    def show(console: Console) -> None:
+        print_fit(fit, vehicle, console, findings)
+        if unchanged := kept(fit, vehicle):
+            text = f"not identifiable, so the file keeps its own: {', '.join(unchanged)}"
+            console.print(text, highlight=False, markup=False)
+
+    record = fit_json(fit, vehicle, out=out, findings=findings) if as_json else None
+    publish(record, show, (out, report, ranges))
     if fit.interrupted:
         raise KeyboardInterrupt
     return vehicle
-
-
-def _print_places(fit: Fit, vehicle: Vehicle, places: _Places, console: Console) -> None:
-    left = kept(fit, vehicle)
-    if left:
-        console.print(
-            f"not identifiable, so the file keeps its own: {', '.join(left)}", highlight=False, markup=False
-        )
-    for place in filter(None, (places.out, places.report, places.ranges)):
-        console.print(f"written: {place}", highlight=False, markup=False, soft_wrap=True)
-
-
-def _command(kind: str, inputs: Sequence[Path], **options: Any) -> str:
-    """The command line that does this again."""
-    words = ["finssim", "calibrate", kind, *map(str, inputs)]
-    for name, value in options.items():
-        option = f"--{name.replace('_', '-')}"
-        if value is True:
-            words.append(option)
-        elif value is not None and value is not False:
-            words += [option, str(value)]
-    return shlex.join(words)

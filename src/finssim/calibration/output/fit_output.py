@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +11,7 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
+from finssim.calibration.findings import Finding, sentences
 from finssim.calibration.fit import Estimate, Fit
 from finssim.calibration.output.calibrate import kept, number_in
 from finssim.provenance import provenance
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 __all__ = [
+    "HEADS",
+    "estimate_rows",
     "file_number",
     "fit_json",
     "interval_text",
@@ -28,6 +31,8 @@ __all__ = [
     "quality_text",
     "state_text",
 ]
+
+HEADS = ("parameter", "estimate", "95 % interval", "unit", "file had", "state")
 
 QUALITY = {
     "r2": "R²",
@@ -44,7 +49,7 @@ QUALITY = {
 
 
 def fit_json(
-    fit: Fit, vehicle: Vehicle, *, out: Path | None = None, warnings: tuple[str, ...] | list[str] = ()
+    fit: Fit, vehicle: Vehicle, *, out: Path | None = None, findings: Sequence[Finding] = ()
 ) -> dict[str, Any]:
     """What `--json` prints and the report's `fit.json` holds; numbers that are not finite are None.
 
@@ -52,7 +57,7 @@ def fit_json(
         fit: The fit.
         vehicle: `calibrated(fit)`.
         out: File it was written to.
-        warnings: The fit's and those about the calibrated vehicle.
+        findings: The fit's and those about the calibrated vehicle.
     """
     return {
         "kind": fit.kind,
@@ -70,7 +75,7 @@ def fit_json(
             "names": list(fit.correlation.names),
             "matrix": [[_finite(x) for x in row] for row in fit.correlation.matrix],
         },
-        "warnings": list(warnings),
+        "findings": [one.as_json() for one in findings],
         "trials": dict(fit.trials),
         "settings": vehicle.calibrations[-1].settings,
         "interrupted": fit.interrupted,
@@ -80,42 +85,47 @@ def fit_json(
     }
 
 
-def print_fit(
-    fit: Fit, vehicle: Vehicle, console: Console, warnings: tuple[str, ...] | list[str] = ()
-) -> None:
-    """Print estimates, figures of the fit and warnings; fits 100 columns.
+def print_fit(fit: Fit, vehicle: Vehicle, console: Console, findings: Sequence[Finding] = ()) -> None:
+    """Print estimates, figures of the fit and findings; fits 100 columns.
 
     Args:
         fit: The fit.
         vehicle: `calibrated(fit)`.
         console: Where to print.
-        warnings: The fit's and those about the calibrated vehicle.
+        findings: The fit's and those about the calibrated vehicle.
     """
     console.print(f"{fit.vehicle.name}: {vehicle.calibrations[-1].sentence()}", highlight=False, markup=False)
     table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("parameter", "estimate", "95 % interval", "unit", "file had", "state"):
+    for heading in HEADS:
         right = heading in ("estimate", "file had")
         table.add_column(heading, justify="right" if right else "left", overflow="fold")
     notes: dict[str, list[str]] = {}
-    for name, estimate in fit.estimates.items():
-        table.add_row(
-            escape(name),
-            number_text(estimate.estimate),
-            interval_text(estimate),
-            escape(estimate.unit),
-            number_text(file_number(estimate, fit.vehicle)),
-            state_text(estimate, fit, vehicle),
-            style="" if estimate.identifiable else "yellow",
-        )
+    for row, estimate in zip(estimate_rows(fit, vehicle), fit.estimates.values(), strict=True):
+        table.add_row(*map(escape, row), style="" if estimate.identifiable else "yellow")
         if estimate.note:
-            notes.setdefault(estimate.note, []).append(name)
+            notes.setdefault(estimate.note, []).append(row[0])
     console.print(table)
     for what, figures in fit.quality.items():
         console.print(f"  {what}: {quality_text(figures, whole=False)}", highlight=False, markup=False)
     for note, names in notes.items():
         console.print(f"· {', '.join(names)}: {note}", highlight=False, markup=False)
-    for sentence in warnings:
+    for sentence in sentences(findings):
         console.print(f"! {sentence}", highlight=False, markup=False, style="yellow")
+
+
+def estimate_rows(fit: Fit, vehicle: Vehicle) -> list[tuple[str, ...]]:
+    """Texts of the table of estimates, in the order of `HEADS`."""
+    return [
+        (
+            name,
+            number_text(e.estimate),
+            interval_text(e),
+            e.unit,
+            number_text(file_number(e, fit.vehicle)),
+            state_text(e, fit, vehicle),
+        )
+        for name, e in fit.estimates.items()
+    ]
 
 
 def number_text(value: float | None) -> str:

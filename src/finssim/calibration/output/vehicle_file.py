@@ -3,19 +3,297 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
+import re
 import shutil
-from collections.abc import Mapping
+import textwrap
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.output import origins as tree_of
-from finssim.calibration.output.vehicle_text import vehicle_text
 from finssim.files import atomic_write
 from finssim.vehicles import Provenance, Vehicle, load_vehicle
+from finssim.vehicles.terms import TERMS
 
 __all__ = ["check_vehicle_path", "write_vehicle"]
+
+# The text of a vehicle file: sections in the catalogue's order, origins at the highest level they hold for, units.
+
+WIDTH = 118
+"""Longest line of prose."""
+LONG = 180
+"""Longest line of a section of `ONE_LINE`."""
+
+UNITS = {
+    "mass": "kg",
+    "inertia": "kg m²",
+    "center_of_gravity": "m",
+    "center_of_buoyancy": "m",
+    "displaced_volume": "m³",
+    "size": "m",
+    "surface_half_height": "m",
+    "reference_point": "m",
+    "wrench_reference": "m",
+    "added_mass": "kg, kg m²: surge, sway, heave, roll, pitch, yaw",
+    "linear_damping": "N s/m, N m s",
+    "quadratic_damping": "N s²/m², N m s²",
+    "c_plus": "N s²/rad²",
+    "c_minus": "N s²/rad²",
+    "rpm_min": "rpm",
+    "rpm_max": "rpm",
+    "dead_rpm_minus": "rpm",
+    "dead_rpm_plus": "rpm",
+    "force_min": "N",
+    "force_max": "N",
+    "time_constant": "s",
+    "delay": "s",
+    "rate": "Hz",
+    "latency": "s",
+    "gyro_noise_density": "rad/s/√Hz",
+    "accel_noise_density": "m/s²/√Hz",
+    "edge": "m",
+    "rpm_full_scale": "rpm",
+    "command_timeout": "s",
+    "command_rate": "Hz",
+    "max_tilt": "rad",
+    "max_tilt_duration": "s",
+}
+"""Key -> unit of its value, written behind it."""
+
+ONE_LINE = (("water",), ("hull",), ("thrusters", "*"), ("tags", "mounts", "*"))
+"""Sections that are written on one line where they fit."""
+
+
+def vehicle_text(tree: Mapping[str, Any], origins: Mapping[tree_of.Path, Provenance]) -> str:
+    """YAML of a vehicle file.
+
+    Args:
+        tree: Plain values by section; `title`, `description` and `calibrations` included.
+        origins: Origin of every number of it, by path.
+    """
+    prose = ("title", "description", "calibrations")
+    body = {key: value for key, value in tree.items() if key not in prose}
+    sections = Counter(_common(node, (key,), origins, None) for key, node in body.items())
+    del sections[None]
+    common = sections.most_common(1)[0][0] if sections else None
+    lines = [f"title: {_word(tree['title'])}", *_prose(str(tree["description"]))]
+    lines += [f"{key}: {_word(text)}" for key, text in _marks(common, None).items()]
+    for key, node in body.items():
+        lines += ["", *_lines(key, node, (str(key),), common, origins, "")]
+    if tree.get("calibrations"):
+        lines += ["", "# How numbers above were fitted, oldest first: trial -> SHA-256 of what it holds."]
+        lines += ["calibrations:", *(line for r in tree["calibrations"] for line in _record(r))]
+    return "\n".join(lines) + "\n"
+
+
+def _lines(
+    key: Any,
+    node: Any,
+    path: tree_of.Path,
+    inherited: Provenance | None,
+    origins: Mapping[tree_of.Path, Provenance],
+    pad: str,
+) -> Iterator[str]:
+    """Lines of `key: node`, block or flow."""
+    head = f"{pad}{_word(str(key))}:"
+    flow = f"{head} {_flow(node, path, inherited, origins)}"
+    if isinstance(node, Mapping):
+        if not node or (_on_one_line(path) and len(flow) <= LONG):
+            yield flow
+            return
+        common = _common(node, path, origins, inherited)
+        yield head
+        for mark, text in _marks(common, inherited).items():
+            yield f"{pad}  {mark}: {_word(text)}"
+        for inner, value in node.items():
+            yield from _lines(inner, value, (*path, str(inner)), common, origins, pad + "  ")
+        return
+    unit = f"  # [{_unit(path)}]" if _unit(path) else ""
+    if isinstance(node, list) and not _uniform(node, path, origins):
+        yield head + unit
+        for i, item in enumerate(node):
+            yield from _item(item, (*path, str(i)), inherited, origins, pad + "  ")
+    elif isinstance(node, list) and node and isinstance(node[0], list):  # a matrix: one row on a line
+        common = origins.get(next(tree_of.leaves(node, path))[0])
+        marks = _marks(common, inherited)
+        inner = pad
+        if marks:
+            yield head + unit
+            inner = pad + "  "
+            yield from (f"{inner}{mark}: {_word(text)}" for mark, text in marks.items())
+            yield f"{inner}value:"
+        else:
+            yield head + unit
+        for i, row in enumerate(node):
+            yield f"{inner}  - {_flow(row, (*path, str(i)), common, origins)}"
+    else:
+        yield flow + unit
+
+
+def _unit(path: tree_of.Path) -> str:
+    """Of the value at a path; empty where there is none to write."""
+    term = TERMS.get(path[2]) if path[0] == "hydrodynamics" and len(path) > 2 else None
+    return UNITS.get(path[-1], "") if term is None else term.units.get(path[-1], "")
+
+
+def _item(
+    node: Any,
+    path: tree_of.Path,
+    inherited: Provenance | None,
+    origins: Mapping[tree_of.Path, Provenance],
+    pad: str,
+) -> Iterator[str]:
+    """An item of a list on one line; a row whose entries have long notes on a line for each."""
+    flow = f"{pad}- {_flow(node, path, inherited, origins)}"
+    if isinstance(node, list) and len(flow) > LONG and not _uniform(node, path, origins):
+        yield f"{pad}-"
+        for i, item in enumerate(node):
+            yield from _item(item, (*path, str(i)), inherited, origins, pad + "  ")
+    else:
+        yield flow
+
+
+def _flow(
+    node: Any, path: tree_of.Path, inherited: Provenance | None, origins: Mapping[tree_of.Path, Provenance]
+) -> str:
+    """A node on one line."""
+    if isinstance(node, Mapping):
+        common = _common(node, path, origins, inherited)
+        parts = [f"{mark}: {_word(text)}" for mark, text in _marks(common, inherited).items()]
+        parts += [
+            f"{_word(str(key))}: {_flow(v, (*path, str(key)), common, origins)}" for key, v in node.items()
+        ]
+        return "{" + ", ".join(parts) + "}"
+    if isinstance(node, list):
+        first = next((origins.get(leaf) for leaf, _ in tree_of.leaves(node, path)), None)
+        common = first if _uniform(node, path, origins) else inherited
+        items = [_flow(item, (*path, str(i)), common, origins) for i, item in enumerate(node)]
+        value, marks = f"[{', '.join(items)}]", _marks(common, inherited)
+    else:
+        value, marks = _scalar(node), _marks(origins.get(path, inherited), inherited)
+    if not marks:
+        return value
+    return "{" + ", ".join([f"value: {value}", *(f"{k}: {_word(t)}" for k, t in marks.items())]) + "}"
+
+
+def _common(
+    node: Any, path: tree_of.Path, origins: Mapping[tree_of.Path, Provenance], inherited: Provenance | None
+) -> Provenance | None:
+    """The origin to state for a section: that of most of its values, counting a list once.
+
+    Values of one origin and source that differ in their notes share the section's, each with its note alone.
+    """
+    notes: dict[tuple[Any, str], list[str]] = {}
+    seen: set[tuple[tree_of.Path, Provenance]] = set()
+    for leaf, _ in tree_of.leaves(node, path):
+        value = leaf[:-1] if leaf[-1].isdigit() else leaf
+        if leaf in origins and (value, origins[leaf]) not in seen:
+            seen.add((value, origins[leaf]))
+            notes.setdefault(origins[leaf][:2], []).append(origins[leaf].note)
+    if not notes:
+        return inherited
+    best = max(notes, key=lambda pair: len(notes[pair]))
+    note = _shared(notes[best])
+    if inherited is not None:
+        same = notes.get(inherited[:2], [])
+        if inherited[:2] == best and same.count(note) <= same.count(inherited.note):
+            return inherited
+        if inherited[:2] != best and len(same) >= len(notes[best]):
+            return inherited
+    return Provenance(*best, note)
+
+
+def _shared(notes: list[str]) -> str:
+    """The note to state for values of one origin and source: the most frequent one, if several values have it.
+
+    A value without a note under one needs its origin and source again, so these count double.
+    """
+    note = max(notes, key=notes.count)
+    several = len(notes) == 1 or notes.count(note) > 1
+    return note if several and notes.count(note) > 2 * notes.count("") else ""
+
+
+def _uniform(node: list[Any], path: tree_of.Path, origins: Mapping[tree_of.Path, Provenance]) -> bool:
+    return len({origins.get(leaf) for leaf, _ in tree_of.leaves(node, path)}) <= 1
+
+
+def _marks(own: Provenance | None, inherited: Provenance | None) -> dict[str, str]:
+    """What must be written so that a reader who inherits one origin finds the other."""
+    if own is None or own == inherited:
+        return {}
+    if inherited is not None and own.origin == inherited.origin:
+        if own.source == inherited.source and own.note:
+            return {"note": own.note}
+        if own.source and own.source != inherited.source:
+            return {"source": own.source} | ({"note": own.note} if own.note else {})
+    marks = {"origin": str(own.origin), "source": own.source, "note": own.note}
+    return {mark: text for mark, text in marks.items() if text}
+
+
+def _on_one_line(path: tree_of.Path) -> bool:
+    return any(
+        len(path) == len(pattern) and all(p in ("*", q) for p, q in zip(pattern, path, strict=True))
+        for pattern in ONE_LINE
+    )
+
+
+def _record(record: Mapping[str, Any]) -> Iterator[str]:
+    lead = "  - "
+    for key, value in record.items():
+        if key == "trials":
+            yield f"{lead}{key}:"
+            yield from (f"      {_word(name)}: {json.dumps(digest)}" for name, digest in value.items())
+        else:
+            yield f"{lead}{key}: {_plain(value)}"
+        lead = "    "
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{_word(str(k))}: {_plain(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(_plain(v) for v in value)}]"
+    return _scalar(value)
+
+
+def _scalar(value: Any) -> str:
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int):
+        return str(value)
+    if isinstance(value, float):
+        return repr(value).replace("inf", ".inf").replace("nan", ".nan")
+    return _word(str(value))
+
+
+def _word(text: str) -> str:
+    """A string as YAML: bare where it can only be read as that string, else in double quotes."""
+    if re.fullmatch(r"[A-Za-z_][\w./-]*", text, flags=re.ASCII) and text not in (
+        "null",
+        "true",
+        "false",
+        "n",
+    ):
+        return text
+    if re.fullmatch(r"[0-9]{1,9}", text) and not (len(text) > 1 and text[0] == "0"):
+        return text  # a key such as the number of a tag
+    return json.dumps(text, ensure_ascii=False)
+
+
+def _prose(text: str) -> list[str]:
+    """The description as a folded block, or in quotes where folding would change it."""
+    body = text.rstrip("\n")
+    lines = textwrap.wrap(body, WIDTH - 2, break_long_words=False, break_on_hyphens=False)
+    if not lines or " ".join(lines) != body or len(text) - len(body) > 1 or not body.isprintable():
+        return [f"description: {json.dumps(text, ensure_ascii=False)}"]
+    return [f"description: {'>' if text.endswith(chr(10)) else '>-'}", *(f"  {line}" for line in lines)]
+
 
 OWN = ("position", "axis", "group", "motor_index", "motor_sign")
 """What a thruster keeps for itself; the rest goes to its group where all its members agree."""

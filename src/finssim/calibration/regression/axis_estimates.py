@@ -1,4 +1,4 @@
-"""From the regression of one axis to estimates, changes of the vehicle file, figures and warnings."""
+"""From the regression of one axis to estimates, changes of the vehicle file, figures and findings."""
 
 from __future__ import annotations
 
@@ -9,17 +9,168 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate
-from finssim.calibration.regression.axis_doubts import damping_known, doubts, quality, speed_range, worthless
 from finssim.calibration.regression.axis_fit import TERMS, AxisData
 from finssim.calibration.regression.plant_terms import Matrices
 from finssim.calibration.regression.selection import Selection
 from finssim.vehicles import AXES
 from finssim.vehicles.terms import unit_of
 
-__all__ = ["BIAS_NOTE", "CERTAIN", "AxisResult", "axis_result", "term_estimate"]
+__all__ = ["AxisResult", "BIAS_NOTE", "CERTAIN", "axis_result", "term_estimate"]
 
 Array = NDArray[np.float64]
+
+# How much the regression of one axis is worth: figures of the fit, whether it explains anything, and findings.
+
+EXPLAINED = 0.2
+"""R² below which the model of an axis explains nothing: at 0 the mean of the wrench does as well."""
+
+SEPARATE = 0.05
+"""By how much velocity has to lag the rates to be named [s]."""
+
+MOST_TILTED = 0.4
+"""Share of samples at large tilt beyond which what remains is not believed: pitching fast through level."""
+
+USEFUL_DRAG = 0.5
+"""Half width of the interval of a damping force, as a part of it, up to which it is written: better than a guess."""
+
+LARGE_DELAY = 0.02
+"""Lag of the motion behind the wrench worth a warning [s]."""
+
+
+def worthless(data: AxisData, figures: dict[str, float], chosen: Selection) -> str:
+    """Why nothing that was found of an axis can be believed; empty where it can.
+
+    Args:
+        data: Its trials.
+        figures: `quality`.
+        chosen: Its model.
+    """
+    if not figures["r2"] >= EXPLAINED:
+        return f"the model explains nothing of this axis' wrench: R² {figures['r2']:.2f}"
+    if not chosen.fit.theta[M] > 0.0:
+        return f"the fit finds no inertia on this axis: free, it would be {chosen.fit.free[M]:.3g}"
+    if data.tilted > MOST_TILTED:
+        return (
+            f"{100.0 * data.tilted:.0f} % of the samples are at large tilt, where the file's numbers for other axes "
+            "decide: fit surge, sway and heave together, or push less"
+        )
+    return ""
+
+
+def damping_known(data: AxisData, chosen: Selection, before: tuple[float, float]) -> bool:
+    """Whether the drag is known at the speeds of the trials, at their median and near their top.
+
+    To `USEFUL_DRAG`, or well enough to exclude that of the vehicle file.
+
+    Args:
+        data: The trials.
+        chosen: The model.
+        before: d1 and d2 of the file.
+    """
+    from scipy.stats import t
+
+    fit = chosen.fit
+    found = (
+        (fit.covariance.local, fit.covariance.trials)
+        if fit.covariance.alone.any()
+        else (fit.covariance.trials,)
+    )
+    dof = fit.covariance.dof[np.isin(np.flatnonzero(fit.terms), (D1, D2))]
+    quantile = float(t.ppf(0.975, min(float(np.min(dof, initial=np.inf)), 1e6)))
+    for speed in np.percentile(_moving(data, chosen), [50.0, 95.0]):
+        weights = np.zeros(len(fit.terms))
+        weights[[D1, D2]] = speed, speed**2
+        force, w = float(weights @ fit.theta), weights[fit.terms]
+        with np.errstate(invalid="ignore"):
+            std = np.sqrt(max(w @ covariance @ w for covariance in found))
+        if not (np.isfinite(std) and force > 0.0):
+            return False
+        close = quantile * std < USEFUL_DRAG * force
+        excluded = abs(before[0] * speed + before[1] * speed**2 - force) > quantile * std
+        if not close and not excluded:
+            return False
+    return True
+
+
+def _moving(data: AxisData, chosen: Selection) -> Array:
+    """Speeds of the rows that stand out of their noise; a zero where none does."""
+    speed = np.concatenate(
+        [np.abs(rows.X[used, 1]) for rows, used in zip(data.rows, chosen.fit.used, strict=True)]
+    )
+    top = float(np.percentile(speed, 95.0)) if len(speed) else 0.0
+    moving = speed[speed > 0.02 * top]
+    return moving if len(moving) else np.zeros(1)
+
+
+def speed_range(data: AxisData, chosen: Selection) -> tuple[float, float]:
+    """5th and 95th percentile of the speeds that damping rests on: rows whose speed stands out of its noise."""
+    moving = _moving(data, chosen)
+    if len(moving) < 5:
+        return 0.0, float(moving.max())
+    low, high = np.percentile(moving, [5.0, 95.0])
+    return float(low), float(high)
+
+
+def quality(data: AxisData, chosen: Selection) -> dict[str, float]:
+    """Figures of the fit."""
+    fit = chosen.fit
+    y = np.concatenate([rows.y[used] for rows, used in zip(data.rows, fit.used, strict=True)])
+    p = np.concatenate([line[used] for line, used in zip(fit.fitted, fit.used, strict=True)])
+    rmse = float(np.sqrt(np.mean((y - p) ** 2)))
+    spread = float(np.percentile(y, 95.0) - np.percentile(y, 5.0))
+    low, high = speed_range(data, chosen)
+    return {
+        "r2": 1.0 - rmse**2 / max(float(np.var(y)), 1e-300),
+        "rmse": rmse,
+        "nrmse": rmse / max(spread, 1e-300),
+        "samples": float(sum(rows.samples for rows in data.rows)),
+        "rejected": float(sum(rows.rejected for rows in data.rows)),
+        "trials": float(len(data.rows)),
+        "independent": float(fit.independent),
+        "speed_low": low,
+        "speed_high": high,
+        "delay": float(fit.theta[DELAY] + data.shift),
+        **{f"p_{name}": value for name, value in chosen.p_value.items()},
+    }
+
+
+def axis_findings(axis: str, data: AxisData, chosen: Selection) -> list[Finding]:
+    """What may be wrong with the fit of an axis."""
+    fit, out = chosen.fit, []
+    lag, value = chosen.interval[DELAY] + data.shift, fit.theta[DELAY] + data.shift
+    if abs(value) > LARGE_DELAY and (lag[0] > 0.0 or lag[1] < 0.0):
+        sense = "lags" if value > 0 else "leads"
+        out.append(finding("motion_late", axis, sense=sense, lag=abs(value), low=lag[0], high=lag[1]))
+    if not fit.instrumental:
+        out.append(finding("least_squares", axis))
+    if fit.evidence.unit == "blocks":
+        out.append(finding("block_intervals", axis, trials=len(data.rows)))
+    level = [s.name for s in data.signals if not np.isfinite(s.up).any()]
+    if level:
+        out.append(finding("attitude_missing", axis, trials=tuple(level)))
+    unknown = sorted({j for s in data.signals for j in s.unknown})
+    if unknown:
+        out.append(finding("velocity_unknown", axis, axes=tuple(str(AXES[j]) for j in unknown)))
+    return out
+
+
+def late_velocity(figures: dict[str, dict[str, float]], *, explained: list[str]) -> list[Finding]:
+    """A finding where surge, sway and heave lag the wrench by more than roll, pitch and yaw: two streams, two clocks.
+
+    Args:
+        figures: `quality` of every axis.
+        explained: Axes whose fit is worth something.
+    """
+    lags = [[figures[a]["delay"] for a in some if a in explained] for some in (AXES[:3], AXES[3:])]
+    if not all(lags):
+        return []
+    difference = float(np.median(lags[0]) - np.median(lags[1]))
+    if difference < SEPARATE:
+        return []
+    return [finding("velocity_late", late=difference)]
+
 
 M, D1, D2, BIAS, DELAY, SMOOTHING, K = range(len(TERMS))
 
@@ -54,7 +205,7 @@ class AxisResult:
     estimates: dict[str, Estimate]
     changes: dict[str, Any]
     quality: dict[str, float]
-    warnings: list[str]
+    findings: list[Finding]
     curves: list[Curve] = field(default_factory=list)
     worthless: str = ""
     """Why nothing that was found can be believed; empty where it can."""
@@ -73,7 +224,7 @@ def axis_result(data: AxisData, chosen: Selection, file: Matrices) -> AxisResult
     """
     axis = AXES[data.axis]
     low, high = speed_range(data, chosen)
-    speeds = f"speeds of {low:.2g}-{high:.2g} {'m/s' if data.axis < 3 else 'rad/s'}"
+    speeds = {"low": low, "high": high, "unit": "m/s" if data.axis < 3 else "rad/s"}
     draft = _Draft(data=data, chosen=chosen, file=file)
     draft.inertia()
     draft.added_mass(float(file.M_RB[data.axis, data.axis]))
@@ -82,14 +233,14 @@ def axis_result(data: AxisData, chosen: Selection, file: Matrices) -> AxisResult
         draft.add("k", K, "N m/rad", "body.center_of_buoyancy.2")
     draft.bias()
     if 0.0 < low and high < DECADE * low:
-        draft.warnings.append(f"{axis} damping rests on {speeds}, less than a decade")
-    draft.warnings += doubts(axis, data, chosen)
+        draft.findings.append(finding("few_speeds", axis, **speeds))
+    draft.findings += axis_findings(axis, data, chosen)
     figures = quality(data, chosen)
     reason = worthless(data, figures, chosen)
     if reason:
         draft.believe_nothing(reason)
     return AxisResult(
-        estimates=draft.estimates, changes=draft.changes, quality=figures, warnings=draft.warnings,
+        estimates=draft.estimates, changes=draft.changes, quality=figures, findings=draft.findings,
         curves=_curves(data, chosen), worthless=reason,
     )  # fmt: skip
 
@@ -103,7 +254,7 @@ class _Draft:
     file: Matrices
     estimates: dict[str, Estimate] = field(default_factory=dict)
     changes: dict[str, Any] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
 
     @property
     def axis(self) -> str:
@@ -119,15 +270,13 @@ class _Draft:
         return f"{SET}.{family}.{self.data.axis}.{self.data.axis}"
 
     def add(self, name: str, term: int, unit: str, path: str | None = None) -> Estimate:
-        """Take the estimate of a term, and a warning where it rests on its bound."""
+        """Take the estimate of a term, and a finding where it rests on its bound."""
         fit = self.chosen.fit
         value, (lower, upper) = fit.theta[term], self.chosen.interval[term]
         note, sure = "", bool(np.isfinite([lower, upper]).all())
         if fit.active[term]:
             note, sure = f"held at its bound 0; free, it would be {fit.free[term]:.3g}", False
-            self.warnings.append(
-                f"{self.axis}.{name} rests on its bound: free, it would be {fit.free[term]:.3g} {unit}"
-            )
+            self.findings.append(finding("at_bound", f"{self.axis}.{name}", free=fit.free[term], unit=unit))
         elif sure and 0.5 * (upper - lower) > CERTAIN * abs(value):
             note, sure = f"known to no better than {_percent(upper - lower, value)}", False
         found = Estimate(
@@ -168,10 +317,8 @@ class _Draft:
         if value <= 0.0:
             sure = False
             note = f"m_eff is below the file's rigid {rigid:.4g} {unit}"
-            self.warnings.append(
-                f"{self.axis}: an effective inertia of {whole.estimate:.4g} {unit} is below the rigid {rigid:.4g} "
-                f"{unit} of the vehicle file, so that added mass would be negative: check the thrust and the file's "
-                "mass or inertia"
+            self.findings.append(
+                finding("inertia_too_small", self.axis, effective=whole.estimate, rigid=rigid, unit=unit)
             )
         elif ends[0] <= 0.0:
             sure, note = False, "not distinguishable from zero"
@@ -184,7 +331,7 @@ class _Draft:
             name=name, estimate=value, ci95=_pair(ends), unit=unit, identifiable=sure, note=note, path=path
         )
 
-    def damping(self, speeds: str) -> None:
+    def damping(self, speeds: Mapping[str, Any]) -> None:
         """d1 and d2; both go to the vehicle file or neither."""
         theta = self.chosen.fit.theta
         for name, term, family, unit in (
@@ -195,7 +342,8 @@ class _Draft:
                 whole = f"{self.axis}.{name}"
                 self.estimates[whole] = Estimate(
                     name=whole, estimate=0.0, ci95=_pair(self.chosen.interval[term]), unit=unit, identifiable=False,
-                    note=f"not distinguishable from zero at {speeds}", path=self.path(family),
+                    note="not distinguishable from zero at speeds of {low:.2g}-{high:.2g} {unit}".format(**speeds),
+                    path=self.path(family),
                 )  # fmt: skip
             elif self.chosen.fit.terms[term]:
                 self.add(name, term, unit, self.path(family))
@@ -204,9 +352,7 @@ class _Draft:
             self.changes[self.path("linear_damping")] = max(float(theta[D1]), 0.0)
             self.changes[self.path("quadratic_damping")] = max(float(theta[D2]), 0.0)
         else:
-            self.warnings.append(
-                f"{self.axis}: damping is not determined by {speeds}; the vehicle file keeps its numbers"
-            )
+            self.findings.append(finding("damping_unknown", self.axis, **speeds))
 
     def bias(self) -> None:
         """b, identifiable wherever it has an interval, for it may well be zero."""
@@ -220,12 +366,12 @@ class _Draft:
             name: replace(e, identifiable=False, note=reason) for name, e in self.estimates.items()
         }
         self.changes = {}
-        self.warnings.append(f"{self.axis}: {reason}; the vehicle file keeps its numbers")
+        self.findings.append(finding("axis_refused", self.axis, reason=reason))
 
 
 def term_estimate(
     path: str, chosen: Mapping[int, tuple[AxisData, Selection]]
-) -> tuple[Estimate | None, list[str]]:
+) -> tuple[Estimate | None, list[Finding]]:
     """A parameter of the vehicle's terms from all axes on which it acts, weighted by the squares of their intervals.
 
     Args:
@@ -233,7 +379,7 @@ def term_estimate(
         chosen: Data and model of the axes that can be believed.
 
     Returns:
-        None where it acts on none of them; and a sentence where axes disagree, or none has an interval.
+        None where it acts on none of them; and a finding where axes disagree, or none has an interval.
     """
     values, halves, names = [], [], []
     for i, (data, selection) in chosen.items():
@@ -244,9 +390,7 @@ def term_estimate(
             halves.append(max(high - values[-1], values[-1] - low))
             names.append(AXES[i])
     if not values:
-        return None, [
-            f"{path}: no axis on which it acts has a fit to believe; the vehicle file keeps its number"
-        ]
+        return None, [finding("term_unfitted", path)]
     weight = np.asarray(halves) ** -2.0
     value = float(weight @ values / weight.sum())
     half = float(np.hypot(weight.sum() ** -0.5, FORMED * value))
@@ -255,10 +399,8 @@ def term_estimate(
         note += f"; known to no better than {_percent(2.0 * half, value)}"
     said = []
     if np.any(np.abs(np.asarray(values) - value) > 2.0 * np.hypot(halves, half)):
-        told = ", ".join(
-            f"{name} {x:.4g} ± {h:.2g}" for name, x, h in zip(names, values, halves, strict=True)
-        )
-        said = [f"{path}: axes disagree ({told}); their weighted mean was taken"]
+        told = tuple(f"{name} {x:.4g} ± {h:.2g}" for name, x, h in zip(names, values, halves, strict=True))
+        said = [finding("term_disagrees", path, estimates=told)]
     found = Estimate(
         name=path, estimate=value, ci95=(value - half, value + half), unit=unit_of(path), identifiable=sure, note=note,
         path=f"{SET}.{path}",

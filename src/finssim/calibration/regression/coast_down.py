@@ -23,8 +23,7 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Curve, Estimate
 from finssim.calibration.motion.signals import motion
 from finssim.calibration.regression.plant_terms import Matrices
-from finssim.calibration.trials.columns import NU
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial import NU, Trial
 from finssim.calibration.uncertainty import Evidence, correlated_samples, intervals, trial_covariance
 from finssim.vehicles import AXES, Vehicle
 
@@ -105,7 +104,7 @@ def coast_of(trial: Trial, axis: str, vehicle: Vehicle) -> Coast:
     nu = moved.nu[:, i]
     known = np.isfinite(nu)
     if known.sum() < 20:
-        raise CalibrationError(f"{trial.name}: the velocity of {axis} is unknown")
+        raise CalibrationError(f"the velocity of {axis} is unknown", trial.name)
     t, speed = moved.t[known], np.abs(nu[known])
     noise = float(np.nan_to_num(moved.noise_std[i]))
     begin = int(np.argmax(speed))
@@ -118,7 +117,7 @@ def coast_of(trial: Trial, axis: str, vehicle: Vehicle) -> Coast:
         or speed[end] > FALLS_TO * speed[begin]
         or end - begin < 20
     ):
-        raise CalibrationError(f"{trial.name}: {axis} does not coast to a lower speed")
+        raise CalibrationError(f"{axis} does not coast to a lower speed", trial.name)
     start, stop = float(t[begin]), float(t[end])
     nothing = np.empty(0), np.empty(0)
     rate, angle = nothing, nothing

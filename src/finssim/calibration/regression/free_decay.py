@@ -91,9 +91,7 @@ def free_decay(trial: Trial, axis: str, *, terms: tuple[bool, bool] | None = Non
     """
     p, s = _samples(trial, axis)
     if len(p[0]) < 20 and len(s[0]) < 20:
-        raise CalibrationError(
-            f"{trial.name}: neither rate nor attitude of {axis}: nothing to see a decay in"
-        )
+        raise CalibrationError(f"neither rate nor attitude of {axis}: nothing to see a decay in", trial.name)
     rate = p if len(p[0]) >= 20 else (s[0], np.gradient(s[1], s[0]))
     begin, end, period = _window(rate, trial.name, axis)
     p, s = ((t[(t >= begin) & (t <= end)], y[(t >= begin) & (t <= end)]) for t, y in (p, s))
@@ -134,8 +132,9 @@ def _window(rate: tuple[Array, Array], name: str, axis: str) -> tuple[float, flo
     after = (t >= begin) & (t <= begin + 20.0)
     span = float(t[after][-1] - begin) if after.any() else 0.0
     refusal = CalibrationError(
-        f"{name}: {axis} does not ring down: expected a release after which it swings freely for "
-        f"{FEWEST_PERIODS:g} periods or more"
+        f"{axis} does not ring down: expected a release after which it swings freely for {FEWEST_PERIODS:g} periods or "
+        "more",
+        name,
     )
     if after.sum() < 20 or span < 1.0:
         raise refusal

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.regression.coast_down import COASTING, coast_of, coast_result
 from finssim.calibration.regression.free_decay import BOTH, Decay, free_decay
@@ -68,7 +69,7 @@ def pooled_positive(values: Array, stds: Array, dof: Array) -> tuple[float, floa
     return float(mean), float(low), float(high)
 
 
-# From free decays of roll or pitch to estimates, changes of the vehicle file and warnings.
+# From free decays of roll or pitch to estimates, changes of the vehicle file and findings.
 
 Of = Callable[[Array, Decay], float]
 """A function of x = ln w2, c1, c2 and the decay."""
@@ -85,7 +86,7 @@ class DecayResult:
     estimates: list[Estimate]
     changes: dict[str, Any]
     """Dotted path -> value, of the vehicle file."""
-    warnings: list[str]
+    findings: list[Finding]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,20 +156,16 @@ def decay_result(
     changes: dict[str, Any] = {}
     if ratio.identifiable and whole.identifiable:
         changes |= {str(e.path): max(e.estimate, 0.0) for e in damping}
-    drifts = [
-        f"{d.trial}: the equilibrium of {axis} moved during the decay; straight pieces follow it"
-        for d in decays
-        if d.drift
-    ]
+    drifts = [finding("equilibrium_moved", d.trial, axis=axis) for d in decays if d.drift]
     if assume == "inertia":
         k = _stiffness(decays, known)
         taken = replace(whole, identifiable=False)
-        return DecayResult(estimates=[frequency, ratio, taken, *damping, k], changes=changes, warnings=drifts)
+        return DecayResult(estimates=[frequency, ratio, taken, *damping, k], changes=changes, findings=drifts)
     added, contradictions = _added_mass(whole, known)
     if added.estimate > 0.0 and whole.identifiable:
         changes[str(added.path)] = added.estimate
     return DecayResult(
-        estimates=[frequency, ratio, whole, added, *damping], changes=changes, warnings=contradictions + drifts
+        estimates=[frequency, ratio, whole, added, *damping], changes=changes, findings=contradictions + drifts
     )  # fmt: skip
 
 
@@ -220,8 +217,8 @@ def _stiffness(decays: Sequence[Decay], known: _Known) -> Estimate:
     )  # fmt: skip
 
 
-def _added_mass(whole: Estimate, known: _Known) -> tuple[Estimate, list[str]]:
-    """The inertia less the file's rigid one, and what to say where that is negative."""
+def _added_mass(whole: Estimate, known: _Known) -> tuple[Estimate, list[Finding]]:
+    """The inertia less the file's rigid one, and a finding where that is negative."""
     rigid, (low, high) = known.rigid, whole.ci95
     added = Estimate(
         name=f"{known.axis}.added_mass", estimate=whole.estimate - rigid, ci95=(low - rigid, high - rigid),
@@ -231,8 +228,7 @@ def _added_mass(whole: Estimate, known: _Known) -> tuple[Estimate, list[str]]:
     if added.estimate > 0.0:
         return added, []
     return added, [
-        f"{known.axis}: {known.said} the inertia is {whole.estimate:.4g} {INERTIA}, below the file's rigid "
-        f"{rigid:.4g} {INERTIA}: check the centres of gravity and buoyancy, or the inertia"
+        finding("inertia_below_rigid", known.axis, assumed=known.said, inertia=whole.estimate, rigid=rigid)
     ]
 
 
@@ -307,7 +303,7 @@ def buoyant_rise(trial: Trial) -> Rise:
     t, z = trial.series("z") if trial.has("z") else trial.series("depth")
     z = z if trial.has("z") else -z
     if len(t) < 20:
-        raise CalibrationError(f"{trial.name}: neither z nor depth: nothing to see a rise in")
+        raise CalibrationError("neither z nor depth: nothing to see a rise in", trial.name)
     begin, end = _longest_rise(t, z, trial.name)
     inside = (t >= begin) & (t <= end)
     t, z = t[inside], z[inside]
@@ -356,7 +352,8 @@ def _longest_rise(t: Array, z: Array, name: str) -> tuple[float, float]:
     longest = max(edges, key=lambda e: e[1] - e[0], default=(0, 0))
     if (longest[1] - longest[0]) * 0.1 < SHORTEST:
         raise CalibrationError(
-            f"{name}: nothing rises faster than {RISING} m/s for {SHORTEST:g} s: expected a vehicle let go under water"
+            f"nothing rises faster than {RISING} m/s for {SHORTEST:g} s: expected a vehicle let go under water",
+            name,
         )
     return float(grid[longest[0]]), float(grid[longest[1] - 1])
 
@@ -421,7 +418,8 @@ def passive(
     estimates: dict[str, Estimate] = {}
     changes: dict[str, Any] = {}
     quality: dict[str, dict[str, float]] = {}
-    warnings, missing, curves, used = list[str](), list[str](), list[Curve](), set[str]()
+    findings, missing = list[Finding](), list[CalibrationError]()
+    curves, used = list[Curve](), set[str]()
     for axis in ("roll", "pitch"):
         decays = _decays(trials, axis, missing) if axes is None or axis in axes else []
         if not decays:
@@ -429,7 +427,7 @@ def passive(
         found = decay_result(axis, decays, plant, assume)
         estimates |= {e.name: e for e in found.estimates}
         changes |= found.changes
-        warnings += found.warnings
+        findings += found.findings
         quality[axis] = _decay_quality(decays)
         curves += [_decay_curve(d) for d in decays]
         used |= {d.trial for d in decays}
@@ -437,7 +435,7 @@ def passive(
     if rises:
         risen = _rise_estimates(rises, plant)
         estimates |= risen
-        warnings += _contradictions(risen, plant)
+        findings += _contradictions(risen, plant)
         curves += [_rise_curve(rise) for rise in rises]
         used |= {rise.trial for rise in rises}
     for axis in COASTING:
@@ -451,14 +449,16 @@ def passive(
             curves += coasted.curves
             used |= {coast.trial for coast in coasts}
     if not estimates:
-        reasons = "; ".join(sentence for sentence in missing if sentence.startswith(f"{trials[0].name}: "))
+        reasons = "; ".join(str(error) for error in missing if error.subject == trials[0].name)
         others = f"; and {len(trials) - 1} trials more" if len(trials) > 1 else ""
         raise CalibrationError(
             f"no trial shows a free decay, a coast or a rise: {reasons or 'none was given'}{others}"
         )
     # That a trial shows one motion and not the others is no news.
-    warnings += [
-        sentence for sentence in missing if not sentence.startswith(tuple(f"{name}: " for name in used))
+    findings += [
+        finding("unusable", error.subject, severity="care", reason=error.reason)
+        for error in missing
+        if error.subject not in used
     ]
     return Fit(
         kind="hydrodynamics",
@@ -467,14 +467,14 @@ def passive(
         estimates=estimates,
         changes=changes,
         quality=quality,
-        warnings=tuple(dict.fromkeys(warnings)),
+        findings=tuple(dict.fromkeys(findings)),
         curves=tuple(curves),
         trials={trial.name: trial.sha256 for trial in trials if trial.name in used},
         settings={"assume": assume},
     )
 
 
-def _decays(trials: Sequence[Trial], axis: str, missing: list[str]) -> list[Decay]:
+def _decays(trials: Sequence[Trial], axis: str, missing: list[CalibrationError]) -> list[Decay]:
     """Those of one axis, all with the same kind of damping."""
     decays: list[Decay] = _each(trials, partial(free_decay, axis=axis), missing)
     if len({d.terms for d in decays}) > 1:  # one vehicle, one kind of damping
@@ -491,14 +491,16 @@ def _decay_quality(decays: Sequence[Decay]) -> dict[str, float]:
     }
 
 
-def _each(trials: Sequence[Trial], find: Callable[[Trial], Any], missing: list[str]) -> list[Any]:
+def _each(
+    trials: Sequence[Trial], find: Callable[[Trial], Any], missing: list[CalibrationError]
+) -> list[Any]:
     """What is found in each trial; why one shows nothing goes to `missing`."""
     found = []
     for trial in trials:
         try:
             found.append(find(trial))
         except CalibrationError as error:
-            missing.append(str(error))
+            missing.append(error)
     return found
 
 
@@ -523,16 +525,18 @@ def _rise_estimates(rises: list[Rise], plant: Matrices) -> dict[str, Estimate]:
     return {e.name: e for e in found}
 
 
-def _contradictions(found: dict[str, Estimate], plant: Matrices) -> list[str]:
-    """A sentence where the file's excess of buoyancy, which a rise does not replace, lies outside the interval."""
+def _contradictions(found: dict[str, Estimate], plant: Matrices) -> list[Finding]:
+    """A finding where the file's excess of buoyancy, which a rise does not replace, lies outside the interval."""
     excess = found.get("buoyancy_excess")
     if excess is None or excess.ci95[0] <= plant.excess <= excess.ci95[1]:
         return []
     low, high = excess.ci95
-    sign = ": the vehicle rises, the file's sinks" if plant.excess < 0.0 < low else ""
+    fields = {"file": plant.excess, "low": low, "high": high}
+    sinks = plant.excess < 0.0 < low
     return [
-        f"heave: the vehicle file's buoyancy less weight is {plant.excess:.3g} N, outside the {low:.2g} to "
-        f"{high:.2g} N of the rise{sign}: weigh the vehicle in water, or set body.displaced_volume"
+        finding("buoyancy_sign", "heave", **fields)
+        if sinks
+        else finding("buoyancy_contradicted", "heave", **fields)
     ]
 
 

@@ -11,23 +11,26 @@ from numpy.typing import NDArray
 
 from finssim.calibration.degeneracy import degeneracy
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.fit import Correlation, Estimate, Fit
 from finssim.calibration.motion.attitude_signal import attitude_samples
 from finssim.calibration.motion.signals import Motion, motion
-from finssim.calibration.regression.axis_doubts import LARGE_DELAY, late_velocity, quality, worthless
 from finssim.calibration.regression.axis_estimates import (
+    LARGE_DELAY,
     AxisResult,
     axis_result,
+    late_velocity,
     outside,
+    quality,
     term_estimate,
     trim,
+    worthless,
 )
 from finssim.calibration.regression.axis_fit import TERMS, AxisData, informative
 from finssim.calibration.regression.plant_terms import Matrices, matrices
 from finssim.calibration.regression.rows import Signals, axis_rows, kernel, signals
 from finssim.calibration.regression.selection import DAMPING, Selection, select
-from finssim.calibration.trials.fittable import require_axes, require_fittable
-from finssim.calibration.trials.inputs import drive
+from finssim.calibration.trials.inputs import drive, require_axes, require_fittable
 from finssim.calibration.trials.trial import Trial
 from finssim.geometry.rotations import quat_inverse_rotate
 from finssim.vehicles import AXES, Vehicle
@@ -96,7 +99,7 @@ def coasts(data: AxisData) -> list[Coast]:
     return found
 
 
-def buoyancy_estimate(data: AxisData, chosen: Selection, vehicle: Vehicle) -> tuple[Estimate, list[str]]:
+def buoyancy_estimate(data: AxisData, chosen: Selection, vehicle: Vehicle) -> tuple[Estimate, list[Finding]]:
     """B - W from the bias of heave: m w_dot + d1 w + d2 |w| w + b = tau_z, b = -(B - W).
 
     Args:
@@ -113,7 +116,7 @@ def buoyancy_estimate(data: AxisData, chosen: Selection, vehicle: Vehicle) -> tu
     free = coasts(data)
     speeds = np.concatenate([r.X[u, 1] for r, u in zip(data.rows, chosen.fit.used, strict=True)])
     both = bool((speeds > RISING).any() and (speeds < -RISING).any())
-    warnings = []
+    findings = []
     if free:
         fastest = max(free, key=lambda c: abs(c.speed))
         note = (
@@ -123,10 +126,7 @@ def buoyancy_estimate(data: AxisData, chosen: Selection, vehicle: Vehicle) -> tu
         note = "from driven motion up and down; no coast without thrust reached 0.01 m/s"
     else:
         note = "no coast and one direction only: the excess trades off with the damping"
-        warnings.append(
-            "heave: the trials go one way only and never coast, so that the buoyancy excess trades off with the "
-            "damping: add a dive followed by a coast"
-        )
+        findings.append(finding("buoyancy_traded", "heave"))
     known = bool(np.isfinite([low, high]).all())
     known = known and 0.5 * (high - low) <= max(USEFUL * abs(value), FAINT * vehicle.weight)
     if not known:
@@ -143,7 +143,7 @@ def buoyancy_estimate(data: AxisData, chosen: Selection, vehicle: Vehicle) -> tu
             note=f"{note}; with the file's weight a displaced volume of {volume:.6g} m³",
             path="body.displaced_volume",
         ),
-        warnings,
+        findings,
     )
 
 
@@ -184,18 +184,17 @@ class Prepared:
     """Of the water, where the velocity does not know of it, world frame [m/s], (3,)."""
 
 
-def prepare(trials: Sequence[Trial], vehicle: Vehicle) -> tuple[list[Prepared], list[str]]:
-    """Trials on their grids, and a sentence on each that cannot be used or that something was assumed of."""
-    out, notes = [], []
+def prepare(trials: Sequence[Trial], vehicle: Vehicle) -> tuple[list[Prepared], list[Finding]]:
+    """Trials on their grids, and a finding on each that cannot be used or that something was assumed of."""
+    out, findings = [], []
     for trial in trials:
         try:
             found = motion(trial, vehicle)
             held = drive(trial, vehicle)
         except CalibrationError as error:
-            text = str(error)
-            notes.append(text if text.startswith(trial.name) else f"{trial.name}: {text}")
+            findings.append(finding("unusable", trial.name, severity="care", reason=error.reason))
             continue
-        notes += [f"{trial.name}: {note}" for note in found.notes]
+        findings += [one.about(trial.name) for one in found.findings]
         if held.held and not held.commanded:
             # A row's value acts until the next row: at the row itself the wrench jumps, and the middle of the jump has
             # the same integral under any smooth weight.
@@ -205,7 +204,7 @@ def prepare(trials: Sequence[Trial], vehicle: Vehicle) -> tuple[list[Prepared], 
         moving = water.current is not None and any(water.current)
         current = np.asarray(water.current) if moving else None
         out.append(Prepared(trial=trial, motion=found, up=_up(trial, found), current=current))
-    return out, notes
+    return out, findings
 
 
 def _up(trial: Trial, found: Motion) -> Array:
@@ -251,7 +250,7 @@ def _span(tau: Array, vehicle: Vehicle) -> Array:
 
 def axis_data(
     axis: int, prepared: Sequence[Prepared], plants: Sequence[Matrices], *, keep_tilted: bool = False
-) -> tuple[AxisData | None, list[str]]:
+) -> tuple[AxisData | None, list[Finding]]:
     """Rows of one axis from the trials that excite it.
 
     Args:
@@ -261,20 +260,20 @@ def axis_data(
         keep_tilted: Whether samples beyond `LARGEST_TILT` stay: where the axes that they depend on are fitted too.
 
     Returns:
-        None where no trial can be used; and sentences on what was left out.
+        None where no trial can be used; and findings on what was left out.
     """
-    said, kept, tilted = [], [], 0.0
+    said, kept, tilted, of = list[Finding](), [], 0.0, str(AXES[axis])
     for one, plant in zip(prepared, plants, strict=True):
         found, name = one.motion, one.trial.name
         if not np.isfinite(found.nu[:, axis]).any():
-            said.append(f"left out: {name}: no {AXES[axis]} velocity, measured or derived")
+            said.append(finding("axis_unmeasured", name, axis=of))
         elif axis in (3, 4) and not np.isfinite(found.quaternion).any():
-            said.append(f"left out: {name}: {AXES[axis]} needs the attitude for its restoring moment")
+            said.append(finding("attitude_needed", name, axis=of))
         else:
             kept.append(signals(name, found, one.up, plant, current=one.current))
     if axis not in (3, 4):
-        kept, tilted, note = _level(kept, keep_tilted)
-        said += note
+        kept, tilted, cut = _level(kept, keep_tilted)
+        said += [one.about(of) for one in cut]
     spread = [_noise_and_range(s.nu[s.usable, axis]) for s in kept]
     largest = max((r for _, r in spread), default=0.0)
     out = []
@@ -286,9 +285,9 @@ def axis_data(
         )
         rows = axis_rows(s, axis, kernels)
         if rows is None:
-            said.append(f"left out: {s.name}: no stretch of {len(kernels.phi) / s.rate:.1f} s without a gap")
+            said.append(finding("no_stretch", s.name, axis=of, seconds=len(kernels.phi) / s.rate))
         elif informative(rows, s).sum() < FEWEST_ROWS:
-            said.append(f"left out: {s.name}: hardly any wrench or motion on {AXES[axis]}")
+            said.append(finding("axis_idle", s.name, axis=of))
         else:
             out.append((s, rows, kernels))
     if not out:
@@ -321,8 +320,8 @@ def later(data: AxisData, by: float) -> AxisData:
     return replace(data, signals=tuple(moved), rows=tuple(rows), shift=data.shift + by)
 
 
-def _level(found: list[Signals], keep: bool) -> tuple[list[Signals], float, list[str]]:
-    """Without samples at large tilt, the share of those, and a sentence where there were any.
+def _level(found: list[Signals], keep: bool) -> tuple[list[Signals], float, list[Finding]]:
+    """Without samples at large tilt, the share of those, and a finding where there were any.
 
     There weight, Coriolis forces and the other axes' drag are as large as the thrust; the file knows them at best.
     """
@@ -332,18 +331,13 @@ def _level(found: list[Signals], keep: bool) -> tuple[list[Signals], float, list
     beyond = sum(int((own & ~flat).sum()) for own, flat in zip(inside, level, strict=True))
     if not beyond:
         return found, 0.0, []
-    share = f"{100.0 * beyond / total:.0f} %" if beyond >= 0.01 * total else "less than 1 %"
+    percent = 100.0 * beyond / total
     if keep and beyond < WORTH_SAYING * total:
         return found, 0.0, []
     if keep:
-        note = (
-            f"{share} of the samples are at a tilt beyond {LARGEST_TILT:.0f}°; they were kept, as the axes that they "
-            "depend on are fitted too, but the intervals are then somewhat too sure"
-        )
-        return found, 0.0, [note]
+        return found, 0.0, [finding("tilted_kept", percent=percent, tilt=LARGEST_TILT)]
     cut = [replace(s, usable=s.usable & flat) for s, flat in zip(found, level, strict=True)]
-    said = [f"{share} of the samples, at a tilt beyond {LARGEST_TILT:.0f}°, were left out"]
-    return cut, beyond / total, said
+    return cut, beyond / total, [finding("tilted_left_out", percent=percent, tilt=LARGEST_TILT)]
 
 
 def _noise_and_range(nu: Array) -> tuple[float, float]:
@@ -418,11 +412,11 @@ def regress(
         raise CalibrationError(f"unknown damping '{damping}'; available: {', '.join(DAMPING)}")
     require_fittable(trials)
     driven = [trial for trial in trials if not trial.header.passive]
-    prepared, warnings = prepare(driven, vehicle)
+    prepared, findings = prepare(driven, vehicle)
     chosen, plant, more = _fit_axes(
         prepared, vehicle, wanted, axes is not None, damping, known or {}, estimate, file_prior
     )
-    warnings += more
+    findings += more
     file = matrices(vehicle)
     estimates: dict[str, Estimate] = {}
     changes: dict[str, Any] = {}
@@ -431,25 +425,25 @@ def regress(
         results[AXES[i]] = result = axis_result(data, selection, file)
         estimates |= result.estimates
         changes |= result.changes
-        warnings += result.warnings
+        findings += result.findings
         if i == 2:
             buoyancy, notes = buoyancy_estimate(data, selection, vehicle)
             if result.worthless:
                 buoyancy = replace(buoyancy, identifiable=False, note=result.worthless)
             estimates[buoyancy.name] = buoyancy
-            warnings += notes
+            findings += notes
     told = {i: pair for i, pair in chosen.items() if not results[AXES[i]].worthless}
     for path in estimate:
         found, notes = term_estimate(path, told)
-        warnings += notes
+        findings += notes
         if found is not None:
             estimates[path] = found
             changes |= {str(found.path): found.estimate} if found.identifiable else {}
     used = {s.name for data, _ in chosen.values() for s in data.signals}
-    _hydrostatics(estimates, changes, vehicle, plant, warnings)
+    _hydrostatics(estimates, changes, vehicle, plant, findings)
     figures = {axis: result.quality for axis, result in results.items()}
     curves = [curve for result in results.values() for curve in result.curves]
-    warnings += late_velocity(figures, explained=[AXES[i] for i in told])
+    findings += late_velocity(figures, explained=[AXES[i] for i in told])
     quiet = _passive(trials, vehicle, [i for i in wanted if i not in told], known or {})
     if quiet is not None:
         estimates, changes, figures = (
@@ -457,15 +451,15 @@ def regress(
             changes | quiet.changes,
             figures | quiet.quality,
         )
-        warnings += quiet.warnings
+        findings += quiet.findings
         curves += quiet.curves
         used |= set(quiet.trials)
     if not estimates:
         raise CalibrationError(
             f"no axis of {vehicle.name} can be fitted from these trials: "
-            f"{'; '.join(warnings) or 'none excites an axis'}"
+            f"{'; '.join(sentences(findings)) or 'none excites an axis'}"
         )
-    correlation, sentences = _correlation(chosen)
+    correlation, traded = _correlation(chosen)
     return Fit(
         kind="hydrodynamics",
         method="regression",
@@ -474,7 +468,7 @@ def regress(
         changes=changes,
         quality=figures,
         correlation=correlation,
-        warnings=tuple(dict.fromkeys([*warnings, *sentences])),
+        findings=tuple(dict.fromkeys([*findings, *traded])),
         curves=tuple(curves),
         trials={trial.name: trial.sha256 for trial in trials if trial.name in used},
         settings={
@@ -501,27 +495,27 @@ def _fit_axes(
     known: Mapping[str, float],
     estimate: Sequence[str],
     file_prior: bool,
-) -> tuple[dict[int, tuple[AxisData, Selection]], Matrices, list[str]]:
+) -> tuple[dict[int, tuple[AxisData, Selection]], Matrices, list[Finding]]:
     """Data and model of every axis that can be fitted; couplings between axes use the estimates of the round before."""
     file = plant = matrices(vehicle, estimate=estimate)
-    warnings = list[str]()
+    findings = list[Finding]()
     waters = [matrices(vehicle, one.trial.header.water.density, estimate=estimate) for one in prepared]
     active = excited(prepared, vehicle) if prepared else np.zeros((0, 6), bool)
     fitted = {i for i in wanted if active[:, i].any()}
     chosen: dict[int, tuple[AxisData, Selection]] = {}
     for round_ in range(PASSES):
         settled, former = True, chosen
-        chosen, warnings = {}, []
+        chosen, findings = {}, []
         for i in wanted:
             those = np.flatnonzero(active[:, i])
             keep = TILTS_INTO.get(i, set()) <= fitted
             data, said = axis_data(
                 i, [prepared[g] for g in those], [waters[g] for g in those], keep_tilted=keep
             )
-            warnings += [f"{AXES[i]}: {sentence}" for sentence in said]
+            findings += said
             if data is None:
                 if asked and not len(those):
-                    warnings.append(f"{AXES[i]}: no trial excites it; the vehicle file keeps its numbers")
+                    findings.append(finding("axis_not_driven", str(AXES[i])))
                 continue
             data = replace(data, inertia=known.get(AXES[i]), prior=prior(data, file, file_prior))
             if i in former and former[i][0].shift:
@@ -542,7 +536,7 @@ def _fit_axes(
             if not worthless(data, quality(data, selection), selection):
                 plant = plant.with_axis(i, m - plant.M_RB[i, i], max(d1, 0.0), max(d2, 0.0))
                 waters = [w.with_axis(i, m - w.M_RB[i, i], max(d1, 0.0), max(d2, 0.0)) for w in waters]
-    return chosen, plant, warnings
+    return chosen, plant, findings
 
 
 def prior(data: AxisData, file: Matrices, file_prior: bool) -> dict[str, tuple[float, float]]:
@@ -582,7 +576,7 @@ def _hydrostatics(
     changes: dict[str, Any],
     vehicle: Vehicle,
     plant: Matrices,
-    warnings: list[str],
+    findings: list[Finding],
 ) -> None:
     """Buoyancy excess and stiffness as changes of volume and centre of buoyancy; weight and centre of gravity stay."""
     volume = vehicle.body.displaced_volume
@@ -600,31 +594,28 @@ def _hydrostatics(
     half = np.array([0.5 * (e.ci95[1] - e.ci95[0]) for e in found])
     value = np.array([e.estimate for e in found])
     if len(found) == 2 and abs(value[0] - value[1]) > float(np.hypot(*half)):
-        warnings.append(
-            f"roll and pitch disagree on the stiffness ({value[0]:.4g} and {value[1]:.4g} N m/rad), which one height "
-            "of the centre of buoyancy cannot give; their weighted mean was taken"
-        )
+        findings.append(finding("stiffness_disagrees", roll=value[0], pitch=value[1]))
     k = float(np.sum(value / half**2) / np.sum(1.0 / half**2))
     reference = float(vehicle.hydrodynamic_set("calibrated").reference_point[2])
     gravity_part = vehicle.weight * (float(vehicle.body.center_of_gravity[2]) - reference)
     changes["body.center_of_buoyancy.2"] = reference + (k + gravity_part) / buoyancy
 
 
-def _correlation(chosen: dict[int, tuple[AxisData, Selection]]) -> tuple[Correlation | None, list[str]]:
-    """Of all axes together, block by block, with a sentence for every trade-off."""
-    names, blocks, sentences = list[str](), list[Array](), list[str]()
+def _correlation(chosen: dict[int, tuple[AxisData, Selection]]) -> tuple[Correlation | None, list[Finding]]:
+    """Of all axes together, block by block, with a finding for every trade-off."""
+    names, blocks, findings = list[str](), list[Array](), list[Finding]()
     for i, (data, selection) in chosen.items():
         fit, terms = selection.fit, (*TERMS, *data.estimated)
         own = [f"{AXES[i]}.{name}" for name, on in zip(terms, fit.terms, strict=True) if on]
         found, said = degeneracy(own, fit.covariance.local, fit.free[fit.terms])
         names += own
         blocks.append(found.matrix)
-        sentences += said
+        findings += said
     if not names:
         return None, []
     from scipy.linalg import block_diag
 
-    return Correlation(names=tuple(names), matrix=block_diag(*blocks)), sentences
+    return Correlation(names=tuple(names), matrix=block_diag(*blocks)), findings
 
 
 def _passive(

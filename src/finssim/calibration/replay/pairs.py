@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.trials.columns import NU
-from finssim.calibration.trials.trial import Array
+from finssim.calibration.findings import Finding
+from finssim.calibration.trials.trial import NU, Array
 from finssim.vehicles.vehicle import AXES, Axis
 
 __all__ = ["RESPONSES", "UNITS", "Pair", "excited_axes", "find_phases", "models_of", "onset", "resampled"]
@@ -72,7 +72,7 @@ class Pair:
     comparison allows; only where it shows."""
     in_sample: bool = False
     """Whether the vehicle was fitted on this very trial."""
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     def response(self, axis: Axis) -> str:
         """The velocity of an axis: `u` of surge."""

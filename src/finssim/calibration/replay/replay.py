@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.replay.metrics import (
     SEED,
     Aggregate,
@@ -25,8 +26,7 @@ from finssim.calibration.replay.metrics import (
 from finssim.calibration.replay.pairs import Pair, excited_axes, find_phases, resampled
 from finssim.calibration.simulation.rollout import Response, Rollouts
 from finssim.calibration.simulation.segments import Segment, Streams, segments, streams
-from finssim.calibration.trials.columns import NU
-from finssim.calibration.trials.trial import Array, Trial
+from finssim.calibration.trials.trial import NU, Array, Trial
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.geometry.rotations import quat_rotate, quat_to_euler
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
@@ -80,7 +80,7 @@ def replay_pairs(
     vehicle: Vehicle,
     models: Sequence[str],
     progress: Callable[[str], None] | None = None,
-) -> tuple[list[Pair], list[str]]:
+) -> tuple[list[Pair], list[Finding]]:
     """Every trial beside what each model makes of it, simulated from its start and anew after every gap.
 
     Args:
@@ -90,20 +90,20 @@ def replay_pairs(
         progress: Told the name of each model before it runs.
 
     Returns:
-        Pairs in the order of the trials, and a sentence for every trial that could not be replayed.
+        Pairs in the order of the trials, and a finding for every trial that could not be replayed.
     """
     prepared: list[Streams] = []
     cut: list[Segment] = []
-    left_out = []
+    left_out: list[Finding] = []
     for trial in trials:
         try:
             s = streams(trial, vehicle)
             parts = segments(s, vehicle, step=STEP, index=len(prepared))
         except CalibrationError as error:
-            left_out.append(str(error) if trial.name in str(error) else f"{trial.name}: {error}")
+            left_out.append(finding("unusable", trial.name, reason=error.reason))
             continue
         if not parts:
-            left_out.append(f"{trial.name}: nothing measured while the input is known")
+            left_out.append(finding("nothing_to_replay", trial.name))
             continue
         prepared.append(s)
         cut += parts
@@ -157,7 +157,7 @@ def _bare_pair(s: Streams, vehicle: Vehicle) -> Pair:
         noise=noise,
         segment=np.full(len(t), -1),
         in_sample=vehicle.fitted_on(trial.sha256),
-        notes=trial.notes,
+        findings=trial.findings,
     )
 
 
@@ -184,7 +184,7 @@ def _axes_of_passive(pair: Pair) -> Pair:
     if pair.axes:
         return pair
     moving = tuple(axis for axis in AXES if response_span(pair, pair.response(axis)).value is not None)
-    return replace(pair, axes=moving, notes=(*pair.notes, "no input: every axis that moves is compared"))
+    return replace(pair, axes=moving, findings=(*pair.findings, finding("no_input")))
 
 
 def _add(
@@ -372,8 +372,8 @@ class Replay:
     """The first is the one that single numbers are of."""
     pairs: tuple[Pair, ...]
     """Trials beside their replays."""
-    left_out: tuple[str, ...] = ()
-    """A sentence for each trial that could not be replayed."""
+    left_out: tuple[Finding, ...] = ()
+    """Of each trial that could not be replayed."""
     horizon: float | None = None
     """How far predictions from measured states looked ahead [s]; None for none."""
     ahead: dict[Axis, dict[str, Ahead]] = field(default_factory=dict)
@@ -422,7 +422,7 @@ class Replay:
 
     def as_json(self) -> dict[str, Any]:
         """What `--json` prints."""
-        from finssim.calibration.replay.as_json import replay_json
+        from finssim.calibration.replay.report import replay_json
 
         return replay_json(self)
 

@@ -3,23 +3,367 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import numpy as np
 from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from finssim.calibration.replay.as_json import DEFINITION
+from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.replay.figure import MODEL_LABELS, draw_ahead, draw_overlay, draw_response_envelopes
-from finssim.calibration.replay.gates import classify, gates
-from finssim.calibration.replay.metrics import Aggregate, phase_score
+from finssim.calibration.replay.metrics import RESAMPLES, Aggregate, Score, phase_score, response_span, score
+from finssim.calibration.replay.pairs import Pair, onset
 from finssim.calibration.replay.replay import Replay
+from finssim.calibration.trials.trial import Array
 from finssim.files import atomic_directory
-from finssim.vehicles.vehicle import AXES
+from finssim.provenance import provenance
+from finssim.vehicles.vehicle import AXES, Axis
 
-__all__ = ["REPLAY_FILE", "print_replay", "replay_markdown", "write_replay"]
+__all__ = ["DEFINITION", "REPLAY_FILE", "print_replay", "replay_json", "replay_markdown", "write_replay"]
+
+# The gates of the replay validation: does a model respond as the vehicle does, or where not.
+
+LIMITS = {
+    "input wrench": 0.05,
+    "excitation": 0.20,
+    "coast": 0.30,
+    "initial slope": 0.30,
+    "steady value": 0.20,
+    "coast t10": 0.25,
+}
+"""Gate -> largest value that passes (facts of the published replay validation)."""
+
+INITIAL = 0.5
+"""Time after the onset over which the initial slope is taken [s]."""
+LAST = 0.25
+"""Share of the excitation, at its end, over which the steady value is taken."""
+STEADY = 0.2
+"""An input is steady there if its deviation stays below this share of its mean."""
+SMOOTHING = 0.2
+"""Width of the moving average before the decay time of a coast is read [s]."""
+
+
+class Gate(NamedTuple):
+    """One check."""
+
+    value: float | None
+    limit: float
+    why: str = ""
+    """Why there is no value."""
+
+    @property
+    def passed(self) -> bool | None:
+        """None where it could not be evaluated."""
+        return None if self.value is None else self.value <= self.limit
+
+
+def gates(pair: Pair, model: str, axis: Axis) -> dict[str, Gate]:
+    """Every gate of one model on one axis of one trial.
+
+    - input wrench: P95 of the difference between the wrench simulated and logged, over the P95 of the logged one
+    - excitation, coast: NRMSE of the phase
+    - initial slope: relative difference of the slopes over the first 0.5 s after the onset
+    - steady value: relative difference of the means over the last quarter of the excitation
+    - coast t10: relative difference of the times to fall to a tenth of the speed at the start of the coast
+
+    The onset is where the input reaches a tenth of its greatest magnitude. Slope, steady value and decay are those of
+    the measurement before smoothing, which would delay them.
+
+    Args:
+        pair: Trial and replays.
+        model: Which replay.
+        axis: Which axis.
+
+    Returns:
+        Key of `LIMITS` -> gate.
+    """
+    response = pair.response(axis)
+    width = response_span(pair, response)
+    if width.value is None:
+        return {name: Gate(None, limit, width.why) for name, limit in LIMITS.items()}
+    real, simulated = pair.raw.get(response, pair.measured[response]), pair.simulated[model][response]
+    found = {
+        "input wrench": _input_difference(pair, model, axis),
+        "excitation": phase_score(pair, model, response, "excitation"),
+        "coast": phase_score(pair, model, response, "coast"),
+        "initial slope": _initial_slope(pair, axis, real, simulated),
+        "steady value": _steady_value(pair, axis, real, simulated),
+        "coast t10": _decay(pair, real, simulated),
+    }
+    return {name: Gate(s.value, LIMITS[name], s.why) for name, s in found.items()}
+
+
+def classify(results: dict[str, Gate]) -> str:
+    """`mismatch` where a gate fails, else `incomplete` where one could not be evaluated, else `consistent`."""
+    passed = [gate.passed for gate in results.values()]
+    if False in passed:
+        return "mismatch"
+    return "incomplete" if None in passed else "consistent"
+
+
+def coupling(pair: Pair, values: dict[str, Array], axis: Axis) -> dict[str, float]:
+    """Response on the other axes per response on the excited one, by root mean square over the excitation.
+
+    There is no gate on it: it shows what a model without coupling terms leaves out. Noise counts as response.
+
+    Args:
+        pair: The trial.
+        values: `pair.measured` or those of a model.
+        axis: The excited axis.
+
+    Returns:
+        Axis of the same kind (linear or angular) -> ratio [-]; only where both were measured.
+    """
+    here = pair.phase == "excitation"
+    kind = AXES[:3] if axis in AXES[:3] else AXES[3:]
+
+    def rms(other: Axis) -> float:
+        x = values.get(pair.response(other), np.empty(0))
+        x = x[here & np.isfinite(x)] if len(x) else x
+        return float(np.sqrt(np.mean(np.square(x)))) if len(x) else float("nan")
+
+    ratios = {other: rms(other) / max(rms(axis), 1e-12) for other in kind if other != axis}
+    return {other: ratio for other, ratio in ratios.items() if np.isfinite(ratio)}
+
+
+def _input_difference(pair: Pair, model: str, axis: Axis) -> Score:
+    k = AXES.index(axis)
+    logged = np.abs(pair.tau[pair.scored(), k])
+    logged = logged[np.isfinite(logged)]
+    level = float(np.percentile(logged, 95.0)) if len(logged) else 0.0
+    if not level > 0.0:
+        return Score(None, f"no input on {axis}")
+    if model not in pair.applied:
+        return Score(None, "the wrench that was simulated is not known")
+    difference = np.abs(pair.applied[model][:, k] - pair.tau[:, k])[pair.scored()]
+    difference = difference[np.isfinite(difference)]
+    if not len(difference):
+        return Score(None, "the input and the replay have no time in common")
+    return Score(float(np.percentile(difference, 95.0)) / level)
+
+
+def _initial_slope(pair: Pair, axis: Axis, real: Array, simulated: Array) -> Score:
+    start = onset(pair, axis)
+    if start is None:
+        return Score(None, f"no input on {axis}")
+    rows = slice(start, start + round(INITIAL * pair.rate) + 1)
+    both = np.isfinite(real[rows]) & np.isfinite(simulated[rows])
+    if both.sum() < 4:
+        return Score(None, f"fewer than 4 samples in the first {INITIAL:g} s after the onset")
+    t = pair.t[rows][both]
+    covered = pair.measured[pair.response(axis)][rows]
+    covered = covered[np.isfinite(covered)]
+    theirs, ours = np.polyfit(t - t[0], np.c_[real[rows][both], simulated[rows][both]], 1)[0]
+    if abs(theirs) * INITIAL < 0.5 * float(np.ptp(covered)):
+        return Score(None, f"the response turns within {INITIAL:g} s of the onset")
+    return _relative(ours, theirs, _slope_noise(t, pair.noise.get(pair.response(axis), 0.0)), "initial slope")
+
+
+def _slope_noise(t: Array, noise: float) -> float:
+    """Standard deviation of a fitted slope."""
+    return float(noise / np.sqrt(np.sum(np.square(t - t.mean()))))
+
+
+def _steady_value(pair: Pair, axis: Axis, real: Array, simulated: Array) -> Score:
+    rows = np.flatnonzero(pair.phase == "excitation")
+    rows = rows[len(rows) - int(LAST * len(rows)) :]
+    tau = pair.tau[rows, AXES.index(axis)]
+    rows, tau = rows[np.isfinite(tau)], tau[np.isfinite(tau)]
+    if len(rows) < 4:
+        return Score(None, "the excitation is too short for a steady value")
+    if np.std(tau) > STEADY * abs(float(np.mean(tau))):
+        return Score(None, "the input is not steady at the end of the excitation")
+    both = np.isfinite(real[rows]) & np.isfinite(simulated[rows])
+    if both.sum() < 4:
+        return Score(None, "fewer than 4 samples at the end of the excitation")
+    smooth = pair.measured[pair.response(axis)][rows]
+    if np.nanstd(smooth) > STEADY * abs(float(np.nanmean(smooth))):
+        return Score(None, "the response is not steady at the end of the excitation")
+    noise = pair.noise.get(pair.response(axis), 0.0) / np.sqrt(both.sum())
+    return _relative(
+        float(simulated[rows][both].mean()), float(real[rows][both].mean()), noise, "steady value"
+    )
+
+
+def _relative(ours: float, theirs: float, noise: float, what: str) -> Score:
+    if not abs(theirs) > 3.0 * (noise if np.isfinite(noise) else 0.0) or theirs == 0.0:
+        return Score(None, f"the measured {what} is zero within its noise")
+    return Score(abs(float(ours) - float(theirs)) / abs(float(theirs)))
+
+
+def _decay(pair: Pair, real: Array, simulated: Array) -> Score:
+    rows = np.flatnonzero(pair.phase == "coast")
+    before = np.flatnonzero(pair.phase == "excitation")
+    if len(rows) < 4 or not len(before) or before[-1] > rows[0]:
+        return Score(None, "no coast after the excitation")
+    first = rows[: np.argmax(np.diff(rows, append=rows[-1] + 2) > 1) + 1]
+    theirs, ours = (_fall_time(x[first], pair.rate) for x in (real, simulated))
+    if theirs == 0.0:
+        return Score(None, "the coast is no decay: the response oscillates, or there is none")
+    if theirs is None:
+        return Score(None, "the measured speed does not fall to a tenth within the coast")
+    if ours is None:
+        # It takes longer than the coast lasts: at least that much is known, and where that fails the gate, it fails.
+        least = len(first) / pair.rate / theirs - 1.0
+        if least > LIMITS["coast t10"]:
+            return Score(least)
+        return Score(None, "the simulated speed does not fall to a tenth within the coast")
+    return Score(abs(ours - theirs) / theirs)
+
+
+def _fall_time(x: Array, rate: float) -> float | None:
+    """Time until the magnitude is a tenth of what it was at first [s]; None if it never is, 0 if it comes back."""
+    width = max(1, round(SMOOTHING * rate))
+    good = np.isfinite(x)
+    if good.sum() < 4 * min(width, 2):
+        return None
+    full = np.interp(np.arange(len(x)), np.flatnonzero(good), x[good])
+    padded = np.pad(full, (width // 2, width - 1 - width // 2), mode="edge")
+    smooth = np.abs(np.convolve(padded, np.full(width, 1.0 / width), mode="valid"))
+    below = np.flatnonzero(smooth <= 0.1 * smooth[0])
+    if not len(below):
+        return None
+    return 0.0 if smooth[below[0] :].max() > 0.3 * smooth[0] else float(max(below[0], 1) / rate)
+
+
+# A replay as plain values.
+
+DEFINITION = (
+    "nrmse: RMSE / (P95 - P5 of the measured response), both over excitation and coast of a trial; phases use the "
+    "same span. Measured velocities and angles are smoothed as for a fit; nrmse_unsmoothed counts their noise too. "
+    "aggregate: median over the trials of an axis, then the mean of the axes; aggregate_mean: mean over the trials "
+    "instead. ci95: trial bootstrap. Held-out trials count where there are any; in_sample says that there are none."
+)
+
+PHASES = ("excitation", "coast")
+
+
+def replay_json(replay: Replay) -> dict[str, Any]:
+    """What `finssim replay --json` prints and `replay.json` holds.
+
+    The numbers at the top are of the first model; `models` has those of all. What could not be computed is null, and
+    `why` says why.
+    """
+    models = {model: _model(replay, model) for model in replay.models}
+    first = models[replay.models[0]]
+    return {
+        "vehicle": {"name": replay.vehicle.name, "sha256": replay.vehicle.sha256},
+        "hydrodynamics": replay.models[0],
+        **first,
+        "in_sample": replay.in_sample,
+        "in_sample_trials": [p.name for p in replay.pairs if p.in_sample],
+        "definition": DEFINITION,
+        "models": models,
+        "horizon": replay.horizon,
+        "trials": {pair.name: _trial(replay, i, pair) for i, pair in enumerate(replay.pairs)},
+        "left_out": [one.as_json() for one in replay.left_out],
+        "bootstrap": {"resamples": RESAMPLES, "seed": replay.seed, "unit": "trial"},
+        "provenance": provenance(),
+    }
+
+
+def _model(replay: Replay, model: str) -> dict[str, Any]:
+    main = replay.aggregate(model)
+    mean = replay.aggregate(model, statistic=np.nanmean)
+    axes = list(dict.fromkeys(axis for pair in replay.pairs for axis in pair.axes))
+    rows = list(zip(replay.pairs, replay.scores[model], strict=True))
+    return {
+        "nrmse": {a: {p.name: s[a].value for p, s in rows if a in s} for a in axes},
+        "nrmse_by_axis": {a: main.by_axis.get(a) for a in axes},
+        "aggregate": main.value,
+        "ci95": main.ci95,
+        "aggregate_mean": mean.value,
+        "ci95_mean": mean.ci95,
+        "why": main.why,
+        "held_out": _aggregate(replay.aggregate(model, in_sample=False)),
+        "in_sample_only": _aggregate(replay.aggregate(model, in_sample=True)),
+        "ahead": {axis: _ahead(by_model[model]) for axis, by_model in replay.ahead.items()},
+    }
+
+
+def _aggregate(a: Aggregate) -> dict[str, Any] | None:
+    if not a.trials:
+        return None
+    return {"aggregate": a.value, "ci95": a.ci95, "by_axis": a.by_axis, "trials": a.trials, "why": a.why}
+
+
+def _ahead(a: Any) -> dict[str, Any]:
+    return {
+        "seconds": a.seconds.tolist(),
+        "rmse": _plain(a.rmse),
+        "nrmse": _plain(a.nrmse),
+        "persistence_rmse": _plain(a.persistence),
+        "skill": _plain(a.skill),
+        "predictions": a.count.tolist(),
+    }
+
+
+def _plain(x: Any) -> list[float | None]:
+    return [float(v) if math.isfinite(v) else None for v in x]
+
+
+def _trial(replay: Replay, i: int, pair: Pair) -> dict[str, Any]:
+    others = [r for r in pair.measured if r not in {pair.response(a) for a in pair.axes}]
+    return {
+        "sha256": pair.sha256,
+        "in_sample": pair.in_sample,
+        "axes": list(pair.axes),
+        "rate_hz": pair.rate,
+        "duration_s": float(pair.t[-1]),
+        "source": {r: pair.source.get(r, "") for r in pair.measured},
+        "noise_std": {r: x for r, x in pair.noise.items() if r in pair.measured and math.isfinite(x)},
+        "findings": [one.as_json() for one in pair.findings],
+        "models": {
+            model: {
+                "nrmse": {a: s.value for a, s in replay.scores[model][i].items()},
+                "nrmse_unsmoothed": {
+                    a: score(pair, model, pair.response(a), raw=True).value for a in pair.axes
+                },
+                "late_s": pair.late.get(model, 0.0),
+                "why": {a: s.why for a, s in replay.scores[model][i].items() if s.why},
+                "phases": {
+                    a: {p: phase_score(pair, model, pair.response(a), p).value for p in PHASES}
+                    for a in pair.axes
+                },
+                "other_responses": _others(pair, model, others),
+                **_gates(pair, model),
+            }
+            for model in replay.models
+        },
+    }
+
+
+def _others(pair: Pair, model: str, responses: list[str]) -> dict[str, float]:
+    """NRMSE of what was measured besides the excited axes, where it is more than noise."""
+    found = {r: score(pair, model, r).value for r in responses}
+    return {r: value for r, value in found.items() if value is not None}
+
+
+def _gates(pair: Pair, model: str) -> dict[str, Any]:
+    checked = {axis: gates(pair, model, axis) for axis in pair.axes}
+    return {
+        "gates": {
+            axis: {
+                name: {"value": g.value, "limit": g.limit, "passed": g.passed, "why": g.why}
+                for name, g in found.items()
+            }
+            for axis, found in checked.items()
+        },
+        "class": {axis: classify(found) for axis, found in checked.items()},
+        "coupling": {
+            axis: {
+                "measured": coupling(pair, pair.measured, axis),
+                "simulated": coupling(pair, pair.simulated[model], axis),
+            }
+            for axis in pair.axes
+        },
+    }
+
 
 REPLAY_FILE = "replay.json"
 
@@ -138,30 +482,23 @@ def _ahead_table(replay: Replay) -> tuple[list[str], Rows]:
 
 def _remarks(replay: Replay) -> list[str]:
     """What could not be scored or replayed, what was derived, and why there is no interval; equal ones together."""
-    found: dict[str, list[str]] = {}
-    for pair, scores in zip(replay.pairs, replay.scores[replay.models[0]], strict=True):
-        said = [f"{axis}: {one.why}" for axis, one in scores.items() if one.why]
-        for axis in scores:
-            source = pair.source.get(pair.response(axis), "")
-            if source not in ("", "measured"):
-                said.append(f"{axis}: the velocity was not measured but {source}")
-        if not scores:
-            said.append("no axis is excited and measured")
-        for model, late in pair.late.items():
-            said.append(
-                f"{_label(model)}: the motion {'lags' if late > 0.0 else 'leads'} the recorded commands by "
-                f"{abs(late):.2f} s, which the comparison allows for: two clocks"
-            )
-        for sentence in said:
-            found.setdefault(sentence, []).append(pair.name)
-    out = [*replay.left_out]
+    found: list[Finding] = [*replay.left_out]
     for model in replay.models:
         why = replay.aggregate(model).why
-        out += [f"{_label(model)}: {why}"] if why else []
-    for sentence, names in found.items():
-        shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-        out.append(f"{sentence} ({shown})")
-    return out
+        found += [finding("no_interval", _label(model), reason=why)] if why else []
+    for pair, scores in zip(replay.pairs, replay.scores[replay.models[0]], strict=True):
+        for axis, one in scores.items():
+            if one.why:
+                found.append(finding("not_scored", pair.name, axis=str(axis), reason=one.why))
+            source = pair.source.get(pair.response(axis), "")
+            if source not in ("", "measured"):
+                found.append(finding("velocity_derived", pair.name, axis=str(axis), source=source))
+        if not scores:
+            found.append(finding("no_axis", pair.name))
+        for model, late in pair.late.items():
+            sense = "lags" if late > 0.0 else "leads"
+            found.append(finding("clocks_apart", pair.name, model=_label(model), sense=sense, late=abs(late)))
+    return sentences(found)
 
 
 def _label(model: str) -> str:

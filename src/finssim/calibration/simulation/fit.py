@@ -2,22 +2,814 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.calibration.degeneracy import degeneracy
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.fit import Fit
+from finssim.calibration.findings import Finding, finding
+from finssim.calibration.fit import Curve, Estimate, Fit
+from finssim.calibration.motion.signals import Motion
+from finssim.calibration.regression.axis_estimates import USEFUL, outside, trim
 from finssim.calibration.regression.selection import AKAIKE, DAMPING
-from finssim.calibration.simulation.estimates import estimates
-from finssim.calibration.simulation.excited import excited, observable, speeds, telling
-from finssim.calibration.simulation.parameters import EXTRAS
-from finssim.calibration.simulation.report import Clock
-from finssim.calibration.simulation.segments import Streams, streams
-from finssim.calibration.simulation.stages import Stages
-from finssim.calibration.trials.fittable import require_axes, require_fittable
+from finssim.calibration.simulation.bordered import CUT, huber
+from finssim.calibration.simulation.estimates import FEWEST_TRIALS, Confidence, confidence, estimates
+from finssim.calibration.simulation.gauss_newton import Point, Solution, solve
+from finssim.calibration.simulation.parameters import EXTRAS, Parameters
+from finssim.calibration.simulation.segments import Segment, Streams, segments, streams
+from finssim.calibration.simulation.shooting import Shooting
+from finssim.calibration.trials.inputs import require_axes, require_fittable
 from finssim.calibration.trials.trial import Trial
-from finssim.vehicles import AXES, HydrodynamicSet, Vehicle
+from finssim.engine.plant_arrays import twist_shift
+from finssim.vehicles import AXES, HydrodynamicSet, Vehicle, VehicleError
 
 __all__ = ["ESTIMATE", "fit_by_simulation"]
+
+Array = NDArray[np.float64]
+
+# What trials show: which axes they excite, which measurements tell of an axis, how fast the vehicle answers.
+
+TELL = {
+    "surge": ("u", "x", "y"),
+    "sway": ("v", "x", "y"),
+    "heave": ("w", "z", "depth"),
+    "roll": ("p", "roll"),
+    "pitch": ("q", "pitch"),
+    "yaw": ("r", "yaw"),
+}
+"""Measured columns that tell of an axis, the most direct first."""
+
+DRIFTING = {"x": "u", "y": "v", "yaw": "r"}
+"""Integrals without a restoring force: where the rate is measured they add drift, not knowledge."""
+
+SEEN = 0.9
+"""Part of a segment for which a velocity has to be known to be imposed."""
+
+PUSH = 0.03
+"""Range of a wrench, as part of the vehicle's limit, below which an axis is not driven."""
+
+SWING = 0.2
+"""Range of the rate of roll or pitch that tells of it though no thruster is meant for it [rad/s]."""
+
+ANSWER = (0.02, 0.02, 0.02, 0.04, 0.04, 0.04)
+"""Range of a velocity below which an axis does not answer [m/s, rad/s]."""
+
+
+def compared(segment: Segment, motion: Motion, axes: Sequence[str]) -> Segment:
+    """The segment as a fit of some axes uses it.
+
+    Axes that are not fitted move as they were seen to, where they were seen: their numbers in the vehicle file may be
+    wrong, and couplings would carry that into the others. They are not compared, nor are integrals that add drift.
+    """
+    held = np.full((segment.steps + 1, 6), np.nan)
+    t = segment.t0 + segment.step * np.arange(segment.steps + 1)
+    drop = {column for column, rate in DRIFTING.items() if rate in segment.measured}
+    inside = (motion.t >= t[0] - 0.1) & (motion.t <= t[-1] + 0.1)
+    for i, axis in enumerate(AXES):
+        good = inside & np.isfinite(motion.nu[:, i])
+        if axis not in axes and good.sum() >= max(2.0, SEEN * inside.sum()):
+            held[:, i] = np.interp(t, motion.t[good], motion.nu[good, i])
+            drop |= {TELL[axis][0]}
+    if not np.isnan(held[:, 3:5]).any():
+        drop |= {"roll", "pitch"}
+    measured = {c: pair for c, pair in segment.measured.items() if c not in drop}
+    return replace(segment, measured=measured, held=held)
+
+
+def observable(trials: Sequence[Streams]) -> tuple[str, ...]:
+    """Axes that some trial measures anything of."""
+    columns = {c for s in trials for c in s.measured}
+    return tuple(a for a in AXES if columns & set(TELL[a]))
+
+
+def excited(trials: Sequence[Streams], vehicle: Vehicle) -> tuple[str, ...]:
+    """Axes that the trials excite: those their headers name, else those that were driven, or moved while passive, and
+    answered."""
+    found = {axis for s in trials for axis in excites(s, vehicle)}
+    return tuple(a for a in AXES if a in found and a in observable(trials))
+
+
+def telling(trials: Sequence[Streams], vehicle: Vehicle, axes: Sequence[str]) -> list[Streams]:
+    """Trials that excite one of some axes; all of them where none does.
+
+    In the others the vehicle moves on axes that are not fitted, maybe not even measured, and couplings carry that over.
+    """
+    return [s for s in trials if set(excites(s, vehicle)) & set(axes)] or list(trials)
+
+
+def excites(s: Streams, vehicle: Vehicle) -> set[str]:
+    """Axes that one trial excites: those its header names, else those that were driven, or moved while passive."""
+    return set(s.trial.header.axis) or _moved(s, vehicle)
+
+
+def _moved(s: Streams, vehicle: Vehicle) -> set[str]:
+    try:
+        limits = vehicle.wrench_limits
+    except VehicleError:
+        limits = np.zeros(6)
+    tau = s.motion.tau @ np.linalg.inv(twist_shift(list(vehicle.wrench_reference)))
+    out: set[str] = set()
+    for i, axis in enumerate(AXES):
+        nu = s.motion.nu[:, i]
+        noise = s.motion.noise_std[i]
+        answers = _range(nu) > max(ANSWER[i], 4.0 * noise if np.isfinite(noise) else 0.0)
+        pushed = limits[i] > 0.0 and _range(tau[:, i]) > PUSH * limits[i]
+        # Weight rights roll and pitch again: a swing tells of them whatever began it.
+        swings = i in (3, 4) and _range(nu) > max(SWING, 10.0 * np.nan_to_num(noise))
+        if answers and (pushed or swings or s.drive.source == "passive"):
+            out.add(axis)
+    return out
+
+
+def _range(values: Array) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.ptp(np.percentile(finite, [2.0, 98.0]))) if len(finite) else 0.0
+
+
+def speeds(motions: Sequence[Motion], axis: str) -> tuple[float, float]:
+    """Range of speeds at which an axis was seen moving, from the 20th to the 99th percentile [m/s or rad/s]."""
+    i = AXES.index(axis)
+    values = np.concatenate([np.abs(m.nu[:, i]) for m in motions] or [np.empty(0)])
+    values = values[np.isfinite(values)]
+    moving = values[values > max(0.02 * values.max(initial=0.0), 1e-9)]
+    return (
+        (float(np.percentile(moving, 20.0)), float(np.percentile(moving, 99.0)))
+        if len(moving)
+        else (0.0, 0.0)
+    )
+
+
+def horizon(
+    vehicle: Vehicle, trials: Sequence[Streams], axes: Sequence[str], hydrodynamics: str = "calibrated"
+) -> float:
+    """Length of segments that shows steady motion and yet forgets what no model knows [s]: five of the slowest time
+    constant, at least forty samples, between 5 and 12 s."""
+    chosen = vehicle.hydrodynamic_set(hydrodynamics)
+    M = np.diag(vehicle.mass_matrix(hydrodynamics))
+    slowest = 0.5
+    if isinstance(chosen, HydrodynamicSet):
+        for axis in axes:
+            i = AXES.index(axis)
+            top = speeds([s.motion for s in trials], axis)[1]
+            drag = chosen.linear_damping[i, i] + chosen.quadratic_damping[i, i] * top
+            slowest = max(slowest, float(M[i] / drag) if drag > 0.0 else 3.0)
+    return float(np.clip(max(5.0 * slowest, 40.0 * sampling(trials)), 5.0, 12.0))
+
+
+def sampling(trials: Sequence[Streams]) -> float:
+    """Usual time between the samples of a channel [s]."""
+    steps = [float(np.median(np.diff(t))) for s in trials for t, _ in s.measured.values() if len(t) > 2]
+    return float(np.median(steps or [0.02]))
+
+
+# What a simulation-error fit shows besides its estimates: figures by axis, curves, findings.
+
+LATE = 0.03
+"""Lag of a stream worth a warning [s]."""
+
+SHOWN = 4
+"""Trials in the curve of an axis."""
+
+DECADE = 10.0
+
+
+def _column(problem: Shooting, axis: str) -> int | None:
+    """The most direct channel in use that tells of an axis."""
+    names = problem.measured.names
+    return next((names.index(c) for c in TELL[axis] if c in names), None)
+
+
+def quality(
+    problem: Shooting, solution: Solution, axes: Sequence[str], used: Sequence[Streams]
+) -> dict[str, dict[str, float]]:
+    """Figures of each axis over the trials that move it: the simulated against the measured channel."""
+    m, out = problem.measured, {}
+    trial = problem.groups[m.segment]
+    for axis in axes:
+        column = _column(problem, axis)
+        if column is None:
+            continue
+        rows = np.flatnonzero(m.channel == column)
+        spread = {
+            g: float(np.ptp(np.percentile(m.value[rows][trial[rows] == g], [5.0, 95.0])))
+            for g in np.unique(trial[rows])
+        }
+        moving = [g for g, s in spread.items() if s > 0.2 * max(spread.values())]
+        rows = rows[np.isin(trial[rows], moving)]
+        residual, value = solution.linear.residual[rows], m.value[rows]
+        nrmse = [
+            float(np.sqrt(np.mean(residual[trial[rows] == g] ** 2))) / max(spread[g], 1e-12) for g in moving
+        ]
+        low, high = speeds([s.motion for s in used], axis)
+        out[axis] = {
+            "r2": 1.0 - float(np.mean(residual**2)) / max(float(np.var(value)), 1e-300),
+            "rmse": float(np.sqrt(np.mean(residual**2))),
+            "nrmse": float(np.mean(nrmse)),
+            "samples": float(len(rows)),
+            "rejected": float(np.sum(np.abs(residual) > 2.0 * CUT * solution.std[rows])),
+            "trials": float(len(moving)),
+            "speed_low": low,
+            "speed_high": high,
+            "noise": float(np.median(solution.std[rows])),
+        }
+    return out
+
+
+def pictures(problem: Shooting, solution: Solution, axes: Sequence[str]) -> tuple[Curve, ...]:
+    """Measured and simulated channel of each axis, over the trials that move it most."""
+    m, out = problem.measured, []
+    trial = problem.groups[m.segment]
+    clock = m.time + np.array([s.t0 for s in problem.segments])[m.segment]
+    for axis in axes:
+        column = _column(problem, axis)
+        if column is None:
+            continue
+        rows = np.flatnonzero(m.channel == column)
+        present = np.unique(trial[rows])
+        spread = [float(np.ptp(np.percentile(m.value[rows][trial[rows] == g], [5.0, 95.0]))) for g in present]
+        x, y, p, offset = [], [], [], 0.0
+        for g in np.sort(present[np.argsort(spread)[::-1][:SHOWN]]):
+            those = rows[trial[rows] == g]
+            those = those[np.argsort(clock[those], kind="stable")]
+            t = clock[those] - clock[those[0]] + offset
+            x += [t, [np.nan]]
+            y += [m.value[those], [np.nan]]
+            p += [m.value[those] - solution.linear.residual[those], [np.nan]]
+            offset = float(t[-1]) + 1.0
+        name = m.names[column]
+        out.append(
+            Curve(
+                title=f"{axis}: {name}, simulated from the inputs alone",
+                x_label="time, trial after trial [s]",
+                y_label=f"{name} [{_unit(name)}]",
+                x=np.concatenate(x),
+                measured=np.concatenate(y),
+                fitted=np.concatenate(p),
+            )
+        )
+    return tuple(out)
+
+
+def _unit(name: str) -> str:
+    if name in ("u", "v", "w"):
+        return "m/s"
+    return "rad/s" if name in ("p", "q", "r") else "rad" if name in ("roll", "pitch", "yaw") else "m"
+
+
+def fit_findings(
+    problem: Shooting,
+    solution: Solution,
+    found: Confidence,
+    estimates: dict[str, Estimate],
+    used: Sequence[Streams],
+) -> list[Finding]:
+    """What a reader should know before using the numbers."""
+    out = []
+    if solution.interrupted:
+        out.append(finding("interrupted"))
+    elif not solution.converged:
+        out.append(finding("not_converged", iterations=solution.iterations))
+    p = problem.parameters
+    for axis, i in zip(p.axes, p.index, strict=True):
+        if f"{axis}.m_eff" not in estimates:
+            continue
+        whole, added = estimates[f"{axis}.m_eff"], estimates[f"{axis}.added_mass"]
+        if added.estimate <= 0.0:
+            fields = {"effective": whole.estimate, "rigid": p.M_RB[i, i], "unit": whole.unit}
+            out.append(finding("inertia_too_small", axis, **fields))
+        low, high = speeds([s.motion for s in used], axis)
+        if 0.0 < low and high < DECADE * low:
+            unit = "m/s" if i < 3 else "rad/s"
+            out.append(finding("few_speeds", axis, low=low, high=high, unit=unit))
+    P = len(p.names)
+    for stream, late, (low, high) in zip(
+        problem.errors.streams, solution.point.theta[P:], found.interval[P:], strict=True
+    ):
+        if abs(late) > LATE and (low > 0.0 or high < 0.0):
+            sense = "lags" if late > 0.0 else "leads"
+            out.append(finding("motion_late", stream, sense=sense, lag=abs(late), low=low, high=high))
+    if found.evidence.unit == "blocks":
+        out.append(finding("block_intervals", trials=len(used)))
+    return out
+
+
+class Clock:
+    """Tells progress over several stages: iteration, cost, rate and what may remain."""
+
+    def __init__(self, progress: Callable[[float, str], None] | None) -> None:
+        self.progress, self.begin, self.part, self.worlds = progress, time.perf_counter(), 0.0, 0
+
+    def __call__(self, words: str, toward: float = 1.0) -> None:
+        # How many iterations remain nobody knows; each takes a share of the rest.
+        self.part += 0.2 * max(toward - self.part, 0.0)
+        spent = time.perf_counter() - self.begin
+        if self.progress:
+            self.progress(self.part, f"{words}, {spent:.0f} s")
+
+
+# The stages of a simulation-error fit: short segments first, then longer ones, then other choices of parameters.
+
+# A rough start where no regression gives one: an evolution strategy whose population are parallel worlds.
+
+FINE = 0.02
+"""Part of a coordinate's size around its bound where steps are linear; beyond, they are logarithmic."""
+
+
+def evolve(
+    cost: Callable[[Array], Array],
+    start: Array,
+    *,
+    sigma: float,
+    population: int,
+    generations: int,
+    seed: int,
+    tolerance: float = 1e-3,
+) -> tuple[Array, float]:
+    """Minimise by covariance matrix adaptation                                         (Hansen 2016, CMA-ES tutorial).
+
+    Args:
+        cost: Of many points at once, (n, P) -> (n,); infinite where a point has none.
+        start: First mean, (P,).
+        sigma: First standard deviation.
+        population: Points in a generation.
+        generations: At most.
+        seed: Of the draws.
+        tolerance: Standard deviation below which it stops.
+
+    Returns:
+        The best point seen, and its cost.
+    """
+    rng, n = np.random.default_rng(seed), len(start)
+    mu = population // 2
+    weights = np.log(mu + 0.5) - np.log(np.arange(1, mu + 1))
+    weights /= weights.sum()
+    mass = 1.0 / float(np.square(weights).sum())
+    c_path = (mass + 2.0) / (n + mass + 5.0)
+    damping = 1.0 + 2.0 * max(0.0, np.sqrt((mass - 1.0) / (n + 1.0)) - 1.0) + c_path
+    c_cum = (4.0 + mass / n) / (n + 4.0 + 2.0 * mass / n)
+    c_one = 2.0 / ((n + 1.3) ** 2 + mass)
+    c_mu = min(1.0 - c_one, 2.0 * (mass - 2.0 + 1.0 / mass) / ((n + 2.0) ** 2 + mass))
+    expected = np.sqrt(n) * (1.0 - 1.0 / (4.0 * n) + 1.0 / (21.0 * n * n))
+
+    mean, C, path_s, path_c = np.array(start, float), np.eye(n), np.zeros(n), np.zeros(n)
+    best, lowest = mean.copy(), float(cost(mean[None])[0])
+    for generation in range(generations):
+        values, vectors = np.linalg.eigh(C)
+        root = np.sqrt(np.maximum(values, 1e-20))
+        steps = (rng.standard_normal((population, n)) * root) @ vectors.T
+        costs = cost(mean + sigma * steps)
+        order = np.argsort(costs)
+        if costs[order[0]] < lowest:
+            best, lowest = mean + sigma * steps[order[0]], float(costs[order[0]])
+        chosen = steps[order[:mu]]
+        shift = weights @ chosen
+        mean = mean + sigma * shift
+        path_s = (1.0 - c_path) * path_s
+        path_s += np.sqrt(c_path * (2.0 - c_path) * mass) * (vectors @ ((vectors.T @ shift) / root))
+        length = float(np.linalg.norm(path_s))
+        steady = (
+            length / np.sqrt(1.0 - (1.0 - c_path) ** (2 * generation + 2))
+            < (1.4 + 2.0 / (n + 1.0)) * expected
+        )
+        path_c = (1.0 - c_cum) * path_c
+        if steady:
+            path_c += np.sqrt(c_cum * (2.0 - c_cum) * mass) * shift
+        C = (1.0 - c_one - c_mu) * C + c_one * np.outer(path_c, path_c) + c_mu * (chosen.T * weights) @ chosen
+        C = 0.5 * (C + C.T)
+        sigma *= float(np.exp(c_path / damping * (length / expected - 1.0)))
+        if sigma * root.max() < tolerance:
+            break
+    return best, lowest
+
+
+def coarse_search(
+    cost: Callable[[Array], Array],
+    start: Array,
+    low: Array,
+    high: Array,
+    scale: Array,
+    *,
+    population: int = 48,
+    generations: int = 25,
+    seed: int = 0,
+) -> tuple[Array, float]:
+    """Search a box over orders of magnitude.
+
+    A coordinate with a lower bound is searched in y = log(1 + (x - low) / (FINE scale)), the others in x / scale.
+
+    Args:
+        cost: Of many points at once, (n, P) -> (n,).
+        start: Where to begin, (P,).
+        low: Lower bounds, -inf where none, (P,).
+        high: Upper bounds, (P,).
+        scale: Sizes of the coordinates, (P,).
+        population: Points in a generation.
+        generations: At most.
+        seed: Of the draws.
+
+    Returns:
+        The best point seen, and its cost.
+    """
+    bounded = np.isfinite(low)
+    unit = FINE * scale
+    base = np.where(bounded, low, 0.0)
+
+    def inside(y: Array) -> Array:
+        grown = base + unit * np.expm1(np.clip(y, -50.0, 50.0))
+        return np.clip(np.where(bounded, grown, y * scale), low, high)
+
+    y = np.where(bounded, np.log1p(np.maximum(start - base, 0.0) / unit), start / scale)
+    best, lowest = evolve(
+        lambda points: cost(inside(points)),
+        y,
+        sigma=0.7,
+        population=population,
+        generations=generations,
+        seed=seed,
+        tolerance=0.03,
+    )
+    return inside(best), lowest
+
+
+# From a simulation-error fit to changes of the vehicle file: only what the trials determine.
+
+
+def changes(
+    p: Parameters,
+    x: Array,
+    found: dict[str, Estimate],
+    evidence: Confidence,
+    axes: Sequence[str],
+    speed: dict[str, float],
+    scaled: bool,
+) -> dict[str, Any]:
+    """Changes of the vehicle file; an axis' damping changes as a pair, where its force at top speed is known.
+
+    Args:
+        p: What was free.
+        x: Where it ended, (P,).
+        found: Its estimates.
+        evidence: For the error of the damping force.
+        axes: Which to write.
+        speed: Highest speed of each axis [m/s or rad/s].
+        scaled: Whether a thrust scale belongs to the thrusters' curves.
+    """
+    out: dict[str, Any] = {}
+    base = f"hydrodynamics.{p.hydrodynamics}"
+    new = dict(
+        zip(("added_mass", "linear_damping", "quadratic_damping"), (m[0] for m in p.matrices(x)), strict=True)
+    )
+    chosen = p.set
+    written: dict[str, list[int]] = {"added_mass": [], "linear_damping": [], "quadratic_damping": []}
+    for axis in axes:
+        i = AXES.index(axis)
+        whole = found[f"{axis}.m_eff"]
+        half = 0.5 * (whole.ci95[1] - whole.ci95[0])
+        added = found[f"{axis}.added_mass"]
+        before = float(np.asarray(chosen.added_mass, float)[i, i])
+        if added.estimate > 0.0 and (half <= USEFUL * whole.estimate or outside(before, added.ci95)):
+            written["added_mass"].append(i)
+        if _force_known(p, x, evidence, axis, speed.get(axis, 0.0)):
+            written["linear_damping"].append(i)
+            written["quadratic_damping"].append(i)
+    # The numbers of axes that nobody measured, but that were simulated: the others hold with these.
+    for axis in p.unseen:
+        for rows in written.values():
+            rows.append(AXES.index(axis))
+    for family, rows in written.items():
+        old = np.asarray(getattr(chosen, family), float)
+        for i in rows:
+            for j in range(6):
+                # Couplings are written where both axes are, and where the fit did away with them.
+                if i == j or (new[family][i, j] != old[i, j] and (j in rows or new[family][i, j] == 0.0)):
+                    out[f"{base}.{family}.{i}.{j}"] = float(new[family][i, j])
+    water, body = p.vehicle.water, p.vehicle.body
+    volume = float(body.displaced_volume)
+    excess = found.get("buoyancy_excess")
+    if excess is not None and excess.identifiable:
+        volume = (p.vehicle.weight + excess.estimate) / (water.density * water.gravity)
+        out["body.displaced_volume"] = volume
+    stiff = [found[n] for n in ("roll.k", "pitch.k") if n in found]
+    before = p.expected[p.names.index("k")] if "k" in p.names else 0.0
+    stiff = [e for e in stiff if e.identifiable or (e.estimate > 0.0 and outside(before, e.ci95))]
+    if stiff:
+        out["body.center_of_buoyancy.2"] = float(p.buoyancy_height(stiff[0].estimate, volume))
+    out |= trim(found, water.density * water.gravity * volume, body.center_of_buoyancy)
+    for name, path in (("thrust_lag", "time_constant"), ("thrust_delay", "delay")):
+        if name in found and found[name].identifiable:
+            out[f"thrusters.*.{path}"] = max(found[name].estimate, 1e-4 if path == "time_constant" else 0.0)
+    for path in p.terms:
+        if found[path].identifiable:
+            out[f"{base}.{path}"] = found[path].estimate
+    if "thrust_scale" in found and found["thrust_scale"].identifiable and scaled:
+        scale = found["thrust_scale"].estimate
+        for name, thruster in p.vehicle.thrusters.items():
+            for key in ("c_plus", "c_minus", "force_min", "force_max"):
+                out[f"thrusters.{name}.{key}"] = scale * float(getattr(thruster, key))
+    return out
+
+
+def _force_known(p: Parameters, x: Array, found: Confidence, axis: str, speed: float) -> bool:
+    """Whether the damping force of an axis at a speed is known to `USEFUL`, or excludes that of the vehicle file."""
+    i = AXES.index(axis)
+    unit = 1e-5 * np.maximum(np.abs(x), p.scale)
+    points = np.concatenate([x[None], np.clip(x + np.diag(unit), p.low, p.high)])
+    _, D1, D2 = p.matrices(points)
+    force = D1[:, i, i] * speed + D2[:, i, i] * speed**2
+    slope = (force[1:] - force[0]) / unit
+    before = float(p.set.linear_damping[i][i] * speed + p.set.quadratic_damping[i][i] * speed**2)
+    used = np.flatnonzero(slope)
+    V = found.covariance.trials[np.ix_(used, used)]
+    if found.covariance.alone[used].any():
+        V = found.covariance.local[np.ix_(used, used)]
+    if not np.isfinite(V).all():
+        return False
+    std = float(np.sqrt(max(slope[used] @ V @ slope[used], 0.0)))
+    close, excluded = 2.0 * std < USEFUL * force[0], abs(before - force[0]) > 2.0 * std
+    return bool(force[0] > 0.0 and (close or excluded))
+
+
+STEP = 0.02
+"""Of the simulation [s]."""
+
+SHORT = 2.5
+"""Of the segments at first [s]: over so short a time every problem is nearly linear."""
+
+OWN_ERROR, BETWEEN = 0.003, 0.05
+"""Error of the simulation itself, as a part of an estimate; and how it grows with the time between samples of the
+inputs [1/s], for nobody recorded what happened in between."""
+
+GROWTH = 12.0
+"""Growth of a disturbance of the initial velocity over a segment above which its trial is cut into shorter ones.
+
+A fast vehicle without fins turns broadside by itself, and derivatives over a long run of that mean little."""
+
+HALVINGS = 2
+
+ROUGH = 3.0
+"""Residual, against a twentieth of the range, from which a coarse search comes first."""
+
+COARSE_SEGMENTS = 24
+
+
+@dataclass
+class Stage:
+    """One fit of one set of parameters."""
+
+    problem: Shooting
+    solution: Solution
+    found: Confidence
+
+    @property
+    def x(self) -> Array:
+        """Where the parameters ended, (P,)."""
+        return self.solution.point.theta[: len(self.problem.parameters.names)]
+
+
+class Stages:
+    """The stages of one fit: they share trials and segments."""
+
+    def __init__(
+        self,
+        prepared: Sequence[Streams],
+        vehicle: Vehicle,
+        axes: tuple[str, ...],
+        estimate: tuple[str, ...],
+        length: float | None,
+        start: Fit | None,
+        seed: int,
+        say: Clock,
+    ) -> None:
+        self.prepared, self.vehicle, self.axes, self.seed, self.say = prepared, vehicle, axes, seed, say
+        self.base = vehicle.replace(start.changes) if start is not None and start.changes else vehicle
+        self.given = length
+        self.excites = [excites(s, vehicle) for s in prepared]
+        # The added mass of axes that are not fitted pushes and turns the others; roll's and pitch's hardly does.
+        self.imposed = tuple(a for a in ("surge", "sway", "heave", "yaw") if a not in axes)
+        measured = observable(prepared)
+        self.unseen = tuple(a for a in self.imposed if a not in measured)
+        apart = [float(np.median(np.diff(s.drive.t))) for s in prepared if not s.drive.held]
+        self.own_error = OWN_ERROR + BETWEEN * max([0.0, *(dt - STEP for dt in apart)])
+        self.shorter: dict[str, float] = {}
+        self.used: list[Streams] = []
+        self.segments: list[Segment] = []
+        self.extras = {word for word in estimate if word not in ("bias", "trial_bias")}
+        if "heave" in axes:
+            self.extras.add("buoyancy_excess")
+        if {"roll", "pitch"} & set(axes):
+            self.extras.add("k")
+        biased = [a for a in axes if a != "heave"]
+        self.trial_biases = biased if "trial_bias" in estimate else []
+        self.biases = [] if self.trial_biases else biased
+        self.guess = {} if start is None else {name: e.estimate for name, e in start.estimates.items()}
+
+    def first(self, kinds: dict[str, str]) -> Stage:
+        """Short segments from a rough start, then segments of the length that the answer calls for."""
+        short = max(SHORT, 15.0 * sampling(self.prepared))
+        self.cut(min(short, self.given or short))
+        problem = self.problem(kinds, self.base, self.guess)
+        point = self._rough(problem, problem.start())
+        problem.hold_clocks(True)
+        rough = solve(
+            problem, point, iterations=12, std=problem.size(), rough=True, report=self.report("start", 0.3)
+        )
+        if not np.isfinite(rough.cost):
+            raise CalibrationError(
+                "the simulation diverges with the vehicle file's numbers: give better ones, or shorter segments "
+                f"(now {self.length:.3g} s)"
+            )
+        p, x = problem.parameters, rough.point.theta[: len(problem.parameters.names)]
+        if rough.interrupted:
+            problem.hold_clocks(False)
+            return Stage(problem, rough, confidence(problem, rough))
+        self.cut(self.given or horizon(self.base.replace(_matrices(p, x)), self.prepared, self.axes))
+        problem = self.problem(kinds, self.base, dict(zip(p.names, x, strict=True)))
+        for _ in range(0 if self.given else HALVINGS):
+            growth = problem.growth(problem.start())
+            wild = {self.used[g].trial.name for g in np.unique(problem.groups[growth > GROWTH])}
+            if not wild:
+                break
+            for name in wild:
+                self.shorter[name] = 0.5 * self.shorter.get(name, 1.0)
+            self.cut(self.length)
+            problem = self.problem(kinds, self.base, dict(zip(p.names, x, strict=True)))
+        return self.finish(problem, problem.start(), 0.6)
+
+    def next(self, kinds: dict[str, str], before: Stage, full: bool = False) -> Stage:
+        """Another set of parameters, from where a fit ended."""
+        old, x = before.problem.parameters, before.x
+        base = self.base.replace(_matrices(old, x)) if full else self.base
+        problem = self.problem(kinds, base, dict(zip(old.names, x, strict=True)), full)
+        point = problem.start()
+        late = len(problem.errors.streams)
+        theta = np.concatenate([point.theta[:-late], before.solution.point.theta[-late:]])
+        point = Point(theta, before.solution.point.phi, before.solution.point.z)
+        return self.finish(problem, point, 0.95, before.solution.std)
+
+    def finish(self, problem: Shooting, point: Point, toward: float, std: Array | None = None) -> Stage:
+        """Fit with robust weights and clocks let go, after a first approach without."""
+        words = "couplings" if problem.parameters.coupled else "fit"
+        if std is None:
+            problem.hold_clocks(True)
+            rough = solve(
+                problem,
+                point,
+                iterations=6,
+                std=problem.size(),
+                rough=True,
+                report=self.report(words, toward),
+            )
+            problem.hold_clocks(False)
+            point = rough.point
+            if rough.interrupted:
+                return Stage(problem, rough, confidence(problem, rough))
+        solution = solve(problem, point, std=std, report=self.report(words, toward))
+        return Stage(problem, solution, confidence(problem, solution))
+
+    def report(self, words: str, toward: float) -> Callable[[int, float], None]:
+        return lambda i, rms: self.say(f"{words}: iteration {i}, residual {rms:.4g} σ", toward)
+
+    def cut(self, length: float) -> None:
+        """Cut the trials into segments of about a length [s]."""
+        tells = {column for axis in self.axes for column in TELL[axis]}
+        cut = [
+            [
+                compared(s, one.motion, self.axes)
+                for s in segments(one, self.vehicle, length=length * self._part(one), step=STEP)
+            ]
+            for one in self.prepared
+        ]
+        kept = [[s for s in stretch if tells & set(s.measured)] for stretch in cut]
+        self.length = length
+        self.used = [one for one, stretch in zip(self.prepared, kept, strict=True) if stretch]
+        self.segments = [replace(s, index=g) for g, stretch in enumerate(filter(None, kept)) for s in stretch]
+        if not self.segments:
+            raise CalibrationError(
+                f"no stretch of these trials has both inputs and measurements that tell of {', '.join(self.axes)}"
+            )
+        commanded = np.array([s.commanded for s in self.segments])
+        # Where every input is said to have acted, whoever asks for a lag doubts that.
+        self.lagged = commanded if commanded.any() else np.ones_like(commanded)
+
+    def _part(self, one: Streams) -> float:
+        return self.shorter.get(one.trial.name, 1.0)
+
+    def problem(
+        self, kinds: dict[str, str], base: Vehicle, start: dict[str, float], full: bool = False
+    ) -> Shooting:
+        """What is free, over the segments."""
+        parameters = Parameters(
+            base,
+            axes=self.axes,
+            damping=kinds,
+            full=full,
+            extras=tuple(self.extras),
+            biases=self.biases,
+            start=start,
+            imposed=() if full else self.imposed,
+            unseen=() if full else self.unseen,
+        )
+        return Shooting(
+            self.segments,
+            parameters,
+            sorted({c for s in self.segments for c in s.measured}),
+            trial_biases=self.trial_biases,
+            lagged=self.lagged,
+            few=min(sum(axis in one for one in self.excites) for axis in self.axes) < FEWEST_TRIALS,
+        )
+
+    def _rough(self, problem: Shooting, point: Point) -> Point:
+        """The start, or a better one from a coarse search over some of the segments."""
+        every = max(1, len(self.segments) // COARSE_SEGMENTS)
+        few = Shooting(
+            self.segments[::every], problem.parameters, problem.measured.names, lagged=self.lagged[::every]
+        )
+        size, own = few.size(), few.start()
+        P, late = len(problem.parameters.names), len(few.errors.streams)
+
+        def cost(x: Array) -> Array:
+            theta = np.concatenate([x, np.zeros((len(x), late))], axis=1)
+            parts = (np.repeat(part[None], len(x), axis=0) for part in (own.phi, own.z))
+            loss = huber(few.residuals(Point(theta, *parts)) / size[:, None])[0].mean(axis=0)
+            return np.asarray(np.where(np.isfinite(loss), loss, np.inf))
+
+        first = float(cost(point.theta[None, :P])[0])
+        if first < 0.5 * ROUGH**2:
+            return point
+        self.say("coarse search", 0.2)
+        p = problem.parameters
+        best, lowest = coarse_search(cost, point.theta[:P], p.low, p.high, p.scale, seed=self.seed)
+        if not lowest < first:
+            return point
+        return Point(np.concatenate([best, point.theta[P:]]), point.phi, point.z)
+
+    def result(
+        self,
+        stage: Stage,
+        wider: dict[str, tuple[float, float]],
+        dropped: dict[str, str],
+        remarks: list[Finding],
+        *,
+        full: bool,
+        damping: str,
+    ) -> Fit:
+        """The finished fit."""
+        p, x = stage.problem.parameters, stage.x
+        found, _, bounds = estimates(
+            p, x, stage.found, axes=self.axes, own_error=self.own_error, wider=wider, dropped=dropped
+        )
+        top = {axis: speeds([s.motion for s in self.used], axis)[1] for axis in self.axes}
+        sources = {s.drive.source for s in self.used}
+        new = changes(p, x, found, stage.found, self.axes, top, scaled=sources <= {"rpm", "pwm"})
+        P, local = stage.problem.judged, stage.found.covariance.local
+        correlation, traded = degeneracy(p.names[:P], local[:P, :P], stage.found.free[:P])
+        left_out = [one.trial.name for one in self.prepared if one not in self.used]
+        remarks = [
+            *remarks,
+            *(finding("trial_left_out", name) for name in left_out),
+            *fit_findings(stage.problem, stage.solution, stage.found, found, self.used),
+            *bounds,
+            *traded,
+        ]
+        settings: dict[str, Any] = {
+            "axes": list(self.axes),
+            "damping": damping,
+            "full": full,
+            "estimate": sorted(self.extras) + (["trial_bias"] if self.trial_biases else []),
+            "horizon": round(self.length, 3),
+            "step": STEP,
+            "segments": len(self.segments),
+            "iterations": stage.solution.iterations,
+            "seed": self.seed,
+        }
+        self.say("done")
+        return Fit(
+            kind="hydrodynamics",
+            method="simulation",
+            vehicle=self.vehicle,
+            estimates=found,
+            changes=new,
+            quality=quality(stage.problem, stage.solution, self.axes, self.used),
+            correlation=correlation,
+            findings=tuple(dict.fromkeys(remarks)),
+            curves=pictures(stage.problem, stage.solution, self.axes),
+            trials={one.trial.name: one.trial.sha256 for one in self.used},
+            settings=settings,
+            interrupted=stage.solution.interrupted,
+        )
+
+
+def _matrices(p: Parameters, x: Array) -> dict[str, Any]:
+    """Changes of the vehicle file to the matrices of a vector."""
+    base = f"hydrodynamics.{p.hydrodynamics}"
+    names = ("added_mass", "linear_damping", "quadratic_damping")
+    return {f"{base}.{name}": m[0] for name, m in zip(names, p.matrices(x), strict=True)}
+
 
 Progress = Callable[[float, str], None]
 
@@ -65,7 +857,7 @@ def fit_by_simulation(
     """
     _check(trials, vehicle, axes, damping, estimate)
     prepared = [streams(trial, vehicle) for trial in trials]
-    chosen, warnings = _axes(prepared, vehicle, axes)
+    chosen, remarks = _axes(prepared, vehicle, axes)
     say = Clock(progress)
     fit = Stages(
         telling(prepared, vehicle, chosen), vehicle, chosen, tuple(estimate), horizon, start, seed, say
@@ -75,7 +867,7 @@ def fit_by_simulation(
     wider: dict[str, tuple[float, float]] = {}
     dropped: dict[str, str] = {}
     if damping == "auto" and not stage.solution.interrupted:
-        first, p_value = estimates(
+        first, p_value, _ = estimates(
             stage.problem.parameters, stage.x, stage.found, axes=chosen, own_error=fit.own_error
         )
         kinds, dropped = _select(kinds, p_value, prepared)
@@ -84,7 +876,7 @@ def fit_by_simulation(
             stage = fit.next(kinds, stage)
     if full and len(chosen) > 1 and not stage.solution.interrupted:
         stage = fit.next(kinds, stage, full=True)
-    return fit.result(stage, wider, dropped, warnings, full=full, damping=damping)
+    return fit.result(stage, wider, dropped, remarks, full=full, damping=damping)
 
 
 def _check(
@@ -110,7 +902,7 @@ def _check(
 
 def _axes(
     prepared: Sequence[Streams], vehicle: Vehicle, axes: Sequence[str] | None
-) -> tuple[tuple[str, ...], list[str]]:
+) -> tuple[tuple[str, ...], list[Finding]]:
     """Axes to fit, and why some that were asked for are not."""
     moved, seen = excited(prepared, vehicle), observable(prepared)
     if axes is None:
@@ -119,18 +911,12 @@ def _axes(
                 f"no trial excites an axis of {vehicle.name}: name the axes, or give trials with larger inputs"
             )
         return moved, []
-    warnings = [
-        f"{axis}: nothing was measured that tells of it; left out" for axis in axes if axis not in seen
-    ]
-    warnings += [
-        f"{axis}: no trial excites it; expect little of its numbers"
-        for axis in axes
-        if axis in seen and axis not in moved
-    ]
+    remarks = [finding("axis_untold", axis) for axis in axes if axis not in seen]
+    remarks += [finding("axis_doubtful", axis) for axis in axes if axis in seen and axis not in moved]
     chosen = tuple(a for a in AXES if a in axes and a in seen)
     if not chosen:
         raise CalibrationError(f"nothing that tells of {', '.join(axes)} was measured in these trials")
-    return chosen, warnings
+    return chosen, remarks
 
 
 def _select(

@@ -145,7 +145,7 @@ def segments(
     """
     if not step > 0.0 or (length is not None and not length > 0.0):
         raise CalibrationError(
-            f"{_name(trial)}: segments of {length} s in steps of {step} s, expected times above 0 s"
+            f"segments of {length} s in steps of {step} s, expected times above 0 s", _name(trial)
         )
     s = trial if isinstance(trial, Streams) else streams(trial, vehicle)
     out = []

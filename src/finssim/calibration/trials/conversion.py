@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.trials.columns import COLUMNS, INPUT_PREFIXES, column_of
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.trials.header import Conversion
 from finssim.calibration.trials.time_base import merged
+from finssim.calibration.trials.trial import COLUMNS, INPUT_PREFIXES, column_of
 from finssim.geometry.frames import FROM_FOSSEN
 from finssim.geometry.rotations import (
     matrix_to_quat,
@@ -48,18 +49,20 @@ def new_names(columns: Iterable[str], convert: Conversion) -> dict[str, str]:
     for old, new in convert.rename.items():
         if old not in columns:
             raise CalibrationError(
-                f"convert.rename: the log has no column '{old}'{did_you_mean(old, columns)} it has {_some(columns)}"
+                f"the log has no column '{old}'{did_you_mean(old, columns)} it has {_some(columns)}",
+                "convert.rename",
             )
         if new not in ("t", "phase") and column_of(new) is None:
             raise CalibrationError(
-                f"convert.rename: '{new}' is not a column of a trial{did_you_mean(new, ['t', 'phase', *COLUMNS])} "
-                f"columns are t, phase, {', '.join(COLUMNS)} and {', '.join(f'{p}NAME' for p in INPUT_PREFIXES)}"
+                f"'{new}' is not a column of a trial{did_you_mean(new, ['t', 'phase', *COLUMNS])} "
+                f"columns are t, phase, {', '.join(COLUMNS)} and {', '.join(f'{p}NAME' for p in INPUT_PREFIXES)}",
+                "convert.rename",
             )
     names = {name: convert.rename.get(name, name) for name in columns}
     for new in convert.rename.values():
         twice = [old for old, name in names.items() if name == new]
         if len(twice) > 1:
-            raise CalibrationError(f"convert.rename: columns {_some(twice)} would all be '{new}'")
+            raise CalibrationError(f"columns {_some(twice)} would all be '{new}'", "convert.rename")
     return names
 
 
@@ -123,23 +126,18 @@ def _attitude_of_one_side(channels: Channels, body: bool) -> Channels:
     return result
 
 
-def tidy_quaternions(channels: Channels) -> list[str]:
-    """Give quaternions unit length and a continuous sign, in place; notes on what could not be used."""
+def tidy_quaternions(channels: Channels) -> list[Finding]:
+    """Give quaternions unit length and a continuous sign, in place; findings on what could not be used."""
     given = [name for name in QUATERNION if name in channels]
     if not given:
         return []
     if len(given) < 4:
         for name in given:
             del channels[name]
-        return [f"columns {_some(given)} were left out: an attitude needs qx, qy, qz and qw"]
+        return [finding("quaternion_incomplete", columns=tuple(given))]
     q = np.stack([channels[name] for name in QUATERNION], axis=-1)
     length = np.linalg.norm(q, axis=-1)
-    notes = []
     useless = np.isfinite(length) & (length < 0.5)
-    if useless.any():
-        notes.append(
-            f"{useless.sum()} quaternions have a length below 0.5 (0 means no fix) and count as empty"
-        )
     bad = ~np.isfinite(length) | useless
     q[bad] = np.nan
     stretched = ~bad & (np.abs(length - 1.0) > LENGTH_TOLERANCE)
@@ -149,7 +147,7 @@ def tidy_quaternions(channels: Channels) -> list[str]:
     q[good[1:]] *= np.where(np.cumsum(flips) % 2 == 1, -1.0, 1.0)[:, None]
     for i, name in enumerate(QUATERNION):
         channels[name] = q[:, i]
-    return notes
+    return [finding("quaternion_lengths", samples=useless.sum())] if useless.any() else []
 
 
 def upside_down(channels: Mapping[str, Array]) -> bool:
@@ -175,8 +173,9 @@ def shifted(t: Array, channels: Channels, convert: Conversion) -> tuple[Array, C
     for key in asked:
         if key not in GROUPS and key not in channels:
             raise CalibrationError(
-                f"convert.time_offset: '{key}' is neither a group nor a column of this log"
-                f"{did_you_mean(key, [*GROUPS, *channels])} groups are {', '.join(GROUPS)}"
+                f"'{key}' is neither a group nor a column of this log"
+                f"{did_you_mean(key, [*GROUPS, *channels])} groups are {', '.join(GROUPS)}",
+                "convert.time_offset",
             )
     streams, moved = {}, False
     for name, values in channels.items():
@@ -192,7 +191,8 @@ def _named(key: str, columns: list[str], where: str) -> list[str]:
     found = [name for name in columns if name == key or (key.endswith("*") and name.startswith(key[:-1]))]
     if not found:
         raise CalibrationError(
-            f"convert.{where}: this log has no column '{key}'{did_you_mean(key, columns)} it has {_some(columns)}"
+            f"this log has no column '{key}'{did_you_mean(key, columns)} it has {_some(columns)}",
+            f"convert.{where}",
         )
     return found
 

@@ -3,21 +3,55 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.trials.columns import INPUT_PREFIXES, TAU
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.trials.header import Header
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial import INPUT_PREFIXES, TAU, Trial
 from finssim.geometry.rotations import skew
 from finssim.physics.types import MAX_THRUSTERS
-from finssim.vehicles import Vehicle
+from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.part import did_you_mean
 
 __all__ = ["Drive", "applied_wrench", "delivered", "drive", "thruster_motors", "widest_step", "wrench_motors"]
+
+# What every fit asks of the trials and axes that it is given.
+
+
+def require_fittable(trials: Sequence[Trial]) -> None:
+    """Refuse trials that no fit may use.
+
+    Raises:
+        CalibrationError: There are none, two share a name, or one is held out.
+    """
+    if not trials:
+        raise CalibrationError("no trials were given, expected at least one to fit")
+    names = [trial.name for trial in trials]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise CalibrationError(f"two trials are called '{min(twice)}', expected a name for each: rename one")
+    for trial in trials:
+        if trial.header.role == "held-out":
+            raise CalibrationError(
+                f"{trial.name}: its header says that it is held out: fit on other trials and replay this one"
+            )
+
+
+def require_axes(axes: Sequence[str] | None) -> None:
+    """Refuse words that name no axis.
+
+    Raises:
+        CalibrationError: It says which there are.
+    """
+    for axis in axes or ():
+        if axis not in AXES:
+            raise CalibrationError(f"unknown axis '{axis}'; available: {', '.join(AXES)}")
+
 
 # What the motors of a vehicle make of commanded forces: the engine's actuation in NumPy, exact in time.
 
@@ -183,7 +217,7 @@ def first_complete(present: dict[str, list[str]], trial: Trial, vehicle: Vehicle
     for kind in ORDER:
         if present[kind] and (kind == "tau" or len(present[kind]) == len(vehicle.thrusters)):
             return kind
-    raise CalibrationError(f"{trial.name}: {_what_is_missing(present, trial, vehicle)}")
+    raise CalibrationError(_what_is_missing(present, vehicle), trial.name)
 
 
 def _columns(trial: Trial, vehicle: Vehicle, kind: str) -> list[str]:
@@ -194,13 +228,14 @@ def _columns(trial: Trial, vehicle: Vehicle, kind: str) -> list[str]:
         if name not in vehicle.thrusters:
             meant = next((own for own in vehicle.thrusters if own.lower() == name.lower()), name)
             raise CalibrationError(
-                f"{trial.name}: {column}: {vehicle.name} has no thruster '{name}'"
-                f"{did_you_mean(meant, list(vehicle.thrusters))} it has {', '.join(vehicle.thrusters)}"
+                f"{column}: {vehicle.name} has no thruster '{name}'"
+                f"{did_you_mean(meant, list(vehicle.thrusters))} it has {', '.join(vehicle.thrusters)}",
+                trial.name,
             )
     return [names[name] for name in vehicle.thrusters if name in names and trial.has(names[name])]
 
 
-def _what_is_missing(present: dict[str, list[str]], trial: Trial, vehicle: Vehicle) -> str:
+def _what_is_missing(present: dict[str, list[str]], vehicle: Vehicle) -> str:
     for kind in ORDER:
         if present[kind]:
             missing = [f"{kind}{n}" for n in vehicle.thrusters if f"{kind}{n}" not in present[kind]]
@@ -248,8 +283,8 @@ class Drive:
     """`rpm`, `force`, `tau`, `pwm`, `command`, or `passive`."""
     end: float | None = None
     """From here on the recording goes on and the inputs are unknown [s]; None where they last as long."""
-    notes: tuple[str, ...] = ()
-    """What was assumed, one sentence each."""
+    findings: tuple[Finding, ...] = ()
+    """What was assumed."""
 
     def at(self, t: Array) -> Array:
         """Forces at given times [s], (m,) -> (m, k), before the motors; beyond the ends the nearest."""
@@ -283,8 +318,9 @@ def drive(trial: Trial, vehicle: Vehicle) -> Drive:
     if len(names) > MAX_THRUSTERS:
         if commanded:
             raise CalibrationError(
-                f"{trial.name}: {len(names)} commanded thrusters are more than the {MAX_THRUSTERS} that are simulated; "
-                "give the wrench that acted as tau_x ... tau_n"
+                f"{len(names)} commanded thrusters are more than the {MAX_THRUSTERS} that are simulated; "
+                "give the wrench that acted as tau_x ... tau_n",
+                trial.name,
             )
         force, B, names = force @ B.T, np.eye(6), TAU
     return Drive(
@@ -298,8 +334,7 @@ def drive(trial: Trial, vehicle: Vehicle) -> Drive:
         spans=_held_spans(t, trial.t, end) if held else _spans(t),
         end=end,
         source=kind.rstrip("_"),
-        notes=_notes(kind, present, stepped)
-        + (("the inputs end before the recording: none from there on",) if zero_after else ()),
+        findings=(*_assumed(kind, present, stepped), *([finding("inputs_zero_after")] if zero_after else [])),
     )
 
 
@@ -340,23 +375,18 @@ def _channels(
     return wrench, _about_origin(trial.header, vehicle), TAU
 
 
-def _notes(kind: str, present: dict[str, list[str]], stepped: bool) -> tuple[str, ...]:
+def _assumed(kind: str, present: dict[str, list[str]], stepped: bool) -> list[Finding]:
     """What was assumed."""
     source = kind.rstrip("_")
-    notes = [
-        f"{k}* is there for some thrusters only; {source} was used"
-        for k in ORDER[: ORDER.index(kind)]
-        if present[k]
+    findings = [
+        finding("inputs_incomplete", kind=k, used=source) for k in ORDER[: ORDER.index(kind)] if present[k]
     ]
     if stepped:
-        notes.append(
-            f"{source} keeps its levels exactly and jumps from row to row: read as held from each row to the next; "
-            "write 'inputs_between: linear' in trial.yaml if it was sampled while it changed"
-        )
+        findings.append(finding("inputs_held", kind=source))
     missing = [name for name in TAU if name not in present[kind]] if kind == "tau" else []
     if missing:
-        notes.append(f"no column {', '.join(missing)}: taken as zero")
-    return tuple(notes)
+        findings.append(finding("wrench_zero", columns=tuple(missing)))
+    return findings
 
 
 def applied_wrench(drive: Drive, vehicle: Vehicle, t: Array) -> Array:
@@ -440,7 +470,8 @@ def _together(trial: Trial, columns: list[str], held: bool) -> tuple[Array, Arra
     t = t[(t >= first) & (t <= end)]
     if len(t) < 2:
         raise CalibrationError(
-            f"{trial.name}: {', '.join(columns[:8])} are never known together: expected inputs that overlap in time"
+            f"{', '.join(columns[:8])} are never known together: expected inputs that overlap in time",
+            trial.name,
         )
     if held:
         return t, np.stack([v[np.searchsorted(s, t, side="right") - 1] for s, v in series], axis=-1)
@@ -463,8 +494,9 @@ def _forces(kind: str, values: Array, t: Array, trial: Trial, vehicle: Vehicle) 
     bare = [name for name, thruster in thrusters if thruster.esc is None]
     if bare:
         raise CalibrationError(
-            f"{trial.name}: pwm_{bare[0]} needs an esc section for thruster {bare[0]} in vehicle {vehicle.name}: "
-            "calibrate one with 'finssim calibrate thruster', or log rpm, force or wrench"
+            f"pwm_{bare[0]} needs an esc section for thruster {bare[0]} in vehicle {vehicle.name}: "
+            "calibrate one with 'finssim calibrate thruster', or log rpm, force or wrench",
+            trial.name,
         )
     voltage: Array | float | None = trial.header.voltage
     if trial.has("voltage"):

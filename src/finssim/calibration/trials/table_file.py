@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import csv
-import io
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
+from finssim.text_table import TextTable, number, read_text_table
 
 __all__ = ["Table", "read_table", "write_table"]
 
 Array = NDArray[np.float64]
-
-NOTHING = frozenset({"", "nan", "none", "null", "na", "n/a", "-", "--"})
-"""Words for "no sample", in lower case."""
 
 MOST_RAGGED = 0.1
 """Part of the rows that may have a wrong number of cells; a file with more of them is no table."""
@@ -36,8 +35,8 @@ class Table:
     """Column -> values, NaN for empty cells and cells that hold no number."""
     words: dict[str, list[str]] = field(default_factory=dict)
     """Column -> text, for columns in which no cell is a number (and for `phase`)."""
-    notes: list[str] = field(default_factory=list)
-    """What was left out or repaired, one sentence each."""
+    findings: list[Finding] = field(default_factory=list)
+    """What was left out or repaired."""
 
     @property
     def columns(self) -> list[str]:
@@ -45,18 +44,26 @@ class Table:
         return [*self.numbers, *self.words]
 
 
-def read_table(path: Path) -> Table:
+def read_table(
+    path: Path, *, skip: int = 0, names: Sequence[str] | None = None, spaces: bool = False
+) -> Table:
     """The columns of a `.csv` (`.txt`, `.tsv`) or `.parquet` file.
 
     A CSV file needs a line of column names; cells may be separated by commas, semicolons or tabs, lines that begin
     with # are comments. A file that a crash cut short opens up to the cut.
 
+    Args:
+        path: The file.
+        skip: Lines of a text before its table.
+        names: Of the columns of a text that has no line of names.
+        spaces: Whether blanks separate the cells of a text.
+
     Raises:
         CalibrationError: Unreadable, empty, without column names, or no table.
     """
-    if path.suffix.lower() == ".parquet":
+    if path.suffix.lower() in (".parquet", ".pq"):
         return _read_parquet(path)
-    return _read_csv(path)
+    return _read_csv(path, skip=skip, names=names, spaces=spaces)
 
 
 def write_table(path: Path, numbers: dict[str, Array], phase: NDArray[np.str_] | None = None) -> None:
@@ -86,44 +93,29 @@ def write_table(path: Path, numbers: dict[str, Array], phase: NDArray[np.str_] |
         writer.writerows(zip(*cells, strict=True))
 
 
-def _read_csv(path: Path) -> Table:
-    try:
-        raw = path.read_bytes()
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be read: {error.strerror or error}") from None
-    table = Table()
-    whole = raw.split(b"\0", 1)[0]  # a crash leaves zeros where the file system had made room
-    text = whole.decode("utf-8-sig", errors="replace")
-    if len(whole) < len(raw):
-        table.notes.append("the file ends in zero bytes, as after a crash; it was read up to them")
-    cut = not text.endswith(("\n", "\r"))
-    lines = (line for line in io.StringIO(text, newline=None) if line.strip() and not line.startswith("#"))
-    first = next(lines, "")
-    delimiter = max(",;\t", key=first.count)
-    names = [name.strip() for name in next(csv.reader([first], delimiter=delimiter), [])]
-    while names and not names[-1]:
-        names.pop()
+def _read_csv(path: Path, **how: Any) -> Table:
+    text = read_text_table(path, CalibrationError, **how)
+    table, names = Table(), text.names
+    if text.zeros:
+        table.findings.append(finding("zero_bytes"))
     _check_names(names, path)
     columns: list[list[Any]] = [[] for _ in names]
     ragged: list[int] = []
     rows: list[list[str]] = []
-    count, last = 0, []
-    for row in csv.reader(lines, delimiter=delimiter):
-        count += 1
-        last = row
-        if len(row) != len(names):
-            if len(row) < len(names) or any(cell.strip() for cell in row[len(names) :]):
-                ragged.append(count)
-                continue
+    for count, line in enumerate(text.texts, start=1):
+        row = text.split(line)
+        if len(row) < len(names) or any(row[len(names) :]):
+            ragged.append(count)
+            continue
+        if text.unfinished and count == len(text.texts) and row[-1]:
+            row[-1] = ""
+            table.findings.append(finding("last_cell_cut"))
         rows.append(row)
         if len(rows) == CHUNK:
-            _append(columns, rows, delimiter)
+            _append(columns, rows, text)
             rows = []
-    if cut and rows and last is rows[-1] and last[-1].strip():
-        rows[-1] = [*last[:-1], ""]
-        table.notes.append("the last line has no end: its last cell may be cut and was left out")
-    _append(columns, rows, delimiter)
-    _tell_ragged(ragged, count, len(names), cut, table, path)
+    _append(columns, rows, text)
+    _tell_ragged(ragged, len(text.texts), len(names), text.unfinished, table, path)
     for name, column in zip(names, columns, strict=True):
         _keep(table, name, column)
     return table
@@ -142,39 +134,26 @@ def _check_names(names: list[str], path: Path) -> None:
     raise CalibrationError(f"{path}: begins with numbers, expected a line of column names such as t,tau_x,u")
 
 
-def _append(columns: list[list[Any]], rows: list[list[str]], delimiter: str) -> None:
+def _append(columns: list[list[Any]], rows: list[list[str]], text: TextTable) -> None:
     """Add rows of text to the columns, as numbers where every cell of the chunk is one."""
     for column, cells in zip(columns, zip(*rows, strict=False), strict=False):
-        if delimiter != ",":
-            cells = tuple(cell.replace(",", ".") for cell in cells)  # decimal commas
         try:
             column.extend([float(cell) if cell else math.nan for cell in cells])
         except ValueError:
-            column.extend([_number_or_word(cell) for cell in cells])
-
-
-def _number_or_word(cell: str) -> float | str:
-    cell = cell.strip()
-    if cell.lower() in NOTHING:
-        return math.nan
-    try:
-        return float(cell)
-    except ValueError:
-        return cell
+            numbers = [text.number(cell) for cell in cells]
+            column.extend([cell if x is None else x for cell, x in zip(cells, numbers, strict=True)])
 
 
 def _tell_ragged(ragged: list[int], count: int, width: int, cut: bool, table: Table, path: Path) -> None:
     if ragged == [count] and cut:
-        table.notes.append("the last line is cut short and was left out")
+        table.findings.append(finding("last_line_cut"))
     elif len(ragged) > max(1.0, MOST_RAGGED * count):
         raise CalibrationError(
-            f"{path}: {len(ragged)} of {count} rows have not the {width} cells that the column names announce "
+            f"{path}: {len(ragged)} of {count} rows do not have {width} cells, one for each column name "
             f"(first: row {ragged[0]}): is one table in it, with one separator?"
         )
     elif ragged:
-        table.notes.append(
-            f"{len(ragged)} rows have not {width} cells and were left out (first: row {ragged[0]})"
-        )
+        table.findings.append(finding("ragged_rows", rows=len(ragged), expected=width, first=ragged[0]))
 
 
 def _keep(table: Table, name: str, column: list[Any]) -> None:
@@ -186,9 +165,10 @@ def _keep(table: Table, name: str, column: list[Any]) -> None:
         table.words[name] = [cell if isinstance(cell, str) else "" for cell in column]
         return
     if words:
-        table.notes.append(
-            f"column '{name}': {len(words)} cells hold no number and count as empty "
-            f"(first: '{column[words[0]][:40]}' in row {words[0] + 1})"
+        table.findings.append(
+            finding(
+                "not_numbers", column=name, cells=len(words), cell=column[words[0]][:40], row=words[0] + 1
+            )
         )
         for i in words:
             column[i] = math.nan
@@ -227,7 +207,8 @@ def _read_parquet(path: Path) -> Table:
             or (pyarrow.types.is_dictionary(kind))
         ):
             cells = ["" if cell is None else str(cell) for cell in column.to_pylist()]
-            _keep(table, name, [_number_or_word(cell) for cell in cells])
+            numbers = [number(cell) for cell in cells]
+            _keep(table, name, [c if x is None else x for c, x in zip(cells, numbers, strict=True)])
         else:
-            table.notes.append(f"column '{name}' holds {kind}, not numbers, and was left out")
+            table.findings.append(finding("column_kind", column=name, kind=str(kind)))
     return table

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 
 __all__ = ["SAME_ROW", "merged", "ordered", "sampled"]
 
@@ -50,7 +51,7 @@ def merged(streams: Mapping[str, tuple[Array, Array]]) -> tuple[Array, dict[str,
     return base, channels
 
 
-def ordered(t: Array, columns: Mapping[str, Array]) -> tuple[Array, NDArray[np.intp], list[str]]:
+def ordered(t: Array, columns: Mapping[str, Array]) -> tuple[Array, NDArray[np.intp], list[Finding]]:
     """Times in order, and the order of the rows.
 
     Rows that arrived a little late, reversed and shuffled logs are sorted. Where the clock itself jumped back (a long
@@ -62,7 +63,7 @@ def ordered(t: Array, columns: Mapping[str, Array]) -> tuple[Array, NDArray[np.i
         columns: Column -> values, (n,); two pieces that fill different columns do not collide.
 
     Returns:
-        Times not decreasing (n,), row numbers in that order (n,), and notes.
+        Times not decreasing (n,), row numbers in that order (n,), and findings.
     """
     back = np.flatnonzero(np.diff(t) < 0.0) + 1
     rows = np.arange(len(t))
@@ -73,7 +74,7 @@ def ordered(t: Array, columns: Mapping[str, Array]) -> tuple[Array, NDArray[np.i
         if jumps:
             return _in_pieces(t, jumps)
     rows = np.argsort(t, kind="stable")
-    return t[rows], rows, [f"times step back at {len(back)} of {len(t)} rows; the rows were sorted by time"]
+    return t[rows], rows, [finding("times_sorted", rows=len(back), total=len(t))]
 
 
 def _collides(t: Array, columns: Mapping[str, Array], i: int) -> bool:
@@ -87,27 +88,26 @@ def _collides(t: Array, columns: Mapping[str, Array], i: int) -> bool:
     )
 
 
-def _in_pieces(t: Array, jumps: list[int]) -> tuple[Array, NDArray[np.intp], list[str]]:
-    moved, order, notes, end = [], [], [], -np.inf
+def _in_pieces(t: Array, jumps: list[int]) -> tuple[Array, NDArray[np.intp], list[Finding]]:
+    moved, order, findings, end = [], [], [], -np.inf
     for start, stop in zip([0, *jumps], [*jumps, len(t)], strict=True):
         rows = start + np.argsort(t[start:stop], kind="stable")
         times = t[rows]
         if start:
             shift = end + PIECE_GAP - times[0]
-            notes.append(
-                f"the clock jumps back from {t[start - 1]:.6g} s to {t[start]:.6g} s at row {start + 1}: the rows from "
-                f"there on were moved {shift:.6g} s later, behind a gap, for how much time passed is not known"
+            findings.append(
+                finding("clock_jump", before=t[start - 1], after=t[start], row=start + 1, shift=shift)
             )
             times = times + shift
         moved.append(times)
         order.append(rows)
         end = times[-1]
-    return np.concatenate(moved), np.concatenate(order), notes
+    return np.concatenate(moved), np.concatenate(order), findings
 
 
 def sampled(
     t: Array, columns: Mapping[str, Array]
-) -> tuple[Array, dict[str, Array], NDArray[np.intp], list[str]]:
+) -> tuple[Array, dict[str, Array], NDArray[np.intp], list[Finding]]:
     """One row for each time: rows of equal times are laid over one another, the later number where both have one.
 
     Args:
@@ -115,7 +115,7 @@ def sampled(
         columns: Column -> values, (n,).
 
     Returns:
-        Times, strictly increasing (m,), columns (m,), the row each came from (m,), and notes.
+        Times, strictly increasing (m,), columns (m,), the row each came from (m,), and findings.
     """
     starts = np.concatenate([[True], np.diff(t) > 0.0])
     kept = np.flatnonzero(starts)
@@ -128,12 +128,9 @@ def sampled(
         merged_columns[name] = np.full(len(kept), np.nan)
         merged_columns[name][row_of[good]] = values[good]  # NumPy keeps the last of equal indices
         conflicts[row_of[good][values[good] != merged_columns[name][row_of[good]]]] = True
-    notes = []
+    findings = []
     if conflicts.any():
-        notes.append(
-            f"{conflicts.sum()} times are there more than once with different numbers "
-            f"(first: {t[kept][conflicts][0]:.6g} s); the later numbers were kept"
-        )
+        findings.append(finding("times_conflict", times=conflicts.sum(), first=t[kept][conflicts][0]))
     elif len(columns):
-        notes.append(f"{len(t) - len(kept)} rows repeat a time and were laid over the first")
-    return t[kept], merged_columns, kept, notes
+        findings.append(finding("times_repeat", rows=len(t) - len(kept)))
+    return t[kept], merged_columns, kept, findings

@@ -7,15 +7,78 @@ import json
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.trials.columns import column_of
+from finssim.calibration.findings import Finding
 from finssim.calibration.trials.header import Header
 
-__all__ = ["PHASES", "Array", "Trial"]
+__all__ = ["Array", "PHASES", "Trial", "COLUMNS", "INPUT_PREFIXES", "NU", "TAU", "column_of"]
+
+# The canonical columns of a trial: names, units, frames.
+
+
+class Column(NamedTuple):
+    """One canonical column."""
+
+    group: str
+    """Columns of one group come from one sensor: command velocity rates acceleration attitude position depth."""
+    unit: str
+    meaning: str
+
+
+TAU = ("tau_x", "tau_y", "tau_z", "tau_k", "tau_m", "tau_n")
+"""Wrench, body frame; moments about the header's `wrench_at`."""
+
+NU = ("u", "v", "w", "p", "q", "r")
+"""nu, body frame."""
+
+COLUMNS: dict[str, Column] = {
+    **{name: Column("command", "N", f"force on the vehicle along body {name[-1]}") for name in TAU[:3]},
+    **{
+        name: Column("command", "N m", f"moment about body {axis}")
+        for name, axis in zip(TAU[3:], "xyz", strict=True)
+    },
+    **{
+        name: Column("velocity", "m/s", f"velocity along body {axis}")
+        for name, axis in zip(NU[:3], "xyz", strict=True)
+    },
+    **{
+        name: Column("rates", "rad/s", f"angular rate about body {axis}")
+        for name, axis in zip(NU[3:], "xyz", strict=True)
+    },
+    **{f"a{axis}": Column("acceleration", "m/s²", f"acceleration along body {axis}") for axis in "xyz"},
+    "roll": Column("attitude", "rad", "about body x, the last of yaw-pitch-roll (z-y-x)"),
+    "pitch": Column("attitude", "rad", "about body y; positive is nose down, for z is up"),
+    "yaw": Column("attitude", "rad", "about world z, to the left"),
+    **{f"q{c}": Column("attitude", "-", "quaternion body to world, xyzw") for c in "xyzw"},
+    **{axis: Column("position", "m", f"world {axis}; z up, 0 on the still surface") for axis in "xyz"},
+    "depth": Column("depth", "m", "of the pressure sensor below the still surface, positive down"),
+    "voltage": Column("command", "V", "battery"),
+}
+"""Columns with fixed names."""
+
+INPUT_PREFIXES: dict[str, Column] = {
+    "force_": Column("command", "N", "thrust of one thruster"),
+    "rpm_": Column("command", "rpm", "shaft speed of one thruster, positive for positive thrust"),
+    "pwm_": Column("command", "µs", "pulse width sent to the speed controller of one thruster"),
+    "command_": Column("command", "N", "thrust asked of one thruster"),
+}
+"""Columns named PREFIX + thruster name."""
+
+
+def column_of(name: str) -> Column | None:
+    """The canonical column of that name, or None."""
+    if name in COLUMNS:
+        return COLUMNS[name]
+    for prefix, column in INPUT_PREFIXES.items():
+        if name.startswith(prefix) and len(name) > len(prefix):
+            return column
+    return None
+
 
 Array = NDArray[np.float64]
 
@@ -27,7 +90,7 @@ PHASES = ("baseline", "excitation", "coast", "rest")
 class Trial:
     """Measurements over one time base; streams of other rates leave NaN where they have no sample.
 
-    Frames and units are those of `finssim.calibration.trials.columns`; conversions that the header asks for are done.
+    Frames and units are those of `finssim.calibration.trials.trial`; conversions that the header asks for are done.
     """
 
     name: str
@@ -40,8 +103,8 @@ class Trial:
     """A word of `PHASES` or "" for every row, (n,); None where the log names no phases."""
     header: Header = field(default_factory=Header)
     """What `trial.yaml` says."""
-    notes: tuple[str, ...] = ()
-    """What was repaired or left out while reading, one sentence each."""
+    findings: tuple[Finding, ...] = ()
+    """What was repaired or left out while reading."""
     path: Path | None = None
     """Folder or file it was read from."""
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.trials.columns import COLUMNS, INPUT_PREFIXES, column_of
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.trials.conversion import (
     factor_and_offset,
     in_our_frames,
@@ -27,7 +27,7 @@ from finssim.calibration.trials.conversion import (
 from finssim.calibration.trials.header import Conversion, Header, TrialWater
 from finssim.calibration.trials.table_file import Table, read_table, write_table
 from finssim.calibration.trials.time_base import ordered, sampled
-from finssim.calibration.trials.trial import PHASES, Trial
+from finssim.calibration.trials.trial import COLUMNS, INPUT_PREFIXES, PHASES, Trial, column_of
 from finssim.files import OutputError, atomic_directory
 from finssim.vehicles.part import did_you_mean
 from finssim.yaml_file import read_mapping
@@ -48,8 +48,8 @@ REGULAR = 0.9
 """Part of the runs that may not be much longer than the usual one: clocks repeat regularly, resting sensors do not."""
 
 
-def without_repeats(channels: dict[str, Array]) -> list[str]:
-    """Turn the repeated samples of measured streams into empty ones, in place; notes on what was found.
+def without_repeats(channels: dict[str, Array]) -> list[Finding]:
+    """Turn the repeated samples of measured streams into empty ones, in place; findings on what was found.
 
     Left in, they would count as measurements of their own, and their steps as motion. Inputs are left alone: a command
     that stays is a command.
@@ -58,7 +58,7 @@ def without_repeats(channels: dict[str, Array]) -> list[str]:
     for name in channels:
         if name in COLUMNS and COLUMNS[name].group != "command":
             groups.setdefault(COLUMNS[name].group, []).append(name)
-    notes = []
+    findings = []
     for group, names in groups.items():
         values = np.stack([channels[name] for name in names], axis=-1)
         rows = np.flatnonzero(np.isfinite(values).any(axis=1))
@@ -67,11 +67,8 @@ def without_repeats(channels: dict[str, Array]) -> list[str]:
             for name in names:
                 channels[name] = channels[name].copy()
                 channels[name][rows[~new]] = np.nan
-            notes.append(
-                f"{group}: every new sample is repeated, {len(rows) / new.sum():.1f} rows on average; "
-                "repeats count as empty"
-            )
-    return notes
+            findings.append(finding("repeated_samples", group=group, rows=len(rows) / new.sum()))
+    return findings
 
 
 def new_samples(values: Array) -> NDArray[np.bool_]:
@@ -110,7 +107,7 @@ EPOCH = 1.0e8
 
 
 def trial_from_table(name: str, table: Table, header: Header, path: Path | None = None) -> Trial:
-    """A trial from the columns of a log: renamed, scaled, in our frames, in order of time, with notes on every repair.
+    """A trial from the columns of a log: renamed, scaled, in our frames, in order of time, each repair a finding.
 
     Args:
         name: Of the trial.
@@ -121,31 +118,28 @@ def trial_from_table(name: str, table: Table, header: Header, path: Path | None 
     Raises:
         CalibrationError: No time, fewer than two rows, no usable column, or a conversion of what is not there.
     """
-    notes = list(table.notes)
+    findings = list(table.findings)
     names = new_names(table.columns, header.convert)
     numbers = {names[old]: values for old, values in table.numbers.items()}
     words = {names[old]: values for old, values in table.words.items()}
     if "t" not in numbers and "t" not in words:
         raise CalibrationError(_no_time(table.columns))
     change = factor_and_offset([*numbers, *words], header.convert)
-    t = _seconds(numbers.pop("t", None), words.pop("t", None), change.get("t", (1.0, 0.0)), notes)
-    phase = _phases(words.pop("phase", None), notes)
-    channels = _canonical(numbers, list(words), notes)
+    t = _seconds(numbers.pop("t", None), words.pop("t", None), change.get("t", (1.0, 0.0)), findings)
+    phase = _phases(words.pop("phase", None), findings)
+    channels = _canonical(numbers, list(words), findings)
     for column, values in channels.items():
         infinite = np.isinf(values)
         if infinite.any():
-            notes.append(f"column '{column}': {infinite.sum()} infinite numbers count as empty")
+            findings.append(finding("infinite_numbers", column=column, cells=infinite.sum()))
         factor, offset = change.get(column, (1.0, 0.0))
         channels[column] = np.where(infinite, np.nan, values) * factor + offset
-    t, channels, phase = _in_order(t, channels, phase, notes)
-    notes += without_repeats(channels)
+    t, channels, phase = _in_order(t, channels, phase, findings)
+    findings += without_repeats(channels)
     channels = in_our_frames(channels, header.convert)
-    notes += tidy_quaternions(channels)
+    findings += tidy_quaternions(channels)
     if upside_down(channels):
-        notes.append(
-            "the attitude has the vehicle on its back most of the time: "
-            "are convert.body and convert.world what the log uses?"
-        )
+        findings.append(finding("upside_down"))
     if not any(np.isfinite(values).sum() >= 2 for values in channels.values()):
         raise CalibrationError(
             f"no usable column beside t: expected some of {', '.join(COLUMNS)}, "
@@ -157,7 +151,9 @@ def trial_from_table(name: str, table: Table, header: Header, path: Path | None 
     if phase is not None and t is not old:
         phase = phase[np.clip(np.searchsorted(old, t, side="right") - 1, 0, None)]
     header = header.model_copy(update={"convert": type(header.convert)()})
-    return Trial(name=name, t=t, channels=channels, phase=phase, header=header, notes=tuple(notes), path=path)
+    return Trial(
+        name=name, t=t, channels=channels, phase=phase, header=header, findings=tuple(findings), path=path
+    )
 
 
 def _no_time(columns: list[str]) -> str:
@@ -170,7 +166,7 @@ def _no_time(columns: list[str]) -> str:
 
 
 def _seconds(
-    numbers: Array | None, words: list[str] | None, change: tuple[float, float], notes: list[str]
+    numbers: Array | None, words: list[str] | None, change: tuple[float, float], findings: list[Finding]
 ) -> Array:
     """Times in s from numbers or dates; those that count from 1970 begin at 0."""
     factor, offset = change
@@ -183,63 +179,64 @@ def _seconds(
             ) from None
         known = dates[~np.isnat(dates)]
         start = known[0] if len(known) else np.datetime64("NaT", "ns")
-        notes.append(f"t holds dates; times count from {start}")
+        findings.append(finding("dates", start=str(start)))
         return np.where(np.isnat(dates), np.nan, (dates - start) / np.timedelta64(1, "s"))
     known = numbers[np.isfinite(numbers)]
     if len(known) and abs(known[0] * factor + offset) > EPOCH:
-        notes.append(
-            f"t counts from 1970; times count from the first row, {known[0] * factor + offset:.6f} s"
-        )
+        findings.append(finding("epoch", start=known[0] * factor + offset))
         return (numbers - known[0]) * factor
     return numbers * factor + offset
 
 
-def _phases(words: list[str] | None, notes: list[str]) -> NDArray[np.str_] | None:
+def _phases(words: list[str] | None, findings: list[Finding]) -> NDArray[np.str_] | None:
     if words is None:
         return None
     table = {word: word.strip().lower() for word in set(words)}
     unknown = sorted(word for word in table.values() if word not in PHASES and word)
     if unknown:
-        notes.append(
-            f"phase '{unknown[0]}'{did_you_mean(unknown[0], list(PHASES))} known words are {', '.join(PHASES)}; "
-            f"{len(unknown)} unknown words count as empty"
+        findings.append(
+            finding(
+                "unknown_phases",
+                word=unknown[0],
+                hint=did_you_mean(unknown[0], list(PHASES)),
+                known=PHASES,
+                count=len(unknown),
+            )
         )
     return np.array([table[w] if table[w] in PHASES else "" for w in words], dtype=np.str_)
 
 
-def _canonical(numbers: dict[str, Array], words: list[str], notes: list[str]) -> dict[str, Array]:
+def _canonical(numbers: dict[str, Array], words: list[str], findings: list[Finding]) -> dict[str, Array]:
     """The columns of a trial among those of the log."""
     channels = {column: values for column, values in numbers.items() if column_of(column)}
     for column in words:
         if column_of(column):
-            notes.append(f"column '{column}' holds words, not numbers, and was left out")
+            findings.append(finding("column_kind", column=column, kind="words"))
     unknown = [column for column in [*numbers, *words] if not column_of(column)]
     for column in unknown[:5]:
         close = did_you_mean(column.lower(), [c for c in COLUMNS if c not in channels]).rstrip(";")
-        notes.append(f"column '{column}' is not one of a trial and was left out{close}")
+        findings.append(finding("unknown_column", column=column, hint=close))
     if len(unknown) > 5:
-        notes.append(
-            f"{len(unknown) - 5} more columns are not of a trial and were left out: {', '.join(unknown[5:17])}"
-        )
+        findings.append(finding("unknown_columns", count=len(unknown) - 5, columns=tuple(unknown[5:])))
     return channels
 
 
 def _in_order(
-    t: Array, channels: dict[str, Array], phase: NDArray[np.str_] | None, notes: list[str]
+    t: Array, channels: dict[str, Array], phase: NDArray[np.str_] | None, findings: list[Finding]
 ) -> tuple[Array, dict[str, Array], NDArray[np.str_] | None]:
     """Rows with strictly increasing times."""
     timed = np.isfinite(t)
     if not timed.all():
-        notes.append(f"{(~timed).sum()} rows have no time and were left out")
+        findings.append(finding("rows_untimed", rows=(~timed).sum()))
         t, channels = t[timed], {column: values[timed] for column, values in channels.items()}
         phase = None if phase is None else phase[timed]
     if len(t) < 2:
         raise CalibrationError(f"{len(t)} rows with a time, expected at least 2")
     t, rows, said = ordered(t, channels)
-    notes += said
+    findings += said
     phase = None if phase is None else phase[rows]
     t, channels, kept, said = sampled(t, {column: values[rows] for column, values in channels.items()})
-    notes += said
+    findings += said
     if len(t) < 2:
         raise CalibrationError(f"all rows have the time {t[0]:.6g} s: expected times that increase")
     return t, channels, None if phase is None else phase[kept]
@@ -346,7 +343,7 @@ def load_trial(path: str | os.PathLike[str]) -> Trial:
 
     Raises:
         CalibrationError: There is no trial, or one that cannot be used; the message says where and why. What could be
-            repaired is told in the trial's `notes` instead.
+            repaired is told in the trial's `findings` instead.
     """
     path = Path(path)
     name, data, header_path = _locate(path)
@@ -355,7 +352,7 @@ def load_trial(path: str | os.PathLike[str]) -> Trial:
     try:
         return trial_from_table(name, table, header, path)
     except CalibrationError as error:
-        shown = header_path if header_path and str(error).startswith("convert") else data
+        shown = header_path if header_path and error.subject else data
         raise CalibrationError(f"{shown}: {error}") from None
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,24 +11,22 @@ import numpy as np
 from rich.console import Console
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import finding
 from finssim.calibration.fit import Estimate
 from finssim.calibration.output.fit_figures import BLUE, GRAY, ORANGE, new_figure, png
 from finssim.calibration.output.fit_output import interval_text, number_text
+from finssim.calibration.output.publish import command_line, progress_bar, publish, refuse_places
 from finssim.calibration.vision.boards import Board, BoardView, board_found, parse_size, see_board
 from finssim.calibration.vision.camera_fit import COLUMNS, MODELS, ROWS, CameraFit, calibrate_camera
 from finssim.calibration.vision.report import (
+    ExtraTable,
     Report,
-    command_line,
     correlation_json,
-    html_row,
     picture_axes,
     plain,
-    publish,
-    refuse_places,
 )
 from finssim.localization.camera_file import write_camera
 from finssim.localization.detection.pictures import pictures
-from finssim.page import html_table
 from finssim.provenance import provenance
 
 if TYPE_CHECKING:
@@ -65,7 +62,7 @@ def camera_record(fit: CameraFit) -> dict[str, Any]:
         "held_out_rms_px": plain(fit.held_out_rms, DIGITS),
         "views": len(fit.used),
         "left_out": {view.name: view.left_out for view in fit.views if view.left_out},
-        "advice": list(fit.advice),
+        "findings": [one.as_json() for one in fit.findings],
         "settings": fit.settings,
         "interrupted": fit.interrupted,
         "provenance": provenance(),
@@ -116,8 +113,10 @@ def camera_report(fit: CameraFit) -> Report:
         estimates=list(fit.estimates.values()),
         cells=_cells,
         summary=summary,
-        notes=[f"{view.name} left out: {view.left_out}" for view in fit.views if view.left_out],
-        advice=fit.advice,
+        findings=[
+            *(finding("view_left_out", v.name, reason=v.left_out) for v in fit.views if v.left_out),
+            *fit.findings,
+        ],
         advice_title="What to photograph next",
         reading=READING,
     )
@@ -128,15 +127,13 @@ def _cells(estimate: Estimate) -> tuple[str, ...]:
     return estimate.name, value, interval_text(estimate), estimate.unit, estimate.note
 
 
-def _views_table(fit: CameraFit) -> str:
+def _views_table(fit: CameraFit) -> ExtraTable:
     rows = [
-        html_row(
-            (v.name, f"{v.rms:.3f}", f"{math.degrees(v.tilt):.0f}", str(len(v.pixels)), v.left_out or "used"),
-            "doubt" if v.left_out else "",
-        )
+        (v.name, f"{v.rms:.3f}", f"{math.degrees(v.tilt):.0f}", str(len(v.pixels)), v.left_out or "used")
         for v in fit.views
     ]
-    return html_table(("view", "rms [px]", "tilt [deg]", "corners", "state"), rows)
+    heads = ("view", "rms [px]", "tilt [deg]", "corners", "state")
+    return heads, rows, ["doubt" if v.left_out else "" for v in fit.views]
 
 
 # Pictures of a lens calibration: where corners were seen, how well the picture is known, what is left over.
@@ -261,12 +258,12 @@ def run(
         screen.print(f"found a {chosen.words}; --board says otherwise", highlight=False, markup=False)
     views, without = _views(images, chosen, screen)
     for name in without:
-        screen.print(f"{name}: left out: the board is not seen in it", highlight=False, markup=False)
+        screen.print(str(finding("board_unseen", name)), highlight=False, markup=False)
     if not views:
         raise CalibrationError(
             f"none of {len(without)} pictures shows a {chosen.words}: give --board or --charuco"
         )
-    with _progress(screen) as progress:
+    with progress_bar() as progress:
         fit = calibrate_camera(views, model=model, seed=seed, progress=progress)
     fit.settings.update(board=chosen.words, square=chosen.square)
     write_camera(out, fit.lens, {**camera_record(fit), "without_board": without})
@@ -319,14 +316,3 @@ def _views(images: Sequence[Path], board: Board, screen: Console) -> tuple[list[
     except KeyboardInterrupt:
         screen.print(f"stopped after {len(views) + len(without)} pictures; fitting to those", highlight=False)
     return views, without
-
-
-@contextmanager
-def _progress(screen: Console) -> Iterator[Callable[[float, str], None]]:
-    """A bar on standard error, fed with the part done and a few words."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as bars:
-        bar = bars.add_task("fit", total=1.0)
-        yield lambda part, words: bars.update(bar, completed=part, description=words)

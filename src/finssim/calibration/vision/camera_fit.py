@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from finssim.calibration.degeneracy import correlation
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Correlation, Estimate
 from finssim.calibration.uncertainty import Covariance, Evidence, intervals, trial_covariance
 from finssim.calibration.vision.boards import BoardView
@@ -376,7 +377,7 @@ class CameraFit:
     """The same for views that the lens was not fitted to, only their pose; NaN if there are too few views [px]."""
     reach: LensReach
     """How well pixels are known over the picture."""
-    advice: tuple[str, ...]
+    findings: tuple[Finding, ...]
     settings: dict[str, Any] = field(default_factory=dict)
     interrupted: bool = False
 
@@ -431,7 +432,7 @@ def calibrate_camera(
         rms=_rms(np.concatenate(bundle.residuals)),
         held_out_rms=held_out,
         reach=reach,
-        advice=camera_advice(bundle.lens, [v for v in every if not v.left_out], estimates, reach),
+        findings=camera_findings(bundle.lens, [v for v in every if not v.left_out], estimates, reach),
         settings={"model": model, "seed": seed},
         interrupted=bundle.interrupted,
     )
@@ -604,48 +605,29 @@ def _error95(lens: Lens, pixels: Array, covered: NDArray[np.bool_], covariance: 
     return np.asarray(np.where(ok, radius, np.nan))
 
 
-def camera_advice(
+def camera_findings(
     lens: Lens, views: Sequence[View], estimates: Mapping[str, Estimate], reach: LensReach
-) -> tuple[str, ...]:
-    """Sentences on coverage, tilt and what cannot be told, and on what to photograph; none if nothing is to say."""
-    tilts, sentences = np.array([view.tilt for view in views]), []
+) -> tuple[Finding, ...]:
+    """Coverage, tilt and what cannot be told, and what to photograph; none if nothing is to say."""
+    tilts, findings = np.array([view.tilt for view in views]), []
     tilted = int(np.sum(tilts > TILTED))
     if tilts.max() < FLAT:
-        sentences.append(
-            f"all views are within {math.degrees(tilts.max()):.0f} degrees of fronto-parallel: focal length and "
-            "distance are not separable: tilt the board by 20 to 50 degrees about both its axes"
-        )
+        findings.append(finding("views_flat", tilt=math.degrees(tilts.max())))
     elif tilted < 3:
-        sentences.append(
-            f"only {tilted} views show the board tilted by more than 20 degrees: the focal length "
-            "rests on them: tilt the board in more pictures"
-        )
-    empty = [
-        f"{100.0 * share:.0f} % of the {side} edge" for side, share in reach.edges.items() if share > BORDER
-    ]
+        findings.append(finding("few_tilted", views=tilted))
+    empty = {side: share for side, share in reach.edges.items() if share > BORDER}
     if empty:
-        sentences.append(
-            f"no corner within {', '.join(empty)}: distortion there is extrapolated: take pictures with the board in "
-            "the corners"
-        )
+        shares = tuple(f"{100.0 * share:.0f} % of the {side} edge" for side, share in empty.items())
+        findings.append(finding("edges_empty", sides=tuple(empty), shares=shares))
     if len(views) < FEW_VIEWS:
-        sentences.append(
-            f"{len(views)} views are few: intervals are wide and rest on single pictures: take 15 to 30"
-        )
+        findings.append(finding("few_views", views=len(views)))
     unsure = [e for e in estimates.values() if not e.identifiable]
     if unsure:
-        names = ", ".join(e.name for e in unsure)
-        sentences.append(
-            f"the pictures do not determine {names}: {unsure[0].note}: take more, with the board tilted"
-        )
+        names = tuple(e.name for e in unsure)
+        findings.append(finding("lens_undetermined", parameters=names, reason=unsure[0].note))
     nothing = [e.name for e in estimates.values() if e.identifiable and e.note]
     if lens.model == "rational" and len(nothing) >= 3:
-        sentences.append(
-            f"{', '.join(nothing)} are not told apart from 0: plumb_bob does as well: --model plumb_bob"
-        )
+        findings.append(finding("coefficients_zero", parameters=tuple(nothing)))
     if np.isfinite(reach.anywhere) and reach.anywhere >= LARGE_ERROR:
-        sentences.append(
-            f"pixels are known to {reach.inside:.2f} px (95 %) where corners were seen, but only to "
-            f"{reach.anywhere:.1f} px at the worst place of the picture"
-        )
-    return tuple(sentences)
+        findings.append(finding("pixels_uncertain", inside=reach.inside, anywhere=reach.anywhere))
+    return tuple(findings)

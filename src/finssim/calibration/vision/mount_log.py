@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.vision.sensor_mounts import Gyro
 from finssim.calibration.vision.tag_mounts import Moment
 from finssim.geometry.rotations import quat_inverse_rotate
@@ -73,8 +74,8 @@ class MountLog:
     """[m]"""
     sha256: str
     """Of the files read."""
-    notes: tuple[str, ...]
-    """What was left out or is missing, one sentence each."""
+    findings: tuple[Finding, ...]
+    """What was left out or is missing."""
 
     def moments(self, imu_offset: float = 0.0) -> tuple[Moment, ...]:
         """The pictures with tilt and depth at their time.
@@ -107,31 +108,40 @@ def read_mount_log(folder: str | Path, pool: Pool, vehicle: Vehicle) -> MountLog
         raise CalibrationError(
             f"{folder}: no {DETECTIONS} in it: give a folder with {DETECTIONS}, {IMU}, {DEPTH}"
         )
-    notes: list[str] = []
-    frames = read_detections(folder / DETECTIONS, notes)
+    remarks: list[str] = []
+    frames = read_detections(folder / DETECTIONS, remarks)
+    findings = [finding("as_read", remark=remark) for remark in remarks]
     time = np.array([frame.time for frame in frames]) - pool.latency
     if not np.isfinite(time).all():
         raise CalibrationError(f"{folder / DETECTIONS}: pictures without a time: add a column 'time' [s]")
-    up, gyro, turning = _imu(folder / IMU, vehicle, notes)
+    up, gyro, turning = _imu(folder / IMU, vehicle, findings)
     pictures = tuple(
         (float(time[i]), {d.tag: np.asarray(d.corners, float) for d in most_certain(frames[i].detections)})
         for i in np.argsort(time, kind="stable")
     )
-    depth = _depth(folder / DEPTH, notes)
+    depth = _depth(folder / DEPTH, findings)
     files = [folder / name for name in (DETECTIONS, IMU, DEPTH) if (folder / name).is_file()]
     sha256 = hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
     return MountLog(
-        pictures=pictures, up=up, gyro=gyro, turning=turning, depth=depth, sha256=sha256, notes=tuple(notes)
+        pictures=pictures,
+        up=up,
+        gyro=gyro,
+        turning=turning,
+        depth=depth,
+        sha256=sha256,
+        findings=tuple(findings),
     )
 
 
-def _imu(path: Path, vehicle: Vehicle, notes: list[str]) -> tuple[Stream | None, Gyro | None, Stream | None]:
+def _imu(
+    path: Path, vehicle: Vehicle, findings: list[Finding]
+) -> tuple[Stream | None, Gyro | None, Stream | None]:
     """Up in body axes, the gyro in its own, and the angular rate about the vertical."""
     if not path.is_file():
-        notes.append(f"no {IMU}: how tags sit in the body is not told, only how they sit to one another")
+        findings.append(finding("imu_missing", file=IMU))
         return None, None, None
     table = read_stream_table(path)
-    notes.extend(table.notes)
+    findings += [finding("as_read", remark=note) for note in table.notes]
     imu = vehicle.sensors.imu
     mount = np.array([0.0, 0.0, 0.0, 1.0] if imu is None else imu.orientation)
     own = table.has(*SENSOR_RATE) and not table.has(*RATE)
@@ -152,9 +162,9 @@ def _imu(path: Path, vehicle: Vehicle, notes: list[str]) -> tuple[Stream | None,
         up = in_body_axes(up, mount) if own else up
     elif rate is not None and force is not None:
         up = _tilt(table.t, rate, force, vehicle.water.gravity)
-        notes.append(f"{IMU} holds no attitude: roll and pitch are made from gyro and accelerometer")
+        findings.append(finding("attitude_made", file=IMU))
     else:
-        notes.append(f"{IMU} holds neither an attitude nor rates with accelerations: no tilt is known")
+        findings.append(finding("tilt_unknown", file=IMU))
         return None, gyro, None
     tilt = _stream(table.t, up)
     if gyro is None or clean is None or len(tilt.t) < 2:
@@ -198,12 +208,12 @@ def _tilt(t: Array, omega: Array, force: Array, gravity: float) -> Array:
     return up
 
 
-def _depth(path: Path, notes: list[str]) -> Stream | None:
+def _depth(path: Path, findings: list[Finding]) -> Stream | None:
     if not path.is_file():
-        notes.append(f"no {DEPTH}: heights over the pressure port are not told")
+        findings.append(finding("depth_missing", file=DEPTH))
         return None
     table = read_stream_table(path)
-    notes.extend(table.notes)
+    findings += [finding("as_read", remark=note) for note in table.notes]
     if not table.has("depth"):
         raise CalibrationError(
             f"{path}: no column 'depth': add the depth of the pressure port [m], positive down"

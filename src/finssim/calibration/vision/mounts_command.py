@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
-from finssim.calibration.output.calibrate import calibrated, doubts, kept
+from finssim.calibration.output.calibrate import all_findings, calibrated, kept
 from finssim.calibration.output.fit_output import fit_json, print_fit
-from finssim.calibration.output.report import FIT_FILE, write_report
-from finssim.calibration.output.vehicle_file import check_vehicle_path, write_vehicle
+from finssim.calibration.output.publish import command_line, publish, refuse_places
+from finssim.calibration.output.report import write_report
+from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.calibration.vision.least_squares import Pose
 from finssim.calibration.vision.mount_log import MountLog, read_mount_log
-from finssim.calibration.vision.report import command_line, publish
 from finssim.calibration.vision.sensor_mounts import (
     UNSURE_TURN,
     Attitude,
@@ -40,7 +41,6 @@ from finssim.calibration.vision.tag_mounts import (
     reference_tag,
     residuals,
 )
-from finssim.files import atomic_directory, atomic_write, refuse_unwritable
 from finssim.geometry.rotations import (
     matrix_to_quat,
     quat_conjugate,
@@ -149,43 +149,33 @@ def imu_orientation(
     return estimates, orientation if (half < UNSURE_TURN).any() else {}
 
 
-def of_frozen(found: MountFit) -> list[str]:
-    """What the motion does not tell of the tags, one sentence each."""
-    sentences, tag = [], found.rig.reference
+def of_frozen(found: MountFit) -> list[Finding]:
+    """What the motion does not tell of the tags."""
+    findings, tag = [], found.rig.reference
     frozen = [name.partition(".")[2] for name in found.frozen if name.startswith("reference.")]
-    turns = " and ".join(name[-1] for name in frozen if "turn" in name)
-    lengths = " and ".join(name for name in frozen if "turn" not in name)
+    turns = tuple(name[-1] for name in frozen if "turn" in name)
+    lengths = tuple(name for name in frozen if "turn" not in name)
     if turns:
-        sentences.append(
-            f"the motion does not tell the turn of tag {tag} about body {turns}: it keeps the file's, which so "
-            "defines the body's axes: rock the vehicle by 10 degrees and more about two axes to tell it from the IMU"
-        )
+        findings.append(finding("tag_turn_unknown", tag=tag, axes=turns))
     if lengths:
-        sentences.append(
-            f"the motion does not tell {lengths} of tag {tag} to {100.0 * UNSURE_LENGTH:g} cm: it keeps "
-            "the file's, which so defines the body's origin: measure one tag by hand, rock further, or turn on the "
-            "spot about a known point (--turns-about)"
-        )
+        findings.append(finding("tag_place_unknown", tag=tag, axes=lengths, limit=UNSURE_LENGTH))
     others = sorted({name.partition(".")[0] for name in found.frozen if name[0].isdigit()}, key=int)
     if others:
-        sentences.append(
-            f"tag {', '.join(others)}: too few pictures show it together with others to tell its place"
-        )
-    return sentences
+        findings.append(finding("tags_apart", tags=tuple(others)))
+    return findings
 
 
-def of_imu(imu: ImuMounting | CalibrationError | None, estimate: str) -> list[str]:
-    """What is to be said of the gyro, one sentence each."""
+def of_imu(imu: ImuMounting | CalibrationError | None, estimate: str) -> list[Finding]:
+    """What is to be said of the gyro."""
     if isinstance(imu, CalibrationError):
-        return [f"the gyro was not used: {imu}"]
+        return [finding("gyro_unused", reason=str(imu))]
     if imu is None:
         return []
     turns = {axis: imu.estimates[f"imu.turn_{axis}"] for axis in "xyz"}
     return [
-        *imu.advice,
+        *imu.findings,
         *(
-            f"the gyro says that the IMU is turned by {turn.estimate:.0f} deg about body {axis} against the "
-            "tags found: check sensors.imu.orientation, or estimate it (--estimate sensors)"
+            finding("imu_turned", angle=turn.estimate, axis=axis)
             for axis, turn in turns.items()
             if estimate == "tags" and turn.identifiable and not turn.ci95[0] - 2.0 < 0.0 < turn.ci95[1] + 2.0
         ),
@@ -247,7 +237,7 @@ def calibrate_mounts(
     found = fit_mounts(rig, mounts, log.moments(offset), estimate=estimate)
     imu = _imu(found, log, vehicle, offset)
     rows, changes = tag_estimates(found, mounts, vehicle)
-    warnings = [*log.notes, *of_frozen(found), *of_imu(imu, estimate)]
+    findings = [*log.findings, *of_frozen(found), *of_imu(imu, estimate)]
     quality = {"corners [px]": _figures(found.rms, found.left_out, len(found.moments), found.held_out_rms)}
     if estimate == "sensors":
         of_tilt, written = imu_orientation(found, imu, vehicle)
@@ -261,7 +251,7 @@ def calibrate_mounts(
     pressure = _pressure(rig, found, mounts) if estimate == "sensors" else None
     if pressure is not None:
         rows += pressure.estimates.values()
-        warnings += pressure.advice
+        findings += pressure.findings
         if pressure.estimates["depth.offset"].identifiable and depth is not None:
             changes["sensors.depth.position.2"] = float(depth.position[2]) - pressure.offset
         quality["depth [m]"] = _figures(pressure.rms, pressure.rejected)
@@ -272,7 +262,7 @@ def calibrate_mounts(
         estimates={row.name: row for row in rows},
         changes=changes,
         quality=quality,
-        warnings=tuple(warnings),
+        findings=tuple(findings),
         curves=_curves(found),
         trials={name: log.sha256},
         settings={"estimate": estimate, "seed": seed, "reference_tag": found.rig.reference},
@@ -429,28 +419,26 @@ def run(
     """
     if isinstance(turns_about, str):
         turns_about = _three(turns_about)
-    refuse_unwritable(atomic_write(check_vehicle_path(out)))
-    if report is not None:
-        refuse_unwritable(atomic_directory(report, replaces=FIT_FILE))
+    refuse_places(out, report, "vehicle")
     where, body = load_pool(pool), load_vehicle(vehicle)
     recording = read_mount_log(log, where, body)
     fit = calibrate_mounts(
         recording, where, body, name=Path(log).name, estimate=estimate, centre=turns_about, seed=seed
     )
     after = calibrated(fit)
-    warnings = doubts(fit, after)
+    findings = all_findings(fit, after)
     write_vehicle(after, out)
     if report is not None:
         options = {"pool": pool, "vehicle": vehicle, "out": out, "estimate": estimate, "seed": seed}
         point = None if turns_about is None else ",".join(f"{x:g}" for x in turns_about)
         command = command_line("mounts", [log], {**options, "turns_about": point})
-        write_report(fit, report, after, command=command, warnings=warnings, out=out)
+        write_report(fit, report, after, command=command, findings=findings, out=out)
 
     def show(console: Console) -> None:
-        print_fit(fit, after, console, warnings)
+        print_fit(fit, after, console, findings)
         if unchanged := kept(fit, after):
             console.print(f"kept from the file: {', '.join(unchanged)}", highlight=False, markup=False)
 
-    record = fit_json(fit, after, out=out, warnings=warnings) if as_json else None
+    record = fit_json(fit, after, out=out, findings=findings) if as_json else None
     publish(record, show, (out, report))
     return after

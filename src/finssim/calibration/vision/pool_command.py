@@ -15,20 +15,18 @@ from numpy.typing import NDArray
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Estimate
 from finssim.calibration.output.fit_figures import BLUE, ORANGE, draw_correlation, new_figure, png
-from finssim.calibration.vision.pool_fit import EXACT_LENS, PoolFit, calibrate_pool, doubted
+from finssim.calibration.output.publish import command_line, publish, refuse_places
+from finssim.calibration.vision.pool_fit import PoolFit, calibrate_pool, doubted
 from finssim.calibration.vision.pool_model import Settings
 from finssim.calibration.vision.pool_refine import HeldOut, rms
 from finssim.calibration.vision.report import (
     AS_GIVEN,
     Report,
-    command_line,
     correlation_json,
     draw_arrows,
     picture_axes,
     plain,
     plain_axes,
-    publish,
-    refuse_places,
 )
 from finssim.calibration.vision.survey import Observations, observe, observe_combined, read_survey
 from finssim.geometry.optics import Layer
@@ -70,7 +68,6 @@ def pool_json(
         out: Pool file that was written.
         inputs: File -> SHA-256 of what the fit was made from.
     """
-    exact = [note for note in fit.notes if note == EXACT_LENS]
     settings = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(fit.settings).items()}
     minima = [{"residual_ratio": plain(ratio), "camera_clearance": plain(at)} for ratio, at in fit.minima]
     return {
@@ -87,8 +84,7 @@ def pool_json(
         "outliers": fit.outliers,
         "other_minima": minima,
         "correlation": correlation_json(fit.correlation, 4),
-        "notes": [note for note in fit.notes if note != EXACT_LENS],
-        "advice": [*fit.advice, *exact],
+        "findings": [one.as_json() for one in fit.findings],
         "settings": settings,
         "inputs": dict(inputs or {}),
         "out": None if out is None else str(out),
@@ -129,8 +125,7 @@ def pool_report(fit: PoolFit) -> Report:
         estimates=list(fit.estimates.values()),
         cells=_cells,
         summary=summary,
-        notes=fit.notes,
-        advice=fit.advice,
+        findings=fit.findings,
         reading=READING,
     )
 

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
+from scipy.stats import t as student
 
+from finssim.calibration.degeneracy import correlation
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Correlation, Estimate
-from finssim.calibration.vision.pool_advice import advice, estimates
 from finssim.calibration.vision.pool_model import (
+    LENS_NAMES,
     NAMES,
     PoolModel,
     Prior,
@@ -32,15 +37,250 @@ from finssim.calibration.vision.pool_refine import (
     held_out,
     refine,
     rms,
+    surprise,
     touched,
 )
 from finssim.calibration.vision.pool_search import UP, Found, prior_of, search
+from finssim.calibration.vision.report import AS_GIVEN
 from finssim.calibration.vision.survey import Observations
 from finssim.geometry.optics import Lens
+from finssim.geometry.rotations import quat_to_euler
 
-__all__ = ["EXACT_LENS", "PoolFit", "calibrate_pool", "doubted"]
+__all__ = ["PoolFit", "calibrate_pool", "doubted"]
 
 Array = NDArray[np.float64]
+
+# What was estimated, with intervals and whether the pictures tell it, and what to measure so that they do.
+
+TOLD = 0.7
+"""A standard error above this part of what was known before means that the pictures tell next to nothing."""
+
+FAR = 0.05
+"""Standard error of a distance, over the whole distance, above which it counts as not determined."""
+
+AT_BOUND = 0.01
+"""Distance from the plane, over the whole distance, below which camera or points lie on it."""
+
+STEPS = np.array([1e-5] * 3 + [1e-6] * 5 + [1e-5, 1e-5, 1e-6, 1e-3, 1e-3, 1e-6, 1e-6] + [1e-7] * 3)
+"""Of the derivatives by the parameters."""
+
+
+def estimates(
+    fit: Refined, surface: bool, settings: Settings, centre: Array
+) -> tuple[dict[str, Estimate], Correlation]:
+    """Table of estimates, and the correlation of their errors, without what was not fitted.
+
+    Args:
+        fit: In the frame of the middle of the points.
+        surface: The plane is a water surface.
+        settings: Options, in the same frame.
+        centre: The middle of the points in the survey's frame [m].
+    """
+    table, quantile = _quantities(fit.model, surface, centre), float(student.ppf(0.975, fit.dof))
+    G = np.zeros((len(table), len(NAMES)))
+    for k in np.flatnonzero(fit.active):
+        step = STEPS[k] * np.eye(len(NAMES))[k]
+        ends = (_quantities(fit.model.moved(s), surface, centre).values() for s in (step, -step))
+        after, before = (np.array([value for _, value in end]) for end in ends)
+        G[:, k] = (after - before) / (2.0 * STEPS[k])
+    V = G @ fit.covariance @ G.T
+    rows, moved = {}, (np.abs(G) > 1e-12).any(axis=1)
+    for (name, (unit, value)), variance, moves in zip(table.items(), np.diagonal(V), moved, strict=True):
+        std = float(np.sqrt(max(0.0, variance)))
+        note = _doubt(name, std, fit, settings) if moves else AS_GIVEN
+        rows[name] = Estimate.within(name, value, quantile * std, unit, not note, note)
+    names = [name for name, moves in zip(table, moved, strict=True) if moves]
+    return rows, correlation(names, V[np.ix_(moved, moved)])
+
+
+def _quantities(model: PoolModel, surface: bool, centre: Array) -> dict[str, tuple[str, float]]:
+    """Name -> unit and value of everything that is told."""
+    camera, lens, n = model.camera, model.camera.lens, model.interface.normal
+    rows = dict(
+        zip(("camera_x", "camera_y", "camera_z"), (("m", x) for x in camera.position + centre), strict=True)
+    )
+    angles = np.degrees(quat_to_euler(np.asarray(camera.orientation)))
+    rows |= dict(
+        zip(("camera_roll", "camera_pitch", "camera_yaw"), (("deg", x) for x in angles), strict=True)
+    )
+    if surface:
+        rows["camera_height"] = ("m", model.clearance)
+        rows["water_height"] = ("m", float(model.interface.height(0.0, 0.0) + centre[2]))
+        rows["tilt_x"], rows["tilt_y"] = (("deg", np.degrees(np.arctan2(x, abs(n[2])))) for x in n[:2])
+    else:
+        rows["camera_distance"], rows["point_distance"] = ("m", model.clearance), ("m", model.depth)
+        rows |= {f"normal_{axis}": ("1", x) for axis, x in zip("xyz", n, strict=True)}
+    rows["index"], rows["focal"] = ("1", model.interface.index_far), ("px", lens.fx)
+    rows["center_x"], rows["center_y"] = ("px", lens.cx), ("px", lens.cy)
+    return rows | {name: ("1", x) for name, x in zip(LENS_NAMES[3:], lens.distortion, strict=False)}
+
+
+def _doubt(name: str, std: float, fit: Refined, settings: Settings) -> str:
+    """What a number rests on where the pictures do not tell it; empty where they do."""
+    model, prior = fit.model, fit.prior
+    reach = model.clearance + max(model.depth, 0.0)
+    before, sentence = np.inf, ""
+    if name == "index":
+        before, sentence = prior.index_std, f"the pixels do not tell it: held at {settings.index:g}"
+    elif name in ("tilt_x", "tilt_y"):
+        before, sentence = np.degrees(prior.tilt_std), "the pixels do not tell it: held level"
+    elif name in LENS_NAMES:
+        before = prior.lens_std[LENS_NAMES.index(name)] * (model.camera.lens.fx if name == "focal" else 1.0)
+        sentence = "the pixels do not tell it: held at the camera file's"
+    elif name in ("water_height", "point_distance") and settings.known_depth:
+        before, sentence = prior.depth_std, "rests on the measured height"
+    elif name in ("camera_height", "camera_distance", "water_height", "point_distance"):
+        if min(model.clearance, model.depth - model.interface.thickness) < AT_BOUND * reach:
+            return "at its bound: the plane touches the camera or a point"
+        before, sentence = FAR * reach / TOLD, "the pixels do not tell it"
+    return sentence if np.isfinite(before) and std > TOLD * before else ""
+
+
+# What a survey cannot tell, and what to measure so that the next one can.
+
+NARROW = np.radians(20.0)
+"""Angle of incidence below which refraction looks like a nearer floor."""
+
+ONE_DEPTH = 0.02
+"""Spread of depths, over the distance to the camera, below which they count as one."""
+
+SAME_PLACE = 0.005
+"""Two places of the plane nearer than this are one [m]."""
+
+CERTAIN = 0.999
+"""Share of the marks above the water that are taken for such."""
+
+WHOLE_LENS = "--fit pose,height,tilt,index,focal,center,distortion"
+
+
+def advice(
+    fit: Refined,
+    seen: Observations,
+    surface: bool,
+    settings: Settings,
+    table: Mapping[str, Estimate],
+    minima: Sequence[tuple[float, float]],
+    touching: Sequence[str],
+    contradicted: Sequence[Finding],
+) -> Iterator[Finding]:
+    """Findings for the user, the gravest first.
+
+    Args:
+        fit: In the frame of `seen`.
+        seen: All rows.
+        surface: The plane is a water surface.
+        settings: Options, in the same frame.
+        table: Estimates.
+        minima: Other places where the search came to rest.
+        touching: What the plane came to rest against.
+        contradicted: On measurements that the pixels contradict.
+    """
+    if touching:
+        yield finding("plane_touches", places=tuple(touching))
+    yield from contradicted
+    yield from _place(fit, seen, surface, settings, table)
+    yield from _conflicts(fit, surface, settings)
+    yield from _numbers(fit, seen)
+    yield from _left_out(fit, seen, surface)
+    place = table["camera_height" if surface else "camera_distance"]
+    close = [at for ratio, at in minima if ratio < 1.1 and abs(at - place.estimate) > SAME_PLACE]
+    if close and not place.identifiable:
+        yield finding("other_place", other=close[0], chosen=place.estimate)
+
+
+def _place(
+    fit: Refined, seen: Observations, surface: bool, settings: Settings, table: Mapping[str, Estimate]
+) -> Iterator[Finding]:
+    """On camera height, water height and index, which few points cannot separate."""
+    model, wet = fit.model, seen.subset(fit.used & ~seen.dry)
+    height = table["camera_height" if surface else "camera_distance"]
+    half = 0.5 * (height.ci95[1] - height.ci95[0])
+    n = model.interface.normal
+    across = (wet.points - model.camera.position) - ((wet.points - model.camera.position) @ n)[:, None] * n
+    radius = float(np.linalg.norm(across, axis=1).max())
+    whole = model.clearance + model.depth
+    steepest = float(np.arctan2(radius, whole))
+    levels = float(np.ptp(wet.points @ n))
+    what = "camera height, water height" if surface else "distances of camera and points from the wall"
+    tape = "measure the water's height with a tape and give --water-height"
+    tape = (
+        ""
+        if settings.known_depth
+        else f": {tape if surface else 'measure where the wall is and give --plane'}"
+    )
+    if steepest < NARROW:
+        angle = float(np.degrees(steepest))
+        yield finding("points_narrow", radius=radius, angle=angle, quantities=what, remedy=tape)
+    if levels < ONE_DEPTH * whole and half > 0.01 * whole:
+        yield finding("one_depth", spread=levels, quantities=what, half=1000.0 * half, remedy=tape)
+    if not height.identifiable:
+        low, high = height.ci95
+        yield finding("height_unknown", height.name, estimate=height.estimate, low=low, high=high)
+    focal = table["focal"]
+    loose = focal.ci95[1] - focal.ci95[0] > 0.02 * focal.estimate
+    if fit.active[NAMES.index("focal")] and loose and levels < 0.05 * whole:
+        yield finding("focal_of_one_depth")
+
+
+def _conflicts(fit: Refined, surface: bool, settings: Settings) -> Iterator[Finding]:
+    """Where the pixels pull an estimate far from what was known."""
+    prior, model = fit.prior, fit.model
+    focal = NAMES.index("focal")
+    place = "water's height" if surface else "plane's place"
+    lens = "" if fit.active[focal] else f"; or let the lens be fitted ({WHOLE_LENS})"
+    if np.isfinite(prior.index_std):
+        pull = (model.interface.index_far - settings.index) / prior.index_std
+        if abs(pull) > 3.0:
+            yield finding(
+                "index_pulled",
+                index=model.interface.index_far,
+                given=settings.index,
+                times=abs(pull),
+                place=place,
+                remedy=lens,
+            )
+    pull = np.log(model.camera.lens.fx / prior.start.camera.lens.fx) / prior.lens_std[0]
+    if fit.active[focal] and abs(pull) > 2.0:
+        change = float(np.exp(pull * prior.lens_std[0]) - 1.0)
+        yield finding("focal_pulled", change=change, expected=prior.lens_std[0])
+    if np.isfinite(prior.tilt_std) and prior.normal is not None:
+        lean = float(np.arccos(np.clip(model.interface.normal @ prior.normal, -1.0, 1.0)))
+        if lean > 3.0 * prior.tilt_std:
+            yield finding("tilt_pulled", lean=float(np.degrees(lean)), remedy=lens)
+
+
+def _numbers(fit: Refined, seen: Observations) -> Iterator[Finding]:
+    locations = len(np.unique(seen.location[fit.used]))
+    if locations < 12:
+        yield finding("few_places", places=locations)
+    if fit.noise.pixel > 1.5:
+        yield finding("residuals_large", residual=fit.noise.pixel, options=WHOLE_LENS)
+    if fit.noise.scale > 2.0:
+        error = 1000.0 * fit.noise.survey * fit.noise.scale
+        yield finding("survey_rough", times=fit.noise.scale, error=error)
+
+
+def _left_out(fit: Refined, seen: Observations, surface: bool) -> Iterator[Finding]:
+    """Rows that were left out: marks above the water that nobody called dry, and others."""
+    above = _above(fit, seen)
+    wrong = int((~fit.used & ~above).sum())
+    if above.any():
+        names = tuple(seen.names[i] for i in np.flatnonzero(above))
+        place = "above the water found" if surface else "on the camera's side of the plane found"
+        yield finding("marks_dry", marks=names, place=place)
+    if wrong:
+        yield finding("rows_wrong", rows=wrong)
+
+
+def _above(fit: Refined, seen: Observations) -> NDArray[np.bool_]:
+    """Rows left out that lie on the camera's side of the plane and are met by straight lines, as far as the pose is
+    told, (N,)."""
+    side = seen.points @ fit.model.interface.normal + fit.model.interface.offset > 0.0
+    side &= ~fit.used & ~seen.dry
+    straight = surprise(fit.model, replace(seen, dry=np.ones(len(seen), bool)), fit.noise, fit.covariance)
+    met = side & (straight < float(chi2.ppf(CERTAIN, 2)))
+    return met & (2 * met.sum() > side.sum())  # some are met by chance
+
 
 DOUBT = 20.0
 """Fall of chi² above which a prior counts as contradicted: by chance once in 20000 surveys, more in very poor ones."""
@@ -82,8 +322,8 @@ class PoolFit:
     pinhole_held_out: HeldOut | None
     lens_fitted: tuple[str, ...]
     """Groups of `FITTED` that the lens gave up."""
-    notes: tuple[str, ...]
-    advice: tuple[str, ...]
+    findings: tuple[Finding, ...]
+    """The gravest first, then what is merely worth knowing."""
     minima: tuple[tuple[float, float], ...]
     """Other places where the search came to rest: residual over that of the best, clearance of the camera [m]."""
     touching: tuple[str, ...]
@@ -128,18 +368,15 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
     centre = seen.points[~seen.dry].mean(axis=0)
     here, told = seen.shifted(-centre), shifted_settings(settings, -centre)
     found = search(here, extended_lens(lens), told)
-    notes = list(seen.notes)
+    notes = list(seen.findings)
     fit = _best_lens(here, found, told, notes)
     level = abs(float(fit.model.interface.normal[2])) > np.cos(LEVEL)
     if level and not found.surface and settings.interface == "auto" and settings.plane is None:
-        found, notes = replace(found, surface=True), list(seen.notes)
+        found, notes = replace(found, surface=True), list(seen.findings)
         fit = _best_lens(here, found, told, notes)
     fit = _released(here, told, fit, notes)
     if found.surface and fit.model.interface.normal[2] < 0.0:
-        notes.append(
-            "the camera is on the -z side: the survey's z points down (or a flat survey is left-handed, which its "
-            "points cannot tell); heights and --z of other commands are meant in that frame"
-        )
+        notes.append(finding("camera_below"))
     pinhole = _pinhole(here, found, told, fit)
     normal = UP if found.surface else fit.model.interface.normal
     parts = [held_out(f, here, settings.folds, settings.seed, normal) for f in (fit, pinhole)]
@@ -162,8 +399,10 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
         pinhole_residual=residuals(pinhole.model, here)[0],
         pinhole_held_out=parts[1],
         lens_fitted=_lens_groups(fit.active),
-        notes=tuple(notes),
-        advice=tuple(advice(fit, here, found.surface, told, table, found.minima, touching, contradicted)),
+        findings=(
+            *advice(fit, here, found.surface, told, table, found.minima, touching, contradicted),
+            *notes,
+        ),
         minima=found.minima,
         touching=touching,
     )
@@ -177,7 +416,7 @@ def _refined(
     return refine(model, here, active, prior, noise, pixel_known=told.pixel_sigma is not None)
 
 
-def _best_lens(here: Observations, found: Found, told: Settings, notes: list[str]) -> Refined:
+def _best_lens(here: Observations, found: Found, told: Settings, notes: list[Finding]) -> Refined:
     """The fit as asked; where nobody asked, the lens is fitted as far as held-out points get better by it."""
     start = replace(found.model, interface=replace(found.model.interface, index_far=told.index))
 
@@ -202,10 +441,7 @@ def _best_lens(here: Observations, found: Found, told: Settings, notes: list[str
         if further < BETTER * error:
             best, error = other, further
     if groups := _lens_groups(best.active & ~active_names(told)):
-        notes.append(
-            f"the camera file does not fit these pixels: {', '.join(groups)} of the lens fitted here as well, because "
-            "points held out are met better so; a calibration of the camera by itself is worth more"
-        )
+        notes.append(finding("lens_refitted", groups=groups))
     return best
 
 
@@ -223,7 +459,7 @@ def _lens_groups(active: NDArray[np.bool_]) -> tuple[str, ...]:
     return tuple(group for group, name in named.items() if active[NAMES.index(name)])
 
 
-def _released(here: Observations, told: Settings, fit: Refined, notes: list[str]) -> Refined:
+def _released(here: Observations, told: Settings, fit: Refined, notes: list[Finding]) -> Refined:
     """Let the surface tilt freely where the pixels contradict a level one and nobody set how level it is."""
     if not np.isfinite(fit.prior.tilt_std) or told.tilt_sigma is not None or not fit.active[6]:
         return fit
@@ -232,11 +468,7 @@ def _released(here: Observations, told: Settings, fit: Refined, notes: list[str]
     if free is None or not _leans(free, fit.prior.normal):
         return fit
     lean = float(np.degrees(np.arccos(np.clip(free.model.interface.normal @ fit.prior.normal, -1.0, 1.0))))
-    notes.append(
-        f"the pixels contradict a plane along the survey's axis and want it {lean:.2f} degrees tilted: its "
-        "direction was fitted freely; the survey's z may not be plumb (a sloping floor taken for level), or the camera "
-        "file is off"
-    )
+    notes.append(finding("plane_tilted", lean=lean))
     return free
 
 
@@ -247,19 +479,16 @@ def _leans(free: Refined, normal: Array) -> bool:
     return lean < MOST_LEAN and error < lean / 3.0
 
 
-def _contradicted(here: Observations, told: Settings, fit: Refined) -> list[str]:
-    """A sentence where the pixels by themselves put the plane elsewhere than it was measured."""
+def _contradicted(here: Observations, told: Settings, fit: Refined) -> list[Finding]:
+    """A finding where the pixels by themselves put the plane elsewhere than it was measured."""
     if not told.known_depth or not fit.active[NAMES.index("depth")]:
         return []
     free = _without(here, told, fit, replace(fit.prior, depth_std=np.inf))
     if free is None:
         return []
     by = 1000.0 * (free.model.depth - fit.prior.depth)
-    where = "nearer to" if by > 0.0 else "further from"
-    return [
-        f"the pixels by themselves put the plane {abs(by):.0f} mm {where} the camera than it was measured, "
-        "which its error does not explain: check the tape, the survey's zero, the window and the camera file"
-    ]
+    sense = "nearer to" if by > 0.0 else "further from"
+    return [finding("plane_contradicted", distance=abs(by), sense=sense)]
 
 
 def _without(here: Observations, told: Settings, fit: Refined, loose: Prior) -> Refined | None:
@@ -316,19 +545,9 @@ MOST_ABOVE = 0.4
 MET = 4.0, 3.0
 """Residual of straight lines that meets a mark: so many residuals of the rest, and so many pixels more."""
 
-MOST_NAMES = 12
-"""Marks that a sentence names."""
-
-EXACT_LENS = (
-    "the lens is taken as exact, because neither the camera file nor the options tell its errors: if its focal length "
-    "or centre is off, the intervals of the camera's place are too narrow; a lens that was calibrated is usually known "
-    "to 0.3 % and 4 px, --focal-sigma 0.003 --center-sigma 4"
-)
-"""A note, not an alarm: what the intervals of most camera files rest on."""
-
 
 def doubted(fit: PoolFit, lens: Lens, *, lens_told: bool = True) -> PoolFit:
-    """The calibration with what speaks against it put before its advice.
+    """The calibration with what speaks against it put first.
 
     Args:
         fit: The calibration.
@@ -340,8 +559,8 @@ def doubted(fit: PoolFit, lens: Lens, *, lens_told: bool = True) -> PoolFit:
     """
     _refuse_depth(fit)
     found = [*_touching(fit), *_unmarked(fit, lens), *_handed(fit)]
-    exact = [] if lens_told or "focal" in fit.lens_fitted else [EXACT_LENS]
-    return replace(fit, advice=(*_straight(fit), *found, *fit.advice), notes=(*fit.notes, *exact))
+    exact = [] if lens_told or "focal" in fit.lens_fitted else [finding("lens_exact")]
+    return replace(fit, findings=(*_straight(fit), *found, *fit.findings, *exact))
 
 
 def _refuse_depth(fit: PoolFit) -> None:
@@ -369,7 +588,7 @@ def _told_depth(fit: PoolFit) -> tuple[float, str]:
     return 0.0, ""
 
 
-def _touching(fit: PoolFit) -> list[str]:
+def _touching(fit: PoolFit) -> list[Finding]:
     """Where the camera comes to rest on the plane, which it cannot pass; refused where that is absurd."""
     model, error = fit.model, rms(fit.residual[fit.used])
     if model.clearance >= TOUCHING * (model.clearance + max(model.depth, 0.0)) or error <= ODD:
@@ -380,13 +599,10 @@ def _touching(fit: PoolFit) -> list[str]:
             "the points so; check the unit and sign of the water's height, the window's thickness [m], the index, and "
             "whether there is water between at all; nothing is written"
         )
-    return [
-        f"the camera ends on the plane itself, with residuals of {error:.1f} px: the plane's place, the window, the "
-        "index or the camera file is wrong; do not use this pool file"
-    ]
+    return [finding("camera_on_plane", residual=error)]
 
 
-def _straight(fit: PoolFit) -> list[str]:
+def _straight(fit: PoolFit) -> list[Finding]:
     """Where straight lines foretell points better than refraction."""
     bent, straight = fit.held_out, fit.pinhole_held_out
     if bent is None or straight is None or len(bent.rows) < ENOUGH:
@@ -394,14 +610,10 @@ def _straight(fit: PoolFit) -> list[str]:
     errors = rms(bent.pixels), rms(straight.pixels)
     if not errors[1] < STRAIGHTER * errors[0]:
         return []
-    return [
-        f"straight lines meet held-out points better ({errors[1]:.2f} px) than refraction does ({errors[0]:.2f} px): "
-        "there is probably no water between camera and points, or the index, the window or the place given for the "
-        "plane is wrong; do not use this pool file under water"
-    ]
+    return [finding("straight_better", straight=errors[1], refraction=errors[0])]
 
 
-def _unmarked(fit: PoolFit, lens: Lens) -> list[str]:
+def _unmarked(fit: PoolFit, lens: Lens) -> list[Finding]:
     """Marks above the water that nobody called dry, for which the plane was put over them, or the lens bent."""
     seen, rows = fit.seen, _highest(fit)
     if not rows.any():
@@ -414,11 +626,13 @@ def _unmarked(fit: PoolFit, lens: Lens) -> list[str]:
     above = clearances(other.model, marks.points) + other.model.interface.thickness < 0.0
     if not (above & _met(other, marks)).all():
         return []
-    listed = ", ".join(marks.names[:MOST_NAMES]) + (", ..." if len(marks) > MOST_NAMES else "")
     return [
-        f"without {listed}, the plane is found {other.model.clearance:.2f} m from the camera in place of "
-        f"{fit.model.clearance:.2f} m, beyond them, and straight lines meet them: mark them dry (a column dry with "
-        "yes); do not use this pool file"
+        finding(
+            "marks_unmarked",
+            marks=marks.names,
+            clearance=other.model.clearance,
+            instead=fit.model.clearance,
+        )
     ]
 
 
@@ -445,7 +659,7 @@ def _met(fit: PoolFit, marks: Observations) -> NDArray[np.bool_]:
     return np.asarray(np.linalg.norm(off, axis=1) < times * rms(fit.residual[fit.used]) + more)
 
 
-def _handed(fit: PoolFit) -> list[str]:
+def _handed(fit: PoolFit) -> list[Finding]:
     """A flat survey whose z points down, or is left-handed: the same pixels, unless the water's height is told."""
     settings = fit.settings
     if not fit.surface or fit.model.interface.normal[2] > 0.0:
@@ -455,8 +669,4 @@ def _handed(fit: PoolFit) -> list[str]:
     values = np.linalg.svd(fit.seen.points - fit.seen.points.mean(axis=0), compute_uv=False)
     if values[2] >= FLAT * values[1]:
         return []
-    return [
-        "flat points cannot tell whether the survey's z points down or its x and y are left-handed (seen from the "
-        "camera, y to the right of x): it is taken for the first; if z points up, every height but theirs comes out "
-        "mirrored: negate y in the survey, or give --water-height, which tells the two apart"
-    ]
+    return [finding("handedness_open")]

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
-import shlex
-import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,11 +14,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, sentences
 from finssim.calibration.fit import Correlation, Estimate
 from finssim.calibration.output.fit_figures import BLUE, GRAY, ORANGE
-from finssim.files import atomic_directory, atomic_write, refuse_unwritable
-from finssim.page import html_page, html_picture, html_table
+from finssim.page import Page, Pictures
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,21 +25,18 @@ if TYPE_CHECKING:
     from finssim.geometry.optics import Lens
 
 __all__ = [
-    "AS_GIVEN", "Report", "command_line", "correlation_json", "draw_arrows", "html_row", "picture_axes",
-    "plain", "plain_axes", "publish", "refuse_places",
+    "AS_GIVEN", "ExtraTable", "Report", "correlation_json", "draw_arrows", "picture_axes", "plain", "plain_axes",
 ]  # fmt: skip
 
 HEADS = ("parameter", "estimate", "95 % interval", "unit", "note")
-REPORT_FILE, MARKDOWN_FILE, RECORD_FILE = "report.html", "report.md", "fit.json"
-
 AS_GIVEN = "as given"
 """Note of a number that was not estimated: the table on the terminal leaves it out."""
 
 ARROW = 0.06
 """Length of the 95th percentile of arrows in a figure, in widths of what is drawn."""
 
-Pictures = Mapping[str, tuple[str, bytes]]
-"""File name -> what the picture shows, and the PNG."""
+ExtraTable = tuple[Sequence[str], Sequence[Sequence[str]], Sequence[str]]
+"""Heads, rows, and a class of the page's style for each row."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,11 +52,20 @@ class Report:
     """Texts of an estimate, in the order of `HEADS`."""
     summary: Sequence[str]
     """The figures that say how good the calibration is, one sentence each."""
-    notes: Sequence[str]
-    advice: Sequence[str]
+    findings: Sequence[Finding]
     advice_title: str = "Advice"
     reading: str
     """What the intervals mean."""
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences worth knowing."""
+        return sentences(one for one in self.findings if one.severity == "note")
+
+    @property
+    def advice(self) -> list[str]:
+        """Sentences on what to do."""
+        return sentences(one for one in self.findings if one.severity != "note")
 
     def show(self, console: Console) -> None:
         """Print estimates, figures and advice; fits 100 columns."""
@@ -89,7 +89,7 @@ class Report:
         record: Mapping[str, Any],
         pictures: Pictures,
         repeat: Sequence[str],
-        tables: Mapping[str, str] | None = None,
+        tables: Mapping[str, ExtraTable] | None = None,
     ) -> None:
         """Write `report.html`, `report.md`, the pictures as PNG and `fit.json`.
 
@@ -98,92 +98,26 @@ class Report:
             record: What `fit.json` holds.
             pictures: To draw.
             repeat: The command line that makes the fit again, and what it was made from.
-            tables: Heading -> HTML of further tables for the page.
+            tables: Heading -> further tables.
 
         Raises:
             OutputError: The folder holds other files, or cannot be written.
         """
-        texts = {
-            RECORD_FILE: json.dumps(record, indent=1, allow_nan=False) + "\n",
-            REPORT_FILE: self._html(pictures, repeat, tables or {}),
-            MARKDOWN_FILE: self._markdown(pictures, repeat),
-        }
-        with atomic_directory(folder, replaces=RECORD_FILE) as temporary:
-            for name, (_, data) in pictures.items():
-                (temporary / name).write_bytes(data)
-            for name, text in texts.items():
-                (temporary / name).write_text(text, encoding="utf-8")
-
-    def _html(self, pictures: Pictures, repeat: Sequence[str], tables: Mapping[str, str]) -> str:
-        rows = [
-            html_row((*self.cells(e)[:4], e.note), "" if e.identifiable or e.note == AS_GIVEN else "doubt")
-            for e in self.estimates
-        ]
-        parts = [f"<h1>{escape(self.title)}</h1>"]
-        parts += [f'<p class="lead">{escape(sentence)}</p>' for sentence in self.summary]
-        if self.advice:
-            items = "".join(f'<li class="warning">{escape(sentence)}</li>' for sentence in self.advice)
-            parts += [f"<h2>{self.advice_title}</h2>", f"<ul>{items}</ul>"]
-        parts += ["<h2>Estimates</h2>", html_table(HEADS, rows)]
-        parts += [f'<p class="note">{escape(note)}</p>' for note in (self.reading, *self.notes)]
-        for text, data in pictures.values():
-            parts += [f"<h2>{escape(text)}</h2>", html_picture(data, text)]
-        for heading, table in tables.items():
-            parts += [f"<h2>{heading}</h2>", table]
-        parts += ["<h2>How to repeat it</h2>", f"<pre>{escape(chr(10).join(repeat))}</pre>"]
-        return html_page(self.title, parts)
-
-    def _markdown(self, pictures: Pictures, repeat: Sequence[str]) -> str:
-        rows = [HEADS, ["---"] * len(HEADS), *map(self.cells, self.estimates)]
-        lines = [f"# {self.title}", "", *(f"{sentence}.  " for sentence in self.summary)]
-        if self.advice:
-            lines += ["", f"## {self.advice_title}", "", *(f"- {sentence}" for sentence in self.advice)]
-        lines += ["", "## Estimates", ""]
-        lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
-        lines += ["", self.reading]
-        lines += ["", *(f"- {note}" for note in self.notes)] if self.notes else []
-        lines += ["", "## Pictures", "", *(f"![{text}]({name})" for name, (text, _) in pictures.items())]
-        lines += ["", "## How to repeat it", "", "```text", *repeat, "```"]
-        return "\n".join(lines) + "\n"
-
-
-def html_row(cells: Sequence[str], kind: str = "") -> str:
-    """A row of a table, its last cell in words; `kind` is a class of the page's style."""
-    inner = "".join(f"<td>{escape(cell)}</td>" for cell in cells[:-1])
-    return f'<tr class="{kind}">{inner}<td class="words">{escape(cells[-1])}</td></tr>'
-
-
-def refuse_places(out: Path, report: Path | None, kind: str) -> None:
-    """Refuse a file that is no YAML, or a place that cannot be written, before anything is computed."""
-    if Path(out).suffix not in (".yaml", ".yml"):
-        raise CalibrationError(
-            f"{out} ends in '{Path(out).suffix}', expected .yaml: name a {kind} file to write"
-        )
-    refuse_unwritable(atomic_write(out))
-    if report is not None:
-        refuse_unwritable(atomic_directory(report, replaces=RECORD_FILE))
-
-
-def publish(
-    record: Mapping[str, Any] | None, show: Callable[[Console], None], written: Iterable[Path | None]
-) -> None:
-    """Print one JSON object for programs; or, without one, for people, and which files were written."""
-    if record is not None:
-        print(json.dumps(record, allow_nan=False))
-        return
-    console = Console() if sys.stdout.isatty() else Console(width=100)
-    show(console)
-    for path in filter(None, written):
-        console.print(f"written: {path}", highlight=False, markup=False, soft_wrap=True)
-
-
-def command_line(kind: str, inputs: Iterable[Path], options: Mapping[str, Any]) -> str:
-    """The command line that does this again; options that are None or empty are left out."""
-    words = ["finssim", "calibrate", kind, *map(str, inputs)]
-    for name, value in options.items():
-        for item in value if isinstance(value, (list, tuple)) else [] if value is None else [value]:
-            words += [f"--{name.replace('_', '-')}", str(item)]
-    return shlex.join(words)
+        page = Page(self.title)
+        for sentence in self.summary:
+            page.lead(sentence)
+        page.items(self.advice_title, self.advice)
+        page.heading("Estimates")
+        kinds = ["" if e.identifiable or e.note == AS_GIVEN else "doubt" for e in self.estimates]
+        page.table(HEADS, [self.cells(e) for e in self.estimates], kinds, last="words")
+        for note in (self.reading, *self.notes):
+            page.note(note)
+        page.pictures(pictures)
+        for heading, (heads, rows, kinds) in (tables or {}).items():
+            page.heading(heading)
+            page.table(heads, rows, kinds, last="words")
+        page.code("How to repeat it", repeat)
+        page.write(folder, record, pictures)
 
 
 def plain(x: float | None, digits: int = 17) -> float | None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Estimate
 from finssim.calibration.motion.smoothing import longest_step
 from finssim.calibration.uncertainty import Covariance, intervals, trial_covariance
@@ -189,7 +190,7 @@ class ImuMounting:
     windows: int
     correlation: float
     """Of the turns' sizes once the clocks agree."""
-    advice: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
     @property
     def whole(self) -> bool:
@@ -274,7 +275,7 @@ def fit_imu_mounting(
         rejected=fit.rejected,
         windows=len(fit.weight),
         correlation=correlation,
-        advice=_imu_advice(estimates, fit.rejected / len(fit.weight)),
+        findings=_imu_findings(estimates, fit.rejected / len(fit.weight)),
     )
 
 
@@ -365,20 +366,15 @@ def _imu_estimates(theta: Array, half: Array) -> dict[str, Estimate]:
     return {row.name: row for row in rows}
 
 
-def _imu_advice(estimates: dict[str, Estimate], rejected: float) -> tuple[str, ...]:
-    """Sentences on what is not told; `rejected` is the share of windows without weight."""
-    sentences = []
+def _imu_findings(estimates: dict[str, Estimate], rejected: float) -> tuple[Finding, ...]:
+    """What is not told; `rejected` is the share of windows without weight."""
+    findings = []
     unsure = [axis for axis in "xyz" if not estimates[f"imu.turn_{axis}"].identifiable]
     if unsure:
-        sentences.append(
-            f"the motion does not tell how the IMU is turned about body {' and '.join(unsure)}: rock the "
-            "vehicle about at least two axes, by 10 degrees and more"
-        )
+        findings.append(finding("imu_turn_unknown", axes=tuple(unsure)))
     if rejected > 0.1:
-        sentences.append(
-            f"{100.0 * rejected:.0f} % of the windows disagree and have no weight: look at the attitude"
-        )
-    return tuple(sentences)
+        findings.append(finding("windows_disagree", share=rejected))
+    return tuple(findings)
 
 
 def turn_residual(
@@ -500,7 +496,7 @@ class DepthFit:
     """Of what is left over, robust [m]."""
     rejected: int
     """Samples without weight."""
-    advice: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def fit_depth(known: ArrayLike, reading: ArrayLike, *, known_std: float = 0.0) -> DepthFit:
@@ -543,7 +539,7 @@ def fit_depth(known: ArrayLike, reading: ArrayLike, *, known_std: float = 0.0) -
         estimates={row.name: row for row in rows},
         rms=fit.rms,
         rejected=fit.rejected,
-        advice=_depth_advice(rows[1], float(np.ptp(x))),
+        findings=_depth_findings(rows[1], float(np.ptp(x))),
     )
 
 
@@ -555,12 +551,9 @@ def _line(A: Array, y: Array) -> tuple[Array, Array, TukeyFit[Array]]:
     return fit.state, intervals(np.zeros(A.shape[1]), covariance)[:, 1], fit
 
 
-def _depth_advice(scale: Estimate, span: float) -> tuple[str, ...]:
+def _depth_findings(scale: Estimate, span: float) -> tuple[Finding, ...]:
     if not scale.identifiable:
-        return (
-            f"the depths span {100.0 * span:.0f} cm: too little to tell the scale, so that fresh and salt water "
-            f"({100.0 * (SALT - 1.0):.1f} %) look alike: dive to two depths half a metre apart, or more",
-        )
+        return (finding("depths_alike", span=span, share=SALT - 1.0),)
     low, high = scale.ci95
     for right, others in (
         (1.0, ""),
@@ -568,7 +561,5 @@ def _depth_advice(scale: Estimate, span: float) -> tuple[str, ...]:
         (1.0 / SALT, "salt water in fresh water"),
     ):
         if low <= right <= high:
-            return (f"the sensor reads as if set to {others}: set its water density",) if others else ()
-    return (
-        f"the sensor's scale is {scale.estimate:.3f}, and no water explains it: check its setting and the survey",
-    )
+            return (finding("water_setting", setting=others),) if others else ()
+    return (finding("scale_unexplained", scale=scale.estimate),)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from collections.abc import Sequence
@@ -14,18 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.findings import Finding, finding
+from finssim.calibration.trials.units import UNITS
 from finssim.geometry.rotations import quat_from_euler, quat_rotate
 from finssim.localization.detection.detections import Frame, most_certain, read_detections
 from finssim.localization.detection.tags import corners
 from finssim.localization.errors import LocalizationError
 from finssim.localization.fields import Fields
+from finssim.text_table import TextTable, read_text, read_text_table, text_table
+from finssim.text_table import number as _number
 from finssim.yaml_file import read_mapping
 
 __all__ = ["Observations", "observe", "observe_combined", "read_survey"]
 
 Array = NDArray[np.float64]
 
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
+METRES = {**UNITS["length"], "inch": 0.0254}
 """Metres in one of each."""
 
 LENGTHS, ANGLES = ("x", "y", "z", "sigma", "edge"), ("yaw", "roll", "pitch")
@@ -58,6 +61,8 @@ _ALIASES = {
 """Standard name of a column -> what people call it, without case, blanks and signs."""
 
 _BY_WORD = {word: name for name, words in _ALIASES.items() for word in words.split()}
+
+COMMENT = ("#", "%", "//")
 
 _UNIT_AT_END = re.compile(r"[\s_]*[\[(]\s*([^\])]*?)\s*[\])]\s*$|_(m|cm|mm|in|inch|ft|deg|rad|px)$")
 _UNIT_COMMENT = re.compile(
@@ -138,45 +143,40 @@ def read_table(path: str | Path, *, unit: str | None = None) -> Table:
     Raises:
         CalibrationError: Unreadable, no header, a cell that must be a number is none; names the line.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
-        raise CalibrationError(f"cannot read {path}: {error.strerror or error}") from error
-    lines = [(i, line.strip()) for i, line in enumerate(text.splitlines(), start=1) if line.strip()]
-    said = next((m[1].lower() for _, line in lines if (m := _UNIT_COMMENT.match(line))), None)
-    comments = [line for _, line in lines if line.startswith(("#", "%", "//"))]
-    lines = [(i, line) for i, line in lines if not line.startswith(("#", "%", "//"))]
-    if lines and comments and _known(lines[0][1]) < 2:  # the header itself may be behind a comment sign
-        head = max((line.lstrip("#%/ ") for line in comments), key=_known)
-        lines = [(0, head), *lines] if _known(head) >= 2 else lines
-    if not lines:
-        what = "holds nothing but comments" if comments else "is empty"
+    text, _ = read_text(path, CalibrationError)
+    table = text_table(text, spaces=None, comment=COMMENT)
+    heads = [text_table(line.lstrip("#%/ "), spaces=None).names for line in table.comments]
+    if heads and table.names and _known(table.names) < 2:  # the header itself may be behind a comment sign
+        head = max(heads, key=_known)
+        if _known(head) >= 2:
+            table = text_table(text, names=head, spaces=None, comment=COMMENT)
+    if not table.names:
+        what = "holds nothing but comments" if table.comments else "is empty"
         raise CalibrationError(
             f"{path}: the file {what}: expected a line of names, such as id,x,y,z, and rows"
         )
-    if _is_numeric(lines[0][1]):
+    if all(_number(cell) is not None for cell in table.names):
         raise CalibrationError(
             f"{path}: the first line is no header: name the columns, such as id,x,y,z or u,v,x,y,z"
         )
-    default = "m" if said and said.startswith("met") else said or unit
-    return _table(str(path), lines, default)
+    said = next((m[1].lower() for line in table.comments if (m := _UNIT_COMMENT.match(line))), None)
+    return _table(str(path), table, "m" if said and said.startswith("met") else said or unit)
 
 
-def _table(path: str, lines: list[tuple[int, str]], default: str | None) -> Table:
-    split = _splitter(lines[0][1])
-    heads = [_column(word) for word in split(lines[0][1])]
+def _table(path: str, text: TextTable, default: str | None) -> Table:
+    heads = [_column(word) for word in text.names]
     names = [name for name, _ in heads]
     twice = sorted({name for name in names if name and names.count(name) > 1})
     if twice:
         raise CalibrationError(f"{path}: two columns mean '{twice[0]}': leave one of them")
-    united = default is not None or any(unit in UNITS for _, unit in heads)
-    cells = [(i, split(line)) for i, line in lines[1:]]
+    united = default is not None or any(unit in METRES for _, unit in heads)
+    cells = text.rows
     factors = [
-        _factor(name, unit, default, [c[k] for _, c in cells if k < len(c)])
+        _factor(name, unit, default, [c[k] for c in cells if k < len(c)])
         for k, (name, unit) in enumerate(heads)
     ]
     rows = []
-    for i, words in cells:
+    for i, words in zip(text.lines, cells, strict=True):
         columns = [(n, w, f) for n, w, f in zip(names, words, factors, strict=False) if n and w]
         numbers = {n: x * f for n, w, f in columns if (x := _number(w)) is not None and math.isfinite(x)}
         row = Row(i, {n: w for n, w, _ in columns}, numbers)
@@ -190,7 +190,7 @@ def _check(path: str, row: Row) -> None:
     """Refuse words where numbers belong; an empty cell or NaN is a missing number, which is the reader's affair."""
     for name in ("u", "v", *LENGTHS, *ANGLES):
         word = row.words.get(name, "0")
-        if _number(word) is None and word.lower() not in ("none", "null", "na", "n/a", "-"):
+        if _number(word) is None:
             raise CalibrationError(
                 f"{path}: line {row.line}: {name} is '{word}', expected a number: the whole file is refused; correct "
                 "the cell, or empty it to have the row left out"
@@ -213,9 +213,9 @@ def _column(word: str) -> tuple[str, str]:
 def _factor(name: str, unit: str, default: str | None, words: list[str]) -> float:
     if name in LENGTHS:
         unit = unit or default or "m"
-        if unit not in UNITS:
-            raise CalibrationError(f"unknown unit '{unit}'; available: {', '.join(UNITS)}")
-        return UNITS[unit]
+        if unit not in METRES:
+            raise CalibrationError(f"unknown unit '{unit}'; available: {', '.join(METRES)}")
+        return METRES[unit]
     if name in ANGLES:
         if unit == "deg":
             return math.pi / 180.0
@@ -225,27 +225,9 @@ def _factor(name: str, unit: str, default: str | None, words: list[str]) -> floa
     return 1.0
 
 
-def _splitter(head: str):  # type: ignore[no-untyped-def]
-    for mark in ("\t", ";", ","):
-        if mark in head:
-            return lambda line: [cell.strip() for cell in next(csv.reader([line], delimiter=mark))]
-    return str.split
-
-
-def _known(head: str) -> int:
-    """How many columns of a line of names mean something here."""
-    return sum(bool(_column(word)[0]) for word in _splitter(head)(head))
-
-
-def _number(word: str) -> float | None:
-    try:
-        return float(word)
-    except ValueError:
-        return None
-
-
-def _is_numeric(line: str) -> bool:
-    return all(_number(word) is not None for word in re.split(r"[,;\s]+", line.strip()) if word)
+def _known(names: Sequence[str]) -> int:
+    """How many column names mean something here."""
+    return sum(bool(_column(word)[0]) for word in names)
 
 
 # Tags on one board, surveyed as a whole: a YAML file that says where the first lies and how the others follow.
@@ -331,7 +313,7 @@ class Survey:
     """Fixed tags by id."""
     locations: dict[str, list[tuple[int | None, Placed]]] = field(default_factory=dict)
     """Image -> tags that lay there (id, or None for whichever was seen)."""
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 def read_survey(
@@ -366,11 +348,11 @@ def read_survey(
         raise CalibrationError(f"{table.path}: no column 'z': add it, or give the height of all points (--z)")
     if not {"id", "tag", "image"} & set(table.columns):
         raise CalibrationError(f"{table.path}: no column names the points: add id, tag or image")
-    notes: list[str] = []
+    findings: list[Finding] = []
     survey, lines, every = Survey(str(path)), {}, []
     for row in table.rows:
         if missing := row.missing("x", "y", *(["z"] if z is None else [])):
-            notes.append(f"{table.path}: line {row.line}: left out: {', '.join(missing)} is missing")
+            findings.append(finding("row_incomplete", table.path, line=row.line, missing=tuple(missing)))
             continue
         name, tag, here = _surveyed(table, row, edge, z)
         every.append(here.points)
@@ -391,7 +373,7 @@ def read_survey(
     if not every:
         raise CalibrationError(f"{path}: no surveyed point in it: give rows of id,x,y,z")
     table.refuse_other_units(np.ptp(np.concatenate(every), axis=0).max())
-    return replace(survey, notes=tuple(notes))
+    return replace(survey, findings=tuple(findings))
 
 
 def _surveyed(table: Table, row: Row, edge: float | None, z: float | None) -> tuple[str, int | None, Placed]:
@@ -432,7 +414,7 @@ class Observations:
     """Displacement of the point by a turn of its location about z [m/rad], (N, 3); zero for single points."""
     dry: NDArray[np.bool_]
     """On the camera's side of the plane, (N,)."""
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     def __len__(self) -> int:
         return len(self.points)
@@ -475,7 +457,9 @@ def observe(inputs: Sequence[Path], survey: Survey, *, family: str | None = None
         (tables if is_table else pictures).append(path)
     for path in tables:
         if _is_detections(path):
-            _match_frames(rows, read_detections(path, rows.notes), survey)
+            remarks: list[str] = []
+            _match_frames(rows, read_detections(path, remarks), survey)
+            rows.findings += [finding("as_read", remark=remark) for remark in remarks]
         else:
             _match_table(rows, read_table(path), survey)
     if pictures:
@@ -508,8 +492,11 @@ def observe_combined(
             new = row.placed(name, row.position(z)[None])
             placed = points.setdefault((name, *new.points[0].tolist()), new)
             rows.add(_Match(row.words.get("image", ""), name, placed, 0, row.pixel))
-        lost = [row.line for row in table.rows if row.missing(*needed)]
-        rows.notes += [f"{path}: line {line}: left out: a number is missing" for line in lost]
+        rows.findings += [
+            finding("row_incomplete", str(path), line=row.line, missing=tuple(missing))
+            for row in table.rows
+            if (missing := row.missing(*needed))
+        ]
     return rows.observations(", ".join(map(str, paths)), None)
 
 
@@ -527,20 +514,19 @@ class _Rows:
     """Matches as they are gathered."""
 
     def __init__(self) -> None:
-        self.notes: list[str] = []
+        self.findings: list[Finding] = []
         self.unknown: dict[str, None] = {}
         self._matches: dict[tuple[object, ...], _Match] = {}
 
     def add(self, match: _Match) -> None:
         key = (match.image, id(match.placed), match.corner, *match.pixel.tolist())
         if key in self._matches:
-            self.notes.append(f"{match.name} is there twice with the same pixel: counted once")
+            self.findings.append(finding("counted_twice", match.name))
         self._matches.setdefault(key, match)
 
     def observations(self, source: str, survey: Survey | None) -> Observations:
         if self.unknown:
-            listed = ", ".join(list(self.unknown)[:8]) + (", ..." if len(self.unknown) > 8 else "")
-            self.notes.append(f"not in the survey, so left out: {listed}")
+            self.findings.append(finding("not_surveyed", names=tuple(self.unknown)))
         matches = list(self._matches.values())
         if not matches:
             known = [] if survey is None else [*survey.points, *map(str, survey.tags), *survey.locations]
@@ -566,19 +552,13 @@ class _Rows:
             sigma=np.array([m.placed.sigma for m in matches]),
             arm=np.stack([m.placed.arm(m.corner) for m in matches]),
             dry=np.array([m.placed.dry for m in matches]),
-            notes=(*(survey.notes if survey else ()), *self.notes),
+            findings=(*(survey.findings if survey else ()), *self.findings),
         )
 
 
 def _is_detections(path: Path) -> bool:
-    try:
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
-        raise CalibrationError(f"cannot read {path}: {error.strerror or error}") from error
-    head = next(
-        (line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), ""
-    )
-    plain = {re.sub(r"[\s\"']", "", cell).lower() for cell in re.split(r"[,;\t]", head)}
+    names = read_text_table(path, CalibrationError).names
+    plain = {re.sub(r"[\s\"']", "", name).lower() for name in names}
     numbered = [cell for cell in plain if re.search(r"\d", cell) and re.search(r"[uvxy]", cell)]
     return plain >= {"u0", "v0", "u3", "v3"} or len(numbered) >= 8
 
@@ -615,7 +595,7 @@ def _match_table(rows: _Rows, table: Table, survey: Survey) -> None:
         if placed is None:
             rows.unknown[name or f"line {row.line}"] = None
         elif row.missing("u", "v"):
-            rows.notes.append(f"{table.path}: line {row.line}: left out: {name} has no pixel")
+            rows.findings.append(finding("pixel_missing", table.path, line=row.line, point=name))
         else:
             rows.add(_Match(row.words.get("image", ""), name, placed, corner, row.pixel))
 

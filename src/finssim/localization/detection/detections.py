@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from finssim.files import atomic_write
 from finssim.localization.errors import LocalizationError
+from finssim.text_table import read_text_table
 
 __all__ = ["Detection", "Frame", "most_certain", "read_detections", "write_detections"]
 
@@ -124,21 +125,21 @@ def read_detections(path: str | Path, notes: list[str] | None = None) -> list[Fr
         LocalizationError: Unreadable, without the tag or corner columns, or with a cell that is no number; names file
             and line.
     """
-    lines, unfinished = _lines(Path(path))
-    if not lines:
+    table = read_text_table(path, LocalizationError)
+    header, rows = table.names, list(zip(table.lines, table.rows, strict=True))
+    if not header:
         raise LocalizationError(f"{path}: no line of column names: expected one such as {','.join(COLUMNS)}")
-    delimiter = max(",;\t", key=lines[0][1].count)
-    header = _split(lines[0][1], delimiter)
     columns = _columns(header, str(path))
-    if unfinished and len(lines) > 1:
-        whole = len(_split(lines[-1][1], delimiter)) >= len(header) and tuple(header) != COLUMNS
+    if table.unfinished and rows:
+        line, last = rows[-1]
+        whole = len(last) >= len(header) and tuple(header) != COLUMNS
         what = "may be cut" if whole else "is cut short and was left out"
-        _note(notes, f"{path}: line {lines[-1][0]}, the last, has no end: it {what}")
-        lines = lines if whole else lines[:-1]
+        _note(notes, f"{path}: line {line}, the last, has no end: it {what}")
+        rows = rows if whole else rows[:-1]
     pictures: dict[tuple[str, str], tuple[float, str, list[Detection]]] = {}
-    for number, line in lines[1:]:
-        row = _row(_split(line, delimiter), columns, len(header), f"{path}: line {number}")
-        if delimiter != ",":
+    for line, cells in rows:
+        row = _row(cells, columns, len(header), f"{path}: line {line}")
+        if table.decimal_comma:
             row.cells = {name: cell.replace(",", ".") for name, cell in row.cells.items()}
         key = row.cells.get("image", ""), row.cells.get("time", "")
         if key not in pictures:
@@ -194,23 +195,6 @@ class _Row:
             hamming=self.whole("hamming", 0),
             family=self.cells.get("family", ""),
         )
-
-
-def _lines(path: Path) -> tuple[list[tuple[int, str]], bool]:
-    """Numbered lines that hold something, and whether the last one lacks its end."""
-    try:
-        raw = path.read_bytes()
-    except OSError as error:
-        raise LocalizationError(f"{path}: cannot be read: {error.strerror or error}") from None
-    whole = raw.split(b"\0", 1)[0]  # a crash leaves zeros where the file system had made room
-    text = whole.decode("utf-8-sig", errors="replace")
-    numbered = enumerate(text.splitlines(), start=1)
-    lines = [(number, line) for number, line in numbered if line.strip() and not line.startswith("#")]
-    return lines, not text.endswith(("\n", "\r"))
-
-
-def _split(line: str, delimiter: str) -> list[str]:
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter))]
 
 
 def _row(cells: list[str], columns: Mapping[str, int], width: int, where: str) -> _Row:

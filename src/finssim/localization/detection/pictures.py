@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 import sys
@@ -15,6 +14,7 @@ import numpy.typing as npt
 
 from finssim.files import atomic_write
 from finssim.localization.errors import LocalizationError
+from finssim.text_table import read_text_table
 
 __all__ = ["PICTURE_FILES", "VIDEO_FILES", "pictures", "read_picture", "write_picture"]
 
@@ -216,22 +216,16 @@ def _time_in(stem: str) -> float:
 
 def _read_times(path: Path) -> dict[str, float]:
     """Name -> time [s] of a CSV file with the columns image and time."""
-    try:
-        rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
-    except (OSError, UnicodeDecodeError) as error:
-        raise LocalizationError(f"{path}: cannot be read: {error}") from None
-    header = [cell.strip().lower() for cell in rows[0]] if rows else []
-    image = next((i for i, cell in enumerate(header) if cell in ("image", "file", "filename", "name")), None)
-    time = next((i for i, cell in enumerate(header) if cell in ("time", "t", "timestamp", "time_s")), None)
+    table = read_text_table(path, LocalizationError)
+    image = table.place(("image", "file", "filename", "name"))
+    time = table.place(("time", "t", "timestamp", "time_s"))
     if image is None or time is None:
         raise LocalizationError(f"{path}: expected a first line 'image,time'")
     times = {}
-    for number, row in enumerate(rows[1:], start=2):
-        if not row:
-            continue
+    for number, row in zip(table.lines, table.rows, strict=True):
         try:
             value = float(row[time])
-            times[row[image].strip()] = value
+            times[row[image]] = value
         except (ValueError, IndexError):
             value = math.nan
         if not math.isfinite(value):

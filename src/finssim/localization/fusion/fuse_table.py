@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,13 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.localization.errors import LocalizationError
+from finssim.text_table import EMPTY, TextTable, read_text_table
 
 __all__ = ["StreamTable", "read_stream_table"]
 
 Array = npt.NDArray[np.float64]
 
 TIME = ("t", "time", "time_s", "timestamp", "stamp", "seconds")
-EMPTY = ("", "nan", "none", "null", "na", "n/a", "-")
+TRUTH = {"true": 1.0, "yes": 1.0, "false": 0.0, "no": 0.0}
 
 
 @dataclass
@@ -51,32 +51,27 @@ def read_stream_table(path: Path) -> StreamTable:
     Raises:
         LocalizationError: Unreadable, without names, without a column of times, or without rows.
     """
-    try:
-        text = path.read_bytes().split(b"\0", 1)[0].decode("utf-8-sig", errors="replace")
-    except OSError as error:
-        raise LocalizationError(f"{path}: cannot be read: {error.strerror or error}") from None
-    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    delimiter = max(",;\t", key=lines[0].count) if lines else ","
-    rows = list(csv.reader(lines, delimiter=delimiter))
-    names = [name.strip().lower() for name in rows[0]] if rows else []
+    text = read_text_table(path, LocalizationError)
+    names = [name.lower() for name in text.names]
     time = next((name for name in TIME if name in names), None)
     if time is None or len(set(names)) < len(names):
         raise LocalizationError(
             f"{path}: expected a line of different column names with t, such as t,depth; found "
             f"'{','.join(names)[:60]}'"
         )
-    whole = [row for row in rows[1:] if len(row) == len(names)]
+    rows = text.rows
+    whole = [row for row in rows if len(row) == len(names)]
     table = StreamTable(str(path), np.empty(0), {}, {})
-    if len(whole) < len(rows) - 1:
+    if len(whole) < len(rows):
         table.notes.append(
-            f"{path.name}: {len(rows) - 1 - len(whole)} rows have not {len(names)} cells and were left out"
+            f"{path.name}: {len(rows) - len(whole)} rows do not have {len(names)} cells and were left out"
         )
     if not whole:
         raise LocalizationError(f"{path}: holds no rows: give a table with samples")
     for name, cells in zip(names, zip(*whole, strict=True), strict=True):
-        values = [_number(cell, decimal_comma=delimiter != ",") for cell in cells]
-        if all(math.isnan(v) for v in values) and any(c.strip().lower() not in EMPTY for c in cells):
-            table.words[name] = [cell.strip() for cell in cells]
+        values = [_number(cell, text) for cell in cells]
+        if all(math.isnan(v) for v in values) and any(c.lower() not in EMPTY for c in cells):
+            table.words[name] = list(cells)
         else:
             table.numbers[name] = np.array(values, float)
     if time not in table.numbers:
@@ -85,10 +80,7 @@ def read_stream_table(path: Path) -> StreamTable:
     return table
 
 
-def _number(cell: str, *, decimal_comma: bool) -> float:
+def _number(cell: str, text: TextTable) -> float:
     """The number in a cell; NaN where there is none. Infinities stay: the estimator refuses and counts them."""
-    cell = cell.strip().replace(",", ".") if decimal_comma else cell.strip()
-    try:
-        return float(cell)
-    except ValueError:
-        return {"true": 1.0, "yes": 1.0, "false": 0.0, "no": 0.0}.get(cell.lower(), math.nan)
+    value = text.number(cell)
+    return TRUTH.get(cell.lower(), math.nan) if value is None else value

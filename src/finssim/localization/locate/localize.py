@@ -32,6 +32,7 @@ from finssim.localization.pool import Pool, load_pool
 from finssim.localization.poses.measurement import Measurement, refused
 from finssim.localization.poses.methods import METHODS, NEEDS_DEPTH
 from finssim.provenance import provenance
+from finssim.text_table import read_text_table
 from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["COLUMNS", "Locator", "Run", "run", "write_rows"]
@@ -259,12 +260,8 @@ def load_truth(path: str | Path, longest_gap: float = 1.0) -> Truth:
     Raises:
         LocalizationError: Unreadable, without these columns, or with a cell that is no number; names file and line.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
-        raise LocalizationError(f"{path}: cannot be read: {error.strerror or error}") from None
-    rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines()) if row]
-    names = [name.lower() for name in rows[0]] if rows else []
+    table = read_text_table(path, LocalizationError)
+    names = [name.lower() for name in table.names]
     time = next((name for name in TIMES if name in names), None)
     if not {"x", "y"} <= set(names) or (time is None and "image" not in names):
         raise LocalizationError(
@@ -272,7 +269,7 @@ def load_truth(path: str | Path, longest_gap: float = 1.0) -> Truth:
         )
     by_image: dict[str, Array] = {}
     times, values = [], []
-    for number, row in enumerate(rows[1:], start=2):
+    for number, row in zip(table.lines, table.rows, strict=True):
         cells = dict(zip(names, row, strict=False))
         value = _value(cells, f"{path}: line {number}")
         if cells.get("image"):

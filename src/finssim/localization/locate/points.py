@@ -8,7 +8,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from finssim.files import atomic_write, refuse_unwritable
 from finssim.geometry.optics import Status, back_project, count_rejections, plane_jacobian, project
 from finssim.localization.errors import LocalizationError
 from finssim.localization.pool import load_pool
+from finssim.text_table import text_table
 
 __all__ = ["run_backproject", "run_project"]
 
@@ -66,11 +67,10 @@ def read_points(path: Path, wanted: Sequence[str], optional: Sequence[str] = ())
         LocalizationError: A column is missing, or cells are not numbers: the lines are named.
     """
     where = "standard input" if str(path) == "-" else str(path)
-    lines = [(i, line) for i, line in enumerate(_text(path, where).splitlines(), 1) if _counts(line)]
-    if not lines:
+    table = text_table(_text(path, where), names=(), spaces=None)
+    if not table.texts:
         raise LocalizationError(f"{where}: holds no rows, expected columns {', '.join(wanted)}")
-    split = _splitter(lines[0][1])
-    rows = [(i, split(line)) for i, line in lines]
+    rows = list(zip(table.lines, table.rows, strict=True))
     first = rows[0][1]
     if all(_number(cell) is not None for cell in first):
         names = _bare(first, wanted, optional, where)
@@ -117,18 +117,6 @@ def _text(path: Path, where: str) -> str:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise LocalizationError(f"{where}: is not text, expected a CSV table") from None
-
-
-def _counts(line: str) -> bool:
-    return bool(line.strip()) and not line.lstrip().startswith("#")
-
-
-def _splitter(line: str) -> Callable[[str], list[str]]:
-    """How to split lines that are written as this one."""
-    delimiter = next((c for c in ";\t," if c in line), None)
-    if delimiter is None:
-        return str.split
-    return lambda text: [cell.strip() for cell in next(csv.reader([text], delimiter=delimiter))]
 
 
 def _number(cell: str) -> float | None:

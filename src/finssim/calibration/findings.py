@@ -1,0 +1,114 @@
+"""What is found out about data and fits: one record for all of it, filtered by its code and worded here alone."""
+
+from __future__ import annotations
+
+import math
+import string
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+__all__ = ["SEVERITIES", "Finding", "Severity", "finding", "sentences", "wordings"]
+
+Severity = Literal["refused", "care", "note"]
+"""What a finding makes of a trial or fit: nothing can rest on it; something may not; worth knowing."""
+
+SEVERITIES: tuple[Severity, ...] = ("refused", "care", "note")
+"""The worst first."""
+
+MOST_NAMES = 8
+"""Items of a list that a sentence names."""
+
+MOST_SUBJECTS = 3
+"""Subjects that a sentence names where it holds for several."""
+
+
+class _Template(string.Formatter):
+    """`str.format` that writes a tuple as a list of words."""
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if not isinstance(value, (tuple, list)):
+            return str(super().format_field(value, format_spec))
+        return _listed([format(item, format_spec) for item in value], MOST_NAMES)
+
+
+def _listed(words: list[str], most: int) -> str:
+    return ", ".join(words[:most]) + (f" and {len(words) - most} more" if len(words) > most else "")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One remark about data or a fit."""
+
+    code: str
+    """Key of `wordings`."""
+    severity: Severity
+    subject: str = ""
+    """What it is about: a trial, file, thruster, axis or parameter; empty where that goes without saying."""
+    values: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    """Fields of the sentence, in SI or in the unit that the sentence names."""
+
+    @property
+    def text(self) -> str:
+        """The sentence without its subject: what, and what to do."""
+        return _Template().format(wordings()[self.code][1], **self.values)
+
+    def __str__(self) -> str:
+        return f"{self.subject}: {self.text}" if self.subject else self.text
+
+    def about(self, subject: str) -> Finding:
+        """The same about something, or about a part of it where it has a subject already."""
+        return replace(self, subject=f"{subject}: {self.subject}" if self.subject else subject)
+
+    def as_json(self) -> dict[str, Any]:
+        """Code, severity, subject, values and sentence; numbers that are not finite become None."""
+        return {
+            "code": self.code,
+            "severity": self.severity,
+            "subject": self.subject,
+            "values": {name: _plain(value) for name, value in self.values.items()},
+            "sentence": str(self),
+        }
+
+
+def finding(code: str, subject: str = "", /, *, severity: Severity | None = None, **values: Any) -> Finding:
+    """A finding with the severity that its code usually has.
+
+    Args:
+        code: Key of `wordings`.
+        subject: What it is about.
+        severity: Where it differs from the usual one.
+        values: Fields of the sentence.
+    """
+    return Finding(code, severity or wordings()[code][0], subject, values)
+
+
+def sentences(findings: Iterable[Finding]) -> list[str]:
+    """Sentences in their order; what holds for several subjects is one sentence."""
+    subjects: dict[tuple[str, str], list[str]] = {}
+    for one in findings:
+        named = subjects.setdefault((one.code, one.text), [])
+        if one.subject not in named:
+            named.append(one.subject)
+    return [
+        f"{_listed(named, MOST_SUBJECTS)}: {text}" if any(named) else text
+        for (_, text), named in subjects.items()
+    ]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, (tuple, list)):
+        return [_plain(item) for item in value]
+    value = value.item() if hasattr(value, "item") else value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+@cache
+def wordings() -> dict[str, tuple[Severity, str]]:
+    """Code -> its usual severity, and its sentence with the fields that `Finding.values` fills (`findings.yaml`)."""
+    table = yaml.safe_load(Path(__file__).with_name("findings.yaml").read_text(encoding="utf-8"))
+    return {code: next(iter(wording.items())) for code, wording in table.items()}
