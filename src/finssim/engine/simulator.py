@@ -157,13 +157,15 @@ class Simulator:
         if self._drifts:
             s = self.state
             pipeline.add(advance_drift, [self.water, s.steps, self.control_step, self.seed, s.episode])
+        # One world at a time on a processor, what is not there costs less than another kernel takes to compile.
+        general = self.device.is_cpu and not self.in_lanes
         kernel = physics_kernel(
             self.hydrodynamics,
             self.integrator,
             water_moving=bool(self.water.moving),
-            walls_present=self.surroundings[1] is not None,
-            tether_present=self.surroundings[2] is not None,
-            speed_lag=bool(self.plant.speed_lag.numpy().any()),
+            walls_present=general or self.surroundings[1] is not None,
+            tether_present=general or self.surroundings[2] is not None,
+            speed_lag=general or bool(self.plant.speed_lag.numpy().any()),
             terms=self.plant.terms,
             funnel_present=self.dock is not None,
             lanes=self.in_lanes,
