@@ -19,7 +19,7 @@ from finssim.vehicles import VehicleError, load_vehicle
 from finssim.vehicles.check import check_vehicle
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = sorted((ROOT / "docs").glob("*.md"))
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
 
 
 def blocks(page: Path, language: str) -> list[str]:
