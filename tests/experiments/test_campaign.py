@@ -77,7 +77,7 @@ def test_workers_do_not_outlive_a_campaign(tmp_path, signal):
         "from finssim.experiments.pool_trial import Job\n"
         "if __name__ == '__main__':\n"
         "    jobs = [Job(row='pid', controller='pid', target='P01')]\n"
-        f"    run_jobs(jobs, Path({str(tmp_path)!r}), played.endless, processes=1)\n"
+        f"    run_jobs(jobs, Path({str(tmp_path)!r}), played.endless, processes=2)\n"
     )
     script = tmp_path / "campaign_of_one.py"
     script.write_text(program)

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 
 SMALL = Scope(
     levels={"surge": [18.0]},
-    shuttles={"yaw": [1.8]},
+    shuttles={},
     held_out={"surge": [12.0]},
     setpoints=("P01",),
     pictures=("P02",),

@@ -155,15 +155,16 @@ def run_jobs(
         The results in the order of the jobs, each with its `job` and `key`.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    files = {job.key(): folder / f"{job.key()}.json" for job in jobs}
-    missing = {job.key(): job for job in jobs if not files[job.key()].is_file()}
+    keys = [job.key() for job in jobs]
+    files = {key: folder / f"{key}.json" for key in keys}
+    missing = {key: job for key, job in zip(keys, jobs, strict=True) if not files[key].is_file()}
     with closing(
-        spread(partial(_play_one, folder=folder, play=play), list(missing.values()), processes)
+        spread(partial(_play_one, folder=folder, play=play), list(missing.items()), processes)
     ) as played:
-        for left, (job, future) in zip(reversed(range(len(missing))), played, strict=True):
+        for left, ((_, job), future) in zip(reversed(range(len(missing))), played, strict=True):
             show(job, future.result())
             say(1.0 - left / len(files), f"{left} trials left")
-    return [json.loads(files[job.key()].read_text(encoding="utf-8")) for job in jobs]
+    return [json.loads(files[key].read_text(encoding="utf-8")) for key in keys]
 
 
 def run_in_turn(
@@ -183,13 +184,13 @@ def run_in_turn(
     """
     folder.mkdir(parents=True, exist_ok=True)
     results = []
-    for job in {job.key(): job for job in jobs}.values():
-        file = folder / f"{job.key()}.json"
+    for key, job in {job.key(): job for job in jobs}.items():
+        file = folder / f"{key}.json"
         if not file.is_file():
-            result = play(job, folder / job.key())
+            result = play(job, folder / key)
             if result is None:
                 continue
-            show(job, _write(job, folder, result))
+            show(job, _write(key, job, folder, result))
         results.append(json.loads(file.read_text(encoding="utf-8")))
     return results
 
@@ -197,21 +198,31 @@ def run_in_turn(
 def spread(
     work: Callable[[Any], Any], items: Sequence[Any], processes: int | None = None
 ) -> Generator[tuple[Any, Future[Any]], None, None]:
-    """Work on items in processes of their own, as many at once as there are processors if None.
+    """Work on items in processes of their own, as many at once as there are processors if None; in this one if 1.
 
     Args:
         work: A function of a module, as it is called in other processes.
         items: What it is called with, each by itself.
-        processes: At once.
+        processes: At once. A process of one's own takes some 3 s to start, which a single one does not make up for.
 
     Yields:
         An item and its outcome, as each ends. Whoever stops iterating, by Ctrl-C or by closing this, ends them all.
     """
+    processes = processes or os.cpu_count() or 1
+    if processes == 1:
+        for item in items:
+            outcome: Future[Any] = Future()
+            try:
+                outcome.set_result(work(item))
+            except Exception as error:
+                outcome.set_exception(error)
+            yield item, outcome
+        return
     if not items:
         return
     # A fork would copy the threads of Warp and torch half-alive.
     executor = ProcessPoolExecutor(
-        min(processes or os.cpu_count() or 1, len(items)),
+        min(processes, len(items)),
         mp_context=multiprocessing.get_context("spawn"),
         initializer=_prepare,
         initargs=(os.getpid(),),
@@ -244,14 +255,13 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-def _play_one(job: Job, folder: Path, play: Play) -> dict[str, Any]:
-    return _write(job, folder, play(job, folder / job.key()))
+def _play_one(keyed: tuple[str, Job], folder: Path, play: Play) -> dict[str, Any]:
+    key, job = keyed
+    return _write(key, job, folder, play(job, folder / key))
 
 
-def _write(job: Job, folder: Path, played: Mapping[str, Any]) -> dict[str, Any]:
+def _write(key: str, job: Job, folder: Path, played: Mapping[str, Any]) -> dict[str, Any]:
     """Write KEY.json of a result, with its job."""
-    result = {
-        "key": job.key(), "job": {**job.described(), "row": job.row, "target": job.target}, **played
-    }  # fmt: skip
-    write_json(folder / f"{job.key()}.json", result)
+    result = {"key": key, "job": {**job.described(), "row": job.row, "target": job.target}, **played}
+    write_json(folder / f"{key}.json", result)
     return result
