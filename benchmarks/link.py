@@ -15,8 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from finssim.robot.link.clock import ClockMap
-from finssim.robot.link.decoder import MCU, Decoder
-from finssim.robot.link.frames import crc16_modbus, encode_command, encode_telemetry
+from finssim.robot.link.frames import MCU, Decoder, crc16_modbus, encode_command, encode_telemetry
 from finssim.robot.messages import Telemetry, ThrusterCommand
 
 ROUNDS, EACH = 40, 1000

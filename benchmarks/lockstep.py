@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from finssim.control.guidance import Station
-from finssim.experiments.paper import T1_SETPOINTS, T1_START
+from finssim.experiments.metrics import T1_SETPOINTS, T1_START
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.pool import VirtualPool, draw_plant
 from finssim.pool.camera import PoolCamera

@@ -18,9 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from finssim.robot.messages import Picture, Telemetry
-from finssim.robot.record_messages import Messages
-from finssim.robot.record_topics import TOPICS
-from finssim.robot.record_types import definition
+from finssim.robot.record_messages import TOPICS, Messages, definition
 from finssim.robot.recorder import Recorder
 from finssim.robot.robot import Reading
 from finssim.vehicles import load_vehicle

@@ -1,6 +1,6 @@
 """Push a vehicle forward and to the left for ten seconds, and read where it went."""
 
-from finssim.control.allocator import Allocator
+from finssim.control.allocation import Allocator
 from finssim.engine import Simulator
 from finssim.vehicles import load_vehicle
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from finssim.control.allocator import Allocator
+from finssim.control.allocation import Allocator
 from finssim.engine import PictureError, Pool, Scene
 from finssim.vehicles import load_vehicle
 

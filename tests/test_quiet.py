@@ -14,7 +14,7 @@ import json
 from finssim.quiet import start_warp
 start_warp()
 import numpy as np
-from finssim.control.allocator import Allocator
+from finssim.control.allocation import Allocator
 from finssim.vehicles import load_vehicle
 thrusts, _ = Allocator.from_vehicle(load_vehicle("finsrov")).allocate(np.ones(6))
 print(json.dumps(thrusts.tolist()))

@@ -7,10 +7,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from finssim.control.allocation import AllocationData, allocate_kernel, allocation_data, allocation_residual
-from finssim.control.allocation_tables import regularisation_weight
-from finssim.control.allocator import Allocator
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
+from finssim.control.allocation import (
+    AllocationData,
+    Allocator,
+    allocate_kernel,
+    allocation_data,
+    allocation_residual,
+    regularisation_weight,
+)
 from finssim.physics.types import vec6, vec8
 from finssim.vehicles import catalogue, load_vehicle
 

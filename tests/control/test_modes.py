@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
 from finssim.control.modes import MODES, Thruster8, Wrench4, Wrench6, action_mode, mode_from_dict
 
 

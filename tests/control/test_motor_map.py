@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
 from finssim.control.motor_map import SHORTEST_PULSE, MotorMap
 from finssim.vehicles import catalogue, load_vehicle
 

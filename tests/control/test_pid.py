@@ -7,11 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from finssim.control.controllers import CONTROLLERS, controller
-from finssim.control.errors import ControlError
-from finssim.control.pid import Pid
-from finssim.control.pole_placement import AxisModel, place_poles
-from finssim.control.tracking import Goal, tracking_error
+from finssim.control import ControlError
+from finssim.control.guidance import Goal, tracking_error
+from finssim.control.pid import CONTROLLERS, AxisModel, Pid, controller, place_poles
 from finssim.geometry.frames import FROM_CONTROLLER
 from finssim.geometry.rotations import (
     quat_from_euler,

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from finssim.control.allocator import Allocator
-from finssim.control.pid_paper import PaperPid
-from finssim.control.tracking import Goal
+from finssim.control.allocation import Allocator
+from finssim.control.guidance import Goal
+from finssim.control.pid import PaperPid
 from finssim.geometry.rotations import quat_from_euler, quat_from_yaw
 from finssim.vehicles import load_vehicle
 

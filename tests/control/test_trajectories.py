@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
 from finssim.control.guidance import goal_at
 from finssim.control.trajectories import (
     PUBLISHED_LIMITS,
@@ -15,8 +15,8 @@ from finssim.control.trajectories import (
     check_limits,
     check_vehicle,
     load_trajectory,
+    polyline,
 )
-from finssim.control.trajectory_shapes import polyline
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.vehicles import load_vehicle
 

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from finssim.control.errors import ControlError
-from finssim.control.trajectories import TRAJECTORIES, load_trajectory
-from finssim.control.trajectory_file import read_trajectory, through_points
+from finssim.control import ControlError
+from finssim.control.trajectories import TRAJECTORIES, load_trajectory, read_trajectory, through_points
 
 
 def test_a_table_of_samples_follows_the_motion_they_were_taken_from(tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.reference.observed import published_t2
 
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
 from finssim.control.policy_description import ObservationEntry, ObservationSchema
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.control.trim import Trim

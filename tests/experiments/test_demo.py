@@ -14,7 +14,7 @@ from finssim.control.policy import Policy
 from finssim.experiments import demo as demo_module
 from finssim.experiments.demo import FULL, Scope, demo
 from finssim.experiments.identify import identify
-from finssim.experiments.paper import T1_SETPOINTS
+from finssim.experiments.metrics import T1_SETPOINTS
 from finssim.experiments.pool_trial import read_series
 from finssim.files import OutputError
 from finssim.learning.training_loop import Loop

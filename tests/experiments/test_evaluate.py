@@ -9,13 +9,13 @@ import torch
 from rich.console import Console
 from torch import nn
 
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
 from finssim.control.modes import action_mode
 from finssim.control.policy_description import PolicyDescription, PolicyError, VehicleIdentity
 from finssim.engine import read_run
 from finssim.experiments import trials as trials_module
 from finssim.experiments.evaluate import EvaluationError, evaluate, evaluate_controller
-from finssim.experiments.paper import PAPER_T1, T1_SETPOINTS, T1_START
+from finssim.experiments.metrics import PAPER_T1, T1_SETPOINTS, T1_START
 from finssim.experiments.plants import Plant, PlantError, available_plants, load_plant
 from finssim.experiments.trials import run_trials
 from finssim.files import OutputError

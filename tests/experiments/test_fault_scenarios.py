@@ -9,8 +9,7 @@ from finssim.experiments.faults import FaultyWire
 from finssim.pool.draw_plant import draw_plant
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.quiet import start_warp
-from finssim.robot.link.decoder import Decoder
-from finssim.robot.link.frames import encode_command
+from finssim.robot.link.frames import Decoder, encode_command
 from finssim.robot.messages import ThrusterCommand
 from finssim.vehicles import load_vehicle
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.experiments.demo import camera_view
-from finssim.experiments.metrics import measure_trial
-from finssim.experiments.paper import T1_SETPOINTS
+from finssim.experiments.metrics import T1_SETPOINTS, measure_trial
 from finssim.experiments.pool_trial import pool_evaluation, pool_jobs, write_series
 from finssim.geometry.rotations import quat_from_yaw
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from finssim.experiments.paper import T1_SETPOINTS, T1_START, in_room
+from finssim.experiments.metrics import T1_SETPOINTS, T1_START, in_room
 from finssim.experiments.pool_trial import Job, play, read_series
 from finssim.vehicles import load_vehicle
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.control.pole_placement import axis_model
+from finssim.control.pid import axis_model
 from finssim.experiments.demo import FULL, SHARE, STEADY, matched
 from finssim.vehicles import catalogue, load_vehicle
 from finssim.vehicles.capability import level_speed, terminal_speed

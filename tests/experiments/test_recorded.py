@@ -8,12 +8,11 @@ import pytest
 
 from finssim import boundary
 from finssim.cli import app
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
 from finssim.control.guidance import Station
 from finssim.control.trajectories import load_trajectory
 from finssim.experiments.evaluate import evaluate
-from finssim.experiments.metrics import measure_trial
-from finssim.experiments.paper import T1_SETPOINTS
+from finssim.experiments.metrics import T1_SETPOINTS, measure_trial
 from finssim.experiments.recorded import RecordedError, read_record
 from finssim.experiments.stack import site_of
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from finssim.experiments.paper import T1_PUBLISHED, T1_SETPOINTS, T1_START, from_published
+from finssim.experiments.metrics import T1_PUBLISHED, T1_SETPOINTS, T1_START, from_published
 
 EXCHANGE_Y_Z = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 """Controller axes (x forward, y up, z left) from ours (x forward, y left, z up)."""

@@ -8,10 +8,9 @@ import torch
 from rich.console import Console
 from torch import nn
 
-from finssim.control.controllers import controller_for
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
 from finssim.control.modes import action_mode
-from finssim.control.pid_paper import PAPER_PROFILE, TRAJECTORY_PROFILE
+from finssim.control.pid import PAPER_PROFILE, TRAJECTORY_PROFILE, controller_for
 from finssim.control.policy_description import PolicyDescription, VehicleIdentity
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.experiments.evaluate import (
@@ -21,8 +20,7 @@ from finssim.experiments.evaluate import (
     evaluate,
     evaluate_controller,
 )
-from finssim.experiments.metrics import MEASURES
-from finssim.experiments.paper import PAPER_T2, paper_t2_row
+from finssim.experiments.metrics import MEASURES, PAPER_T2, paper_t2_row
 from finssim.experiments.plants import load_plant
 from finssim.experiments.trials import T2_TRAJECTORIES, run_tracking
 from finssim.learning.export import export_policy

@@ -7,8 +7,8 @@ import pytest
 
 from finssim import boundary
 from finssim.cli import app
+from finssim.experiments.tasks_show import attribute_docs, describe_task
 from finssim.tasks import TASKS, make
-from finssim.tasks.describe import attribute_docs, describe_task
 from finssim.tasks.station_keeping import StationKeeping
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own_task_torch.py"

@@ -6,8 +6,8 @@ import pytest
 
 from finssim import boundary
 from finssim.cli import app
-from finssim.experiments import timing
-from finssim.experiments.timing import lockstep_speed
+from finssim.experiments import reliability
+from finssim.experiments.reliability import lockstep_speed
 
 
 def test_lockstep_is_timed_by_the_vehicles_time():
@@ -25,8 +25,8 @@ def test_an_unknown_camera_is_refused_before_anything_starts(capsys, tmp_path):
 @pytest.mark.slow
 def test_a_run_in_real_time_is_timed(capsys, tmp_path, monkeypatch):
     """Both processes' own words, each figure against its limit."""
-    monkeypatch.setattr(timing, "TRIED", {"corners": 2.0, "pictures": 1.0})
-    monkeypatch.setattr(timing, "WARM_UP", 0.2)
+    monkeypatch.setattr(reliability, "TRIED", {"corners": 2.0, "pictures": 1.0})
+    monkeypatch.setattr(reliability, "WARM_UP", 0.2)
     words = [
         "experiment",
         "timing",

@@ -7,8 +7,9 @@ from finssim.pool import draw_plant
 from finssim.pool.firmware import Firmware
 from finssim.pool.motors import RPM
 from finssim.pool.sensors import Sample
-from finssim.robot.link.decoder import HOST, Decoder
 from finssim.robot.link.frames import (
+    HOST,
+    Decoder,
     RejectFlag,
     StatusFlag,
     command_count,

@@ -18,14 +18,11 @@ from finssim.pool.server import LockstepServer, serve_realtime
 from finssim.pool.truth import read_truth
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.goals import station_of
-from finssim.robot.link.decoder import Decoder
-from finssim.robot.link.layout import LinkError
-from finssim.robot.link.transports import memory_pair
-from finssim.robot.link.udp import UdpTransport
-from finssim.robot.lockstep import LockstepClient
-from finssim.robot.lockstep_codec import LockstepError, encode_request
+from finssim.robot.link.frames import Decoder, LinkError
+from finssim.robot.link.transports import UdpTransport, memory_pair
+from finssim.robot.lockstep import LockstepClient, LockstepError, encode_request
 from finssim.robot.messages import Telemetry
-from finssim.robot.picture_source import SharedMemoryPictures, UdpPictures
+from finssim.robot.pictures import SharedMemoryPictures, UdpPictures
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")

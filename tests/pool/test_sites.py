@@ -14,7 +14,7 @@ from finssim.pool.run import make_plan
 from finssim.pool.site import camera_of
 from finssim.pool.sites import OPEN, positioning_of, site_of
 from finssim.pool.virtual_pool import VirtualPool
-from finssim.robot.link.decoder import Decoder
+from finssim.robot.link.frames import Decoder
 from finssim.robot.messages import HEADING, POSE, POSITION, VELOCITY, NavigationAid
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import SITES, vehicle_at

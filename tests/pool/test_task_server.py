@@ -12,8 +12,7 @@ import pytest
 
 from finssim import boundary
 from finssim.cli import app
-from finssim.control.guidance import Station
-from finssim.control.tracking import Track
+from finssim.control.guidance import Station, Track
 from finssim.pool.fleet import one_picture
 from finssim.pool.medium import Medium
 from finssim.pool.run import swimming

@@ -9,7 +9,7 @@ import pytest
 
 from finssim import boundary
 from finssim.cli import app
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.experiments.stack import BATCH, site_of
 from finssim.pool.medium import Medium

@@ -8,8 +8,7 @@ from finssim.pool import VirtualPool, draw_plant, read_truth
 from finssim.pool.motors import RPM
 from finssim.pool.plant_spec import Instruments
 from finssim.pool.virtual_pool import PoolClockError
-from finssim.robot.link.decoder import Decoder
-from finssim.robot.link.frames import encode_command
+from finssim.robot.link.frames import Decoder, encode_command
 from finssim.robot.messages import ThrusterCommand
 from finssim.vehicles import load_vehicle
 

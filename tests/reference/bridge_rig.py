@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from finssim.robot.bridge import Bridge
-from finssim.robot.bridge_settings import BridgeSettings
+from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.messages import CommandEcho, Telemetry
 from finssim.robot.robot import Reading
 

@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from finssim.robot.bridge import Bridge
-from finssim.robot.bridge_settings import BridgeError, BridgeSettings
+from finssim.robot.bridge import Bridge, BridgeError, BridgeSettings
 from finssim.robot.link.frames import StatusFlag
 from finssim.vehicles import catalogue, load_vehicle
 from reference.bridge_rig import DT, Rig, echo, moves, quiet, reading, telemetry

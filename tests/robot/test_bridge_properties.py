@@ -7,8 +7,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from finssim.robot.bridge import STATES, Bridge
-from finssim.robot.bridge_settings import BridgeSettings
+from finssim.robot.bridge import STATES, Bridge, BridgeSettings
 from finssim.vehicles import load_vehicle
 from reference.bridge_rig import DT, echo, moves, quiet, reading, telemetry
 

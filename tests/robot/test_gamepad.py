@@ -9,8 +9,8 @@ import pytest
 pytest.importorskip("pygame")
 import pygame
 
-from finssim.robot.gamepad import XBOX, Gamepad, Layout
 from finssim.robot.teleop import TeleopError
+from finssim.robot.teleop_devices import XBOX, Gamepad, Layout
 
 GAME_CONTROLLER = 1
 """SDL_JOYSTICK_TYPE_GAMECONTROLLER"""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from finssim.control.tracking import Track
+from finssim.control.guidance import Track
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.robot.goals import HeardGoal
 

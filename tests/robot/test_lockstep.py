@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from finssim.robot.lockstep import LockstepClient
-from finssim.robot.lockstep_codec import (
+from finssim.robot.lockstep import (
+    LockstepClient,
     LockstepError,
     decode_delivery,
     decode_request,

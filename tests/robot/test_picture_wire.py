@@ -13,12 +13,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from finssim.pool.picture_wire import SharedMemorySender, UdpSender
-from finssim.robot.link.layout import LinkError
+from finssim.robot.link.frames import LinkError
 from finssim.robot.messages import Picture, TagCorners
-from finssim.robot.picture_codec import decode_picture, encode_picture
-from finssim.robot.picture_fragments import MOST_BYTES, Assembler, fragments
-from finssim.robot.picture_memory import HEAD
-from finssim.robot.picture_source import NoPictures, SharedMemoryPictures, UdpPictures, open_pictures
+from finssim.robot.pictures import (
+    MEMORY_HEAD,
+    MOST_BYTES,
+    Assembler,
+    NoPictures,
+    SharedMemoryPictures,
+    UdpPictures,
+    decode_picture,
+    encode_picture,
+    fragments,
+    open_pictures,
+)
 
 RANDOM = np.random.default_rng(0)
 NOISE = RANDOM.integers(0, 256, (48, 64)).astype(np.uint8)
@@ -230,16 +238,16 @@ def test_a_slot_that_is_being_written_is_left_out():
     key = name()
     camera, robot = SharedMemorySender(key, slots=4, slot_bytes=8192), SharedMemoryPictures(key)
     try:
-        slot = HEAD.size
+        slot = MEMORY_HEAD.size
         for at, data in (
             (slot, bytes(8)),
             (slot + 100, b"spoilt"),
             (0, b"????"),
-            (HEAD.size - 8, b"\xff" * 8),
+            (MEMORY_HEAD.size - 8, b"\xff" * 8),
         ):
             camera.send(Picture(0.0, 1, NOISE), 0.0)
-            slot = HEAD.size + (camera.sent - 1) % 4 * 8192
-            place = at + (slot - HEAD.size if at >= HEAD.size else 0)
+            slot = MEMORY_HEAD.size + (camera.sent - 1) % 4 * 8192
+            place = at + (slot - MEMORY_HEAD.size if at >= MEMORY_HEAD.size else 0)
             os.pwrite(camera._file, data, place)
             assert robot.receive(0.0) == []
         os.truncate(camera._file, 30)

@@ -8,18 +8,18 @@ import pytest
 import yaml
 from onnx import TensorProto, helper, numpy_helper
 
-from finssim.control.controllers import controller
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
 from finssim.control.guidance import Station, goal_at
 from finssim.control.modes import Wrench4, Wrench6
+from finssim.control.pid import controller
 from finssim.control.policy_description import PolicyError
 from finssim.control.trim import Trim
+from finssim.experiments.pool_trial import NoisyInput
 from finssim.geometry.rotations import quat_from_euler
-from finssim.robot.ablation import NoisyInput
-from finssim.robot.counters import Ticks
 from finssim.robot.goals import GoalError, check_reachable, guide_of, station_of
 from finssim.robot.pilots import ModeSwitch, WrenchPilot, make_pilot
 from finssim.robot.robot import Reading
+from finssim.robot.runtime import Ticks
 from finssim.tasks import StationKeeping
 from finssim.tasks.observer import Observer
 from finssim.vehicles import load_vehicle

@@ -10,14 +10,13 @@ import pytest
 
 from finssim.control.guidance import Station
 from finssim.robot.hardware import HardwareRobot
-from finssim.robot.link.decoder import MCU, Decoder
-from finssim.robot.link.frames import encode_telemetry
+from finssim.robot.link.frames import MCU, Decoder, encode_telemetry
 from finssim.robot.link.transports import memory_pair
 from finssim.robot.messages import Picture
+from finssim.robot.pictures import TagFinder
 from finssim.robot.pilots import make_pilot
-from finssim.robot.realtime import run_realtime
 from finssim.robot.runtime import Runtime
-from finssim.robot.tag_finder import TagFinder
+from finssim.robot.wiring import run_realtime
 from finssim.vehicles import load_vehicle
 from reference.rounds import Rounds, overhead, without_latency
 from reference.tag_picture import draw, pose_corners

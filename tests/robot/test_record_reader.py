@@ -9,9 +9,8 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from finssim.robot.messages import Telemetry
-from finssim.robot.record_reader import open_record
-from finssim.robot.record_repair import repair_record
-from finssim.robot.record_types import RecordError
+from finssim.robot.record_messages import RecordError
+from finssim.robot.record_reader import open_record, repair_record
 from finssim.robot.recorder import Recorder
 from finssim.vehicles import load_vehicle
 

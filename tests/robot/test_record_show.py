@@ -12,9 +12,9 @@ pytest.importorskip("mcap")
 pytest.importorskip("rosbags")
 
 from finssim.robot.messages import Picture, Telemetry
-from finssim.robot.record_play import play
+from finssim.robot.record_messages import RecordError
 from finssim.robot.record_reader import open_record
-from finssim.robot.record_types import RecordError
+from finssim.robot.record_show import play
 from finssim.robot.recorder import Recorder
 from finssim.vehicles import load_vehicle
 

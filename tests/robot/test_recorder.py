@@ -19,7 +19,7 @@ from finssim.robot.messages import (
     TagCorners,
     Telemetry,
 )
-from finssim.robot.record_topics import TOPICS
+from finssim.robot.record_messages import TOPICS
 from finssim.robot.robot import Reading
 from finssim.vehicles import load_vehicle
 
@@ -29,9 +29,9 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2.metadata import dump_qos_v8, parse_qos
 
-from finssim.robot.record_info import describe_record
 from finssim.robot.record_messages import Messages
 from finssim.robot.record_reader import open_record
+from finssim.robot.record_show import describe_record
 from finssim.robot.recorder import Recorder
 
 VEHICLE = load_vehicle("finsrov")

@@ -11,9 +11,8 @@ from finssim import boundary
 from finssim.cli import app
 from finssim.localization.pool import write_pool
 from finssim.pool import read_truth
-from finssim.robot.link.decoder import MCU, Decoder
-from finssim.robot.link.frames import encode_telemetry
-from finssim.robot.lockstep_codec import decode_request, encode_delivery, receive
+from finssim.robot.link.frames import MCU, Decoder, encode_telemetry
+from finssim.robot.lockstep import decode_request, encode_delivery, receive
 from finssim.robot.messages import Delivery
 from finssim.robot.record_reader import open_record
 from finssim.tasks import task_named

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from finssim.control.guidance import Station
-from finssim.robot.link.decoder import MCU, Decoder
-from finssim.robot.link.frames import encode_telemetry
+from finssim.robot.link.frames import MCU, Decoder, encode_telemetry
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.messages import Delivery
 from finssim.robot.pilots import make_pilot

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from finssim.control.tracking import Track
+from finssim.control.guidance import Track
 from finssim.geometry.rotations import quat_from_euler
 from finssim.robot.robot import Reading
 from finssim.robot.team import Team, decode_track, encode_track

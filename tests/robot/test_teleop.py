@@ -8,11 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from finssim.robot.bridge import Bridge
-from finssim.robot.bridge_settings import BridgeSettings
+from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.messages import Telemetry
-from finssim.robot.operator import Operator
-from finssim.robot.teleop import GEARS, Hands, Teleop, TeleopSettings, shaped
+from finssim.robot.teleop import GEARS, Hands, Operator, Teleop, TeleopSettings, shaped
 from finssim.vehicles import load_vehicle
 
 VEHICLE = load_vehicle("finsrov")

@@ -11,8 +11,7 @@ import pytest
 
 from finssim.localization.pool import write_pool
 from finssim.robot.interrupt import interruptible
-from finssim.robot.link.decoder import MCU, Decoder
-from finssim.robot.link.frames import encode_telemetry
+from finssim.robot.link.frames import MCU, Decoder, encode_telemetry
 from finssim.robot.link.transports import memory_pair
 from finssim.robot.messages import Telemetry
 from finssim.robot.teleop import Hands
@@ -109,8 +108,8 @@ def test_a_drive_is_recorded(world, tmp_path):
     """Telemetry, commands and events; it becomes a trial that its shaft speeds drive."""
     pytest.importorskip("mcap")
     pytest.importorskip("rosbags")
-    from finssim.robot.record_info import describe_record
     from finssim.robot.record_reader import open_record
+    from finssim.robot.record_show import describe_record
     from finssim.robot.recorder import Recorder
 
     with Recorder(tmp_path / "drive.mcap", VEHICLE, {}) as recorder:

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from finssim.sensors import SensorSuite
-from finssim.sensors.noise import digitised
+from finssim.sensors.sampling import digitised
 
 
 @pytest.fixture

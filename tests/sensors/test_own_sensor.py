@@ -10,8 +10,17 @@ import warp as wp
 from finssim.physics.types import vec6
 from finssim.sensors import SensorError, SensorSuite, add_sensor
 from finssim.sensors.batch import SensorBatch
-from finssim.sensors.noise import WHITE, normal, sample_key
-from finssim.sensors.sampling import Sampling, arrival, begin_update, restart, sample_due, slot_of
+from finssim.sensors.sampling import (
+    WHITE,
+    Sampling,
+    arrival,
+    begin_update,
+    normal,
+    restart,
+    sample_due,
+    sample_key,
+    slot_of,
+)
 from finssim.vehicles import VehicleError, load_vehicle
 from finssim.vehicles.equipment import Sensor
 from finssim.vehicles.part import NonNegative

@@ -5,13 +5,21 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from finssim.control.guidance import Goal
 from finssim.control.pid import Pid, PidMemory
-from finssim.control.tracking import Goal
 from finssim.geometry.rotations import quat_from_euler, quat_multiply, quat_rotate
 from finssim.tasks import TASKS, make
-from finssim.tasks.baselines import BASELINES, BaselineError, baseline, restarted
+from finssim.tasks.baselines import (
+    BASELINES,
+    BaselineError,
+    acceleration_ahead,
+    attitude_from,
+    baseline,
+    heading_rate,
+    restarted,
+    seen_from_goal,
+)
 from finssim.tasks.fitting import coefficients_of, driven_axes
-from finssim.tasks.pid_baselines import acceleration_ahead, attitude_from, heading_rate, seen_from_goal
 from finssim.vehicles import catalogue, load_vehicle
 
 SINGLE = ("t1", "t2", "t3", "docking")

@@ -9,7 +9,7 @@ from finssim.engine.randomize import Randomization
 from finssim.engine.ranges_file import Ranges
 from finssim.experiments.plants import load_plant
 from finssim.tasks import Environment, EnvironmentSetupError, StationKeeping
-from finssim.tasks.curriculum import LOOK
+from finssim.tasks.drawing import LOOK
 
 MASS = (0.6, 1.8)
 ALWAYS, NEVER = {"episode_return": -1e9}, {"episode_return": 1e9}

@@ -8,15 +8,15 @@ from rich.console import Console
 
 from finssim import make
 from finssim.control.modes import mode_from_dict
-from finssim.control.pole_placement import axis_model
+from finssim.control.pid import axis_model
 from finssim.control.policy import Policy
 from finssim.engine import Pool
-from finssim.experiments.paper import T1_SETPOINTS, in_room
+from finssim.experiments.metrics import T1_SETPOINTS, in_room
 from finssim.learning.train import train
 from finssim.tasks import EnvironmentSetupError
-from finssim.tasks.catalogue import TASKS
 from finssim.tasks.fitting import authority
 from finssim.tasks.given import crew
+from finssim.tasks.make import TASKS
 from finssim.vehicles import catalogue, load_vehicle
 from finssim.vehicles.defaults import room
 

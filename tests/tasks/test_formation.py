@@ -13,7 +13,7 @@ from finssim.tasks import Environment, EnvironmentSetupError
 from finssim.tasks.baselines import baseline
 from finssim.tasks.communication import Communication
 from finssim.tasks.formation import Formation, sorted_edges, triangle_distance
-from finssim.tasks.pursuit_drive import DriveNumbers
+from finssim.tasks.pursuit import DriveNumbers
 from finssim.vehicles import load_vehicle
 
 QUIET = Formation(drift=0.0)

@@ -7,8 +7,8 @@ import pytest
 
 import finssim
 from finssim.tasks import EnvironmentSetupError, TrajectoryTracking
-from finssim.tasks.kernels import settings_of
-from finssim.tasks.levels import LevelPlan, climb
+from finssim.tasks.environment import LevelPlan, climb
+from finssim.tasks.task import settings_of
 from finssim.tasks.team_pursuit import TeamPursuit
 
 SUCCESSES: list[float] | None = None

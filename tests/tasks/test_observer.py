@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from finssim.control.errors import ControlError
-from finssim.control.guidance import Reference, Station
-from finssim.control.tracking import Track
+from finssim.control import ControlError
+from finssim.control.guidance import Reference, Station, Track
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.geometry.rotations import quat_from_yaw, quat_rotate, quat_yaw
 from finssim.tasks import TASKS, Environment, follow, task_named

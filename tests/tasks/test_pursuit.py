@@ -10,9 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from finssim.tasks import Environment, EnvironmentSetupError
 from finssim.tasks.baselines import baseline
-from finssim.tasks.pursuit import Pursuit
-from finssim.tasks.pursuit_drive import DriveNumbers
-from finssim.tasks.pursuit_prey import PREY_MODES, Prey
+from finssim.tasks.pursuit import PREY_MODES, DriveNumbers, Prey, Pursuit
 from finssim.vehicles import load_vehicle
 
 STILL = Pursuit(prey_speed=0.0)

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from finssim.engine import Pool
 from finssim.tasks import Environment, StationKeeping
-from finssim.tasks.kernels import kernels_of, settings_of
 from finssim.tasks.station_keeping import Reward
+from finssim.tasks.task import kernels_of, settings_of
 
 TASK = StationKeeping()
 LARGE = Pool(length=20.0, width=20.0, depth=10.0)

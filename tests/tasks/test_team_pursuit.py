@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from finssim.tasks import Environment, EnvironmentSetupError
 from finssim.tasks.baselines import baseline
 from finssim.tasks.communication import Communication
-from finssim.tasks.pursuit_drive import DriveNumbers
-from finssim.tasks.pursuit_prey import Prey
+from finssim.tasks.pursuit import DriveNumbers, Prey
 from finssim.tasks.team_pursuit import LEVELS, TeamPursuit, net_distance
 from finssim.vehicles import load_vehicle
 

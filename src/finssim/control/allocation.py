@@ -9,33 +9,138 @@ d = f_C - f0_C, everything else is linear in d:
     thrust of the others   f_F = f0_F - H_FF^-1 H_FC d
     multipliers at limits  mu  = (H_CC - H_CF H_FF^-1 H_FC) d
 
-Eight thrusters have 256 such sets, so one 8x8 table per set (`allocation_tables`) holds both maps. The
+Eight thrusters have 256 such sets, so one 8x8 table per set (`tables`) holds both maps. The
 search for the right set is principal pivoting: change every thruster that breaks its optimality condition at once
 (Judice and Pires, 1994), and one at a time (Murty's rule, which cannot cycle) when that stops making progress.
 The entries of the tables stay of order one however small lambda is, which is what lets float32 solve the problem.
 """
 
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,valid-type,misc,untyped-decorator"
+from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from finssim.control.allocation_tables import REGULARISATION, Tables, tables
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
 from finssim.physics.types import MAX_THRUSTERS, vec6, vec8
 
 __all__ = [
+    "REGULARISATION",
     "AllocationData",
+    "Allocator",
+    "Tables",
     "allocate",
     "allocate_kernel",
     "allocation_data",
     "allocation_residual",
+    "axis_weights",
+    "regularisation_weight",
     "residual_kernel",
+    "tables",
 ]
+
+
+# The tables that wrench allocation looks up, computed once per vehicle in float64.
+
+
+Array = npt.NDArray[np.float64]
+
+REGULARISATION = 1e-4
+"""Default lambda, as a fraction of the mean non-zero eigenvalue of B' W^2 B: wrenches within reach are met to 1e-4."""
+
+
+def regularisation_weight(
+    B: npt.ArrayLike, weights: npt.ArrayLike, regularisation: float = REGULARISATION
+) -> float:
+    """lambda [1/N^2] of the objective: `regularisation` times the mean non-zero eigenvalue of B' W^2 B."""
+    WB = np.asarray(weights, float)[:, None] * np.asarray(B, float)
+    return regularisation * float(np.sum(WB**2)) / float(np.linalg.matrix_rank(WB))
+
+
+class Tables(NamedTuple):
+    """Fields of `allocation.AllocationData` for one vehicle type, padded with absent thrusters (no gain, no thrust)."""
+
+    gain: npt.NDArray[np.float32]
+    """Columns of H^-1 B' W^2, (6, 8)."""
+
+    clamped: npt.NDArray[np.float32]
+    """Columns of the map d -> (f_F - f0_F, mu) for each set of thrusters at a limit, (256, 8, 8)."""
+
+    hessian: npt.NDArray[np.float32]
+    """Columns of H / h, h the mean of its diagonal, (8, 8)."""
+
+    lower: npt.NDArray[np.float32]
+    """Least thrust [N], (8,)."""
+
+    upper: npt.NDArray[np.float32]
+    """Greatest thrust [N], (8,)."""
+
+
+def tables(
+    B: npt.ArrayLike,
+    lower: npt.ArrayLike,
+    upper: npt.ArrayLike,
+    weights: npt.ArrayLike,
+    regularisation: float = REGULARISATION,
+) -> Tables:
+    """Tables of one vehicle type; arguments as one entry of `allocation.allocation_data`.
+
+    Raises:
+        ControlError: Wrong shapes, limits that exclude zero, or numbers that make the problem singular.
+    """
+    B, W = np.asarray(B, float), np.asarray(weights, float)
+    low, high = np.asarray(lower, float), np.asarray(upper, float)
+    n = B.shape[-1]
+    if B.shape != (6, n) or n > MAX_THRUSTERS or low.shape != (n,) or high.shape != (n,) or W.shape != (6,):
+        raise ControlError(
+            f"allocation got B {B.shape}, limits {low.shape} and {high.shape}, weights {W.shape}: "
+            f"expected (6, n), (n,), (n,), (6,) with n <= {MAX_THRUSTERS}"
+        )
+    if not (np.isfinite([*B.ravel(), *low, *high, *W]).all() and (low <= 0.0).all() and (high >= 0.0).all()):
+        raise ControlError("allocation needs finite numbers and limits with lower <= 0 <= upper")
+    if not ((W >= 0.0).all() and np.any(W[:, None] * B) and 1e-8 <= regularisation <= 1.0):
+        raise ControlError(
+            "allocation needs weights >= 0, one of them on an axis with thrust, and regularisation in 1e-8 to 1"
+        )
+
+    WB = W[:, None] * B
+    H = WB.T @ WB + regularisation_weight(B, W, regularisation) * np.eye(n)
+    h = np.trace(H) / n
+    gain = np.zeros((6, MAX_THRUSTERS))
+    gain[:, :n] = np.linalg.solve(H, WB.T * W).T
+    hessian = np.zeros((MAX_THRUSTERS, MAX_THRUSTERS))
+    hessian[:n, :n] = H / h
+
+    clamped = np.zeros((1 << MAX_THRUSTERS, MAX_THRUSTERS, MAX_THRUSTERS))
+    for mask in range(1, 1 << n):
+        at_limit = (mask >> np.arange(n)) & 1 == 1
+        C, F = np.flatnonzero(at_limit), np.flatnonzero(~at_limit)
+        response = -np.linalg.solve(H[np.ix_(F, F)], H[np.ix_(F, C)])
+        clamped[mask][np.ix_(C, F)] = response.T
+        clamped[mask][np.ix_(C, C)] = (H[np.ix_(C, C)] + H[np.ix_(C, F)] @ response) / h
+    return Tables(
+        gain.astype(np.float32),
+        clamped.astype(np.float32),
+        hessian.astype(np.float32),
+        _toward_zero(low),
+        _toward_zero(high),
+    )
+
+
+def _toward_zero(limits: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
+    """Limits as eight float32, rounded so that none lies outside its float64 value."""
+    rounded = np.zeros(MAX_THRUSTERS, np.float32)
+    nearest = limits.astype(np.float32)
+    beyond = np.abs(nearest.astype(float)) > np.abs(limits)
+    rounded[: len(limits)] = np.where(beyond, np.nextafter(nearest, np.float32(0.0)), nearest)
+    return rounded
+
+
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,valid-type,misc,untyped-decorator"
+
 
 BLOCK_PATIENCE = wp.constant(3)
 """Block pivots without progress before single pivots take over."""
@@ -268,3 +373,113 @@ def allocation_data(
         stacked = np.stack([getattr(one, name) for one in types])
         setattr(data, name, wp.array(stacked, dtype=vec8, device=device))
     return data
+
+
+# Wrench allocation from NumPy: the code of the training kernels, called on the robot with one wrench at a time.
+
+
+class Allocator:
+    """Thrusts nearest to wanted wrenches within the limits of one vehicle's thrusters (paper, eq. 18).
+
+    Note:
+        Runs on the CPU and reuses its launch buffers, so one instance belongs to one thread.
+    """
+
+    def __init__(
+        self,
+        B: npt.ArrayLike,
+        lower: npt.ArrayLike,
+        upper: npt.ArrayLike,
+        weights: npt.ArrayLike,
+        regularisation: float = REGULARISATION,
+    ) -> None:
+        """Precomputes the tables of one vehicle; arguments as one entry of `allocation_data`.
+
+        Raises:
+            ControlError: Wrong shapes, limits that exclude zero, or numbers that make the problem singular.
+        """
+        self.data = allocation_data([B], [lower], [upper], [weights], regularisation)
+        self.B: Array = np.array(B, float)
+        self.lower: Array = np.array(lower, float)
+        self.upper: Array = np.array(upper, float)
+        self.weights: Array = np.array(weights, float)
+        self._launch = _Launch(1, self.data)
+
+    @classmethod
+    def from_vehicle(cls, vehicle: Any, regularisation: float = REGULARISATION) -> Allocator:
+        """Allocator about `vehicle.wrench_reference`, weighing each axis by its wrench limit."""
+        lower, upper = vehicle.force_limits
+        return cls(vehicle.control_matrix, lower, upper, axis_weights(vehicle.wrench_limits), regularisation)
+
+    @property
+    def thrusters(self) -> int:
+        """Number of thrusters n."""
+        return int(self.B.shape[1])
+
+    def allocate(self, tau: npt.ArrayLike) -> tuple[Array, Array]:
+        """Thrusts for wanted wrenches.
+
+        Args:
+            tau: Wrenches about the point of B, body frame [N, N m], (..., 6).
+
+        Returns:
+            Thrusts [N], (..., n), never outside the limits; and how far each is from the optimum [N], (...), which is
+            rounding (about 1e-6 of the thrusts an unlimited vehicle would need).
+
+        Raises:
+            ControlError: The last axis is not 6 long, or a number is not finite.
+        """
+        wanted = np.asarray(tau, float)
+        if wanted.shape[-1:] != (6,):
+            raise ControlError(f"wrench has shape {wanted.shape}, expected (..., 6)")
+        if not np.isfinite(wanted).all():
+            raise ControlError("wrench is not finite: find where the NaN or infinity came from")
+        worlds = wanted.size // 6
+        if worlds == 0:
+            return np.zeros((*wanted.shape[:-1], self.thrusters)), np.zeros(wanted.shape[:-1])
+        if worlds != self._launch.worlds:
+            self._launch = _Launch(worlds, self.data)
+        f, residual = self._launch.run(wanted.reshape(worlds, 6))
+        return f[:, : self.thrusters].reshape(*wanted.shape[:-1], -1), residual.reshape(wanted.shape[:-1])
+
+    def achieved(self, f: npt.ArrayLike) -> Array:
+        """Wrench B f that thrusts produce, about the point of B, body frame [N, N m], (..., n) -> (..., 6)."""
+        return np.asarray(f, float) @ self.B.T
+
+
+class _Launch:
+    """Recorded launches for one batch size: a call writes the wrenches, launches, and reads the thrusts."""
+
+    def __init__(self, worlds: int, data: Any) -> None:
+        tau = wp.zeros(worlds, dtype=vec6, device="cpu")
+        f = wp.zeros(worlds, dtype=vec8, device="cpu")
+        vehicle = wp.zeros(worlds, dtype=wp.int32, device="cpu")
+        residual = wp.zeros(worlds, dtype=wp.float32, device="cpu")
+        self.worlds = worlds
+        self._commands = [
+            wp.launch(allocate_kernel, worlds, [tau, vehicle, data, f], device="cpu", record_cmd=True),
+            wp.launch(
+                residual_kernel, worlds, [f, tau, vehicle, data, residual], device="cpu", record_cmd=True
+            ),
+        ]
+        self._arrays = (tau, f, residual, vehicle)
+        views: list[npt.NDArray[np.float32]] = [np.asarray(array) for array in self._arrays[:3]]
+        self._tau, self._f, self._residual = views
+
+    def run(self, tau: Array) -> tuple[Array, Array]:
+        """Thrusts (worlds, 8) and residuals (worlds,) for wrenches (worlds, 6)."""
+        self._tau[:] = tau
+        for command in self._commands:
+            command.launch()
+        return self._f.astype(float), self._residual.astype(float)
+
+
+def axis_weights(wrench_limits: npt.ArrayLike) -> Array:
+    """Diagonal of W [1/N, 1/(N m)], (6,): one over each wrench limit, and zero on an axis with no authority.
+
+    Args:
+        wrench_limits: Largest wrench on each axis alone, body axes [N, N m], (6,).
+    """
+    limits = np.asarray(wrench_limits, float)
+    weights: Array = np.divide(1.0, limits, out=np.zeros_like(limits), where=limits > 0.0)
+    return weights

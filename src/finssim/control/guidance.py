@@ -1,20 +1,161 @@
-"""Where a vehicle should be, as a function of time: a station, or a trajectory (`control.trajectories`)."""
+"""Where a vehicle should be as a function of time, what a controller is given, and how far it is from its goal."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from finssim.control.tracking import Goal
-from finssim.geometry.rotations import quat_from_yaw
+from finssim.geometry.rotations import (
+    cross,
+    quat_conjugate,
+    quat_from_yaw,
+    quat_inverse_rotate,
+    quat_multiply,
+    quat_rotate,
+    quat_to_rotvec,
+    wrap_angle,
+)
 
-__all__ = ["Guide", "Reference", "Station", "acceleration_at", "goal_at"]
+__all__ = [
+    "Controller",
+    "Goal",
+    "Guide",
+    "Known",
+    "Measured",
+    "Reference",
+    "Station",
+    "Track",
+    "TrackingError",
+    "acceleration_at",
+    "goal_at",
+    "tracking_error",
+    "velocity_at",
+]
+
+
+# What every pose controller is given and how far it is from its goal; the interface controllers share.
+
 
 Array = npt.NDArray[np.float64]
+
+
+class Measured(Protocol):
+    """A vehicle's state as a controller reads it; any object with these attributes will do."""
+
+    @property
+    def position(self) -> Any:
+        """Body origin, world frame [m], (..., 3)."""
+
+    @property
+    def quaternion(self) -> Any:
+        """Body to world, xyzw, (..., 4)."""
+
+    @property
+    def nu(self) -> Any:
+        """Velocity of the body origin and angular velocity, body frame [m/s, rad/s], (..., 6)."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """What is known of another vehicle, or of anything else that moves; it is a `Measured`."""
+
+    position: Array
+    """Its origin, world frame [m], (3,)."""
+    quaternion: Array
+    """Body to world, xyzw, (4,)."""
+    nu: Array
+    """Body frame [m/s, rad/s], (6,)."""
+    time: float = math.nan
+    """When that was measured [s]; NaN where it is not told."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """Readings as plain arrays; what nobody looks at may be left out."""
+
+    observation: Any
+    position: Any = None
+    quaternion: Any = None
+    nu: Any = None
+
+
+@dataclass(frozen=True)
+class Goal:
+    """The pose to hold, and how it moves."""
+
+    position: Any
+    """Where the body origin should be, world frame [m], (..., 3)."""
+    quaternion: Any
+    """Attitude the body should have, body to world, xyzw, (..., 4)."""
+    velocity: Any = (0.0, 0.0, 0.0)
+    """Velocity of the goal, world frame [m/s], (..., 3)."""
+    acceleration: Any = (0.0, 0.0, 0.0)
+    """Acceleration of the goal, world frame [m/s²], (..., 3)."""
+
+
+class Controller(Protocol):
+    """A controller keeps no state of its own: its memory goes in with every call and comes back."""
+
+    @property
+    def period(self) -> float:
+        """Time between two calls of `command` [s]."""
+
+    def reset(self, n: int | None = None) -> Any:
+        """Memory at the start, for one vehicle or for a batch of n."""
+
+    def command(self, memory: Any, measured: Measured, goal: Goal) -> tuple[Array, Any]:
+        """Wanted wrench about `vehicle.wrench_reference`, body frame [N, N m], (..., 6), and the memory after."""
+
+
+class TrackingError(NamedTuple):
+    """Goal minus measured, in the measured body's axes."""
+
+    pose: Array
+    """Three distances of a body point to its goal [m], then tilt about x and y and heading [rad], (..., 6)."""
+    velocity: Array
+    """Velocity of the goal, body frame; its angular part is zero [m/s, rad/s], (..., 6)."""
+
+
+def tracking_error(measured: Measured, goal: Goal, point: npt.ArrayLike) -> TrackingError:
+    """Error of a body point's position and of the attitude.
+
+    The rotation to the goal is split into a turn about the body's z (heading error, wrapped) and a tilt without any
+    turn about z, so that half a turn to make does not disturb the levelling.
+
+    Args:
+        measured: Where the vehicle is.
+        goal: Where it should be.
+        point: The body point, body frame [m], (3,).
+    """
+    q, q_goal = np.asarray(measured.quaternion, float), np.asarray(goal.quaternion, float)
+    to_goal = np.asarray(goal.position, float) - np.asarray(measured.position, float)
+    to_goal = to_goal + quat_rotate(q_goal, point)
+    distance = quat_inverse_rotate(q, to_goal) - np.asarray(point, float)
+
+    relative = quat_multiply(quat_conjugate(q), q_goal)
+    heading = wrap_angle(2.0 * np.arctan2(relative[..., 2], relative[..., 3]))
+    tilt = quat_to_rotvec(quat_multiply(relative, quat_from_yaw(-heading)))[..., :2]
+    drift = quat_inverse_rotate(q, np.asarray(goal.velocity, float))
+    return TrackingError(
+        np.concatenate([distance, tilt, heading[..., None]], axis=-1),
+        np.concatenate([drift, np.zeros_like(drift)], axis=-1),
+    )
+
+
+def velocity_at(nu: npt.ArrayLike, point: npt.ArrayLike) -> Array:
+    """Twist of the body at a body point: v + omega x r and omega, body frame [m/s, rad/s], (..., 6).
+
+    Args:
+        nu: Twist of the body origin, body frame [m/s, rad/s], (..., 6).
+        point: r from the body origin, body frame [m], (3,).
+    """
+    nu = np.asarray(nu, float)
+    return np.concatenate([nu[..., :3] + cross(nu[..., 3:], np.asarray(point, float)), nu[..., 3:]], axis=-1)
+
 
 DIFFERENCE = 0.05
 """Half the time across which an acceleration is taken [s]: a controller's period."""

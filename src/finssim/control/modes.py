@@ -9,8 +9,8 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from finssim.control.allocator import Allocator
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
+from finssim.control.allocation import Allocator
 
 __all__ = ["MODES", "ActionMode", "Thruster8", "Wrench4", "Wrench6", "action_mode", "mode_from_dict"]
 

@@ -1,34 +1,214 @@
-"""Trajectories to follow: the published ones by name, and anyone's own from a file."""
+"""Trajectories to follow: shapes, the published ones by name, and anyone's own from a file."""
 
 from __future__ import annotations
 
+import csv
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
 from finssim.control.guidance import Reference
-from finssim.control.trajectory_shapes import DEPTH, Motion, circle, ellipse, gerono, helix, polyline
 from finssim.geometry.rotations import quat_from_yaw, quat_inverse_rotate, wrap_angle
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import room
+from finssim.yaml_file import read_mapping
 
 __all__ = [
     "PUBLISHED_LIMITS",
+    "SHAPES",
     "TRAJECTORIES",
     "Limits",
+    "Motion",
     "Trajectory",
     "check_limits",
     "check_vehicle",
+    "circle",
+    "ellipse",
+    "gerono",
+    "helix",
+    "hermite",
     "load_trajectory",
+    "polyline",
+    "read_trajectory",
+    "through_points",
 ]
 
+
+# Shapes that a trajectory can follow: position and its exact derivative as functions of time.
+#
+# A shape lies in the horizontal plane z = `depth` (negative under water) unless it says otherwise. In the paper's
+# controller frame that is the x-z plane: its x is ours, its z is our y, both at y = depth.
+
+
 Array = npt.NDArray[np.float64]
+
+Motion = Callable[[Array], tuple[Array, Array]]
+"""Times since the start [s], (...) -> position [m] and velocity [m/s], world frame, (..., 3) each."""
+
+DEPTH = -0.5
+"""Height of the published trajectories [m]."""
+
+TABLE_SIZE = 2048
+"""Knots of the ellipse's table: its spline is then exact to 1e-10 rad."""
+
+
+def polyline(points: Sequence[Sequence[float]], durations: Sequence[float]) -> Motion:
+    """Straight segments from point to point, each begun and ended at rest: s = 3u² - 2u³.
+
+    Args:
+        points: Corners, world frame [m], (n + 1, 3).
+        durations: Time for each segment [s], (n,).
+
+    Raises:
+        ControlError: Lengths do not fit, or a time is not positive.
+    """
+    corners, times = np.asarray(points, float), np.asarray(durations, float)
+    if corners.ndim != 2 or corners.shape[1:] != (3,) or times.shape != (len(corners) - 1,):
+        raise ControlError(
+            f"polyline of points {corners.shape} with durations {times.shape}: expected (n + 1, 3) and (n,)"
+        )
+    _positive(polyline=float(times.min()))
+    starts = np.concatenate([[0.0], np.cumsum(times)])
+
+    def motion(t: Array) -> tuple[Array, Array]:
+        i = np.clip(np.searchsorted(starts, t, side="right") - 1, 0, len(times) - 1)
+        s, s_dot = _smooth_step((t - starts[i]) / times[i])
+        way = corners[i + 1] - corners[i]
+        return corners[i] + s[..., None] * way, (s_dot / times[i])[..., None] * way
+
+    return motion
+
+
+def circle(radius: float, turns: float, duration: float, depth: float = DEPTH) -> Motion:
+    """Circles about the pool's middle at constant speed, counter-clockwise from (radius, 0).
+
+    Args:
+        radius: [m]
+        turns: Number of circles.
+        duration: Time for all of them [s].
+        depth: Height of their plane, world frame [m]: negative under water.
+    """
+    _positive(radius=radius, turns=turns, duration=duration)
+    return helix(radius, turns, duration, depth, depth)
+
+
+def helix(radius: float, turns: float, duration: float, bottom: float, top: float) -> Motion:
+    """A circle that rises steadily from `bottom` to `top` (heights in the world frame [m])."""
+    _positive(radius=radius, turns=turns, duration=duration)
+    rate, climb = 2.0 * math.pi * turns / duration, (top - bottom) / duration
+
+    def motion(t: Array) -> tuple[Array, Array]:
+        c, s = radius * np.cos(rate * t), radius * np.sin(rate * t)
+        position = np.stack([c, s, bottom + climb * t], axis=-1)
+        return position, np.stack([-rate * s, rate * c, np.full_like(c, climb)], axis=-1)
+
+    return motion
+
+
+def gerono(a: float, b: float, duration: float, depth: float = DEPTH) -> Motion:
+    """A figure of eight at constant phase rate: x = a sin θ, y = b sin θ cos θ (Gerono's lemniscate).
+
+    Args:
+        a: Half its length along world x [m].
+        b: Its width along world y [m].
+        duration: Time for one figure [s].
+        depth: Height of its plane, world frame [m]: negative under water.
+    """
+    _positive(a=a, b=b, duration=duration)
+    rate = 2.0 * math.pi / duration
+
+    def motion(t: Array) -> tuple[Array, Array]:
+        phase = rate * t
+        x, y = a * np.sin(phase), 0.5 * b * np.sin(2.0 * phase)
+        x_dot, y_dot = a * rate * np.cos(phase), b * rate * np.cos(2.0 * phase)
+        return np.stack([x, y, np.full_like(x, depth)], axis=-1), np.stack([x_dot, y_dot, 0.0 * x], axis=-1)
+
+    return motion
+
+
+def ellipse(a: float, b: float, duration: float, depth: float = DEPTH) -> Motion:
+    """One turn of an ellipse, slower at its four vertices, begun and ended at rest.
+
+    The speed along the arc follows 0.5 + 0.5 sin² 2θ, and time itself runs by s = 3u² - 2u³. That reading of what is
+    published gives the published peak: 0.1031 m/s for half axes of 1.0 and 0.4 m in 92.70 s.
+
+    Args:
+        a: Half axis along world x [m].
+        b: Half axis along world y [m].
+        duration: Time for the turn [s].
+        depth: Height of its plane, world frame [m]: negative under water.
+    """
+    _positive(a=a, b=b, duration=duration)
+    theta = np.linspace(0.0, 2.0 * math.pi, TABLE_SIZE + 1)
+
+    def slowness(angle: Array) -> Array:
+        """Time per angle, up to a factor: |dr/dθ| / (0.5 + 0.5 sin² 2θ)."""
+        stretch = np.hypot(a * np.sin(angle), b * np.cos(angle))
+        return np.asarray(stretch / (0.5 + 0.5 * np.sin(2.0 * angle) ** 2))
+
+    middle = slowness(0.5 * (theta[1:] + theta[:-1]))
+    ends = slowness(theta)
+    pieces = (ends[:-1] + 4.0 * middle + ends[1:]) * np.diff(theta) / 6.0  # Simpson's rule
+    table = np.concatenate([[0.0], np.cumsum(pieces)])
+    knots, slopes = table / table[-1], table[-1] / ends
+
+    def motion(t: Array) -> tuple[Array, Array]:
+        s, s_dot = _smooth_step(t / duration)
+        angle, slope = hermite(s, knots, theta, slopes)
+        rate = slope * s_dot / duration
+        c, n = np.cos(angle), np.sin(angle)
+        position = np.stack([a * c, b * n, np.full_like(c, depth)], axis=-1)
+        return position, np.stack([-a * rate * n, b * rate * c, 0.0 * c], axis=-1)
+
+    return motion
+
+
+SHAPES: dict[str, Callable[..., Motion]] = {
+    "polyline": polyline,
+    "circle": circle,
+    "helix": helix,
+    "gerono": gerono,
+    "ellipse": ellipse,
+}
+"""Shapes by the name that trajectory files use."""
+
+
+def hermite(x: Array, knots: Array, values: Array, slopes: Array) -> tuple[Array, Array]:
+    """Cubic Hermite interpolation and its exact derivative.
+
+    Args:
+        x: Where, within the knots, (...).
+        knots: Increasing, (n,).
+        values: At the knots, (n,) or (n, m).
+        slopes: Derivatives there, like `values`.
+
+    Returns:
+        Value and derivative, (...) or (..., m).
+    """
+    i = np.clip(np.searchsorted(knots, x, side="right") - 1, 0, len(knots) - 2)
+    h, shape = knots[i + 1] - knots[i], (*np.shape(x), *(1,) * (values.ndim - 1))
+    u, h = np.reshape((x - knots[i]) / h, shape), np.reshape(h, shape)
+    way, a, b = values[i + 1] - values[i], slopes[i] * h, slopes[i + 1] * h
+    value = values[i] + u * (a + u * (3.0 * way - 2.0 * a - b + u * (a + b - 2.0 * way)))
+    return value, (a + u * (6.0 * way - 4.0 * a - 2.0 * b + 3.0 * u * (a + b - 2.0 * way))) / h
+
+
+def _smooth_step(u: Array) -> tuple[Array, Array]:
+    """3u² - 2u³ and its derivative."""
+    return u * u * (3.0 - 2.0 * u), 6.0 * u * (1.0 - u)
+
+
+def _positive(**numbers: float) -> None:
+    for name, number in numbers.items():
+        if not (math.isfinite(number) and number > 0.0):
+            raise ControlError(f"{name} is {number}, expected a positive number")
+
 
 TANGENT_SPAN = 0.1
 """The tangent is taken across this much time on either side [s], so that it is known at rests and corners too."""
@@ -129,7 +309,7 @@ def load_trajectory(
     """A trajectory by name or from a YAML or CSV file.
 
     Args:
-        name_or_file: Key of `TRAJECTORIES`, or a file as `control.trajectory_file` reads it.
+        name_or_file: Key of `TRAJECTORIES`, or a file as `read_trajectory` reads it.
         heading: Keep one heading, or look along the way; as the trajectory has it if None.
         yaw: That heading, or the angle to the way [rad]; as the trajectory has it if None.
         vehicle: Scales a published trajectory by the room that the vehicle needs (1 for FinsROV); one that it cannot
@@ -142,8 +322,6 @@ def load_trajectory(
     if name in TRAJECTORIES:
         trajectory = TRAJECTORIES[name].scaled(1.0 if vehicle is None else room(vehicle.body.size))
     elif Path(name_or_file).is_file():
-        from finssim.control.trajectory_file import read_trajectory
-
         trajectory = read_trajectory(Path(name_or_file))
     else:
         known = ", ".join(TRAJECTORIES)
@@ -227,3 +405,143 @@ def check_vehicle(trajectory: Trajectory, vehicle: Vehicle) -> None:
 def _samples(trajectory: Trajectory) -> tuple[Array, Reference]:
     t = np.linspace(0.0, trajectory.duration, max(3, math.ceil(trajectory.duration / CHECK_STEP) + 1))
     return t, trajectory.at(t)
+
+
+# Trajectory files: points in time as CSV or YAML, or a shape with its measures as YAML.
+
+
+COLUMNS = ("t", "x", "y", "z", "yaw")
+"""Of a table of points: time [s], world position [m], and if wanted the heading [rad]."""
+
+KEYS = {"name", "heading", "yaw", "points", "shape"}
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """A trajectory from a file.
+
+    CSV: a header `t,x,y,z` or `t,x,y,z,yaw`, one row per point. YAML: `points`, a list of such rows, or `shape`, a
+    mapping of `kind` (key of `SHAPES`) and its arguments such as radius and duration; with it `name`, `heading` (fixed
+    or tangent) and `yaw` [rad].
+
+    Raises:
+        ControlError: The file cannot be read, or what it says is no trajectory; one sentence with the file's name.
+    """
+    try:
+        if path.suffix.lower() == ".csv":
+            return through_points(path.stem, _rows_of_table(path))
+        data = read_mapping(path, ControlError, such_as="points: [[0, 0, 0, -0.5], [10, 1, 0, -0.5]]")
+        return _from_mapping(path.stem, data)
+    except ControlError as error:
+        said = str(error)
+        raise ControlError(said if said.startswith(str(path)) else f"{path}: {said}") from None
+
+
+def through_points(name: str, points: npt.ArrayLike, **options: Any) -> Trajectory:
+    """A trajectory through points in time: smooth, and never beyond two neighbours on any axis.
+
+    Piecewise cubic with the slopes of Fritsch and Carlson (1980): a rest between two equal points stays a rest.
+
+    Args:
+        name: Of the trajectory.
+        points: t [s] from 0 on, x, y, z [m] and if wanted yaw [rad], (n, 4) or (n, 5).
+        options: `heading` and `yaw` of `Trajectory`.
+
+    Raises:
+        ControlError: Fewer than two points, numbers that are not finite, or times that do not increase from 0.
+    """
+    table = _checked_points(points)
+    t = table[:, 0]
+    table[:, 4:] = np.unwrap(table[:, 4:], axis=0)
+    slopes = _monotone_slopes(t, table[:, 1:])
+    place, drift = table[:, 1:4], slopes[:, :3]
+
+    def motion(time: Array) -> tuple[Array, Array]:
+        return hermite(time, t, place, drift)
+
+    if table.shape[1] == 5:
+        yaw, rate = table[:, 4], slopes[:, 3]
+        options["turning"] = lambda time: hermite(time, t, yaw, rate)[0]
+    return Trajectory(name=name, duration=float(t[-1]), motion=motion, **options)
+
+
+def _from_mapping(name: str, data: Mapping[str, Any]) -> Trajectory:
+    unknown = sorted(map(str, data.keys() - KEYS))
+    if unknown:
+        raise ControlError(f"unknown key '{unknown[0]}'; available: {', '.join(sorted(KEYS))}")
+    if ("points" in data) == ("shape" in data):
+        raise ControlError("expected either 'points' or 'shape'")
+    options: dict[str, Any] = {"heading": data.get("heading", "fixed"), "yaw": _number(data, "yaw", 0.0)}
+    name = str(data.get("name", name))
+    if "points" in data:
+        return through_points(name, data["points"], **options)
+    motion, duration = _shape(data["shape"])
+    return Trajectory(name=name, duration=duration, motion=motion, **options)
+
+
+def _shape(data: Any) -> tuple[Motion, float]:
+    if not isinstance(data, Mapping) or data.get("kind") not in SHAPES:
+        raise ControlError(f"shape: expected a mapping whose 'kind' is one of {', '.join(SHAPES)}")
+    arguments = {str(key): value for key, value in data.items() if key != "kind"}
+    if data["kind"] == "polyline":
+        durations = arguments.get("durations", [])
+    else:
+        durations = [_number(arguments, "duration", math.nan)]
+    try:
+        return SHAPES[data["kind"]](**arguments), float(np.sum(np.asarray(durations, float)))
+    except (TypeError, ValueError) as error:
+        raise ControlError(f"shape: {str(error).replace('()', '')}") from None
+
+
+def _number(data: Mapping[str, Any], key: str, otherwise: float) -> float:
+    value = data.get(key, otherwise)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ControlError(f"{key} is {value!r}, expected a number")
+    return float(value)
+
+
+def _rows_of_table(path: Path) -> list[list[str]]:
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = [row for row in csv.reader(file) if row]
+    except (OSError, UnicodeDecodeError) as error:
+        raise ControlError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    header = tuple(cell.strip() for cell in rows[0]) if rows else ()
+    if header not in (COLUMNS, COLUMNS[:4]):
+        raise ControlError(f"its header is '{','.join(header)}', expected t,x,y,z or t,x,y,z,yaw")
+    return rows[1:]
+
+
+def _checked_points(points: Any) -> Array:
+    try:
+        table = np.array(points, dtype=float)
+    except (TypeError, ValueError):
+        raise ControlError(
+            "points: expected rows of 4 or 5 numbers, all of one length: t, x, y, z and yaw"
+        ) from None
+    if table.ndim != 2 or table.shape[1] not in (4, 5) or len(table) < 2:
+        raise ControlError(
+            f"points are {table.shape}, expected two or more rows of t, x, y, z and if wanted yaw"
+        )
+    if not np.isfinite(table).all():
+        row = int(np.argwhere(~np.isfinite(table))[0, 0])
+        raise ControlError(f"point {row + 1} is {table[row].tolist()}, expected finite numbers")
+    if table[0, 0] != 0.0:
+        raise ControlError(f"the first time is {table[0, 0]:g} s, expected 0: times count from the start")
+    late = np.flatnonzero(np.diff(table[:, 0]) <= 0.0)
+    if len(late):
+        row = int(late[0]) + 2
+        raise ControlError(f"point {row} is at {table[row - 1, 0]:g} s, not after the one before it")
+    return table
+
+
+def _monotone_slopes(t: Array, values: Array) -> Array:
+    """Slopes at the points, (n, m): zero at every turn, else a harmonic mean of the neighbours; at rest at the ends."""
+    h = np.diff(t)[:, None]
+    slope = np.diff(values, axis=0) / h
+    slopes = np.zeros_like(values)
+    before, after = slope[:-1], slope[1:]
+    same = before * after > 0.0
+    w1, w2 = 2.0 * h[1:] + h[:-1], h[1:] + 2.0 * h[:-1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slopes[1:-1] = np.where(same, (w1 + w2) / (w1 / before + w2 / after), 0.0)
+    return slopes

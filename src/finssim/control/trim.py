@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
+from finssim.control.guidance import Measured
 from finssim.control.policy_description import ObservationSchema
-from finssim.control.tracking import Measured
 from finssim.geometry.rotations import quat_inverse_rotate
 
 __all__ = ["Trim"]

@@ -42,15 +42,13 @@ _MUJOCO_BODY = """<mujoco><option timestep="0.01" integrator="Euler"/><worldbody
 def best_rate(
     step: Callable[[], object],
     work: float,
-    seconds: float = SECONDS,
     finish: Callable[[], object] = lambda: None,
 ) -> float:
-    """Work done per second in the best of several rounds.
+    """Work done per second in the best of several rounds, which take `SECONDS` in all.
 
     Args:
         step: What is timed; called often enough to fill the time.
         work: Done by one call.
-        seconds: Time for all rounds [s].
         finish: Waits for what steps have started; a GPU works on after a step returns.
 
     Returns:
@@ -61,7 +59,7 @@ def best_rate(
     start = time.perf_counter()
     step()
     finish()
-    calls = max(1, round(seconds / ROUNDS / max(time.perf_counter() - start, 1e-7)))
+    calls = max(1, round(SECONDS / ROUNDS / max(time.perf_counter() - start, 1e-7)))
     best = 0.0
     for _ in range(ROUNDS):
         start = time.perf_counter()

@@ -33,7 +33,7 @@ from finssim.provenance import provenance
 from finssim.tasks import TASKS
 from finssim.vehicles import load_vehicle
 
-__all__ = ["CompareError", "MEASURES", "compare", "print_comparison"]
+__all__ = ["MEASURES", "CompareError", "compare", "print_comparison"]
 
 CURVES_FILE = "curves.csv"
 SEED_AT_END = re.compile(r"[-_]?(?:seed|s)?[-_]?\d+$")

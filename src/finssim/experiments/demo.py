@@ -25,8 +25,8 @@ from finssim.calibration.excitation.programmes import RATE, Programme, programme
 from finssim.calibration.output.calibrate import number_in
 from finssim.calibration.output.fit_output import interval_text, number_text, state_text
 from finssim.calibration.trials.trial import Trial
-from finssim.control.allocator import Allocator
-from finssim.control.pole_placement import AxisModel, axis_model
+from finssim.control.allocation import Allocator
+from finssim.control.pid import AxisModel, axis_model
 from finssim.control.policy import Policy
 from finssim.control.policy_description import DESCRIPTION_FILE
 from finssim.engine import Pool
@@ -50,8 +50,8 @@ from finssim.experiments.identify import (
     identify,
     vehicle_files,
 )
+from finssim.experiments.metrics import T1_SETPOINTS, paper_row
 from finssim.experiments.on_robot import Attendant, OnRobot, kept_folder
-from finssim.experiments.paper import T1_SETPOINTS, paper_row
 from finssim.experiments.pool_trial import (
     HARDWARE,
     Job,

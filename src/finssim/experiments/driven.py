@@ -30,9 +30,9 @@ from finssim.tasks.observer import Observer
 from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = [
+    "SAME_GOAL",
     "Drive",
     "DriveError",
-    "SAME_GOAL",
     "collect",
     "collect_records",
     "datasets",

@@ -26,8 +26,14 @@ from finssim.experiments.figures import (
     new_figure,
     save_figure,
 )
-from finssim.experiments.metrics import summarize, summarize_tracking
-from finssim.experiments.paper import PAPER_T2, T1_SETPOINTS, paper_row, paper_t2_row
+from finssim.experiments.metrics import (
+    PAPER_T2,
+    T1_SETPOINTS,
+    paper_row,
+    paper_t2_row,
+    summarize,
+    summarize_tracking,
+)
 from finssim.experiments.plants import Plant, load_plant
 from finssim.experiments.tables import console_table, figure_text
 from finssim.experiments.trials import (
@@ -47,9 +53,9 @@ from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = [
     "CAPTION",
+    "T1_COLUMNS",
     "Evaluation",
     "EvaluationError",
-    "T1_COLUMNS",
     "TrackingRun",
     "by_setpoint",
     "cells",

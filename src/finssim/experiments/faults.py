@@ -26,16 +26,14 @@ from rich.console import Console
 
 from finssim.experiments.campaign import Job, Say, choice, run_in_turn, run_jobs, write_json
 from finssim.experiments.pool_trial import noise_seed, stand_in_pool
-from finssim.experiments.processes import Pair, ReliabilityError, await_flush, await_thrust, pair
+from finssim.experiments.reliability import Pair, ReliabilityError, await_flush, await_thrust, pair
 from finssim.experiments.tables import Shown, markdown_of, print_shown
 from finssim.pool import VirtualPool, read_truth
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
-from finssim.robot.bridge import Bridge
-from finssim.robot.bridge_settings import BridgeSettings
+from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.goals import station_of
-from finssim.robot.link.decoder import MCU, Decoder
-from finssim.robot.link.frames import encode_telemetry
+from finssim.robot.link.frames import MCU, Decoder, encode_telemetry
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.messages import Delivery, Picture, Telemetry
 from finssim.robot.pilots import make_pilot

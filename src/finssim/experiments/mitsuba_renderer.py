@@ -22,7 +22,7 @@ from finssim.sensors.overhead_camera.photometry import digitise, noise_key
 from finssim.sensors.overhead_camera.surface import waves_of
 from finssim.sensors.overhead_camera.view import SurfaceFrame, surface_frame
 
-__all__ = ["render_with_mitsuba", "radiance_by_mitsuba"]
+__all__ = ["radiance_by_mitsuba", "render_with_mitsuba"]
 
 Array = NDArray[np.float64]
 

@@ -21,13 +21,13 @@ from finssim.files import atomic_directory, refuse_unwritable
 from finssim.geometry.rotations import quat_yaw, wrap_angle
 from finssim.localization.pool import Pool, load_pool
 from finssim.robot.goals import check_reachable
-from finssim.robot.keyboard import Keyboard
 from finssim.robot.link.transports import DEFAULT_BIND
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import Pilot, WrenchPilot, make_pilot
 from finssim.robot.recorder import Recorder
 from finssim.robot.robot import Reading
 from finssim.robot.runtime import Runtime
+from finssim.robot.teleop_devices import Keyboard
 from finssim.robot.wiring import Drive, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import vehicle_at

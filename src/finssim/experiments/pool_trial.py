@@ -17,14 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from finssim.control.controllers import CONTROLLERS
-from finssim.control.guidance import Guide, Station
+from finssim.control.guidance import Guide, Measured, Station
+from finssim.control.pid import CONTROLLERS
 from finssim.control.policy_description import DESCRIPTION_FILE, NETWORK_FILE
 from finssim.control.trajectories import load_trajectory
 from finssim.control.trim import Trim
 from finssim.experiments import campaign
 from finssim.experiments.evaluate import Evaluation
-from finssim.experiments.metrics import summarize
+from finssim.experiments.metrics import T1_SETPOINTS, T1_START, in_room, summarize
 from finssim.experiments.on_robot import (
     Attendant,
     OnRobot,
@@ -36,7 +36,6 @@ from finssim.experiments.on_robot import (
     play_trial,
     session,
 )
-from finssim.experiments.paper import T1_SETPOINTS, T1_START, in_room
 from finssim.experiments.recorded import (
     PERIOD,
     Motion,
@@ -48,14 +47,13 @@ from finssim.experiments.recorded import (
 )
 from finssim.experiments.trials import DURATION, Trials
 from finssim.files import atomic_write
-from finssim.geometry.rotations import quat_from_yaw, quat_yaw
+from finssim.geometry.rotations import quat_from_yaw, quat_multiply, quat_yaw
 from finssim.localization.pool import Pool
 from finssim.pool import Truth, VirtualPool, draw_plant, read_truth
 from finssim.pool.camera import PoolCamera
 from finssim.pool.site import camera_of
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
-from finssim.robot.ablation import NoisyInput
 from finssim.robot.goals import check_reachable
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.perception import Perception
@@ -70,6 +68,7 @@ from finssim.vehicles.defaults import room
 __all__ = [
     "HARDWARE",
     "Job",
+    "NoisyInput",
     "noise_seed",
     "play",
     "play_in_pool",
@@ -80,7 +79,80 @@ __all__ = [
     "stand_in_pool",
 ]
 
+
+# What an ablation takes away from a pilot: noise on the state that it sees.
+
+
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """The state as the pilot sees it."""
+
+    position: Array
+    quaternion: Array
+    nu: Array
+
+
+class NoisyInput:
+    """A pilot that sees its position and heading with independent errors, drawn anew for every decision.
+
+    The published ablation "+ localization noise" has 5 cm per axis and 10 degrees; it touches the controller's input
+    alone.
+    """
+
+    def __init__(
+        self,
+        pilot: Pilot,
+        *,
+        position_std: float = 0.05,
+        yaw_std: float = math.radians(10.0),
+        seed: int = 0,
+    ) -> None:
+        """
+        Args:
+            pilot: Who decides.
+            position_std: Standard deviation of each coordinate [m].
+            yaw_std: Of the heading [rad].
+            seed: Of the errors; `reset` starts them again.
+        """
+        self._pilot, self._stds, self._seed = pilot, (position_std, yaw_std), seed
+        self._random = np.random.default_rng(seed)
+
+    @property
+    def name(self) -> str:
+        """That of the pilot."""
+        return self._pilot.name
+
+    @property
+    def period(self) -> float:
+        """Time between two decisions [s]."""
+        return self._pilot.period
+
+    @property
+    def needs_state(self) -> bool:
+        """As the pilot."""
+        return self._pilot.needs_state
+
+    def describe(self) -> dict[str, Any]:
+        """The pilot and the noise."""
+        position_std, yaw_std = self._stds
+        noise = {"position_std_m": position_std, "yaw_std_rad": yaw_std, "seed": self._seed}
+        return {**self._pilot.describe(), "input_noise": noise}
+
+    def reset(self) -> None:
+        """Forget what was before, the errors too."""
+        self._random = np.random.default_rng(self._seed)
+        self._pilot.reset()
+
+    def act(self, reading: Measured, guide: Guide, t: float) -> Array:
+        """Wanted thrusts in canonical order [N], (n,)."""
+        position_std, yaw_std = self._stds
+        moved = np.asarray(reading.position, float) + self._random.normal(0.0, position_std, 3)
+        turned = quat_multiply(quat_from_yaw(self._random.normal(0.0, yaw_std)), reading.quaternion)
+        return self._pilot.act(_Seen(moved, turned, np.asarray(reading.nu, float)), guide, t)
+
 
 HARDWARE = "hardware"
 """In place of the severity of a pool, and of what its camera sends."""

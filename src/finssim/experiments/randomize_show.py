@@ -14,7 +14,7 @@ import warp as wp
 from numpy.typing import NDArray
 from rich.console import Console
 
-from finssim.control.allocator import Allocator
+from finssim.control.allocation import Allocator
 from finssim.engine import Simulator, Water
 from finssim.engine.distributions import Distribution
 from finssim.engine.plant_arrays import NO_LIMIT, vehicle_parameters

@@ -14,12 +14,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.calibration.trials.table_file import read_table
-from finssim.control.guidance import Guide, Reference
-from finssim.control.tracking import Track
+from finssim.control.guidance import Guide, Reference, Track
 from finssim.control.trajectories import load_trajectory
 from finssim.experiments.driven import SAME_GOAL, Drive, read_drive, station_at, trajectory_of
-from finssim.experiments.metrics import ERRORS, MAX_GAP, measure_tracking, measure_trial
-from finssim.experiments.paper import T1_SETPOINTS, in_room
+from finssim.experiments.metrics import (
+    ERRORS,
+    MAX_GAP,
+    T1_SETPOINTS,
+    in_room,
+    measure_tracking,
+    measure_trial,
+)
 from finssim.experiments.trials import DURATION, TrackingTrials, Trials
 from finssim.geometry.rotations import (
     quat_conjugate,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from finssim.control.allocator import Allocator
+from finssim.control.allocation import Allocator
 from finssim.engine import Simulator
 from finssim.engine.recorder import STATE_COLUMNS
 from finssim.experiments.tables import console_table

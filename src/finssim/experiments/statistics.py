@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
-    "Interval",
     "RESAMPLES",
     "SEED",
+    "Interval",
     "Statistic",
     "better",
     "bootstrap",

@@ -23,8 +23,8 @@ from finssim.experiments.figures import (
     save_figure,
 )
 from finssim.experiments.identify import identify
+from finssim.experiments.metrics import PAPER_T2, T1_SETPOINTS, paper_row, paper_t2_row
 from finssim.experiments.on_robot import Attendant, OnRobot
-from finssim.experiments.paper import PAPER_T2, T1_SETPOINTS, paper_row, paper_t2_row
 from finssim.experiments.pool_trial import HARDWARE, Job, play, read_series, run_on_robot
 from finssim.experiments.statistics import Interval, Statistic, paired_difference, with_interval
 from finssim.experiments.tables import Shown, figure_text, markdown_of, print_shown

@@ -11,24 +11,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.control.guidance import Guide, acceleration_at
-from finssim.control.tracking import Goal
+from finssim.control.guidance import Goal, Guide, acceleration_at
 from finssim.control.trajectories import load_trajectory
-from finssim.experiments.metrics import measure_tracking, measure_trial
-from finssim.experiments.paper import T1_SETPOINTS, T1_START, in_room
+from finssim.experiments.metrics import T1_SETPOINTS, T1_START, in_room, measure_tracking, measure_trial
 from finssim.experiments.plants import Plant
 from finssim.experiments.statistics import with_interval
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.tasks import Environment, Task, TrajectoryTracking, follow
-from finssim.tasks.agents import NOWHERE, Agent
-from finssim.tasks.rollout import rollout
+from finssim.tasks.agents import NOWHERE, Agent, rollout
 from finssim.vehicles import Vehicle
 
 __all__ = [
     "DURATION",
     "EPISODES",
-    "EpisodeError",
     "T2_TRAJECTORIES",
+    "EpisodeError",
     "TrackingTrials",
     "Trials",
     "run_episodes",

@@ -12,7 +12,7 @@ import yaml
 from numpy.typing import NDArray
 from rich.console import Console
 
-from finssim.control.allocator import Allocator
+from finssim.control.allocation import Allocator
 from finssim.engine import Simulator
 from finssim.experiments.tables import console_table
 from finssim.provenance import provenance

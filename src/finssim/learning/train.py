@@ -23,8 +23,8 @@ from finssim.files import atomic_directory, refuse_unwritable
 from finssim.learning.learners import learner_named
 from finssim.quiet import start_warp
 from finssim.tasks import Environment, Task, make, task_named
+from finssim.tasks.environment import LevelPlan, climb
 from finssim.tasks.fitting import authority
-from finssim.tasks.levels import LevelPlan, climb
 from finssim.tasks.sensing import seen_with
 from finssim.vehicles import Vehicle, load_vehicle
 

@@ -6,8 +6,7 @@ import random
 import struct
 from dataclasses import dataclass, replace
 
-from finssim.robot.link.frames import TELEMETRY, crc16_modbus, encode_telemetry
-from finssim.robot.link.layout import forms
+from finssim.robot.link.frames import TELEMETRY, crc16_modbus, encode_telemetry, forms
 from finssim.robot.messages import Telemetry
 
 __all__ = ["FaultError", "Faults"]

@@ -9,10 +9,11 @@ from finssim.pool.attitude import AttitudeFilter
 from finssim.pool.motors import RPM
 from finssim.pool.plant_spec import PlantSpec
 from finssim.pool.sensors import Sample
-from finssim.robot.link.decoder import MCU, Decoder
 from finssim.robot.link.frames import (
     DEBUG_ECHO,
+    MCU,
     DebugConfig,
+    Decoder,
     RejectFlag,
     StatusFlag,
     crc16_modbus,

@@ -9,9 +9,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.control.guidance import Guide
+from finssim.control.guidance import Guide, Measured, Track
 from finssim.control.modes import action_mode
-from finssim.control.tracking import Measured, Track
 from finssim.engine.launch import Pipeline
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.robot import Reading

@@ -22,7 +22,7 @@ from finssim.pool.picture_wire import PictureSink, SharedMemorySender, UdpSender
 from finssim.pool.plant_spec import Basin
 from finssim.pool.site import CameraSettings
 from finssim.quiet import start_warp
-from finssim.robot.link.layout import LinkError
+from finssim.robot.link.frames import LinkError
 from finssim.robot.messages import Picture
 from finssim.vehicles import Vehicle
 

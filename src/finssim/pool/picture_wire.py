@@ -11,11 +11,18 @@ import zlib
 from pathlib import Path
 from typing import Protocol
 
-from finssim.robot.link.layout import LinkError
+from finssim.robot.link.frames import LinkError
 from finssim.robot.messages import Picture
-from finssim.robot.picture_codec import encode_picture
-from finssim.robot.picture_fragments import LONGEST_FRAGMENT, fragments
-from finssim.robot.picture_memory import HEAD, MAGIC, SLOT, VERSION, memory_path
+from finssim.robot.pictures import (
+    LONGEST_FRAGMENT,
+    MEMORY_HEAD,
+    MEMORY_MAGIC,
+    MEMORY_SLOT,
+    MEMORY_VERSION,
+    encode_picture,
+    fragments,
+    memory_path,
+)
 
 __all__ = ["PictureSink", "SharedMemorySender", "UdpSender"]
 
@@ -100,23 +107,27 @@ class SharedMemorySender:
         if _taken(self.path):
             raise LinkError(f"shm:{name} belongs to a camera that is running: end it, or give another name")
         try:
-            self._file = _ring(self.path, HEAD.pack(MAGIC, VERSION, slots, slot_bytes, 0), slots * slot_bytes)
+            self._file = _ring(
+                self.path,
+                MEMORY_HEAD.pack(MEMORY_MAGIC, MEMORY_VERSION, slots, slot_bytes, 0),
+                slots * slot_bytes,
+            )
         except OSError as problem:
             raise LinkError(f"shared memory {self.path}: {problem.strerror}: free some or use udp") from None
 
     def send(self, picture: Picture, now: float) -> None:
         """Write a picture into the next slot; one that is too long, or finds no memory, is counted and forgotten."""
         data = encode_picture(picture, late=max(now - picture.time, 0.0))
-        if len(data) > self._size - SLOT.size:
+        if len(data) > self._size - MEMORY_SLOT.size:
             self.lost += 1
             return
         number = self.sent + 1
-        at = HEAD.size + (number - 1) % self._slots * self._size
+        at = MEMORY_HEAD.size + (number - 1) % self._slots * self._size
         try:
-            os.pwrite(self._file, bytes(SLOT.size), at)
-            os.pwrite(self._file, data, at + SLOT.size)
-            os.pwrite(self._file, SLOT.pack(number, len(data), zlib.crc32(data)), at)
-            os.pwrite(self._file, struct.pack("<Q", number), HEAD.size - 8)
+            os.pwrite(self._file, bytes(MEMORY_SLOT.size), at)
+            os.pwrite(self._file, data, at + MEMORY_SLOT.size)
+            os.pwrite(self._file, MEMORY_SLOT.pack(number, len(data), zlib.crc32(data)), at)
+            os.pwrite(self._file, struct.pack("<Q", number), MEMORY_HEAD.size - 8)
             self.sent = number
         except OSError:
             self.lost += 1

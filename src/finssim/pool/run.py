@@ -31,10 +31,9 @@ from finssim.pool.task_server import MediumServer, serve_fleet
 from finssim.pool.task_site import TaskSite
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.goals import station_of
-from finssim.robot.link.layout import LinkError
-from finssim.robot.link.transports import host_port
-from finssim.robot.link.udp import UdpTransport
-from finssim.robot.picture_memory import memory_path
+from finssim.robot.link.frames import LinkError
+from finssim.robot.link.transports import UdpTransport, host_port
+from finssim.robot.pictures import memory_path
 from finssim.tasks.observer import fitted_task
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at

@@ -12,9 +12,9 @@ from typing import Protocol
 
 from finssim.pool.picture_wire import PictureSink
 from finssim.pool.virtual_pool import PoolClockError, VirtualPool
-from finssim.robot.link.layout import LinkError
+from finssim.robot.link.frames import LinkError
 from finssim.robot.link.transports import Transport
-from finssim.robot.lockstep_codec import (
+from finssim.robot.lockstep import (
     LockstepError,
     decode_request,
     encode_delivery,

@@ -12,7 +12,7 @@ from dataclasses import replace
 from finssim.pool.fleet import Fleet, one_picture
 from finssim.pool.medium import Medium
 from finssim.pool.picture_wire import PictureSink
-from finssim.robot.link.layout import LinkError
+from finssim.robot.link.frames import LinkError
 from finssim.robot.link.transports import Transport
 from finssim.robot.messages import Picture
 from finssim.robot.team import decode_track

@@ -17,10 +17,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.control.errors import ControlError
-from finssim.control.guidance import Guide, Reference
+from finssim.control import ControlError
+from finssim.control.guidance import Guide, Reference, Track
 from finssim.control.modes import action_mode
-from finssim.control.tracking import Track
 from finssim.engine.launch import Pipeline
 from finssim.engine.state import State
 from finssim.geometry.rotations import quat_from_yaw, quat_inverse_rotate, quat_yaw
@@ -31,8 +30,7 @@ from finssim.pool.others import ScriptedPilot, TrueState, truth_of
 from finssim.pool.plant_spec import Basin, PlantSpec
 from finssim.pool.sites import positioning_of
 from finssim.pool.virtual_pool import VirtualPool
-from finssim.robot.bridge import Bridge
-from finssim.robot.bridge_settings import BridgeSettings
+from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.lockstep import run_together
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import AgentPilot, Pilot

@@ -12,21 +12,709 @@ Only `armed` sends enabled frames; hold, fault and disarmed send zeros with the 
 from __future__ import annotations
 
 import math
+from collections import Counter, deque
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from finssim.control.allocation import Allocator
 from finssim.control.motor_map import MotorMap
-from finssim.robot.bridge_settings import BridgeError, BridgeSettings
-from finssim.robot.events import Event, EventLog
+from finssim.geometry.rotations import quat_inverse_rotate, quat_to_matrix
+from finssim.robot.link.frames import StatusFlag
 from finssim.robot.messages import CommandEcho, Telemetry, ThrusterCommand
 from finssim.robot.robot import Reading
-from finssim.robot.supervision import Clock, Supervision
 from finssim.vehicles import Vehicle
 
-__all__ = ["STATES", "Bridge"]
+__all__ = [
+    "STATES",
+    "Bridge",
+    "BridgeError",
+    "BridgeSettings",
+    "Clock",
+    "Commander",
+    "EchoWatch",
+    "Event",
+    "EventLog",
+    "FollowWatch",
+    "StateWatch",
+    "Supervision",
+    "TelemetryWatch",
+    "TiltWatch",
+    "Workspace",
+]
+
+
+# What a bridge tells its operator and its record: events in order, a repeated one at most once a second.
+
+
+KEPT = 1000
+"""Events that wait for somebody to drain them."""
+REPEAT = 1.0
+"""Least time between two events of one kind and source [s]."""
+
+
+class Event(NamedTuple):
+    """Something that happened."""
+
+    time: float
+    """Robot's clock [s]."""
+    kind: str
+    """One or two words: state, fault, hold, command, telemetry, echo, clock, refused."""
+    text: str
+    """One sentence."""
+
+
+class EventLog:
+    """The newest events, and how many there were of each kind."""
+
+    def __init__(self) -> None:
+        self.events: deque[Event] = deque(maxlen=KEPT)
+        self.counts: Counter[str] = Counter()
+        self._last: dict[str, float] = {}
+
+    def add(self, time: float, kind: str, text: str) -> None:
+        """Notes an event, always.
+
+        Args:
+            time: Robot's clock [s].
+            kind: One or two words.
+            text: One sentence.
+        """
+        self.counts[kind] += 1
+        self.events.append(Event(time, kind, text))
+
+    def repeat(self, time: float, kind: str, text: str) -> None:
+        """Counts an event that may come with every message, and notes it if none of its kind was noted just now.
+
+        Args:
+            time: Robot's clock [s].
+            kind: One or two words.
+            text: One sentence.
+        """
+        last = self._last.get(kind)
+        if last is not None and 0.0 <= time - last < REPEAT:
+            self.counts[kind] += 1
+            return
+        self._last[kind] = time
+        self.add(time, kind, text)
+
+    def drain(self) -> list[Event]:
+        """All events since the last call, oldest first."""
+        drained = list(self.events)
+        self.events.clear()
+        return drained
+
+
+# The limits of a bridge: from the safety section of a vehicle file, or changed one by one.
+
 
 Array = npt.NDArray[np.float64]
+
+FULL_RANGE = 0.1
+"""Time from full reverse to full forward where the vehicle file gives no slew limit of the thrust [s]."""
+
+
+class BridgeError(ValueError):
+    """A bridge was set up with limits it cannot keep: the message says which and what to give."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BridgeSettings:
+    """Limits that stop the thrusters. Make them with `of`; `math.inf` switches a watchdog off."""
+
+    slew: Array
+    """Fastest change of each thrust, canonical order [N/s], (n,)."""
+    command_timeout: float = 0.5
+    """Longest silence of the commander [s]."""
+    telemetry_timeout: float = 0.5
+    """Longest silence of the motor controller [s]."""
+    state_timeout: float = 0.5
+    """Oldest reading to act on [s]."""
+    frozen_limit: float = 0.3
+    """Longest time that gyro or accelerometer may repeat its numbers to the last bit [s]."""
+    max_tilt: float = math.inf
+    """[rad]"""
+    max_tilt_duration: float = 1.0
+    """Longest time above `max_tilt` [s]."""
+    workspace_lower: Array
+    """Lower corner of the allowed box, world frame [m], (3,)."""
+    workspace_upper: Array
+    """Upper corner [m], (3,)."""
+    workspace_margin: float = 0.1
+    """Thrust may only push inwards this near to a face, on either side; further outside is a fault [m]."""
+    hold_limit: float = 5.0
+    """Longest hold before it becomes a fault, unless the operator asked for it [s]."""
+    clock_step: float = 1.0
+    """Longest step of the clock forward between two calls [s]."""
+    reject_limit: float = 0.5
+    """Longest time that the motor controller may refuse every command, or not hear any [s]."""
+    need_reading: bool = True
+    """Whether the estimator must be ready; False lets an operator drive without localization."""
+    vision_modes: tuple[str, ...] = ("fresh", "coast")
+    """Modes of vision in which a reading may be acted on."""
+
+    def __post_init__(self) -> None:
+        for name in DURATIONS:
+            if not getattr(self, name) > 0.0:
+                raise BridgeError(f"{name} is {getattr(self, name)}, expected a number above 0")
+        if not self.workspace_margin >= 0.0:
+            raise BridgeError(f"workspace_margin is {self.workspace_margin}, expected 0 m or more")
+        if np.shape(self.workspace_lower) != (3,) or np.shape(self.workspace_upper) != (3,):
+            raise BridgeError("workspace_lower and workspace_upper must be points of three numbers [m]")
+        if not np.less(self.workspace_lower, self.workspace_upper).all():
+            raise BridgeError("workspace_lower must be below workspace_upper on every axis")
+        if np.ndim(self.slew) != 1 or not np.greater(self.slew, 0.0).all():
+            raise BridgeError("slew must be one rate above 0 N/s per thruster")
+
+    @classmethod
+    def of(cls, vehicle: Vehicle, **changes: Any) -> BridgeSettings:
+        """Limits of a vehicle's `safety` section.
+
+        Args:
+            vehicle: Its `safety` section and the slew limits of its thrusters are read.
+            changes: Fields by name that shall differ.
+
+        Raises:
+            BridgeError: A limit that cannot be kept, or no field of that name.
+        """
+        known = {field.name for field in fields(cls)}
+        if not changes.keys() <= known:
+            unknown = sorted(changes.keys() - known)
+            raise BridgeError(
+                f"no bridge setting {', '.join(unknown)}; available: {', '.join(sorted(known))}"
+            )
+        own: dict[str, Any] = {"slew": _slew(vehicle)}
+        own.update({name: getattr(vehicle.safety, name) for name in FROM_FILE})
+        return replace(cls(**own), **changes) if changes else cls(**own)
+
+
+FROM_FILE = (
+    "command_timeout",
+    "telemetry_timeout",
+    "state_timeout",
+    "max_tilt",
+    "max_tilt_duration",
+    "workspace_lower",
+    "workspace_upper",
+)
+"""Fields that the safety section of a vehicle file gives under the same name."""
+DURATIONS = (
+    "command_timeout",
+    "telemetry_timeout",
+    "state_timeout",
+    "frozen_limit",
+    "max_tilt",
+    "hold_limit",
+    "clock_step",
+    "reject_limit",
+)
+
+
+def _slew(vehicle: Vehicle) -> Array:
+    """Fastest change of each thrust [N/s], (n,): the file's own where it limits thrust, else from range and time."""
+    lower, upper = vehicle.force_limits
+    own = np.array([t.slew if t.domain == "force" else math.inf for t in vehicle.thrusters.values()])
+    return np.where(np.isfinite(own), own, (upper - lower) / FULL_RANGE)
+
+
+# Who commands a robot, and the newest command that was fit to be used.
+
+
+EARLY = 0.1
+"""How far a stamp may lie ahead of the robot's clock [s]."""
+
+
+class Commander:
+    """Takes thrust commands; what it refuses does not count as a sign of life."""
+
+    def __init__(self, thrusters: int, timeout: float) -> None:
+        """
+        Args:
+            thrusters: Numbers in a command, n.
+            timeout: Age at which a command, or a word from another source, no longer counts [s].
+        """
+        self._thrusters = thrusters
+        self._timeout = timeout
+        self.forget()
+
+    def forget(self) -> None:
+        """As before the first command."""
+        self.force: Array = np.zeros(self._thrusters)
+        """Of the newest command, canonical order [N], (n,)."""
+        self.received = -math.inf
+        """When it came [s]."""
+        self.source = ""
+        self._stamp = -math.inf
+        self._heard: dict[str, float] = {}
+
+    def rival(self, now: float, source: str) -> str:
+        """Another source that was heard, whatever it said, within the timeout; "" if there is none."""
+        self._heard[source] = now
+        self._heard = {name: time for name, time in self._heard.items() if now - time <= self._timeout}
+        return next((name for name in self._heard if name != source), "")
+
+    def sources(self, now: float) -> list[str]:
+        """Everybody heard within the timeout."""
+        return [name for name, time in self._heard.items() if now - time <= self._timeout]
+
+    def accept(self, now: float, force: npt.ArrayLike, source: str, stamp: float | None) -> str:
+        """Takes a command if it is fit to be used; otherwise says why not and keeps the one before.
+
+        Args:
+            now: When it came [s].
+            force: Thrusts along the thrusters' axes, canonical order [N], (n,).
+            source: Who sent it.
+            stamp: Time of what its sender knew, robot's clock [s]; None: it does not tell.
+        """
+        try:
+            wanted = np.array(force, float)
+        except (TypeError, ValueError):
+            return "command is no list of numbers"
+        if wanted.shape != (self._thrusters,):
+            return f"command has shape {wanted.shape}, expected {self._thrusters} thrusts"
+        if not np.isfinite(wanted).all():
+            return "command is not finite"
+        if stamp is not None:
+            if not -EARLY <= now - stamp <= self._timeout:
+                return f"command is stamped {stamp:.3f} s, received at {now:.3f} s"
+            if source == self.source and stamp < self._stamp:
+                return "command is older than the one before"
+        self.force, self.source, self.received = wanted, source, now
+        self._stamp = -math.inf if stamp is None else stamp
+        return ""
+
+    def asks(self, now: float) -> bool:
+        """Whether the newest command still counts and asks for thrust."""
+        return now - self.received <= self._timeout and bool(self.force.any())
+
+
+# What watches the messages of a robot: each watchdog takes a message with its time and answers in one sentence.
+
+
+TOLD, FOLLOWS = int(StatusFlag.DIAGNOSTICS), int(StatusFlag.DIRECT_THRUSTERS)
+REORDERED = 1000
+"""A datagram may be overtaken by this much of the controller's clock [ms]; further back is a restart."""
+
+
+class TelemetryWatch:
+    """Silence, repetition and restarts of the motor controller."""
+
+    def __init__(self, outputs: int, timeout: float) -> None:
+        self._outputs = outputs
+        self._timeout = timeout
+        self.forget()
+
+    def forget(self) -> None:
+        """As before the first message."""
+        self.fresh_since = -math.inf
+        self._last: Telemetry | None = None
+        self._changed = {"gyro": math.inf, "accel": math.inf}
+
+    def age(self, now: float) -> float:
+        """Time since the last message that brought something new [s]; infinite before the first."""
+        return now - self.fresh_since
+
+    def malformed(self, message: Telemetry) -> str:
+        """Why a message cannot be used; "" if it can."""
+        numbers = (*message.quaternion, *message.gyro, *message.accel, message.depth, message.pressure)
+        if not all(map(math.isfinite, (*numbers, *(message.motor_rpm or ())))):
+            return "a number in the telemetry is not finite"
+        if not 0.9 < math.hypot(*message.quaternion) < 1.1:
+            return "the attitude in the telemetry is not a unit quaternion"
+        if message.motor_rpm is not None and len(message.motor_rpm) != self._outputs:
+            return f"the telemetry has {len(message.motor_rpm)} motor speeds, expected {self._outputs}"
+        return ""
+
+    def accept(self, now: float, message: Telemetry) -> str:
+        """Takes a well-formed message; a repeated or overtaken one refreshes nothing.
+
+        Returns:
+            "restarted" if the controller's clock went back, "old" if the message brings nothing new, "" otherwise.
+        """
+        last = self._last
+        if last is not None and (message.sequence, message.mcu_ms) == (last.sequence, last.mcu_ms):
+            return "old"
+        # After a silence the old numbers say nothing about the new ones.
+        if last is None or self.age(now) > self._timeout:
+            restarted = last is not None and _signed(message.mcu_ms - last.mcu_ms, 32) < -REORDERED
+            self._take(now, message, None)
+            return "restarted" if restarted else ""
+        elapsed = _signed(message.mcu_ms - last.mcu_ms, 32)
+        if elapsed < -REORDERED:
+            self._take(now, message, None)
+            return "restarted"
+        if elapsed < 0 or _signed(message.sequence - last.sequence, 16) <= 0:
+            return "old"
+        self._take(now, message, last)
+        return ""
+
+    def frozen(self, now: float, limit: float) -> str:
+        """Which sensor has repeated its numbers to the last bit for longer than `limit` [s]; "" if none has."""
+        for sensor, changed in self._changed.items():
+            # Silence is another watchdog's: what counts is how long messages kept coming with the same numbers.
+            if min(now, self.fresh_since) - changed > limit:
+                return sensor
+        return ""
+
+    def _take(self, now: float, message: Telemetry, last: Telemetry | None) -> None:
+        self.fresh_since = now
+        self._last = message
+        for sensor in self._changed:
+            if last is None or getattr(message, sensor) != getattr(last, sensor):
+                self._changed[sensor] = now
+
+
+class EchoWatch:
+    """What the motor controller made of the commands."""
+
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """As before the first echo."""
+        self._count: int | None = None
+        self._mcu_ms = 0
+        self.rejected_since = math.inf
+        self.rejected_until = -math.inf
+
+    def accept(self, now: float, echo: CommandEcho, armed: bool) -> str:
+        """Takes an echo; "restarted" if its count of commands began again, "rejected" if it refused one, else ""."""
+        elapsed = _signed(echo.mcu_ms - self._mcu_ms, 32)
+        restarted = False
+        if self._count is not None:
+            if -REORDERED <= elapsed < 0:
+                return ""  # overtaken by a newer one
+            restarted = elapsed < 0 or _signed(echo.command_count - self._count, 32) < 0
+        self._count, self._mcu_ms = echo.command_count, echo.mcu_ms
+        if restarted:
+            return "restarted"
+        if not armed or echo.accepted:
+            self.rejected_since = math.inf
+            return ""
+        self.rejected_since = min(self.rejected_since, now)
+        self.rejected_until = now
+        return "rejected"
+
+    def rejecting(self, limit: float) -> bool:
+        """Whether every command was refused for longer than `limit` [s]."""
+        return self.rejected_until - self.rejected_since > limit
+
+
+class FollowWatch:
+    """Whether the motors follow the commands, as the status bits of the telemetry tell: frames may be lost unseen."""
+
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """As if they did."""
+        self._since, self._until = math.inf, -math.inf
+
+    def accept(self, now: float, flags: int, armed: bool) -> None:
+        """Takes status bits, and whether commands were enabled; those of a firmware that sets none say nothing."""
+        if not armed or flags & FOLLOWS or not flags & TOLD:
+            return self.forget()
+        self._since, self._until = min(self._since, now), now
+
+    def deaf(self, limit: float) -> bool:
+        """Whether they have not followed for longer than `limit` [s]."""
+        return self._until - self._since > limit
+
+
+class TiltWatch:
+    """How long a vehicle has been tilted beyond a limit."""
+
+    def __init__(self, limit: float, duration: float, level: npt.ArrayLike = (0.0, 0.0, 1.0)) -> None:
+        """
+        Args:
+            limit: [rad]
+            duration: Longest time beyond it [s].
+            level: The body's z axis in the frame whose attitude is given, (3,).
+        """
+        self._cosine = math.cos(min(limit, math.pi)) if math.isfinite(limit) else -math.inf
+        self._duration = duration
+        self._level = tuple(float(part) for part in np.asarray(level, float))
+        self._since = math.inf
+
+    def forget(self) -> None:
+        """As if the vehicle had been level."""
+        self._since = math.inf
+
+    def accept(self, now: float, quaternion: npt.ArrayLike) -> None:
+        """Takes an attitude, given frame to world, xyzw, of any length, (4,)."""
+        x, y, z, w = (float(part) for part in np.asarray(quaternion, float))
+        a, b, c = self._level
+        square = x * x + y * y + z * z + w * w
+        up = 2.0 * (x * z - w * y) * a + 2.0 * (y * z + w * x) * b + (square - 2.0 * (x * x + y * y)) * c
+        self._since = min(self._since, now) if up < self._cosine * square else math.inf
+
+    def over(self, now: float) -> bool:
+        """Whether it lasted too long."""
+        return now - self._since > self._duration
+
+
+class StateWatch:
+    """Whether what the estimator says may be acted on."""
+
+    def __init__(self, timeout: float, modes: tuple[str, ...]) -> None:
+        """
+        Args:
+            timeout: Oldest reading to act on [s].
+            modes: Modes of vision in which one may be acted on.
+        """
+        self._timeout = timeout
+        self._modes = modes
+        self.forget()
+
+    def forget(self) -> None:
+        """As before the first reading."""
+        self._oldest = -math.inf
+        self._why = "the estimator has said nothing yet"
+        self._pose: tuple[Array, Array] | None = None
+
+    def accept(self, now: float, reading: Reading) -> None:
+        """Takes a reading."""
+        self._oldest = min(now, reading.time)
+        self._why = self._unfit(reading)
+        self._pose = None if self._why else (np.asarray(reading.position), np.asarray(reading.quaternion))
+
+    def pose(self, now: float) -> tuple[Array, Array] | None:
+        """World position [m], (3,), and quaternion, (4,), of the newest reading; None where it may not be acted on."""
+        return None if self.missing(now) else self._pose
+
+    def missing(self, now: float) -> str:
+        """Why there is none to act on; "" if there is."""
+        if self._why:
+            return self._why
+        return (
+            f"the newest reading is older than {self._timeout:g} s"
+            if now - self._oldest > self._timeout
+            else ""
+        )
+
+    def _unfit(self, reading: Reading) -> str:
+        """Why a reading cannot be acted on; "" if it can."""
+        if not reading.ready:
+            return f"the estimator is not ready: {reading.reason or 'no reason given'}"
+        if reading.mode not in self._modes:
+            return f"vision is {reading.mode}"
+        shapes = np.shape(reading.position), np.shape(reading.quaternion), np.shape(reading.nu)
+        if shapes != ((3,), (4,), (6,)):
+            return f"the reading has shapes {shapes}, expected position (3,), quaternion (4,) and nu (6,)"
+        numbers = (reading.time, *reading.position, *reading.quaternion, *reading.nu)
+        if not all(map(math.isfinite, numbers)):
+            return "a number in the reading is not finite"
+        return "" if 0.9 < math.hypot(*reading.quaternion) < 1.1 else "its attitude is not a unit quaternion"
+
+
+def _signed(difference: int, bits: int) -> int:
+    """A difference of two counters modulo 2^bits, as the nearest signed number."""
+    half = 1 << (bits - 1)
+    return (difference + half) % (1 << bits) - half
+
+
+# The box a vehicle may move in: near a face thrust may only push inwards.
+
+
+ROUNDING = 1e-3
+"""Outward force that is left to the rounding of the allocation [N]."""
+
+
+class Workspace:
+    """A box in the world frame with a margin to both sides of each face."""
+
+    def __init__(self, vehicle: Vehicle, lower: npt.ArrayLike, upper: npt.ArrayLike, margin: float) -> None:
+        """
+        Args:
+            vehicle: Whose thrusters push.
+            lower: Corner, world frame [m], (3,).
+            upper: Opposite corner [m], (3,).
+            margin: Half width of the band around each face in which thrust may only push inwards [m].
+        """
+        self.lower: Array = np.array(lower, float)
+        self.upper: Array = np.array(upper, float)
+        self.margin = margin
+        self._inner = self.lower + margin, self.upper - margin
+        self._outer = self.lower - margin, self.upper + margin
+        self._allocator = Allocator.from_vehicle(vehicle)
+
+    def left(self, position: Array) -> str:
+        """Which face lies more than the margin behind the vehicle; "" while it is inside. World frame [m], (3,)."""
+        for axis, name in enumerate("xyz"):
+            if not self._outer[0][axis] <= position[axis] <= self._outer[1][axis]:
+                box = f"{self.lower[axis]:g} to {self.upper[axis]:g}"
+                return f"{name} is {position[axis]:.2f} m, outside {box} m by more than {self.margin:g} m"
+        return ""
+
+    def outward(self, position: Array) -> Array:
+        """Direction out of the box on each axis where the vehicle is near a face, else 0: -1, 0 or 1, (3,).
+
+        Args:
+            position: World frame [m], (3,).
+        """
+        return (position > self._inner[1]).astype(float) - (position < self._inner[0])
+
+    def inward_only(self, force: Array, position: Array, quaternion: Array) -> Array:
+        """Thrusts without the part of their net force that pushes further out; the moment is kept.
+
+        tau = B f,   the outward components of R tau_F are removed,   f = allocate(tau)
+
+        Args:
+            force: Canonical order, within the limits [N], (n,).
+            position: World frame [m], (3,).
+            quaternion: Body to world, xyzw, (4,).
+
+        Returns:
+            (n,); zeros where the thrusters cannot give the wrench without pushing out.
+        """
+        outward = self.outward(position)
+        if not outward.any():
+            return force
+        R = quat_to_matrix(quaternion)
+        tau = self._allocator.achieved(force)
+        push = R @ tau[:3]
+        out = push * outward > ROUNDING
+        if not out.any():
+            return force
+        push[out] = 0.0
+        allocated, _ = self._allocator.allocate(np.concatenate([R.T @ push, tau[3:]]))
+        still = (R @ self._allocator.achieved(allocated)[:3]) * outward
+        return allocated if bool((still <= ROUNDING).all()) else np.zeros_like(force)
+
+
+# All that watches a robot together: whether it is in danger, in want of something, or fit to be armed.
+
+
+UP = (0.0, 0.0, 1.0)
+BACK = 0.05
+"""The clock may seem to go back by this much, where messages are handed over out of the order of their arrival [s]."""
+
+
+class Clock:
+    """The time of the latest call, and whether time runs as it should."""
+
+    def __init__(self, step: float) -> None:
+        """
+        Args:
+            step: Longest step forward between two calls [s].
+        """
+        self.now = 0.0
+        """The latest [s]."""
+        self._step = step
+        self._started = False
+
+    def wrong(self, now: float) -> str:
+        """Takes the time of a call; says what is wrong with it, "" if nothing."""
+        if not math.isfinite(now):
+            return "the clock is not a number"
+        step = now - self.now if self._started else 0.0
+        self._started = True
+        if -BACK <= step <= self._step:
+            self.now = now if step == 0.0 else max(now, self.now)
+            return ""
+        self.now = now
+        return f"the clock jumped by {step:+.2f} s"
+
+
+class Supervision:
+    """The watchdogs of one vehicle and what they conclude. Every answer is one sentence, "" where all is well."""
+
+    def __init__(self, vehicle: Vehicle, settings: BridgeSettings, outputs: int) -> None:
+        self.settings = settings
+        self.commander = Commander(len(vehicle.thrusters), settings.command_timeout)
+        self.telemetry = TelemetryWatch(outputs, settings.telemetry_timeout)
+        self.echo, self.follow = EchoWatch(), FollowWatch()
+        self.state = StateWatch(settings.state_timeout, settings.vision_modes)
+        imu = vehicle.sensors.imu
+        level = UP if imu is None else quat_inverse_rotate(imu.orientation, UP)
+        self.tilts = {
+            "telemetry": TiltWatch(settings.max_tilt, settings.max_tilt_duration, level),
+            "estimator": TiltWatch(settings.max_tilt, settings.max_tilt_duration),
+        }
+        self.workspace = Workspace(
+            vehicle, settings.workspace_lower, settings.workspace_upper, settings.workspace_margin
+        )
+
+    def forget(self) -> None:
+        """As before the first message."""
+        for watch in (self.commander, self.telemetry, self.echo, self.follow, self.state):
+            watch.forget()
+        for tilt in self.tilts.values():
+            tilt.forget()
+
+    def take_telemetry(self, now: float, message: Telemetry, armed: bool) -> str:
+        """Takes a well-formed message that came while `armed`, or not; "restarted" if the controller began anew."""
+        news = self.telemetry.accept(now, message)
+        if news != "old":
+            self.follow.accept(now, message.flags, armed)
+            self.tilts["telemetry"].accept(now, message.quaternion)
+        return news if news == "restarted" else ""
+
+    def take_reading(self, now: float, reading: Reading) -> None:
+        """Takes a reading of the estimator."""
+        self.state.accept(now, reading)
+        pose = self.state.pose(now)
+        if pose is None:
+            self.tilts["estimator"].forget()
+        else:
+            self.tilts["estimator"].accept(now, pose[1])
+
+    def danger(self, now: float) -> str:
+        """What must stop the thrusters until somebody has looked."""
+        limits = self.settings
+        if self.telemetry.age(now) > limits.telemetry_timeout:
+            return f"no fresh telemetry from the motor controller for {limits.telemetry_timeout:g} s"
+        frozen = self.telemetry.frozen(now, limits.frozen_limit)
+        if frozen:
+            return f"telemetry is frozen: the {frozen} has repeated its numbers for {limits.frozen_limit:g} s"
+        if self.echo.rejecting(limits.reject_limit):
+            return f"the motor controller has refused every command for {limits.reject_limit:g} s"
+        if self.follow.deaf(limits.reject_limit):
+            return f"the motor controller has not followed any command for {limits.reject_limit:g} s"
+        for source, tilt in self.tilts.items():
+            if tilt.over(now):
+                degrees = math.degrees(limits.max_tilt)
+                return f"tilted beyond {degrees:.0f} degrees for {limits.max_tilt_duration:g} s, says the {source}"
+        pose = self.state.pose(now)
+        left = "" if pose is None else self.workspace.left(pose[0])
+        return left and f"left the workspace: {left}"
+
+    def want(self, now: float, since: float) -> str:
+        """What thrust has to wait for: the estimator, or a command, counted from `since` [s] at the earliest."""
+        # The estimator first: a controller that is not told where it is falls silent for that very reason.
+        why = self._estimator(now)
+        if why:
+            return why
+        late = now - max(self.commander.received, since) > self.settings.command_timeout
+        return f"no command for {self.settings.command_timeout:g} s" if late else ""
+
+    def unfit(self, now: float) -> str:
+        """What stands against arming."""
+        why = self.danger(now) or self._estimator(now)
+        if why:
+            return why
+        rivals = self.commander.sources(now)
+        if len(rivals) > 1:
+            return f"two publishers command the thrusters: {' and '.join(rivals)}"
+        if self.commander.asks(now):
+            return "the command is not zero: release the sticks or stop the controller"
+        return ""
+
+    def limited(self, now: float, force: Array) -> Array:
+        """Thrusts without what pushes out of the workspace, canonical order [N], (n,).
+
+        Args:
+            now: [s]
+            force: Along the thrusters' axes, canonical order, within the limits [N], (n,).
+        """
+        pose = self.state.pose(now)
+        return force if pose is None else self.workspace.inward_only(force, *pose)
+
+    def _estimator(self, now: float) -> str:
+        return self.state.missing(now) if self.settings.need_reading else ""
+
 
 STATES = ("disarmed", "armed", "hold", "fault")
 RUNNING = ("armed", "hold")

@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
-from finssim.control.guidance import Guide, Reference, Station
-from finssim.control.tracking import Track
+from finssim.control.guidance import Guide, Reference, Station, Track
 from finssim.geometry.rotations import quat_rotate, quat_yaw
 from finssim.vehicles import Vehicle
 

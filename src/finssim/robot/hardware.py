@@ -11,16 +11,15 @@ import numpy.typing as npt
 
 from finssim.localization.pool import Pool
 from finssim.robot.bridge import Bridge
-from finssim.robot.counters import Counters
-from finssim.robot.intake import Intake
 from finssim.robot.link.frames import encode_command
 from finssim.robot.link.transports import Transport
 from finssim.robot.perception import Perception
 from finssim.robot.robot import Reading
+from finssim.robot.runtime import Counters, Intake
 from finssim.vehicles import Vehicle
 
 if TYPE_CHECKING:
-    from finssim.robot.picture_source import PictureSource
+    from finssim.robot.pictures import PictureSource
 
 __all__ = ["HardwareRobot"]
 

@@ -1,24 +1,190 @@
-"""Lock-step: the robot's software and a world take turns, so that time goes as fast as both can compute."""
+"""Lock-step: the robot's software and a world take turns, so that time goes as fast as both can compute.
+
+Over a stream every message is its length (u32), a kind (u8) and a body, all little endian:
+
+    1 request   until f64, n u32, n frames
+    2 delivery  time f64, n u32, n x (arrival f64, frame), m u32, m pictures
+    3 refusal   a sentence, UTF-8: the world cannot go on
+
+A frame is its length (u32) and bytes. A picture is time f64, sequence u32, rows u32, columns u32, rows x columns bytes,
+k u32, k x (tag id i32, corners 8 x f64); without an image, rows and columns are zero.
+"""
 
 from __future__ import annotations
 
 import itertools
 import socket
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from typing import Protocol
 
+import numpy as np
+
 from finssim.robot.interrupt import interruptible
-from finssim.robot.lockstep_codec import (
-    LockstepError,
-    decode_delivery,
-    encode_request,
-    receive,
-)
-from finssim.robot.messages import Delivery
+from finssim.robot.messages import Delivery, Picture, TagCorners
 from finssim.robot.runtime import Runtime
 
-__all__ = ["DEFAULT_PORT", "Carrier", "Exchange", "LockstepClient", "run_lockstep", "run_together"]
+__all__ = [
+    "DEFAULT_PORT",
+    "Carrier",
+    "Exchange",
+    "LockstepClient",
+    "LockstepError",
+    "decode_delivery",
+    "decode_request",
+    "encode_delivery",
+    "encode_refusal",
+    "encode_request",
+    "receive",
+    "run_lockstep",
+    "run_together",
+]
+
+
+REQUEST, DELIVERY, REFUSAL = 1, 2, 3
+LONGEST = 256 * 2**20
+"""A longer message is none [bytes]."""
+
+_F8, _U4, _KIND = struct.Struct("<d"), struct.Struct("<I"), struct.Struct("<IB")
+_ARRIVED, _PICTURE, _TAG = struct.Struct("<dI"), struct.Struct("<dIII"), struct.Struct("<i8d")
+
+
+class LockstepError(ValueError):
+    """The other end is not there, has gone, or does not speak this protocol."""
+
+
+def encode_request(until: float, sent: Sequence[bytes]) -> bytes:
+    """Ask a world to go on to a time [s] with what the robot sent to its motor controller."""
+    parts = [_F8.pack(until), _U4.pack(len(sent))]
+    for frame in sent:
+        parts += (_U4.pack(len(frame)), frame)
+    return _message(REQUEST, parts)
+
+
+def decode_request(kind: int, body: bytes) -> tuple[float, tuple[bytes, ...]]:
+    """Time [s] and frames of a request.
+
+    Raises:
+        LockstepError: It is none.
+    """
+    if kind != REQUEST:
+        raise LockstepError(
+            f"message of kind {kind}, expected a request ({REQUEST}): is the robot of this version?"
+        )
+    reader = _Reader(body)
+    (until,), (n,) = reader.take(_F8), reader.take(_U4)
+    return until, tuple(reader.block(reader.take(_U4)[0]) for _ in range(n))
+
+
+def encode_delivery(delivery: Delivery) -> bytes:
+    """Answer a request."""
+    parts = [_F8.pack(delivery.time), _U4.pack(len(delivery.frames))]
+    for arrival, frame in delivery.frames:
+        parts += (_ARRIVED.pack(arrival, len(frame)), frame)
+    parts.append(_U4.pack(len(delivery.pictures)))
+    for picture in delivery.pictures:
+        rows, columns = (0, 0) if picture.image is None else picture.image.shape
+        parts.append(_PICTURE.pack(picture.time, picture.sequence, rows, columns))
+        if picture.image is not None:
+            parts.append(np.ascontiguousarray(picture.image).tobytes())
+        parts.append(_U4.pack(len(picture.tags)))
+        parts += [_TAG.pack(tag.tag_id, *np.ravel(tag.corners)) for tag in picture.tags]
+    return _message(DELIVERY, parts)
+
+
+def encode_refusal(sentence: str) -> bytes:
+    """Answer that the world cannot go on, and why."""
+    return _message(REFUSAL, [sentence.encode()])
+
+
+def decode_delivery(kind: int, body: bytes) -> Delivery:
+    """What reached the robot.
+
+    Raises:
+        LockstepError: A refusal, with its sentence, or no delivery.
+    """
+    if kind == REFUSAL:
+        raise LockstepError(body.decode(errors="replace"))
+    if kind != DELIVERY:
+        raise LockstepError(
+            f"message of kind {kind}, expected a delivery ({DELIVERY}): is it a FinsSim pool?"
+        )
+    reader = _Reader(body)
+    (time,), (n,) = reader.take(_F8), reader.take(_U4)
+    frames = []
+    for _ in range(n):
+        arrival, size = reader.take(_ARRIVED)
+        frames.append((arrival, reader.block(size)))
+    (m,) = reader.take(_U4)
+    return Delivery(time, tuple(frames), tuple(_picture(reader) for _ in range(m)))
+
+
+def receive(connection: socket.socket) -> tuple[int, bytes] | None:
+    """The next message's kind and body; None where the other end has closed between two messages.
+
+    Raises:
+        LockstepError: It closed within a message, or what came is none.
+        OSError: The connection broke or was silent for longer than its timeout.
+    """
+    head = _exactly(connection, _KIND.size)
+    if head is None:
+        return None
+    size, kind = _KIND.unpack(head)
+    if kind not in (REQUEST, DELIVERY, REFUSAL) or size > LONGEST:
+        raise LockstepError("what came is no lock-step message: is the other end a FinsSim of this version?")
+    body = _exactly(connection, size) if size else b""
+    if body is None:
+        raise LockstepError("the other end closed within a message")
+    return kind, body
+
+
+def _message(kind: int, parts: Sequence[bytes]) -> bytes:
+    body = b"".join(parts)
+    return _KIND.pack(len(body), kind) + body
+
+
+def _picture(reader: _Reader) -> Picture:
+    time, sequence, rows, columns = reader.take(_PICTURE)
+    image = None
+    if rows and columns:
+        image = np.frombuffer(reader.block(rows * columns), np.uint8).reshape(rows, columns)
+    tags = []
+    for _ in range(reader.take(_U4)[0]):
+        tag, *corners = reader.take(_TAG)
+        tags.append(TagCorners(tag, np.array(corners).reshape(4, 2)))
+    return Picture(time, sequence, image, tuple(tags))
+
+
+def _exactly(connection: socket.socket, size: int) -> bytes | None:
+    """That many bytes; None where there is nothing at all before the end."""
+    buffer = bytearray(size)
+    view, at = memoryview(buffer), 0
+    while at < size:
+        n = connection.recv_into(view[at:])
+        if n == 0:
+            if at == 0:
+                return None
+            raise LockstepError("the other end closed within a message")
+        at += n
+    return bytes(buffer)
+
+
+class _Reader:
+    """Takes a body apart from its front."""
+
+    def __init__(self, body: bytes) -> None:
+        self._body, self._at = body, 0
+
+    def take(self, form: struct.Struct) -> tuple[float, ...] | tuple[int, ...]:
+        return form.unpack(self.block(form.size))
+
+    def block(self, size: int) -> bytes:
+        start, self._at = self._at, self._at + size
+        if self._at > len(self._body):
+            raise LockstepError("a message ends before what it announces: is the other end of this version?")
+        return self._body[start : self._at]
+
 
 DEFAULT_PORT = 58768
 """Where a pool listens for a robot in lock-step, on this machine."""

@@ -11,7 +11,9 @@ __all__ = [
     "HEADING",
     "POSE",
     "POSITION",
+    "POSITION_STD",
     "VELOCITY",
+    "YAW_STD",
     "CommandEcho",
     "Delivery",
     "NavigationAid",
@@ -95,6 +97,8 @@ class NavigationAid:
 
 VELOCITY, HEADING, POSITION, POSE = 1, 2, 3, 4
 """Kinds of `NavigationAid`."""
+POSITION_STD, YAW_STD = 0.5, 0.1
+"""Of a fix that does not tell its own [m, rad]."""
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.rotations import matrix_to_quat
+from finssim.geometry.rotations import (
+    matrix_to_quat,
+    quat_conjugate,
+    quat_multiply,
+    quat_to_matrix,
+    wrap_angle,
+)
 from finssim.localization.detection.detections import Detection, Frame
 from finssim.localization.detection.detector import detector
 from finssim.localization.detection.region import RegionTracker
@@ -18,18 +25,309 @@ from finssim.localization.fusion.estimator import Estimator
 from finssim.localization.fusion.fuse_detections import Fixes
 from finssim.localization.fusion.fuse_settings import Settings, settings_of, site_of
 from finssim.localization.fusion.health import Estimate, Health, health_of
-from finssim.localization.fusion.streams import DepthSample, HeadingSample, ImuSample, Sample, VisionSample
+from finssim.localization.fusion.streams import (
+    DepthSample,
+    HeadingSample,
+    ImuSample,
+    Sample,
+    VelocitySample,
+    VisionSample,
+)
 from finssim.localization.pool import Pool
 from finssim.localization.poses.measurement import axes_of_up
-from finssim.robot.aboard import Aboard, Stuck
-from finssim.robot.messages import POSITION, NavigationAid, Picture, Telemetry
+from finssim.robot.messages import (
+    HEADING,
+    POSE,
+    POSITION,
+    POSITION_STD,
+    VELOCITY,
+    YAW_STD,
+    NavigationAid,
+    Picture,
+    Telemetry,
+)
 from finssim.robot.robot import Reading
-from finssim.robot.unfused import Unfused
 from finssim.vehicles import Vehicle
 
-__all__ = ["Perception"]
+__all__ = ["Aboard", "Perception", "Stuck", "Unfused", "Unlocated"]
+
+
+# Telemetry as samples for the estimator: body axes, times of measurement, no sample twice, nothing that has frozen.
+
+
+Three = tuple[float, float, float]
+
+FASTEST, STRONGEST, DEEPEST = 100.0, 1000.0, 1.0e4
+"""Rates [rad/s], specific forces [m/s²] and depths [m] beyond these are no measurements."""
+IMU_STUCK, DEPTH_STUCK = 0.2, 1.0
+"""A sensor that has noise and repeats one value for this long has frozen [s]."""
+
+
+class Stuck:
+    """Notices that a source says the same thing for too long."""
+
+    def __init__(self, longest: float) -> None:
+        """
+        Args:
+            longest: Time for which a live source may repeat itself [s]; inf: for ever.
+        """
+        self.longest = longest
+        self._value: Hashable = None
+        self._since = math.nan
+
+    def look(self, value: Hashable, time: float) -> bool:
+        """Whether the source has frozen, now that it says this.
+
+        Args:
+            value: What it says.
+            time: When it said so [s].
+        """
+        if value != self._value or time < self._since:
+            self._value, self._since = value, time
+        return time - self._since > self.longest
+
+
+class Aboard:
+    """The sensors aboard one vehicle. The methods return a sample, or in a word why there is none ("" for no news)."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        """
+        Args:
+            vehicle: Its sensors' mounting, rates, latencies and noise.
+        """
+        imu, depth = vehicle.sensors.imu, vehicle.sensors.depth
+        R = quat_to_matrix(imu.orientation if imu else (0.0, 0.0, 0.0, 1.0))
+        log = vehicle.sensors.dvl
+        self._R_bl = quat_to_matrix(log.orientation if log else (0.0, 0.0, 0.0, 1.0))
+        self._R_bs = tuple(tuple(row) for row in R.tolist())
+        self._imu_latency = imu.latency if imu else 0.0
+        self._depth_latency = depth.latency if depth else 0.0
+        self._depth_period = 1.0 / depth.rate if depth else 0.05
+        noisy = imu is not None and imu.gyro_noise_density * math.sqrt(imu.rate) > 0.5 * imu.gyro_quantisation
+        self._imu_stuck = Stuck(IMU_STUCK if noisy else math.inf)
+        noisy = depth is not None and depth.noise_std > 0.5 * depth.quantisation
+        self._depth_stuck = Stuck(DEPTH_STUCK if noisy else math.inf)
+        self._depth, self._depth_time = math.nan, -math.inf
+
+    def imu(self, telemetry: Telemetry, time: float, arrival: float) -> ImuSample | str:
+        """The angular rate, specific force and tilt of a telemetry.
+
+        Args:
+            telemetry: As it came.
+            time: When it was sent, robot's clock [s].
+            arrival: When it came [s].
+        """
+        gyro, accel = telemetry.gyro, telemetry.accel
+        if not (_within(gyro, FASTEST) and _within(accel, STRONGEST)):
+            return "implausible"
+        if self._imu_stuck.look((gyro, accel), time):
+            return "frozen"
+        omega, force = self.to_body(gyro), self.to_body(accel)
+        return ImuSample(time - self._imu_latency, omega, force, self.tilt(telemetry), arrival)
+
+    def depth(self, telemetry: Telemetry, time: float, arrival: float) -> DepthSample | str:
+        """The depth, once each time that it was measured: telemetry repeats it until there is a new one.
+
+        Args:
+            telemetry: As it came.
+            time: When it was sent, robot's clock [s].
+            arrival: When it came [s].
+        """
+        depth = telemetry.depth
+        if not abs(depth) <= DEEPEST:
+            return "implausible"
+        if self._depth_stuck.look(depth, time):
+            return "frozen"
+        waited = time - self._depth_time
+        # The same value may have been measured again; half a period lets a jittery sensor be early.
+        if 0.0 <= waited < (0.5 if depth != self._depth else 1.0) * self._depth_period - 1e-6:
+            return ""
+        self._depth, self._depth_time = depth, time
+        return DepthSample(time - self._depth_latency, depth, arrival)
+
+    def aid(self, aid: NavigationAid, arrival: float) -> Sample | str:
+        """The sample of a navigation aid, or in a word why there is none.
+
+        Args:
+            aid: As it came.
+            arrival: When it came [s].
+        """
+        time = arrival - max(aid.age, 0.0)
+        x, y, z = aid.values
+        if aid.kind == VELOCITY:
+            velocity = self._R_bl @ np.array(aid.values)
+            if not _within(aid.values, FASTEST):
+                return "implausible"
+            return VelocitySample(time, (velocity[0], velocity[1], velocity[2]), arrival)
+        if aid.kind == HEADING:
+            return HeadingSample(time, math.remainder(x, math.tau), arrival)
+        if aid.kind not in (POSITION, POSE):
+            return "unknown aid"
+        std, turn = aid.std[0] or POSITION_STD, aid.std[1] or YAW_STD
+        rows = ((std**2, 0.0, 0.0), (0.0, std**2, 0.0), (0.0, 0.0, turn**2))
+        return VisionSample(time, (x, y), z if aid.kind == POSE else None, rows, arrival)
+
+    def to_body(self, vector_s: Three) -> Three:
+        """A vector of the IMU's frame in body axes."""
+        x, y, z = vector_s
+        a, b, c = self._R_bs
+        return (
+            a[0] * x + a[1] * y + a[2] * z,
+            b[0] * x + b[1] * y + b[2] * z,
+            c[0] * x + c[1] * y + c[2] * z,
+        )
+
+    def tilt(self, telemetry: Telemetry) -> tuple[float, float] | None:
+        """Roll and pitch of the body [rad], from what the attitude filter takes for upwards; None: it has none."""
+        up = self._up(telemetry)
+        return up and (math.atan2(up[1], up[2]), math.atan2(-up[0], math.hypot(up[1], up[2])))
+
+    def yaw(self, telemetry: Telemetry) -> float:
+        """Heading of the body's x axis by the attitude filter alone [rad], which drifts; NaN where it has none."""
+        if self._up(telemetry) is None:
+            return math.nan
+        x, y, z, w = telemetry.quaternion
+        # Columns of R_ls weighted with the body's x axis in the sensor's frame, which is the first row of R_bs.
+        a, b, c = self._R_bs[0]
+        east = a * (1.0 - 2.0 * (y * y + z * z)) + b * 2.0 * (x * y - z * w) + c * 2.0 * (x * z + y * w)
+        north = a * 2.0 * (x * y + z * w) + b * (1.0 - 2.0 * (x * x + z * z)) + c * 2.0 * (y * z - x * w)
+        return math.atan2(north, east)
+
+    def _up(self, telemetry: Telemetry) -> Three | None:
+        x, y, z, w = telemetry.quaternion
+        if not abs(x * x + y * y + z * z + w * w - 1.0) < 0.1:
+            return None
+        return self.to_body((2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)))
+
+
+def _within(values: Three, bound: float) -> bool:
+    """Whether all are numbers of at most that size."""
+    return all(abs(v) <= bound for v in values)
+
+
+# State without a filter, for the ablation "without EKF": the latest fix, the IMU's heading, differences as speeds.
+
 
 Array = npt.NDArray[np.float64]
+
+ALPHA = 0.35
+"""Part of a new difference that enters the speed (published velocity filter)."""
+LONGEST = 0.5
+"""Differences over longer times tell no speed [s]."""
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """The latest values of some coordinates, and their speeds."""
+
+    value: Array
+    speed: Array
+    time: float = math.nan
+
+    def after(self, value: Array, time: float) -> _Axis:
+        """With one more measurement, unless it is older."""
+        if not math.isnan(self.time) and time <= self.time:
+            return self
+        step = time - self.time
+        if not step <= LONGEST:
+            return replace(self, value=value, speed=np.zeros(len(value)), time=time)
+        speed = self.speed + ALPHA * ((value - self.value) / step - self.speed)
+        return _Axis(value, speed, time)
+
+
+class Unfused:
+    """Position, velocity and heading in the pool frame as the sensors alone have them."""
+
+    def __init__(self) -> None:
+        self._xy = _Axis(np.full(2, math.nan), np.zeros(2))
+        self._z = _Axis(np.full(1, math.nan), np.zeros(1))
+        self._heading = math.nan
+        self._offset = math.nan
+
+    def heading(self, yaw: float) -> None:
+        """Take in the attitude filter's own heading [rad]."""
+        if math.isfinite(yaw):
+            self._heading = yaw
+
+    def height(self, z: float, time: float) -> None:
+        """Take in the height of the body origin [m]."""
+        if math.isfinite(z):
+            self._z = self._z.after(np.array([z]), time)
+
+    def fix(self, position: tuple[float, float], yaw: float | None, time: float) -> None:
+        """Take in a fix; the first with a yaw says where the attitude filter's zero points.
+
+        Args:
+            position: x, y of the body origin, pool frame [m].
+            yaw: Left positive, pool frame [rad]; None where it is not known.
+            time: Middle of the exposure [s].
+        """
+        self._xy = self._xy.after(np.array(position), time)
+        if math.isnan(self._offset) and yaw is not None:
+            self._offset = yaw - self._heading
+
+    @property
+    def vision_time(self) -> float | None:
+        """Time of the latest fix [s]."""
+        return None if math.isnan(self._xy.time) else self._xy.time
+
+    @property
+    def x(self) -> Array:
+        """Position [m] and velocity [m/s], (6,); NaN where not known."""
+        return np.concatenate([self._xy.value, self._z.value, self._xy.speed, self._z.speed])
+
+    @property
+    def yaw(self) -> float:
+        """[rad]; NaN before the first fix."""
+        return float(wrap_angle(self._heading + self._offset))
+
+
+# What a vehicle knows of itself without a camera: attitude and rates, no position. Enough for a person who drives.
+
+
+class Unlocated:
+    """In place of `Perception` where there is no pool file: never ready, so that no pilot that needs a state acts."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self.vehicle = vehicle
+        imu = vehicle.sensors.imu
+        self._q_body_imu = np.array(imu.orientation if imu is not None else (0.0, 0.0, 0.0, 1.0))
+        self._R_body_imu = quat_to_matrix(self._q_body_imu)
+        self._quaternion = np.array([0.0, 0.0, 0.0, 1.0])
+        self._nu = np.full(6, np.nan)
+
+    def telemetry(self, now: float, telemetry: Telemetry, time: float) -> None:
+        """Take attitude and rates; what is not finite is passed over.
+
+        Args:
+            now: When it came [s].
+            telemetry: As it was decoded.
+            time: When it was measured, the vehicle's clock mapped to ours [s].
+        """
+        q, gyro = np.array(telemetry.quaternion), self._R_body_imu @ telemetry.gyro
+        if np.isfinite(q).all() and np.isfinite(gyro).all():
+            self._quaternion = quat_multiply(q, quat_conjugate(self._q_body_imu))
+            self._nu[3:] = gyro
+
+    def aid(self, arrival: float, aid: NavigationAid) -> None:
+        """Nothing is located, so nothing is aided."""
+
+    def picture(self, now: float, picture: Picture) -> Any:
+        """Pictures say nothing without a pool file."""
+        return None
+
+    def reading(self, now: float) -> Reading:
+        """Attitude and rates at a time [s]; position and velocity are NaN."""
+        return Reading(
+            time=now,
+            position=np.full(3, np.nan),
+            quaternion=self._quaternion.copy(),
+            nu=self._nu.copy(),
+            ready=False,
+            mode="uninitialized",
+            reason="driven without localization",
+        )
+
 
 PICTURE_STUCK = 0.4
 """Corners that stay the same to the last digit for this long are one picture sent again and again [s]."""
@@ -65,7 +363,7 @@ class Perception:
             pool: Camera, water and frames; None where no camera looks: the pool frame is then the world's.
             method: How tags become fixes, a name of `localization.poses.methods.METHODS`.
             mode: Of the estimator: constant-velocity or error-state.
-            fusion: False: no filter, for the ablation "without EKF" (`robot.unfused`).
+            fusion: False: no filter, for the ablation "without EKF" (`Unfused`).
             settings: Of the estimator; the vehicle file's noises if None.
             library: That finds tags in pictures: apriltag or opencv; apriltag if None.
             let_in: x, y of where the vehicle begins, world frame [m]: the one fix that dead reckoning starts from.

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from finssim.control.controllers import CONTROLLERS
-from finssim.control.errors import ControlError
-from finssim.control.guidance import Guide, goal_at
+from finssim.control import ControlError
+from finssim.control.guidance import Goal, Guide, Known, Measured, goal_at
 from finssim.control.modes import Wrench6, action_mode, mode_from_dict
+from finssim.control.pid import CONTROLLERS
 from finssim.control.policy_description import PolicyError, read_description
-from finssim.control.tracking import Goal, Known, Measured
 from finssim.control.trim import Trim
 from finssim.vehicles import Vehicle
 

@@ -3,27 +3,383 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
-from collections.abc import Mapping
+import os
+import struct
+import threading
+import zlib
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from finssim.files import OutputError, atomic_write, refuse_unwritable
+from finssim.mcap_repair import END, MAGIC
 from finssim.provenance import provenance
-from finssim.robot.mcap_writer import McapWriter
 from finssim.robot.messages import CommandEcho, NavigationAid, Picture, Telemetry
-from finssim.robot.record_messages import Messages
-from finssim.robot.record_pictures import jpeg
-from finssim.robot.record_sink import RecordSink
-from finssim.robot.record_topics import TOPICS, offered_qos
-from finssim.robot.record_types import METADATA, definition
+from finssim.robot.pictures import jpeg
+from finssim.robot.record_messages import METADATA, TOPICS, Messages, definition, offered_qos
 from finssim.robot.robot import Reading
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["Recorder"]
+__all__ = ["McapWriter", "RawFile", "RecordSink", "Recorder"]
+
+
+# MCAP files whose chunks close when their writer says so, so that little is lost when the process dies.
+
+
+MESSAGE = struct.Struct("<BQHIQQ")
+"""Kind 5, length of what follows, channel, sequence, log time and publish time [ns]."""
+
+COMPRESSION = "lz4"
+
+
+class RawFile(Protocol):
+    """What is written to: a file opened without a buffer."""
+
+    def write(self, data: memoryview, /) -> int | None:
+        """Take some of the bytes; returns how many."""
+
+
+class McapWriter:
+    """One file: metadata and attachments at once, messages in chunks that `close_chunk` ends (MCAP specification 0).
+
+    The writer of the `mcap` package closes a chunk by its size alone; here time has to. Its records are used for
+    everything that is rare.
+    """
+
+    def __init__(self, file: RawFile, *, profile: str = "ros2", library: str = "finssim") -> None:
+        from mcap.records import Header
+
+        self._file = file
+        self._at = 0
+        self._schemas: dict[str, Any] = {}
+        self._channels: dict[int, Any] = {}
+        self._counts: Counter[int] = Counter()
+        self._spans: list[tuple[int, int]] = []
+        self._indexes: dict[str, list[Any]] = {"chunk": [], "attachment": [], "metadata": []}
+        self._open_chunk()
+        self._put(MAGIC + _bytes(Header(profile=profile, library=library)))
+
+    @property
+    def pending(self) -> int:
+        """Bytes in the open chunk."""
+        return len(self._chunk)
+
+    @property
+    def written(self) -> int:
+        """Bytes of the whole records in the file."""
+        return self._at
+
+    @property
+    def messages(self) -> int:
+        """Messages in the file and in the open chunk."""
+        return sum(self._counts.values())
+
+    def metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Write a table of words."""
+        from mcap.records import Metadata, MetadataIndex
+
+        at = self._at
+        self._put(_bytes(Metadata(name=name, metadata=dict(values))))
+        self._indexes["metadata"].append(MetadataIndex(offset=at, length=self._at - at, name=name))
+
+    def attachment(self, name: str, media_type: str, data: bytes, time: int = 0) -> None:
+        """Write a file into the file; `time` in ns."""
+        from mcap.records import Attachment, AttachmentIndex
+
+        at, told = self._at, {"log_time": time, "create_time": time, "name": name, "media_type": media_type}
+        self._put(_bytes(Attachment(data=data, **told)))
+        self._indexes["attachment"].append(
+            AttachmentIndex(offset=at, length=self._at - at, data_size=len(data), **told)
+        )
+
+    def channel(self, topic: str, kind: str, definition: str, qos: str) -> int:
+        """Announce a topic of ROS 2 messages in CDR; returns its number.
+
+        Args:
+            topic: Name of the topic.
+            kind: Type, such as `sensor_msgs/msg/Imu`.
+            definition: Text of the type and of all that it uses, as in a rosbag.
+            qos: Offered profiles as rosbag2 keeps them (`offered_qos`).
+        """
+        from mcap.records import Channel, Schema
+
+        if kind not in self._schemas:
+            number = len(self._schemas) + 1
+            self._schemas[kind] = Schema(id=number, name=kind, encoding="ros2msg", data=definition.encode())
+            self._chunk += _bytes(self._schemas[kind])
+        number = len(self._channels) + 1
+        self._channels[number] = Channel(
+            id=number,
+            schema_id=self._schemas[kind].id,
+            topic=topic,
+            message_encoding="cdr",
+            metadata={"offered_qos_profiles": qos},
+        )
+        self._chunk += _bytes(self._channels[number])
+        return number
+
+    def message(self, channel: int, time: int, data: bytes) -> None:
+        """Add a message to the open chunk; `time` in ns."""
+        self._places[channel].append((time, len(self._chunk)))
+        self._chunk += MESSAGE.pack(
+            5, 22 + len(data), channel, self._counts[channel] & 0xFFFFFFFF, time, time
+        )
+        self._chunk += data
+        self._counts[channel] += 1
+
+    def close_chunk(self) -> None:
+        """Write the open chunk and its index; nothing if it is empty."""
+        import lz4.frame
+        from mcap.records import Chunk, ChunkIndex, MessageIndex
+
+        if not self._chunk:
+            return
+        times = [time for places in self._places.values() for time, _ in places]
+        first, last = (min(times), max(times)) if times else (0, 0)
+        packed = lz4.frame.compress(bytes(self._chunk))
+        told = {"message_start_time": first, "message_end_time": last, "compression": COMPRESSION}
+        told["uncompressed_size"] = len(self._chunk)
+        chunk = _bytes(Chunk(data=packed, uncompressed_crc=zlib.crc32(self._chunk), **told))
+        at, offsets, indexes = self._at, {}, b""
+        for channel, places in self._places.items():
+            offsets[channel] = at + len(chunk) + len(indexes)
+            indexes += _bytes(MessageIndex(channel_id=channel, records=places))
+        self._put(chunk + indexes)
+        self._indexes["chunk"].append(
+            ChunkIndex(
+                chunk_start_offset=at,
+                chunk_length=len(chunk),
+                message_index_offsets=offsets,
+                message_index_length=len(indexes),
+                compressed_size=len(packed),
+                **told,
+            )
+        )
+        self._spans += [(first, last)] if times else []
+        self._open_chunk()
+
+    def finish(self) -> None:
+        """Close the last chunk and write the summary by which readers find their way."""
+        from mcap.records import DataEnd, Footer, SummaryOffset
+
+        self.close_chunk()
+        self._put(_bytes(DataEnd(data_section_crc=0)))
+        start, summary, offsets = self._at, b"", b""
+        for kind, records in self._summary().items():
+            group = b"".join(map(_bytes, records))
+            place = SummaryOffset(
+                group_opcode=kind, group_start=start + len(summary), group_length=len(group)
+            )
+            offsets += _bytes(place) if group else b""
+            summary += group
+        listed = start + len(summary)
+        summary += offsets
+        crc = zlib.crc32(struct.pack("<BQQQ", 2, 20, start, listed), zlib.crc32(summary))
+        footer = Footer(summary_start=start, summary_offset_start=listed, summary_crc=crc)
+        self._put(summary + _bytes(footer) + MAGIC)
+
+    def _summary(self) -> dict[Any, list[Any]]:
+        """Records of the summary by their kind."""
+        from mcap.opcode import Opcode
+        from mcap.records import Statistics
+
+        statistics = Statistics(
+            message_count=self.messages,
+            schema_count=len(self._schemas),
+            channel_count=len(self._channels),
+            attachment_count=len(self._indexes["attachment"]),
+            metadata_count=len(self._indexes["metadata"]),
+            chunk_count=len(self._indexes["chunk"]),
+            message_start_time=min((first for first, _ in self._spans), default=0),
+            message_end_time=max((last for _, last in self._spans), default=0),
+            channel_message_counts=dict(self._counts),
+        )
+        return {
+            Opcode.SCHEMA: list(self._schemas.values()),
+            Opcode.CHANNEL: list(self._channels.values()),
+            Opcode.STATISTICS: [statistics],
+            Opcode.CHUNK_INDEX: self._indexes["chunk"],
+            Opcode.ATTACHMENT_INDEX: self._indexes["attachment"],
+            Opcode.METADATA_INDEX: self._indexes["metadata"],
+        }
+
+    def _open_chunk(self) -> None:
+        self._chunk = bytearray()
+        self._places: dict[int, list[tuple[int, int]]] = defaultdict(list)
+
+    def _put(self, data: bytes) -> None:
+        """Write all of it; counted only when the system has taken it whole."""
+        view = memoryview(data)
+        while view:
+            view = view[self._file.write(view) or 0 :]
+        self._at += len(data)
+
+
+def _bytes(record: Any) -> bytes:
+    from mcap.data_stream import RecordBuilder
+
+    builder = RecordBuilder()
+    record.write(builder)
+    return bytes(builder.end())
+
+
+# The thread that puts a record on disk: the control loop never waits for it, and a full disk never stops it.
+
+
+Payload = bytes | Callable[[], "bytes | None"]
+
+LOG = logging.getLogger(__name__)
+
+LARGEST_CHUNK = 1 << 20
+"""A chunk is closed when it has grown to so many bytes."""
+
+DISORDER = 1_000_000_000
+"""A message that is late by less is recorded at the time of the one before; later ones mean a clock set back [ns]."""
+
+POLLS = 5
+"""The queue is looked at so many times a chunk."""
+
+
+class RecordSink:
+    """A file that messages are put into from one thread and written by another.
+
+    A chunk is written and flushed to disk when its messages span `chunk_seconds`, or lie in it that long: a process
+    that is killed loses no more than that and a fifth of it. Where the system refuses to write, the file is closed
+    after its last whole chunk, `problem` says why in a sentence, and what comes later is dropped and counted.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        announce: Callable[[McapWriter, str], int],
+        *,
+        chunk_seconds: float = 0.5,
+        longest_queue: int = 64 << 20,
+    ) -> None:
+        """Args:
+            path: File to make; an existing one is refused.
+            announce: Makes the channel of a key when its first message is written, and returns its number.
+            chunk_seconds: [s]
+            longest_queue: Bytes that may wait for the disk; more are dropped.
+
+        Raises:
+            OutputError: The file exists or cannot be made.
+        """
+        if os.path.lexists(path):
+            raise OutputError(
+                f"cannot write {path}: it exists, and records are never replaced: give a new name"
+            )
+        refuse_unwritable(atomic_write(path))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.path = path
+        self.problem = ""
+        """Why recording stopped; empty while it goes on."""
+        self.dropped = 0
+        """Messages that were not recorded."""
+        self._file = open(path, "xb", buffering=0)
+        self.writer = McapWriter(self._file)
+        """For metadata and attachments, before `start`."""
+        self._announce = announce
+        self._channels: dict[str, int] = {}
+        self._chunk_seconds, self._longest_queue = chunk_seconds, longest_queue
+        self._queue: deque[tuple[str, int, Payload, int]] = deque()
+        self._put_bytes = self._taken_bytes = 0  # each written by one thread only
+        self._newest = 0
+        self._opened: int | None = None
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"recorder {path.name}", daemon=True)
+
+    def start(self) -> None:
+        """Begin to write."""
+        os.fsync(self._file.fileno())
+        self._thread.start()
+
+    def put(self, key: str, time: int, payload: Payload, size: int) -> None:
+        """Queue a message.
+
+        Args:
+            key: Of its channel.
+            time: [ns]
+            payload: Its bytes, or what makes them, called on the writing thread; None where it cannot.
+            size: About how many bytes wait.
+        """
+        if self.problem or self._put_bytes - self._taken_bytes > self._longest_queue:
+            self.dropped += 1
+            return
+        # Readers of a file without an index want its messages in order; their own stamps keep when things were.
+        if 0 < self._newest - time < DISORDER:
+            time = self._newest
+        self._newest = time
+        self._put_bytes += size
+        self._queue.append((key, time, payload, size))
+
+    def close(self) -> None:
+        """Write what waits, and the summary; returns when it is on disk."""
+        self._closing.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            idle = 0
+            while not self._closing.wait(self._chunk_seconds / POLLS):
+                self._drain()
+                idle = idle + 1 if self.writer.pending else 0
+                if idle >= POLLS:
+                    self._close_chunk()
+                    idle = 0
+            self._drain()
+            self.writer.finish()
+            os.fsync(self._file.fileno())
+        except Exception as error:  # whatever it is, it must be told, and must not stop the vehicle's control
+            self._stop(error)
+        finally:
+            self._file.close()
+
+    def _drain(self) -> None:
+        while self._queue:
+            key, time, payload, size = self._queue.popleft()
+            self._taken_bytes += size
+            data = payload() if callable(payload) else payload
+            if data is None:
+                self.dropped += 1
+                continue
+            if key not in self._channels:
+                self._channels[key] = self._announce(self.writer, key)
+            self._opened = time if self._opened is None else self._opened
+            self.writer.message(self._channels[key], time, data)
+            if time - self._opened >= self._chunk_seconds * 1e9 or self.writer.pending >= LARGEST_CHUNK:
+                self._close_chunk()
+
+    def _close_chunk(self) -> None:
+        self.writer.close_chunk()
+        self._opened = None
+        os.fsync(self._file.fileno())
+
+    def _stop(self, error: Exception) -> None:
+        """Give up: the file ends after its last whole record, if the system lets it."""
+        reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
+        self.problem = (
+            f"{self.path}: recording stopped: {reason}: what was recorded until then is kept; "
+            "free some space or record elsewhere"
+        )
+        self.dropped += len(self._queue)
+        self._queue.clear()
+        LOG.warning(self.problem)
+        try:
+            self._file.truncate(self.writer.written)
+            self._file.seek(0, os.SEEK_END)
+            self._file.write(END)
+        except OSError:
+            # No room even for that: readers find the last whole record themselves.
+            LOG.warning("%s: ends without a summary: `finssim record repair` writes one", self.path)
 
 
 class Recorder:

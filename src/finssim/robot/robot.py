@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from finssim.control.tracking import Track
+from finssim.control.guidance import Track
 from finssim.vehicles import Vehicle
 
 __all__ = ["Reading", "Robot"]
@@ -19,7 +19,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Reading:
-    """What is known of the vehicle at one time; it is a `control.tracking.Measured`."""
+    """What is known of the vehicle at one time; it is a `control.guidance.Measured`."""
 
     time: float
     """[s], the robot's clock."""

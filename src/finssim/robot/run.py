@@ -1,35 +1,239 @@
-"""`finssim run`: put a robot together, run it on its wires or in lock-step, and tell how it went."""
+"""`finssim run`: put a robot together, or a team's, run it on its wires or in lock-step, and tell how it went."""
 
 from __future__ import annotations
 
 import json
 import math
+import os
+import signal
+import subprocess
+import sys
 import time
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from rich.console import Console
+from rich.table import Table
 
-from finssim.control.controllers import CONTROLLERS
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
 from finssim.control.guidance import Station
+from finssim.control.pid import CONTROLLERS
+from finssim.control.policy_description import read_description
 from finssim.control.trim import Trim
+from finssim.geometry.rotations import quat_yaw, wrap_angle
 from finssim.localization.pool import load_pool
 from finssim.robot.goals import HeardGoal, check_reachable, guide_of, place_of
-from finssim.robot.interrupt import follow_parent
+from finssim.robot.interrupt import PARENT, follow_parent, interruptible
+from finssim.robot.link.transports import host_port
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import Pilot, make_pilot
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
-from finssim.robot.summary import Summary, show
 from finssim.robot.team import Team
 from finssim.robot.wiring import POOL_ADDRESS, Drive, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
 
-__all__ = ["FAULT", "POOL_ADDRESS", "UNHEARD", "Wiring", "run"]
+__all__ = ["APART", "FAULT", "POOL_ADDRESS", "UNHEARD", "Summary", "Wiring", "run", "run_team"]
+
+
+# What a person wants to know of a run: how near the goal it was, what stopped it, and whether it was in time.
+
+
+LAST = 20.0
+"""Errors are those of this much of the end [s]."""
+EVERY = 0.1
+"""Between two errors [s]."""
+
+
+class Summary:
+    """Looks at a runtime after every step, and tells at the end.
+
+    Note:
+        Errors are those of the estimate, which is all that a robot knows.
+    """
+
+    def __init__(self) -> None:
+        self._errors: deque[tuple[float, float]] = deque(maxlen=round(LAST / EVERY))
+        self._next = -math.inf
+
+    def look(self, runtime: Runtime) -> None:
+        """Take down the distance to the goal [m] and the heading error [rad], where they are known."""
+        reading = runtime.reading
+        if reading is None or reading.time < self._next or math.isnan(runtime.started) or not reading.ready:
+            return
+        self._next = reading.time + EVERY - 1e-6
+        goal = runtime.guide.at(runtime.t)
+        turn = float(wrap_angle(quat_yaw(reading.quaternion) - goal.yaw))
+        self._errors.append((float(np.linalg.norm(reading.position - goal.position)), turn))
+
+    @property
+    def newest(self) -> str:
+        """The latest error in words."""
+        if not self._errors:
+            return "position not known"
+        distance, turn = self._errors[-1]
+        return f"{100.0 * distance:.1f} cm and {math.degrees(turn):+.1f} deg off"
+
+    def tell(self, runtime: Runtime, duration: float, state: str) -> dict[str, Any]:
+        """All of it as plain data.
+
+        Args:
+            runtime: After the run.
+            duration: Of the run [s].
+            state: Of the bridge before the run was ended.
+        """
+        rms = np.sqrt(np.mean(np.square(self._errors), axis=0)) if self._errors else (None, None)
+        faults = [event.text for event in runtime.counters.events if event.kind == "fault"]
+        return {
+            "state": state,
+            "reason": runtime.bridge.reason or runtime.refusal or _waiting(runtime),
+            "duration_s": duration,
+            "goal": runtime.guide.name,
+            "pilot": runtime.pilot.describe(),
+            "position_rms_m": None if rms[0] is None else float(rms[0]),
+            "yaw_rms_deg": None if rms[1] is None else math.degrees(rms[1]),
+            "faults": faults,
+            "samples": runtime.perception.health().counts,
+            **runtime.counters.summary(),
+        }
+
+
+def _waiting(runtime: Runtime) -> str:
+    """What a run that never began was waiting for; empty for one that did."""
+    began = not math.isnan(runtime.started)
+    return "" if began or runtime.reading is None else runtime.reading.reason
+
+
+def show(told: dict[str, Any], console: Console) -> None:
+    """Print what `Summary.tell` told as a table."""
+    table = Table(show_header=False, box=None)
+    latency = told["latency_s"]
+    position, yaw = told["position_rms_m"], told["yaw_rms_deg"]
+    off = "position not known" if position is None else f"{100.0 * position:.1f} cm, {yaw:.2f} deg"
+    rows = {
+        "state": told["state"] + (f": {told['reason']}" if told["reason"] else ""),
+        "time": f"{told['duration_s']:.1f} s",
+        f"off the goal, rms of the last {LAST:g} s": off,
+        "pictures used": f"{told['fixes']} of {told['pictures']}",
+        "decisions missed": f"{told['missed']} of {told['decisions'] + told['missed']}",
+        "late steps": f"{told['overruns']} of {told['steps']}",
+        "picture to command": "no picture"
+        if latency["p50"] is None
+        else f"{1e3 * latency['p50']:.0f} ms, 99 % within {1e3 * latency['p99']:.0f} ms",
+        "faults": "; ".join(told["faults"]) or "none",
+    }
+    for name, value in rows.items():
+        table.add_row(name, value)
+    console.print(table)
+
+
+# `finssim run --team POLICY`: a stack of its own for every agent of a task, each in a process of its own.
+
+
+APART = 10
+"""Ports between one vehicle of a team and the next."""
+MESSAGES = 5
+"""The messages of a team are so far from the first vehicle's port."""
+POLL = 0.05
+"""Between looks whether they have ended [s]."""
+
+
+def run_team(
+    policy: str,
+    options: Sequence[str],
+    *,
+    task: str | None,
+    vehicle: str,
+    robot: str = "pool",
+    bind: str = "127.0.0.1:54321",
+    messages: str = "",
+    record: Path | None = None,
+    as_json: bool = False,
+) -> int:
+    """Run every agent of a task, and print how each went; one that ends leaves the others alone.
+
+    Args:
+        policy: A policy's directory, or a baseline of the task, for all.
+        options: Of `finssim run`, the same for all.
+        task: Of several vehicles; the policy's if None.
+        vehicle: Name or file.
+        robot: Motor controller of the first; the others' are ten ports on, each. `pool`: that of this machine.
+        bind: Own end of the first, likewise.
+        messages: What carries messages between them; the port five after `robot` if empty.
+        record: Folder that takes AGENT.mcap of each; nothing is kept if None.
+        as_json: Print one JSON object, by agent.
+
+    Returns:
+        The greatest exit status of them.
+
+    Raises:
+        ControlError, PolicyError, LinkError: Policy, task, vehicle and addresses do not fit.
+    """
+    from finssim.tasks.observer import fitted_task
+
+    words = task or (read_description(Path(policy)).task if Path(policy).is_dir() else None)
+    if words is None:
+        raise ControlError(f"--team {policy} is a baseline: give its task with --task")
+    agents = fitted_task(words, load_vehicle(vehicle)).agents
+    if len(agents) < 2:
+        raise ControlError(f"task '{words}' has one agent: run it with --policy {policy}, and --messages")
+    kind, _, address = (POOL_ADDRESS if robot == "pool" else robot).rpartition("//")
+    if kind not in ("", "udp:"):
+        raise ControlError(
+            f"--robot {robot}: a team's motor controllers are at udp://HOST:PORT, ten ports apart"
+        )
+    (theirs, port), (host, own) = host_port(address, "--robot"), host_port(bind, "--bind")
+    alike = [
+        *("--policy", policy, "--task", words, "--vehicle", vehicle, "--json"),
+        *("--messages", messages or f"{theirs}:{port + MESSAGES}"),
+        *options,
+    ]
+    children: dict[str, subprocess.Popen[str]] = {}
+    environment = {**os.environ, PARENT: str(os.getpid())}
+    with interruptible() as interrupted:
+        try:
+            for i, agent in enumerate(agents):
+                ends = [
+                    "--robot",
+                    f"udp://{theirs}:{port + APART * i}",
+                    "--bind",
+                    f"{host}:{own + APART * i}",
+                ]
+                kept = [] if record is None else ["--record", str(record / f"{agent}.mcap")]
+                children[agent] = subprocess.Popen(
+                    [sys.executable, "-m", "finssim", "run", "--agent", agent, *ends, *kept, *alike],
+                    env=environment,
+                    start_new_session=True,  # Ctrl-C reaches us alone, and we tell them once
+                    stdout=subprocess.PIPE,
+                    text=True,
+                )
+            while not interrupted() and any(child.poll() is None for child in children.values()):
+                time.sleep(POLL)
+        finally:
+            for child in children.values():
+                if child.poll() is None:
+                    child.send_signal(signal.SIGINT)
+            said = {agent: child.communicate()[0] for agent, child in children.items()}
+    _tell({agent: json.loads(text) if text.strip() else None for agent, text in said.items()}, as_json)
+    return max(abs(child.returncode) for child in children.values())
+
+
+def _tell(told: dict[str, Any], as_json: bool) -> None:
+    """How each went."""
+    if as_json:
+        print(json.dumps(told))
+        return
+    console = Console()
+    for agent, one in told.items():
+        console.print(agent if one is not None else f"{agent}: did not run, see above", highlight=False)
+        if one is not None:
+            show(one, console)
+
 
 FAULT = 3
 """Exit status of a run that ended in a fault of the vehicle."""
@@ -209,7 +413,6 @@ def _run_team(
     **rest: Any,
 ) -> int:
     """Run every agent of a task, each with these options, in a process of its own."""
-    from finssim.robot.team_run import run_team
 
     options = {
         "--site": site or "open-water",

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,20 +14,170 @@ import numpy.typing as npt
 from finssim.control.guidance import Guide
 from finssim.localization.pool import Pool
 from finssim.robot.bridge import Bridge
-from finssim.robot.counters import Counters, Ticks
-from finssim.robot.intake import Intake
-from finssim.robot.link.frames import encode_command
-from finssim.robot.messages import Picture, ThrusterCommand
+from finssim.robot.link.clock import ClockMap
+from finssim.robot.link.frames import Decoder, encode_command
+from finssim.robot.messages import CommandEcho, NavigationAid, Picture, Telemetry, ThrusterCommand
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import Pilot
 from finssim.robot.robot import Reading
-from finssim.robot.team import Team
 from finssim.vehicles import Vehicle
 
 if TYPE_CHECKING:
     from finssim.robot.recorder import Recorder
+    from finssim.robot.team import Team
 
-__all__ = ["Runtime"]
+__all__ = ["Counters", "Intake", "Runtime", "Ticks"]
+
+
+# What a run counts: steps, decisions that came late, and the time from camera to command.
+
+
+EARLY = 0.002
+"""A decision may come this much before its time [s], so that a loop that jitters misses no turn."""
+REMEMBERED = 20_000
+"""Latencies that are kept: half an hour at ten a second."""
+
+
+class Ticks:
+    """When a periodic thing is due: on the grid of its start, never later because an earlier turn was late."""
+
+    def __init__(self, start: float = 0.0) -> None:
+        """
+        Args:
+            start: First turn [s].
+        """
+        self._next = start
+
+    def due(self, now: float, period: float) -> tuple[bool, int]:
+        """Whether it is time, and how many turns were missed altogether since the last one.
+
+        Args:
+            now: [s]
+            period: From now on [s].
+        """
+        early = min(EARLY, 0.1 * period)
+        if self._next - now > 2.0 * period:  # the clock was set back, or the period has become shorter
+            self._next = now
+        late = now + early - self._next
+        if late < 0.0:
+            return False, 0
+        missed = math.floor(late / period)
+        self._next += (missed + 1) * period
+        return True, missed
+
+
+@dataclass
+class Counters:
+    """Totals of a run."""
+
+    steps: int = 0
+    telemetry: int = 0
+    pictures: int = 0
+    fixes: int = 0
+    """Pictures that became part of the state."""
+    decisions: int = 0
+    missed: int = 0
+    """Turns of the pilot that passed without a decision because the loop was late."""
+    overruns: int = 0
+    """Steps that took longer than their period."""
+    latencies: deque[float] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    """From the arrival of the newest picture in the state to the command that is decided on it [s]."""
+    events: deque[Any] = field(default_factory=lambda: deque(maxlen=200))
+    """The latest events of the bridge."""
+    _newest: float = math.nan
+    _pending: float = math.nan
+
+    def picture(self, arrival: float, used: bool) -> None:
+        """A picture came [s]."""
+        self.pictures += 1
+        if used:
+            self.fixes += 1
+            self._newest = arrival
+
+    def decided(self) -> None:
+        """A decision was made on what is known now."""
+        self._pending, self._newest = self._newest, math.nan
+
+    def sent(self, now: float) -> None:
+        """What was decided has gone out [s]."""
+        if not math.isnan(self._pending):
+            self.latencies.append(now - self._pending)
+            self._pending = math.nan
+
+    def summary(self) -> dict[str, Any]:
+        """Totals as plain data; percentiles of the latency [s], None where there was none."""
+        kept = np.array(self.latencies)
+        percentiles = {f"p{p}": float(np.percentile(kept, p)) if kept.size else None for p in (50, 95, 99)}
+        names = ("steps", "telemetry", "pictures", "fixes", "decisions", "missed", "overruns")
+        return {**{name: getattr(self, name) for name in names}, "latency_s": percentiles}
+
+
+# Everything that arrives: decoded, put on the robot's clock, and given to perception, bridge and record.
+
+
+USED = ("accepted", "initialized", "reacquired")
+
+
+class Intake:
+    """Feeds one perception and one bridge. Nothing that arrives can raise."""
+
+    def __init__(
+        self, perception: Perception, bridge: Bridge, counters: Counters, recorder: Recorder | None = None
+    ) -> None:
+        """
+        Args:
+            perception: Learns what the sensors say.
+            bridge: Watches whether they still speak.
+            counters: Counts it.
+            recorder: Takes it down.
+        """
+        self.decoder = Decoder(outputs=perception.vehicle.mcu.outputs)
+        self.clock = ClockMap()
+        self._perception, self._bridge = perception, bridge
+        self._counters, self.recorder = counters, recorder
+
+    def take(
+        self, now: float, frames: Sequence[tuple[float, bytes]], pictures: Sequence[Picture] = ()
+    ) -> None:
+        """Take in what has come.
+
+        Args:
+            now: Robot's clock [s].
+            frames: Datagrams from the motor controller, each with its time of arrival [s].
+            pictures: From the camera.
+        """
+        for arrival, data in frames:
+            for message in self.decoder.feed(data):
+                if isinstance(message, Telemetry):
+                    self._telemetry(arrival, message)
+                elif isinstance(message, CommandEcho):
+                    self._echo(arrival, message)
+                elif isinstance(message, NavigationAid):
+                    self._aid(arrival, message)
+        for picture in pictures:
+            verdict = self._perception.picture(now, picture)
+            self._counters.picture(picture.time, verdict in USED)
+            if self.recorder is not None:
+                self.recorder.picture(now, picture)
+
+    def _telemetry(self, arrival: float, telemetry: Telemetry) -> None:
+        time = self.clock.stamp(telemetry.mcu_ms, arrival)
+        self._counters.telemetry += 1
+        self._perception.telemetry(arrival, telemetry, time)
+        self._bridge.telemetry(arrival, telemetry)
+        if self.recorder is not None:
+            self.recorder.telemetry(arrival, telemetry, time)
+
+    def _aid(self, arrival: float, aid: NavigationAid) -> None:
+        self._perception.aid(arrival, aid)
+        if self.recorder is not None:
+            self.recorder.aid(arrival, aid)
+
+    def _echo(self, arrival: float, echo: CommandEcho) -> None:
+        self._bridge.echo(arrival, echo)
+        if self.recorder is not None:
+            self.recorder.echo(arrival, echo)
+
 
 Array = npt.NDArray[np.float64]
 

@@ -14,9 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from finssim.control.tracking import Track
-from finssim.robot.counters import Ticks
+from finssim.control.guidance import Track
 from finssim.robot.robot import Reading
+from finssim.robot.runtime import Ticks
 
 __all__ = ["LONGEST_NAME", "Team", "decode_track", "encode_track"]
 

@@ -12,20 +12,17 @@ from typing import Annotated
 
 from finssim.control.guidance import Guide, Station
 from finssim.localization.pool import Pool, load_pool
-from finssim.robot.bridge import Bridge
-from finssim.robot.bridge_settings import BridgeSettings
+from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.goals import check_reachable, station_of
 from finssim.robot.link.transports import Transport, open_transport
-from finssim.robot.operator import Device, Operator
-from finssim.robot.perception import Perception
-from finssim.robot.picture_source import PictureSource
+from finssim.robot.perception import Perception, Unlocated
+from finssim.robot.pictures import PictureSource
 from finssim.robot.pilots import ModeSwitch, Pilot, WrenchPilot, make_pilot
-from finssim.robot.realtime import run_realtime
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
-from finssim.robot.teleop import TeleopError
-from finssim.robot.unlocated import Unlocated
-from finssim.robot.wiring import POOL_ADDRESS, Wiring, open_camera
+from finssim.robot.teleop import Device, Operator, TeleopError
+from finssim.robot.teleop_devices import GAMEPAD_HELP, KEYBOARD_HELP, Gamepad, Keyboard
+from finssim.robot.wiring import POOL_ADDRESS, Wiring, open_camera, run_realtime
 from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["drive", "run"]
@@ -189,13 +186,9 @@ def _controller(
 def _open_device(name: str, key_hold: float, stack: ExitStack) -> tuple[Device, str]:
     """The device and what its keys do."""
     if name == "keyboard":
-        from finssim.robot import keyboard
-
-        return stack.enter_context(keyboard.Keyboard(hold=key_hold)), keyboard.HELP
+        return stack.enter_context(Keyboard(hold=key_hold)), KEYBOARD_HELP
     if name == "gamepad":
-        from finssim.robot import gamepad
-
-        return stack.enter_context(gamepad.Gamepad()), gamepad.HELP
+        return stack.enter_context(Gamepad()), GAMEPAD_HELP
     raise TeleopError(f"unknown device '{name}': expected gamepad or keyboard")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from finssim.robot.record_topics import (
+from finssim.robot.record_messages import (
     COMMAND,
     LATCHED,
     QUALITIES,

@@ -10,8 +10,7 @@ from rclpy.clock import Clock, ClockType
 
 from finssim.engine import Simulator
 from finssim.geometry.rotations import quat_from_yaw
-from finssim.robot.bridge import Bridge
-from finssim.robot.bridge_settings import BridgeSettings
+from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.goals import station_of
 from finssim.robot.robot import Reading
 from finssim.ros2.nodes.bridge_topics import BridgeTopics

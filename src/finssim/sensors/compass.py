@@ -6,14 +6,19 @@ from typing import Any
 import warp as wp
 
 from finssim.sensors.batch import SensorBatch
-from finssim.sensors.noise import TURN_ON, WHITE, digitised, lost, normal, sample_key
 from finssim.sensors.sampling import (
+    TURN_ON,
+    WHITE,
     Sampling,
     SensedState,
     arrival,
     begin_update,
+    digitised,
+    lost,
+    normal,
     restart,
     sample_due,
+    sample_key,
     slot_of,
 )
 

@@ -6,15 +6,21 @@ from typing import Any
 import warp as wp
 
 from finssim.sensors.batch import SensorBatch
-from finssim.sensors.noise import TURN_ON, WALK, WHITE, digitised, lost, normal, sample_key
 from finssim.sensors.sampling import (
+    TURN_ON,
+    WALK,
+    WHITE,
     Sampling,
     SensedState,
     arrival,
     begin_update,
+    digitised,
+    lost,
+    normal,
     restart,
     root_of_wait,
     sample_due,
+    sample_key,
     slot_of,
 )
 

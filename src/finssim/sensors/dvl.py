@@ -8,25 +8,23 @@ import warp as wp
 
 from finssim.physics.types import angular, linear, vec6
 from finssim.sensors.batch import SensorBatch
-from finssim.sensors.noise import (
+from finssim.sensors.sampling import (
     TURN_ON,
     TURN_ON_2,
     WALK,
     WHITE,
-    digitised3,
-    lost,
-    normal,
-    normal3,
-    sample_key,
-)
-from finssim.sensors.sampling import (
     Sampling,
     SensedState,
     arrival,
     begin_update,
+    digitised3,
+    lost,
+    normal,
+    normal3,
     restart,
     root_of_wait,
     sample_due,
+    sample_key,
     slot_of,
 )
 

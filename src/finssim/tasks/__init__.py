@@ -1,9 +1,8 @@
 """Tasks, and the batched environment that runs any of them."""
 
-from finssim.tasks.catalogue import TASKS
 from finssim.tasks.docking import Docking
 from finssim.tasks.environment import Environment, EnvironmentSetupError, Step
-from finssim.tasks.make import make, task_named
+from finssim.tasks.make import TASKS, make, task_named
 from finssim.tasks.measurement import MeasurementNoise
 from finssim.tasks.moving_target import MovingTarget
 from finssim.tasks.reference import follow

@@ -5,8 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import warp as wp
 
-from finssim.control.allocation import AllocationData, allocate, allocation_data
-from finssim.control.allocator import axis_weights
+from finssim.control.allocation import AllocationData, allocate, allocation_data, axis_weights
 from finssim.engine.packed import Packed
 from finssim.physics.plant import VehicleCommand
 from finssim.physics.types import MAX_THRUSTERS, vec6, vec8

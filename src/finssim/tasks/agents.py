@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
@@ -9,13 +11,16 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.control.controllers import CONTROLLERS, controller_for
+from finssim.control.guidance import Controller, Goal, Known
 from finssim.control.modes import mode_from_dict
+from finssim.control.pid import CONTROLLERS, controller_for
 from finssim.control.policy import Policy
 from finssim.control.policy_description import DESCRIPTION_FILE
-from finssim.control.tracking import Controller, Goal, Known
 from finssim.control.trim import Trim
+from finssim.engine import Recorder
 from finssim.tasks.baselines import BASELINES, baseline
+from finssim.tasks.environment import Environment
+from finssim.tasks.given import Step
 from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle
 
@@ -31,7 +36,9 @@ __all__ = [
     "WorldReadings",
     "agent_for",
     "expert_for",
+    "rollout",
 ]
+
 
 Array = NDArray[np.float64]
 
@@ -277,3 +284,40 @@ def expert_for(
             f"{expert.action}"
         )
     return expert
+
+
+# An agent in a batch of worlds, decision after decision.
+
+
+def rollout(
+    agent: Agent,
+    environment: Environment,
+    steps: int,
+    goal: Callable[[float], Goal],
+    *,
+    record: Path | None = None,
+) -> Iterator[tuple[int, Step | None]]:
+    """Let an agent act; whoever iterates looks at the worlds before each decision and after the last.
+
+    Args:
+        agent: Who acts; several agents of a world share it.
+        environment: As it stands.
+        steps: How many decisions, unless the iteration is ended before.
+        goal: Where to go at a time since the start [s].
+        record: New folder for every state, command and thrust; none if None.
+
+    Yields:
+        How many decisions were made, and what the environment said to the last one; None before the first.
+    """
+    worlds, agents = environment.worlds, environment.agents
+    shape = (worlds, -1) if agents == 1 else (worlds, agents, -1)
+    readings, memory = WorldReadings(environment.arrays, agents), agent.reset(worlds * agents)
+    step: Step | None = None
+    with nullcontext() if record is None else Recorder(environment.simulator, record) as recorder:
+        for k in range(steps + 1):
+            yield k, step
+            if recorder is not None:
+                recorder.record()
+            if k < steps:
+                action, memory = agent.act(memory, readings, goal(k * agent.period))
+                step = environment.step(np.asarray(action, dtype=np.float32).reshape(shape))

@@ -2,28 +2,439 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.control.pid import PidMemory
-from finssim.control.tracking import Goal
-from finssim.geometry.rotations import cross, matrix_to_quat, quat_conjugate, quat_rotate
-from finssim.tasks.docking import DISTANCE_SCALE, Docking
-from finssim.tasks.formation_baselines import ConsensusFormation
-from finssim.tasks.pid_baselines import PERIOD, Seen, StationPid, TargetPid, TrackingPid, WrenchPid
-from finssim.tasks.pursuit_baselines import LeadPursuit
-from finssim.tasks.team_pursuit_baselines import FormationPursuit
+from finssim.control.guidance import Goal
+from finssim.control.pid import Pid, PidMemory
+from finssim.geometry.rotations import (
+    cross,
+    matrix_to_quat,
+    quat_conjugate,
+    quat_from_euler,
+    quat_from_yaw,
+    quat_rotate,
+)
+from finssim.tasks.docking import DISTANCE_SCALE as DOCK_SCALE
+from finssim.tasks.docking import Docking
+from finssim.tasks.fitting import coefficients_of
+from finssim.tasks.formation import NEAR, Formation
+from finssim.tasks.moving_target import DISTANCE_SCALE as TARGET_DISTANCE_SCALE
+from finssim.tasks.moving_target import TARGET_SCALE
+from finssim.tasks.pursuit import DISTANCE_SCALE as CHASE_SCALE
+from finssim.tasks.pursuit import PI, DriveNumbers
+from finssim.tasks.station_keeping import DISTANCE_SCALE as STATION_SCALE
+from finssim.tasks.trajectory_tracking import DISTANCE_SCALE as TRACKING_SCALE
+from finssim.tasks.trajectory_tracking import LOOK_AHEAD
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["BASELINES", "Baseline", "BaselineError", "baseline", "restarted"]
+__all__ = [
+    "BASELINES",
+    "Baseline",
+    "BaselineError",
+    "ConsensusFormation",
+    "FormationPursuit",
+    "LeadPursuit",
+    "Seen",
+    "StationPid",
+    "TargetPid",
+    "TrackingPid",
+    "WrenchPid",
+    "baseline",
+    "restarted",
+]
 
-# The classical way into a dock: come before its mouth, turn to it, and go in as far as the nose is on the axis.
+
+# The PID as a baseline: the state that it needs is read from the observation, and from nothing else.
+
 
 Array = NDArray[np.float64]
+
+PERIOD = 0.1
+"""Control step of every task [s]."""
+
+
+class Seen(NamedTuple):
+    """A vehicle's state as `Pid` takes it, in axes that the observation can tell: z up, the rest as said there."""
+
+    position: Array
+    """Body origin [m], (n, 3)."""
+    quaternion: Array
+    """Body to those axes, xyzw, (n, 4)."""
+    nu: Array
+    """Body frame [m/s, rad/s], (n, 6)."""
+
+
+@dataclass(frozen=True)
+class WrenchPid:
+    """The full-wrench PID of `control.pid`, whose wrench is given as a part of each axis' limit."""
+
+    pid: Pid
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD) -> WrenchPid:
+        """Gains by pole placement for a vehicle and the time between two actions [s]; a batch shows it the present."""
+        return cls(Pid.from_vehicle(vehicle, coefficients_of(vehicle), period, least_lag=0.0))
+
+    def command(self, memory: PidMemory, seen: Seen, goal: Goal) -> tuple[NDArray[np.float32], PidMemory]:
+        """Actions (n, 6), limited to ±1, and the memory after."""
+        tau, memory = self.pid.command(memory, seen, goal)
+        limits = self.pid.wrench_limits
+        action = np.divide(tau, limits, out=np.zeros_like(tau), where=limits > 0.0)
+        return action.astype(np.float32), memory
+
+
+@dataclass(frozen=True)
+class StationPid:
+    """PID of T1. The goal is level, so its own axes have z up: the vehicle's pose in them is all that matters."""
+
+    controller: WrenchPid
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD) -> StationPid:
+        """For a vehicle, and the time between two actions [s]."""
+        return cls(WrenchPid.for_vehicle(vehicle, period))
+
+    @property
+    def period(self) -> float:
+        """Time between two actions [s]."""
+        return self.controller.pid.period
+
+    def reset(self, n: int) -> PidMemory:
+        """Empty integrals."""
+        return self.controller.pid.reset(n)
+
+    def act(
+        self, memory: PidMemory, observation: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], PidMemory]:
+        """Actions for observations of T1."""
+        seen = seen_from_goal(observation)
+        here = Goal(
+            np.zeros_like(seen.position), np.broadcast_to([0.0, 0.0, 0.0, 1.0], seen.quaternion.shape)
+        )
+        return self.controller.command(memory, seen, here)
+
+
+def seen_from_goal(observation: NDArray[np.float32]) -> Seen:
+    """The vehicle in the axes of its goal, from the first 15 numbers of T1's observation."""
+    o = np.asarray(observation, float)
+    x, y = o[..., 3:6], o[..., 6:9]
+    # The columns of R_b' R*: the goal's axes in the body. Together with their cross product they are the rotation.
+    q = quat_conjugate(matrix_to_quat(np.stack([x, y, cross(x, y)], axis=-1)))
+    return Seen(-quat_rotate(q, STATION_SCALE * o[..., :3]), q, o[..., 9:15])
+
+
+class TrackingMemory(NamedTuple):
+    """What `TrackingPid` remembers."""
+
+    heading: Array
+    """Heading since the start, counted from the yaw rate [rad], (n,)."""
+    pid: PidMemory
+
+
+@dataclass(frozen=True)
+class TrackingPid:
+    """PID of T2. The observation has no heading, and none is asked for: the vehicle keeps the one it starts with.
+
+    The axes are level, with the vehicle at the origin and x where it pointed at the start, as its yaw rate tells.
+    """
+
+    controller: WrenchPid
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD) -> TrackingPid:
+        """For a vehicle, and the time between two actions [s]."""
+        return cls(WrenchPid.for_vehicle(vehicle, period))
+
+    @property
+    def period(self) -> float:
+        """Time between two actions [s]."""
+        return self.controller.pid.period
+
+    def reset(self, n: int) -> TrackingMemory:
+        """Heading zero, empty integrals."""
+        return TrackingMemory(np.zeros(n), self.controller.pid.reset(n))
+
+    def act(
+        self, memory: TrackingMemory, observation: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], TrackingMemory]:
+        """Actions for observations of T2."""
+        o = np.asarray(observation, float)
+        up, nu = o[..., 21:24], o[..., 15:21]
+        q = attitude_from(up, memory.heading)
+        offsets = [TRACKING_SCALE * o[..., 3 * i : 3 * i + 3] for i in range(3)]
+        goal = Goal(
+            quat_rotate(q, offsets[0]),
+            quat_from_yaw(np.zeros(len(o))),
+            quat_rotate(q, o[..., 12:15]),
+            quat_rotate(q, acceleration_ahead(offsets, o[..., 12:15])),
+        )
+        action, pid = self.controller.command(memory.pid, Seen(np.zeros_like(up), q, nu), goal)
+        return action, TrackingMemory(memory.heading + self.period * heading_rate(up, nu), pid)
+
+
+@dataclass(frozen=True)
+class TargetPid:
+    """PID of T3 with the target's velocity fed forward. The observation has no attitude: it is taken to be level.
+
+    The heading is the one at the start, as the yaw rate tells; roll and pitch are left to the water and their rates.
+    """
+
+    controller: WrenchPid
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD) -> TargetPid:
+        """For a vehicle, and the time between two actions [s]."""
+        return cls(WrenchPid.for_vehicle(vehicle, period))
+
+    @property
+    def period(self) -> float:
+        """Time between two actions [s]."""
+        return self.controller.pid.period
+
+    def reset(self, n: int) -> TrackingMemory:
+        """Heading zero, empty integrals."""
+        return TrackingMemory(np.zeros(n), self.controller.pid.reset(n))
+
+    def act(
+        self, memory: TrackingMemory, observation: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], TrackingMemory]:
+        """Actions for observations of T3."""
+        o = np.asarray(observation, float)
+        q, nu = quat_from_yaw(memory.heading), o[..., 6:12]
+        goal = Goal(
+            quat_rotate(q, TARGET_DISTANCE_SCALE * o[..., :3]),
+            quat_from_yaw(np.zeros(len(o))),
+            quat_rotate(q, TARGET_SCALE * o[..., 3:6]),
+        )
+        action, pid = self.controller.command(memory.pid, Seen(np.zeros((len(o), 3)), q, nu), goal)
+        return action, TrackingMemory(memory.heading + self.period * nu[..., 5], pid)
+
+
+def attitude_from(up: Array, heading: Array) -> Array:
+    """Body to level axes, xyzw, (n, 4), from the world's up in the body, (n, 3), and a heading [rad], (n,)."""
+    roll = np.arctan2(up[..., 1], up[..., 2])
+    pitch = np.arctan2(-up[..., 0], np.hypot(up[..., 1], up[..., 2]))
+    return quat_from_euler(roll, pitch, heading)
+
+
+def heading_rate(up: Array, nu: Array) -> Array:
+    """(q sin φ + r cos φ) / cos θ, with up = [-sin θ, cos θ sin φ, cos θ cos φ].
+
+    Args:
+        up: World's up in the body frame [-], (n, 3).
+        nu: Twist, body frame [m/s, rad/s], (n, 6).
+
+    Returns:
+        [rad/s], (n,).
+    """
+    level = np.maximum(up[..., 1] ** 2 + up[..., 2] ** 2, 1e-6)
+    return np.asarray((nu[..., 4] * up[..., 1] + nu[..., 5] * up[..., 2]) / level)
+
+
+def acceleration_ahead(offsets: list[Array], velocity: Array) -> Array:
+    """Acceleration of a reference from where it is now, one and two `LOOK_AHEAD` later, and its velocity.
+
+    p(k) - p(0) = v k + a k²/2 + j k³/6; of k and 2k together the jerk j falls out.
+
+    Args:
+        offsets: Way to the reference at the three times, in one frame [m], (n, 3) each.
+        velocity: Of the reference, same frame [m/s], (n, 3).
+
+    Returns:
+        Same frame [m/s²], (n, 3).
+    """
+    near, far = offsets[1] - offsets[0], offsets[2] - offsets[0]
+    return np.asarray((8.0 * near - far - 6.0 * LOOK_AHEAD * velocity) / (2.0 * LOOK_AHEAD**2))
+
+
+# Lead pursuit: a baseline of 1-v-1 pursuit that steers to where the prey will be.
+
+
+@dataclass(frozen=True)
+class LeadPursuit:
+    """Point at where the prey will be, turn first while that is far to the side, then come up and keep its speed.
+
+    The point aimed at lies `lead` seconds ahead of the prey. Closing in, the speed wanted is the prey's plus
+    `approach` times the way that is left to `stand_off`, so that the relative speed vanishes there.
+    """
+
+    drive: DriveNumbers
+    lead: float = 0.30
+    """[s]"""
+    turn_first: float = math.radians(15.0)
+    """A heading error above this is turned away before anything else [rad]."""
+    approach: float = 0.5
+    """[1/s]"""
+    stand_off: float = 0.5
+    """Distance that is gone to [m]."""
+    period: float = PERIOD
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle) -> LeadPursuit:
+        """With the numbers of a vehicle."""
+        return cls(DriveNumbers.of(vehicle))
+
+    def reset(self, n: int) -> None:
+        """It remembers nothing."""
+        return None
+
+    def act(self, memory: None, observation: NDArray[np.float32]) -> tuple[NDArray[np.float32], None]:
+        """Actions wrench4 for observations of pursuit, (n, 14)."""
+        o = np.asarray(observation, dtype=float)
+        own, gap, relative = o[:, 0:3], CHASE_SCALE * o[:, 6:9], o[:, 9:12]
+        aim = gap + self.lead * relative
+        error = np.arctan2(aim[:, 1], aim[:, 0])
+        distance = np.maximum(np.linalg.norm(gap, axis=1, keepdims=True), 1e-6)
+        wanted = own + relative + self.approach * (distance - self.stand_off) * aim / distance
+        top = np.array([self.drive.top, *self.drive.terminal[1:3]])
+        wanted = np.clip(wanted, -top, top)
+        velocity = np.column_stack([own, o[:, 5]])
+        action = self.drive.action(velocity, np.column_stack([wanted, self.drive.turned(error)]))
+        action[np.abs(error) > self.turn_first, :2] = 0.0
+        return action, None
+
+
+# The classical controller of formation keeping: a consensus on the shape, and a state machine for where to go.
+
+
+@dataclass(frozen=True)
+class ConsensusFormation:
+    """Each agent pulls its edges to equal sides and its height to the others', and adds what the state asks for.
+
+    gather, while an edge is off by more than `loose`: the shape alone. approach: the net's middle goes to the target.
+    carry, while the net has the target: on to the goal, with the target kept in the middle. Which state it is follows
+    from the observation alone, so that all three agree without a word, as far as they see the same.
+    """
+
+    drive: DriveNumbers
+    side: float
+    """Of the net [m]."""
+    reach: float
+    """Distance from the net within which it has the target [m]."""
+    shape: float = 0.6
+    """Speed per error of an edge or of the height [1/s]."""
+    go: float = 0.4
+    """Speed per distance [1/s]."""
+    cruise: float = 0.5
+    """Largest speed of the net's middle, as a part of the vehicle's slowest steady speed."""
+    loose: float = 0.15
+    """[sides]"""
+    period: float = PERIOD
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle) -> ConsensusFormation:
+        """With the numbers of a vehicle, for the net that three of them carry by the task's default settings."""
+        task = Formation().fitted([vehicle])
+        return cls(DriveNumbers.of(vehicle), task.side, task.reach)
+
+    def reset(self, n: int) -> None:
+        """It remembers nothing."""
+        return None
+
+    def act(self, memory: None, observation: NDArray[np.float32]) -> tuple[NDArray[np.float32], None]:
+        """Actions wrench4 for observations of formation, (n, 34)."""
+        o = np.asarray(observation, dtype=float)
+        own = o[:, 0:3]
+        mates = CHASE_SCALE * np.stack([o[:, 14:17], o[:, 20:23]], axis=1)
+        wanted = self.shaping(mates) + self.going(o, mates.sum(axis=1) / 3.0)
+        velocity = np.column_stack([own, o[:, 5]])
+        turn = self.drive.turned(PI * o[:, 13])
+        return self.drive.action(velocity, np.column_stack([wanted, turn])), None
+
+    def shaping(self, mates: Array) -> Array:
+        """Velocity towards equal sides and equal heights, from the team-mates' places, (n, 2, 3)."""
+        length = np.maximum(np.linalg.norm(mates, axis=2, keepdims=True), 1e-6)
+        pull = np.sum((length - self.side) * mates / length, axis=1)
+        pull[:, 2] = mates[:, :, 2].sum(axis=1)
+        return np.asarray(self.shape * pull)
+
+    def going(self, o: Array, middle: Array) -> Array:
+        """Velocity of the net's middle, from the observation and from where the middle is."""
+        target, goal = NEAR * o[:, 6:9], NEAR * o[:, 26:29]
+        has = (NEAR * o[:, 32] <= self.reach) & (o[:, 33] >= 0.0)
+        way = np.where(has[:, None], goal - target + 0.5 * (target - middle), target - middle)
+        speed = self.go * np.linalg.norm(way, axis=1, keepdims=True)
+        top = self.cruise * min(self.drive.top, *self.drive.terminal[1:3])
+        going = self.go * way * np.minimum(1.0, top / np.maximum(speed, 1e-6))
+        loose = np.abs(o[:, 29:32]).max(axis=1) > self.loose
+        return np.asarray(np.where(loose[:, None], 0.0, going))
+
+
+# The formation baseline of 3-v-1 pursuit: netters abreast of the prey, herder behind it.
+
+
+def level_unit(x: Array) -> Array:
+    """Level directions of vectors (n, 3); zero where there is none."""
+    level = x * np.array([1.0, 1.0, 0.0])
+    length = np.linalg.norm(level, axis=1, keepdims=True)
+    return level / np.maximum(length, 1e-6)
+
+
+@dataclass(frozen=True)
+class FormationPursuit:
+    """Each agent goes to its place relative to the prey, from its own observation and with the prey's velocity added.
+
+    The way ahead leads from the herder through the prey. Netters stand `forward` ahead of the prey and half of
+    `spacing` to either side of the way, so that the net lies across it; the herder stays `behind`. Published with 6, 2
+    and 3 m for vehicles twelve times as fast; here 0.4 times that.
+    """
+
+    drive: DriveNumbers
+    spacing: float = 2.4
+    forward: float = 0.8
+    behind: float = 1.2
+    gain: float = 0.6
+    """Speed per distance to one's place [1/s]."""
+    period: float = PERIOD
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle) -> FormationPursuit:
+        """With the numbers of a vehicle."""
+        return cls(DriveNumbers.of(vehicle))
+
+    def reset(self, n: int) -> None:
+        """It remembers nothing."""
+        return None
+
+    def places(self, observation: Array) -> Array:
+        """Where each agent should be, from itself, body frame [m], (n, 3); one row per agent."""
+        prey = CHASE_SCALE * observation[:, 6:9]
+        mates = CHASE_SCALE * np.stack([observation[:, 16:19], observation[:, 24:27]], axis=1)
+        herds = observation[:, [14, 22]]
+        herder = herds.max(axis=1) < 0.5
+        ahead = level_unit(prey - np.einsum("nm,nmk->nk", herds, mates))
+        across = np.column_stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(ahead))])
+        other = np.einsum("nm,nmk->nk", 1.0 - herds, mates)
+        # Of two netters the one farther to the left of the way takes the left place.
+        side = np.where(np.sum(other * across, axis=1) < 0.0, 1.0, -1.0)[:, None]
+        netter = prey + self.forward * ahead + 0.5 * self.spacing * side * across
+        drives = level_unit(0.5 * mates.sum(axis=1) - prey)
+        return np.asarray(np.where(herder[:, None], prey - self.behind * drives, netter))
+
+    def act(self, memory: None, observation: NDArray[np.float32]) -> tuple[NDArray[np.float32], None]:
+        """Actions wrench4 for observations of team pursuit, (n, 30)."""
+        o = np.asarray(observation, dtype=float)
+        own, relative = o[:, 0:3], o[:, 9:12]
+        place = self.places(o)
+        wanted = own + relative + self.gain * place
+        # Faster than the vehicle goes is the same direction as fast as it goes.
+        level = np.maximum(np.linalg.norm(wanted[:, :2], axis=1, keepdims=True) / self.drive.top, 1.0)
+        wanted[:, :2] /= level
+        wanted[:, 2] = np.clip(wanted[:, 2], -self.drive.terminal[2], self.drive.terminal[2])
+        error = np.where(
+            np.linalg.norm(wanted[:, :2], axis=1) > 0.05, np.arctan2(wanted[:, 1], wanted[:, 0]), 0.0
+        )
+        velocity = np.column_stack([own, o[:, 5]])
+        return self.drive.action(velocity, np.column_stack([wanted, self.drive.turned(error)])), None
+
+
+# The classical way into a dock: come before its mouth, turn to it, and go in as far as the nose is on the axis.
 
 
 @dataclass(frozen=True)
@@ -80,7 +491,7 @@ class DockingPid:
         o = np.asarray(observation, float)
         x, y = o[..., 3:6], o[..., 6:9]
         q = quat_conjugate(matrix_to_quat(np.stack([x, y, cross(x, y)], axis=-1)))
-        nose = DISTANCE_SCALE * o[..., 15:18]
+        nose = DOCK_SCALE * o[..., 15:18]
         arm = np.array([self.nose, 0.0, 0.0])
         place = np.zeros_like(nose)
         place[..., 0] = self._ahead(nose, quat_rotate(q, [1.0, 0.0, 0.0]))

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.control.pole_placement import axis_model
+from finssim.control.pid import axis_model
 from finssim.engine import Dock, Pool
 from finssim.engine.state import State
 from finssim.physics.types import vec6

@@ -1,9 +1,11 @@
 """The batched environment: any task, any vehicle, thousands of worlds, with automatic reset."""
 
+import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -24,16 +26,12 @@ from finssim.tasks.given import (
     refuse_other_thrusters,
 )
 from finssim.tasks.measurement import MeasurementNoise, connect_measured, measure, measurements
-from finssim.tasks.placing import place
-from finssim.tasks.saved_state import load_state, save_state
 from finssim.tasks.sensing import Sensing, SensingBatch
 from finssim.tasks.task import Batch, Task
 from finssim.vehicles import Vehicle
 
-if TYPE_CHECKING:
-    from finssim.tasks.levels import Levels
+__all__ = ["GREATEST_SEED", "Environment", "EnvironmentSetupError", "LevelPlan", "Levels", "Step", "climb"]
 
-__all__ = ["GREATEST_SEED", "Environment", "EnvironmentSetupError", "Step"]
 
 GPU_FROZEN_CHECK = 100
 """Steps between looks for frozen worlds on a GPU."""
@@ -160,7 +158,7 @@ class Environment:
             )
         self.drawing = Drawing(randomization, self.simulator, self.arrays, self._seen, task, privileged)
         self.levels: Levels | None = None
-        """How the task's level rises, after `climb` of `finssim.tasks.levels`."""
+        """How the task's level rises, after `climb` of `finssim.tasks.environment`."""
         self._build()
         self.reset(seed=self.seed)
 
@@ -334,3 +332,249 @@ class Environment:
             EnvironmentSetupError: It was made with other arguments.
         """
         load_state(self, state)
+
+
+# Episodes that start at given poses towards given goals, in place of drawn ones.
+
+
+def place(
+    environment: "Environment",
+    position: ArrayLike,
+    quaternion: ArrayLike,
+    goal_position: ArrayLike,
+    goal_quaternion: ArrayLike,
+) -> None:
+    """Put vehicle 0 of every world somewhere at rest, with a goal; an episode must just have begun there.
+
+    Args:
+        environment: The worlds.
+        position: World frame [m], broadcastable to (worlds, 3).
+        quaternion: Body to world, xyzw, broadcastable to (worlds, 4).
+        goal_position: World frame [m], broadcastable to (worlds, 3).
+        goal_quaternion: Body to world, broadcastable to (worlds, 4).
+    """
+    state, arrays, worlds = environment.simulator.state, environment.arrays, environment.worlds
+    for array, value, width in ((state.position, position, 3), (state.quaternion, quaternion, 4)):
+        everyone = array.numpy().copy()
+        everyone[:, 0] = np.broadcast_to(np.asarray(value, dtype=np.float32), (worlds, width))
+        array.assign(everyone)
+    state.velocity.zero_()
+    for array, value, width in (
+        (arrays.goal_position, goal_position, 3),
+        (arrays.goal_quaternion, goal_quaternion, 4),
+    ):
+        array.assign(np.array(np.broadcast_to(np.asarray(value, dtype=np.float32), (worlds, width))))
+
+
+# All that decides what an environment does next, as NumPy arrays: a run that goes on from them is the same run.
+
+
+def save_state(environment: "Environment") -> dict[str, NDArray[Any]]:
+    """Copies of the vehicles' states, delay lines, water, the task's arrays and all counters.
+
+    Returns:
+        Arrays by name, such as `state.position` or `plant.mass`; the counters under `counters.`.
+    """
+    simulator = environment.simulator
+    saved = {name: np.array(array.numpy()) for name, array in _arrays(environment)}
+    saved["counters.seed"] = np.array(environment.seed)
+    saved["counters.steps"] = np.array(environment._steps)
+    reported = sorted(simulator._reported)
+    if environment.drawing.schedule is not None:
+        saved["counters.schedule"] = np.array(environment.drawing.schedule._steps)
+    if environment.levels is not None:
+        saved.update(environment.levels.state())
+    saved["counters.reported"] = np.array(reported, dtype=np.int64).reshape(-1, 2)
+    return saved
+
+
+def load_state(environment: "Environment", saved: Mapping[str, NDArray[Any]]) -> None:
+    """Bring an environment that was made alike to where `save_state` left another; arrays keep their memory.
+
+    Raises:
+        EnvironmentSetupError: The environment was made with other arguments: a name or shape does not fit.
+    """
+    if (environment.levels is None) == ("counters.level" in saved):
+        where = "has levels and the saved state has none" if environment.levels else "has no levels"
+        raise EnvironmentSetupError(
+            f"saved state does not fit: the environment {where}: make it with the same arguments"
+        )
+    _set_seed(environment, int(saved["counters.seed"]))
+    if environment.levels is not None:
+        environment.levels.load(saved)
+    arrays = dict(_arrays(environment))
+    wanted = {name for name in saved if not name.startswith("counters.")}
+    if arrays.keys() != wanted:
+        name = min(arrays.keys() ^ wanted)
+        where = "is not in the saved state" if name in arrays else "is in the saved state alone"
+        raise EnvironmentSetupError(
+            f"saved state does not fit: '{name}' {where}: make the environment with the same arguments"
+        )
+    for name, array in arrays.items():
+        shape = array.numpy().shape
+        if saved[name].shape != shape:
+            raise EnvironmentSetupError(
+                f"saved state does not fit: '{name}' has shape {saved[name].shape}, expected {shape}: "
+                "make the environment with the same arguments"
+            )
+    for name, array in arrays.items():
+        array.assign(np.ascontiguousarray(saved[name]))
+    environment.simulator.compare_worlds()
+    environment._steps = int(saved["counters.steps"])
+    if environment.drawing.schedule is not None:
+        environment.drawing.schedule._steps = int(saved["counters.schedule"])
+    environment.simulator._reported = {(int(w), int(e)) for w, e in saved["counters.reported"]}
+
+
+def _set_seed(environment: "Environment", seed: int) -> None:
+    if seed != environment.seed:
+        environment.reset(seed=seed)
+
+
+def _arrays(environment: "Environment") -> Iterator[tuple[str, wp.array]]:
+    """Every array that a step or a reset reads from an earlier one, by name."""
+    simulator = environment.simulator
+    for name, packed in (("plant", simulator.plant), ("command", simulator.command)):
+        yield from ((f"{name}.{field}", array) for field, array in packed.fields.items())
+    yield from ((f"drawing.{name}", array) for name, array in environment.drawing.arrays())
+    for name, struct in (
+        ("state", simulator.state),
+        ("water", simulator.water),
+        ("task", environment.arrays),
+    ):
+        yield from _members(name, struct)
+    if environment.sensing is not None:
+        for name, struct in environment.sensing.arrays():
+            yield from _members(name, struct)
+
+
+def _members(prefix: str, struct: Any) -> Iterator[tuple[str, wp.array]]:
+    """The arrays of a Warp struct and of the structs in it; those of structs are left to the views of their fields."""
+    for name in struct._cls.vars:
+        value = getattr(struct, name)
+        if isinstance(value, wp.array):
+            if value.size and not hasattr(value.dtype, "numpy_dtype"):
+                yield f"{prefix}.{name}", value
+        elif hasattr(value, "_cls"):
+            yield from _members(f"{prefix}.{name}", value)
+
+
+# Levels of a task, taken one after the other: the next one when enough of the recent episodes succeeded.
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelPlan:
+    """When a level rises; the last one is the task's own."""
+
+    level_from: int = 0
+    """Level at the start."""
+    level_at: float = 0.8
+    """Share of successes at which it rises."""
+    level_episodes: int = 200
+    """Episodes that the share is taken over, or a few more: as many of each world. All begun at that level."""
+
+    def __post_init__(self) -> None:
+        if self.level_from < 0 or not 0.0 < self.level_at <= 1.0 or self.level_episodes < 1:
+            raise EnvironmentSetupError(
+                f"level_from is {self.level_from}, level_at {self.level_at}, level_episodes {self.level_episodes}: "
+                "expected 0 or more, above 0 to 1, and 1 or more"
+            )
+
+
+class Levels:
+    """Watches the episodes of an environment, and takes it to the next level when `rise` is called and it is time.
+
+    Attributes:
+        plan: When.
+        last: The level at which it ends.
+    """
+
+    def __init__(self, environment: Environment, plan: LevelPlan) -> None:
+        """Begin at the first level; running episodes, which began elsewhere, are not counted.
+
+        Raises:
+            EnvironmentSetupError: The task has no levels, or its own is below the first.
+        """
+        task: Any = environment.task
+        if not task.levels:
+            raise EnvironmentSetupError(f"task '{task.name}' has no levels: leave level_... out")
+        self.plan, self.last, self._environment = plan, int(task.level), environment
+        if "success" not in task.metrics(environment.arrays):
+            raise EnvironmentSetupError(
+                f"task '{task.name}' has no metric 'success', by which its levels rise"
+            )
+        if plan.level_from > self.last:
+            raise EnvironmentSetupError(
+                f"level_from is {plan.level_from}, expected at most the task's own level, {self.last}"
+            )
+        # As many of each world: of the first to end, most are successes, where these end an episode early.
+        each = math.ceil(plan.level_episodes / environment.worlds)
+        self._recent = np.full((environment.worlds, each), np.nan)
+        self._go(plan.level_from)
+
+    @property
+    def level(self) -> int:
+        """Where it is now."""
+        task: Any = self._environment.task
+        return int(task.level)
+
+    @property
+    def share(self) -> float:
+        """Of successes among the episodes counted so far; 0 before the first."""
+        counted = self._recent[~np.isnan(self._recent)]
+        return float(counted.mean()) if len(counted) else 0.0
+
+    def after_step(self) -> None:
+        """Count the episodes that ended in the step just done."""
+        e = self._environment
+        ended = (e.arrays.terminated.numpy() | e.arrays.truncated.numpy()) != 0
+        counted = ended & self._whole
+        if counted.any():
+            success = e.task.metrics(e.arrays)["success"]
+            self._recent[counted] = np.column_stack([self._recent[counted, 1:], success[counted]])
+        self._whole |= ended
+
+    def rise(self) -> None:
+        """Take the next level if enough episodes succeeded; those that run end by its rules, and are not counted."""
+        full = not np.isnan(self._recent).any()
+        if full and self.share >= self.plan.level_at and self.level < self.last:
+            self._go(self.level + 1)
+
+    def restart(self) -> None:
+        """Begin at the first level again."""
+        self._go(self.plan.level_from)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """What decides how it goes on."""
+        return {
+            "counters.level": np.array(self.level),
+            "counters.level_recent": self._recent.copy(),
+            "counters.level_whole": self._whole.copy(),
+        }
+
+    def load(self, saved: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from what `state` gave."""
+        if int(saved["counters.level"]) != self.level:
+            self._go(int(saved["counters.level"]))
+        self._recent = saved["counters.level_recent"].copy()
+        self._whole = saved["counters.level_whole"].copy()
+
+    def _go(self, level: int) -> None:
+        task: Any = self._environment.task
+        self._environment.change(replace(task, level=level))
+        self._recent[:] = np.nan
+        self._whole = np.zeros(self._environment.worlds, dtype=np.bool_)
+
+
+def climb(environment: Environment, plan: LevelPlan | None = None) -> Levels:
+    """Let an environment begin at a lower level and rise: at `set_progress`, which a training calls before each update.
+
+    Args:
+        environment: Its task is at the last level.
+        plan: When to rise.
+
+    Raises:
+        EnvironmentSetupError: See `Levels`.
+    """
+    environment.levels = Levels(environment, plan or LevelPlan())
+    return environment.levels

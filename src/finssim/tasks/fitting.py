@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.control.pole_placement import axis_model
+from finssim.control.pid import axis_model
 from finssim.engine import Pool
 from finssim.vehicles import HydrodynamicSet, Vehicle
 from finssim.vehicles.capability import terminal_speeds

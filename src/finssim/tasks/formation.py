@@ -17,9 +17,7 @@ from finssim.tasks.communication import (
     open_messages,
 )
 from finssim.tasks.given import EnvironmentSetupError
-from finssim.tasks.pursuit import OpenWater
-from finssim.tasks.pursuit_drive import slowest
-from finssim.tasks.pursuit_observation import OWN, PI, gap_to, mate, motion_of
+from finssim.tasks.pursuit import OWN, PI, OpenWater, gap_to, mate, motion_of, slowest
 from finssim.tasks.task import ObservationPart
 from finssim.tasks.team_pursuit import any_outside, bumps
 from finssim.tasks.terms import (

@@ -11,10 +11,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.control.errors import ControlError
-from finssim.control.guidance import Guide, Reference
+from finssim.control import ControlError
+from finssim.control.guidance import Guide, Measured, Reference, Track
 from finssim.control.policy_description import ObservationSchema
-from finssim.control.tracking import Measured, Track
 from finssim.engine.launch import Pipeline
 from finssim.engine.state import State
 from finssim.geometry.rotations import quat_from_yaw, quat_inverse_rotate, quat_rotate

@@ -4,12 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from finssim.engine.state import State
-from finssim.tasks.pursuit_drive import DriveNumbers
-from finssim.tasks.pursuit_observation import CHASE, prey_gap
-from finssim.tasks.pursuit_prey import Prey, command_prey, prey_speed
+from finssim.physics.types import vec6
+from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.communication import mate_position, mate_velocity
+from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.task import ObservationPart, Task
 from finssim.tasks.terms import (
     End,
@@ -19,11 +22,391 @@ from finssim.tasks.terms import (
     action_change,
     action_effort,
     level_direction,
+    linear_velocity,
+    measured_velocity,
     one,
     place_at_rest,
+    turn_rates,
     world_velocity,
 )
-from finssim.vehicles import Vehicle
+from finssim.vehicles import HydrodynamicSet, Vehicle
+from finssim.vehicles.capability import level_speed, terminal_speeds
+
+# Following a wanted velocity with a vehicle's own thrust: for vehicles that a script commands, and for baselines.
+
+
+Array = NDArray[Any]
+
+RATE = 1.2
+"""How fast an error of the velocity goes [1/s]: as fast as motors and a control step of 0.1 s allow."""
+YAW_RATE = 3.0
+"""The same of the yaw rate [1/s]: three times as fast as the heading, or the heading swings."""
+TURN = 1.0
+"""Yaw rate asked for at a heading error of 1 rad [1/s]."""
+MOST_TURN = 0.8
+"""Largest yaw rate asked for [rad/s]."""
+ROWS = [0, 1, 2, 5]
+"""Places in a wrench of the axes that these tasks need: surge, sway, heave, yaw."""
+
+
+@wp.func
+def drive(d: Any, q: wp.quat, nu: vec6, wanted: wp.vec4) -> wp.vec4:
+    """Action that brings the velocity to a wanted one.
+
+    tau = d1 v* + d2 |v*| v* + RATE m (v* - v) + (weight - buoyancy) up,  action = shared(tau / limit)
+
+    Args:
+        d: The vehicle's `DriveNumbers`.
+        q: Body to world.
+        nu: Velocity, body frame [m/s, rad/s].
+        wanted: v*: surge, sway, heave and yaw rate, body frame [m/s, rad/s].
+
+    Returns:
+        Parts of the limits on surge, sway, heave and yaw, each in [-1, 1].
+    """
+    v = wp.vec4(nu[0], nu[1], nu[2], nu[5])
+    up = wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
+    tau = d.sink * wp.vec4(up[0], up[1], up[2], 0.0)
+    a = wp.vec4()
+    for i in range(4):
+        tau[i] = tau[i] + (d.d1[i] + d.d2[i] * wp.abs(wanted[i])) * wanted[i]
+        tau[i] = tau[i] + wp.where(i == 3, YAW_RATE, RATE) * d.mass[i] * (wanted[i] - v[i])
+        a[i] = tau[i] / d.limit[i]
+    return shared(a)
+
+
+@wp.func
+def shared(a: wp.vec4) -> wp.vec4:
+    """Surge, sway and yaw limited together, for the same thrusters give them: yaw up to half, the others the rest."""
+    yaw = wp.clamp(a[3], -0.5, 0.5)
+    part = wp.min(1.0, (1.0 - wp.abs(yaw)) / wp.max(wp.abs(a[0]) + wp.abs(a[1]), 1.0e-6))
+    return wp.vec4(part * a[0], part * a[1], wp.clamp(a[2], -1.0, 1.0), yaw)
+
+
+@wp.func
+def towards(q: wp.quat, velocity: wp.vec3) -> wp.vec4:
+    """A velocity of the world as one of the body, with a yaw rate that turns the body's x axis along it.
+
+    Returns:
+        Surge, sway, heave and yaw rate [m/s, rad/s].
+    """
+    v = wp.quat_rotate_inv(q, velocity)
+    ahead = wp.quat_rotate_inv(q, wp.vec3(velocity[0], velocity[1], 0.0))
+    moving = ahead[0] * ahead[0] + ahead[1] * ahead[1] > 1.0e-8
+    error = wp.where(moving, wp.atan2(ahead[1], ahead[0]), 0.0)
+    return wp.vec4(v[0], v[1], v[2], wp.clamp(TURN * error, -MOST_TURN, MOST_TURN))
+
+
+@wp.func
+def write_scripted(arrays: TaskArrays, w: int, action: wp.vec4):
+    """Write the action of the only vehicle that the task commands, as wrench4 or as wrench6 without roll and pitch."""
+    size = arrays.scripted.shape[1]
+    for i in range(size):
+        arrays.scripted[w, i] = 0.0
+    for i in range(3):
+        arrays.scripted[w, i] = action[i]
+    arrays.scripted[w, size - 1] = action[3]
+
+
+@dataclass(frozen=True)
+class DriveNumbers:
+    """What following a velocity takes; rows are surge, sway, heave, yaw."""
+
+    d1: tuple[float, float, float, float]
+    """Linear damping [N s/m, N m s]."""
+    d2: tuple[float, float, float, float]
+    """Quadratic damping."""
+    mass: tuple[float, float, float, float]
+    """With added mass [kg, kg m²]."""
+    limit: tuple[float, float, float, float]
+    """Wrench of an action of 1 [N, N m]."""
+    terminal: tuple[float, float, float, float]
+    """Steady speed at the limit [m/s, rad/s]."""
+    sink: float
+    """Weight less buoyancy [N]."""
+    level: float
+    """Speed ahead up to which the vehicle's stiffness in pitch outweighs the Munk moment [m/s]; see `level_speed`."""
+
+    @property
+    def top(self) -> float:
+        """Speed ahead that the vehicle can hold, by thrust and without pitching over [m/s]."""
+        return min(self.terminal[0], self.level)
+
+    @classmethod
+    def of(cls, vehicle: Vehicle) -> "DriveNumbers":
+        """The numbers of a vehicle, from its first hydrodynamic set with coefficients.
+
+        Raises:
+            EnvironmentSetupError: It has no coefficients.
+        """
+        sets = [name for name, one in vehicle.hydrodynamics.items() if isinstance(one, HydrodynamicSet)]
+        if not sets:
+            raise EnvironmentSetupError(
+                f"vehicle '{vehicle.name}' has no damping coefficients, which pursuit and formation need: take another "
+                "vehicle"
+            )
+        hydro: Any = vehicle.hydrodynamics[sets[0]]
+        columns = (
+            np.diag(hydro.linear_damping), hydro.axis_drag, np.diag(vehicle.mass_matrix(sets[0])),
+            vehicle.wrench_limits, terminal_speeds(vehicle, sets[0]),
+        )  # fmt: skip
+        rows = (tuple(column[ROWS].tolist()) for column in columns)
+        return cls(*rows, sink=vehicle.weight - vehicle.buoyancy, level=level_speed(vehicle, sets[0]))
+
+    def action(self, velocity: Array, wanted: Array) -> NDArray[np.float32]:
+        """As `drive`, of a level vehicle.
+
+        Args:
+            velocity: Surge, sway, heave, yaw rate [m/s, rad/s], (n, 4).
+            wanted: The same, wanted.
+
+        Returns:
+            Parts of the limits on the four axes, (n, 4), each in [-1, 1].
+        """
+        d1, d2, mass, limit = (np.array(row) for row in (self.d1, self.d2, self.mass, self.limit))
+        rate = np.array([RATE, RATE, RATE, YAW_RATE])
+        tau = (d1 + d2 * np.abs(wanted)) * wanted + rate * mass * (wanted - velocity)
+        tau[:, 2] += self.sink
+        a = tau / limit
+        a[:, 2:] = np.clip(a[:, 2:], [-1.0, -0.5], [1.0, 0.5])
+        left = 1.0 - np.abs(a[:, 3])
+        a[:, :2] *= np.minimum(1.0, left / np.maximum(np.abs(a[:, :2]).sum(axis=1), 1e-6))[:, None]
+        return a.astype(np.float32)
+
+    def turned(self, error: Array) -> Array:
+        """Yaw rate that takes a heading error away [rad/s], from the error [rad]."""
+        return np.clip(TURN * error, -MOST_TURN, MOST_TURN)
+
+
+def slowest(vehicles: Sequence[Vehicle]) -> float:
+    """The smallest speed ahead that vehicles can hold [m/s]: what the speed of their prey is tied to."""
+    return min(DriveNumbers.of(vehicle).top for vehicle in vehicles)
+
+
+# What a pursuer sees of itself, of its prey and of its team-mates, all in its body frame.
+
+
+DISTANCE_SCALE = 6.0
+"""Distances are divided by this [m]."""
+REACH = 4.0
+"""Scaled distances are clipped here."""
+VELOCITY_CLIP = 4.0
+"""Velocities are clipped here [m/s, rad/s]."""
+PI = 3.14159265
+
+
+@wp.func
+def prey_gap(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """From agent a to the vehicle after the agents, body frame [m]."""
+    prey = arrays.agent_reward.shape[1]
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], arrays.position[w, prey] - arrays.position[w, a])
+
+
+@wp.func
+def prey_motion(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """Its velocity less the agent's own, body frame [m/s]."""
+    relative = measured_velocity(arrays, w, arrays.agent_reward.shape[1]) - measured_velocity(arrays, w, a)
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], relative)
+
+
+@wp.func
+def prey_distance(gap: wp.vec3) -> float:
+    """From the agent to the vehicle after the agents [m]."""
+    return wp.length(gap)
+
+
+@wp.func
+def prey_bearing(gap: wp.vec3) -> float:
+    """Positive to the left [rad]."""
+    return wp.atan2(gap[1], gap[0])
+
+
+@wp.func
+def gap_to(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
+    """From agent a to agent b, as far as a has heard, body frame of a [m]."""
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], mate_position(arrays, w, a, b) - arrays.position[w, a])
+
+
+@wp.func
+def motion_of(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
+    """Velocity of agent b less that of agent a, as far as a has heard, body frame of a [m/s]."""
+    relative = mate_velocity(arrays, w, a, b) - measured_velocity(arrays, w, a)
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], relative)
+
+
+OWN = (
+    ObservationPart("linear velocity, body frame", 3, "m/s", clip=VELOCITY_CLIP, term=linear_velocity),
+    ObservationPart("angular velocity, body frame", 3, "rad/s", clip=VELOCITY_CLIP, term=turn_rates),
+)
+"""6 numbers of oneself."""
+
+CHASE = (
+    *OWN,
+    ObservationPart("prey from here, body frame", 3, "m", DISTANCE_SCALE, REACH, term="gap"),
+    ObservationPart(
+        "prey's velocity less one's own, body frame", 3, "m/s", clip=VELOCITY_CLIP, term=prey_motion
+    ),
+    ObservationPart("distance to the prey", 1, "m", DISTANCE_SCALE, REACH, term=prey_distance),
+    ObservationPart("bearing of the prey, positive to the left", 1, "rad", PI, 1.0, term=prey_bearing),
+)
+"""14 numbers of one pursuer, for a task that shares `prey_gap` as `gap`."""
+
+
+def mate(k: int, gap: Any, motion: Any) -> tuple[ObservationPart, ...]:
+    """6 numbers of the k-th team-mate, by the terms that tell where it is and how it moves."""
+    moves = "team-mate's velocity less one's own, body frame"
+    return (
+        ObservationPart("team-mate from here, body frame", 3, "m", DISTANCE_SCALE, REACH, gap, k),
+        ObservationPart(moves, 3, "m/s", clip=VELOCITY_CLIP, term=motion, index=k),
+    )
+
+
+# The scripted prey: a vehicle that wanders, keeps straight on or flees, by its own thrusters, no faster than told.
+
+
+PREY_MODES = ("random", "straight", "hybrid", "line-of-sight", "mixed")
+"""What a prey does:
+
+random: a new direction and speed every few seconds. straight: one direction, drawn for the episode, at full speed.
+hybrid: flees from everybody near, askance, and wanders while nobody is. line-of-sight: flees straight away from the
+nearest, always. mixed: one of the four, drawn for the episode.
+"""
+
+RESERVE = 0.9
+"""A prey is never told to go faster than this part of the speed it can hold: the rest is for steering."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prey:
+    """The prey's behaviour. Its speed is a part of what the slowest pursuer can hold, never a number of its own."""
+
+    mode: str = "mixed"
+    """One of `PREY_MODES`."""
+    alarm: float = 3.0
+    """A hybrid prey flees from pursuers nearer than this [m]."""
+    retarget: float = 4.0
+    """Time between two draws of a direction, or of the side to flee to [s]."""
+    range: float = 9.0
+    """Distance from the origin at which it turns along the border [m]."""
+    low: float = -5.0
+    """It stays above this height ..."""
+    high: float = -1.0
+    """... and below this one [m]."""
+
+    def __post_init__(self) -> None:
+        if self.mode not in PREY_MODES:
+            raise EnvironmentSetupError(
+                f"unknown prey mode '{self.mode}'; available: {', '.join(PREY_MODES)}"
+            )
+        if not (self.retarget > 0.0 and self.range > 0.0 and self.low < self.high < 0.0):
+            raise EnvironmentSetupError(
+                f"prey: retarget is {self.retarget} s, range {self.range} m, heights {self.low} to {self.high} m; "
+                "expected times and ranges above 0 and heights below the surface, the lower one first"
+            )
+
+    @property
+    def kind(self) -> int:
+        """Number of the mode."""
+        return PREY_MODES.index(self.mode)
+
+
+def prey_speed(part: float, pursuers: Sequence[Vehicle], prey: Vehicle) -> float:
+    """Speed of a prey: `part` of what the slowest pursuer can hold, within what the prey itself can do [m/s]."""
+    if not 0.0 <= part <= 1.0:
+        raise EnvironmentSetupError(
+            f"prey_speed is {part}, expected 0 to 1: a part of the slowest pursuer's speed"
+        )
+    return min(part * slowest(pursuers), RESERVE * DriveNumbers.of(prey).top)
+
+
+@wp.func
+def most_climb(p: Any) -> float:
+    """Up or down [m/s]."""
+    return wp.min(0.5 * p.speed, RESERVE * p.prey_drive.terminal[2])
+
+
+@wp.func
+def wander(p: Any, key: int, w: int, draw: int) -> wp.vec3:
+    """Velocity of a random walk in its n-th stretch [m/s]."""
+    rng = wp.rand_init(wp.randi(wp.rand_init(key, 4 * w + 2)), draw)
+    direction = level_direction(wp.randf(rng, -3.14159265, 3.14159265))
+    pace = wp.randf(rng, 0.3, 1.0) * p.speed
+    return pace * direction + wp.vec3(0.0, 0.0, wp.randf(rng, -1.0, 1.0) * most_climb(p))
+
+
+@wp.func
+def flight(state: State, p: Any, pursuers: int, w: int, reach: float) -> wp.vec3:
+    """Away from all pursuers within reach, each weighted by 1/d²; zero where there is none."""
+    x = state.position[w, pursuers]
+    away = wp.vec3()
+    for a in range(pursuers):
+        gap = x - state.position[w, a]
+        d = wp.max(wp.length(gap), 1.0e-3)
+        if d < reach:
+            away += gap / (d * d * d)
+    return away
+
+
+@wp.func
+def nearest_pursuer(state: State, pursuers: int, w: int) -> float:
+    """Distance from the prey to the nearest pursuer [m]."""
+    x = state.position[w, pursuers]
+    d = wp.length(x - state.position[w, 0])
+    for a in range(1, pursuers):
+        d = wp.min(d, wp.length(x - state.position[w, a]))
+    return d
+
+
+@wp.func
+def kept_inside(p: Any, x: wp.vec3, v: wp.vec3) -> wp.vec3:
+    """The velocity without what leads out of the prey's range: it slides along the border, at the same speed."""
+    pace = wp.sqrt(v[0] * v[0] + v[1] * v[1])
+    r = wp.sqrt(x[0] * x[0] + x[1] * x[1])
+    out = wp.vec3(x[0], x[1], 0.0) / wp.max(r, 1.0e-6)
+    radial = v[0] * out[0] + v[1] * out[1]
+    kept = v
+    if r > p.prey.range and radial > 0.0:
+        around = wp.vec3(-out[1], out[0], 0.0)
+        side = wp.where(wp.dot(around, v) < 0.0, -1.0, 1.0)
+        kept = pace * wp.normalize(side * around - 0.2 * out) + wp.vec3(0.0, 0.0, v[2])
+    climb = wp.clamp(kept[2], -most_climb(p), most_climb(p))
+    climb = wp.where(x[2] > p.prey.high, -0.5 * most_climb(p), climb)
+    climb = wp.where(x[2] < p.prey.low, 0.5 * most_climb(p), climb)
+    return wp.vec3(kept[0], kept[1], climb)
+
+
+@wp.func
+def prey_velocity(state: State, p: Any, pursuers: int, key: int, w: int) -> wp.vec3:
+    """Velocity that the prey wants, world frame; its level part is no faster than `speed` [m/s]."""
+    pi = 3.14159265
+    rng = wp.rand_init(key, 4 * w + 3)
+    heading = wp.randf(rng, -pi, pi)
+    mode = wp.where(p.prey.kind == 4, wp.randi(rng, 0, 4), p.prey.kind)
+    draw = int(float(state.steps[w]) * p.control_step / p.prey.retarget + 1.0e-4)
+    v = wander(p, key, w, draw)
+    if mode == 1:
+        v = p.speed * level_direction(heading)
+    if mode == 3:
+        v = flight(state, p, pursuers, w, nearest_pursuer(state, pursuers, w) * 1.0001 + 1.0e-3)
+    if mode == 2:
+        away = flight(state, p, pursuers, w, p.prey.alarm)
+        if wp.length(away) > 0.0:
+            turn = wp.where(wp.randf(wp.rand_init(key + draw, 4 * w + 1)) < 0.5, -0.6, 0.6)
+            v = wp.quat_rotate(wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), turn), away)
+    if mode >= 2 and (mode == 3 or nearest_pursuer(state, pursuers, w) < p.prey.alarm):
+        pace = wp.sqrt(v[0] * v[0] + v[1] * v[1])
+        v = v * (p.speed / wp.max(pace, 1.0e-6))
+    return kept_inside(p, state.position[w, pursuers], v)
+
+
+@wp.func
+def command_prey(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
+    """Write the action of the prey, which is the vehicle after the pursuers; it sees the truth."""
+    pursuers = arrays.agent_reward.shape[1]
+    q = state.quaternion[w, pursuers]
+    wanted = towards(q, prey_velocity(state, p, pursuers, key + 7, w))
+    write_scripted(arrays, w, drive(p.prey_drive, q, state.velocity[w, pursuers], wanted))
+
 
 DISTANCE_SLOPE = 8.0
 """The distance costs its full weight here and beyond [m]."""

@@ -31,7 +31,7 @@ from finssim.sensors import SensorSuite
 from finssim.sensors.depth import DepthArrays, DepthParameters
 from finssim.sensors.dvl import DvlArrays, DvlParameters
 from finssim.sensors.imu import ImuArrays, ImuParameters
-from finssim.sensors.noise import (
+from finssim.sensors.sampling import (
     DROPOUT,
     TURN_ON,
     TURN_ON_2,
@@ -39,11 +39,12 @@ from finssim.sensors.noise import (
     WALK_2,
     WHITE,
     WHITE_2,
+    Sampling,
     normal,
     normal3,
     sample_key,
+    samples_until,
 )
-from finssim.sensors.sampling import Sampling, samples_until
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.measurement import LONGEST_DELAY, MeasurementNoise

@@ -1,8 +1,14 @@
 """What a task is: what is seen, done and paid for, as terms, and how long an episode takes."""
 
-from collections.abc import Sequence
+import hashlib
+import inspect
+import itertools
+import linecache
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
-from typing import Any, ClassVar, NamedTuple
+from functools import cache
+from types import UnionType
+from typing import Any, ClassVar, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import warp as wp
@@ -13,10 +19,12 @@ from finssim.engine import Dock, Pool
 from finssim.engine.launch import Pipeline
 from finssim.engine.state import State
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.kernels import kernels_of, settings_of
+from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.measurement import MeasurementNoise
-from finssim.tasks.terms import Terms
+from finssim.tasks.terms import Terms, close_episode, open_episode, remember_actions, report_frozen
 from finssim.vehicles import Vehicle
+
+__all__ = ["Kernels", "kernels_of", "settings_of"]
 
 
 @dataclass(frozen=True)
@@ -199,3 +207,395 @@ class Task:
         """What each reward and each end added to the return of the episode that ended last, (worlds,) by name."""
         columns = arrays.final_earned.numpy()
         return {name: np.array(columns[:, i], dtype=np.float64) for i, name in enumerate(self.earnings)}
+
+
+# The kernels of a task, written from its terms; and the struct of its settings that they take.
+#
+# Each stage of an episode is one kernel for all tasks but for the terms that it calls: what every task does at the
+# start, in each step and at the end of an episode stands here once. A term is called by the names of its arguments:
+#
+#     state   the truth                           a     number of the agent; a reward without it is the team's
+#     arrays  what is measured, wanted, counted   k     the index given with the term
+#     p       the task's settings                 key   of an episode's draws, at its start
+#     w       number of the world                 seed  of all draws
+#
+# and after a step any of the task's totals by its name, as it was before, `was` for the total's own, and `held`: the
+# time within the tolerance of success without a break [s]; and whatever the task shares between its terms, by name.
+
+
+APART = ("name", "observation", "training_noise", "communication")
+"""Fields of a task that its kernels do not take."""
+VECTORS = {
+    (float, 2): wp.vec2, (float, 3): wp.vec3, (float, 4): wp.vec4,
+    (int, 2): wp.vec2i, (int, 3): wp.vec3i, (int, 4): wp.vec4i,
+}  # fmt: skip
+"""What a tuple of so many numbers is in a kernel."""
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """The stages of a task's episodes, each over worlds."""
+
+    evaluate: wp.Kernel
+    """(state, arrays, p, weights, world_offset), after each step."""
+    spawn: wp.Kernel
+    """(state, arrays, p, seed, mask, world_offset), where an episode starts."""
+    observe: wp.Kernel
+    """(arrays, p, mask, world_offset), its first observation."""
+    command: wp.Kernel | None
+    """(state, arrays, p, seed, world_offset), before each step, of a task with vehicles of its own."""
+    weights: Any
+    """Type of the vector of reward weights: of the terms, then of the ends."""
+
+
+_made: dict[tuple[Any, ...], Kernels] = {}
+
+
+def kernels_of(task: Task) -> Kernels:
+    """The kernels of a task; of equal terms the same.
+
+    Raises:
+        EnvironmentSetupError: A term takes what there is not.
+    """
+    writer = _Writer(task)
+    text = writer.text()
+    key = (task.settings_class(), text, tuple(writer.functions.values()))
+    if key not in _made:
+        _made[key] = _compiled(task, text, writer.functions)
+    return _made[key]
+
+
+class _Writer:
+    """Writes the source of a task's kernels."""
+
+    def __init__(self, task: Task) -> None:
+        self.task, self.terms = task, task.terms()
+        self.functions: dict[str, Any] = {}
+        """Name in the source -> function."""
+        self._totals = {name: i for i, name in enumerate(task.totals)}
+        self._agents = len(task.agents)
+
+    def text(self) -> str:
+        """All of it."""
+        return "\n\n".join([self._look(), self._evaluate(), self._spawn(), self._observe(), self._command()])
+
+    def _call(self, function: Any, what: str, **known: str) -> str:
+        """A call of a term, with what it takes by name."""
+        if isinstance(function, str):
+            if function not in known:
+                raise EnvironmentSetupError(
+                    f"task '{self.task.name}': {what} is '{function}', which it does not share"
+                )
+            return known[function]
+        known = {"arrays": "arrays", "p": "p", "w": "w", "a": "a" if self._agents > 1 else "0"} | known
+        taken = []
+        for name in inspect.signature(function.func).parameters:
+            if name not in known:
+                raise EnvironmentSetupError(
+                    f"task '{self.task.name}': {what} ({function.key}) takes '{name}', expected of: "
+                    f"{', '.join(known)}"
+                )
+            taken.append(known[name])
+        own = next(
+            (n for n, f in self.functions.items() if f is function), f"t{len(self.functions)}_{function.key}"
+        )
+        self.functions[own] = function
+        return f"{own}({', '.join(taken)})"
+
+    def _stepped(self) -> dict[str, str]:
+        """What a term after a step may take besides."""
+        return {"state": "state", **{name: f"arrays.totals[w, {i}]" for name, i in self._totals.items()}}
+
+    def _shared(
+        self, functions: Mapping[str, Any], known: dict[str, str]
+    ) -> tuple[list[str], dict[str, str]]:
+        """Lines that compute what terms share, and what is known with it."""
+        lines, known = [], dict(known)
+        for name, function in functions.items():
+            lines.append(f"s_{name} = {self._call(function, f'shared {name!r}', **known)}")
+            known[name] = f"s_{name}"
+        return lines, known
+
+    def _look(self) -> str:
+        writes, first, size = [], 0, self.task.observation_size
+        values, seen = self._shared(self.terms.seen, {})
+        for i, part in enumerate(self.task.observation if self.terms.shown else ()):
+            at = f"a * {size} + {first}" if self._agents > 1 else str(first)
+            value = self._call(part.term, f"observation '{part.name}'", **seen, k=str(part.index))
+            number = f"x{i}" if part.size == 1 else f"x{i}[i]"
+            if part.scale != 1.0:
+                number = f"{number} / {float(part.scale)!r}"
+            if part.clip is not None:
+                number = f"wp.clamp({number}, {-float(part.clip)!r}, {float(part.clip)!r})"
+            values.append(f"x{i} = {value}")
+            if part.size == 1:
+                writes.append(f"arrays.observation[w, {at}] = {number}")
+            else:
+                writes += [f"for i in range({part.size}):", f"    arrays.observation[w, {at} + i] = {number}"]
+            first += part.size
+        return _function("look(arrays: TaskArrays, p: P, w: int)", self._each([*values, *writes]) or ["pass"])
+
+    def _each(self, lines: Sequence[str]) -> list[str]:
+        """Lines for every agent."""
+        if self._agents == 1 or not lines:
+            return list(lines)
+        return [f"for a in range({self._agents}):", *(f"    {line}" for line in lines)]
+
+    def _evaluate(self) -> str:
+        """All terms are computed before anything is written, so that the compiler does what they share only once."""
+        terms = self.terms
+        inside = "False"
+        lines = [
+            "w = world_offset + wp.tid()",
+            "if state.frozen[w] != 0:",
+            "    report_frozen(state, arrays, w)",
+            "    return",
+            "t = float(state.steps[w]) * p.control_step",
+            "arrays.time[w] = t",
+        ]
+        if terms.advance is not None:
+            lines.append(self._call(terms.advance, "advance", **self._stepped()))
+        shared, known = self._shared(terms.shared, self._stepped())
+        lines += shared
+        if terms.inside is not None:
+            inside = self._call(terms.inside, "inside", **known)
+        known["held"] = "held"
+        lines += [f"held = wp.where({inside}, arrays.held[w] + p.control_step, 0.0)", "ended = bool(False)"]
+        for i, end in enumerate(terms.ends):
+            lines += [
+                f"e{i} = {self._call(end.term, f'end {end.name!r}', **known)} and not ended",
+                f"ended = ended or e{i}",
+            ]
+        counts, counted = self._counts(known)
+        lines += [
+            "late = t >= p.time_limit - 0.5 * p.control_step",
+            *counts,
+            *self._rewards(known),
+            *counted,
+            "arrays.held[w] = held",
+            "arrays.terminated[w] = wp.where(ended, 1, 0)",
+            "arrays.truncated[w] = wp.where(late and not ended, 1, 0)",
+            "arrays.done[w] = wp.where(ended or late, 1, 0)",
+            "arrays.episode_return[w] = arrays.episode_return[w] + reward",
+            "remember_actions(arrays, w)",
+            "look(arrays, p, w)",
+            "if ended or late:",
+            "    close_episode(state, arrays, w)",
+        ]
+        return _function(
+            "evaluate(state: State, arrays: TaskArrays, p: P, weights: W, world_offset: int)", lines
+        )
+
+    def _rewards(self, known: Mapping[str, str]) -> list[str]:
+        """Every term once, for all agents or for each; what they add up to, and each by itself over the episode."""
+        shared, own, names, each = [], [], [], []
+        for i, term in enumerate(self.terms.rewards):
+            names.append(f"r{i}")
+            line = f"r{i} = weights[{i}] * {self._call(term.term, f'reward {term.name!r}', **known)}"
+            takes = () if isinstance(term.term, str) else inspect.signature(term.term.func).parameters
+            each.append(self._agents > 1 and "a" in takes)
+            (own if each[i] else shared).append(line)
+        for i, _ in enumerate(self.terms.ends):
+            names.append(f"r{len(names)}")
+            each.append(False)
+            shared.append(f"{names[-1]} = weights[{len(names) - 1}] * wp.where(e{i}, 1.0, 0.0)")
+        whole = " + ".join(names) or "0.0"
+        kept = [
+            f"arrays.earned[w, {i}] = arrays.earned[w, {i}] + "
+            + (f"m{i} / {float(self._agents)!r}" if of else name)
+            for i, (name, of) in enumerate(zip(names, each, strict=True))
+        ]
+        if self._agents == 1:
+            return [*shared, f"reward = {whole}", *kept, "arrays.reward[w] = reward"]
+        sums = [i for i, of in enumerate(each) if of]
+        zeros = [f"m{i} = float(0.0)" for i in sums]
+        loop = [
+            *own,
+            f"total = {whole}",
+            *(f"m{i} += r{i}" for i in sums),
+            "arrays.agent_reward[w, a] = total",
+            f"reward += total / {float(self._agents)!r}",
+        ]
+        begin = [*shared, *zeros, "reward = float(0.0)"]
+        return [*begin, *self._each(loop), *kept, "arrays.reward[w] = reward"]
+
+    def _counts(self, known: Mapping[str, str]) -> tuple[list[str], list[str]]:
+        """The totals, each from what all were before; then how they are written."""
+        values, writes, totals = [], [], self._totals
+        if self.task.succeeds == "once":
+            success, time = totals["success"], totals["success_time"]
+            writes += [
+                f"if held >= p.hold - 0.5 * p.control_step and arrays.totals[w, {success}] == 0.0:",
+                f"    arrays.totals[w, {success}] = 1.0",
+                f"    arrays.totals[w, {time}] = t",
+            ]
+        for i, total in enumerate(self.terms.totals):
+            place = totals[total.name]
+            own = {"was": f"arrays.totals[w, {place}]", "k": str(total.index)}
+            values.append(f"n{i} = {self._call(total.term, f'total {total.name!r}', **known, **own)}")
+            writes.append(f"arrays.totals[w, {place}] = n{i}")
+        for i, end in enumerate(self.terms.ends):
+            if end.name in totals:
+                writes.append(f"arrays.totals[w, {totals[end.name]}] = wp.where(e{i}, 1.0, 0.0)")
+        return values, writes
+
+    def _spawn(self) -> str:
+        known = {"state": "state", "seed": "seed", "key": "key"}
+        lines = [
+            "w = world_offset + wp.tid()",
+            "if mask[w] == 0:",
+            "    return",
+            "key = seed + 15485863 * state.episode[w]",
+            "open_episode(arrays, w)",
+            self._call(self.terms.start, "start", **known),
+        ]
+        if not all(isinstance(total.first, int | float) for total in self.terms.totals):
+            shared, known = self._shared(self.terms.shared, known)
+            lines += shared
+        for total in self.terms.totals:
+            first = total.first
+            if first != 0.0:
+                value = repr(float(first)) if isinstance(first, int | float) else self._call(
+                    first, f"first of total {total.name!r}", **known
+                )  # fmt: skip
+                lines.append(f"arrays.totals[w, {self._totals[total.name]}] = {value}")
+        head = (
+            "state: State, arrays: TaskArrays, p: P, seed: int, mask: wp.array(dtype=int), world_offset: int"
+        )
+        return _function(f"spawn({head})", lines)
+
+    def _observe(self) -> str:
+        begin = [] if self.terms.begin is None else [f"    {self._call(self.terms.begin, 'begin')}"]
+        lines = ["w = world_offset + wp.tid()", "if mask[w] != 0:", *begin, "    look(arrays, p, w)"]
+        return _function(
+            "observe(arrays: TaskArrays, p: P, mask: wp.array(dtype=int), world_offset: int)", lines
+        )
+
+    def _command(self) -> str:
+        if self.terms.command is None:
+            return ""
+        known = {"state": "state", "seed": "seed", "key": "(seed + 15485863 * state.episode[w])"}
+        lines = ["w = world_offset + wp.tid()", self._call(self.terms.command, "command", **known)]
+        return _function(
+            "command(state: State, arrays: TaskArrays, p: P, seed: int, world_offset: int)", lines
+        )
+
+
+def _function(head: str, lines: Sequence[str]) -> str:
+    return "\n".join([f"def {head}:", *(f"    {line}" for line in lines)]) + "\n"
+
+
+_numbers = itertools.count()
+
+
+def _compiled(task: Task, text: str, functions: Mapping[str, Any]) -> Kernels:
+    """Kernels of a source, in a module of Warp's of their own."""
+    kind = task.settings_class()
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
+    name = f"{kind.__module__}.{kind.__qualname__}_{digest}"
+    if any(
+        kernels.evaluate.module.name == name for kernels in _made.values()
+    ):  # other functions of the same names
+        name = f"{name}_{next(_numbers)}"
+    place = f"<kernels of {name}>"
+    linecache.cache[place] = (len(text), None, text.splitlines(keepends=True), place)  # Warp reads the source
+    terms = task.terms()
+    W = wp.types.vector(length=max(len(terms.rewards) + len(terms.ends), 1), dtype=float)
+    space: dict[str, Any] = {
+        "__name__": name, "wp": wp, "State": State, "TaskArrays": TaskArrays, "P": _struct(kind), "W": W,
+        "open_episode": open_episode, "close_episode": close_episode, "report_frozen": report_frozen,
+        "remember_actions": remember_actions, **functions,
+    }  # fmt: skip
+    exec(compile(text, place, "exec"), space)
+    module = wp.get_module(name)
+    space["look"] = wp.func(space["look"], module=module)
+    made: list[wp.Kernel] = [
+        wp.kernel(space[stage], enable_backward=False, module=module)
+        for stage in ("evaluate", "spawn", "observe", "command")
+        if stage in space
+    ]
+    return Kernels(made[0], made[1], made[2], made[3] if len(made) > 3 else None, W)
+
+
+def settings_of(task: Task) -> Any:
+    """The struct of a task's settings: its numbers, those of its parts, and what follows from them.
+
+    Every field and property with an annotation of float, int, bool, a tuple of two to four of these, or a dataclass of
+    such, under its own name.
+
+    Raises:
+        EnvironmentSetupError: It is not fitted to vehicles.
+    """
+    return _filled(task, task.settings_class(), f"task '{task.name}'")
+
+
+def _filled(one: Any, of: type, whose: str) -> Any:
+    kind = _struct(of)
+    out = kind()
+    for name, hint in _numbers_of(of).items():
+        value = getattr(one, name)
+        if is_dataclass(hint):
+            if value is None:
+                raise EnvironmentSetupError(f"{whose} is not fitted to vehicles: call fitted([...]) first")
+            value = _filled(value, type(value), whose)
+        elif isinstance(value, tuple):
+            value = kind.vars[name].type(*value)
+        setattr(out, name, value)
+    return out
+
+
+@cache
+def _struct(kind: type) -> Any:
+    """Warp's struct of a dataclass."""
+    types = {name: _warp_type(hint) for name, hint in _numbers_of(kind).items()}
+    made = type(kind.__name__, (), {"__annotations__": types, "__module__": kind.__module__})
+    # Classes of one name that functions make are not one class.
+    made.__qualname__ = f"{kind.__qualname__}Settings" + (
+        str(next(_numbers)) if "<" in kind.__qualname__ else ""
+    )
+    return wp.struct(made)
+
+
+def _warp_type(hint: Any) -> Any:
+    if is_dataclass(hint):
+        return _struct(hint)  # type: ignore[arg-type]
+    parts = get_args(hint)
+    return VECTORS[parts[0], len(parts)] if parts else hint
+
+
+@cache
+def _numbers_of(kind: type) -> dict[str, Any]:
+    """Names and types of what kernels can take of a dataclass."""
+
+    hints = _hints(kind)
+    found = {one.name: hints.get(one.name) for one in fields(kind) if one.name not in APART}
+    for name, value in inspect.getmembers(kind, lambda one: isinstance(one, property)):
+        if not hasattr(Task, name) and value.fget is not None:
+            found[name] = _return_type(value.fget)
+    taken = {name: _number(hint) for name, hint in found.items()}
+    return {name: hint for name, hint in taken.items() if hint is not None}
+
+
+def _hints(one: Any) -> dict[str, Any]:
+    """Annotations of a class or function; none where they name what is imported for type checkers alone."""
+    try:
+        return get_type_hints(one)
+    except NameError:
+        return {}
+
+
+def _return_type(function: Callable[..., Any]) -> Any:
+    return _hints(function).get("return")
+
+
+def _number(hint: Any) -> Any:
+    """The type, of a dataclass also where it may be None; None where kernels cannot take it."""
+    if get_origin(hint) in (Union, UnionType):
+        rest = [one for one in get_args(hint) if one is not type(None)]
+        return rest[0] if len(rest) == 1 and is_dataclass(rest[0]) and _numbers_of(rest[0]) else None
+    if hint in (float, int, bool):
+        return hint
+    if get_origin(hint) is tuple:
+        parts = get_args(hint)
+        return hint if len(set(parts)) == 1 and (parts[0], len(parts)) in VECTORS else None
+    return hint if isinstance(hint, type) and is_dataclass(hint) and _numbers_of(hint) else None

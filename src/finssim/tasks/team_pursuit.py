@@ -16,10 +16,21 @@ from finssim.tasks.communication import (
     open_messages,
 )
 from finssim.tasks.given import EnvironmentSetupError
-from finssim.tasks.pursuit import OpenWater, outside, prey_start
-from finssim.tasks.pursuit_drive import DriveNumbers
-from finssim.tasks.pursuit_observation import CHASE, gap_to, mate, motion_of, prey_gap
-from finssim.tasks.pursuit_prey import Prey, command_prey, nearest_pursuer, prey_speed
+from finssim.tasks.pursuit import (
+    CHASE,
+    DriveNumbers,
+    OpenWater,
+    Prey,
+    command_prey,
+    gap_to,
+    mate,
+    motion_of,
+    nearest_pursuer,
+    outside,
+    prey_gap,
+    prey_speed,
+    prey_start,
+)
 from finssim.tasks.task import ObservationPart
 from finssim.tasks.terms import (
     End,

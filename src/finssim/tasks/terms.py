@@ -1,6 +1,6 @@
 """Terms: small functions of which a task is made, each with a name; and those that tasks share.
 
-A term is a `wp.func` whose arguments are told by their names; see `finssim.tasks.kernels`. What a policy sees comes
+A term is a `wp.func` whose arguments are told by their names; see `finssim.tasks.task`. What a policy sees comes
 from `arrays`, which holds what is measured; what it is paid for and how an episode ends comes from `state`, the truth.
 """
 

@@ -13,12 +13,14 @@ from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.fitting import Fit, fit
 from finssim.tasks.measurement import MeasurementNoise
 from finssim.tasks.reference import (
+    SHAPE_NAMES,
+    fill_reference,
+    greatest_rate,
     reference_position,
     reference_progress,
     reference_table,
     reference_velocity,
 )
-from finssim.tasks.reference_shapes import SHAPE_NAMES, fill_reference, greatest_rate
 from finssim.tasks.task import ObservationPart, Task
 from finssim.tasks.terms import (
     End,

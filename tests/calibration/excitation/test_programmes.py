@@ -7,7 +7,7 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation.programmes import programmes, which_axes
 from finssim.calibration.excitation.recording import record
 from finssim.calibration.trials.trial import PHASES
-from finssim.control.allocator import Allocator
+from finssim.control.allocation import Allocator
 from finssim.vehicles import AXES, load_vehicle
 
 FINSROV = load_vehicle("finsrov")

@@ -12,8 +12,7 @@ import random
 import struct
 import time
 
-from finssim.robot.link.decoder import HOST, MCU, Decoder
-from finssim.robot.link.frames import DebugConfig
+from finssim.robot.link.frames import HOST, MCU, DebugConfig, Decoder
 from robot.link import wire
 from robot.link.test_frames import COMMAND, ECHO, TELEMETRY
 

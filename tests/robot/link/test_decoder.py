@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from finssim.robot.link.decoder import HOST, MCU, Decoder
-from finssim.robot.link.frames import DebugConfig
+from finssim.robot.link.frames import HOST, MCU, DebugConfig, Decoder
 from robot.link import wire
 from robot.link.test_frames import COMMAND, ECHO, TELEMETRY
 

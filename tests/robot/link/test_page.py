@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from finssim.robot.link.frames import LAYOUTS, RejectFlag, StatusFlag, encode_command
-from finssim.robot.link.layout import Layout, forms
+from finssim.robot.link.frames import LAYOUTS, Layout, RejectFlag, StatusFlag, encode_command, forms
 from robot.link import wire
 from robot.link.test_frames import COMMAND
 

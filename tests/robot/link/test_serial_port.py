@@ -5,11 +5,8 @@ import select
 
 import pytest
 
-from finssim.robot.link.decoder import MCU, Decoder
-from finssim.robot.link.frames import encode_command, encode_telemetry
-from finssim.robot.link.layout import LinkError
-from finssim.robot.link.serial_port import SerialTransport
-from finssim.robot.link.transports import open_transport
+from finssim.robot.link.frames import MCU, Decoder, LinkError, encode_command, encode_telemetry
+from finssim.robot.link.transports import SerialTransport, open_transport
 from robot.link import wire
 from robot.link.test_frames import COMMAND, TELEMETRY
 

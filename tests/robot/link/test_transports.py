@@ -6,10 +6,8 @@ import socket
 
 import pytest
 
-from finssim.robot.link.frames import encode_command, encode_telemetry
-from finssim.robot.link.layout import LinkError
-from finssim.robot.link.transports import DryRun, memory_pair, open_transport
-from finssim.robot.link.udp import UdpTransport
+from finssim.robot.link.frames import LinkError, encode_command, encode_telemetry
+from finssim.robot.link.transports import DryRun, UdpTransport, memory_pair, open_transport
 from robot.link.test_frames import COMMAND, TELEMETRY
 
 LOCAL = "127.0.0.1"

@@ -24,7 +24,7 @@ from finssim.calibration.errors import CalibrationError
 from finssim.vehicles import Esc
 from finssim.vehicles.thruster import Thruster
 
-__all__ = ["Bench", "SIDES", "bench", "fit_esc"]
+__all__ = ["SIDES", "Bench", "bench", "fit_esc"]
 
 # The law between pulse width, battery voltage and shaft speed, fitted to tables.
 

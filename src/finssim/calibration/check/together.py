@@ -9,7 +9,7 @@ import numpy as np
 from finssim.calibration.check.report import PARAMETERS, Finding, TrialReport
 from finssim.vehicles import AXES
 
-__all__ = ["told_by", "together"]
+__all__ = ["together", "told_by"]
 
 
 LATE = 0.03

@@ -15,7 +15,7 @@ from finssim.calibration.excitation.programmes import Programme, programmes
 from finssim.calibration.excitation.synthetic import simulate_programme
 from finssim.calibration.trials.columns import TAU
 from finssim.calibration.trials.trial_files import write_trial
-from finssim.control.allocator import Allocator
+from finssim.control.allocation import Allocator
 from finssim.files import atomic_directory, atomic_write
 from finssim.quiet import start_warp
 from finssim.vehicles import Vehicle, load_vehicle

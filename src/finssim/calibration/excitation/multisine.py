@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation.programmes import RATE, Programme
 from finssim.calibration.excitation.travel import within
-from finssim.control.allocator import Allocator
+from finssim.control.allocation import Allocator
 from finssim.quiet import start_warp
 from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.vehicle import Axis

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation.programmes import Programme
-from finssim.control.allocator import Allocator
+from finssim.control.allocation import Allocator
 from finssim.engine import Pool, Simulator, TetherLine, Water
 from finssim.geometry.rotations import quat_from_euler
 from finssim.physics.plant import DERIVED
@@ -64,7 +64,7 @@ def record(
 
     Args:
         programmes: What to run, W of them.
-        vehicle: The vehicle; its thrusters are commanded by the allocator of `finssim.control.allocator`.
+        vehicle: The vehicle; its thrusters are commanded by the allocator of `finssim.control.allocation`.
         seed: Of the initial conditions.
         hydrodynamics: Key of the vehicle's hydrodynamic sets.
         plant: Where the real plant differs from the file: field of `VehicleParameters` -> value, or one for each world.

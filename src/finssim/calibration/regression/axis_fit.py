@@ -17,7 +17,7 @@ from finssim.calibration.regression.robust import bounded, huber_weights
 from finssim.calibration.regression.rows import Kernel, Rows, Signals, simulated_columns
 from finssim.calibration.uncertainty import Covariance, Evidence, correlated_samples, trial_covariance
 
-__all__ = ["AxisData", "AxisFit", "TERMS", "fit_axis", "informative"]
+__all__ = ["TERMS", "AxisData", "AxisFit", "fit_axis", "informative"]
 
 # Sums over the rows of each trial, and the instrumental-variable estimate that follows from them.
 

@@ -25,7 +25,7 @@ from finssim.calibration.motion.signals import Motion
 from finssim.calibration.regression.plant_terms import Matrices, known_wrench, unit_wrenches
 from finssim.calibration.regression.robust import local_outliers
 
-__all__ = ["Kernel", "Rows", "Signals", "axis_rows", "kernel", "simulated_columns", "signals"]
+__all__ = ["Kernel", "Rows", "Signals", "axis_rows", "kernel", "signals", "simulated_columns"]
 
 Array = NDArray[np.float64]
 

@@ -31,7 +31,14 @@ from finssim.geometry.optics import Lens, OpticsError
 from finssim.geometry.rotations import skew
 
 __all__ = [
-    "COLUMNS", "CameraFit", "MODELS", "ROWS", "adjust", "calibrate_camera", "evidence", "lens_names",
+    "COLUMNS",
+    "MODELS",
+    "ROWS",
+    "CameraFit",
+    "adjust",
+    "calibrate_camera",
+    "evidence",
+    "lens_names",
     "lens_vector",
 ]  # fmt: skip
 

@@ -23,7 +23,7 @@ from finssim.calibration.vision.survey import Observations
 from finssim.geometry.optics import Camera, Interface, Lens
 from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_to_matrix
 
-__all__ = ["Found", "RobustPixels", "UP", "prior_of", "search"]
+__all__ = ["UP", "Found", "RobustPixels", "prior_of", "search"]
 
 Array = NDArray[np.float64]
 

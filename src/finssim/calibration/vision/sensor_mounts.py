@@ -26,8 +26,19 @@ from finssim.geometry.rotations import (
 )
 
 __all__ = [
-    "Attitude", "DepthFit", "Gyro", "ImuMounting", "SALT", "UNSURE_TURN", "fit_depth", "fit_imu_mounting",
-    "imu_clock", "level_from_rest", "rotation_between", "turn_pairs", "turn_residual",
+    "SALT",
+    "UNSURE_TURN",
+    "Attitude",
+    "DepthFit",
+    "Gyro",
+    "ImuMounting",
+    "fit_depth",
+    "fit_imu_mounting",
+    "imu_clock",
+    "level_from_rest",
+    "rotation_between",
+    "turn_pairs",
+    "turn_residual",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]

@@ -39,8 +39,20 @@ from finssim.geometry.rotations import (
 from finssim.localization.pool import Pool
 
 __all__ = [
-    "AXES", "Moment", "MountFit", "MountState", "Noise", "Rig", "UNSURE_LENGTH", "change", "fit_mounts",
-    "moment_blocks", "moved", "reference_tag", "residuals", "start_state",
+    "AXES",
+    "UNSURE_LENGTH",
+    "Moment",
+    "MountFit",
+    "MountState",
+    "Noise",
+    "Rig",
+    "change",
+    "fit_mounts",
+    "moment_blocks",
+    "moved",
+    "reference_tag",
+    "residuals",
+    "start_state",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]

@@ -17,7 +17,7 @@ from finssim.localization.detection.detections import Detection
 from finssim.localization.detection.families import FAMILIES, bitmap, family_named
 from finssim.localization.errors import LocalizationError
 
-__all__ = ["Detector", "LIBRARIES", "Library", "Region", "detector", "fit_tag"]
+__all__ = ["LIBRARIES", "Detector", "Library", "Region", "detector", "fit_tag"]
 
 # A tag as it should look in a picture, and how its gray changes as it moves, blurs or brightens.
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from finssim.localization.detection.detections import Detection
 
-__all__ = ["REFINEMENTS", "find", "family_table"]
+__all__ = ["REFINEMENTS", "family_table", "find"]
 
 Image = npt.NDArray[np.uint8]
 

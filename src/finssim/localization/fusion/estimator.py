@@ -44,7 +44,7 @@ from finssim.localization.fusion.streams import (
 from finssim.localization.fusion.timeline import Surroundings, Timeline
 from finssim.localization.poses.measurement import axes_of_up
 
-__all__ = ["Estimator", "MODELS", "Model"]
+__all__ = ["MODELS", "Estimator", "Model"]
 
 # Fusion with the IMU's acceleration: the error-state filter behind the same gates, states and timings.
 

@@ -21,11 +21,11 @@ from finssim.localization.poses.pose_refinement import RefinedPose, See, refine_
 from finssim.localization.poses.pose_start import mirrored, tag_poses
 
 __all__ = [
-    "Constraints",
     "METHODS",
+    "NEEDS_DEPTH",
+    "Constraints",
     "Measurement",
     "Method",
-    "NEEDS_DEPTH",
     "pinhole",
     "pinhole_depth",
     "refractive_bundle",

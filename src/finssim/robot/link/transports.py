@@ -2,15 +2,286 @@
 
 from __future__ import annotations
 
-from collections import deque
-from typing import Protocol
+import logging
+import os
+import socket
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Any, Protocol
 from urllib.parse import parse_qs, urlsplit
 
-from finssim.robot.link.layout import LinkError
-from finssim.robot.link.serial_port import SerialTransport
-from finssim.robot.link.udp import UdpTransport
+from finssim.robot.link.frames import LinkError
 
-__all__ = ["DEFAULT_BIND", "DryRun", "MemoryTransport", "Transport", "memory_pair", "open_transport"]
+__all__ = [
+    "DEFAULT_BIND",
+    "DryRun",
+    "MemoryTransport",
+    "SerialTransport",
+    "Transport",
+    "UdpTransport",
+    "memory_pair",
+    "open_transport",
+]
+
+
+# The wire as UDP datagrams, to and from one peer alone.
+
+
+Address = tuple[str, int]
+
+_LOG = logging.getLogger("finssim.robot.link")
+_DATAGRAM = 2048
+"""Bytes taken of a datagram; a longer one is cut, and its CRC no longer fits."""
+_DATAGRAMS_AT_ONCE = 1024
+"""Datagrams taken by one call, so that a flood cannot hold the loop up."""
+_NAMED = 64
+"""Refused senders that are told apart; those beyond are counted together."""
+
+
+class UdpTransport:
+    """Datagrams with one peer; those of any other address or port are refused, counted and named once in the log.
+
+    Note:
+        `refused` counts by sender, `send_errors` the frames that could not leave (nobody listens, network down).
+    """
+
+    def __init__(self, bind: Address, peer: Address) -> None:
+        """Args:
+            bind: Address and port of this end; port 0 takes a free one (see `address`).
+            peer: Host and port of the motor controller; the name is looked up once.
+
+        Raises:
+            LinkError: An address cannot be found, bound, or reached from `bind`.
+        """
+        self.peer = _resolved(peer)
+        if self.peer[0] == "0.0.0.0" or not self.peer[1]:
+            raise LinkError(
+                f"peer {peer[0]}:{peer[1]} is not one address and port: give those of the vehicle"
+            )
+        here = _resolved(bind)
+        if here[0].startswith("127.") and not self.peer[0].startswith("127."):
+            raise LinkError(
+                f"{peer[0]}:{peer[1]} is on another machine and this end is bound to {here[0]}, which only this "
+                "machine reaches: bind the address that this machine has on the vehicle's network"
+            )
+        self.refused: Counter[Address | None] = Counter()
+        self.send_errors = 0
+        self._send_problem = ""
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        try:
+            self._socket.bind(here)
+        except OSError as problem:
+            self._socket.close()
+            raise LinkError(
+                f"cannot bind {here[0]}:{here[1]} ({problem.strerror}): end the program that has it, or bind another"
+            ) from None
+        self.address: Address = self._socket.getsockname()
+
+    def send(self, data: bytes) -> None:
+        """Send one datagram to the peer; one that cannot leave is counted."""
+        try:
+            self._socket.sendto(data, self.peer)
+            self._send_problem = ""
+        except OSError as problem:
+            self.send_errors += 1
+            if str(problem) != self._send_problem:
+                self._send_problem = str(problem)
+                _LOG.warning("nothing leaves for %s: %s", _name(self.peer), problem)
+
+    def receive(self) -> list[bytes]:
+        """Datagrams of the peer, oldest first; at most 1024 are looked at in one call."""
+        found: list[bytes] = []
+        for _ in range(_DATAGRAMS_AT_ONCE):
+            try:
+                data, sender = self._socket.recvfrom(_DATAGRAM)
+            except BlockingIOError:
+                break
+            except ConnectionError:  # how some systems tell that an earlier datagram found nobody
+                continue
+            except OSError:  # closed
+                break
+            if sender == self.peer:
+                found.append(data)
+            else:
+                self._refuse(sender)
+        return found
+
+    def _refuse(self, sender: Address) -> None:
+        key = sender if sender in self.refused or len(self.refused) < _NAMED else None
+        if key not in self.refused:
+            _LOG.warning(
+                "refused a datagram from %s: this end listens to %s alone",
+                _name(key) if key else "yet another sender, the last one named",
+                _name(self.peer),
+            )
+        self.refused[key] += 1
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+    def describe(self) -> str:
+        """Both ends, and what went wrong so far."""
+        text = f"udp {_name(self.address)} to {_name(self.peer)}"
+        text += f", {self.send_errors} frames could not leave" if self.send_errors else ""
+        return text + (f", {sum(self.refused.values())} datagrams of others refused" if self.refused else "")
+
+
+def _resolved(address: Address) -> Address:
+    """IPv4 address of a host name."""
+    try:
+        (*_, found), *_ = socket.getaddrinfo(*address, family=socket.AF_INET, type=socket.SOCK_DGRAM)
+    except OSError as problem:
+        raise LinkError(
+            f"{address[0]}: no such host ({problem.strerror}): give a name or an IPv4 address"
+        ) from None
+    return str(found[0]), int(found[1])
+
+
+def _name(address: Address) -> str:
+    return f"{address[0]}:{address[1]}"
+
+
+# The wire as a serial line, which may be unplugged and plugged in again.
+
+
+_BYTES_AT_ONCE = 65536
+"""Bytes taken by one call."""
+
+
+class SerialTransport:
+    """8N1 without flow control, opened for this program alone; a lost device is tried again every second.
+
+    Note:
+        `send_errors` counts frames that found no line, `reconnects` how often it came back.
+    """
+
+    def __init__(
+        self,
+        device: str,
+        baud: int = 115200,
+        *,
+        retry: float = 1.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Args:
+            device: Path or name as the operating system has it.
+            baud: Bits a second.
+            retry: Time between attempts to open a lost device [s].
+            clock: Tells the time for it [s].
+
+        Raises:
+            LinkError: The device cannot be opened now.
+        """
+        self.device, self.baud, self.retry = device, baud, retry
+        self.send_errors, self.reconnects = 0, 0
+        self._clock, self._next_try, self._closed = clock, 0.0, False
+        self._port: Any = None
+        try:
+            self._port = _opened(device, baud)
+        except LinkError:
+            raise
+        except _problems(ValueError) as problem:
+            raise LinkError(
+                f"serial:{device}: cannot be opened at {baud} baud ({problem}): check the cable, the name, "
+                "your right to use it and that no other program does"
+            ) from None
+
+    def send(self, data: bytes) -> None:
+        """Write one frame; without a line, or on one that is stuck, it is counted and dropped."""
+        if not self._ready():
+            self.send_errors += 1
+            return
+        try:
+            if _written(self._port, data) < len(data):
+                self._forget_waiting()
+        except BlockingIOError:
+            self._forget_waiting()
+        except _problems() as problem:
+            self.send_errors += 1
+            self._lose(problem)
+
+    def receive(self) -> list[bytes]:
+        """What has come, as one piece or none; opens a lost device again when it is time."""
+        if not self._ready():
+            return []
+        try:
+            data = bytes(self._port.read(_BYTES_AT_ONCE))
+        except _problems() as problem:
+            self._lose(problem)
+            return []
+        return [data] if data else []
+
+    def close(self) -> None:
+        """Close the device for good."""
+        self._closed = True
+        self._drop()
+
+    def describe(self) -> str:
+        """Device, speed and whether it is there."""
+        state = "closed" if self._closed else "connected" if self._port else "not connected"
+        return f"serial {self.device} at {self.baud} baud, {state}"
+
+    def _ready(self) -> bool:
+        """Whether there is a line, after an attempt to open it if one is due."""
+        now = self._clock()
+        if self._port is None and not self._closed and now >= self._next_try:
+            self._next_try = now + self.retry
+            try:
+                self._port = _opened(self.device, self.baud)
+            except _problems():
+                return False
+            self.reconnects += 1
+            _LOG.warning("serial %s: is back", self.device)
+        return self._port is not None
+
+    def _forget_waiting(self) -> None:
+        """Drop what a stuck line has not taken: by the time that it moves again those commands are old."""
+        self.send_errors += 1
+        try:
+            self._port.reset_output_buffer()
+        except _problems() as problem:
+            self._lose(problem)
+
+    def _lose(self, problem: BaseException) -> None:
+        _LOG.warning("serial %s: lost (%s); trying again every %g s", self.device, problem, self.retry)
+        self._next_try = self._clock() + self.retry
+        self._drop()
+
+    def _drop(self) -> None:
+        port, self._port = self._port, None
+        if port is not None:
+            try:
+                port.close()
+            except _problems() as problem:
+                _LOG.debug("serial %s: closing a lost device: %s", self.device, problem)
+
+
+def _opened(device: str, baud: int) -> Any:
+    try:
+        import serial
+    except ImportError:
+        raise LinkError(
+            f"serial:{device}: needs pyserial, which is not installed: pip install 'finssim[hardware]'"
+        ) from None
+    return serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
+
+
+def _problems(*more: type[Exception]) -> tuple[type[Exception], ...]:
+    """What a lost device raises: `termios.error` is no OSError, and other systems have none."""
+    try:
+        from termios import error
+    except ImportError:
+        return (OSError, *more)
+    return (OSError, error, *more)
+
+
+def _written(port: Any, data: bytes) -> int:
+    """Bytes that the line took at once; pyserial's own `write` waits on POSIX, whatever its timeout."""
+    return os.write(port.fileno(), data) if os.name == "posix" else int(port.write(data))
+
 
 DEFAULT_BIND = "127.0.0.1:54321"
 """Address of the robot's own end."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from finssim.localization.pool import load_pool
 from finssim.robot.messages import Picture
-from finssim.robot.picture_source import DEFAULT_CAMERA, DEFAULT_PICTURES, open_pictures
+from finssim.robot.pictures import DEFAULT_CAMERA, DEFAULT_PICTURES, open_pictures
 from finssim.ros2.nodes.robot_node import RobotNode
 
 __all__ = ["Camera"]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
 from finssim.control.guidance import Guide, Station
 from finssim.geometry.rotations import quat_yaw
 from finssim.robot.goals import GoalError, check_reachable, guide_of

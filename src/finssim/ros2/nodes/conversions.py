@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
 from finssim.control.guidance import Station
-from finssim.control.trajectories import Trajectory
-from finssim.control.trajectory_file import through_points
+from finssim.control.trajectories import Trajectory, through_points
 from finssim.geometry.rotations import quat_yaw
 from finssim.robot.messages import (
     HEADING,
@@ -25,8 +24,8 @@ from finssim.robot.messages import (
     TagCorners,
     Telemetry,
 )
+from finssim.robot.pictures import picture_of
 from finssim.robot.record_messages import FIRST_TIME, LAST_TIME, UNKNOWN
-from finssim.robot.record_pictures import picture_of
 from finssim.robot.robot import Reading
 
 __all__ = [

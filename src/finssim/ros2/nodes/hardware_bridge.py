@@ -8,14 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from finssim.robot.bridge import Bridge
-from finssim.robot.bridge_settings import BridgeSettings
-from finssim.robot.counters import Counters
-from finssim.robot.intake import Intake
+from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.link.frames import encode_command
 from finssim.robot.link.transports import DEFAULT_BIND, open_transport
 from finssim.robot.messages import CommandEcho, NavigationAid, Telemetry
-from finssim.robot.unlocated import Unlocated
+from finssim.robot.perception import Unlocated
+from finssim.robot.runtime import Counters, Intake
 from finssim.robot.wiring import POOL_ADDRESS
 from finssim.ros2.nodes.bridge_topics import BridgeTopics
 from finssim.ros2.nodes.robot_node import RobotNode
@@ -45,7 +43,7 @@ class HardwareBridge(RobotNode):
         self.event("start", self.transport.describe())
 
     def telemetry(self, now: float, telemetry: Telemetry, time: float) -> None:
-        """Publish a snapshot, as `robot.intake` gives it to a recorder; stamps are of the measurement.
+        """Publish a snapshot, as `robot.runtime.Intake` gives it to a recorder; stamps are of the measurement.
 
         Args:
             now: When it came [s].

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from finssim.control.controllers import CONTROLLERS
-from finssim.control.errors import ControlError
-from finssim.control.guidance import Guide
+from finssim.control import ControlError
+from finssim.control.guidance import Guide, Measured
+from finssim.control.pid import CONTROLLERS
 from finssim.control.policy_description import NETWORK_FILE
-from finssim.control.tracking import Measured
 from finssim.control.trim import Trim
 from finssim.robot.pilots import AgentPilot, ModeSwitch, WrenchPilot, make_pilot
 from finssim.robot.runtime import Runtime

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from finssim.robot.events import Event
+from finssim.robot.bridge import Event
 from finssim.robot.messages import Telemetry, ThrusterCommand
 from finssim.robot.record_messages import STATES
 from finssim.robot.robot import Reading
@@ -69,7 +69,7 @@ class RemoteState:
             node: That hears it.
             oldest: Age at which a reading may not be acted on any more [s].
         """
-        # `robot.intake` wants to know the frames of a motor controller; here none comes.
+        # `robot.runtime.Intake` wants to know the frames of a motor controller; here none comes.
         self.vehicle = node.vehicle if node.vehicle.mcu else SimpleNamespace(mcu=SimpleNamespace(outputs=8))
         self._oldest = oldest
         nothing = np.full(3, math.nan), np.array([0.0, 0.0, 0.0, 1.0]), np.full(6, math.nan)

@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from finssim.localization.pool import Pool
 from finssim.robot.messages import Picture
+from finssim.robot.pictures import jpeg
 from finssim.robot.record_messages import MAP, Messages, floats
-from finssim.robot.record_pictures import jpeg
 from finssim.vehicles import Vehicle
 
 __all__ = ["OPTICAL", "RosMessages", "ros_type"]

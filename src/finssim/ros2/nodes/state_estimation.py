@@ -11,8 +11,8 @@ import numpy as np
 from finssim.localization.fusion.health import Health
 from finssim.localization.pool import load_pool
 from finssim.robot.goals import place_of
-from finssim.robot.intake import USED
 from finssim.robot.perception import Perception
+from finssim.robot.runtime import USED
 from finssim.ros2.nodes.conversions import aid_of, telemetry_of
 from finssim.ros2.nodes.fix_frame import FixFrame
 from finssim.ros2.nodes.frames import Frames

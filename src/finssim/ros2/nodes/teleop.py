@@ -6,9 +6,8 @@ import sys
 from contextlib import ExitStack
 from typing import Any
 
-from finssim.robot.gamepad import XBOX
-from finssim.robot.operator import Device, Operator
-from finssim.robot.teleop import Hands, TeleopError
+from finssim.robot.teleop import Device, Hands, Operator, TeleopError
+from finssim.robot.teleop_devices import XBOX
 from finssim.ros2.nodes.remote import RemoteBridge
 from finssim.ros2.nodes.robot_node import RobotNode
 from finssim.ros2.nodes.ros_messages import ros_type
@@ -41,13 +40,13 @@ class Teleop(RobotNode):
             )
             return device
         if name == "gamepad":
-            from finssim.robot.gamepad import Gamepad
+            from finssim.robot.teleop_devices import Gamepad
 
             return self._stack.enter_context(Gamepad())
         if name == "keyboard":
-            from finssim.robot.keyboard import HELP, Keyboard
+            from finssim.robot.teleop_devices import KEYBOARD_HELP, Keyboard
 
-            print(HELP, file=sys.stderr)
+            print(KEYBOARD_HELP, file=sys.stderr)
             return self._stack.enter_context(Keyboard())
         raise TeleopError(f"unknown device '{name}': expected joy, gamepad or keyboard")
 

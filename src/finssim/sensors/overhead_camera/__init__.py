@@ -1,7 +1,6 @@
 """What a fixed camera above a pool sees: tags, tiles and bodies through a flat or rippling surface."""
 
-from finssim.sensors.overhead_camera.neighbourhood import Rectangle
-from finssim.sensors.overhead_camera.render import OverheadCamera, render
+from finssim.sensors.overhead_camera.render import OverheadCamera, Rectangle, render
 from finssim.sensors.overhead_camera.scene import (
     Basin,
     Body,

@@ -18,8 +18,8 @@ from finssim.files import plain_name
 from finssim.localization.pool import Pool, load_pool
 from finssim.pool.truth import Truth, read_truth
 from finssim.robot.messages import TagCorners
+from finssim.robot.pictures import picture_of
 from finssim.robot.record_messages import STATES
-from finssim.robot.record_pictures import picture_of
 from finssim.robot.record_reader import Record, open_record
 from finssim.vehicles import Vehicle, VehicleError, catalogue_vehicle, load_vehicle
 from finssim.viewer.frame import Curve, Frame, Picture, Stage, ViewError

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from finssim.control.allocator import Allocator
-from finssim.control.errors import ControlError
+from finssim.control import ControlError
+from finssim.control.allocation import Allocator
 from finssim.control.guidance import Station
-from finssim.robot.programme_pilot import ProgrammePilot
+from finssim.experiments.excitation import ProgrammePilot
 from finssim.vehicles import load_vehicle
 
 VEHICLE = load_vehicle("finsrov")

@@ -1,0 +1,524 @@
+"""`finssim experiment soak` and `timing`, and what they share with `faults`: the processes of a robot and its pool."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from finssim.experiments.campaign import Say, choice, write_json
+from finssim.experiments.pool_trial import stand_in_pool
+from finssim.pool import TruthError, VirtualPool, read_truth
+from finssim.provenance import provenance
+from finssim.robot.goals import station_of
+from finssim.robot.lockstep import run_lockstep
+from finssim.robot.pilots import make_pilot
+from finssim.robot.runtime import Runtime
+from finssim.vehicles import load_vehicle
+
+__all__ = [
+    "Pair",
+    "Process",
+    "ReliabilityError",
+    "await_flush",
+    "await_thrust",
+    "pair",
+    "print_soak",
+    "print_timing",
+    "soak",
+    "timing",
+]
+
+
+# The processes of a robot and its virtual pool: started as a person starts them, watched, and killed.
+
+
+STARTING = 120.0
+"""Longest time that a process takes to start, or to do what is waited for [s]."""
+POLL = 0.005
+"""Between looks [s]."""
+
+
+class ReliabilityError(ValueError):
+    """A trial could not be made: what it needs did not come about."""
+
+
+class Process:
+    """A `finssim` command in a process of its own, its words kept in files."""
+
+    def __init__(self, words: Sequence[str], folder: Path, name: str) -> None:
+        """
+        Args:
+            words: Of the command line, after `finssim`.
+            folder: Takes NAME.out and NAME.err.
+            name: Of its files.
+        """
+        self.name = name
+        self._out, self._err = folder / f"{name}.out", folder / f"{name}.err"
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        with self._out.open("wb") as out, self._err.open("wb") as err:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "finssim", *words], stdout=out, stderr=err, env=environment
+            )
+
+    @property
+    def said(self) -> str:
+        """Standard output so far."""
+        return self._out.read_text(encoding="utf-8", errors="replace")
+
+    @property
+    def complained(self) -> str:
+        """Standard error so far."""
+        return self._err.read_text(encoding="utf-8", errors="replace")
+
+    @property
+    def running(self) -> bool:
+        """Whether it is there."""
+        return self._process.poll() is None
+
+    def kill(self) -> None:
+        """As `kill -9`."""
+        self._process.kill()
+        self._process.wait()
+
+    def end(self) -> int:
+        """As Ctrl-C, and not as gently where that is not heard; returns the exit status."""
+        if self.running:
+            self._process.send_signal(signal.SIGINT)
+        try:
+            return self._process.wait(20.0)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            return self._process.returncode
+
+    def broke(self) -> str:
+        """What broke through to the person who started it; nothing if it ended as it should."""
+        lines = self.complained.splitlines()
+        if any(line.startswith("Traceback") for line in lines) or self._process.returncode == 1:
+            return f"{self.name}: {lines[-1] if lines else 'exit status 1'}"
+        return ""
+
+
+@contextmanager
+def start(words: Sequence[str], folder: Path, name: str) -> Iterator[Process]:
+    """A process that does not outlive the block; arguments as of `Process`."""
+    process = Process(words, folder, name)
+    try:
+        yield process
+    finally:
+        if process.running:
+            process.kill()
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A robot in a pool, each in a process of its own."""
+
+    pool: Process
+    robot: Process
+    port: int
+    """Of the motor controller."""
+
+
+@contextmanager
+def pair(
+    folder: Path, vehicle: str, goal: str, *, pool: Sequence[str], robot: Sequence[str]
+) -> Iterator[Pair]:
+    """Both at work on free ports, the robot armed.
+
+    Args:
+        folder: Takes what they say, and the pool's file.
+        vehicle: Name or file.
+        goal: As `finssim run` takes it.
+        pool: Further words of `finssim pool`.
+        robot: Further words of `finssim run`.
+
+    Raises:
+        ReliabilityError: The pool never stood.
+    """
+    port, peer = free_ports()
+    end, both = f"127.0.0.1:{peer}", ["--vehicle", vehicle, "--pool-file", str(folder / "pool.yaml")]
+    world = ["pool", *both, "--port", str(port), "--robot", end, *pool]
+    ours = ["run", *both, "--goal", goal, "--arm", "--json", "--bind", end, *robot]
+    wires = ["--robot", f"udp://127.0.0.1:{port}", "--pictures", f"udp://127.0.0.1:{port + 1}"]
+    with start(world, folder, "pool") as first:
+        await_line("pictures: ", first)
+        with start([*ours, *wires], folder, "robot") as second:
+            yield Pair(first, second, port)
+
+
+def await_line(text: str, process: Process) -> None:
+    """Wait until a process has said something.
+
+    Raises:
+        ReliabilityError: It ended, or took too long.
+    """
+    deadline = time.monotonic() + STARTING
+    while text not in process.said:
+        if not process.running or time.monotonic() > deadline:
+            raise ReliabilityError(
+                f"{process.name} never said '{text}': {process.complained.strip()[-300:] or 'no error'}"
+            )
+        time.sleep(10.0 * POLL)
+
+
+def await_thrust(truth: Path, bound: float, process: Process) -> None:
+    """Wait until the thrusters of a pool turn, as its truth file tells.
+
+    Raises:
+        ReliabilityError: They never do, or the process that should turn them has ended.
+    """
+    deadline = time.monotonic() + STARTING
+    while True:
+        try:
+            if abs(read_truth(truth).thrust[-50:]).max(initial=0.0) > bound:
+                return
+        except TruthError:
+            pass  # not begun yet
+        if not process.running or time.monotonic() > deadline:
+            why = (process.complained + process.said).strip()[-300:] or "it said nothing"
+            raise ReliabilityError(f"no thruster ever turned: {process.name}: {why}")
+        time.sleep(20.0 * POLL)
+
+
+def await_flush(truth: Path) -> float:
+    """Wait for the next piece of a truth file that grows; returns the pool's clock then [s].
+
+    The pool writes half a second at a time, so that the last record is as old as one look takes.
+    """
+    size, deadline = truth.stat().st_size, time.monotonic() + STARTING
+    while truth.stat().st_size == size:
+        if time.monotonic() > deadline:
+            raise ReliabilityError(f"{truth} does not grow: the pool stands still")
+        time.sleep(POLL)
+    return float(read_truth(truth).time[-1])
+
+
+def free_ports() -> tuple[int, int]:
+    """Ports of the pool's and of the robot's end; the two after the first and the one after the second are free too."""
+    for _ in range(100):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(("127.0.0.1", 0))
+            first = probe.getsockname()[1]
+        wanted = [first + k for k in range(6)]
+        if wanted[-1] < 65536 and all(map(_free, wanted)):
+            return first, first + 4
+    raise ReliabilityError("no six free ports in a row on this machine: end some programs")
+
+
+def _free(port: int) -> bool:
+    try:
+        for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM):
+            with socket.socket(socket.AF_INET, kind) as probe:
+                probe.bind(("127.0.0.1", port))
+    except OSError:
+        return False
+    return True
+
+
+# `finssim experiment soak`: the robot's whole software at work for hours of vehicle time, its memory watched.
+
+
+Array = NDArray[np.float64]
+
+SAMPLED = 10.0
+"""Vehicle time between two samples [s]."""
+WARM = 0.25
+"""The first part of a run does not count: caches fill [-]."""
+FLAT = 1.0
+"""Memory is flat if it grows by less in an hour of vehicle time [MiB/h]; 20 MiB in 20 hours."""
+GOAL = "0,0,-0.5,0"
+HEADS = ("vehicle_s", "wall_s", "memory_mib", "error_m", "state")
+
+
+def soak(
+    *,
+    out: Path,
+    hours: Annotated[float, (0.001, None)] = 20.0,
+    seed: int = 1,
+    severity: str = "realistic",
+    vehicle: str = "finsrov",
+    say: Say = lambda part, what: None,
+) -> dict[str, Any]:
+    """Keep a station for hours in lock-step and watch the memory [MiB]. Ctrl-C ends it with what is known until then.
+
+    Exit status 3: the memory grew, or the bridge stopped the vehicle.
+
+    Example: finssim experiment soak --hours 20 --out soak
+
+    Args:
+        out (DIR): Directory for the result and the samples.
+        hours: Vehicle time to keep a station [h].
+        seed: Seed of every random number; equal seeds give equal results.
+        severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        say: Told the share that is done and how it goes.
+
+    Returns:
+        What `soak.json` holds: `verdict`, `slope_mib_per_h`, first and last memory [MiB], errors [m], and totals.
+    """
+    duration, folder = 3600.0 * hours, Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    body, station = load_vehicle(vehicle), station_of(GOAL)
+    pool, site = stand_in_pool(body, station, plant=seed, severity=severity, seed=seed)
+    runtime = Runtime(body, site, make_pilot("pid", body), station, arm=True)
+    began = time.perf_counter()
+    with (folder / "soak.csv").open("w", newline="", encoding="utf-8") as file:
+        samples = _Samples(file, pool, lambda t, words: say(min(t / duration, 1.0), words))
+        run_lockstep(
+            runtime, pool, duration, gentle=True, show=samples, until=lambda r: r.bridge.state == "fault"
+        )
+    took = time.perf_counter() - began
+    rows = np.array([row[:4] for row in samples.rows], float)
+    result = {
+        "experiment": "soak",
+        "vehicle_h": pool.time / 3600.0,
+        "wall_s": took,
+        "times_real_time": pool.time / took,
+        **verdict(rows[:, 0], rows[:, 2]),
+        "error_rms_m": float(np.sqrt(np.mean(rows[1:, 3] ** 2))) if len(rows) > 1 else None,
+        "error_max_m": float(rows[1:, 3].max()) if len(rows) > 1 else None,
+        "faults": [event.text for event in runtime.counters.events if event.kind == "fault"],
+        "missed_decisions": runtime.counters.missed,
+        "decisions": runtime.counters.decisions,
+        "fixes": runtime.counters.fixes,
+        "severity": severity,
+        "seed": seed,
+        "provenance": provenance(),
+    }
+    result["ok"] = result["verdict"] != "grows" and not result["faults"]
+    write_json(folder / "soak.json", result)
+    return result
+
+
+def verdict(vehicle_s: Array, memory: Array) -> dict[str, Any]:
+    """Whether memory is flat: its slope over all but the warm-up, by least squares.
+
+    Args:
+        vehicle_s: Time of each sample [s], (k,).
+        memory: [MiB], (k,).
+
+    Returns:
+        `verdict`: flat, grows, or too short to tell; `slope_mib_per_h`, None if too short; `first_mib`, `last_mib`.
+    """
+    kept = vehicle_s >= vehicle_s[-1] * WARM
+    ends = {"first_mib": float(memory[0]), "last_mib": float(memory[-1])}
+    if kept.sum() < 10:
+        return {"verdict": "too short to tell", "slope_mib_per_h": None, **ends}
+    slope = 3600.0 * float(np.polyfit(vehicle_s[kept], memory[kept], 1)[0])
+    return {"verdict": "flat" if slope < FLAT else "grows", "slope_mib_per_h": slope, **ends}
+
+
+def memory_mib() -> float:
+    """Memory of this process that is in use now [MiB]; the most it ever was where the system tells no more."""
+    try:
+        # Not statm, which on a machine of many processors may be tens of MiB behind.
+        told = Path("/proc/self/smaps_rollup").read_text(encoding="ascii")
+        return int(re.search(r"^Rss:\s+(\d+) kB", told, re.MULTILINE)[1]) / 1024.0  # type: ignore[index]
+    except OSError:
+        import resource
+
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+class _Samples:
+    """A row of the table for every so much of vehicle time."""
+
+    def __init__(self, file: Any, pool: VirtualPool, say: Any) -> None:
+        self.rows: list[tuple[float, float, float, float, str]] = []
+        self._file, self._writer, self._pool, self._say = file, csv.writer(file), pool, say
+        self._began, self._next = time.perf_counter(), 0.0
+        self._writer.writerow(HEADS)
+
+    def __call__(self, runtime: Runtime) -> None:
+        if self._pool.time >= self._next:
+            self._next += SAMPLED
+            self._sample(runtime)
+
+    def _sample(self, runtime: Runtime) -> None:
+        goal = runtime.guide.at(0.0).position
+        error = float(np.linalg.norm(self._pool.plant.position - goal))
+        wall = time.perf_counter() - self._began
+        row = (self._pool.time, wall, memory_mib(), error, runtime.bridge.state)
+        self.rows.append(row)
+        self._writer.writerow([f"{value:.4f}" if isinstance(value, float) else value for value in row])
+        self._file.flush()
+        self._say(row[0], f"{row[0] / 3600.0:.2f} h, {row[2]:.1f} MiB, {row[4]}")
+
+
+def print_soak(result: Mapping[str, Any], console: Console) -> None:
+    """Print what came out."""
+    slope = result["slope_mib_per_h"]
+    grown = "" if slope is None else f", {slope:+.2f} MiB per hour of vehicle time"
+    rms = result["error_rms_m"]
+    lines = [
+        f"{result['vehicle_h']:.2f} h of vehicle time in {result['wall_s'] / 60.0:.1f} min, "
+        f"{result['times_real_time']:.1f} times real time",
+        f"memory: {result['verdict']}{grown}; {result['first_mib']:.1f} MiB at the start, "
+        f"{result['last_mib']:.1f} at the end",
+        f"off the station: rms {math.nan if rms is None else 100.0 * rms:.1f} cm; "
+        f"faults: {'; '.join(result['faults']) or 'none'}; "
+        f"decisions missed: {result['missed_decisions']} of {result['decisions']}",
+    ]
+    for line in lines:
+        console.print(line, highlight=False, soft_wrap=True)
+
+
+# `finssim experiment timing`: does the robot keep its times on this machine, and how fast does lock-step go?
+
+
+CAMERAS = ("pictures", "corners")
+STATION = "0,0,-0.5,0"
+LATENCY_LIMIT = 0.060
+"""What the newest picture may have been here when the command that it decided leaves, 99 of 100 times [s]."""
+SPEED_LIMITS = {"corners": 20.0, "pictures": 2.0}
+"""Lock-step: at least so many times real time."""
+TRIED = {"corners": 60.0, "pictures": 10.0}
+"""Vehicle time over which lock-step is timed [s]."""
+WARM_UP = 3.0
+"""Before it [s]."""
+PATIENCE = 120.0
+"""How long a run may take beyond its time, to start and to end [s]."""
+
+
+def timing(
+    *,
+    out: Path,
+    minutes: Annotated[float, (0.05, None)] = 10.0,
+    camera: str = "pictures",
+    policy: str = "pid",
+    seed: int = 1,
+    vehicle: str = "finsrov",
+    say: Say = lambda part, what: None,
+) -> dict[str, Any]:
+    """Time the robot beside its pool on this machine: decisions missed, picture to command [ms], lock-step speed.
+
+    Example: finssim experiment timing --minutes 10 --out timing
+
+    Args:
+        out (DIR): Directory for the result.
+        minutes: Of the run in real time [min].
+        camera (MODE): corners (projected through the rippling water, with noise), or pictures (drawn, and searched for
+            tags: several times slower).
+        policy (DIR|pid|pid-paper): A policy's directory, or pid, or pid-paper.
+        seed: Seed of every random number; equal seeds give equal results.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        say: Told the share that is done and what comes next.
+
+    Returns:
+        What `timing.json` holds: `realtime` (what the robot told at the end, and what the pool said), `lockstep` (times
+        real time by camera), `reached` (each figure against its limit).
+
+    Raises:
+        ReliabilityError: An unknown camera, or a process that did not start or end.
+    """
+    choice(CAMERAS, camera, "camera", ReliabilityError)
+    lockstep = {}
+    for k, mode in enumerate(CAMERAS):
+        say(0.1 * k, f"lock-step, {mode}")
+        lockstep[mode] = lockstep_speed(vehicle, mode, seed=seed, policy=policy)  # type: ignore[arg-type]
+    realtime = _realtime(60.0 * minutes, camera, policy, seed, vehicle, say)
+    told = realtime["robot"]
+    p99 = told["latency_s"]["p99"]
+    result = {
+        "experiment": "timing",
+        "camera": camera,
+        "policy": policy,
+        "minutes": minutes,
+        "processors": os.cpu_count(),
+        "load": os.getloadavg()[0],
+        "realtime": realtime,
+        "lockstep": lockstep,
+        "reached": {
+            "no decision missed": told["missed"] == 0 and told["state"] == "armed",
+            "picture to command, p99": p99 is not None and p99 <= LATENCY_LIMIT,
+            **{f"lock-step, {mode}": lockstep[mode] >= limit for mode, limit in SPEED_LIMITS.items()},
+        },
+        "provenance": provenance(),
+    }
+    write_json(Path(out) / "timing.json", result)
+    return result
+
+
+def lockstep_speed(
+    vehicle: str,
+    camera: Literal["pictures", "corners"],
+    *,
+    seed: int = 1,
+    policy: str = "pid",
+    duration: float | None = None,
+) -> float:
+    """How many times real time the robot's whole software and its pool go together, in this process.
+
+    Args:
+        vehicle: Name or file.
+        camera: pictures or corners.
+        seed: Of the pool.
+        policy: Who steers.
+        duration: Vehicle time [s]; long enough for the camera if None.
+    """
+    body, station = load_vehicle(vehicle), station_of(STATION)
+    pool, site = stand_in_pool(body, station, plant=seed, severity="realistic", seed=seed, camera=camera)
+    runtime = Runtime(body, site, make_pilot(policy, body), station, arm=True)
+    run_lockstep(runtime, pool, WARM_UP)
+    before, began = pool.time, time.perf_counter()
+    run_lockstep(runtime, pool, duration or TRIED[camera], start=before)
+    return (pool.time - before) / (time.perf_counter() - began)
+
+
+def _realtime(seconds: float, camera: str, policy: str, seed: int, vehicle: str, say: Say) -> dict[str, Any]:
+    world = ["--plant", str(seed), "--camera", camera]
+    ours = ["--policy", policy, "--duration", str(seconds)]
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        pair(Path(folder), vehicle, STATION, pool=world, robot=ours) as both,
+    ):
+        robot = both.robot
+        _wait(robot, seconds, say)
+        if robot.running or not robot.said:
+            raise ReliabilityError(f"the robot did not end: {robot.complained.strip()[-300:]}")
+        robot.end()
+        both.pool.end()
+        return {"robot": json.loads(robot.said), "pool": both.pool.said.splitlines()}
+
+
+def _wait(robot: Process, seconds: float, say: Say) -> None:
+    began = time.monotonic()
+    while robot.running and (passed := time.monotonic() - began) < seconds + PATIENCE:
+        say(0.2 + 0.8 * min(passed / seconds, 1.0), f"real time: {passed / 60.0:.1f} min")
+        time.sleep(0.5)
+
+
+def print_timing(result: Mapping[str, Any], console: Console) -> None:
+    """Print what came out."""
+    told, reached = result["realtime"]["robot"], result["reached"]
+    latency = told["latency_s"]
+    ms = ", ".join(f"{name} {1e3 * value:.0f} ms" for name, value in latency.items() if value is not None)
+    lines = [
+        f"real time, {result['camera']}, {result['minutes']:g} min, {result['processors']} processors, "
+        f"load {result['load']:.1f} before: ended {told['state']}{': ' + told['reason'] if told['reason'] else ''}",
+        f"decisions missed: {told['missed']} of {told['decisions'] + told['missed']}; "
+        f"late steps: {told['overruns']} of {told['steps']}",
+        f"picture to command: {ms or 'no picture'}",
+        *(f"lock-step, {mode}: {speed:.1f} times real time" for mode, speed in result["lockstep"].items()),
+        "; ".join(f"{what}: {'reached' if good else 'not reached'}" for what, good in reached.items()),
+    ]
+    for line in lines:
+        console.print(line, highlight=False, soft_wrap=True)

@@ -1,0 +1,624 @@
+"""Pictures on their way to the robot: as bytes, over UDP, through shared memory, and searched for tags on a thread."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import re
+import socket
+import struct
+import tempfile
+import threading
+import time
+import zlib
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.localization.detection.detector import detector
+from finssim.localization.detection.region import RegionTracker
+from finssim.robot.link.frames import LinkError
+from finssim.robot.link.transports import host_port
+from finssim.robot.messages import Picture, TagCorners
+from finssim.vehicles import Vehicle
+
+__all__ = [
+    "DEFAULT_CAMERA",
+    "DEFAULT_PICTURES",
+    "LONGEST_FRAGMENT",
+    "MEMORY_HEAD",
+    "MEMORY_MAGIC",
+    "MEMORY_SLOT",
+    "MEMORY_VERSION",
+    "Assembler",
+    "NoPictures",
+    "PictureSource",
+    "Posted",
+    "SharedMemoryPictures",
+    "TagFinder",
+    "UdpPictures",
+    "decode_picture",
+    "encode_picture",
+    "fragments",
+    "jpeg",
+    "memory_path",
+    "open_pictures",
+    "picture_of",
+]
+
+
+# Pictures of a record, in JPEG.
+
+
+QUALITY = 90
+
+Image = npt.NDArray[np.uint8]
+
+
+def jpeg(image: Image) -> bytes | None:
+    """A gray picture (h, w) or one in blue, green and red (h, w, 3); None where it is no such picture."""
+    import cv2
+
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or not image.size:
+        return None
+    try:
+        well, packed = cv2.imencode(".jpg", np.ascontiguousarray(image), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    except cv2.error:  # a size that the format has not
+        return None
+    return packed.tobytes() if well else None
+
+
+def picture_of(data: Image | bytes) -> Image | None:
+    """The gray picture, (h, w); None where the data are none."""
+    import cv2
+
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if len(data) else None
+    return None if image is None else np.asarray(image, np.uint8)
+
+
+# A picture as bytes, for UDP and shared memory: a head, the tags, and the image as it is or as JPEG.
+#
+# magic "FSPC", version u8, format u8, tags u16, time f64, late f64, sequence u32, rows u32, columns u32,
+# length of the image u32; per tag: id i32, corners 8 x f64; the image. All little endian.
+
+
+_HEAD = struct.Struct("<4sBBHddIIII")
+_TAG = struct.Struct("<i8d")
+_MAGIC, _VERSION = b"FSPC", 1
+NO_IMAGE, RAW, JPEG = 0, 1, 2
+MOST_TAGS = 256
+LARGEST = 64 * 2**20
+"""Pixels; a larger picture is none."""
+
+
+@dataclass(frozen=True)
+class Posted:
+    """A picture and what its sender said about the time."""
+
+    picture: Picture
+    """`time` is on the sender's clock."""
+    late: float
+    """How much later than `time` it was sent [s]: what drawing it took beyond the camera's latency."""
+
+
+def encode_picture(picture: Picture, *, late: float = 0.0, compress: bool = False) -> bytes:
+    """A picture as bytes.
+
+    Args:
+        picture: Gray, or tags alone.
+        late: Time of sending minus `picture.time` [s].
+        compress: As JPEG of quality 90, which moves corners by 0.004 px and takes an eighth of the bytes.
+    """
+    rows, columns = (0, 0) if picture.image is None else picture.image.shape
+    kind, data = NO_IMAGE, b""
+    if picture.image is not None:
+        packed = jpeg(picture.image) if compress else None
+        kind, data = (JPEG, packed) if packed else (RAW, np.ascontiguousarray(picture.image).tobytes())
+    counts = len(picture.tags), picture.time, late, picture.sequence % 2**32, rows, columns, len(data)
+    head = _HEAD.pack(_MAGIC, _VERSION, kind, *counts)
+    tags = [_TAG.pack(tag.tag_id, *np.ravel(tag.corners)) for tag in picture.tags]
+    return b"".join([head, *tags, data])
+
+
+def decode_picture(data: bytes) -> Posted | None:
+    """The picture; None where the bytes are none. Never raises."""
+    if len(data) < _HEAD.size:
+        return None
+    magic, version, kind, n, time, late, sequence, rows, columns, size = _HEAD.unpack_from(data)
+    start = _HEAD.size + n * _TAG.size
+    if magic != _MAGIC or version != _VERSION or n > MOST_TAGS or len(data) != start + size:
+        return None
+    if not (math.isfinite(time) and math.isfinite(late)) or rows * columns > LARGEST:
+        return None
+    tags = _tags(data, n)
+    image = _image(kind, data[start:], rows, columns)
+    if tags is None or (image is None) != (kind == NO_IMAGE):
+        return None
+    return Posted(Picture(time, sequence, image, tags), late)
+
+
+def _tags(data: bytes, n: int) -> tuple[TagCorners, ...] | None:
+    found = []
+    for i in range(n):
+        tag, *corners = _TAG.unpack_from(data, _HEAD.size + i * _TAG.size)
+        if not all(map(math.isfinite, corners)):
+            return None
+        found.append(TagCorners(tag, np.array(corners).reshape(4, 2)))
+    return tuple(found)
+
+
+def _image(
+    kind: int, data: bytes, rows: int, columns: int
+) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]] | None:
+    """Pixels, None where they are not those that the head announces."""
+    if kind == RAW and len(data) == rows * columns > 0:
+        return np.frombuffer(data, np.uint8).reshape(rows, columns)
+    if kind == JPEG and data[:2] == b"\xff\xd8" and _announced(data) == (rows, columns):
+        image = picture_of(data)
+        return image if image is not None and image.shape == (rows, columns) else None
+    return None
+
+
+def _announced(data: bytes) -> tuple[int, int] | None:
+    """Rows and columns in a JPEG's own frame header, so that no bomb is unpacked."""
+    at = 2
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        marker, size = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            return int.from_bytes(data[at + 5 : at + 7], "big"), int.from_bytes(data[at + 7 : at + 9], "big")
+        at += 2 + max(size, 2)
+    return None
+
+
+# Messages longer than a datagram: cut into numbered fragments, and put together again with bounded memory.
+#
+# magic "FSPF", message u32, index u16, count u16, CRC-32 of the whole message u32; then a piece of it.
+# All little endian; every piece but the last has the same length.
+
+
+_FRAGMENT_HEAD = struct.Struct("<4sIHHI")
+_FRAGMENT_MAGIC = b"FSPF"
+LONGEST_FRAGMENT = 60_000
+"""Bytes of the message in a datagram: what loopback takes whole. Elsewhere 1400 keep below a network's MTU."""
+MOST_FRAGMENTS = 4096
+UNFINISHED = 4
+"""Messages that may be under way at once; an older one is given up."""
+MOST_BYTES = 32 * 2**20
+"""That unfinished messages may hold together."""
+
+
+def fragments(data: bytes, number: int, size: int = LONGEST_FRAGMENT) -> list[bytes]:
+    """Datagrams that carry a message.
+
+    Args:
+        data: The message.
+        number: Of the message, counting up; the next one's is different.
+        size: Bytes of the message in each.
+    """
+    pieces = [data[i : i + size] for i in range(0, len(data), size)] or [b""]
+    crc = zlib.crc32(data)
+    return [
+        _FRAGMENT_HEAD.pack(_FRAGMENT_MAGIC, number % 2**32, i, len(pieces), crc) + piece
+        for i, piece in enumerate(pieces)
+    ]
+
+
+class Assembler:
+    """Takes fragments in any order, some twice and some never; gives whole messages. Never raises."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        """whole, unknown (no fragment), incomplete (given up), corrupt (CRC)."""
+        self._parts: OrderedDict[tuple[int, int, int], dict[int, bytes]] = OrderedDict()
+        self._held = 0
+        self._done: OrderedDict[tuple[int, int, int], None] = OrderedDict()
+
+    def add(self, datagram: bytes) -> bytes | None:
+        """The message that this fragment completes, if it does."""
+        if len(datagram) < _FRAGMENT_HEAD.size:
+            self.counts["unknown"] += 1
+            return None
+        magic, number, index, count, crc = _FRAGMENT_HEAD.unpack_from(datagram)
+        if magic != _FRAGMENT_MAGIC or not index < count <= MOST_FRAGMENTS:
+            self.counts["unknown"] += 1
+            return None
+        key = (number, count, crc)
+        if key in self._done:
+            return None
+        parts = self._parts.setdefault(key, {})
+        if index not in parts:
+            parts[index] = datagram[_FRAGMENT_HEAD.size :]
+            self._held += len(parts[index])
+        if len(parts) < count:
+            self._give_up()
+            return None
+        del self._parts[key]
+        self._held -= sum(map(len, parts.values()))
+        return self._whole(key, b"".join(parts[i] for i in range(count)))
+
+    def _whole(self, key: tuple[int, int, int], data: bytes) -> bytes | None:
+        if zlib.crc32(data) != key[2]:
+            self.counts["corrupt"] += 1
+            return None
+        self.counts["whole"] += 1
+        self._done[key] = None
+        if len(self._done) > UNFINISHED:
+            self._done.popitem(last=False)
+        return data
+
+    def _give_up(self) -> None:
+        while len(self._parts) > UNFINISHED or self._held > MOST_BYTES:
+            _, parts = self._parts.popitem(last=False)
+            self._held -= sum(map(len, parts.values()))
+            self.counts["incomplete"] += 1
+
+
+# Pictures over UDP from one peer alone, received by a thread of its own so that none waits for the control loop.
+
+
+Address = tuple[str, int]
+
+_LOG = logging.getLogger("finssim.robot.pictures")
+_WAITING = 4
+"""Pictures that wait for the loop; the oldest is forgotten."""
+_NAMED = 64
+"""Refused senders that are told apart."""
+_BUFFER = 4 * 2**20
+"""Asked of the system for what has not been read yet [bytes]."""
+_LATEST = 10.0
+"""A picture cannot be later than this [s]."""
+
+
+class UdpPictures:
+    """The camera's end is one address; what others send is refused, counted and named once in the log.
+
+    A picture's time is that of its reception, less what its sender says that sending was late.
+    """
+
+    def __init__(self, bind: Address, peer: Address) -> None:
+        """
+        Args:
+            bind: Address and port of this end; port 0 takes a free one (see `address`).
+            peer: Address and port of the camera's end.
+
+        Raises:
+            LinkError: An address cannot be found or bound.
+        """
+        self.refused: Counter[Address | None] = Counter()
+        self.not_understood = 0
+        self.assembler = Assembler()
+        self._waiting: deque[tuple[float, Picture]] = deque(maxlen=_WAITING)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self.peer: Address = (socket.gethostbyname(peer[0]), peer[1])
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+            self._socket.bind(bind)
+        except OSError as problem:
+            self._socket.close()
+            raise LinkError(
+                f"pictures on {bind[0]}:{bind[1]} from {peer[0]}:{peer[1]}: {problem.strerror or problem}: "
+                "end the program that has the port, or give another address"
+            ) from None
+        self.address: Address = self._socket.getsockname()
+        self._socket.settimeout(0.2)
+        self._open = True
+        self._thread = threading.Thread(target=self._listen, name="pictures", daemon=True)
+        self._thread.start()
+
+    def receive(self, now: float) -> list[Picture]:
+        """Pictures since the last call, oldest first, with times on the clock of `now` [s]."""
+        found, later = [], time.monotonic() - now
+        while self._waiting:
+            came, picture = self._waiting.popleft()
+            found.append(replace(picture, time=came - later))
+        return found
+
+    def close(self) -> None:
+        """Let go of the socket."""
+        self._open = False
+        self._thread.join(timeout=2.0)
+        self._socket.close()
+
+    def describe(self) -> str:
+        """Both ends, and what went wrong so far."""
+        counts = self.assembler.counts
+        text = f"udp {self.address[0]}:{self.address[1]} from {self.peer[0]}:{self.peer[1]}, "
+        text += f"{counts['whole']} pictures"
+        bad = counts["incomplete"] + counts["corrupt"] + counts["unknown"] + self.not_understood
+        text += f", {bad} incomplete or corrupt" if bad else ""
+        return text + (f", {sum(self.refused.values())} datagrams of others refused" if self.refused else "")
+
+    def _listen(self) -> None:
+        while self._open:
+            try:
+                data, sender = self._socket.recvfrom(65536)
+            except (TimeoutError, ConnectionError):
+                continue
+            except OSError:
+                return
+            if sender != self.peer:
+                self._refuse(sender)
+                continue
+            whole = self.assembler.add(data)
+            if whole is not None:
+                self._take(time.monotonic(), whole)
+
+    def _take(self, came: float, whole: bytes) -> None:
+        posted = decode_picture(whole)
+        if posted is None or not 0.0 <= posted.late < _LATEST:
+            self.not_understood += 1
+            return
+        self._waiting.append((came - posted.late, posted.picture))
+
+    def _refuse(self, sender: Address) -> None:
+        key = sender if sender in self.refused or len(self.refused) < _NAMED else None
+        if key is not None and key not in self.refused:
+            _LOG.warning("refused pictures from %s:%d: this end listens to %s:%d alone", *sender, *self.peer)
+        self.refused[key] += 1
+
+
+# Pictures through shared memory: a ring of slots in a file that lives in memory, written by one and read by many.
+#
+# The file begins with "FSPM", version u32, slots u32, bytes of a slot u32, and the number of the newest picture u64,
+# counted from 1; 0 while there is none. Picture n lies in slot (n - 1) mod slots: n u64, length u32, CRC-32 u32, bytes.
+# A slot is numbered 0 while it is being written, and its reader looks at the number before and after: what was
+# overwritten meanwhile is left out. Nobody waits for anybody, so either side may die and start again at any time.
+
+
+MEMORY_MAGIC, MEMORY_VERSION = b"FSPM", 1
+MEMORY_HEAD = struct.Struct("<4sIIIQ")
+MEMORY_SLOT = struct.Struct("<QII")
+_MOST_AT_ONCE = 4
+"""A reader that is further behind goes on with the newest ones."""
+_SAME_CLOCK = 10.0
+"""Times further from now are of another clock [s]."""
+
+
+def memory_path(name: str) -> Path:
+    """The file behind a name.
+
+    Raises:
+        LinkError: It is not a plain name.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):
+        raise LinkError(f"shm:{name}: expected a name of up to 64 letters, digits, - and _, such as shm:pool")
+    memory = Path("/dev/shm")
+    folder = memory if memory.is_dir() and os.access(memory, os.W_OK) else Path(tempfile.gettempdir())
+    return folder / f"finssim-pictures-{name}"
+
+
+class SharedMemoryPictures:
+    """Reads what a camera on this machine writes; before there is one, and after it, nothing comes."""
+
+    def __init__(self, name: str) -> None:
+        """
+        Args:
+            name: As given to the camera.
+
+        Raises:
+            LinkError: It is not a plain name.
+        """
+        self.path = memory_path(name)
+        self.received = self.missed = self.not_understood = 0
+        self._file: int | None = None
+        self._inode = 0
+        self._last = 0
+
+    def receive(self, now: float) -> list[Picture]:
+        """Pictures since the last call, oldest first. Both sides' clock is this machine's `time.monotonic`."""
+        self._follow()
+        if self._file is None:
+            return []
+        head = os.pread(self._file, MEMORY_HEAD.size, 0)
+        if len(head) < MEMORY_HEAD.size:
+            return []
+        magic, version, slots, size, newest = MEMORY_HEAD.unpack(head)
+        if (
+            magic != MEMORY_MAGIC
+            or version != MEMORY_VERSION
+            or not (2 <= slots <= 1024 and MEMORY_SLOT.size < size <= 2**30)
+        ):
+            return []
+        if newest < self._last:  # begun anew in the same file, or spoilt
+            self._last = 0
+        first = max(self._last + 1, newest - min(_MOST_AT_ONCE, slots - 1) + 1)
+        self.missed += max(first - self._last - 1, 0) if self._last else 0
+        found = [
+            self._read(n, MEMORY_HEAD.size + (n - 1) % slots * size, size) for n in range(first, newest + 1)
+        ]
+        self._last = newest
+        return [self._on_clock(picture, now) for picture in found if picture is not None]
+
+    def close(self) -> None:
+        """Let go of the file; it is its writer's."""
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
+
+    def describe(self) -> str:
+        """Which memory, and how it fares."""
+        text = f"shared memory {self.path.name}, {self.received} pictures"
+        return text + (
+            f", {self.missed + self.not_understood} missed" if self.missed + self.not_understood else ""
+        )
+
+    def _follow(self) -> None:
+        """Open the file that has the name now: a camera that starts again makes a new one."""
+        try:
+            inode = os.stat(self.path).st_ino
+        except OSError:
+            return  # what is open already may still hold a last picture
+        if self._file is not None and inode == self._inode:
+            return
+        self.close()
+        try:
+            self._file = os.open(self.path, os.O_RDONLY)
+            self._inode, self._last = os.fstat(self._file).st_ino, 0
+        except OSError:
+            self._file = None
+
+    def _read(self, number: int, at: int, size: int) -> Picture | None:
+        assert self._file is not None
+        head = os.pread(self._file, MEMORY_SLOT.size, at)
+        if len(head) == MEMORY_SLOT.size and MEMORY_SLOT.unpack(head)[0] == number:
+            _, length, crc = MEMORY_SLOT.unpack(head)
+            data = os.pread(self._file, min(length, size - MEMORY_SLOT.size), at + MEMORY_SLOT.size)
+            again = os.pread(self._file, MEMORY_SLOT.size, at)
+            posted = decode_picture(data) if again == head and zlib.crc32(data) == crc else None
+            if posted is not None:
+                self.received += 1
+                return posted.picture
+        self.not_understood += 1
+        return None
+
+    @staticmethod
+    def _on_clock(picture: Picture, now: float) -> Picture:
+        return picture if 0.0 <= now - picture.time < _SAME_CLOCK else replace(picture, time=now)
+
+
+# Where pictures come from: over UDP, through shared memory, or nowhere.
+
+
+DEFAULT_CAMERA = "127.0.0.1:58767"
+"""Address of the virtual pool's camera."""
+DEFAULT_PICTURES = "127.0.0.1:54322"
+"""Address at which the robot takes its pictures."""
+
+
+class PictureSource(Protocol):
+    """The robot's end of the camera's wire. No call blocks, and none raises for what happens on the wire."""
+
+    def receive(self, now: float) -> list[Picture]:
+        """Pictures that came since the last call, oldest first, each with its time on the clock of `now` [s]."""
+
+    def close(self) -> None:
+        """Let go of the wire."""
+
+    def describe(self) -> str:
+        """The wire and how it fares, in a few words."""
+
+
+class NoPictures:
+    """No camera."""
+
+    def receive(self, now: float) -> list[Picture]:
+        """Nothing."""
+        return []
+
+    def close(self) -> None:
+        """Nothing to let go of."""
+
+    def describe(self) -> str:
+        """That there is none."""
+        return "no pictures"
+
+
+def open_pictures(address: str, bind: str = DEFAULT_PICTURES) -> PictureSource:
+    """The source that an address names.
+
+    Args:
+        address: "udp://HOST:PORT" of the camera's end, "shm:NAME" on this machine, or "none".
+        bind: "ADDRESS:PORT" of this end, for UDP.
+
+    Raises:
+        LinkError: It names no source, or the source cannot be opened.
+    """
+    kind, _, rest = address.partition(":")
+    if kind == "udp" and rest.startswith("//"):
+        return UdpPictures(host_port(bind, "bind"), host_port(rest[2:], address))
+    if kind == "shm" and rest:
+        return SharedMemoryPictures(rest)
+    if address == "none":
+        return NoPictures()
+    raise LinkError(f"unknown source of pictures {address!r}: give udp://HOST:PORT, shm:NAME or none")
+
+
+# A picture source whose tags are found on a thread of its own, so that the control loop never waits for a detector.
+
+
+_TAGS_LOG = logging.getLogger(__name__)
+POLL = 0.002
+"""Time between two looks for a new picture [s]."""
+WAITING = 8
+"""Pictures that wait for the loop."""
+
+
+class TagFinder:
+    """Pictures in, pictures with their tags out; one without tags comes out without its image."""
+
+    def __init__(
+        self,
+        source: PictureSource,
+        vehicle: Vehicle,
+        *,
+        size: tuple[int, int],
+        library: str | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Start looking.
+
+        Args:
+            source: Where pictures come from; it belongs to the finder from now on.
+            vehicle: Its tags are looked for.
+            size: Rows and columns of the camera's pictures; others are passed on as they are, to be refused.
+            library: Detector: apriltag or opencv; apriltag if None.
+            clock: The robot's [s].
+        """
+        assert vehicle.tags is not None
+        self._source, self._size, self._clock = source, size, clock
+        self._tracker = RegionTracker(
+            detector(vehicle.tags.family, library=library), set(vehicle.tags.mounts)
+        )
+        self._found: deque[Picture] = deque(maxlen=WAITING)
+        self._over = threading.Event()
+        self.problem = ""
+        """Why a picture could not be searched, as the detector said it first; it passed as one without tags."""
+        self.skipped = 0
+        """Pictures that were left out because newer ones had come meanwhile."""
+        self._thread = threading.Thread(target=self._look, name="tag finder", daemon=True)
+        self._thread.start()
+
+    def receive(self, now: float) -> list[Picture]:
+        """What has been looked at since the last call."""
+        found = []
+        while self._found:
+            found.append(self._found.popleft())
+        return found
+
+    def describe(self) -> str:
+        """The source and how it fares, in a few words."""
+        problem = f", {self.problem}" if self.problem else ""
+        return f"{self._source.describe()}, {self.skipped} skipped{problem}"
+
+    def close(self) -> None:
+        """Stop looking and let go of the source."""
+        self._over.set()
+        self._thread.join()
+        self._source.close()
+
+    def _look(self) -> None:
+        while not self._over.wait(POLL):
+            pictures = self._source.receive(self._clock())
+            if pictures:
+                self.skipped += len(pictures) - 1
+                self._found.append(self._with_tags(pictures[-1]))
+
+    def _with_tags(self, picture: Picture) -> Picture:
+        image = picture.image
+        if image is None or picture.tags or image.shape != self._size or image.dtype != np.uint8:
+            return picture
+        try:
+            found = self._tracker.detect(image, picture.time)
+        except Exception as error:  # whatever it is: the next picture may be better
+            if not self.problem:
+                self.problem = f"tags cannot be sought: {type(error).__name__}: {error}"
+                _TAGS_LOG.warning(self.problem)
+            return replace(picture, image=None)
+        tags = tuple(TagCorners(d.tag, d.corners) for d in found)
+        return replace(picture, tags=tags, image=image if tags else None)
