@@ -9,14 +9,17 @@ from unittest import mock
 
 import pytest
 
+from finssim.calibration.importers.dispatch import read_trials
 from finssim.engine.ranges_file import load_ranges
 from finssim.experiments.plants import load_plant
+from finssim.localization.pool import load_pool
 from finssim.tasks import TASKS
 from finssim.tasks.sensing import load_sensing
 from finssim.vehicles import VehicleError, load_vehicle
+from finssim.vehicles.check import check_vehicle
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = sorted((ROOT / "docs").glob("*.md"))
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -52,12 +55,33 @@ def test_the_vehicle_on_the_page_loads(tmp_path):
 
 def test_the_ranges_and_the_plant_on_the_pages_load(tmp_path):
     """The example files of the learning and evaluation pages are what the commands take."""
-    for page, load in (("learning", load_sensing), ("learning", load_ranges), ("evaluation", load_plant)):
-        examples = blocks(ROOT / "docs" / f"{page}.md", "yaml")
-        example = examples[1] if load is load_ranges else examples[0]
-        assert len(examples) == (2 if page == "learning" else 1)
-        (tmp_path / f"{page}.yaml").write_text(example, encoding="utf-8")
-        load(tmp_path / f"{page}.yaml")
+    sensing, ranges, _ = blocks(ROOT / "docs" / "learning.md", "yaml")
+    (plant,) = blocks(ROOT / "docs" / "evaluation.md", "yaml")
+    for example, load in ((sensing, load_sensing), (ranges, load_ranges), (plant, load_plant)):
+        (tmp_path / "example.yaml").write_text(example, encoding="utf-8")
+        load(tmp_path / "example.yaml")
+
+
+def test_the_pools_on_the_page_load(tmp_path):
+    """The full file and the shortest one are what the commands take."""
+    full, shortest = blocks(ROOT / "docs" / "pool_file.md", "yaml")
+    for example, height in ((full, 0.96), (shortest, 1.0)):
+        (tmp_path / "pool.yaml").write_text(example, encoding="utf-8")
+        assert load_pool(tmp_path / "pool.yaml").interface.height(0.0, 0.0) == pytest.approx(height)
+
+
+def test_the_rov_on_the_page_is_sound_and_its_log_is_read(tmp_path, monkeypatch):
+    """The vehicle of the hour loads, its checks pass, its truth extends it, and its map reads its log."""
+    page = ROOT / "docs" / "own_rov.md"
+    monkeypatch.chdir(tmp_path)
+    for name, example in zip(("minnow.yaml", "log.yaml", "water.yaml"), blocks(page, "yaml"), strict=True):
+        Path(name).write_text(example, encoding="utf-8")
+    (log,) = blocks(page, "text")
+    Path("dive_surge.csv").write_text(log, encoding="utf-8")
+    assert [found.sentence for found in check_vehicle(load_vehicle("minnow.yaml")) if not found.passed] == []
+    assert load_vehicle("water.yaml").thruster_names == load_vehicle("minnow.yaml").thruster_names
+    (trial,) = read_trials([Path("dive_surge.csv")], column_map=Path("log.yaml"))
+    assert trial.channels["v"][0] == -0.0067 and trial.channels["rpm_back_right"][1] == 835.0
 
 
 def test_every_range_on_the_page_of_randomisation_loads(tmp_path):

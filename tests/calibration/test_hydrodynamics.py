@@ -19,11 +19,11 @@ from finssim.calibration.replay.replay import replay
 from finssim.vehicles import load_vehicle
 
 DATA = Path(__file__).parents[1] / "data" / "standins"
-DOCS = Path(__file__).parents[2] / "docs" / "importing.md"
+DOCS = Path(__file__).parents[2] / "docs" / "trials.md"
 
 
 def read(pattern, name, folder, tmp):
-    """Trials of a set by the map that the page on importing prints under this name."""
+    """Trials of a set by the map that the page on trials prints under this name."""
     block = DOCS.read_text(encoding="utf-8").split(f"# {name}\n", 1)[1].split("```", 1)[0]
     (tmp / name).write_text(block)
     files = sorted(path for p in pattern for path in (DATA / folder).glob(p))

@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""What rclpy refuses, the built-in rclpy refuses: docs/ros2.md lists each rule with its test here or beside."""
+"""What rclpy refuses, the built-in rclpy refuses: docs/reference/rclpy.md lists each rule with its test."""
 
 import array
 import ast
@@ -47,7 +47,7 @@ from std_srvs.srv import Trigger
 
 from finssim.ros2.graphs import NODES
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "ros2.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "rclpy.md"
 FREE = ParameterDescriptor(dynamic_typing=True)
 
 

@@ -12,7 +12,7 @@ from finssim.ros2.errors import Ros2Error
 from finssim.ros2.graphs import GRAPHS, NODES, Plan, topics_of
 from finssim.ros2.up import Options, plan_of
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "ros2_nodes.md").read_text()
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "ros2.md").read_text()
 FILE = Path("/somewhere/pool.yaml")
 
 

@@ -7,7 +7,7 @@ import pytest
 from finssim.ros2.codec import codec_of
 from finssim.ros2.topics import FRAMES, QUALITIES, SERVICES, TOPICS
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "ros2.md").read_text()
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "ros2_topics.md").read_text()
 
 
 def row(*cells):

@@ -147,7 +147,7 @@ def quat_from_euler(roll: npt.ArrayLike, pitch: npt.ArrayLike, yaw: npt.ArrayLik
 
 
 def quat_to_euler(q: npt.ArrayLike) -> tuple[Array, Array, Array]:
-    """Roll in [-pi, pi], pitch in [-pi/2, pi/2], yaw in [-pi, pi] [rad], (..., 4) -> (...) each.
+    """Roll in [-pi, pi], pitch in [-pi/2, pi/2], yaw in [-pi, pi], all [rad], (..., 4) -> (...) each.
 
     Note:
         At a pitch of +-90 degrees only roll -+ yaw is defined; the split returned there is arbitrary.
@@ -179,7 +179,7 @@ def quat_from_rotvec(rotvec: npt.ArrayLike) -> Array:
 
 
 def quat_to_rotvec(q: npt.ArrayLike) -> Array:
-    """Rotation vector of the shorter way round, length in [0, pi] [rad], (..., 4) -> (..., 3)."""
+    """Rotation vector of the shorter way round, length [rad] in [0, pi], (..., 4) -> (..., 3)."""
     q = np.asarray(q, float)
     q = np.where(q[..., 3:] < 0.0, -q, q)
     sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)

@@ -94,7 +94,7 @@ def heading(q: wp.quat) -> float:
 
 @wp.func
 def wrapped(angle: float) -> float:
-    """An angle in (-2π, 2π) brought to [-π, π] [rad]."""
+    """An angle [rad] in (-2π, 2π), brought to [-π, π]."""
     return angle - wp.sign(angle) * wp.where(wp.abs(angle) > 3.14159265, 6.2831853, 0.0)
 
 

@@ -176,7 +176,7 @@ def angular_velocity(state: State, w: int) -> wp.vec3:
 
 @wp.func
 def attitude_error(state: State, arrays: TaskArrays, w: int) -> float:
-    """Angle of the rotation from vehicle 0's attitude to its goal's, in [0, π] [rad]."""
+    """Angle of the rotation from vehicle 0's attitude to its goal's [rad], in [0, π]."""
     d = wp.quat_inverse(state.quaternion[w, 0]) * arrays.goal_quaternion[w]
     return 2.0 * wp.atan2(wp.length(wp.vec3(d[0], d[1], d[2])), wp.abs(d[3]))
 

@@ -76,7 +76,7 @@ def about_axis(axis: int, angle: Tensor) -> Tensor:
 
 
 def angle(q: Tensor) -> Tensor:
-    """Of a rotation, whatever its axis, in [0, π] [rad], (...)."""
+    """Of a rotation, whatever its axis [rad], in [0, π], (...)."""
     return 2.0 * torch.atan(torch.linalg.vector_norm(q[..., :3], dim=-1) / q[..., 3].abs())
 
 
@@ -87,12 +87,12 @@ def heading(q: Tensor) -> Tensor:
 
 
 def arctangent(y: Tensor, x: Tensor) -> Tensor:
-    """Angle of the point (x, y), in [-π, π] [rad]; 0 at the origin."""
+    """Angle of the point (x, y) [rad], in [-π, π]; 0 at the origin."""
     r = torch.sqrt(x * x + y * y)
     half = torch.atan(y / (r + x.abs()).clamp(min=torch.finfo(y.dtype).tiny))
     return torch.where(x >= 0.0, 2.0 * half, torch.copysign(torch.full_like(y, math.pi), y) - 2.0 * half)
 
 
 def wrapped(angle: Tensor) -> Tensor:
-    """An angle brought to [-π, π] [rad], (...,)."""
+    """An angle [rad], brought to [-π, π], (...,)."""
     return angle - 2.0 * math.pi * torch.round(angle / (2.0 * math.pi))

@@ -14,11 +14,11 @@ from finssim.calibration.trials.units import factor
 from finssim.files import OutputError
 
 HINSDALE = Path(__file__).parents[2] / "data" / "hinsdale"
-DOCS = Path(__file__).parents[3] / "docs" / "importing.md"
+DOCS = Path(__file__).parents[3] / "docs" / "trials.md"
 
 
 def shipped_map(name):
-    """The map file that the page on importing prints under this name."""
+    """The map file that the page on trials prints under this name."""
     block = DOCS.read_text(encoding="utf-8").split(f"# {name}\n", 1)[1]
     return block.split("```", 1)[0]
 

@@ -1,4 +1,4 @@
-"""The page about the link: its tables are those of the code, and its C reads what Python writes."""
+"""The page about the wire: its tables are those of the code, and its C reads what Python writes."""
 
 import re
 import shutil
@@ -12,7 +12,7 @@ from finssim.robot.link.frames import LAYOUTS, Layout, RejectFlag, StatusFlag, e
 from robot.link import wire
 from robot.link.test_frames import COMMAND
 
-PAGE = (Path(__file__).parents[3] / "docs" / "link.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "wire.md").read_text(encoding="utf-8")
 TYPES = {"?": "u8", "B": "u8", "H": "u16", "I": "u32", "f": "f32"}
 OUTPUTS = 8
 

@@ -88,7 +88,7 @@ class Measurement:
 
     @property
     def yaw(self) -> float:
-        """Heading of the body's x axis about the pool's z axis, [-pi, pi] [rad]."""
+        """Heading of the body's x axis about the pool's z axis [rad], in [-pi, pi]."""
         return math.atan2(self.rotation[1, 0], self.rotation[0, 0])
 
     @property
