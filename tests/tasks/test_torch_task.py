@@ -192,7 +192,10 @@ def test_a_world_that_breaks_ends_alone(tmp_path):
     assert np.isfinite(step.observation).all() and np.isfinite(step.reward).all()
 
 
-@pytest.mark.parametrize("library", ["gymnasium", "sb3", "torchrl", "rsl_rl", "pettingzoo"])
+@pytest.mark.parametrize(
+    "library",
+    ["gymnasium", "sb3", pytest.param("torchrl", marks=pytest.mark.slow), "rsl_rl", "pettingzoo"],
+)
 def test_adapters_take_it_and_their_checkers_pass(library):
     """As they take any task."""
     if library == "gymnasium":
