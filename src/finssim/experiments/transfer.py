@@ -64,6 +64,8 @@ class Training:
     hydrodynamics: str = "calibrated"
     randomize: str | None = None
     """Name or file of ranges."""
+    integral: bool = False
+    """Whether the policy integrates its errors; those of the paper do not."""
 
 
 @dataclass(frozen=True)
@@ -268,7 +270,8 @@ def trained(
         if not finished(place):
             train(
                 training.task, out=place, vehicle=vehicle, hydrodynamics=training.hydrodynamics,
-                randomize=training.randomize, seed=seed, steps=steps, console=Console(stderr=True, quiet=True),
+                randomize=training.randomize, seed=seed, steps=steps, settings={"integral": training.integral},
+                console=Console(stderr=True, quiet=True),
             )  # fmt: skip
     return policies
 
@@ -399,8 +402,8 @@ def _listed(items: list[str]) -> str:
 
 DR = "hold_for_position"
 """The published ranges of station keeping."""
-TRIM = "An integral in front of the policy"
-POOL = "Randomisation made for a pool"
+INTEGRAL = "An integral of the errors"
+POOL = "Randomisation made for a pool, with an integral of the errors,"
 
 CALIBRATED = Training("calibrated")
 CALIBRATED_DR = Training("calibrated-dr", "t2", randomize=DR)
@@ -449,12 +452,16 @@ T1_ROWS: dict[str, Row] = {
     "pid": Row("PID, tuned from the model", None, None, "The tuned PID", "pid"),
     "calibrated-intervals": Row(
         "Calibrated + ranges of its intervals",
-        Training("calibrated-intervals", randomize=INTERVALS),
-        module="Randomisation within the calibration's intervals",
+        Training("calibrated-intervals", randomize=INTERVALS, integral=True),
+        module="Randomisation within the calibration's intervals, with an integral of the errors,",
     ),
-    "calibrated-trim": Row("Calibrated, with trim", CALIBRATED, module=TRIM, changes={"trim": True}),
+    "calibrated-integral": Row(
+        "Calibrated, integrating", Training("calibrated-integral", integral=True), module=INTEGRAL
+    ),
     "calibrated-pool": Row(
-        "Calibrated + pool ranges", Training("calibrated-pool", randomize="pool"), module=POOL
+        "Pool ranges, integrating",
+        Training("calibrated-pool", randomize="pool", integral=True),
+        module=POOL,
     ),
 }
 """The paper's ten rows of station keeping in the order of its table, and ours beyond them."""
@@ -472,11 +479,15 @@ T2_ROWS: dict[str, Row] = {
     ),
     "pid": Row("PID, tuned from the model", None, None, "The tuned PID", "pid"),
     "pid-paper": Row("PID, published gains", None, "PID", "The published PID", "pid-paper"),
-    "calibrated-dr-trim": Row(
-        "Calibrated + DR, with trim", CALIBRATED_DR, module=TRIM, changes={"trim": True}
+    "calibrated-dr-integral": Row(
+        "Calibrated + DR, integrating",
+        Training("calibrated-dr-integral", "t2", randomize=DR, integral=True),
+        module=INTEGRAL,
     ),
     "calibrated-pool": Row(
-        "Calibrated + pool ranges", Training("calibrated-pool", "t2", randomize="pool"), module=POOL
+        "Pool ranges, integrating",
+        Training("calibrated-pool", "t2", randomize="pool", integral=True),
+        module=POOL,
     ),
 }
 """The paper's three rows of tracking, and ours beyond them."""
