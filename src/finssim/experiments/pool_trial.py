@@ -188,14 +188,20 @@ class Job(campaign.Job):
         """Everything that decides the result, with the contents of files in place of their names."""
         fields = asdict(self)
         fields.pop("row")
-        if self.controller not in CONTROLLERS:
-            fields["controller"] = {
-                name: hashlib.sha256((Path(self.controller) / name).read_bytes()).hexdigest()
-                for name in (DESCRIPTION_FILE, NETWORK_FILE)
-            }
+        fields["controller"] = files_of(self.controller)
         for name in ("vehicle", "pool_vehicle"):
             fields[name] = load_vehicle(fields[name]).sha256
         return fields
+
+
+def files_of(controller: str) -> Any:
+    """The SHA-256 of a policy's files by name; of a PID its name."""
+    if controller in CONTROLLERS:
+        return controller
+    return {
+        name: hashlib.sha256((Path(controller) / name).read_bytes()).hexdigest()
+        for name in (DESCRIPTION_FILE, NETWORK_FILE)
+    }
 
 
 def noise_seed(*words: Any) -> int:
