@@ -21,9 +21,8 @@ from finssim.geometry.rotations import (
     wrap_angle,
 )
 from finssim.localization.detection.detections import Detection, Frame, write_detections
-from finssim.localization.detection.families import bitmap
+from finssim.localization.detection.families import bitmap, tag_corners_b
 from finssim.localization.detection.pictures import write_picture
-from finssim.localization.detection.tags import tag_corners_b
 from finssim.localization.pool import load_pool, write_pool
 from finssim.localization.poses.methods import METHODS, NEEDS_DEPTH
 from finssim.sensors.overhead_camera import Basin, OverheadCamera, Pose, Scene, Sensor, TagInScene

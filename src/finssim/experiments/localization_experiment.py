@@ -29,8 +29,7 @@ from finssim.geometry.optics import Camera, Interface, Lens, Projection, Status,
 from finssim.geometry.rotations import matrix_to_quat, quat_from_euler, quat_to_matrix
 from finssim.localization.camera_file import write_camera
 from finssim.localization.detection.detections import Detection, Frame, write_detections
-from finssim.localization.detection.families import bitmap
-from finssim.localization.detection.tags import corners, tag_corners_b
+from finssim.localization.detection.families import bitmap, corners, tag_corners_b
 from finssim.localization.pool import Pool, write_pool
 from finssim.localization.poses.methods import METHODS, Constraints
 from finssim.provenance import provenance

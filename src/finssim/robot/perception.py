@@ -21,12 +21,11 @@ from finssim.localization.detection.detections import Detection, Frame
 from finssim.localization.detection.detector import detector
 from finssim.localization.detection.region import RegionTracker
 from finssim.localization.fusion.attitude import height_above_origin
-from finssim.localization.fusion.estimator import Estimator
-from finssim.localization.fusion.fuse_detections import Fixes
+from finssim.localization.fusion.estimator import Estimator, Fixes, Health, health_of
 from finssim.localization.fusion.fuse_settings import Settings, settings_of, site_of
-from finssim.localization.fusion.health import Estimate, Health, health_of
 from finssim.localization.fusion.streams import (
     DepthSample,
+    Estimate,
     HeadingSample,
     ImuSample,
     Sample,

@@ -22,7 +22,7 @@ from finssim.calibration.vision.tag_mounts import (
     start_state,
 )
 from finssim.geometry.rotations import quat_conjugate, quat_from_euler, quat_rotate, quat_to_matrix
-from finssim.localization.detection.tags import corners
+from finssim.localization.detection.families import corners
 
 RIG = Rig(pool=POOL, corners_t=corners(EDGE), port=PORT, reference=15)
 TRUTH = MountState(reference=MOUNTS[15], others={16: MOUNTS[15].inverse.then(MOUNTS[16])}, poses=[])

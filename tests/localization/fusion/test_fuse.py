@@ -12,7 +12,7 @@ from finssim.files import OutputError
 from finssim.geometry.optics import project
 from finssim.geometry.rotations import quat_conjugate, quat_rotate, quat_to_euler, quat_to_matrix, wrap_angle
 from finssim.localization.detection.detections import Detection, Frame, write_detections
-from finssim.localization.detection.tags import tag_corners_b
+from finssim.localization.detection.families import tag_corners_b
 from finssim.localization.errors import LocalizationError
 from finssim.localization.fusion.estimator import MODELS
 from finssim.localization.fusion.fuse import COLUMNS, fuse, run

@@ -31,17 +31,7 @@ from finssim.calibration.vision.least_squares import (
 from finssim.geometry.optics import Lens, OpticsError
 from finssim.geometry.rotations import skew
 
-__all__ = [
-    "COLUMNS",
-    "MODELS",
-    "ROWS",
-    "CameraFit",
-    "adjust",
-    "calibrate_camera",
-    "evidence",
-    "lens_names",
-    "lens_vector",
-]  # fmt: skip
+__all__ = ["COLUMNS", "MODELS", "ROWS", "CameraFit", "calibrate_camera"]
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from finssim.calibration.vision.tag_mounts import Moment
 from finssim.geometry.rotations import quat_inverse_rotate
 from finssim.localization.detection.detections import most_certain, read_detections
 from finssim.localization.fusion.attitude import TiltGains, follow, in_body_axes, tilt_from, up_of
-from finssim.localization.fusion.fuse_table import StreamTable, read_stream_table
+from finssim.localization.fusion.fuse_log import StreamTable, read_stream_table
 from finssim.localization.pool import Pool
 from finssim.vehicles import Vehicle
 

@@ -50,11 +50,11 @@ from finssim.geometry.rotations import (
     quat_to_rotvec,
     skew,
 )
-from finssim.localization.detection.tags import corners
+from finssim.localization.detection.families import corners
 from finssim.localization.pool import Pool, load_pool
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["run"]
+__all__ = []
 
 Array = NDArray[np.float64]
 

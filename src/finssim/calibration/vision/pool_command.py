@@ -37,7 +37,7 @@ from finssim.provenance import provenance
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["pool_record", "run"]
+__all__ = ["pool_record"]
 
 Array = NDArray[np.float64]
 

@@ -25,8 +25,8 @@ from finssim.calibration.vision.survey import Observations
 from finssim.geometry.optics import back_project
 
 __all__ = [
-    "CAMERA", "HeldOut", "Noise", "Refined", "Whitener", "error_vectors", "held_out", "refine", "rms",
-    "surprise", "touched",
+    "HeldOut", "Noise", "Refined", "Whitener", "error_vectors", "held_out", "refine", "rms", "surprise",
+    "touched",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]

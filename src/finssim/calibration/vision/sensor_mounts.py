@@ -27,19 +27,8 @@ from finssim.geometry.rotations import (
 )
 
 __all__ = [
-    "SALT",
-    "UNSURE_TURN",
-    "Attitude",
-    "DepthFit",
-    "Gyro",
-    "ImuMounting",
-    "fit_depth",
-    "fit_imu_mounting",
-    "imu_clock",
-    "level_from_rest",
-    "rotation_between",
-    "turn_pairs",
-    "turn_residual",
+    "UNSURE_TURN", "Attitude", "DepthFit", "Gyro", "ImuMounting", "fit_depth", "fit_imu_mounting", "imu_clock",
+    "rotation_between", "turn_residual",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]

@@ -38,22 +38,7 @@ from finssim.geometry.rotations import (
 )
 from finssim.localization.pool import Pool
 
-__all__ = [
-    "AXES",
-    "UNSURE_LENGTH",
-    "Moment",
-    "MountFit",
-    "MountState",
-    "Noise",
-    "Rig",
-    "change",
-    "fit_mounts",
-    "moment_blocks",
-    "moved",
-    "reference_tag",
-    "residuals",
-    "start_state",
-]  # fmt: skip
+__all__ = ["AXES", "UNSURE_LENGTH", "Moment", "MountFit", "Rig", "fit_mounts", "reference_tag", "residuals"]
 
 Array = NDArray[np.float64]
 

@@ -1,8 +1,7 @@
-"""Finding tags in a picture: two libraries behind one interface, with the same corners in the same convention."""
+"""Finding tags in a picture, and their corners to a few hundredths of a pixel."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -12,12 +11,14 @@ import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
-from finssim.localization.detection import detector_apriltag, detector_opencv
 from finssim.localization.detection.detections import Detection
-from finssim.localization.detection.families import FAMILIES, bitmap, family_named
+from finssim.localization.detection.families import EDGES, bitmap, family_named, find_tags
 from finssim.localization.errors import LocalizationError
 
-__all__ = ["LIBRARIES", "Detector", "Library", "Region", "detector", "fit_tag"]
+__all__ = ["REFINEMENTS", "Detector", "Region", "detector"]
+
+Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.uint8]
 
 # A tag as it should look in a picture, and how its gray changes as it moves, blurs or brightens.
 
@@ -334,9 +335,6 @@ def _through(H: Array, points: Array) -> Array:
     return np.asarray(p[:2] / p[2])
 
 
-Array = npt.NDArray[np.float64]
-Image = npt.NDArray[np.uint8]
-
 Region = tuple[int, int, int, int]
 """Part of a picture: left, top, right, bottom [px], right and bottom just outside."""
 
@@ -344,23 +342,8 @@ LEAST_CORRELATION = 0.7
 """Of a picture with the tag that a library says is there; below it there is none."""
 
 
-@dataclass(frozen=True)
-class Library:
-    """One library that finds tags."""
-
-    find: Callable[[Image, str, str, int], list[Detection]]
-    """Picture, family, refinement and most corrected bits -> tags."""
-    refinements: tuple[str, ...]
-    """Its own ways to place corners."""
-    before_fit: str
-    """The one from which our fit starts."""
-
-
-LIBRARIES: Mapping[str, Library] = {
-    "apriltag": Library(detector_apriltag.find, tuple(detector_apriltag.REFINEMENTS), "edges"),
-    "opencv": Library(detector_opencv.find, tuple(detector_opencv.REFINEMENTS), "subpix"),
-}
-"""Name -> library."""
+REFINEMENTS = ("fit", *EDGES)
+"""How corners are placed."""
 
 
 @dataclass(frozen=True)
@@ -368,7 +351,6 @@ class Detector:
     """Finds the tags of one family. Made by `detector`."""
 
     family: str
-    library: str
     refine: str
     gamma: float
     max_hamming: int
@@ -396,13 +378,12 @@ class Detector:
         if left >= right or top >= bottom:
             return []
         part = gray[top:bottom, left:right]
-        library = LIBRARIES[self.library]
-        if self.refine != "fit":
+        if self.refine == "fit":
+            found = find_tags(part, self.family, "edges", self.max_hamming)
+        else:
             light = _linear(part, self.gamma)
             bytes_ = part if light is part else np.rint(light).astype(np.uint8)
-            found = library.find(bytes_, self.family, self.refine, self.max_hamming)
-        else:
-            found = library.find(part, self.family, library.before_fit, self.max_hamming)
+            found = find_tags(bytes_, self.family, self.refine, self.max_hamming)
         corner = np.array([left, top], float)
         moved = [replace(d, corners=d.corners + corner) for d in found]
         return self._fitted(gray, moved) if self.refine == "fit" else moved
@@ -420,38 +401,27 @@ class Detector:
         return fitted
 
 
-def detector(
-    family: str, *, library: str | None = None, refine: str = "fit", gamma: float = 1.0, max_hamming: int = 1
-) -> Detector:
+def detector(family: str, *, refine: str = "fit", gamma: float = 1.0, max_hamming: int = 1) -> Detector:
     """A detector of one family.
 
     Args:
         family: Such as `tag25h9` or `tagStandard41h12`.
-        library: `apriltag` or `opencv`; None: `apriltag`, which has every family.
-        refine: How corners are placed: `fit` lays the whole known tag over the picture (the most accurate); else what
-            the library has: `edges`, `none` (apriltag); `none`, `subpix`, `contour`, `apriltag` (opencv).
+        refine: How corners are placed: `fit` lays the whole known tag over the picture (the most accurate); `edges` are
+            AprilTag's own, `none` those that it starts from.
         gamma: Encoding of the picture, gray ~ light^(1/gamma): 2.2 for what most cameras deliver, 1 for raw sensors. It
             matters because a blurred edge of encoded gray lies in the black by up to half a pixel.
         max_hamming: Most bits that may be corrected.
 
     Raises:
-        LocalizationError: Unknown family, library or refinement, one that does not go with the other, or a gamma out of
-            range.
+        LocalizationError: Unknown family or refinement, or a gamma out of range.
     """
-    name = family_named(family).name
-    chosen = library or "apriltag"
-    if chosen not in LIBRARIES:
-        raise LocalizationError(f"unknown library '{chosen}'; available: {', '.join(LIBRARIES)}")
-    if chosen == "opencv" and not FAMILIES[name].opencv:
-        raise LocalizationError(f"OpenCV has no {name}: use the library 'apriltag'")
-    ways = ("fit", *LIBRARIES[chosen].refinements)
-    if refine not in ways:
-        raise LocalizationError(f"unknown refinement '{refine}' of {chosen}; available: {', '.join(ways)}")
+    if refine not in REFINEMENTS:
+        raise LocalizationError(f"unknown refinement '{refine}'; available: {', '.join(REFINEMENTS)}")
     if not 0.2 <= gamma <= 5.0:
         raise LocalizationError(
             f"gamma is {gamma}, expected 0.2 to 5: 1 for linear pictures, 2.2 for most cameras"
         )
-    return Detector(name, chosen, refine, float(gamma), int(max_hamming))
+    return Detector(family_named(family).name, refine, float(gamma), int(max_hamming))
 
 
 def _clipped(region: Region | None, gray: Image) -> Region:

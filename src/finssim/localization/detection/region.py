@@ -12,7 +12,7 @@ import numpy.typing as npt
 from finssim.localization.detection.detections import Detection, most_certain
 from finssim.localization.detection.detector import Detector, Region
 
-__all__ = ["RegionTracker", "SearchCounts", "merged", "region_around"]
+__all__ = ["RegionTracker", "SearchCounts"]
 
 Array = npt.NDArray[np.float64]
 

@@ -18,17 +18,14 @@ from finssim.files import atomic_write, refuse_unwritable
 from finssim.geometry.rotations import wrap_angle
 from finssim.localization.detection.detections import Frame
 from finssim.localization.errors import LocalizationError
-from finssim.localization.fusion.estimator import Estimator
-from finssim.localization.fusion.fuse_detections import NO_TAGS, Fixes, check_method
-from finssim.localization.fusion.fuse_log import Log, NoFix, load_log
+from finssim.localization.fusion.estimator import MODES, NO_TAGS, Estimator, Fixes, Health, check_method
+from finssim.localization.fusion.fuse_log import Log, NoFix, StreamTable, load_log
 from finssim.localization.fusion.fuse_settings import settings_of, site_of
-from finssim.localization.fusion.fuse_table import StreamTable
-from finssim.localization.fusion.health import MODES, Estimate, Health
-from finssim.localization.fusion.streams import Sample
+from finssim.localization.fusion.streams import Estimate, Sample
 from finssim.localization.pool import Pool, load_pool
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["COLUMNS", "Run", "fuse", "run", "write_rows"]
+__all__ = ["Run", "fuse", "run"]
 
 # The table that the fusion writes, and its summary.
 

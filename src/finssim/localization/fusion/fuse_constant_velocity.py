@@ -11,30 +11,33 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
-from finssim.localization.fusion import position_filter, yaw_filter
+from finssim.localization.fusion import attitude, position_filter
 from finssim.localization.fusion.attitude import (
     Tilt,
     TiltGains,
+    YawNoise,
+    YawState,
     follow,
     height_above_origin,
     roll_pitch,
     tilt_from,
+    yaw_rate,
 )
-from finssim.localization.fusion.changed import changed
 from finssim.localization.fusion.fuse_settings import Settings, Site
 from finssim.localization.fusion.gate import GateMemory, judge, judge_carried
-from finssim.localization.fusion.health import Estimate, Outcome
 from finssim.localization.fusion.position_filter import Motion, PositionState
 from finssim.localization.fusion.streams import (
     DepthSample,
+    Estimate,
     HeadingSample,
     ImuSample,
+    Outcome,
     VelocitySample,
     VisionSample,
+    changed,
 )
-from finssim.localization.fusion.yaw_filter import YawNoise, YawState, yaw_rate
 
-__all__ = ["ConstantVelocity", "Track", "motion_of", "vision_covariance"]
+__all__ = ["GYRO_HOLD", "ConstantVelocity", "Track", "motion_of", "vision_covariance"]
 
 Array = npt.NDArray[np.float64]
 
@@ -226,7 +229,7 @@ class ConstantVelocity:
 
     def _turned(self, track: Track, time: float, seen: float, variance: float) -> tuple[Track, Outcome]:
         s = self.settings
-        found = yaw_filter.innovation(track.yaw, seen, variance)
+        found = attitude.innovation(track.yaw, seen, variance)
         # Flipped yaws agree with one another as distances from the prediction, which turns with the vehicle.
         carried = track.imu_time is not None and time - track.imu_time <= GYRO_HOLD
         distance = float(found.mahalanobis)
@@ -234,11 +237,11 @@ class ConstantVelocity:
             s.gate, track.gates[1], time, float(found.residual), variance, distance, 0.05, carried
         )
         if verdict == "accepted":
-            yaw = yaw_filter.correct(track.yaw, found, variance)
+            yaw = attitude.correct(track.yaw, found, variance)
         elif verdict == "gate":
             yaw = track.yaw
         else:
-            yaw = yaw_filter.restarted(track.yaw, seen, variance, s.bias_std)
+            yaw = attitude.restarted(track.yaw, seen, variance, s.bias_std)
         then = track.yaw_seen if verdict == "gate" else time
         gates = (track.gates[0], memory, track.gates[2])
         track = changed(track, yaw=yaw, yaw_seen=then, gates=gates)
@@ -288,12 +291,12 @@ class ConstantVelocity:
         heard = -math.inf if track.imu_time is None or track.rate is None else track.imu_time + GYRO_HOLD
         for until in _steps(then, time, (heard,)):
             if until <= heard + 1e-12 and track.rate is not None:
-                yaw = yaw_filter.predict(yaw, track.rate, until - then, s.gyro)
+                yaw = attitude.predict(yaw, track.rate, until - then, s.gyro)
             else:
                 noise = YawNoise(rate=s.blind_rate, bias_walk=s.gyro.bias_walk)
-                yaw = yaw_filter.predict(yaw, yaw.bias, until - then, noise)
+                yaw = attitude.predict(yaw, yaw.bias, until - then, noise)
             then = until
-        return yaw_filter.capped(yaw, YAW_CAP) if yaw.variance > YAW_CAP else yaw
+        return attitude.capped(yaw, YAW_CAP) if yaw.variance > YAW_CAP else yaw
 
 
 _H_VISION = np.eye(6)[:2]

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.localization.errors import LocalizationError
+from finssim.localization.fusion.attitude import YawNoise
 from finssim.localization.fusion.gate import Gate
 from finssim.localization.fusion.position_filter import Motion
-from finssim.localization.fusion.yaw_filter import YawNoise
 from finssim.localization.pool import Pool
 from finssim.vehicles import Vehicle
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtri
 
-__all__ = ["Gate", "GateMemory", "Rival", "Suspects", "due", "judge", "judge_carried", "remember"]
+__all__ = ["Gate", "GateMemory", "judge", "judge_carried"]
 
 Array = npt.NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path, PurePath
 from typing import Any
@@ -21,21 +21,244 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from finssim.files import atomic_write, refuse_unwritable
 from finssim.geometry.optics import Lens
-from finssim.geometry.rotations import wrap_angle
+from finssim.geometry.rotations import quat_inverse_rotate, wrap_angle
 from finssim.localization.detection.detections import Frame, read_detections
-from finssim.localization.detection.families import family_named
-from finssim.localization.detection.tags import tag_corners_b
+from finssim.localization.detection.families import family_named, tag_corners_b
 from finssim.localization.errors import LocalizationError
-from finssim.localization.locate.localize_known import Known, known_of
-from finssim.localization.locate.series import Series, series
+from finssim.localization.fusion.attitude import roll_pitch, up_of
+from finssim.localization.fusion.fuse_log import StreamTable, read_stream_table
 from finssim.localization.pool import Pool, load_pool
-from finssim.localization.poses.measurement import Measurement, refused
+from finssim.localization.poses.measurement import Constraints, Measurement, refused
 from finssim.localization.poses.methods import METHODS, NEEDS_DEPTH
 from finssim.provenance import provenance
 from finssim.text_table import read_text_table
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["COLUMNS", "Locator", "Run", "run", "write_rows"]
+__all__ = ["Locator", "Run", "run"]
+
+# Samples over time, read at times between them and nowhere else.
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Samples in the order of their times."""
+
+    what: str
+    """Such as `depth`, as messages call it."""
+    t: Array
+    """[s], rising, (n,)."""
+    values: Array
+    """(n, k)"""
+    longest_gap: float
+    """Nothing is interpolated between samples further apart than this [s]."""
+
+    def at(self, time: float) -> Array | str:
+        """The values at a time [s], in a straight line between two samples, (k,); or why they are not known there."""
+        if not np.isfinite(time):
+            return f"no {self.what} at the exposure: the picture has no time stamp"
+        first, last = float(self.t[0]), float(self.t[-1])
+        if not first <= time <= last:
+            return f"no {self.what} at the exposure: {time:.3f} s is outside the file's {first:.3f} to {last:.3f} s"
+        k = int(np.searchsorted(self.t, time))
+        if self.t[k] == time:
+            return np.asarray(self.values[k])
+        gap = float(self.t[k] - self.t[k - 1])
+        if gap > self.longest_gap:
+            return f"no {self.what} at the exposure: its samples around {time:.3f} s are {gap:.2f} s apart"
+        share = (time - self.t[k - 1]) / gap
+        return np.asarray((1.0 - share) * self.values[k - 1] + share * self.values[k])
+
+
+def series(what: str, t: Array, values: Array, longest_gap: float, *, where: str) -> Series:
+    """Sort samples by time and leave out those without any number; of equal times the last is taken.
+
+    Raises:
+        LocalizationError: None is left.
+    """
+    order = np.argsort(t, kind="stable")
+    t, values = t[order], values[order]
+    good = np.isfinite(t) & np.isfinite(values).any(axis=1)
+    t, values = t[good], values[good]
+    if not len(t):
+        raise LocalizationError(f"{where}: no row holds a time and a {what}: expected numbers")
+    last = np.append(t[1:] > t[:-1], True)
+    return Series(what, t[last], values[last], longest_gap)
+
+
+# What is known of the vehicle's height and tilt at the exposure of a picture, from files or from one number.
+
+LEVEL_STD = math.radians(2.0)
+"""Tilt of a vehicle of which nobody says how it leans [rad]."""
+TILT_STD = math.radians(0.5)
+"""Error of an IMU's roll and pitch [rad]."""
+DEPTH_STD = 0.01
+"""Error of a depth where the vehicle file has no sensor [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Sources of height and tilt."""
+
+    base: Constraints
+    """All that does not change: vertical, port, standard deviations."""
+    surface: float
+    """Height of the still surface along `base.up`, from the pool's origin [m]."""
+    depth: Series | float | None
+    """Of the pressure port below the surface, positive down [m]."""
+    up: Series | None
+    """Unit vector upwards in the body frame; None: level."""
+    assumed: tuple[str, ...]
+    """Sentences on what was assumed."""
+
+    @property
+    def settings(self) -> dict[str, float]:
+        """Standard deviations, as plain values."""
+        return {
+            "depth_std": self.base.z_std,
+            "tilt_std_deg": math.degrees(self.base.tilt_std),
+            "shared_pixel_std": self.base.shared_pixel_std,
+        }
+
+    def at(self, time: float, *, needs_height: bool) -> Constraints | str | None:
+        """Height and tilt at a time [s], or why they are not known; None where nothing is known nor needed.
+
+        z_b = surface - depth - e3 . R_y(θ) R_x(φ) P_port, along the vertical.
+        """
+        if not needs_height and self.up is None:
+            return None
+        roll, pitch = 0.0, 0.0
+        if self.up is not None:
+            up_b = self.up.at(time)
+            if isinstance(up_b, str):
+                return up_b if needs_height else None
+            roll, pitch = (float(angle) for angle in roll_pitch(up_b))
+        depth = self.depth.at(time) if isinstance(self.depth, Series) else self.depth
+        if isinstance(depth, str):
+            if needs_height:
+                return depth
+            depth = None
+        below = math.nan if depth is None else float(np.ravel(depth)[0])
+        lever = float(up_of(roll, pitch) @ np.array(self.base.port))
+        return replace(self.base, z_b=self.surface - below - lever, roll=roll, pitch=pitch)
+
+
+def known_of(
+    pool: Pool,
+    vehicle: Vehicle,
+    *,
+    depth: str | float | Path | None,
+    imu: str | Path | None,
+    depth_std: float | None = None,
+    tilt_std: float | None = None,
+    shared_pixel_std: float = 0.0,
+    longest_gap: float = 1.0,
+) -> Known:
+    """Read the sources.
+
+    Args:
+        pool: Where the water is. Where its plane is a surface, depth and tilt are relative to it; where it is a wall,
+            to the world frame of the pool file.
+        vehicle: Where its pressure port is and how well that measures.
+        depth: File with columns t, depth, or one number [m], or None.
+        imu: File with columns t and roll, pitch or qx, qy, qz, qw, or None.
+        depth_std: Standard deviation of the depth [m]; None: that of the vehicle file's sensor.
+        tilt_std: Of roll and pitch [rad]; None: 0.5 degrees with an IMU, 2 degrees without.
+        shared_pixel_std: Error that all corners share [px].
+        longest_gap: Nothing is interpolated between samples further apart [s].
+
+    Raises:
+        LocalizationError: A file without the columns, or a number that is none.
+    """
+    up, surface = _vertical(pool)
+    sensor = vehicle.sensors.depth
+    port = (0.0, 0.0, 0.0) if sensor is None else tuple(float(x) for x in sensor.position)
+    known_std = DEPTH_STD if sensor is None else math.hypot(sensor.noise_std, sensor.bias_initial)
+    base = Constraints(
+        math.nan,
+        z_std=_spread("depth_std", depth_std, known_std),
+        tilt_std=_spread("tilt_std", tilt_std, LEVEL_STD if imu is None else TILT_STD),
+        up=up,
+        port=(port[0], port[1], port[2]),
+        shared_pixel_std=_spread("shared_pixel_std", shared_pixel_std, 0.0),
+    )
+    assumed = []
+    if imu is None:
+        spread = math.degrees(base.tilt_std)
+        assumed.append(f"no --imu: the vehicle is taken as level, give or take {spread:.1f} degrees")
+    if sensor is None and depth is not None:
+        assumed.append(f"{vehicle.name} has no depth sensor: the depth is taken as that of the body origin")
+    return Known(base, surface, _depth(depth, longest_gap), _tilt(imu, longest_gap), tuple(assumed))
+
+
+def _vertical(pool: Pool) -> tuple[tuple[float, float, float], float]:
+    """The unit vector upwards, pool frame, and the height of the still surface along it.
+
+    It is the plane's own normal where that is within 45 degrees of the world's z axis: water is level, surveys are
+    nearly so.
+    """
+    T_pw = pool.T_pw
+    if float(T_pw[:3, 2] @ pool.interface.normal) > math.sqrt(0.5):
+        x, y, z = (float(a) for a in pool.interface.normal)
+        return (x, y, z), -float(pool.interface.offset)
+    x, y, z = (float(a) for a in T_pw[:3, 2])
+    return (x, y, z), float(T_pw[:3, 2] @ T_pw[:3, 3])
+
+
+def _depth(depth: str | float | Path | None, longest_gap: float) -> Series | float | None:
+    if depth is None:
+        return None
+    try:
+        number = float(str(depth))
+    except ValueError:
+        table = read_stream_table(Path(str(depth)))
+        if not table.has("depth"):
+            raise LocalizationError(
+                f"{depth}: no column 'depth' with numbers: expected t [s] and depth [m], positive down"
+            ) from None
+        return series("depth", table.t, table.columns("depth"), longest_gap, where=str(depth))
+    if not math.isfinite(number):
+        raise LocalizationError(
+            f"depth is {depth}, expected metres below the surface, or a file with t, depth"
+        )
+    return number
+
+
+def _tilt(imu: str | Path | None, longest_gap: float) -> Series | None:
+    if imu is None:
+        return None
+    table = read_stream_table(Path(imu))
+    return series("attitude", table.t, _up(table, str(imu)), longest_gap, where=str(imu))
+
+
+def _up(table: StreamTable, where: str) -> Array:
+    """Up in the body frame for each row, (n, 3); its straight line between rows is how a vehicle leans."""
+    if table.has("qx", "qy", "qz", "qw"):
+        q = table.columns("qx", "qy", "qz", "qw")
+        size = np.linalg.norm(q, axis=1, keepdims=True)
+        if (np.abs(size[np.isfinite(size)] - 1.0) > 0.01).any():
+            raise LocalizationError(f"{where}: qx, qy, qz, qw are not of unit length: expected body to world")
+        return quat_inverse_rotate(q / size, np.array([0.0, 0.0, 1.0]))
+    for names, unit in ((("roll", "pitch"), 1.0), (("roll_deg", "pitch_deg"), math.pi / 180.0)):
+        if table.has(*names):
+            roll, pitch = (table.columns(*names) * unit).T
+            if np.nanmax(np.abs(table.columns(*names) * unit)) > 2.0 * math.pi:
+                raise LocalizationError(f"{where}: roll or pitch exceeds a turn: expected radians, or *_deg")
+            return up_of(roll, pitch)
+    raise LocalizationError(
+        f"{where}: no attitude: expected columns roll, pitch [rad] or qx, qy, qz, qw; of gyro and accelerometer alone "
+        "`finssim fuse` makes one"
+    )
+
+
+def _spread(name: str, value: float | None, default: float) -> float:
+    if value is None:
+        return default
+    if not (math.isfinite(value) and value >= 0.0):
+        raise LocalizationError(f"{name} is {value}, expected a standard deviation that is not negative")
+    return float(value)
+
 
 # Poses of a vehicle from the tags of one picture after the other, with what else is known at each exposure.
 
@@ -204,7 +427,6 @@ def _median(values: list[float]) -> float | None:
 
 # How far measured positions are from surveyed ones.
 
-Array = npt.NDArray[np.float64]
 
 TIMES = ("t", "time", "time_s", "timestamp")
 
@@ -318,7 +540,6 @@ class Seeing:
     family: str
     tags: tuple[int, ...] = ()
     """Those looked for in videos, near where they were a picture before."""
-    library: str | None = None
     refine: str = "fit"
     gamma: float = 1.0
     times: Path | None = None
@@ -365,7 +586,7 @@ def _seen(
     from finssim.localization.detection.pictures import pictures
     from finssim.localization.detection.region import RegionTracker
 
-    find = detector(seeing.family, library=seeing.library, refine=seeing.refine, gamma=seeing.gamma)
+    find = detector(seeing.family, refine=seeing.refine, gamma=seeing.gamma)
     film, tracker = "", None
     for time, name, image in pictures(list(inputs), times=seeing.times, tell=notes.append):
         if image.shape != (lens.height, lens.width):
@@ -415,7 +636,6 @@ def run(
     imu: str | Path | None = None,
     method: str = "refractive",
     family: str | None = None,
-    library: str | None = None,
     refine: str = "fit",
     gamma: float = 1.0,
     times: str | Path | None = None,
@@ -440,8 +660,7 @@ def run(
         imu (FILE): Table with columns t and roll, pitch [rad] or qx, qy, qz, qw; level if not given.
         method (METHOD): refractive, refractive-weighted, refractive-6dof, pinhole-depth or pinhole.
         family (NAME): Family of the tags; that of the vehicle file if not given.
-        library (NAME): Detector: apriltag or opencv.
-        refine (WAY): How corners are placed: fit, or a way of the library.
+        refine (WAY): How corners are placed: fit, or AprilTag's own edges or none.
         gamma: Encoding of the pictures: 1 linear, 2.2 video.
         times (FILE): Table with columns image, time [s], where names of pictures hold none.
         pixel_std: Error of a detected corner, per axis [px]; what the pool's calibration found, else 0.5, if not given.
@@ -477,9 +696,7 @@ def run(
     pixel_std = site.pixel_std if pixel_std is None else pixel_std
     locator = Locator(site, body, known, method=method, pixel_std=pixel_std, family=family)
     surveyed = None if truth is None else load_truth(truth, longest_gap)
-    seeing = Seeing(
-        locator.family, locator.tags, library, refine, gamma, None if times is None else Path(times)
-    )
+    seeing = Seeing(locator.family, locator.tags, refine, gamma, None if times is None else Path(times))
     notes: list[str] = []
     frames, count = frames_of(paths, site.camera.lens, seeing, notes)
     found = _measure(frames, count, locator)

@@ -11,8 +11,7 @@ import numpy as np
 from finssim.localization.detection.detections import Frame
 from finssim.localization.detection.detector import detector
 from finssim.localization.detection.region import RegionTracker
-from finssim.localization.fusion.estimator import Estimator
-from finssim.localization.fusion.fuse_detections import Fixes
+from finssim.localization.fusion.estimator import Estimator, Fixes
 from finssim.localization.fusion.streams import VisionSample
 from finssim.localization.pool import load_pool
 from finssim.robot.messages import Picture, TagCorners
