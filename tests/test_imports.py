@@ -125,7 +125,7 @@ HOMES = {
         "ros2/definitions.py",
     },
     "cv2": {
-        "calibration/vision/boards.py",
+        "calibration/vision/camera_fit.py",
         "calibration/vision/pool_search.py",
         "localization/detection/pictures.py",
         "robot/pictures.py",

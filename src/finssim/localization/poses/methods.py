@@ -133,8 +133,8 @@ class RefinedPose:
     H: Array
     """Weighted J'J by position, a turn about pool axes and, with prior knowledge, the shift, (6, 6) or (8, 8)."""
     curvature: Array
-    """What steps are made with: with prior knowledge H without what lies along the miss of far points, where Huber's rho
-    does not curve."""
+    """What steps are made with: H, with prior knowledge without what lies along the miss of far points, where Huber's
+    rho does not curve."""
     g: Array
     """Slope of half the cost, (6,) or (8,)."""
     iterations: int = 0
