@@ -345,11 +345,9 @@ def test_localize_looks_at_pictures(files, seen, tmp_path, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "words", [["--library", "opencv", "--refine", "subpix"], ["--refine", "edges"], ["--gamma", "2.2"]]
-)
+@pytest.mark.parametrize("words", [["--refine", "edges"], ["--gamma", "2.2"]])
 def test_localize_places_corners_as_it_is_told(files, seen, tmp_path, words):
-    """Another library, way or encoding gives other corners of the same tags, within 3 cm."""
+    """Another way or encoding gives other corners of the same tags, within 3 cm."""
     plain = localized(files, tmp_path, name="a.csv", **SEEN)
     rows = localized(files, tmp_path, *words, name="b.csv", **SEEN)
     off = np.hypot(column(rows, "x") - column(plain, "x"), column(rows, "y") - column(plain, "y"))
@@ -400,7 +398,6 @@ PLAIN = [*NO_DEPTH, "--depth", "0.5"]
         (["localize", "depth.csv", *PLAIN[2:]], "depth.csv: no column 'tag'"),
         (["localize", "pool.yaml", *PLAIN[2:]], "pool.yaml: expected a picture"),
         (["localize", "tags.csv", "seen/dive.avi", *PLAIN[2:]], "mixed"),
-        (["localize", "seen/dive.avi", *PLAIN[2:], "--library", "zbar"], "unknown library 'zbar'"),
         (["localize", "seen/dive.avi", *PLAIN[2:], "--refine", "guess"], "unknown refinement 'guess'"),
         (["localize", "seen/dive.avi", *PLAIN[2:], "--gamma", "50"], "gamma is 50"),
         (["localize", "seen/pictures", *PLAIN[2:], "--times", "nowhere.csv"], "nowhere.csv: cannot be read"),

@@ -34,6 +34,7 @@ from finssim.localization.fusion.streams import (
 )
 from finssim.localization.pool import Pool
 from finssim.localization.poses.measurement import axes_of_up
+from finssim.localization.poses.methods import TagLocator
 from finssim.robot.messages import (
     HEADING,
     POSE,
@@ -372,7 +373,11 @@ class Perception:
             LocalizationError: Unknown method, mode or library; a vehicle without tags; a pool whose z is not up.
         """
         self.vehicle, self.pool = vehicle, pool
-        self.fixes = None if pool is None else Fixes(pool, vehicle, method=method, pixel_std=pool.pixel_std)
+        self.fixes = (
+            None
+            if pool is None
+            else Fixes(TagLocator(pool, vehicle.tags, method=method, pixel_std=pool.pixel_std))
+        )
         self.estimator = Estimator(settings or settings_of(vehicle), site_of(pool, vehicle), mode=mode)
         self.unfused = None if fusion else Unfused()
         self._aboard = Aboard(vehicle)

@@ -7,7 +7,6 @@ picture without tags is a row whose cells after `image` are empty.
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from collections.abc import Iterable, Mapping
@@ -17,9 +16,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from finssim.files import atomic_write
 from finssim.localization.errors import LocalizationError
-from finssim.text_table import read_text_table
+from finssim.text_table import read_text_table, write_csv
 
 __all__ = ["Detection", "Frame", "most_certain", "read_detections", "write_detections"]
 
@@ -94,16 +92,15 @@ def write_detections(frames: Iterable[Frame], path: str | Path) -> None:
     Raises:
         OutputError: The file cannot be written.
     """
-    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        for frame in frames:
-            head = [_cell(frame.time), frame.image]
-            for found in frame.detections:
-                pixels = [_cell(x) for x in np.asarray(found.corners, float).ravel().tolist()]
-                writer.writerow([*head, found.tag, *pixels, _cell(found.margin), found.hamming, found.family])
-            if not frame.detections:
-                writer.writerow(head + [""] * (len(COLUMNS) - 2))
+    rows: list[list[object]] = []
+    for frame in frames:
+        head: list[object] = [_cell(frame.time), frame.image]
+        for found in frame.detections:
+            pixels = [_cell(x) for x in np.asarray(found.corners, float).ravel().tolist()]
+            rows.append([*head, found.tag, *pixels, _cell(found.margin), found.hamming, found.family])
+        if not frame.detections:
+            rows.append(head + [""] * (len(COLUMNS) - 2))
+    write_csv(path, COLUMNS, rows)
 
 
 def read_detections(path: str | Path, notes: list[str] | None = None) -> list[Frame]:

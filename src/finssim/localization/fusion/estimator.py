@@ -11,7 +11,6 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 
 from finssim.localization.detection.detections import Frame
-from finssim.localization.detection.families import tag_corners_b
 from finssim.localization.errors import LocalizationError
 from finssim.localization.fusion.attitude import height_above_origin
 from finssim.localization.fusion.error_state import ErrorState
@@ -31,12 +30,10 @@ from finssim.localization.fusion.streams import (
     VisionSample,
     refusal,
 )
-from finssim.localization.pool import Pool
 from finssim.localization.poses.measurement import Constraints
-from finssim.localization.poses.methods import METHODS, NEEDS_DEPTH
-from finssim.vehicles import Vehicle
+from finssim.localization.poses.methods import TagLocator
 
-__all__ = ["MODELS", "MODES", "NO_TAGS", "Estimator", "Fixes", "Health", "Model", "check_method", "health_of"]
+__all__ = ["MODELS", "MODES", "Estimator", "Fixes", "Health", "Model", "health_of"]
 
 S = TypeVar("S")
 
@@ -461,44 +458,16 @@ class Estimator:
 
 # Pictures with tags as fixes, with the depth and tilt that the estimator knows at their exposure.
 
-NO_TAGS = "the vehicle file has no tags: add a section tags: with family, edge and mounts"
-
-
-def check_method(method: str) -> None:
-    """Refuse a word that is no name of `METHODS`.
-
-    Raises:
-        LocalizationError: It is none; the sentence lists them.
-    """
-    if method not in METHODS:
-        raise LocalizationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
-
 
 class Fixes:
     """Makes a fix of each picture."""
 
-    def __init__(
-        self, pool: Pool, vehicle: Vehicle, *, method: str = "refractive", pixel_std: float = 0.5
-    ) -> None:
+    def __init__(self, locator: TagLocator) -> None:
         """
         Args:
-            pool: Camera and water.
-            vehicle: Its tags.
-            method: A name of `METHODS`.
-            pixel_std: Standard deviation of a corner [px].
-
-        Raises:
-            LocalizationError: Unknown method, a vehicle without tags, or no error at all.
+            locator: Measures the poses.
         """
-        check_method(method)
-        if vehicle.tags is None:
-            raise LocalizationError(NO_TAGS)
-        if not (math.isfinite(pixel_std) and pixel_std > 0.0):
-            raise LocalizationError(
-                f"pixel_std is {pixel_std}, expected the error of a corner in pixels, such as 0.3"
-            )
-        self._pool, self._method, self._pixel_std = pool, method, pixel_std
-        self._tags = tag_corners_b(vehicle.tags)
+        self._locate = locator
 
     def fix(self, frame: Frame, estimator: Estimator) -> VisionSample | str:
         """The fix of one picture, or why there is none.
@@ -511,11 +480,11 @@ class Fixes:
             return "time not finite"
         if not frame.detections:
             return "no tag"
-        time = frame.time - self._pool.latency
+        time = frame.time - self._locate.pool.latency
         constraints = self._constraints(time, estimator)
-        if constraints is None and self._method in NEEDS_DEPTH:
+        if constraints is None and self._locate.needs_height:
             return "no depth or tilt"
-        found = METHODS[self._method](frame.detections, self._pool, self._tags, constraints, self._pixel_std)
+        found = self._locate(frame.detections, constraints)
         if not found.ok:
             return counted(found.reason)
         R = np.asarray(found.covariance, float)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
-import re
 import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -21,71 +19,22 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from finssim.files import atomic_write, refuse_unwritable
 from finssim.geometry.optics import Lens
-from finssim.geometry.rotations import quat_inverse_rotate, wrap_angle
+from finssim.geometry.rotations import wrap_angle
 from finssim.localization.detection.detections import Frame, read_detections
-from finssim.localization.detection.families import family_named, tag_corners_b
+from finssim.localization.detection.families import family_named
 from finssim.localization.errors import LocalizationError
 from finssim.localization.fusion.attitude import roll_pitch, up_of
-from finssim.localization.fusion.fuse_log import StreamTable, read_stream_table
+from finssim.localization.fusion.fuse_log import Series, counted, read_stream_table, series
 from finssim.localization.pool import Pool, load_pool
 from finssim.localization.poses.measurement import Constraints, Measurement, refused
-from finssim.localization.poses.methods import METHODS, NEEDS_DEPTH
+from finssim.localization.poses.methods import NEEDS_DEPTH, TagLocator
 from finssim.provenance import provenance
-from finssim.text_table import read_text_table
+from finssim.text_table import write_csv
 from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["Locator", "Run", "run"]
 
-# Samples over time, read at times between them and nowhere else.
-
 Array = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Series:
-    """Samples in the order of their times."""
-
-    what: str
-    """Such as `depth`, as messages call it."""
-    t: Array
-    """[s], rising, (n,)."""
-    values: Array
-    """(n, k)"""
-    longest_gap: float
-    """Nothing is interpolated between samples further apart than this [s]."""
-
-    def at(self, time: float) -> Array | str:
-        """The values at a time [s], in a straight line between two samples, (k,); or why they are not known there."""
-        if not np.isfinite(time):
-            return f"no {self.what} at the exposure: the picture has no time stamp"
-        first, last = float(self.t[0]), float(self.t[-1])
-        if not first <= time <= last:
-            return f"no {self.what} at the exposure: {time:.3f} s is outside the file's {first:.3f} to {last:.3f} s"
-        k = int(np.searchsorted(self.t, time))
-        if self.t[k] == time:
-            return np.asarray(self.values[k])
-        gap = float(self.t[k] - self.t[k - 1])
-        if gap > self.longest_gap:
-            return f"no {self.what} at the exposure: its samples around {time:.3f} s are {gap:.2f} s apart"
-        share = (time - self.t[k - 1]) / gap
-        return np.asarray((1.0 - share) * self.values[k - 1] + share * self.values[k])
-
-
-def series(what: str, t: Array, values: Array, longest_gap: float, *, where: str) -> Series:
-    """Sort samples by time and leave out those without any number; of equal times the last is taken.
-
-    Raises:
-        LocalizationError: None is left.
-    """
-    order = np.argsort(t, kind="stable")
-    t, values = t[order], values[order]
-    good = np.isfinite(t) & np.isfinite(values).any(axis=1)
-    t, values = t[good], values[good]
-    if not len(t):
-        raise LocalizationError(f"{where}: no row holds a time and a {what}: expected numbers")
-    last = np.append(t[1:] > t[:-1], True)
-    return Series(what, t[last], values[last], longest_gap)
-
 
 # What is known of the vehicle's height and tilt at the exposure of a picture, from files or from one number.
 
@@ -212,7 +161,7 @@ def _depth(depth: str | float | Path | None, longest_gap: float) -> Series | flo
     try:
         number = float(str(depth))
     except ValueError:
-        table = read_stream_table(Path(str(depth)))
+        table = read_stream_table(str(depth))
         if not table.has("depth"):
             raise LocalizationError(
                 f"{depth}: no column 'depth' with numbers: expected t [s] and depth [m], positive down"
@@ -226,30 +175,17 @@ def _depth(depth: str | float | Path | None, longest_gap: float) -> Series | flo
 
 
 def _tilt(imu: str | Path | None, longest_gap: float) -> Series | None:
+    """Up in the body frame, whose straight line between rows is how a vehicle leans."""
     if imu is None:
         return None
-    table = read_stream_table(Path(imu))
-    return series("attitude", table.t, _up(table, str(imu)), longest_gap, where=str(imu))
-
-
-def _up(table: StreamTable, where: str) -> Array:
-    """Up in the body frame for each row, (n, 3); its straight line between rows is how a vehicle leans."""
-    if table.has("qx", "qy", "qz", "qw"):
-        q = table.columns("qx", "qy", "qz", "qw")
-        size = np.linalg.norm(q, axis=1, keepdims=True)
-        if (np.abs(size[np.isfinite(size)] - 1.0) > 0.01).any():
-            raise LocalizationError(f"{where}: qx, qy, qz, qw are not of unit length: expected body to world")
-        return quat_inverse_rotate(q / size, np.array([0.0, 0.0, 1.0]))
-    for names, unit in ((("roll", "pitch"), 1.0), (("roll_deg", "pitch_deg"), math.pi / 180.0)):
-        if table.has(*names):
-            roll, pitch = (table.columns(*names) * unit).T
-            if np.nanmax(np.abs(table.columns(*names) * unit)) > 2.0 * math.pi:
-                raise LocalizationError(f"{where}: roll or pitch exceeds a turn: expected radians, or *_deg")
-            return up_of(roll, pitch)
-    raise LocalizationError(
-        f"{where}: no attitude: expected columns roll, pitch [rad] or qx, qy, qz, qw; of gyro and accelerometer alone "
-        "`finssim fuse` makes one"
-    )
+    table = read_stream_table(imu)
+    up = table.up()
+    if up is None:
+        raise LocalizationError(
+            f"{imu}: no attitude: expected columns roll, pitch [rad] or qx, qy, qz, qw; of gyro and accelerometer "
+            "alone `finssim fuse` makes one"
+        )
+    return series("attitude", table.t, up, longest_gap, where=str(imu))
 
 
 def _spread(name: str, value: float | None, default: float) -> float:
@@ -286,47 +222,32 @@ class Locator:
             family: Of the tags; None: that of the vehicle file.
 
         Raises:
-            LocalizationError: Unknown method, no depth where it needs one, a vehicle without tags, or no error at all.
+            LocalizationError: As of `TagLocator`, or no depth where the method needs one.
         """
-        if method not in METHODS:
-            raise LocalizationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
-        if method in NEEDS_DEPTH and known.depth is None:
+        self._locate = TagLocator(pool, vehicle.file_tags, method=method, pixel_std=pixel_std)
+        if self._locate.needs_height and known.depth is None:
             raise LocalizationError(
                 f"method {method} needs --depth FILE (columns t, depth) or --depth METRES, the depth of the pressure "
                 "port; --method refractive-6dof does without"
             )
-        tags = vehicle.file_tags
-        if tags is None:
-            raise LocalizationError(
-                f"{vehicle.name}: the vehicle file has no tags: add a section tags: with family, edge and mounts"
-            )
-        if not (math.isfinite(pixel_std) and pixel_std > 0.0):
-            raise LocalizationError(
-                f"pixel_std is {pixel_std}, expected the error of a corner in pixels, such as 0.3"
-            )
-        self.known, self.family = known, family_named(family or tags.family).name
-        self._pool, self._method, self._pixel_std = pool, method, pixel_std
-        self._tags_b = tag_corners_b(tags)
-
-    @property
-    def tags(self) -> tuple[int, ...]:
+        self.known, self.tags = known, tuple(self._locate.tags_b)
         """Ids of the vehicle's tags."""
-        return tuple(self._tags_b)
+        self.family = family_named(family or self._locate.family).name
 
     def locate(self, frame: Frame) -> Measurement:
         """The pose in one picture, or why there is none."""
+        locate = self._locate
         seen = [found for found in frame.detections if _name(found.family) in ("", self.family)]
-        needs_height = self._method in NEEDS_DEPTH
         constraints = None
         if seen:
-            known = self.known.at(frame.time - self._pool.latency, needs_height=needs_height)
+            known = self.known.at(frame.time - locate.pool.latency, needs_height=locate.needs_height)
             if isinstance(known, str):
-                return refused(self._method, known)
+                return refused(locate.method, known)
             constraints = known
         elif frame.detections:
             other = ", ".join(sorted({found.family for found in frame.detections}))
-            return refused(self._method, f"no tag of family {self.family} seen: {other}")
-        return METHODS[self._method](seen, self._pool, self._tags_b, constraints, self._pixel_std)
+            return refused(locate.method, f"no tag of family {self.family} seen: {other}")
+        return locate(seen, constraints)
 
 
 @cache
@@ -357,11 +278,7 @@ def write_rows(rows: Sequence[Row], out: Path) -> None:
     Raises:
         OutputError: The file cannot be written.
     """
-    with atomic_write(out) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        for frame, found in rows:
-            writer.writerow(_cells(frame, found))
+    write_csv(out, COLUMNS, (_cells(frame, found) for frame, found in rows))
 
 
 def _cells(frame: Frame, found: Measurement) -> list[Any]:
@@ -379,7 +296,7 @@ def _cells(frame: Frame, found: Measurement) -> list[Any]:
 def summary_of(rows: Sequence[Row]) -> dict[str, Any]:
     """Figures of a run, as plain values."""
     located = [found for _, found in rows if found.ok]
-    reasons = Counter(_short(found.reason) for _, found in rows if not found.ok)
+    reasons = Counter(counted(found.reason) for _, found in rows if not found.ok)
     rejected: Counter[str] = Counter()
     for _, found in rows:
         rejected.update(found.rejected)
@@ -416,19 +333,11 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _short(reason: str) -> str:
-    """A reason without its particulars, for counting."""
-    return re.split(r"[:(]", reason, maxsplit=1)[0].strip()
-
-
 def _median(values: list[float]) -> float | None:
     return float(np.median(values)) if values else None
 
 
 # How far measured positions are from surveyed ones.
-
-
-TIMES = ("t", "time", "time_s", "timestamp")
 
 
 class Truth:
@@ -480,51 +389,18 @@ def load_truth(path: str | Path, longest_gap: float = 1.0) -> Truth:
     """Read a table with columns x, y [m], and image or t [s], and yaw [rad] or yaw_deg where it is known; pool frame.
 
     Raises:
-        LocalizationError: Unreadable, without these columns, or with a cell that is no number; names file and line.
+        LocalizationError: Unreadable, or without these columns.
     """
-    table = read_text_table(path, LocalizationError)
-    names = [name.lower() for name in table.names]
-    time = next((name for name in TIMES if name in names), None)
-    if not {"x", "y"} <= set(names) or (time is None and "image" not in names):
-        raise LocalizationError(
-            f"{path}: columns {','.join(names)[:80]}, expected image or t, x, y and perhaps yaw"
-        )
-    by_image: dict[str, Array] = {}
-    times, values = [], []
-    for number, row in zip(table.lines, table.rows, strict=True):
-        cells = dict(zip(names, row, strict=False))
-        value = _value(cells, f"{path}: line {number}")
-        if cells.get("image"):
-            by_image[PurePath(cells["image"]).name] = value
-        if time and cells.get(time):
-            times.append(_number(cells[time], time, f"{path}: line {number}"))
-            values.append(value)
-    by_time = (
-        series("truth", np.array(times), np.array(values), longest_gap, where=str(path)) if times else None
-    )
-    return Truth(by_image, by_time)
-
-
-def _value(cells: dict[str, str], where: str) -> Array:
-    yaw = math.nan
-    if cells.get("yaw"):
-        yaw = _number(cells["yaw"], "yaw", where)
-    elif cells.get("yaw_deg"):
-        yaw = math.radians(_number(cells["yaw_deg"], "yaw_deg", where))
-    x, y = (_number(cells.get(name, ""), name, where) for name in "xy")
-    return np.array([x, y, math.cos(yaw), math.sin(yaw)])
-
-
-def _number(cell: str, name: str, where: str) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise LocalizationError(
-            f"{where}: {name} is '{cell[:40]}', expected a finite number: correct or remove it"
-        )
-    return value
+    table = read_stream_table(path, timed=False)
+    timed = bool(np.isfinite(table.t).any())
+    if not table.has("x", "y") or not (timed or "image" in table.words):
+        columns = ",".join((*table.words, *table.numbers))[:80]
+        raise LocalizationError(f"{path}: columns {columns}, expected image or t, x, y and perhaps yaw")
+    yaw = table.angle("yaw")
+    values = np.column_stack([table.columns("x", "y"), np.cos(yaw), np.sin(yaw)])
+    images = zip(table.words.get("image", ()), values, strict=False)
+    by_image = {PurePath(name).name: value for name, value in images if name and np.isfinite(value[:2]).all()}
+    return Truth(by_image, series("truth", table.t, values, longest_gap, where=str(path)) if timed else None)
 
 
 # Pictures with the tags found in them: from pictures and videos, or from detection files.

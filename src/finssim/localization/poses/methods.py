@@ -13,6 +13,8 @@ import numpy.typing as npt
 from finssim.geometry.optics import Camera, Lens, back_project, projection_jacobians
 from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_to_matrix, quat_to_rotvec, skew
 from finssim.localization.detection.detections import Detection
+from finssim.localization.detection.families import tag_corners_b
+from finssim.localization.errors import LocalizationError
 from finssim.localization.pool import Pool
 from finssim.localization.poses.measurement import (
     Constraints,
@@ -24,10 +26,11 @@ from finssim.localization.poses.measurement import (
     tilt_matrix,
 )
 from finssim.localization.poses.planar_fit import WORST, planar_fit
+from finssim.vehicles.equipment import Tags
 
 __all__ = [
-    "METHODS", "NEEDS_DEPTH", "Constraints", "Measurement", "Method", "RefinedPose", "refine_pose", "plane_pose",
-    "through_lens",
+    "METHODS", "NEEDS_DEPTH", "Constraints", "Measurement", "Method", "RefinedPose", "TagLocator",
+    "check_method", "plane_pose", "refine_pose", "through_lens",
 ]  # fmt: skip
 
 Array = npt.NDArray[np.float64]
@@ -682,3 +685,46 @@ METHODS: dict[str, Method] = {
 }
 NEEDS_DEPTH = frozenset({"refractive", "refractive-weighted", "pinhole-depth"})
 """Methods that refuse to work without constraints."""
+
+
+def check_method(method: str) -> None:
+    """Refuse a word that is no name of `METHODS`.
+
+    Raises:
+        LocalizationError: It is none; the sentence lists them.
+    """
+    if method not in METHODS:
+        raise LocalizationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
+
+
+class TagLocator:
+    """Measures poses of one vehicle before one camera by one method; it remembers nothing of them."""
+
+    def __init__(
+        self, pool: Pool, tags: Tags | None, *, method: str = "refractive", pixel_std: float = 0.5
+    ) -> None:
+        """
+        Args:
+            pool: Camera and water.
+            tags: Of the vehicle; None is refused.
+            method: A name of `METHODS`.
+            pixel_std: Standard deviation of a corner, per axis [px].
+
+        Raises:
+            LocalizationError: Unknown method, a vehicle without tags, or no error at all.
+        """
+        check_method(method)
+        if tags is None:
+            raise LocalizationError(
+                "the vehicle file has no tags: add a section tags: with family, edge and mounts"
+            )
+        if not (math.isfinite(pixel_std) and pixel_std > 0.0):
+            raise LocalizationError(
+                f"pixel_std is {pixel_std}, expected the error of a corner in pixels, such as 0.3"
+            )
+        self.pool, self.method, self.needs_height = pool, method, method in NEEDS_DEPTH
+        self.tags_b, self.family, self._pixel_std = tag_corners_b(tags), tags.family, pixel_std
+
+    def __call__(self, detections: Iterable[Detection], constraints: Constraints | None) -> Measurement:
+        """The pose in one picture, or why there is none."""
+        return METHODS[self.method](detections, self.pool, self.tags_b, constraints, self._pixel_std)
