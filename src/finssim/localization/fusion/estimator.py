@@ -17,7 +17,7 @@ from finssim.localization.fusion.error_state import ErrorState
 from finssim.localization.fusion.fuse_constant_velocity import (
     ConstantVelocity,
 )
-from finssim.localization.fusion.fuse_log import counted
+from finssim.localization.fusion.fuse_log import counted, rows_of
 from finssim.localization.fusion.fuse_settings import Settings, Site
 from finssim.localization.fusion.streams import (
     DepthSample,
@@ -488,8 +488,7 @@ class Fixes:
         if not found.ok:
             return counted(found.reason)
         R = np.asarray(found.covariance, float)
-        rows = tuple((float(row[0]), float(row[1]), float(row[2])) for row in 0.5 * (R + R.T))
-        return VisionSample(time, (found.x, found.y), found.yaw, rows, frame.time)
+        return VisionSample(time, (found.x, found.y), found.yaw, rows_of(0.5 * (R + R.T)), frame.time)
 
     def _constraints(self, time: float, estimator: Estimator) -> Constraints | None:
         near, site = estimator.at(time), estimator.site

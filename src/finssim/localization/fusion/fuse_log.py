@@ -6,6 +6,7 @@ import math
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,8 +18,20 @@ from finssim.localization.fusion.attitude import in_body_axes, roll_pitch, up_of
 from finssim.localization.fusion.streams import DepthSample, ImuSample, Sample, VisionSample
 from finssim.text_table import EMPTY, TextTable, read_text_table
 from finssim.vehicles import Vehicle
+from finssim.vehicles.equipment import Imu
 
-__all__ = ["Log", "NoFix", "Series", "StreamTable", "counted", "load_log", "read_stream_table", "series"]
+__all__ = [
+    "ImuColumns",
+    "Log",
+    "NoFix",
+    "Series",
+    "StreamTable",
+    "counted",
+    "imu_columns",
+    "load_log",
+    "read_stream_table",
+    "series",
+]
 
 # Reading the tables of a log: columns of numbers by name, empty cells as NaN.
 
@@ -288,49 +301,70 @@ def _present(name: str, table: StreamTable) -> bool:
     return table.has("depth") if name == "depth" else table.has("x", "y")
 
 
-def _imu(
-    table: StreamTable, vehicle: Vehicle, log: Log, *, latency: float, imu_axes: str | None
-) -> list[Sample]:
-    sensor = vehicle.sensors.imu
+class ImuColumns(NamedTuple):
+    """What a table holds of an IMU, in body axes; NaN where a row has none."""
+
+    omega: Array
+    """Angular rate [rad/s], (n, 3)."""
+    force: Array
+    """Specific force [m/s²], (n, 3)."""
+    up: Array | None
+    """Unit vectors upwards, (n, 3); None without an attitude."""
+    mount: Array
+    """Axes of the columns to body axes, xyzw, (4,)."""
+
+
+def imu_columns(table: StreamTable, sensor: Imu | None, axes: str | None = None) -> ImuColumns:
+    """The columns of an IMU, turned into body axes where they are in its own.
+
+    Args:
+        table: The table.
+        sensor: How the IMU is mounted.
+        axes: `body` or `sensor`; None: `gyro_x`, `accel_x`, ... are the sensor's, `p`, `ax`, ... the body's.
+
+    Raises:
+        LocalizationError: Columns are in the sensor's axes, whose mount is not known; or no attitude can be so.
+    """
     own = table.has(*SENSOR_RATES) and not table.has(*RATES)
-    turned = imu_axes == "sensor" or (own and imu_axes is None)
+    turned = axes == "sensor" or (own and axes is None)
     if turned and sensor is None:
         raise LocalizationError(
             f"{table.name}: rates in the IMU's axes, but the vehicle file has no sensors.imu.orientation: add it"
         )
-    mount = np.array(sensor.orientation) if turned and sensor is not None else np.array([0.0, 0.0, 0.0, 1.0])
-    omega = in_body_axes(table.columns(*(SENSOR_RATES if own else RATES)), mount)
-    names = SENSOR_FORCE if table.has(*SENSOR_FORCE) else FORCE
-    force = in_body_axes(table.columns(*names), mount) if table.has(*names) else np.full(omega.shape, np.nan)
+    mount = np.array(sensor.orientation if turned and sensor is not None else (0.0, 0.0, 0.0, 1.0), float)
+    found = [np.full((len(table.t), 3), np.nan)] * 2
+    forces = SENSOR_FORCE if table.has(*SENSOR_FORCE) else FORCE
+    for i, names in enumerate((SENSOR_RATES if own else RATES, forces)):
+        if table.has(*names):
+            found[i] = in_body_axes(table.columns(*names), mount)
+    up = table.up()
+    return ImuColumns(found[0], found[1], None if up is None else in_body_axes(up, mount), mount)
+
+
+def _imu(
+    table: StreamTable, vehicle: Vehicle, log: Log, *, latency: float, imu_axes: str | None
+) -> list[Sample]:
+    sensor = vehicle.sensors.imu
+    omega, force, up, _ = imu_columns(table, sensor, imu_axes)
     size = float(np.nanmedian(np.linalg.norm(force, axis=1))) if np.isfinite(force).any() else math.nan
     if size < 0.5 * vehicle.water.gravity:
         log.notes.append(f"accelerations of {size:.2g} m/s² hold no gravity and were left out")
         force = np.full(omega.shape, np.nan)
-    tilt = _tilt(table, mount)
+    tilt = np.full((len(omega), 2), np.nan) if up is None else np.stack(roll_pitch(up), axis=-1)
     rows = np.flatnonzero(~np.isnan(omega).any(axis=1))
     if len(rows) > 1:  # an attitude that was logged in rows of its own is carried on to the next rate
         tilt = _carried(table.t, tilt)
     arrival = _arrival(table, 0.0 if sensor is None else sensor.latency)
     return [
         ImuSample(
-            float(table.t[k]),
-            (float(omega[k, 0]), float(omega[k, 1]), float(omega[k, 2])),
-            None
-            if np.isnan(force[k]).any()
-            else (float(force[k, 0]), float(force[k, 1]), float(force[k, 2])),
-            None if np.isnan(tilt[k]).any() else (float(tilt[k, 0]), float(tilt[k, 1])),
-            float(arrival[k]),
+            time=float(table.t[k]),
+            omega=_three(omega[k]),
+            force=None if np.isnan(force[k]).any() else _three(force[k]),
+            tilt=None if np.isnan(tilt[k]).any() else (float(tilt[k, 0]), float(tilt[k, 1])),
+            arrival=float(arrival[k]),
         )
         for k in rows
     ]
-
-
-def _tilt(table: StreamTable, mount: Array) -> Array:
-    """Roll and pitch of the body in each row [rad], (n, 2); NaN where the row has none."""
-    up = table.up()
-    if up is None:
-        return np.full((len(table.t), 2), np.nan)
-    return np.stack(roll_pitch(in_body_axes(up, mount)), axis=-1)
 
 
 def _carried(t: Array, values: Array) -> Array:
@@ -366,11 +400,11 @@ def _vision(
     time = table.numbers["exposure"] if table.has("exposure") else table.t - latency
     return [
         VisionSample(
-            float(time[k]),
-            (float(xy[k, 0]), float(xy[k, 1])),
-            None if math.isnan(yaw[k]) else float(yaw[k]),
-            None if np.isnan(covariance[k]).any() else _rows(covariance[k]),
-            float(arrival[k]),
+            time=float(time[k]),
+            position=(float(xy[k, 0]), float(xy[k, 1])),
+            yaw=None if math.isnan(yaw[k]) else float(yaw[k]),
+            covariance=None if np.isnan(covariance[k]).any() else rows_of(covariance[k]),
+            arrival=float(arrival[k]),
         )
         for k in rows
     ]
@@ -411,5 +445,11 @@ def _thinned(rows: npt.NDArray[np.intp], values: Array, stream: str, log: Log) -
     return np.asarray(rows[new])
 
 
-def _rows(R: Array) -> tuple[tuple[float, float, float], ...]:
-    return tuple((float(row[0]), float(row[1]), float(row[2])) for row in R)
+def _three(values: Array) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def rows_of(R: Array) -> tuple[tuple[float, float, float], ...]:
+    """The rows of a matrix (3, 3) as plain numbers."""
+    return tuple(_three(row) for row in R)
