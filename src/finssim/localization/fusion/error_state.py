@@ -14,6 +14,7 @@ With a Doppler log or a compass it has five more (20): [δb_c, δs, δb_v], thei
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -383,6 +384,12 @@ TILT_CAP = 0.5
 """Doubt of roll and pitch does not grow beyond this [rad]."""
 
 
+GATES = ("vision", "yaw", "depth", "velocity", "heading")
+"""Streams in the order of their gates."""
+TIMED = ("vision", "depth", "velocity")
+"""Those whose latest believed measurement's time counts."""
+
+
 @dataclass(frozen=True)
 class InertialTrack:
     """All that the filter knows; nothing else remembers."""
@@ -400,7 +407,7 @@ class InertialTrack:
     imu_time: float | None = None
     velocity_time: float | None = None
     gates: tuple[GateMemory, ...] = (GateMemory(),) * 5
-    """Memories of the gates of position, yaw, depth, Doppler velocity and compass."""
+    """Their memories, in the order of `GATES`."""
     roll: float = 0.0
     pitch: float = 0.0
 
@@ -463,87 +470,119 @@ class ErrorState:
         if track.inertial is None:
             before, outcomes = self._before.depth(track.before, sample)
             return self._begun(changed(track, before=before), sample.time), outcomes
-        s, track = self.settings, self._until(track, sample.time)
-        assert track.inertial is not None
-        height, H = depth_model(track.inertial, self._port, self._up, self.site.offset)
-        residual, R = -sample.depth - height, np.array([[s.depth_std**2]])
-        distance, gain = error_innovation(track.inertial, residual, H, R)
-        verdict, memory = judge(
-            s.gate, track.gates[2], sample.time, residual, R, float(distance), s.speed_std
-        )
-        state = track.inertial
-        if verdict == "accepted":
-            state = correct(state, residual, H, R, gain)
-        elif verdict == "reacquired":
-            state = restarted(state, [2], state.p[2:] + residual / self._up[2], R, s.speed_std)
-        then = track.depth_time if verdict == "gate" else sample.time
-        gates = (*track.gates[:2], memory, *track.gates[3:])
-        track = self._kept(changed(track, inertial=state, depth_time=then, gates=gates))
-        return track, (Outcome("depth", verdict, float(distance), 1),)
+        track, state = self._at(track, sample.time)
+        height, H = depth_model(state, self._port, self._up, self.site.offset)
+        residual, R = -sample.depth - height, np.array([[self.settings.depth_std**2]])
+        speed = self.settings.speed_std
+
+        def restart(state: InertialState) -> InertialState:
+            return restarted(state, [2], state.p[2:] + residual / self._up[2], R, speed)
+
+        track, outcome = self._measured(track, "depth", sample.time, residual, H, R, residual, speed, restart)
+        return self._kept(track), (outcome,)
 
     def vision(self, track: InertialTrack, sample: VisionSample) -> tuple[InertialTrack, tuple[Outcome, ...]]:
         """Take in a fix of the camera."""
         if track.inertial is None:
             before, outcomes = self._before.vision(track.before, sample)
             return self._begun(changed(track, before=before), sample.time), outcomes
-        R = vision_covariance(sample, self.settings)
-        track, seen = self._fixed(self._until(track, sample.time), sample, R[:2, :2])
-        if sample.yaw is None:
+        R, speed = vision_covariance(sample, self.settings), self.settings.speed_std
+        track, state = self._at(track, sample.time)
+        position, H = position_model(state, self._body)
+        fix = np.array(sample.position)
+        off, R_xy = fix - position[:2], R[:2, :2]
+
+        def restart(state: InertialState) -> InertialState:
+            return restarted(state, [0, 1], state.p[:2] + off, R_xy, speed)
+
+        track, seen = self._measured(track, "vision", sample.time, off, H[:2], R_xy, fix, speed, restart)
+        if sample.yaw is None or track.inertial is None:
             return self._kept(track), (seen,)
-        track, turned = self._turned(track, sample, R[2:, 2:])
-        return self._kept(track), (seen, turned)
+        yaw, H = yaw_model(track.inertial)
+        residual, R_yaw = wrap_angle(np.array([sample.yaw]) - yaw), R[2:, 2:]
+        # Flipped yaws agree with one another as distances from the prediction, which turns with the vehicle.
+        carried = track.imu_time is not None and sample.time - track.imu_time <= GYRO_HOLD
+
+        def turn(state: InertialState) -> InertialState:
+            return turned(state, float(residual[0]), float(R_yaw[0, 0]))
+
+        track, turn_outcome = self._measured(
+            track, "yaw", sample.time, residual, H, R_yaw, residual, 0.05, turn, carried=carried
+        )
+        return self._kept(track), (seen, turn_outcome)
 
     def velocity(
         self, track: InertialTrack, sample: VelocitySample
     ) -> tuple[InertialTrack, tuple[Outcome, ...]]:
         """Take in a velocity over the floor."""
-        s = self.settings
-        if track.inertial is None or s.aids is None:
+        aids = self.settings.aids
+        if track.inertial is None or aids is None:
             before, outcomes = self._before.velocity(track.before, sample)
             return changed(track, before=before), outcomes
-        track = self._until(track, sample.time)
-        state = track.inertial
-        assert state is not None
+        track, state = self._at(track, sample.time)
         expected, H = velocity_model(state, np.array(track.omega), self._log)
-        seen, R = np.array(sample.velocity), s.aids.velocity_std**2 * np.eye(3)
-        distance, gain = error_innovation(state, seen - expected, H, R)
-        verdict, memory = judge(s.gate, track.gates[3], sample.time, seen, R, float(distance), 1.0)
-        if (
-            verdict != "gate"
-        ):  # what the log says of velocity is believed in the end, whatever was thought before
-            state = correct(state, seen - expected, H, R, gain)
-        then = track.velocity_time if verdict == "gate" else sample.time
-        gates = (*track.gates[:3], memory, track.gates[4])
-        track = self._kept(changed(track, inertial=state, velocity_time=then, gates=gates))
-        return track, (Outcome("velocity", verdict, float(distance), 3),)
+        seen, R = np.array(sample.velocity), aids.velocity_std**2 * np.eye(3)
+        track, outcome = self._measured(track, "velocity", sample.time, seen - expected, H, R, seen, 1.0)
+        return self._kept(track), (outcome,)
 
     def heading(
         self, track: InertialTrack, sample: HeadingSample
     ) -> tuple[InertialTrack, tuple[Outcome, ...]]:
         """Take in a heading."""
-        s = self.settings
-        if track.inertial is None or s.aids is None:
+        aids = self.settings.aids
+        if track.inertial is None or aids is None:
             before, outcomes = self._before.heading(track.before, sample)
             return self._begun(changed(track, before=before), sample.time), outcomes
-        track = self._until(track, sample.time)
-        state = track.inertial
-        assert state is not None
+        track, state = self._at(track, sample.time)
         expected, H = heading_model(state)
-        residual, R = wrap_angle(np.array([sample.yaw]) - expected), np.array([[s.aids.heading_std**2]])
-        distance, gain = error_innovation(state, residual, H, R)
-        verdict, memory = judge(s.gate, track.gates[4], sample.time, residual, R, float(distance), 0.05)
-        if verdict != "gate":
+        residual, R = wrap_angle(np.array([sample.yaw]) - expected), np.array([[aids.heading_std**2]])
+        track, outcome = self._measured(track, "heading", sample.time, residual, H, R, residual, 0.05)
+        return self._kept(track), (outcome,)
+
+    def _measured(
+        self,
+        track: InertialTrack,
+        stream: str,
+        time: float,
+        residual: Array,
+        H: Array,
+        R: Array,
+        value: Array,
+        drift: float,
+        restart: Callable[[InertialState], InertialState] | None = None,
+        *,
+        carried: bool | None = None,
+    ) -> tuple[InertialTrack, Outcome]:
+        """The track after a measurement that its gate has judged; without a restart a run of refused ones corrects."""
+        state, k = track.inertial, GATES.index(stream)
+        assert state is not None
+        squared, gain = error_innovation(state, residual, H, R)
+        distance, gate, memory = float(squared), self.settings.gate, track.gates[k]
+        if carried is None:
+            verdict, memory = judge(gate, memory, time, value, R, distance, drift)
+        else:
+            apart, variance = float(residual[0]), float(R[0, 0])
+            verdict, memory = judge_carried(gate, memory, time, apart, variance, distance, drift, carried)
+        if verdict == "accepted" or (verdict == "reacquired" and restart is None):
             state = correct(state, residual, H, R, gain)
-        track = changed(track, inertial=state, gates=(*track.gates[:4], memory))
-        return self._kept(track), (Outcome("heading", verdict, float(distance), 1),)
+        elif verdict == "reacquired" and restart is not None:
+            state = restart(state)
+        track = changed(track, inertial=state, gates=(*track.gates[:k], memory, *track.gates[k + 1 :]))
+        if verdict != "gate" and stream in TIMED:
+            track = changed(track, **{f"{stream}_time": time})
+        return track, Outcome(stream, verdict, distance, len(residual))
+
+    def _at(self, track: InertialTrack, time: float) -> tuple[InertialTrack, InertialState]:
+        """The track at a time, and what its filter knows then."""
+        track = self._until(track, time)
+        assert track.inertial is not None
+        return track, track.inertial
 
     def estimate(self, track: InertialTrack, time: float) -> Estimate:
         """The state at a time [s], not before its own."""
         if track.inertial is None:
             return self._before.estimate(track.before, time)
-        track = self._until(track, time)
-        state = track.inertial
-        assert state is not None
+        track, state = self._at(track, time)
         T, x = self._to_body(state, np.array(track.omega))
         aided = _aided(track)
         old = aided is None or time - aided > self.settings.hold
@@ -611,40 +650,6 @@ class ErrorState:
         gates = (*before.gates, GateMemory(1), GateMemory(1))
         track = changed(track, inertial=state, time=time, vision_time=before.vision_time, gates=gates)
         return self._kept(changed(track, depth_time=before.depth_time))
-
-    def _fixed(self, track: InertialTrack, sample: VisionSample, R: Array) -> tuple[InertialTrack, Outcome]:
-        s, state = self.settings, track.inertial
-        assert state is not None
-        position, H = position_model(state, self._body)
-        seen = np.array(sample.position)
-        residual, H = seen - position[:2], H[:2]
-        distance, gain = error_innovation(state, residual, H, R)
-        verdict, memory = judge(s.gate, track.gates[0], sample.time, seen, R, float(distance), s.speed_std)
-        if verdict == "accepted":
-            state = correct(state, residual, H, R, gain)
-        elif verdict == "reacquired":
-            state = restarted(state, [0, 1], state.p[:2] + residual, R, s.speed_std)
-        then = track.vision_time if verdict == "gate" else sample.time
-        track = changed(track, inertial=state, vision_time=then, gates=(memory, *track.gates[1:]))
-        return track, Outcome("vision", verdict, float(distance), 2)
-
-    def _turned(self, track: InertialTrack, sample: VisionSample, R: Array) -> tuple[InertialTrack, Outcome]:
-        s, state = self.settings, track.inertial
-        assert state is not None
-        yaw, H = yaw_model(state)
-        residual = wrap_angle(np.array([sample.yaw]) - yaw)
-        distance, gain = error_innovation(state, residual, H, R)
-        carried = track.imu_time is not None and sample.time - track.imu_time <= GYRO_HOLD
-        apart, variance = float(residual[0]), float(R[0, 0])
-        verdict, memory = judge_carried(
-            s.gate, track.gates[1], sample.time, apart, variance, float(distance), 0.05, carried
-        )
-        if verdict == "accepted":
-            state = correct(state, residual, H, R, gain)
-        elif verdict == "reacquired":
-            state = turned(state, float(residual[0]), float(R[0, 0]))
-        track = changed(track, inertial=state, gates=(track.gates[0], memory, *track.gates[2:]))
-        return track, Outcome("yaw", verdict, float(distance), 1)
 
     def _until(self, track: InertialTrack, time: float) -> InertialTrack:
         """The track at a time; velocity without news is drawn to rest, and then the position stands still."""

@@ -47,6 +47,8 @@ YAW_CAP = 10.0
 """Doubt of yaw does not grow beyond this variance [rad²]: far past a full circle."""
 STEEPEST = math.radians(80.0)
 """Pitch beyond which the gyro tells no yaw rate."""
+GATES = ("vision", "yaw", "depth")
+"""Streams in the order of their gates."""
 TAKEN, STEEP = (Outcome("imu", "accepted"),), (Outcome("imu", "steep"),)
 
 
@@ -73,8 +75,8 @@ class Track:
     velocity_time: float | None = None
     compass: bool = False
     """Whether yaw is what a compass says, offset included."""
-    gates: tuple[GateMemory, GateMemory, GateMemory] = (GateMemory(), GateMemory(), GateMemory())
-    """Memories of the gates of position, yaw and depth."""
+    gates: tuple[GateMemory, ...] = (GateMemory(),) * 3
+    """Memories of the gates, in the order of `GATES`."""
 
 
 class ConstantVelocity:
@@ -126,28 +128,19 @@ class ConstantVelocity:
         lever = height_above_origin(site.depth_port, track.roll, track.pitch)
         z = np.array([-sample.depth - site.offset - lever])
         R = np.array([[s.depth_std**2]])
-        found = position_filter.innovation(track.position, self._H_depth, z, R)
-        verdict, memory = judge(
-            s.gate, track.gates[2], sample.time, z, R, float(found.mahalanobis), s.speed_std
-        )
-        if verdict == "accepted":
-            position = position_filter.correct(track.position, found, self._H_depth, R)
-        elif verdict == "gate":
-            position = track.position
-        else:
-            x, y = track.position.x[:2]
-            height = (z - site.up[0] * x - site.up[1] * y) / site.up[2]
-            position = position_filter.restarted(track.position, [2], height, R, s.speed_std)
-        then = track.depth_time if verdict == "gate" else sample.time
-        track = changed(track, position=position, depth_time=then, gates=(*track.gates[:2], memory))
-        return track, (Outcome("depth", verdict, float(found.mahalanobis), 1),)
+        x, y = track.position.x[:2]
+        height = (z - site.up[0] * x - site.up[1] * y) / site.up[2]
+        track, outcome = self._placed(track, "depth", sample.time, z, self._H_depth, R, [2], height)
+        return track, (outcome,)
 
     def vision(self, track: Track, sample: VisionSample) -> tuple[Track, tuple[Outcome, ...]]:
         """Take in a fix of the camera: x and y, and yaw if it has one."""
         R = vision_covariance(sample, self.settings)
-        track = changed(self._positioned(track, sample.time), yaw=self._yaw_at(track, sample.time))
-        track = changed(track, yaw_time=_later(track.yaw_time, sample.time))
-        track, seen = self._fixed(track, sample, R[:2, :2])
+        track, z = (
+            self._turned_to(self._positioned(track, sample.time), sample.time),
+            np.array(sample.position),
+        )
+        track, seen = self._placed(track, "vision", sample.time, z, _H_VISION, R[:2, :2], [0, 1], z)
         if sample.yaw is None:
             return track, (seen,)
         track, turned = self._turned(track, sample.time, sample.yaw, float(R[2, 2]))
@@ -158,8 +151,7 @@ class ConstantVelocity:
         """Take in a velocity over the floor, turned into the pool frame by the heading so far."""
         if track.yaw_seen is None or self.settings.aids is None:
             return track, (Outcome("velocity", "no heading"),)
-        track = changed(self._positioned(track, sample.time), yaw=self._yaw_at(track, sample.time))
-        track = changed(track, yaw_time=_later(track.yaw_time, sample.time))
+        track = self._turned_to(self._positioned(track, sample.time), sample.time)
         R_pb = quat_to_matrix(quat_from_euler(track.roll, track.pitch, track.yaw.yaw))
         z = R_pb @ np.array(sample.velocity)
         turned = track.yaw.variance * float(z @ z) + self.settings.aids.velocity_bias**2
@@ -174,8 +166,7 @@ class ConstantVelocity:
         aids = self.settings.aids
         if aids is None:
             return track, (Outcome("heading", "no compass"),)
-        track = changed(track, yaw=self._yaw_at(track, sample.time))
-        track = changed(track, yaw_time=_later(track.yaw_time, sample.time))
+        track = self._turned_to(track, sample.time)
         variance = aids.heading_std**2 + aids.heading_bias**2
         track, turned = self._turned(track, sample.time, sample.yaw, variance)
         # Its offset is in every sample: many of them know no better than one.
@@ -211,21 +202,31 @@ class ConstantVelocity:
             velocity_time=track.velocity_time,
         )
 
-    def _fixed(self, track: Track, sample: VisionSample, R: Array) -> tuple[Track, Outcome]:
-        s, z = self.settings, np.array(sample.position)
-        found = position_filter.innovation(track.position, _H_VISION, z, R)
-        verdict, memory = judge(
-            s.gate, track.gates[0], sample.time, z, R, float(found.mahalanobis), s.speed_std
-        )
+    def _placed(
+        self,
+        track: Track,
+        stream: str,
+        time: float,
+        z: Array,
+        H: Array,
+        R: Array,
+        axes: list[int],
+        restart: Array,
+    ) -> tuple[Track, Outcome]:
+        """The track after a fix or a depth that its gate has judged; `restart` is where the axes begin anew."""
+        s, k = self.settings, GATES.index(stream)
+        found = position_filter.innovation(track.position, H, z, R)
+        distance = float(found.mahalanobis)
+        verdict, memory = judge(s.gate, track.gates[k], time, z, R, distance, s.speed_std)
+        position = track.position
         if verdict == "accepted":
-            position = position_filter.correct(track.position, found, _H_VISION, R)
-        elif verdict == "gate":
-            position = track.position
-        else:
-            position = position_filter.restarted(track.position, [0, 1], z, R, s.speed_std)
-        then = track.vision_time if verdict == "gate" else sample.time
-        track = changed(track, position=position, vision_time=then, gates=(memory, *track.gates[1:]))
-        return track, Outcome("vision", verdict, float(found.mahalanobis), 2)
+            position = position_filter.correct(position, found, H, R)
+        elif verdict != "gate":
+            position = position_filter.restarted(position, axes, restart, R, s.speed_std)
+        track = changed(track, position=position, gates=(*track.gates[:k], memory, *track.gates[k + 1 :]))
+        if verdict != "gate":
+            track = changed(track, **{f"{stream}_time": time})
+        return track, Outcome(stream, verdict, distance, len(z))
 
     def _turned(self, track: Track, time: float, seen: float, variance: float) -> tuple[Track, Outcome]:
         s = self.settings
@@ -281,6 +282,9 @@ class ConstantVelocity:
             then = until
         position = position_filter.capped(position, s.largest_variance)
         return changed(track, position=position, position_time=time)
+
+    def _turned_to(self, track: Track, time: float) -> Track:
+        return changed(track, yaw=self._yaw_at(track, time), yaw_time=_later(track.yaw_time, time))
 
     def _yaw_at(self, track: Track, time: float) -> YawState:
         """Yaw at a time: the latest rate held, and none where the gyro has been silent for too long."""
