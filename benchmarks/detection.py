@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from finssim.localization.detection.detector import REFINEMENTS, Detector, detector
+from finssim.localization.detection.detector import REFINEMENTS, Detector, RegionTracker, detector
 from finssim.localization.detection.families import FAMILIES
-from finssim.localization.detection.region import RegionTracker
 from reference.tag_picture import draw, pose_corners
 
 CASES = [(20.0, 0.5), (20.0, 1.0), (30.0, 0.5), (30.0, 1.0), (45.0, 0.5), (45.0, 1.0)]

@@ -682,7 +682,7 @@ def test_points_that_cannot_be_used_are_refused_in_a_sentence(points, capsys, wo
 def test_an_interruption_keeps_the_rows_so_far(files, tmp_path, capsys, monkeypatch, command):
     """Control-C ends with 130 and a sentence; the table holds what was done."""
     from finssim.localization.fusion.estimator import Estimator
-    from finssim.localization.locate.localize import Locator
+    from finssim.localization.localize import Locator
 
     calls = []
 

@@ -13,7 +13,7 @@ import yaml
 
 from finssim.files import atomic_write
 from finssim.geometry.optics import Lens, OpticsError
-from finssim.localization.errors import LocalizationError
+from finssim.localization import LocalizationError
 from finssim.yaml_file import read_mapping
 
 __all__ = ["CameraFile", "Fields", "lens_from", "lens_values", "load_camera", "write_camera"]

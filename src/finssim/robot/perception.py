@@ -18,8 +18,7 @@ from finssim.geometry.rotations import (
     wrap_angle,
 )
 from finssim.localization.detection.detections import Detection, Frame
-from finssim.localization.detection.detector import detector
-from finssim.localization.detection.region import RegionTracker
+from finssim.localization.detection.detector import RegionTracker, detector
 from finssim.localization.fusion.attitude import height_above_origin
 from finssim.localization.fusion.estimator import Estimator, Fixes, Health, health_of
 from finssim.localization.fusion.fuse_settings import Settings, settings_of, site_of

@@ -21,8 +21,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from finssim.localization.detection.detector import detector
-from finssim.localization.detection.region import RegionTracker
+from finssim.localization.detection.detector import RegionTracker, detector
 from finssim.robot.link.frames import LinkError
 from finssim.robot.link.transports import host_port
 from finssim.robot.messages import Picture, TagCorners

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from finssim.localization import LocalizationError
 from finssim.localization.detection.detector import REFINEMENTS, detector, fit_tag
 from finssim.localization.detection.families import FAMILIES, bitmap, family_named, printable
-from finssim.localization.errors import LocalizationError
 from reference.tag_picture import draw, pose_corners
 
 PHOTOGRAPHS = Path(__file__).parents[2] / "data" / "apriltag"

@@ -5,8 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from finssim.localization.detection.detector import detector
-from finssim.localization.detection.region import RegionTracker, merged, region_around
+from finssim.localization.detection.detector import RegionTracker, detector, merged, region_around
 from reference.tag_picture import draw, pose_corners
 
 SHAPE = (360, 480)

@@ -42,7 +42,7 @@ from finssim.provenance import provenance
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = []
+__all__ = ["run"]
 
 READING = (
     "The interval holds the true value in 19 of 20 such calibrations: it comes from how much the pictures disagree, "

@@ -60,7 +60,7 @@ from finssim.localization.fusion.fuse_log import Series, imu_columns, read_strea
 from finssim.localization.pool import Pool, load_pool
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = []
+__all__ = ["run"]
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from finssim.calibration.output.fit_figures import BLUE, ORANGE, draw_correlatio
 from finssim.calibration.output.publish import command_line, publish, refuse_places
 from finssim.calibration.vision.pool_fit import PoolFit, calibrate_pool, doubted
 from finssim.calibration.vision.pool_model import Settings
-from finssim.calibration.vision.pool_refine import HeldOut, rms
+from finssim.calibration.vision.pool_search import HeldOut, rms
 from finssim.calibration.vision.report import (
     AS_GIVEN,
     Report,
@@ -37,7 +37,7 @@ from finssim.provenance import provenance
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["pool_record"]
+__all__ = ["pool_record", "run"]
 
 Array = NDArray[np.float64]
 

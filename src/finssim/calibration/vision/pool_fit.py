@@ -28,19 +28,22 @@ from finssim.calibration.vision.pool_model import (
     shifted_settings,
     solve,
 )
-from finssim.calibration.vision.pool_refine import (
+from finssim.calibration.vision.pool_search import (
+    UP,
+    Found,
     HeldOut,
     Noise,
     Refined,
     Whitener,
     error_vectors,
     held_out,
+    prior_of,
     refine,
     rms,
+    search,
     surprise,
     touched,
 )
-from finssim.calibration.vision.pool_search import UP, Found, prior_of, search
 from finssim.calibration.vision.report import AS_GIVEN
 from finssim.calibration.vision.survey import Observations
 from finssim.geometry.optics import Lens

@@ -27,9 +27,16 @@ from finssim.geometry.rotations import (
 )
 
 __all__ = [
-    "UNSURE_TURN", "Attitude", "DepthFit", "Gyro", "ImuMounting", "fit_depth", "fit_imu_mounting", "imu_clock",
-    "rotation_between", "turn_residual",
-]  # fmt: skip
+    "Attitude",
+    "DepthFit",
+    "Gyro",
+    "ImuMounting",
+    "fit_depth",
+    "fit_imu_mounting",
+    "imu_clock",
+    "turn_residual",
+    "rotation_between",
+]
 
 Array = NDArray[np.float64]
 

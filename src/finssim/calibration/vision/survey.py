@@ -16,10 +16,10 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.trials.units import UNITS
 from finssim.geometry.rotations import quat_from_euler, quat_rotate
+from finssim.localization import LocalizationError
 from finssim.localization.camera_file import Fields
 from finssim.localization.detection.detections import Frame, most_certain, read_detections
 from finssim.localization.detection.families import corners
-from finssim.localization.errors import LocalizationError
 from finssim.text_table import TextTable, read_text, read_text_table, text_table
 from finssim.text_table import number as _number
 from finssim.yaml_file import read_mapping

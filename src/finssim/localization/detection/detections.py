@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from finssim.localization.errors import LocalizationError
+from finssim.localization import LocalizationError
 from finssim.text_table import read_text_table, write_csv
 
 __all__ = ["Detection", "Frame", "most_certain", "read_detections", "write_detections"]

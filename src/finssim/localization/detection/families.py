@@ -11,12 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.geometry.rotations import quat_rotate
+from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Detection
-from finssim.localization.errors import LocalizationError
 from finssim.vehicles.equipment import Tags
 
 __all__ = [
-    "EDGES", "FAMILIES", "Family", "bitmap", "corners", "family_named", "find_tags", "printable", "tag_corners_b",
+    "EDGES", "FAMILIES", "bitmap", "corners", "family_named", "find_tags", "printable", "tag_corners_b",
 ]  # fmt: skip
 
 # Tags found by AprilTag 3, through pupil-apriltags, in our conventions.

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.files import atomic_write
-from finssim.localization.errors import LocalizationError
+from finssim.localization import LocalizationError
 from finssim.text_table import read_text_table
 
 __all__ = ["PICTURE_FILES", "pictures", "read_picture", "write_picture"]

@@ -10,8 +10,8 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Frame
-from finssim.localization.errors import LocalizationError
 from finssim.localization.fusion.attitude import height_above_origin
 from finssim.localization.fusion.error_state import ErrorState
 from finssim.localization.fusion.fuse_constant_velocity import (
@@ -33,7 +33,7 @@ from finssim.localization.fusion.streams import (
 from finssim.localization.poses.measurement import Constraints
 from finssim.localization.poses.methods import TagLocator
 
-__all__ = ["MODELS", "MODES", "Estimator", "Fixes", "Health", "Model", "health_of"]
+__all__ = ["MODELS", "MODES", "Estimator", "Fixes", "Health", "health_of"]
 
 S = TypeVar("S")
 

@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from finssim.files import atomic_write, refuse_unwritable
 from finssim.geometry.rotations import wrap_angle
+from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Frame
-from finssim.localization.errors import LocalizationError
 from finssim.localization.fusion.estimator import MODES, Estimator, Fixes, Health
 from finssim.localization.fusion.fuse_log import Log, NoFix, StreamTable, load_log, series
 from finssim.localization.fusion.fuse_settings import settings_of, site_of

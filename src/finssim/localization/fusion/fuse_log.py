@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.geometry.rotations import quat_inverse_rotate
+from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Frame, read_detections
-from finssim.localization.errors import LocalizationError
 from finssim.localization.fusion.attitude import in_body_axes, roll_pitch, up_of
 from finssim.localization.fusion.streams import DepthSample, ImuSample, Sample, VisionSample
 from finssim.text_table import EMPTY, TextTable, read_text_table
@@ -21,17 +21,9 @@ from finssim.vehicles import Vehicle
 from finssim.vehicles.equipment import Imu
 
 __all__ = [
-    "ImuColumns",
-    "Log",
-    "NoFix",
-    "Series",
-    "StreamTable",
-    "counted",
-    "imu_columns",
-    "load_log",
-    "read_stream_table",
+    "Log", "NoFix", "Series", "StreamTable", "counted", "imu_columns", "load_log", "read_stream_table", "rows_of",
     "series",
-]
+]  # fmt: skip
 
 # Reading the tables of a log: columns of numbers by name, empty cells as NaN.
 

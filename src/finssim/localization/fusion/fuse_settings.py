@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from finssim.localization.errors import LocalizationError
+from finssim.localization import LocalizationError
 from finssim.localization.fusion.attitude import YawNoise
 from finssim.localization.fusion.gate import Gate
 from finssim.localization.fusion.position_filter import Motion

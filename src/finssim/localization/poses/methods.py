@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from finssim.geometry.optics import Camera, Lens, back_project, projection_jacobians
 from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_to_matrix, quat_to_rotvec, skew
+from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Detection
 from finssim.localization.detection.families import tag_corners_b
-from finssim.localization.errors import LocalizationError
 from finssim.localization.pool import Pool
 from finssim.localization.poses.measurement import (
     Constraints,
@@ -29,9 +29,17 @@ from finssim.localization.poses.planar_fit import WORST, planar_fit
 from finssim.vehicles.equipment import Tags
 
 __all__ = [
-    "METHODS", "NEEDS_DEPTH", "Constraints", "Measurement", "Method", "RefinedPose", "TagLocator",
-    "check_method", "plane_pose", "refine_pose", "through_lens",
-]  # fmt: skip
+    "METHODS",
+    "NEEDS_DEPTH",
+    "Constraints",
+    "Measurement",
+    "Method",
+    "TagLocator",
+    "check_method",
+    "plane_pose",
+    "refine_pose",
+    "through_lens",
+]
 
 Array = npt.NDArray[np.float64]
 

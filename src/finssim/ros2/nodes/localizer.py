@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from finssim.localization.detection.detections import Frame
-from finssim.localization.detection.detector import detector
-from finssim.localization.detection.region import RegionTracker
+from finssim.localization.detection.detector import RegionTracker, detector
 from finssim.localization.fusion.estimator import Estimator, Fixes
 from finssim.localization.fusion.streams import VisionSample
 from finssim.localization.pool import load_pool

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from finssim.files import atomic_write, refuse_unwritable
 from finssim.geometry.optics import Status, back_project, count_rejections, plane_jacobian, project
-from finssim.localization.errors import LocalizationError
+from finssim.localization import LocalizationError
 from finssim.localization.pool import load_pool
 from finssim.text_table import text_table
 

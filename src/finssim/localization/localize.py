@@ -20,9 +20,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from finssim.files import atomic_write, refuse_unwritable
 from finssim.geometry.optics import Lens
 from finssim.geometry.rotations import wrap_angle
+from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Frame, read_detections
 from finssim.localization.detection.families import family_named
-from finssim.localization.errors import LocalizationError
 from finssim.localization.fusion.attitude import roll_pitch, up_of
 from finssim.localization.fusion.fuse_log import Series, counted, read_stream_table, series
 from finssim.localization.pool import Pool, load_pool
@@ -458,9 +458,8 @@ def _seen(
     seeing: Seeing,
     notes: list[str],
 ) -> Iterator[Frame]:
-    from finssim.localization.detection.detector import detector
+    from finssim.localization.detection.detector import RegionTracker, detector
     from finssim.localization.detection.pictures import pictures
-    from finssim.localization.detection.region import RegionTracker
 
     find = detector(seeing.family, refine=seeing.refine, gamma=seeing.gamma)
     film, tracker = "", None
