@@ -46,6 +46,7 @@ COMMANDS: dict[str, str | Experiment] = {
     "experiment t1": Experiment("finssim.experiments.transfer:t1", "print_transfer"),
     "experiment t2": Experiment("finssim.experiments.transfer:t2", "print_transfer"),
     "experiment ablation": Experiment("finssim.experiments.ablation:ablation", "print_ablation"),
+    "experiment anatomy": Experiment("finssim.experiments.anatomy:anatomy", "print_anatomy"),
     "experiment open-water": Experiment("finssim.experiments.open_water:open_water", "print_open_water"),
     "experiment all": Experiment("finssim.experiments.ablation:everything", "print_everything"),
     "experiment faults": Experiment("finssim.experiments.faults:faults_experiment", "print_faults"),

@@ -33,7 +33,17 @@ from finssim.learning.train import train
 from finssim.provenance import provenance
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["MEASURES", "T1", "T2", "print_transfer", "t1", "t2", "transfer_experiment"]
+__all__ = [
+    "MEASURES",
+    "T1",
+    "T1_ROWS",
+    "T2",
+    "policies_of",
+    "print_transfer",
+    "t1",
+    "t2",
+    "transfer_experiment",
+]
 
 Results = Mapping[str, Sequence[Mapping[str, Any]]]
 """Row -> results of its trials."""
@@ -43,6 +53,8 @@ TRAINING_SHARE = 0.4
 INTERVALS = "intervals"
 """Stands for the ranges that the calibration's intervals give."""
 RANGES_FILE = "ranges.yaml"
+FORGETFUL = {"integral": False, "history": 0, "last_action": False}
+"""Settings of the learner, for policies as the paper's."""
 
 MEASURES = {
     "success_rate": ("the share of setpoints held", "held [points]", 100.0, "percentage points", ".0f"),
@@ -64,6 +76,8 @@ class Training:
     hydrodynamics: str = "calibrated"
     randomize: str | None = None
     """Name or file of ranges."""
+    remembers: bool = False
+    """Whether the policy has integrals of its errors and sees what it saw and did before; those of the paper do not."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +193,7 @@ def transfer_experiment(
         raise ValueError(f"plants is {plants}, seeds {seeds}: expected at least 1 of each")
     chosen = {name: spec.rows[name] for name in rows}
     places, run_seeds, folder = range(seed, seed + plants), range(seed, seed + seeds), Path(out)
-    policies = _policies(
+    policies = policies_of(
         chosen, run_seeds, folder, vehicle, steps, lambda part, what: say(TRAINING_SHARE * part, what)
     )
     if robot is not None:  # there is one plant, and nobody chose its severity
@@ -213,7 +227,7 @@ def transfer_experiment(
     return result
 
 
-def _policies(
+def policies_of(
     rows: Mapping[str, Row],
     seeds: Sequence[int],
     folder: Path,
@@ -221,6 +235,7 @@ def _policies(
     steps: int | None,
     say: Say,
 ) -> dict[tuple[str, int], Path]:
+    """The policies of rows by training and seed, in `policies` of the folder; arguments as of `trained`."""
     trainings = list(dict.fromkeys(row.training for row in rows.values() if row.training))
     if any(training.randomize == INTERVALS for training in trainings):
         say(0.0, "identifying the vehicle, for the ranges of its intervals")
@@ -268,7 +283,8 @@ def trained(
         if not finished(place):
             train(
                 training.task, out=place, vehicle=vehicle, hydrodynamics=training.hydrodynamics,
-                randomize=training.randomize, seed=seed, steps=steps, console=Console(stderr=True, quiet=True),
+                randomize=training.randomize, seed=seed, steps=steps, settings={} if training.remembers else FORGETFUL,
+                console=Console(stderr=True, quiet=True),
             )  # fmt: skip
     return policies
 
@@ -399,8 +415,8 @@ def _listed(items: list[str]) -> str:
 
 DR = "hold_for_position"
 """The published ranges of station keeping."""
-TRIM = "An integral in front of the policy"
-POOL = "Randomisation made for a pool"
+INTEGRAL = "An integral of the errors"
+POOL = "Randomisation made for a pool, with an integral of the errors,"
 
 CALIBRATED = Training("calibrated")
 CALIBRATED_DR = Training("calibrated-dr", "t2", randomize=DR)
@@ -449,12 +465,16 @@ T1_ROWS: dict[str, Row] = {
     "pid": Row("PID, tuned from the model", None, None, "The tuned PID", "pid"),
     "calibrated-intervals": Row(
         "Calibrated + ranges of its intervals",
-        Training("calibrated-intervals", randomize=INTERVALS),
-        module="Randomisation within the calibration's intervals",
+        Training("calibrated-intervals", randomize=INTERVALS, remembers=True),
+        module="Randomisation within the calibration's intervals, with an integral of the errors,",
     ),
-    "calibrated-trim": Row("Calibrated, with trim", CALIBRATED, module=TRIM, changes={"trim": True}),
+    "calibrated-integral": Row(
+        "Calibrated, integrating", Training("calibrated-integral", remembers=True), module=INTEGRAL
+    ),
     "calibrated-pool": Row(
-        "Calibrated + pool ranges", Training("calibrated-pool", randomize="pool"), module=POOL
+        "Pool ranges, integrating",
+        Training("calibrated-pool", randomize="pool", remembers=True),
+        module=POOL,
     ),
 }
 """The paper's ten rows of station keeping in the order of its table, and ours beyond them."""
@@ -472,11 +492,15 @@ T2_ROWS: dict[str, Row] = {
     ),
     "pid": Row("PID, tuned from the model", None, None, "The tuned PID", "pid"),
     "pid-paper": Row("PID, published gains", None, "PID", "The published PID", "pid-paper"),
-    "calibrated-dr-trim": Row(
-        "Calibrated + DR, with trim", CALIBRATED_DR, module=TRIM, changes={"trim": True}
+    "calibrated-dr-integral": Row(
+        "Calibrated + DR, integrating",
+        Training("calibrated-dr-integral", "t2", randomize=DR, remembers=True),
+        module=INTEGRAL,
     ),
     "calibrated-pool": Row(
-        "Calibrated + pool ranges", Training("calibrated-pool", "t2", randomize="pool"), module=POOL
+        "Pool ranges, integrating",
+        Training("calibrated-pool", "t2", randomize="pool", remembers=True),
+        module=POOL,
     ),
 }
 """The paper's three rows of tracking, and ours beyond them."""
