@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -362,7 +362,6 @@ def calibrate_mounts(
     *,
     name: str,
     estimate: str = "tags",
-    centre: Sequence[float] | None = None,
     seed: int = 0,
 ) -> Fit:
     """Where tags sit in the body, or how IMU and pressure port do, with everything that the motion tells.
@@ -374,7 +373,6 @@ def calibrate_mounts(
         name: Of the recording.
         estimate: `tags`: IMU and pressure port are right in the file, tags are written. `sensors`: the tag that is seen
             most is right in the file; the IMU's orientation, the port's height and the other tags are written.
-        centre: Body point that stays in place while the vehicle turns on the spot [m], if the recording is of that.
         seed: Recorded; nothing here is random.
 
     Raises:
@@ -402,7 +400,6 @@ def calibrate_mounts(
         corners_t=corners(tags.edge),
         port=np.zeros(3) if depth is None else np.asarray(depth.position, float),
         reference=reference_tag(log.moments(), mounts),
-        centre=None if centre is None else np.asarray(centre, float),
     )
     clock = _clock(rig, mounts, log)
     sure = clock is not None and clock.identifiable and not clock.ci95[0] <= 0.0 <= clock.ci95[1]
@@ -546,17 +543,6 @@ def _curves(found: MountFit) -> tuple[Curve, ...]:
     return tuple(curves)
 
 
-def _three(text: str) -> tuple[float, ...]:
-    """A point from `x,y,z`."""
-    try:
-        numbers = tuple(float(word) for word in text.split(","))
-    except ValueError:
-        numbers = ()
-    if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
-        raise CalibrationError(f"--turns-about is '{text}', expected three lengths such as 0,0,-0.08")
-    return numbers
-
-
 def run(
     log: Path,
     *,
@@ -564,7 +550,6 @@ def run(
     vehicle: str,
     out: Path,
     estimate: str = "tags",
-    turns_about: str | Sequence[float] | None = None,
     report: Path | None = None,
     seed: int = 0,
     as_json: bool = False,
@@ -579,7 +564,6 @@ def run(
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         out (FILE): Vehicle file to write (.yaml).
         estimate (WHAT): tags: the sensors are right in the vehicle file; sensors: the tag seen most is.
-        turns_about (X,Y,Z): Body point that stays in place while the vehicle turns on the spot: x,y,z [m].
         report (DIR): Directory for the report and its pictures.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
@@ -590,21 +574,16 @@ def run(
     Raises:
         CalibrationError, LocalizationError, VehicleError, OutputError: As they say; nothing is written then.
     """
-    if isinstance(turns_about, str):
-        turns_about = _three(turns_about)
     refuse_places(out, report, "vehicle")
     where, body = load_pool(pool), load_vehicle(vehicle)
     recording = read_mount_log(log, where, body)
-    fit = calibrate_mounts(
-        recording, where, body, name=Path(log).name, estimate=estimate, centre=turns_about, seed=seed
-    )
+    fit = calibrate_mounts(recording, where, body, name=Path(log).name, estimate=estimate, seed=seed)
     after = calibrated(fit)
     findings = all_findings(fit, after)
     write_vehicle(after, out)
     if report is not None:
         options = {"pool": pool, "vehicle": vehicle, "out": out, "estimate": estimate, "seed": seed}
-        point = None if turns_about is None else ",".join(f"{x:g}" for x in turns_about)
-        command = command_line("mounts", [log], {**options, "turns_about": point})
+        command = command_line("mounts", [log], options)
         write_report(fit, report, after, command=command, findings=findings, out=out)
 
     def show(console: Console) -> None:
