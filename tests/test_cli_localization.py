@@ -651,7 +651,7 @@ def test_backproject_tells_the_error_of_points(points, capsys):
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["project", "nowhere.csv", "--pool", "pool.yaml"], "nowhere.csv: No such file"),
+        (["project", "nowhere.csv", "--pool", "pool.yaml"], "nowhere.csv: cannot be read"),
         (["project", "points.csv", "--pool", "nowhere.yaml"], "nowhere.yaml"),
         (["project", "uv.csv", "--pool", "pool.yaml"], "uv.csv: column x is not there among u, v"),
         (["project", "points.csv", "--pool", "pool.yaml", "--out", "/proc/x/y.csv"], "write elsewhere"),

@@ -95,7 +95,7 @@ def test_camera_as_json_and_as_a_file(place, capsys):
     found = found_by(capsys, *CAMERA, "--board", "9x6", "--report", "report")
     assert found.keys() >= {
         *("kind", "parameters", "per_view", "rms_px", "held_out_rms_px", "views", "left_out", "findings"),
-        *("error95_px", "empty_edges", "correlation", "settings", "interrupted", "out", "provenance"),
+        *("error95_px", "empty_edges", "correlation", "settings", "out", "provenance"),
     }
     assert found["kind"] == "camera" and found["out"] == "camera.yaml"
     assert all(parameter.keys() == PARAMETER for parameter in found["parameters"].values())
@@ -284,7 +284,7 @@ def test_pool_as_json_and_as_a_file(surveyed, plain):
     found, pool = plain
     assert found.keys() >= {
         *("kind", "interface", "parameters", "residual", "held_out", "pinhole", "lens_fitted", "outliers"),
-        *("other_minima", "correlation", "findings", "settings", "inputs", "out", "provenance"),
+        *("correlation", "findings", "settings", "inputs", "out", "provenance"),
     }
     assert found["kind"] == "pool" and found["interface"] == "surface" and found["out"] == "plain.yaml"
     assert all(parameter.keys() == PARAMETER for parameter in found["parameters"].values())

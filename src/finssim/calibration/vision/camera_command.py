@@ -153,7 +153,6 @@ def camera_pictures(fit: CameraFit) -> dict[str, tuple[str, bytes]]:
     drawn = {
         "coverage.png": ("Where corners were seen, and how well pixels are known there", _coverage(fit)),
         "residuals.png": ("Corners less what the lens predicts, enlarged", _residuals(fit)),
-        "views.png": ("Residual of every picture", _per_view(fit)),
     }
     return {name: (text, png(figure)) for name, (text, figure) in drawn.items()}
 
@@ -202,20 +201,6 @@ def _residuals(fit: CameraFit) -> Figure:
     cloud.axhline(0.0, color=GRAY, linewidth=0.6)
     cloud.axvline(0.0, color=GRAY, linewidth=0.6)
     cloud.set_title(f"rms {fit.rms:.3f} px", fontsize=9)
-    return figure
-
-
-def _per_view(fit: CameraFit) -> Figure:
-    figure = new_figure(7.4, 1.0 + 0.2 * len(fit.views))
-    axes = figure.subplots()
-    rows = np.arange(len(fit.views))[::-1]
-    colors = [ORANGE if view.left_out else BLUE for view in fit.views]
-    axes.barh(rows, [view.rms for view in fit.views], color=colors, height=0.7)
-    axes.set_yticks(rows, [view.name for view in fit.views], fontsize=7)
-    axes.axvline(fit.held_out_rms, color="black", linewidth=0.8, linestyle="--", label="views held out")
-    axes.set_xlabel("rms of a corner's distance [px]; orange: left out")
-    axes.legend(fontsize=7, frameon=False)
-    axes.spines[["top", "right"]].set_visible(False)
     return figure
 
 

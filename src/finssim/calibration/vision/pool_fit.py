@@ -147,9 +147,6 @@ NARROW = np.radians(20.0)
 ONE_DEPTH = 0.02
 """Spread of depths, over the distance to the camera, below which they count as one."""
 
-SAME_PLACE = 0.005
-"""Two places of the plane nearer than this are one [m]."""
-
 CERTAIN = 0.999
 """Share of the marks above the water that are taken for such."""
 
@@ -162,7 +159,6 @@ def advice(
     surface: bool,
     settings: Settings,
     table: Mapping[str, Estimate],
-    minima: Sequence[tuple[float, float]],
     touching: Sequence[str],
     contradicted: Sequence[Finding],
 ) -> Iterator[Finding]:
@@ -174,7 +170,6 @@ def advice(
         surface: The plane is a water surface.
         settings: Options, in the same frame.
         table: Estimates.
-        minima: Other places where the search came to rest.
         touching: What the plane came to rest against.
         contradicted: On measurements that the pixels contradict.
     """
@@ -185,10 +180,6 @@ def advice(
     yield from _conflicts(fit, surface, settings)
     yield from _numbers(fit, seen)
     yield from _left_out(fit, seen, surface)
-    place = table["camera_height" if surface else "camera_distance"]
-    close = [at for ratio, at in minima if ratio < 1.1 and abs(at - place.estimate) > SAME_PLACE]
-    if close and not place.identifiable:
-        yield finding("other_place", other=close[0], chosen=place.estimate)
 
 
 def _place(
@@ -327,8 +318,6 @@ class PoolFit:
     """Groups of `FITTED` that the lens gave up."""
     findings: tuple[Finding, ...]
     """The gravest first, then what is merely worth knowing."""
-    minima: tuple[tuple[float, float], ...]
-    """Other places where the search came to rest: residual over that of the best, clearance of the camera [m]."""
     touching: tuple[str, ...]
     """Places of the survey, or the camera, that the plane came to rest against: it can pass neither."""
 
@@ -403,10 +392,9 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
         pinhole_held_out=parts[1],
         lens_fitted=_lens_groups(fit.active),
         findings=(
-            *advice(fit, here, found.surface, told, table, found.minima, touching, contradicted),
+            *advice(fit, here, found.surface, told, table, touching, contradicted),
             *notes,
         ),
-        minima=found.minima,
         touching=touching,
     )
 

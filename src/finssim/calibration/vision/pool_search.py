@@ -231,8 +231,6 @@ class Found:
     pinhole: PoolModel
     surface: bool
     """The plane's normal is along the survey's z."""
-    minima: tuple[tuple[float, float], ...]
-    """Other places where the search came to rest: (residual over the best one's, clearance of the camera [m])."""
 
 
 def search(seen: Observations, lens: Lens, settings: Settings) -> Found:
@@ -257,13 +255,7 @@ def search(seen: Observations, lens: Lens, settings: Settings) -> Found:
             "the interface"
         )
     chosen = _choose(runs, len(seen))
-    minima = tuple(
-        (value / max(chosen[0], 1e-9), model.clearance)
-        for value, model, surface in sorted(runs, key=lambda run: run[0])
-        if surface == chosen[2]
-        and abs(model.clearance - chosen[1].clearance) > 0.02 * abs(chosen[1].clearance)
-    )
-    return Found(chosen[1], near[0], chosen[2], minima)
+    return Found(chosen[1], near[0], chosen[2])
 
 
 def prior_of(
