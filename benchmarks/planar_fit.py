@@ -24,7 +24,7 @@ from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
 from finssim.localization.detection.detections import Detection
 from finssim.localization.detection.families import tag_corners_b
 from finssim.localization.pool import Pool
-from finssim.localization.poses.measurement import Constraints
+from finssim.localization.poses import Constraints
 from finssim.localization.poses.methods import METHODS
 from finssim.vehicles import load_vehicle
 

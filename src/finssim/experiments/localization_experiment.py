@@ -372,7 +372,7 @@ def calibrate(campaign: Campaign, seen: Sequence[Picture]) -> Calibrated:
     )
     fit = calibrate_pool(_observed(frames, rows), campaign.lens, settings)
     level = Interface.water(campaign.water_read, n_air=1.0, n_water=1.0)
-    straight = fit.pinhole.model.shifted(fit.seen.points.mean(axis=0))  # it was fitted about their middle
+    straight = fit.pinhole.model
     return Calibrated(
         Pool(fit.model.camera, fit.model.interface, record=pool_record(fit, {})),
         Pool(straight.camera, level),

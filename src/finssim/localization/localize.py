@@ -26,7 +26,7 @@ from finssim.localization.detection.families import family_named
 from finssim.localization.fusion.attitude import roll_pitch, up_of
 from finssim.localization.fusion.fuse_log import Series, counted, read_stream_table, series
 from finssim.localization.pool import Pool, load_pool
-from finssim.localization.poses.measurement import Constraints, Measurement, refused
+from finssim.localization.poses import Constraints, Measurement, refused
 from finssim.localization.poses.methods import NEEDS_DEPTH, TagLocator
 from finssim.provenance import provenance
 from finssim.text_table import write_csv

@@ -32,7 +32,7 @@ from finssim.localization.fusion.streams import (
     VisionSample,
 )
 from finssim.localization.pool import Pool
-from finssim.localization.poses.measurement import axes_of_up
+from finssim.localization.poses import axes_of_up
 from finssim.localization.poses.methods import TagLocator
 from finssim.robot.messages import (
     HEADING,

@@ -21,7 +21,7 @@ from finssim.localization.fusion.fuse_settings import site_of
 from finssim.localization.fusion.streams import refusal
 from finssim.localization.localize import write_rows as write_localized
 from finssim.localization.pool import load_pool
-from finssim.localization.poses.measurement import Constraints
+from finssim.localization.poses import Constraints
 from finssim.localization.poses.methods import METHODS
 from finssim.vehicles import load_vehicle
 from localization.fusion.hinsdale_log import hinsdale, write_table

@@ -7,7 +7,7 @@ from finssim.geometry.rotations import matrix_to_quat, quat_from_euler, quat_to_
 from finssim.localization.detection.detections import Detection
 from finssim.localization.detection.families import tag_corners_b
 from finssim.localization.pool import Pool
-from finssim.localization.poses.measurement import Constraints, axes_of_up
+from finssim.localization.poses import Constraints, axes_of_up
 from finssim.vehicles import load_vehicle
 
 TAGS = tag_corners_b(load_vehicle("finsrov").tags)

@@ -25,7 +25,6 @@ from finssim.calibration.vision.pool_model import (
     extended_lens,
     lens_std,
     residuals,
-    shifted_settings,
     solve,
 )
 from finssim.calibration.vision.pool_search import (
@@ -68,22 +67,19 @@ STEPS = np.array([1e-5] * 3 + [1e-6] * 5 + [1e-5, 1e-5, 1e-6, 1e-3, 1e-3, 1e-6, 
 """Of the derivatives by the parameters."""
 
 
-def estimates(
-    fit: Refined, surface: bool, settings: Settings, centre: Array
-) -> tuple[dict[str, Estimate], Correlation]:
+def estimates(fit: Refined, surface: bool, settings: Settings) -> tuple[dict[str, Estimate], Correlation]:
     """Table of estimates, and the correlation of their errors, without what was not fitted.
 
     Args:
-        fit: In the frame of the middle of the points.
+        fit: The fit.
         surface: The plane is a water surface.
-        settings: Options, in the same frame.
-        centre: The middle of the points in the survey's frame [m].
+        settings: Options.
     """
-    table, quantile = _quantities(fit.model, surface, centre), float(student.ppf(0.975, fit.dof))
+    table, quantile = _quantities(fit.model, surface), float(student.ppf(0.975, fit.dof))
     G = np.zeros((len(table), len(NAMES)))
     for k in np.flatnonzero(fit.active):
         step = STEPS[k] * np.eye(len(NAMES))[k]
-        ends = (_quantities(fit.model.moved(s), surface, centre).values() for s in (step, -step))
+        ends = (_quantities(fit.model.moved(s), surface).values() for s in (step, -step))
         after, before = (np.array([value for _, value in end]) for end in ends)
         G[:, k] = (after - before) / (2.0 * STEPS[k])
     V = G @ fit.covariance @ G.T
@@ -96,19 +92,17 @@ def estimates(
     return rows, correlation(names, V[np.ix_(moved, moved)])
 
 
-def _quantities(model: PoolModel, surface: bool, centre: Array) -> dict[str, tuple[str, float]]:
+def _quantities(model: PoolModel, surface: bool) -> dict[str, tuple[str, float]]:
     """Name -> unit and value of everything that is told."""
     camera, lens, n = model.camera, model.camera.lens, model.interface.normal
-    rows = dict(
-        zip(("camera_x", "camera_y", "camera_z"), (("m", x) for x in camera.position + centre), strict=True)
-    )
+    rows = dict(zip(("camera_x", "camera_y", "camera_z"), (("m", x) for x in camera.position), strict=True))
     angles = np.degrees(quat_to_euler(np.asarray(camera.orientation)))
     rows |= dict(
         zip(("camera_roll", "camera_pitch", "camera_yaw"), (("deg", x) for x in angles), strict=True)
     )
     if surface:
         rows["camera_height"] = ("m", model.clearance)
-        rows["water_height"] = ("m", float(model.interface.height(0.0, 0.0) + centre[2]))
+        rows["water_height"] = ("m", float(model.interface.height(*model.reference[:2])))
         rows["tilt_x"], rows["tilt_y"] = (("deg", np.degrees(np.arctan2(x, abs(n[2])))) for x in n[:2])
     else:
         rows["camera_distance"], rows["point_distance"] = ("m", model.clearance), ("m", model.depth)
@@ -165,10 +159,10 @@ def advice(
     """Findings for the user, the gravest first.
 
     Args:
-        fit: In the frame of `seen`.
+        fit: The fit.
         seen: All rows.
         surface: The plane is a water surface.
-        settings: Options, in the same frame.
+        settings: Options.
         table: Estimates.
         touching: What the plane came to rest against.
         contradicted: On measurements that the pixels contradict.
@@ -357,26 +351,24 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
     settings = settings or Settings()
     if seen.dry.all():
         raise CalibrationError("every point is marked dry: at least 4 must be under water")
-    centre = seen.points[~seen.dry].mean(axis=0)
-    here, told = seen.shifted(-centre), shifted_settings(settings, -centre)
-    found = search(here, extended_lens(lens), told)
+    found = search(seen, extended_lens(lens), settings)
     notes = list(seen.findings)
-    fit = _best_lens(here, found, told, notes)
+    fit = _best_lens(seen, found, settings, notes)
     level = abs(float(fit.model.interface.normal[2])) > np.cos(LEVEL)
     if level and not found.surface and settings.interface == "auto" and settings.plane is None:
         found, notes = replace(found, surface=True), list(seen.findings)
-        fit = _best_lens(here, found, told, notes)
-    fit = _released(here, told, fit, notes)
+        fit = _best_lens(seen, found, settings, notes)
+    fit = _released(seen, settings, fit, notes)
     if found.surface and fit.model.interface.normal[2] < 0.0:
         notes.append(finding("camera_below"))
-    pinhole = _pinhole(here, found, told, fit)
+    pinhole = _pinhole(seen, found, settings, fit)
     normal = UP if found.surface else fit.model.interface.normal
-    parts = [held_out(f, here, settings.folds, settings.seed, normal) for f in (fit, pinhole)]
-    table, errors = estimates(fit, found.surface, told, centre)
-    touching = touched(fit, here)
-    contradicted = _contradicted(here, told, fit)
+    parts = [held_out(f, seen, settings.folds, settings.seed, normal) for f in (fit, pinhole)]
+    table, errors = estimates(fit, found.surface, settings)
+    touching = touched(fit, seen)
+    contradicted = _contradicted(seen, settings, fit)
     return PoolFit(
-        model=fit.model.shifted(centre),
+        model=fit.model,
         surface=found.surface,
         settings=settings,
         estimates=table,
@@ -384,15 +376,15 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
         seen=seen,
         used=fit.used,
         noise=fit.noise,
-        residual=residuals(fit.model, here)[0],
-        error=error_vectors(fit.model, here, normal),
+        residual=residuals(fit.model, seen)[0],
+        error=error_vectors(fit.model, seen, normal),
         held_out=parts[0],
         pinhole=pinhole,
-        pinhole_residual=residuals(pinhole.model, here)[0],
+        pinhole_residual=residuals(pinhole.model, seen)[0],
         pinhole_held_out=parts[1],
         lens_fitted=_lens_groups(fit.active),
         findings=(
-            *advice(fit, here, found.surface, told, table, touching, contradicted),
+            *advice(fit, seen, found.surface, settings, table, touching, contradicted),
             *notes,
         ),
         touching=touching,

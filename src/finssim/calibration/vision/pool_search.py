@@ -121,9 +121,10 @@ def _candidates(X: Array, xy: Array, rng: np.random.Generator) -> list[tuple[Arr
     """
     import cv2
 
-    centre = X.mean(axis=0)
-    _, values, axes = np.linalg.svd(X - centre)
-    flat, flatness = X - np.outer((X - centre) @ axes[2], axes[2]), values[2] / values[1]
+    middle = X.mean(axis=0)
+    X = X - middle
+    _, values, axes = np.linalg.svd(X)
+    flat, flatness = X - np.outer(X @ axes[2], axes[2]), values[2] / values[1]
 
     def poses(rows: NDArray[np.intp]) -> Iterator[tuple[Array, Array, Array]]:
         solvers = [(cv2.SOLVEPNP_IPPE, flat)] if flatness < SOLID else []
@@ -140,7 +141,7 @@ def _candidates(X: Array, xy: Array, rng: np.random.Generator) -> list[tuple[Arr
                 at = X @ R.T + shift.ravel()
                 off = np.linalg.norm(at[:, :2] / np.maximum(at[:, 2:], 1e-9) - xy, axis=1)
                 if np.isfinite(off).all() and np.median(at[:, 2]) > 0.0:
-                    yield off, R, -R.T @ shift.ravel()
+                    yield off, R, middle - R.T @ shift.ravel()
 
     every = np.arange(len(X))
     samples = [every]

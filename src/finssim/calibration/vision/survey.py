@@ -433,10 +433,6 @@ class Observations:
             dry=self.dry[index],
         )
 
-    def shifted(self, vector: Array) -> Observations:
-        """The same in a frame in which every point lies `vector` further [m]."""
-        return replace(self, points=self.points + vector)
-
 
 def observe(inputs: Sequence[Path], survey: Survey, *, family: str | None = None) -> Observations:
     """Match files of detections or pixels with a survey.

@@ -35,12 +35,14 @@ from finssim.localization.fusion.attitude import roll_pitch
 from finssim.localization.fusion.fuse_constant_velocity import (
     GYRO_HOLD,
     ConstantVelocity,
+    GateMemory,
     Track,
+    judge,
+    judge_carried,
     motion_of,
     vision_covariance,
 )
 from finssim.localization.fusion.fuse_settings import Settings, Site
-from finssim.localization.fusion.gate import GateMemory, judge, judge_carried
 from finssim.localization.fusion.position_filter import Motion, process_noise, transition
 from finssim.localization.fusion.streams import (
     DepthSample,
@@ -52,7 +54,7 @@ from finssim.localization.fusion.streams import (
     VisionSample,
     changed,
 )
-from finssim.localization.poses.measurement import axes_of_up
+from finssim.localization.poses import axes_of_up
 
 __all__ = ["ErrorState"]
 

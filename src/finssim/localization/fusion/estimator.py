@@ -30,7 +30,7 @@ from finssim.localization.fusion.streams import (
     VisionSample,
     refusal,
 )
-from finssim.localization.poses.measurement import Constraints
+from finssim.localization.poses import Constraints
 from finssim.localization.poses.methods import TagLocator
 
 __all__ = ["MODELS", "MODES", "Estimator", "Fixes", "Health", "health_of"]

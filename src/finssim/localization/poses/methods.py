@@ -16,7 +16,7 @@ from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Detection
 from finssim.localization.detection.families import tag_corners_b
 from finssim.localization.pool import Pool
-from finssim.localization.poses.measurement import (
+from finssim.localization.poses import (
     Constraints,
     Correspondences,
     Measurement,

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from finssim.geometry.optics import Status, back_project, count_rejections
 from finssim.localization.detection.detections import Detection
 from finssim.localization.pool import Pool
-from finssim.localization.poses.measurement import (
+from finssim.localization.poses import (
     Constraints,
     Correspondences,
     Measurement,
