@@ -22,6 +22,7 @@ from finssim.geometry.optics import Lens
 from finssim.geometry.rotations import wrap_angle
 from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Frame, read_detections
+from finssim.localization.detection.detector import Detector, RegionTracker, detector
 from finssim.localization.detection.families import family_named
 from finssim.localization.fusion.attitude import roll_pitch, up_of
 from finssim.localization.fusion.fuse_log import Series, counted, read_stream_table, series
@@ -409,23 +410,12 @@ TABLES = (".csv", ".tsv", ".txt")
 """Suffixes of detection files."""
 
 
-@dataclass(frozen=True)
-class Seeing:
-    """How tags are found in pictures; see `detector`."""
-
-    family: str
-    tags: tuple[int, ...] = ()
-    """Those looked for in videos, near where they were a picture before."""
-    refine: str = "fit"
-    gamma: float = 1.0
-    times: Path | None = None
-    """File with the time stamps of the pictures."""
-
-
 def frames_of(
     inputs: Sequence[Path],
     lens: Lens,
-    seeing: Seeing,
+    find: Detector,
+    tags: tuple[int, ...],
+    times: Path | None,
     notes: list[str],
 ) -> tuple[Iterator[Frame], int | None]:
     """Frames one after the other, and how many there will be where that is known.
@@ -433,7 +423,9 @@ def frames_of(
     Args:
         inputs: Pictures, folders of them, videos or detection files.
         lens: Of the camera: pictures of another size are refused.
-        seeing: How tags are found in pictures.
+        find: Finds tags in pictures.
+        tags: Those looked for in videos, near where they were a picture before.
+        times: File with the time stamps of the pictures.
         notes: Takes one sentence on each thing that was left out.
 
     Raises:
@@ -449,21 +441,21 @@ def frames_of(
     if tables:
         frames = [frame for path in tables for frame in read_detections(path, notes)]
         return iter(frames), len(frames)
-    return _seen(inputs, lens, seeing, notes), _count(inputs)
+    return _seen(inputs, lens, find, tags, times, notes), _count(inputs)
 
 
 def _seen(
     inputs: Sequence[Path],
     lens: Lens,
-    seeing: Seeing,
+    find: Detector,
+    tags: tuple[int, ...],
+    times: Path | None,
     notes: list[str],
 ) -> Iterator[Frame]:
-    from finssim.localization.detection.detector import RegionTracker, detector
     from finssim.localization.detection.pictures import pictures
 
-    find = detector(seeing.family, refine=seeing.refine, gamma=seeing.gamma)
     film, tracker = "", None
-    for time, name, image in pictures(list(inputs), times=seeing.times, tell=notes.append):
+    for time, name, image in pictures(list(inputs), times=times, tell=notes.append):
         if image.shape != (lens.height, lens.width):
             raise LocalizationError(
                 f"{name}: {image.shape[1]} x {image.shape[0]} pixels, expected {lens.width} x {lens.height} as the "
@@ -474,7 +466,7 @@ def _seen(
             yield Frame(time, name, tuple(find.detect(image)))
             continue
         if tracker is None or of_film != film:
-            film, tracker = of_film, RegionTracker(find, seeing.tags or None)
+            film, tracker = of_film, RegionTracker(find, tags or None)
         yield Frame(time, name, tuple(tracker.detect(image, time)))
 
 
@@ -571,9 +563,10 @@ def run(
     pixel_std = site.pixel_std if pixel_std is None else pixel_std
     locator = Locator(site, body, known, method=method, pixel_std=pixel_std, family=family)
     surveyed = None if truth is None else load_truth(truth, longest_gap)
-    seeing = Seeing(locator.family, locator.tags, refine, gamma, None if times is None else Path(times))
+    find = detector(locator.family, refine=refine, gamma=gamma)
+    stamps = None if times is None else Path(times)
     notes: list[str] = []
-    frames, count = frames_of(paths, site.camera.lens, seeing, notes)
+    frames, count = frames_of(paths, site.camera.lens, find, locator.tags, stamps, notes)
     found = _measure(frames, count, locator)
     write_rows(found.rows, out)
     found.summary = {

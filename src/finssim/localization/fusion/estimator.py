@@ -6,7 +6,7 @@ import bisect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -22,11 +22,8 @@ from finssim.localization.fusion.fuse_settings import Settings, Site
 from finssim.localization.fusion.streams import (
     DepthSample,
     Estimate,
-    HeadingSample,
-    ImuSample,
     Outcome,
     Sample,
-    VelocitySample,
     VisionSample,
     refusal,
 )
@@ -293,24 +290,9 @@ UNHEARD = 10.0
 """Silence that is taken for one where samples tell no arrival [s]."""
 
 
-class Model(Protocol[S]):
-    """What moves a state from sample to sample: pure functions of it."""
-
-    settings: Settings
-    site: Site
-
-    def start(self) -> S: ...
-    def imu(self, track: S, sample: ImuSample) -> tuple[S, tuple[Outcome, ...]]: ...
-    def depth(self, track: S, sample: DepthSample) -> tuple[S, tuple[Outcome, ...]]: ...
-    def vision(self, track: S, sample: VisionSample) -> tuple[S, tuple[Outcome, ...]]: ...
-    def velocity(self, track: S, sample: VelocitySample) -> tuple[S, tuple[Outcome, ...]]: ...
-    def heading(self, track: S, sample: HeadingSample) -> tuple[S, tuple[Outcome, ...]]: ...
-    def estimate(self, track: S, time: float) -> Estimate:
-        """The state at a time [s]."""
-
-
 MODELS: dict[str, Any] = {"constant-velocity": ConstantVelocity, "error-state": ErrorState}
-"""Name -> model, made from settings and site."""
+"""Name -> model, made from settings and site: `start`, `estimate`, and for each stream a pure function from a track and a
+sample to the track after it and what became of the sample."""
 
 
 class Estimator:

@@ -96,14 +96,7 @@ def remember(
         return Suspects(suspects.since, time, fresh.value, rows, suspects.hits + 1, suspects.misses)
     if suspects.misses + 1 > suspects.hits:
         return fresh
-    return Suspects(
-        suspects.since,
-        suspects.time,
-        suspects.value,
-        suspects.covariance,
-        suspects.hits,
-        suspects.misses + 1,
-    )
+    return replace(suspects, misses=suspects.misses + 1)
 
 
 def due(suspects: Suspects, gate: Gate) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -663,26 +663,11 @@ def _known(constraints: Constraints, pixel_std: float) -> Known:
     return known
 
 
-class Method(Protocol):
-    """What a method is: a pure function that refuses bad measurements with a reason and raises nothing for them."""
-
-    def __call__(
-        self,
-        detections: Iterable[Detection],
-        pool: Pool,
-        tags_b: Mapping[int, Array],
-        constraints: Constraints | None,
-        pixel_std: float,
-    ) -> Measurement:
-        """
-        Args:
-            detections: Tags of one picture.
-            pool: Camera and water.
-            tags_b: Tag id -> corners in the body frame [m], (4, 3).
-            constraints: What is known of height and tilt, or None.
-            pixel_std: Standard deviation of a corner, per axis [px].
-        """
-
+Method: TypeAlias = Callable[
+    [Iterable[Detection], Pool, Mapping[int, Array], Constraints | None, float], Measurement
+]
+"""Tags of one picture, pool, tag id -> corners in the body frame [m] (4, 3), what is known of height and tilt, standard
+deviation of a corner per axis [px] -> the measurement; it refuses a bad picture with a reason and raises nothing."""
 
 METHODS: dict[str, Method] = {
     "refractive": planar_fit,
