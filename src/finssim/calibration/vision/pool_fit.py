@@ -392,48 +392,48 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
 
 
 def _refined(
-    here: Observations, model: PoolModel, told: Settings, active: NDArray[np.bool_], prior: Prior
+    seen: Observations, model: PoolModel, settings: Settings, active: NDArray[np.bool_], prior: Prior
 ) -> Refined:
-    pixel, survey = told.pixel_sigma or 0.4, max(told.survey_sigma, 1e-7)
-    noise = Noise(pixel=pixel, survey=survey, survey_yaw=told.survey_yaw_sigma)
-    return refine(model, here, active, prior, noise, pixel_known=told.pixel_sigma is not None)
+    pixel, survey = settings.pixel_sigma or 0.4, max(settings.survey_sigma, 1e-7)
+    noise = Noise(pixel=pixel, survey=survey, survey_yaw=settings.survey_yaw_sigma)
+    return refine(model, seen, active, prior, noise, pixel_known=settings.pixel_sigma is not None)
 
 
-def _best_lens(here: Observations, found: Found, told: Settings, notes: list[Finding]) -> Refined:
+def _best_lens(seen: Observations, found: Found, settings: Settings, notes: list[Finding]) -> Refined:
     """The fit as asked; where nobody asked, the lens is fitted as far as held-out points get better by it."""
-    start = replace(found.model, interface=replace(found.model.interface, index_far=told.index))
+    start = replace(found.model, interface=replace(found.model.interface, index_far=settings.index))
 
     def fitted(model: PoolModel, active: NDArray[np.bool_]) -> Refined:
-        stds = lens_std(told, model.camera.lens.width)
-        return _refined(here, model, told, active, prior_of(model, start, told, found.surface, stds))
+        stds = lens_std(settings, model.camera.lens.width)
+        return _refined(seen, model, settings, active, prior_of(model, start, settings, found.surface, stds))
 
-    best = fitted(found.model, active_names(told))
-    if told.fit is not None:
+    best = fitted(found.model, active_names(settings))
+    if settings.fit is not None:
         return best
     normal = UP if found.surface else best.model.interface.normal
-    error = _generalisation(best, here, told, normal)
+    error = _generalisation(best, seen, settings, normal)
     for extra in LENS_STEPS:
-        active = active_names(told, extra)
-        if 2 * len(here) < 3 * active.sum() or not np.isfinite(error):
+        active = active_names(settings, extra)
+        if 2 * len(seen) < 3 * active.sum() or not np.isfinite(error):
             break
         try:
             other = fitted(best.model, active)
         except (CalibrationError, np.linalg.LinAlgError):
             continue
-        further = _generalisation(other, here, told, normal)
+        further = _generalisation(other, seen, settings, normal)
         if further < BETTER * error:
             best, error = other, further
-    if groups := _lens_groups(best.active & ~active_names(told)):
+    if groups := _lens_groups(best.active & ~active_names(settings)):
         notes.append(finding("lens_refitted", groups=groups))
     return best
 
 
-def _generalisation(fit: Refined, here: Observations, told: Settings, normal: Array) -> float:
+def _generalisation(fit: Refined, seen: Observations, settings: Settings, normal: Array) -> float:
     """Held-out error in the picture [px], rows that the fit left out counted as far as they lie."""
-    out = held_out(fit, here, told.folds, told.seed, normal)
+    out = held_out(fit, seen, settings.folds, settings.seed, normal)
     if out is None:
         return float("nan")
-    left = residuals(fit.model, here.subset(~fit.used))[0]
+    left = residuals(fit.model, seen.subset(~fit.used))[0]
     return rms(np.concatenate([out.pixels, np.clip(left, -20.0, 20.0)]))
 
 
@@ -442,11 +442,11 @@ def _lens_groups(active: NDArray[np.bool_]) -> tuple[str, ...]:
     return tuple(group for group, name in named.items() if active[NAMES.index(name)])
 
 
-def _released(here: Observations, told: Settings, fit: Refined, notes: list[Finding]) -> Refined:
+def _released(seen: Observations, settings: Settings, fit: Refined, notes: list[Finding]) -> Refined:
     """Let the surface tilt freely where the pixels contradict a level one and nobody set how level it is."""
-    if not np.isfinite(fit.prior.tilt_std) or told.tilt_sigma is not None or not fit.active[6]:
+    if not np.isfinite(fit.prior.tilt_std) or settings.tilt_sigma is not None or not fit.active[6]:
         return fit
-    free = _without(here, told, fit, replace(fit.prior, tilt_std=np.inf))
+    free = _without(seen, settings, fit, replace(fit.prior, tilt_std=np.inf))
     assert fit.prior.normal is not None
     if free is None or not _leans(free, fit.prior.normal):
         return fit
@@ -462,11 +462,11 @@ def _leans(free: Refined, normal: Array) -> bool:
     return lean < MOST_LEAN and error < lean / 3.0
 
 
-def _contradicted(here: Observations, told: Settings, fit: Refined) -> list[Finding]:
+def _contradicted(seen: Observations, settings: Settings, fit: Refined) -> list[Finding]:
     """A finding where the pixels by themselves put the plane elsewhere than it was measured."""
-    if not told.known_depth or not fit.active[NAMES.index("depth")]:
+    if not settings.known_depth or not fit.active[NAMES.index("depth")]:
         return []
-    free = _without(here, told, fit, replace(fit.prior, depth_std=np.inf))
+    free = _without(seen, settings, fit, replace(fit.prior, depth_std=np.inf))
     if free is None:
         return []
     by = 1000.0 * (free.model.depth - fit.prior.depth)
@@ -474,22 +474,22 @@ def _contradicted(here: Observations, told: Settings, fit: Refined) -> list[Find
     return [finding("plane_contradicted", distance=abs(by), sense=sense)]
 
 
-def _without(here: Observations, told: Settings, fit: Refined, loose: Prior) -> Refined | None:
+def _without(seen: Observations, settings: Settings, fit: Refined, loose: Prior) -> Refined | None:
     """The fit with a prior loosened, where the pixels contradict that prior; else None."""
     try:
-        free = _refined(here, fit.model, told, fit.active, loose)
+        free = _refined(seen, fit.model, settings, fit.active, loose)
     except (CalibrationError, np.linalg.LinAlgError):
         return None
-    held = solve(free.model, here.subset(free.used), free.whiten, fit.active, fit.prior)
+    held = solve(free.model, seen.subset(free.used), free.whiten, fit.active, fit.prior)
     return free if 2.0 * (held.cost - free.cost) > DOUBT else None
 
 
-def _pinhole(here: Observations, found: Found, told: Settings, fit: Refined) -> Refined:
+def _pinhole(seen: Observations, found: Found, settings: Settings, fit: Refined) -> Refined:
     """Straight lines fitted to the same rows, as plain calibrations do."""
     model = replace(found.pinhole, camera=replace(found.pinhole.camera, lens=fit.model.camera.lens))
     active = fit.active & np.array([name in NAMES[:6] or name in NAMES[10:] for name in NAMES])
     prior = replace(fit.prior, normal=None, depth=np.nan, depth_std=np.inf, index_std=np.inf)
-    part = here.subset(fit.used)
+    part = seen.subset(fit.used)
     alike = Noise(pixel=1.0, survey=1e-7, survey_yaw=1e-7)
     end = solve(model, part, Whitener(np.zeros((len(part), 2, 3)), part, alike), active, prior).model
     alike = replace(alike, pixel=max(0.05, rms(residuals(end, part)[0]) / np.sqrt(2.0)))
@@ -548,17 +548,17 @@ def doubted(fit: PoolFit, lens: Lens, *, lens_told: bool = True) -> PoolFit:
 
 def _refuse_depth(fit: PoolFit) -> None:
     """Refuse a plane told so far from the points that the camera, seen through it, would be between."""
-    told, option = _told_depth(fit)
+    depth, option = _measured_depth(fit)
     camera = fit.pinhole.model
     apparent = abs(float(fit.model.interface.normal @ (camera.camera.position - camera.reference)))
-    if told > TOO_DEEP * fit.model.interface.index_far * apparent:
+    if depth > TOO_DEEP * fit.model.interface.index_far * apparent:
         raise CalibrationError(
-            f"{option} puts the plane {told:.3g} m from the points, but by the pixels the camera is only about "
+            f"{option} puts the plane {depth:.3g} m from the points, but by the pixels the camera is only about "
             f"{apparent:.3g} m from them: check its unit (metres) and the survey's; nothing is written"
         )
 
 
-def _told_depth(fit: PoolFit) -> tuple[float, str]:
+def _measured_depth(fit: PoolFit) -> tuple[float, str]:
     """Distance of the plane from the middle of the points under water as it was measured [m], and by which option."""
     settings, middle = fit.settings, fit.seen.points[~fit.seen.dry].mean(axis=0)
     if settings.water_height is not None:

@@ -291,8 +291,8 @@ UNHEARD = 10.0
 
 
 MODELS: dict[str, Any] = {"constant-velocity": ConstantVelocity, "error-state": ErrorState}
-"""Name -> model, made from settings and site: `start`, `estimate`, and for each stream a pure function from a track and a
-sample to the track after it and what became of the sample."""
+"""Name -> model, made from settings and site: `start`, `estimate`, and for each stream a pure function from a track and
+a sample to the track after it and what became of the sample."""
 
 
 class Estimator:
