@@ -31,7 +31,6 @@ from finssim.calibration.vision.sensor_mounts import (
     fit_depth,
     fit_imu_mounting,
     imu_clock,
-    turn_residual,
 )
 from finssim.calibration.vision.tag_mounts import (
     AXES,
@@ -414,9 +413,7 @@ def calibrate_mounts(
         rows, changes = rows + of_tilt, changes | written
     if isinstance(imu, ImuMounting):
         rows += [row for row in imu.estimates.values() if "turn" not in row.name]
-        held_out = math.degrees(_turns_held_out(found, log, imu))
-        turns = _figures(math.degrees(imu.residual), imu.rejected, imu.windows, held_out)
-        quality["turns of the gyro [deg]"] = turns
+        quality["turns of the gyro [deg]"] = _figures(math.degrees(imu.residual), imu.rejected)
     rows += [clock] if clock is not None else []
     pressure = _pressure(rig, found, mounts) if estimate == "sensors" else None
     if pressure is not None:
@@ -479,24 +476,6 @@ def _imu(
         return fit_imu_mounting(attitude, log.gyro, start=start, window=_window(attitude), time_offset=offset)
     except CalibrationError as error:
         return error
-
-
-def _turns_held_out(found: MountFit, log: MountLog, imu: ImuMounting) -> float:
-    """Disagreement of the second half's turns with the mounting of the first, robust rms [rad]; NaN if it is short."""
-    assert log.gyro is not None
-    every = _attitude(found)
-    half, window = len(every.t) // 2, _window(every)
-    first, second = (
-        Attitude(t=every.t[part], quaternion=every.quaternion[part])
-        for part in (slice(None, half), slice(half, None))
-    )
-    options = {"start": imu.orientation, "time_offset": imu.time_offset}
-    try:
-        return turn_residual(
-            fit_imu_mounting(first, log.gyro, window=window, **options), second, log.gyro, window=window
-        )
-    except CalibrationError:
-        return math.nan
 
 
 def _pressure(rig: Rig, found: MountFit, mounts: Mapping[int, Pose]) -> DepthFit | None:
