@@ -171,6 +171,8 @@ def _table(path: str, text: TextTable, default: str | None) -> Table:
         raise CalibrationError(f"{path}: two columns mean '{twice[0]}': leave one of them")
     united = default is not None or any(unit in METRES for _, unit in heads)
     cells = text.rows
+    if text.decimal_comma:
+        cells = [[w.replace(",", ".") if text.number(w) is not None else w for w in row] for row in cells]
     factors = [
         _factor(name, unit, default, [c[k] for c in cells if k < len(c)])
         for k, (name, unit) in enumerate(heads)
