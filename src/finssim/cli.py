@@ -53,6 +53,7 @@ COMMANDS: dict[str, str | Experiment] = {
     "experiment soak": Experiment("finssim.experiments.reliability:soak", "print_soak"),
     "experiment timing": Experiment("finssim.experiments.reliability:timing", "print_timing"),
     "experiment stack": "finssim.experiments.stack:play",
+    "report": "finssim.experiments.report:report",
     "localize": "finssim.localization.localize:run",
     "fuse": "finssim.localization.fusion.fuse:run",
     "project": "finssim.localization.points:run_project",

@@ -53,6 +53,8 @@ TRAINING_SHARE = 0.4
 INTERVALS = "intervals"
 """Stands for the ranges that the calibration's intervals give."""
 RANGES_FILE = "ranges.yaml"
+FEWEST_UNITS = 3
+"""Plants and seeds on which a sentence about a difference rests at least; below it there are numbers alone."""
 FORGETFUL = {"integral": False, "history": 0, "last_action": False}
 """Settings of the learner, for policies as the paper's."""
 
@@ -220,7 +222,7 @@ def transfer_experiment(
         "experiment": spec.name, "severity": severity, "camera": camera, "plants": list(places),
         "seeds": list(run_seeds), "targets": targets, "robot": robot and robot.title,
         "vehicle": {"name": body.name, "sha256": body.sha256},
-        **_scores(spec, by_row), "trials": results, "provenance": provenance(),
+        **scores(spec, by_row), "trials": results, "provenance": provenance(),
     }  # fmt: skip
     write_json(folder / f"{spec.name}.json", result, markdown_of(spec.shown(result)))
     spec.draw(by_row, folder)
@@ -302,7 +304,7 @@ def finished(place: Path, vehicle: Vehicle | None = None) -> bool:
         return False
 
 
-def _scores(spec: Spec, by_row: Results) -> dict[str, Any]:
+def scores(spec: Spec, by_row: Results) -> dict[str, Any]:
     """Figures of every row, all targets together and each alone; differences from the reference; sentences."""
     rows = {}
     for name, results in by_row.items():
@@ -324,8 +326,17 @@ def _scores(spec: Spec, by_row: Results) -> dict[str, Any]:
             name: {key: d and d.as_json() for key, d in of_row.items()}
             for name, of_row in differences.items()
         },
-        "sentences": [sentence(spec.rows[name].module, of_row) for name, of_row in differences.items()],
+        "sentences": [
+            sentence(spec.rows[name].module, of_row)
+            for name, of_row in differences.items()
+            if _units(by_row[name]) >= FEWEST_UNITS
+        ],
     }
+
+
+def _units(results: Sequence[Mapping[str, Any]]) -> int:
+    """How many pairs of plant and seed results rest on."""
+    return len({(r["job"]["plant"], r["job"]["seed"]) for r in results})
 
 
 def row_figures(results: Sequence[Mapping[str, Any]], figures: Mapping[str, Statistic]) -> dict[str, Any]:
