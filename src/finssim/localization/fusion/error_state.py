@@ -569,9 +569,9 @@ class ErrorState:
             state = correct(state, residual, H, R, gain)
         elif verdict == "reacquired" and restart is not None:
             state = restart(state)
-        track = changed(track, inertial=state, gates=(*track.gates[:k], memory, *track.gates[k + 1 :]))
-        if verdict != "gate" and stream in TIMED:
-            track = changed(track, **{f"{stream}_time": time})
+        gates = (*track.gates[:k], memory, *track.gates[k + 1 :])
+        believed = {f"{stream}_time": time} if verdict != "gate" and stream in TIMED else {}
+        track = changed(track, inertial=state, gates=gates, **believed)
         return track, Outcome(stream, verdict, distance, len(residual))
 
     def _at(self, track: InertialTrack, time: float) -> tuple[InertialTrack, InertialState]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -319,8 +319,11 @@ class ConstantVelocity:
         lever = height_above_origin(site.depth_port, track.roll, track.pitch)
         z = np.array([-sample.depth - site.offset - lever])
         R = np.array([[s.depth_std**2]])
-        x, y = track.position.x[:2]
-        height = (z - site.up[0] * x - site.up[1] * y) / site.up[2]
+        x = track.position.x
+
+        def height() -> Array:
+            return np.asarray((z - site.up[0] * x[0] - site.up[1] * x[1]) / site.up[2])
+
         track, outcome = self._placed(track, "depth", sample.time, z, self._H_depth, R, [2], height)
         return track, (outcome,)
 
@@ -331,7 +334,7 @@ class ConstantVelocity:
             self._turned_to(self._positioned(track, sample.time), sample.time),
             np.array(sample.position),
         )
-        track, seen = self._placed(track, "vision", sample.time, z, _H_VISION, R[:2, :2], [0, 1], z)
+        track, seen = self._placed(track, "vision", sample.time, z, _H_VISION, R[:2, :2], [0, 1], lambda: z)
         if sample.yaw is None:
             return track, (seen,)
         track, turned = self._turned(track, sample.time, sample.yaw, float(R[2, 2]))
@@ -402,7 +405,7 @@ class ConstantVelocity:
         H: Array,
         R: Array,
         axes: list[int],
-        restart: Array,
+        restart: Callable[[], Array],
     ) -> tuple[Track, Outcome]:
         """The track after a fix or a depth that its gate has judged; `restart` is where the axes begin anew."""
         s, k = self.settings, GATES.index(stream)
@@ -413,10 +416,10 @@ class ConstantVelocity:
         if verdict == "accepted":
             position = position_filter.correct(position, found, H, R)
         elif verdict != "gate":
-            position = position_filter.restarted(position, axes, restart, R, s.speed_std)
-        track = changed(track, position=position, gates=(*track.gates[:k], memory, *track.gates[k + 1 :]))
-        if verdict != "gate":
-            track = changed(track, **{f"{stream}_time": time})
+            position = position_filter.restarted(position, axes, restart(), R, s.speed_std)
+        gates = (*track.gates[:k], memory, *track.gates[k + 1 :])
+        believed = {} if verdict == "gate" else {f"{stream}_time": time}
+        track = changed(track, position=position, gates=gates, **believed)
         return track, Outcome(stream, verdict, distance, len(z))
 
     def _turned(self, track: Track, time: float, seen: float, variance: float) -> tuple[Track, Outcome]:
