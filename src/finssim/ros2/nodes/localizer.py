@@ -34,9 +34,9 @@ class Localizer(RobotNode):
         self.perception = Perception(self.vehicle, self.pool, method=method)
         self.perception.fixes = self.fixes = _Kept(self.perception.fixes)
         self.frame = FixFrame(self.pool, self.perception.estimator)
-        tags, library = self.vehicle.tags, self.parameter("detector", "apriltag")
+        tags = self.vehicle.tags
         assert tags is not None  # Perception has refused such a vehicle
-        self._tracker = RegionTracker(detector(tags.family, library=library), set(tags.mounts))
+        self._tracker = RegionTracker(detector(tags.family), set(tags.mounts))
         self.verdicts: Counter[str] = Counter()
         self.sequence = 0
         self.sends("fix", "tags", "diagnostics", "event")
