@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from finssim.calibration.actuators.steps import Step, find_steps
 from finssim.calibration.findings import Finding, finding
+from finssim.calibration.motion.smoothing import without_spikes
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles.thruster import Thruster
 
@@ -280,16 +281,11 @@ def _columns(trial: Trial, name: str) -> tuple[str, str] | None:
 
 
 def _without_spikes(t: Array, y: Array, findings: list[Finding], column: str) -> tuple[Array, Array]:
-    """Samples that stand alone, far from both neighbours, left out: a lost telegram, a zero in between."""
-    if len(y) < 5:
-        return t, y
-    left, right = y[1:-1] - y[:-2], y[1:-1] - y[2:]
-    jump = np.minimum(np.abs(left), np.abs(right)) * (np.sign(left) == np.sign(right))
-    scatter = 1.4826 * float(np.median(np.abs(np.diff(y))))
-    stray = np.r_[False, jump > max(10.0 * scatter, 0.2 * float(np.ptp(y))), False]
-    if np.any(stray):
-        findings.append(finding("spikes", samples=np.count_nonzero(stray), column=column))
-    return t[~stray], y[~stray]
+    """Samples far from their neighbours left out: a lost telegram, a zero in between."""
+    good = without_spikes(t, y[:, None])
+    if not good.all():
+        findings.append(finding("spikes", samples=np.count_nonzero(~good), column=column))
+    return t[good], y[good]
 
 
 def _voltage(trial: Trial, times: Array) -> Array | float | None:

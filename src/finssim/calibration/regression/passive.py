@@ -22,9 +22,9 @@ from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.motion.attitude_signal import attitude_samples
 from finssim.calibration.motion.signals import Motion, motion
+from finssim.calibration.motion.smoothing import without_spikes
 from finssim.calibration.regression.instruments import Run, simulate_axis
 from finssim.calibration.regression.plant_terms import Matrices, matrices
-from finssim.calibration.regression.robust import local_outliers
 from finssim.calibration.trials.trial import NU, Trial
 from finssim.calibration.uncertainty import Evidence, correlated_samples, trial_covariance
 from finssim.geometry.rotations import quat_inverse_rotate, quat_to_euler
@@ -160,7 +160,7 @@ def _samples(trial: Trial, axis: str, moved: Motion) -> tuple[Samples, Samples]:
 
 def _clean(samples: Samples) -> Samples:
     """Without spikes."""
-    good = ~local_outliers(samples[1]) if len(samples[1]) > 11 else np.ones(len(samples[1]), bool)
+    good = without_spikes(samples[0], samples[1][:, None])
     return samples[0][good], samples[1][good]
 
 
