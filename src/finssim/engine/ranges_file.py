@@ -212,6 +212,8 @@ class Ranges(Part):
     mass: Above0 = ONE
     volume: Annotated[Above0 | Literal["with_mass"], BeforeValidator(_factor_or_with_mass)] = ONE
     """A factor, or `with_mass`: the volume follows the mass, so that the trim is kept."""
+    buoyancy: Above0 = ONE
+    """Factor on the displaced volume, on top of `volume`'s."""
     inertia: Above0 = ONE
     center_of_gravity: Annotated[Interval | Offsets, BeforeValidator(_either(Offsets))] = NONE
     """Offset along each axis [m]."""

@@ -20,7 +20,17 @@ from onnx import TensorProto, helper, numpy_helper
 
 from finssim.control.policy import DESCRIPTION_FILE, NETWORK_FILE, Policy, PolicyDescription
 from finssim.files import atomic_directory
-from finssim.learning.network import Activation, Cell, Linear, Network, asked, first_memory
+from finssim.learning.network import (
+    INTEGRAL_LIMIT,
+    INTEGRAL_RATE,
+    INTEGRAL_REACH,
+    Activation,
+    Cell,
+    Linear,
+    Network,
+    asked,
+    first_memory,
+)
 from finssim.provenance import provenance
 
 if TYPE_CHECKING:
@@ -47,32 +57,38 @@ def write_graph(network: Network, n: int, m: int) -> bytes:
     network = network.as_type(np.float32)
     graph, x = _Graph(), "observation"
     inputs, outputs = [("observation", n)], [("action", m)]
-    if network.mean is not None:
-        x = graph.node(
-            "Mul", [graph.node("Sub", [x, graph.weight(network.mean)]), graph.weight(network.scale)]
-        )
-    scaled, after, parts = x, [], {}
+    parts: dict[str, str] = {}
     if network.memory_size:
         inputs.append(("memory", network.memory_size))
         outputs.append(("memory_after", network.memory_size))
         sizes = {
+            "integral": len(network.errors),
             "past": max(network.history - 1, 0) * n,
             "oldest": n if network.history else 0,
             "last": network.last_action,
             "cell": network.cell.memory_size if network.cell else 0,
         }
         parts = graph.split("memory", {name: size for name, size in sizes.items() if size})
+    after, state = [], []
+    if network.errors:
+        x, integral = graph.integrals(network.errors, parts["integral"], n)
+        after = [integral]
+    if network.mean is not None:
+        x = graph.node(
+            "Mul", [graph.node("Sub", [x, graph.weight(network.mean)]), graph.weight(network.scale)]
+        )
+    scaled = x
     window = [parts[name] for name in ("past", "oldest", "last") if name in parts]
     y = graph.node("Concat", [x, *window], axis=1) if window else x
     if network.cell is not None:
-        y, state = graph.cell(network.cell, y, parts["cell"])
-        after = [state]
+        y, cell = graph.cell(network.cell, y, parts["cell"])
+        state = [cell]
     graph.stack(network.layers, y)
     if window:
         past = [scaled, *([parts["past"]] if "past" in parts else [])] if network.history else []
-        after = [*past, *(["action"] if network.last_action else []), *after]
-    if after:
-        graph.node("Concat", after, "memory_after", axis=1)
+        after += [*past, *(["action"] if network.last_action else [])]
+    if after + state:
+        graph.node("Concat", after + state, "memory_after", axis=1)
     return graph.file(inputs, outputs)
 
 
@@ -106,6 +122,19 @@ class _Graph:
         """y = x W + b."""
         bias = [] if layer.bias is None else [self.weight(layer.bias)]
         return self.node("Gemm", [x, self.weight(layer.weight), *bias])
+
+    def integrals(self, errors: Sequence[int], before: str, n: int) -> tuple[str, str]:
+        """The observation as the policy sees it and the integrals after, as of `with_integrals`."""
+        rate, steepness, low, high = (
+            self.weight(np.full((), value, np.float32))
+            for value in (INTEGRAL_RATE, -1.0 / INTEGRAL_REACH**2, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)
+        )
+        e = self.node("Gather", ["observation", self.weight(np.array(errors, np.int64))], axis=1)
+        near = self.node("Exp", [self.node("Mul", [steepness, self.node("Mul", [e, e])])])
+        gain = self.node("Mul", [rate, self.node("Mul", [e, near])])
+        z = self.node("Clip", [self.node("Add", [before, gain]), low, high])
+        where = np.eye(n, dtype=np.float32)[list(errors)]
+        return self.node("Add", ["observation", self.node("MatMul", [z, self.weight(where)])]), z
 
     def cell(self, cell: Cell, x: str, memory: str) -> tuple[str, str]:
         """One step of an LSTM or a GRU, as `Cell.step` has it: its outputs and its memory after."""
