@@ -668,9 +668,11 @@ class _Result:
         words = f"from the acceleration, {self.note}"
         excess = self.add("buoyancy_excess", "N", lambda r: self.file * r[1], words, "body.displaced_volume")
         low, high = excess.ci95
-        if not low <= self.plant.excess <= high:
-            code = "buoyancy_sign" if self.plant.excess < 0.0 < low else "buoyancy_contradicted"
-            self.findings.append(finding(code, "heave", file=self.plant.excess, low=low, high=high))
+        fields: dict[str, Any] = {"file": self.plant.excess, "low": low, "high": high}
+        if self.plant.excess < 0.0 < low:
+            self.findings.append(finding("buoyancy_sign", "heave", **fields))
+        elif not low <= self.plant.excess <= high:
+            self.findings.append(finding("buoyancy_contradicted", "heave", **fields))
 
     def damping(self) -> None:
         """Drag over inertia, and the drag itself; both terms go to the vehicle file or none."""
