@@ -15,7 +15,7 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.motion.signals import Motion
-from finssim.calibration.regression.axis_estimates import USEFUL, outside, trim
+from finssim.calibration.regression.axis_estimates import USEFUL, hydrostatics, outside
 from finssim.calibration.regression.selection import AKAIKE, DAMPING
 from finssim.calibration.simulation.estimates import FEWEST_TRIALS, Confidence, confidence, estimates
 from finssim.calibration.simulation.parameters import EXTRAS, Parameters
@@ -365,18 +365,7 @@ def changes(
                 # Couplings are written where both axes are, and where the fit did away with them.
                 if i == j or (new[family][i, j] != old[i, j] and (j in rows or new[family][i, j] == 0.0)):
                     out[f"{base}.{family}.{i}.{j}"] = float(new[family][i, j])
-    water, body = p.vehicle.water, p.vehicle.body
-    volume = float(body.displaced_volume)
-    excess = found.get("buoyancy_excess")
-    if excess is not None and excess.identifiable:
-        volume = (p.vehicle.weight + excess.estimate) / (water.density * water.gravity)
-        out["body.displaced_volume"] = volume
-    stiff = [found[n] for n in ("roll.k", "pitch.k") if n in found]
-    before = p.expected[p.names.index("k")] if "k" in p.names else 0.0
-    stiff = [e for e in stiff if e.identifiable or (e.estimate > 0.0 and outside(before, e.ci95))]
-    if stiff:
-        out["body.center_of_buoyancy.2"] = float(p.buoyancy_height(stiff[0].estimate, volume))
-    out |= trim(found, water.density * water.gravity * volume, body.center_of_buoyancy)
+    out |= hydrostatics(found, p.vehicle)[0]
     for name, path in (("thrust_lag", "time_constant"), ("thrust_delay", "delay")):
         if name in found and found[name].identifiable:
             out[f"thrusters.*.{path}"] = max(found[name].estimate, 1e-4 if path == "time_constant" else 0.0)
