@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from finssim.calibration.simulation.solver import Linear, Point, blocks_of, solve, step_of, weights_of
-from finssim.calibration.vision.least_squares import Block
+from finssim.calibration.vision.least_squares import Block, arrow_reduced
 
 
 class Decays:
@@ -75,7 +75,7 @@ def test_the_schur_complement_gives_the_step_of_the_whole_system(seed):
     point = Point(np.append(0.8, rng.normal(size=3)), rng.uniform(1, 2, (6, 1)))
     std = problem.noise(problem.value)
     blocks = blocks_of(problem, problem.linearise(point), std, point)
-    theta, z, error = step_of(problem, blocks, point, 0.0)
+    theta, z, error = step_of(problem, arrow_reduced(blocks, 0.0), point, 0.0)
     whole, side = dense(problem, point, std)
     expected = np.linalg.solve(whole, side)
     np.testing.assert_allclose(theta, expected[:4], rtol=1e-6)
@@ -136,7 +136,7 @@ def test_a_step_in_a_box_satisfies_the_conditions_of_karush_kuhn_and_tucker(seed
     problem = Decays()
     problem.low, problem.high = -rng.uniform(0.0, 1.0, n), rng.uniform(0.0, 1.0, n)
     block = Block(A, np.zeros((n, 1)), np.ones((1, 1)), g, np.zeros(1))
-    d, _, _ = step_of(problem, [block], Point(np.zeros(n), np.zeros((1, 1))), 0.0)
+    d, _, _ = step_of(problem, arrow_reduced([block], 0.0), Point(np.zeros(n), np.zeros((1, 1))), 0.0)
     slope, tiny = g - A @ d, 1e-6 * np.abs(g).max()
     at_low, at_high = d <= problem.low + 1e-8, d >= problem.high - 1e-8
     assert ((d >= problem.low - 1e-8) & (d <= problem.high + 1e-8)).all()

@@ -121,19 +121,19 @@ def blocks_of(problem: Problem, linear: Linear, std: Array, point: Point, cut: f
 
 
 def step_of(
-    problem: Problem, blocks: list[Block], point: Point, damping: float
+    problem: Problem, reduced: tuple[Array, Array, list[Array]], point: Point, damping: float
 ) -> tuple[Array, Array, Array]:
     """Steps of theta (P,) inside the box and of z (S, q), and standard errors of theta, (P,).
 
     Args:
         problem: For its box.
-        blocks: Normal equations at the point.
+        reduced: Normal equations of theta alone at the point, and how z follows; of `arrow_reduced`.
         point: Where the step begins.
-        damping: What the diagonals grow by, as a part of themselves [-].
+        damping: What the diagonal of theta's grows by, as a part of itself [-].
     """
-    total, right, inners = arrow_reduced(blocks, damping)
+    total, right, inners = reduced
     scale = np.sqrt(np.maximum(np.diagonal(total), 1e-30 + 1e-12 * np.diagonal(total).max()))
-    A = total / np.outer(scale, scale) + 1e-9 * np.eye(len(scale))
+    A = total / np.outer(scale, scale) + (damping + 1e-9) * np.eye(len(scale))
     low, high = problem.low - point.theta, problem.high - point.theta
     step = boxed(A, right / scale, np.minimum(low * scale, -1e-12), np.maximum(high * scale, 1e-12)) / scale
     z = np.array([inner[:, -1] - inner[:, :-1] @ step for inner in inners])
@@ -190,14 +190,14 @@ def solve(
         for done in range(1, iterations + 1):
             if report:
                 report(done, float(np.sqrt(2.0 * cost / max(len(std), 1))))
-            blocks = blocks_of(problem, linear, std, point, cut)
-            step, _, error = step_of(problem, blocks, point, 0.0)
+            reduced = arrow_reduced(blocks_of(problem, linear, std, point, cut), 0.0)
+            step, _, error = step_of(problem, reduced, point, 0.0)
             near = error + problem.grain(point.theta)
             remaining = float(np.max(np.abs(step / near)[: problem.judged], initial=0.0))
             if settled and remaining < CLOSE:
                 converged = True
                 break
-            steps = [step_of(problem, blocks, point, damping * factor) for factor in DAMPINGS]
+            steps = [step_of(problem, reduced, point, damping * factor) for factor in DAMPINGS]
             points = Point(
                 np.clip(point.theta + np.array([theta for theta, _, _ in steps]), problem.low, problem.high),
                 point.z + np.array([z for _, z, _ in steps]),
