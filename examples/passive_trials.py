@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.regression.free_decay import Decay, free_decay
+from finssim.calibration.fit import Curve
 from finssim.calibration.regression.passive import passive
 from finssim.calibration.trials.header import Header
 from finssim.calibration.trials.trial import Trial
@@ -42,19 +41,16 @@ def read(folder: Path, name: str) -> Trial:
     return Trial(name=name, t=t, channels=channels, header=Header(passive=True))
 
 
-def draw(decays: list[Decay], path: Path) -> None:
-    """Measured and fitted rate of every decay."""
+def draw(curves: list[Curve], path: Path) -> None:
+    """Measured and fitted motion of every decay."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9.0, 2.4 * len(decays)), layout="constrained")
-    for axes, d in zip(np.atleast_1d(figure.subplots(len(decays), 1)), decays, strict=True):
-        axes.plot(*d.rate_measured, ".", color="0.6", markersize=3, label="IMU")
-        axes.plot(d.t, d.rate, color="C0", label="fitted")
-        period = 2.0 * np.pi / np.sqrt(d.theta[0])
-        axes.set_title(
-            f"{d.trial}, {d.axis}: period {period:.2f} s, released at {d.begin:.1f} s", fontsize=10
-        )
-        axes.set_ylabel("rate [rad/s]")
+    figure = Figure(figsize=(9.0, 2.4 * len(curves)), layout="constrained")
+    for axes, curve in zip(np.atleast_1d(figure.subplots(len(curves), 1)), curves, strict=True):
+        axes.plot(curve.x, curve.measured, ".", color="0.6", markersize=3, label="measured")
+        axes.plot(curve.x, curve.fitted, color="C0", label="fitted")
+        axes.set_title(curve.title, fontsize=10)
+        axes.set_ylabel(curve.y_label)
         axes.grid(alpha=0.3)
         axes.legend(loc="upper right", fontsize=8)
     axes.set_xlabel("time [s]")
@@ -69,20 +65,13 @@ def main() -> None:
     given = parser.parse_args()
     names = sorted(path.name.removesuffix("_mocap.csv") for path in given.folder.glob("*_mocap.csv"))
     trials = [read(given.folder, name) for name in names]
-    fit = passive(trials, load_vehicle("bluerov2_heavy"))
+    fit = passive(trials, load_vehicle("bluerov2_heavy"), axes=["roll", "pitch"])
     for e in fit.estimates.values():
         print(f"{e.name:24s} {e.estimate:9.4g} [{e.ci95[0]:.4g}, {e.ci95[1]:.4g}] {e.unit:8s} {e.note}")
     for finding in fit.findings:
         print(finding)
     if given.picture:
-        decays = []
-        for trial in trials:
-            for axis in ("roll", "pitch"):
-                try:
-                    decays.append(free_decay(trial, axis))
-                except CalibrationError:
-                    continue  # said among the findings
-        draw(decays, given.picture)
+        draw(list(fit.curves), given.picture)
 
 
 if __name__ == "__main__":

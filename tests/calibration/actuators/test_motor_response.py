@@ -1,14 +1,10 @@
 """Motors: dead time and lag from step logs, recovered with intervals that cover, in the vehicle file's domain."""
 
-import math
-
 import numpy as np
 import pytest
 
 from calibration.made_steps import RPM, held, lagged, sampled, step_log
-from finssim.calibration.actuators.motor import fit_motor
-from finssim.calibration.actuators.motor_study import fit_response
-from finssim.calibration.actuators.motor_trial import cut_steps
+from finssim.calibration.actuators.motor import cut_steps, fit_motor, fit_response, loop_gains
 from finssim.calibration.actuators.steps import find_steps, levels
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation.programmes import programmes
@@ -36,7 +32,8 @@ def log(
 
 
 def response(command_times, command, t, y):
-    return fit_response(cut_steps("a", t, y, command_times, find_steps(command_times, command)))
+    steps = [(step.start, step.time, step.end) for step in find_steps(command_times, command)]
+    return fit_response(cut_steps("a", t, y, command_times, steps))
 
 
 CASES = [  # delay [s], time constant [s], sampling [Hz]
@@ -54,7 +51,7 @@ def test_dead_time_and_lag_are_recovered(delay, tau, rate):
     found = response(*log(delay, tau, rate=rate, lost=0.2))
     assert found.delay == pytest.approx(delay, abs=0.2 / rate + 0.002)
     assert found.time_constant == pytest.approx(tau, rel=0.05 if tau * rate > 2.0 else 0.1)
-    assert len(found.used) == 8
+    assert found.used.sum() == 8
 
 
 @pytest.mark.slow
@@ -75,9 +72,7 @@ def test_without_noise_the_answer_is_that_of_the_closed_form():
     assert found.delay == pytest.approx(0.1, abs=1e-3) and found.time_constant == pytest.approx(
         0.25, rel=2e-3
     )
-    rises = [step.rise for step in found.steps]
-    np.testing.assert_allclose(rises, math.log(9.0) * 0.25, rtol=0.02)  # 10 % to 90 % of a first order
-    assert max(step.overshoot for step in found.steps) < 1e-3
+    assert found.overshoot.max() < 1e-3 and found.error < 1e-3
 
 
 def test_an_overshooting_motor_is_not_accepted():
@@ -91,8 +86,8 @@ def test_an_overshooting_motor_is_not_accepted():
         ys.append(y)
     rows = sampled(t, 100.0)
     found = response(t[rows], u[rows], t[rows], np.array(ys)[rows])
-    assert not any(step.accepted for step in found.steps)
-    assert found.steps[0].overshoot == pytest.approx(0.37, abs=0.03)
+    assert not found.accepted.any()
+    assert found.overshoot[0] == pytest.approx(0.37, abs=0.03)
 
 
 def test_steps_are_found_in_what_is_held():
@@ -218,7 +213,7 @@ def test_a_thrust_response_serves_where_no_speed_was_measured():
     )
     fit = fit_motor([force], FINSROV)
     assert fit.estimates["H_LF.time_constant"].estimate == pytest.approx(0.12, rel=0.05)
-    assert "speed_loop" not in fit.quality
+    assert not any(name.startswith("speed_loop") for name in fit.estimates)
 
 
 @pytest.mark.parametrize(
@@ -237,3 +232,37 @@ def test_logs_that_show_no_response_are_refused(channels, said):
     t = np.arange(0.0, 10.0, 0.02)
     with pytest.raises(CalibrationError, match=said):
         fit_motor([Trial(name="a", t=t, channels=channels(t))], FINSROV)
+
+
+@pytest.mark.parametrize(("gain", "delay", "tau"), [(0.9, 0.05, 0.12), (0.72, 0.05, 0.12), (0.9, 0.08, 0.08)])
+def test_a_speed_loop_takes_out_what_the_model_misses(gain, delay, tau):
+    """Tuned for one motor and tried on others within its intervals: at most 10 % of overshoot, 1 % of steady error."""
+    period, asked = 1.0 / 200.0, 120.0
+    g = loop_gains(0.9, 0.05, 0.12, late=0.08, loop_rate=200.0)
+    speed = filtered = integral = slope = 0.0
+    before, speeds = 0.0, []
+    waiting, references = [0.0] * round(delay / period), [0.0] * (round(g["reference_delay"] / period) + 1)
+    for _ in range(600):
+        references.append(filtered)
+        error = references.pop(0) - speed
+        slope += ((speed - before) / period - slope) * period / (g["derivative_filter"] + period)
+        before, rate = speed, (asked - filtered) / g["reference_time"]
+        integral += g["ki"] * error * period
+        wanted = (references[1] - references[0]) / period
+        command = g["feedforward"] * (filtered + g["lead"] * rate) + g["kp"] * error + integral
+        waiting.append(command + g["kd"] * (wanted - slope))
+        filtered += rate * period
+        speed += (1.0 - np.exp(-period / tau)) * (gain * waiting.pop(0) - speed)
+        speeds.append(speed)
+    assert max(speeds) < 1.10 * asked
+    assert np.mean(speeds[-150:]) == pytest.approx(asked, rel=0.01)
+
+
+def test_a_step_log_gives_the_gains_of_a_loop():
+    """The feed-forward is one over the gain, and the integral gain that of the rule, or a slower loop's."""
+    vehicle = FINSROV.replace({"thrusters.*.domain": "speed"})
+    trial = step_log(vehicle.thrusters["H_LF"], "H_LF", PULSES, domain="speed", gain=0.9)
+    fit = fit_motor([trial], vehicle, loop_rate=100.0)
+    assert fit.estimates["speed_loop.feedforward"].estimate == pytest.approx(1.0 / 0.9, rel=0.01)
+    theta = 0.05 + 1.5 / 100.0
+    assert 0.3 / (0.9 * 2.0 * theta) < fit.estimates["speed_loop.ki"].estimate <= 1.05 / (0.9 * 2.0 * theta)

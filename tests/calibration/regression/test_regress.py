@@ -196,8 +196,8 @@ def test_dive_and_coast_gives_the_buoyancy():
     assert changed.buoyancy - changed.weight == pytest.approx(excess.estimate, rel=1e-6)
     prepared, _ = prepare(some, vehicle)
     data, _ = axis_data(2, prepared, [matrices(vehicle)] * len(prepared))
-    dives = [c for c in coasts(data) if "dive" in c.trial]
-    assert len(dives) >= 2 and all(c.speed > 0.01 for c in dives)
+    dives = [speed for trial, speed in coasts(data) if "dive" in trial]
+    assert len(dives) >= 2 and min(dives) > 0.01
 
 
 def test_a_file_too_heavy_is_said():

@@ -1,169 +1,561 @@
-"""From step logs to the response of a vehicle's motors, and a speed loop tuned from it."""
+"""From step logs to the response of a vehicle's motors, and the gains of a speed loop that follow from it.
+
+First order plus dead time, K e^(-T_d s) / (τ s + 1), in the quantity on which the vehicle file lets the lag act.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from finssim.calibration.actuators.motor_study import Study, study
-from finssim.calibration.actuators.motor_trial import NRMSE, thrusters_of, unit_response
-from finssim.calibration.actuators.speed_report import LOOP_RATE, loop_of
+from finssim.calibration.actuators.steps import find_steps
+from finssim.calibration.actuators.thrust_curve import jackknife
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
+from finssim.calibration.motion.smoothing import without_spikes
 from finssim.calibration.trials.trial import Trial
+from finssim.calibration.uncertainty import Evidence, correlated_samples, intervals, trial_covariance
 from finssim.vehicles import Vehicle
 from finssim.vehicles.thruster import Thruster
 
-__all__ = ["fit_motor"]
+__all__ = ["LOOP_RATE", "Response", "StepRecord", "cut_steps", "fit_motor", "fit_response", "loop_gains"]
 
-# Estimates, figures and curves of the motors' responses.
+Array = NDArray[np.float64]
 
-TO_RPM = 30.0 / math.pi
+RPM = math.pi / 30.0
+
+# Command and response of a thruster in a trial.
+
+DOMAINS = ("force", "speed")
+"""Thrust [N] and shaft speed [rad/s]."""
+
 UNIT = {"force": "N", "speed": "rad/s"}
+
+BEFORE = 0.3
+"""Longest part of the level before a step that is fitted with it [s]."""
+
+FEWEST = 5
+"""Samples after a step that it needs."""
+
+SETTLED = 0.4
+"""Part of a level, at its end, that counts as settled."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepRecord:
+    """Samples around one step of the command."""
+
+    trial: str
+    t: Array
+    """Since the step [s], (n,)."""
+    y: Array
+    """Response, (n,)."""
+    sample: float
+    """Time in which the command's change is not told apart [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Log:
+    """One thruster of one trial, thrust [N] or shaft speed [rad/s]."""
+
+    records: list[StepRecord]
+    levels: list[tuple[float, float]]
+    """Held commands and the response at the end of each."""
+    measured: str
+    """Column of the response."""
+    same_unit: bool
+    """Whether command and response are the same quantity; pulses without an ESC's law are not."""
+    findings: tuple[Finding, ...]
+
+
+def log_of(trial: Trial, name: str, thruster: Thruster, domain: str) -> Log | None:
+    """Command and response of a thruster.
+
+    Commands, the first that is there: `rpm_command_NAME` [rpm], `command_NAME` [N], `pwm_NAME` [µs], and `force_NAME`
+    where the header says that inputs are commanded and speeds are measured. Responses: `rpm_NAME`, else `force_NAME`.
+    Thrust and speed turn into each other by the thruster's curve. A response without sign gets the command's.
+
+    Returns:
+        None where the trial has not both.
+    """
+    columns = _columns(trial, name)
+    if columns is None:
+        return None
+    asked, measured = columns
+    findings: list[Finding] = []
+    times, raw = trial.series(asked)
+    same_unit, held = True, raw
+    if asked.startswith("pwm_") and thruster.esc is None:
+        command, same_unit = raw - 1500.0, False
+        findings.append(finding("pulses_raw"))
+    elif asked.startswith("pwm_"):
+        voltage = np.interp(times, *trial.series("voltage")) if trial.has("voltage") else trial.header.voltage
+        command = _as(domain, thruster.shaft_speed(raw, voltage), thruster, "speed")
+    elif asked.startswith("rpm_"):
+        command = _as(domain, raw * RPM, thruster, "speed")
+    else:
+        # Small steps of a force are as plain as large ones in the speed.
+        command, held = _as(domain, raw, thruster, "force"), thruster.speed(raw)
+    t, raw = trial.series(measured)
+    good = without_spikes(t, raw[:, None])
+    if not good.all():
+        findings.append(finding("spikes", samples=np.count_nonzero(~good), column=measured))
+    t, raw = t[good], raw[good]
+    if np.min(command) < 0.0 < np.max(raw) and np.min(raw) > -0.02 * np.max(raw):
+        latest = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 1)
+        raw = np.abs(raw) * _last_sign(command)[latest]
+        findings.append(finding("sign_of_command", column=measured))
+    from_unit = "speed" if measured.startswith("rpm_") else "force"
+    response = _as(domain, raw * RPM if from_unit == "speed" else raw, thruster, from_unit)
+    steps = find_steps(times, held)
+    levels = []
+    for step in steps:
+        rows = (t >= step.end - SETTLED * (step.end - step.time)) & (t <= step.end)
+        if rows.any():
+            level = float(command[np.searchsorted(times, step.time)])
+            levels.append((level, float(np.mean(response[rows]))))
+    records = cut_steps(trial.name, t, response, times, [(s.start, s.time, s.end) for s in steps])
+    return Log(
+        records=records, levels=levels, measured=measured, same_unit=same_unit, findings=tuple(findings)
+    )
+
+
+def cut_steps(
+    trial: str, t: Array, y: Array, command_times: Array, steps: Sequence[tuple[float, float, float]]
+) -> list[StepRecord]:
+    """Samples of the response around every step; steps with fewer than `FEWEST` samples after them are left out.
+
+    The level before a step is taken along where it has settled.
+
+    Args:
+        trial: Its name.
+        t: Times of the response's samples [s], (n,).
+        y: Response, (n,).
+        command_times: Times of the command's samples [s], (m,).
+        steps: Last time before the change, first after it, and last before the next [s].
+    """
+    records = []
+    previous = float(t[0]) if t.size else 0.0
+    for start, time, end in steps:
+        after = (t >= time) & (t <= end)
+        before = (t < time) & (t >= max(previous, time - BEFORE))
+        lately = y[(t < time) & (t >= previous + 0.5 * (time - previous))]
+        scatter = float(np.ptp(lately)) if lately.size else np.inf
+        moved = float(np.ptp(y[after])) if after.any() else 0.0
+        rows = after | before if scatter < 0.25 * moved else after
+        if np.count_nonzero(after) >= FEWEST:
+            near = np.diff(command_times[(command_times >= previous) & (command_times <= end)])
+            sample = float(np.median(near)) if near.size else time - start
+            records.append(StepRecord(trial=trial, t=t[rows] - time, y=y[rows], sample=sample))
+        previous = time
+    return records
+
+
+def _columns(trial: Trial, name: str) -> tuple[str, str] | None:
+    """Columns of command and response, or None."""
+    responses = [column for column in (f"rpm_{name}", f"force_{name}") if trial.has(column)]
+    commands = [c for c in (f"rpm_command_{name}", f"command_{name}", f"pwm_{name}") if trial.has(c)]
+    if not commands and trial.header.inputs == "commanded" and len(responses) == 2:
+        commands = [responses.pop()]
+    return (commands[0], responses[0]) if commands and responses else None
+
+
+def _as(domain: str, values: Array, thruster: Thruster, unit: str) -> Array:
+    if domain == unit:
+        return values
+    return thruster.thrust(values) if domain == "force" else thruster.speed(values)
+
+
+def _last_sign(command: Array) -> Array:
+    """Sign of the last command that was not zero, at every sample; until the first one, the first's."""
+    sign = np.sign(command)
+    known = np.flatnonzero(sign)
+    index = np.maximum.accumulate(np.where(sign != 0.0, np.arange(len(sign)), known[0]))
+    return np.asarray(sign[index])
+
+
+# One dead time and time constant for all steps of a thruster.
+
+GRID = 21
+"""Dead times and time constants of the coarse search, each way."""
+
+LONGEST_DELAY, DELAY_SHARE = 0.8, 0.45
+"""T_d <= min(0.8 s, 0.45 of the step's duration) (facts, §5)."""
+
+OVERSHOOT, NRMSE = 0.10, 0.10
+"""A step is accepted up to this overshoot and this error over its height (facts, §5)."""
+
+FEWEST_TRIALS = 4
+"""With fewer, intervals are over steps."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Response:
+    """What all steps have in common."""
+
+    delay: float
+    """T_d [s]."""
+    time_constant: float
+    """τ [s]."""
+    delay_interval: tuple[float, float]
+    time_constant_interval: tuple[float, float]
+    sample: float
+    """Of the measurement, median [s]."""
+    nrmse: Array
+    """Error of every step over its height, (n,)."""
+    overshoot: Array
+    """Of every step beyond its final level, over its height; noise taken off, (n,)."""
+    moved: NDArray[np.bool_]
+    """Which steps the response follows at all; it does not inside a dead zone, (n,)."""
+    accepted: NDArray[np.bool_]
+    """Which steps follow first order plus dead time, (n,)."""
+    used: NDArray[np.bool_]
+    """Steps that the numbers rest on: the accepted ones, or all that moved where none is accepted, (n,)."""
+
+    @property
+    def hidden(self) -> bool:
+        """Whether the time constant is below half a sample, where the log cannot tell it from 0."""
+        return self.time_constant < 0.5 * self.sample
+
+    @property
+    def error(self) -> float:
+        """Median over the steps used."""
+        return float(np.median(self.nrmse[self.used]))
+
+
+def fit_response(records: Sequence[StepRecord]) -> Response:
+    """One dead time and time constant for all steps; every step has levels of its own.
+
+    y = a + b (1 - e^(-(t - T_d) / τ)) from t = T_d on, with a and b of each step by least squares (variable
+    projection), so that static nonlinearity (dead zone, thrust curve) stays out of the dynamics. A coarse grid of T_d
+    and τ starts SciPy's least squares.
+
+    Args:
+        records: At least one step in which the response moves.
+
+    Returns:
+        Estimates with 95 % intervals, over the steps (over the trials where there are four or more), with the time in
+        which samples cannot tell apart added to T_d's.
+    """
+    sample = float(np.median(np.concatenate([np.diff(record.t) for record in records])))
+    duration = float(np.median([record.t[-1] for record in records]))
+    longest = min(LONGEST_DELAY, DELAY_SHARE * duration)
+    low, high = np.array([0.0, math.log(0.1 * sample)]), np.array([longest, math.log(duration)])
+    corners = np.stack(np.meshgrid(*np.linspace(low, high, GRID).T), axis=-1).reshape(-1, 2)
+    power = np.array([float(np.var(record.y)) * len(record.y) for record in records])
+    left = np.array([[float(np.sum(_misfit(one, x) ** 2)) for one in records] for x in corners])
+    explained = 1.0 - left.min(axis=0) / np.maximum(power, 1e-300)
+    moved = (explained > 0.5) & (power > 0.0)
+    first = moved if moved.any() else np.arange(len(records)) == np.argmax(explained)
+    spread = (left / np.maximum(power, 1e-300))[:, first].sum(axis=1)
+    x = _solved(records, first, corners[np.argmin(spread)], low, high)
+    nrmse, overshoot = np.array([_figures(one, x) for one in records]).T
+    accepted = moved & (nrmse <= NRMSE) & (overshoot <= OVERSHOOT)
+    used = accepted if accepted.any() else first
+    x = _solved(records, used, x, low, high)
+    nrmse, overshoot = np.array([_figures(one, x) for one in records]).T
+    chosen = [record for record, on in zip(records, used, strict=True) if on]
+    ends = intervals(x, trial_covariance(_evidence(chosen, x)))
+    blur = 0.5 * float(np.median([record.sample for record in chosen]))
+    slow = np.exp(np.clip(ends[1], -50.0, 50.0))
+    return Response(
+        delay=float(x[0]),
+        time_constant=float(np.exp(x[1])),
+        delay_interval=(max(float(ends[0, 0]) - blur, 0.0), float(ends[0, 1]) + blur),
+        time_constant_interval=(float(slow[0]), float(slow[1])),
+        sample=sample,
+        nrmse=nrmse,
+        overshoot=overshoot,
+        moved=moved,
+        accepted=accepted,
+        used=used,
+    )
+
+
+def unit_response(t: Array, x: Array) -> Array:
+    """1 - e^(-(t - T_d) / τ) from T_d on, (n,).
+
+    Args:
+        t: Time since the step [s], (n,).
+        x: T_d [s] and ln τ, τ in s, (2,).
+    """
+    return np.asarray(-np.expm1(-np.maximum(t - x[0], 0.0) / math.exp(x[1])))
+
+
+def _levels(record: StepRecord, x: Array) -> tuple[Array, Array]:
+    """Level before a step and height that fit best, and the basis that they multiply, (2,) and (n, 2)."""
+    rows = np.column_stack([np.ones(len(record.t)), unit_response(record.t, x)])
+    return np.linalg.lstsq(rows, record.y, rcond=None)[0], rows
+
+
+def _misfit(record: StepRecord, x: Array) -> Array:
+    """What the best levels leave, (n,): the response and the samples without their means and what they share."""
+    r = unit_response(record.t, x)
+    r, y = r - r.mean(), record.y - record.y.mean()
+    power = float(r @ r)
+    return np.asarray(y - r * (float(r @ y) / power) if power > 1e-12 else y)
+
+
+def _solved(
+    records: Sequence[StepRecord], which: NDArray[np.bool_], x: Array, low: Array, high: Array
+) -> Array:
+    from scipy.optimize import least_squares
+
+    chosen = [record for record, on in zip(records, which, strict=True) if on]
+    scale = [max(float(np.std(record.y)), 1e-300) for record in chosen]
+
+    def residual(x: Array) -> Array:
+        return np.concatenate([_misfit(one, x) / s for one, s in zip(chosen, scale, strict=True)])
+
+    start = np.clip(x, low + 1e-6, high - 1e-6)
+    return np.asarray(
+        least_squares(residual, start, bounds=(low, high), x_scale=(0.01, 0.1), diff_step=1e-5).x
+    )
+
+
+def _evidence(records: Sequence[StepRecord], x: Array) -> Evidence:
+    """What each step, or each trial, says of T_d and ln τ."""
+    h = np.array([1e-4, 1e-3])
+    normal, score = [], []
+    for record in records:
+        r = _misfit(record, x)
+        J = (
+            np.stack(
+                [(_misfit(record, x + step) - _misfit(record, x - step)) / 2.0 for step in np.diag(h)], axis=1
+            )
+            / h
+        )
+        variance = (
+            float(np.mean(r**2)) * len(r) / max(len(r) - 4, 1) + 1e-12 * float(np.var(record.y)) + 1e-300
+        )
+        variance *= correlated_samples(r)
+        normal.append(J.T @ J / variance)
+        score.append(-J.T @ r / variance)
+    trials = [record.trial for record in records]
+    labels = trials if len(set(trials)) >= FEWEST_TRIALS else [str(i) for i in range(len(records))]
+    groups = [[i for i, label in enumerate(labels) if label == name] for name in dict.fromkeys(labels)]
+    return Evidence(
+        names=("delay", "ln_time_constant"),
+        normal=np.array([np.sum([normal[i] for i in rows], axis=0) for rows in groups]),
+        score=np.array([np.sum([score[i] for i in rows], axis=0) for rows in groups]),
+        unit="trials",
+    )
+
+
+def _figures(record: StepRecord, x: Array) -> tuple[float, float]:
+    """Error of one step over its height, and its largest excursion beyond the final level, of means of three samples,
+    less twice their noise."""
+    (start, _), rows = _levels(record, x)
+    settled = record.y[record.t >= 0.75 * record.t[-1]]
+    height = float(np.mean(settled)) - float(start)
+    error = float(np.sqrt(np.mean(_misfit(record, x) ** 2))) / max(abs(height), 1e-300)
+    beyond = (record.y[record.t > 0.0] - np.mean(settled)) * np.sign(height)
+    if len(beyond) < FEWEST or height == 0.0:
+        return error, 0.0
+    smooth = np.convolve(beyond, np.full(3, 1.0 / 3.0), "valid")
+    noise = 2.0 * float(np.std(settled)) / math.sqrt(3.0)
+    return error, max(float(np.max(smooth)) - noise, 0.0) / abs(height)
+
+
+# What the logs say of one thruster.
+
+STANDING = 0.02
+"""Share of the largest response below which a held level counts as standing."""
+
 NARROW_DEAD_ZONE = 2.0
 """A dead zone is told where the smallest command that turns is at most this times the largest that does not."""
 
 
-def is_sure(found: Study) -> bool:
-    """Whether the steps follow first order plus dead time well enough to be written into a vehicle file."""
-    return any(found.response.steps[i].accepted for i in found.response.used)
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """One thruster over all its trials."""
+
+    name: str
+    domain: str
+    logs: tuple[Log, ...]
+    response: Response
+    other_error: float
+    """Error of the same fit in the other domain, over the steps' height; NaN where it could not be made."""
+
+    @property
+    def records(self) -> list[StepRecord]:
+        """All steps."""
+        return [record for log in self.logs for record in log.records]
+
+    @property
+    def same_unit(self) -> bool:
+        """Whether gains and dead zone compare equal quantities."""
+        return all(log.same_unit for log in self.logs)
+
+    @property
+    def sure(self) -> bool:
+        """Whether a step follows first order plus dead time well enough for the numbers to be written."""
+        return bool(self.response.accepted.any())
+
+    @property
+    def levels(self) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
+        """Commands and responses of all levels, and of those that move."""
+        pairs = [pair for log in self.logs for pair in log.levels]
+        largest = max((abs(y) for _, y in pairs), default=0.0)
+        return pairs, [(u, y) for u, y in pairs if u != 0.0 and abs(y) > STANDING * largest]
+
+    @property
+    def gain(self) -> tuple[float, float]:
+        """Steady response over command by least squares through zero, and the half-width of its interval."""
+        _, moving = self.levels
+        if not moving:
+            return math.nan, math.inf
+        u, y = np.array(moving).T
+        if len(u) < 3:
+            return float(u @ y / (u @ u)), math.inf
+        others = [np.arange(len(u)) != i for i in range(len(u))]
+        left_out = np.array([[u[rows] @ y[rows] / (u[rows] @ u[rows])] for rows in others])
+        return float(u @ y / (u @ u)), float(jackknife(left_out)[0])
+
+
+def study(name: str, trials: Sequence[Trial], thruster: Thruster, domain: str | None = None) -> Study | None:
+    """Fit one thruster over all trials that hold it; None where no command of it holds and changes.
+
+    Args:
+        name: Of the thruster.
+        trials: All of them.
+        thruster: As the vehicle file has it; its curve turns thrust and speed into each other.
+        domain: `force` or `speed`; the vehicle file's where not given.
+    """
+    chosen = domain or thruster.domain
+    logs = {
+        d: [log for trial in trials if (log := log_of(trial, name, thruster, d)) is not None] for d in DOMAINS
+    }
+    records = {d: [record for log in found for record in log.records] for d, found in logs.items()}
+    if not records[chosen]:
+        return None
+    responses = {d: fit_response(found) for d, found in records.items() if found}
+    other = responses.get(DOMAINS[1 - DOMAINS.index(chosen)])
+    return Study(
+        name=name, domain=chosen, logs=tuple(logs[chosen]), response=responses[chosen],
+        other_error=math.nan if other is None else other.error,
+    )  # fmt: skip
 
 
 def estimates_of(found: Study, thruster: Thruster) -> list[Estimate]:
     """K, T_d, τ and the dead zone of one thruster."""
     response, name = found.response, found.name
-    count = len(response.used)
-    sure = is_sure(found)
+    count = int(response.used.sum())
     rests = f"{count} step{'s' if count != 1 else ''} sampled every {response.sample:.3g} s"
-    if not sure:
+    if not found.sure:
         rests += ": no step follows first order plus dead time within 10 %"
-    low, high = response.time_constant_interval
-    fast = response.hidden
+    if response.hidden:
+        rests += "; below half a sample, the log cannot tell it from 0"
+    late = "the command's change is known to one sample of its log, which is in the interval"
+    if response.delay < response.sample:
+        late = f"delay {response.delay:.3g} s is below one sample of {response.sample:.3g} s"
+    gain, half = found.gain
     estimates = [
         Estimate(
-            name=f"{name}.time_constant",
-            estimate=response.time_constant,
-            ci95=(low, high),
-            unit="s",
-            identifiable=sure and not fast,
-            note=f"{rests}; below half a sample, the log cannot tell it from 0" if fast else rests,
+            name=f"{name}.time_constant", estimate=response.time_constant, ci95=response.time_constant_interval,
+            unit="s", identifiable=found.sure and not response.hidden, note=rests,
             path=f"thrusters.{name}.time_constant",
         ),
         Estimate(
-            name=f"{name}.delay",
-            estimate=response.delay,
-            ci95=response.delay_interval,
-            unit="s",
-            identifiable=sure,
-            note=_delay_note(found),
+            name=f"{name}.delay", estimate=response.delay, ci95=response.delay_interval, unit="s",
+            identifiable=found.sure, note=late,
         ),
         Estimate(
-            name=f"{name}.gain",
-            estimate=found.gain,
-            ci95=(found.gain - found.gain_half, found.gain + found.gain_half),
+            name=f"{name}.gain", estimate=gain, ci95=(gain - half, gain + half),
             unit="-" if found.same_unit else f"{UNIT[found.domain]}/µs",
-            identifiable=math.isfinite(found.gain_half) and found.gain_half < abs(found.gain),
+            identifiable=math.isfinite(half) and half < abs(gain),
             note=f"steady {'thrust' if found.domain == 'force' else 'speed'} over what was asked",
         ),
-    ]
+    ]  # fmt: skip
+    return estimates + (_dead_zones(found, thruster) if found.same_unit else [])
+
+
+def _dead_zones(found: Study, thruster: Thruster) -> list[Estimate]:
+    """The slowest speed that turns the shaft either way, between two commands that were tried."""
+    pairs, moving = found.levels
+    estimates = []
     for side, sign in (("plus", 1.0), ("minus", -1.0)):
-        if side in found.dead and found.same_unit:
-            estimates.append(_dead_zone(found, thruster, side, sign))
+        turn = [sign * u for u, _ in moving if sign * u > 0.0]
+        if not turn:
+            continue
+        stand = [sign * u for u, y in pairs if sign * u > 0.0 and (u, y) not in moving]
+        low, high = max([u for u in stand if u < min(turn)], default=0.0), min(turn)
+        if found.domain == "force":
+            low, high = (abs(float(thruster.speed(sign * force))) for force in (low, high))
+        known = low > 0.0 and high <= NARROW_DEAD_ZONE * low
+        note = "no commands were tried between the last that stands and the first that turns"
+        if known:
+            note = "between the last command that leaves the shaft standing and the first that turns it"
+        elif low == 0.0:
+            note = f"the smallest command tried, {high / RPM:.0f} rpm, already turns the shaft"
+        ends = sorted((sign * low / RPM + 0.0, sign * high / RPM + 0.0))
+        estimates.append(
+            Estimate(
+                name=f"{found.name}.dead_rpm_{side}", ci95=(ends[0], ends[1]), unit="rpm", identifiable=known,
+                estimate=sign * (0.5 * (low + high) if low > 0.0 else 0.0) / RPM + 0.0, note=note,
+                path=f"thrusters.{found.name}.dead_rpm_{side}",
+            )
+        )  # fmt: skip
     return estimates
 
 
-def _delay_note(found: Study) -> str:
-    response = found.response
-    if response.delay < response.sample:
-        return f"delay {response.delay:.3g} s is below one sample of {response.sample:.3g} s"
-    return "the command's change is known to one sample of its log, which is in the interval"
-
-
-def _dead_zone(found: Study, thruster: Thruster, side: str, sign: float) -> Estimate:
-    """The slowest speed that turns the shaft, between two commands that were tried."""
-    low, high = found.dead[side]
-    if found.domain == "force":
-        low, high = (abs(float(thruster.speed(sign * force))) for force in (low, high))
-    known = low > 0.0 and high <= NARROW_DEAD_ZONE * low
-    ends = sorted((sign * low * TO_RPM, sign * high * TO_RPM))
-    return Estimate(
-        name=f"{found.name}.dead_rpm_{side}",
-        estimate=sign * TO_RPM * (0.5 * (low + high) if low > 0.0 else 0.0) + 0.0,
-        ci95=(ends[0] + 0.0, ends[1] + 0.0),
-        unit="rpm",
-        identifiable=known,
-        note="between the last command that leaves the shaft standing and the first that turns it"
-        if known
-        else f"the smallest command tried, {high * TO_RPM:.0f} rpm, already turns the shaft"
-        if low == 0.0
-        else "no commands were tried between the last that stands and the first that turns",
-        path=f"thrusters.{found.name}.dead_rpm_{side}",
-    )
-
-
 def quality_of(found: Study) -> dict[str, float]:
-    """Figures of the fit: rise, overshoot and steady error of the steps, error over their height."""
-    steps = [found.response.steps[i] for i in found.response.used]
-    rises = [step.rise for step in steps if math.isfinite(step.rise)]
+    """Figures of the fit: overshoot and steady error of the steps, error over their height."""
+    response, (_, moving) = found.response, found.levels
+    errors = [abs(y - u) / abs(u) for u, y in moving]
     return {
-        "nrmse": found.nrmse,
-        "rise": float(np.median(rises)) if rises else math.nan,
-        "overshoot": max(step.overshoot for step in steps),
-        "steady_error": found.steady_error if found.same_unit else math.nan,
-        "steps": float(len(found.response.steps)),
-        "accepted": float(sum(step.accepted for step in found.response.steps)),
-        "sample": found.response.sample,
-        "nrmse_other_domain": found.other_nrmse,
+        "nrmse": response.error,
+        "overshoot": float(response.overshoot[response.used].max(initial=0.0)),
+        "steady_error": float(np.mean(errors)) if errors and found.same_unit else math.nan,
+        "steps": float(len(response.nrmse)),
+        "accepted": float(response.accepted.sum()),
+        "sample": response.sample,
+        "nrmse_other_domain": found.other_error,
     }
 
 
 def findings_of(found: Study) -> list[Finding]:
     """What a reader of the numbers must know."""
-    said = [one.about(motor.trial) for motor in found.motors for one in motor.findings]
-    accepted = sum(step.accepted for step in found.response.steps)
-    moved = sum(step.moved for step in found.response.steps)
+    response, (gain, half) = found.response, found.gain
+    out = [one.about(log.records[0].trial) for log in found.logs for one in log.findings if log.records]
+    accepted, moved = int(response.accepted.sum()), int(response.moved.sum())
     if moved == 0:
-        said.append(finding("not_followed", found.name, column=found.motors[0].measured))
+        out.append(finding("not_followed", found.name, column=found.logs[0].measured))
     elif accepted == 0:
-        said.append(finding("steps_refused", found.name, limit=NRMSE, error=found.nrmse))
+        out.append(finding("steps_refused", found.name, limit=NRMSE, error=response.error))
     elif accepted < moved:
-        said.append(finding("steps_left_out", found.name, steps=moved - accepted, total=moved, limit=NRMSE))
-    other = "speed" if found.domain == "force" else "force"
-    if found.other_nrmse < 0.5 * found.nrmse and found.nrmse > 0.02:
-        said.append(
-            finding("other_domain", found.name, domain=other, other=found.other_nrmse, error=found.nrmse)
+        out.append(finding("steps_left_out", found.name, steps=moved - accepted, total=moved, limit=NRMSE))
+    if found.other_error < 0.5 * response.error and response.error > 0.02:
+        other = DOMAINS[1 - DOMAINS.index(found.domain)]
+        out.append(
+            finding("other_domain", found.name, domain=other, other=found.other_error, error=response.error)
         )
-    if found.same_unit and len(found.response.used) and abs(found.gain - 1.0) > 0.1 + found.gain_half:
-        said.append(finding("steady_gain", found.name, gain=found.gain))
-    return said
+    if found.same_unit and abs(gain - 1.0) > 0.1 + half:
+        out.append(finding("steady_gain", found.name, gain=gain))
+    return out
 
 
 def curve_of(found: Study) -> Curve:
     """Steps used, one after the other, with the common response at each step's own levels."""
     x, measured, fitted, start = [], [], [], 0.0
-    response = found.response
-    for i in response.used:
-        record = found.records[i]
-        r = unit_response(record.t, response.delay, response.time_constant)
-        rows = np.column_stack([np.ones_like(r), r])
-        level, *_ = np.linalg.lstsq(rows, record.y, rcond=None)
+    parameters = np.array([found.response.delay, math.log(found.response.time_constant)])
+    for record in np.array(found.records, dtype=object)[found.response.used]:
+        level, rows = _levels(record, parameters)
         x.append(start + record.t - record.t[0])
         measured.append(record.y)
         fitted.append(rows @ level)
-        start = float(x[-1][-1]) + response.sample
-    unit = "thrust [N]" if found.domain == "force" else "shaft speed [rad/s]"
+        start = float(x[-1][-1]) + found.response.sample
     return Curve(
-        title=f"{found.name}: steps",
-        x_label="time, steps one after the other [s]",
-        y_label=unit,
-        x=np.concatenate(x),
-        measured=np.concatenate(measured),
-        fitted=np.concatenate(fitted),
-    )
+        title=f"{found.name}: steps", x_label="time, steps one after the other [s]",
+        y_label="thrust [N]" if found.domain == "force" else "shaft speed [rad/s]",
+        x=np.concatenate(x), measured=np.concatenate(measured), fitted=np.concatenate(fitted),
+    )  # fmt: skip
 
 
 def fit_motor(
@@ -171,7 +563,7 @@ def fit_motor(
     vehicle: Vehicle,
     *,
     thrusters: Sequence[str] | None = None,
-    loop_rate: float = LOOP_RATE,
+    loop_rate: float | None = None,
     seed: int = 0,
 ) -> Fit:
     """Fit first order plus dead time to the steps of each thruster, in the vehicle file's domain.
@@ -180,10 +572,10 @@ def fit_motor(
     file gets one delay, the median of theirs.
 
     Args:
-        trials: With a held and changed command and its response per thruster; see `motor_of` for the columns.
+        trials: With a held and changed command and its response per thruster; see `log_of` for the columns.
         vehicle: Whose thrusters they are; its curves turn thrust into speed.
         thrusters: The only ones to look at; all that the trials hold where not given.
-        loop_rate: Of the motor controller's speed loop [Hz].
+        loop_rate: Of the motor controller's speed loop [Hz]; `LOOP_RATE` if None.
         seed: For the record; the intervals need no random numbers.
 
     Returns:
@@ -192,10 +584,9 @@ def fit_motor(
     Raises:
         CalibrationError: No trial holds a command that steps and its response.
     """
-    trials = list(trials)
-    names = _names(trials, vehicle, thrusters)
+    trials, loop_rate = list(trials), LOOP_RATE if loop_rate is None else loop_rate
     studies, findings = [], list[Finding]()
-    for name in names:
+    for name in _names(trials, vehicle, thrusters):
         found = study(name, trials, vehicle.thrusters[name])
         if found is None:
             findings.append(finding("no_steps", name))
@@ -209,25 +600,19 @@ def fit_motor(
         )
     estimates = [e for found in studies for e in estimates_of(found, vehicle.thrusters[found.name])]
     changes = {e.path: e.estimate for e in estimates if e.path is not None and e.identifiable}
-    sure = [found for found in studies if is_sure(found)]
+    sure = [found for found in studies if found.sure]
     if sure:
         estimates.insert(0, _common_delay(sure))
         changes["thrusters.*.delay"] = estimates[0].estimate
         changes |= _untested(sure, vehicle, changes, findings)
-    quality = {found.name: quality_of(found) for found in studies}
     speeds = [_in_speed(found, trials, vehicle) for found in sure if not found.response.hidden]
-    loop = loop_of([found for found in speeds if found is not None], vehicle, loop_rate=loop_rate)
-    if loop is not None:
-        estimates += loop.estimates
-        quality["speed_loop"] = loop.quality
-        findings += loop.findings
     return Fit(
         kind="motor",
         method="first order plus dead time",
         vehicle=vehicle,
-        estimates={estimate.name: estimate for estimate in estimates},
+        estimates={e.name: e for e in [*estimates, *_loop([s for s in speeds if s is not None], loop_rate)]},
         changes=changes,
-        quality=quality,
+        quality={found.name: quality_of(found) for found in studies},
         curves=tuple(curve_of(found) for found in studies),
         findings=tuple(dict.fromkeys(findings)),
         trials={trial.name: trial.sha256 for trial in trials},
@@ -236,20 +621,23 @@ def fit_motor(
 
 
 def _names(trials: Sequence[Trial], vehicle: Vehicle, thrusters: Sequence[str] | None) -> list[str]:
-    held = list(dict.fromkeys(name for trial in trials for name in thrusters_of(trial)))
     unknown = [name for name in thrusters or () if name not in vehicle.thrusters]
     if unknown:
         raise CalibrationError(
             f"{vehicle.name} has no thruster '{unknown[0]}': it has {', '.join(vehicle.thrusters)}"
         )
-    found = [name for name in vehicle.thrusters if name in held and (thrusters is None or name in thrusters)]
-    if not found:
+    names = [
+        name
+        for name in vehicle.thrusters
+        if (thrusters is None or name in thrusters) and any(_columns(trial, name) for trial in trials)
+    ]
+    if not names:
         shown = ", ".join(trial.name for trial in trials) or "no trial"
         raise CalibrationError(
             f"{shown}: no thruster of {vehicle.name} has a command (rpm_command_NAME, command_NAME or pwm_NAME) and a "
             f"response (rpm_NAME or force_NAME); its thrusters are {', '.join(vehicle.thrusters)}"
         )
-    return found
+    return names
 
 
 def _common_delay(studies: Sequence[Study]) -> Estimate:
@@ -257,47 +645,116 @@ def _common_delay(studies: Sequence[Study]) -> Estimate:
     delays = [found.response.delay for found in studies]
     ends = [found.response.delay_interval for found in studies]
     middle = float(np.median(delays))
-    apart = max(delays) - min(delays)
-    beyond = any(high < middle or low > middle for low, high in ends)
     note = f"median of {len(delays)} thrusters, which share one link"
-    if beyond:
-        note += f"; they differ by {apart:.3g} s, more than their intervals"
+    if any(high < middle or low > middle for low, high in ends):
+        note += f"; they differ by {max(delays) - min(delays):.3g} s, more than their intervals"
+    low, high = (float(end) for end in np.median(ends, axis=0))
     return Estimate(
-        name="delay",
-        estimate=middle,
-        ci95=(float(np.median([low for low, _ in ends])), float(np.median([high for _, high in ends]))),
-        unit="s",
-        identifiable=True,
-        note=note,
+        name="delay", estimate=middle, ci95=(low, high), unit="s", identifiable=True, note=note,
         path="thrusters.*.delay",
-    )
+    )  # fmt: skip
 
 
 def _untested(
     studies: Sequence[Study], vehicle: Vehicle, changes: dict[str, Any], findings: list[Finding]
 ) -> dict[str, float]:
     """Time constants of the thrusters that no trial steps, from those of their group."""
-    known: dict[str, list[float]] = {}
+    groups: dict[str, list[float]] = {}
     for found in studies:
         if f"thrusters.{found.name}.time_constant" in changes:
             group = vehicle.thrusters[found.name].group
-            known.setdefault(group, []).append(found.response.time_constant)
+            groups.setdefault(group, []).append(found.response.time_constant)
     tested = {found.name for found in studies}
-    given = {
-        name: float(np.mean(known[thruster.group]))
-        for name, thruster in vehicle.thrusters.items()
-        if name not in tested and thruster.group in known
+    out = {}
+    for name, thruster in vehicle.thrusters.items():
+        if name not in tested and thruster.group in groups:
+            out[f"thrusters.{name}.time_constant"] = float(np.mean(groups[thruster.group]))
+            findings.append(finding("group_mean", name))
+        elif name not in tested:
+            findings.append(finding("file_response", name))
+    return out
+
+
+# Feed-forward plus PID for the motor controller.
+
+LOOP_RATE = 200.0
+"""Of the motor controller where the caller does not say [Hz]."""
+
+LEAST_CLOSED = 0.2
+"""Least time constant of the closed loop, as a part of the motor's: keeps the gain below 5 / K."""
+
+GAIN_UNITS = {
+    "feedforward": "-", "kp": "-", "ki": "1/s", "kd": "s", "derivative_filter": "s", "lead": "s",
+    "reference_time": "s", "reference_delay": "s",
+}  # fmt: skip
+
+
+def loop_gains(
+    gain: float, delay: float, time_constant: float, *, late: float, loop_rate: float
+) -> dict[str, float]:
+    """Gains of a speed loop, with r the asked speed and K, T_d, τ of the response:
+
+        ṙ_f = (r - r_f) / λ_r,    u = (r_f + τ ṙ_f) / K + PID(r_f(t - T_d) - ω)
+
+    so that an exact model leaves the PID nothing to do. Its gains are those of the improved SIMC rule (Grimholt and
+    Skogestad 2018, J. Process Control 70: 36-46), in series form K_c = τ / (K (λ + θ)), τ_I = min(τ, 4 (λ + θ)) and
+    τ_D = θ / 3 with θ the longest dead time and one and a half periods of the loop, and λ = θ but at least τ / 5.
+
+    Args:
+        gain: K, steady speed over command [-].
+        delay: T_d [s].
+        time_constant: τ [s].
+        late: The longest dead time to allow for [s].
+        loop_rate: Of the motor controller [Hz].
+
+    Returns:
+        By the names of `GAIN_UNITS`.
+    """
+    theta, tau = late + 1.5 / loop_rate, max(time_constant, 1e-9)
+    closed = max(theta, LEAST_CLOSED * tau)
+    series_gain = tau / (gain * (closed + theta))
+    integral, derivative = min(tau, 4.0 * (closed + theta)), theta / 3.0
+    return {
+        "feedforward": 1.0 / gain,
+        "kp": series_gain * (1.0 + derivative / integral),  # from series to parallel form
+        "ki": series_gain / integral,
+        "kd": series_gain * derivative,
+        "derivative_filter": max(0.5 * derivative, 1.0 / loop_rate),
+        "lead": tau,
+        "reference_time": max(closed, 0.5 * tau),  # the lead then asks for at most twice the steady command
+        "reference_delay": delay,
     }
-    findings += [finding("group_mean", name) for name in given]
-    left = [name for name in vehicle.thrusters if name not in tested and name not in given]
-    findings += [finding("file_response", name) for name in left]
-    return {f"thrusters.{name}.time_constant": value for name, value in given.items()}
 
 
 def _in_speed(found: Study, trials: Sequence[Trial], vehicle: Vehicle) -> Study | None:
     """The same thruster's speeds, for the speed loop; None where no speed was measured."""
-    if not all(motor.measured.startswith("rpm_") for motor in found.motors):
+    if not all(log.measured.startswith("rpm_") for log in found.logs):
         return None
-    if found.domain == "speed":
-        return found
-    return study(found.name, trials, vehicle.thrusters[found.name], domain="speed")
+    return (
+        found
+        if found.domain == "speed"
+        else study(found.name, trials, vehicle.thrusters[found.name], "speed")
+    )
+
+
+def _loop(studies: Sequence[Study], loop_rate: float) -> list[Estimate]:
+    """One set of gains for all motors; none where no speed follows a speed."""
+    usable = [found for found in studies if found.same_unit and found.gain[0] > 0.0]
+    if not usable:
+        return []
+    gain, delay, tau = (
+        float(np.median(values))
+        for values in zip(
+            *((s.gain[0], s.response.delay, s.response.time_constant) for s in usable), strict=True
+        )
+    )
+    late = max(found.response.delay_interval[1] for found in usable)
+    gains = loop_gains(gain, delay, tau, late=min(late, delay + tau), loop_rate=loop_rate)
+    note = f"speed over speed, loop at {loop_rate:g} Hz; follows from gain, delay and time constant"
+    return [
+        Estimate(
+            name=f"speed_loop.{key}", estimate=gains[key], ci95=(math.nan, math.nan), unit=unit, identifiable=True,
+            note=note,
+        )
+        for key, unit in GAIN_UNITS.items()
+    ]  # fmt: skip

@@ -187,7 +187,7 @@ def _at_voltage(result: Bench, before: Thruster, table: ThrustTable) -> dict[str
 
 
 def curves_of(name: str, result: Bench, before: Thruster) -> list[Curve]:
-    """For the report: thrust and its residual against speed; speed and thrust against pulse at every voltage."""
+    """For the report: thrust against speed; speed and thrust against pulse at every voltage."""
     rows = _stack(result.fitted)
     order = np.argsort(rows.speed)
     rpm = rows.speed[order] * TO_RPM
@@ -195,17 +195,9 @@ def curves_of(name: str, result: Bench, before: Thruster) -> list[Curve]:
     curves = []
     if result.speeds_measured:
         force = rows.force[order]
-        curves += [
-            _quality_curve(f"{name}: thrust", "shaft speed [rpm]", "thrust [N]", rpm, force, fitted),
-            _quality_curve(
-                f"{name}: residual",
-                "shaft speed [rpm]",
-                "measured - fitted [N]",
-                rpm,
-                force - fitted,
-                0.0 * rpm,
-            ),
-        ]
+        curves.append(
+            _quality_curve(f"{name}: thrust", "shaft speed [rpm]", "thrust [N]", rpm, force, fitted)
+        )
     if result.esc is None:
         return curves
     for volt in sorted({round(v, 1) for v, _ in result.levels if not math.isnan(v)}) or [math.nan]:

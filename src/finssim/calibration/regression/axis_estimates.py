@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate
 from finssim.calibration.regression.axis_fit import TERMS, AxisData
-from finssim.calibration.regression.plant_terms import Matrices
+from finssim.calibration.regression.plant_terms import Matrices, matrices
 from finssim.calibration.regression.selection import Selection
-from finssim.vehicles import AXES
+from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.terms import unit_of
 
-__all__ = ["AxisResult", "BIAS_NOTE", "CERTAIN", "axis_result", "term_estimate"]
+__all__ = ["AxisResult", "BIAS_NOTE", "CERTAIN", "axis_result", "hydrostatics", "term_estimate"]
 
 Array = NDArray[np.float64]
 
@@ -424,6 +424,41 @@ def trim(found: Mapping[str, Estimate], buoyancy: float, centre: Sequence[float]
         if bias is not None and bias.identifiable and outside(0.0, bias.ci95):
             out[f"body.center_of_buoyancy.{i}"] = float(centre[i]) + sign * bias.estimate / buoyancy
     return out
+
+
+def hydrostatics(found: Mapping[str, Estimate], vehicle: Vehicle) -> tuple[dict[str, float], list[Finding]]:
+    """Buoyancy excess, stiffness and constant moments as volume and centre of buoyancy; weight and its centre stay.
+
+    Args:
+        found: Estimates by name.
+        vehicle: As its file has it.
+
+    Returns:
+        Changes of the vehicle file, and a finding where roll and pitch disagree.
+    """
+    body, water, findings = vehicle.body, vehicle.water, list[Finding]()
+    changes: dict[str, float] = {}
+    volume = float(body.displaced_volume)
+    excess = found.get("buoyancy_excess")
+    if excess is not None and excess.identifiable:
+        volume = (vehicle.weight + excess.estimate) / (water.density * water.gravity)
+        changes["body.displaced_volume"] = volume
+    buoyancy = water.density * water.gravity * volume
+    changes |= trim(found, buoyancy, body.center_of_buoyancy)
+    stiffness = float(matrices(vehicle).arm[2])
+    some = [found[name] for name in ("roll.k", "pitch.k") if name in found]
+    some = [e for e in some if e.identifiable or (e.estimate > 0.0 and outside(stiffness, e.ci95))]
+    if not some:
+        return changes, findings
+    half = np.array([0.5 * (e.ci95[1] - e.ci95[0]) for e in some])
+    value = np.array([e.estimate for e in some])
+    if len(some) == 2 and abs(value[0] - value[1]) > float(np.hypot(*half)):
+        findings.append(finding("stiffness_disagrees", roll=value[0], pitch=value[1]))
+    k = float(np.sum(value / half**2) / np.sum(1.0 / half**2))
+    reference = float(vehicle.hydrodynamic_set("calibrated").reference_point[2])
+    gravity_part = vehicle.weight * (float(body.center_of_gravity[2]) - reference)
+    changes["body.center_of_buoyancy.2"] = reference + (k + gravity_part) / buoyancy
+    return changes, findings
 
 
 def outside(value: float, ends: Array | tuple[float, float]) -> bool:

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.regression.instruments import Piece, Run, cut, joined, simulate_axis
-from finssim.calibration.regression.robust import bounded, huber_weights
 from finssim.calibration.regression.rows import Kernel, Rows, Signals, simulated_columns
 from finssim.calibration.uncertainty import Covariance, Evidence, correlated_samples, trial_covariance
+from finssim.calibration.vision.least_squares import boxed, huber_weight
 
 __all__ = ["TERMS", "AxisData", "AxisFit", "fit_axis", "informative"]
 
@@ -144,6 +144,12 @@ Array = NDArray[np.float64]
 TERMS = ("m_eff", "d1", "d2", "bias", "delay", "smoothing", "k")
 """Names of the first columns; see the module for `delay` [s] and `smoothing` [s²]."""
 
+HUBER, REJECT = 1.345, 8.0
+"""Standard deviations from which a row loses weight (95 % efficient on Gaussian noise), and has none."""
+
+GAUSSIAN_MAD = 1.4826
+"""Standard deviation of a Gaussian in units of its median absolute deviation."""
+
 FREE_ROUNDS = 6
 """After so many the variance of trial offsets stays, so that the rounds settle."""
 
@@ -261,7 +267,7 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
         theta[kept] = solve(sums, ratio, before)[0]
         residual = y[inside] - X[inside] @ theta
         centred = residual - _group_means(residual, weight, group)
-        weight = huber_weights(centred)
+        weight = _weights(centred)
         correlated = correlated_samples(
             centred * np.sqrt(weight), (np.flatnonzero(np.diff(group)) + 1).tolist()
         )
@@ -282,11 +288,12 @@ def fit_axis(data: AxisData, terms: NDArray[np.bool_], *, iterations: int = 25) 
     free = np.zeros(p)
     free[kept], N_g, scores, rss = solve(sums, ratio, before)
     lower = np.array([0.0, 0.0, 0.0, -np.inf, -np.inf, -np.inf, 0.0, *data.lowest])[kept]
-    held, active_kept = bounded(
-        N_g.sum(axis=0) + np.diag(before[1]) + 1e-12 * np.eye(kept.sum()), free[kept], lower
-    )
+    normal = N_g.sum(axis=0) + np.diag(before[1]) + 1e-12 * np.eye(kept.sum())
     theta, active = np.zeros(p), np.zeros(p, bool)
-    theta[kept], active[kept] = held, active_kept
+    theta[kept] = free[kept]
+    if (free[kept] < lower).any():
+        theta[kept] = boxed(normal, normal @ free[kept], lower, np.full(len(lower), np.inf))
+        active[kept] = theta[kept] <= lower
     variance = float(rss.sum()) / max(float(sums.weight.sum()) - kept.sum(), 1.0) * correlated
     unit = "trials"
     if len(data.rows) < FEWEST_TRIALS:
@@ -317,6 +324,15 @@ def informative(rows: Rows, signals: Signals) -> NDArray[np.bool_]:
     """Rows in the wanted phases that show a wrench or a motion."""
     still = (np.abs(rows.X[:, :2]) < SMALL_MOTION).all(axis=1)
     return signals.wanted[rows.at] & ~(still & (np.abs(rows.y) < SMALL_WRENCH))
+
+
+def _weights(residual: Array) -> Array:
+    """Huber's, by the median absolute deviation; 0 beyond `REJECT` standard deviations, (n,)."""
+    size = np.abs(residual - np.median(residual))
+    scale = GAUSSIAN_MAD * float(np.median(size))
+    if scale <= 0.0 or len(residual) < 8:
+        return np.ones_like(residual)
+    return np.where(size > REJECT * scale, 0.0, huber_weight(size, HUBER * scale))
 
 
 def _group_means(x: Array, weight: Array, group: NDArray[np.int64]) -> Array:

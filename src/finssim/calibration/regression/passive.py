@@ -1,16 +1,18 @@
-"""Trials with the thrusters off: free decay of roll and pitch, coasts of surge, sway and yaw, and buoyant rise.
+"""Trials with the thrusters off: one axis with no input, from its release until it rests or something pushes again.
 
-Without a known force a motion shows ratios only: k/m, d1/m, d2/m of a decay, d1/m, d2/m of a coast, (B - W)/m of a
-rise. Absolute values follow from one number that is given or the vehicle file's, which every estimate names.
+    nu_dot + c1 nu + c2 |nu| nu + w2 (s - s_0) = e,    s_dot = nu,    c1 = d1/m,  c2 = d2/m
+
+w2 = k/m where the weight rights the vehicle, s being the sine of its roll or pitch; e = (B - W)/m of a rise. Such a
+motion shows ratios only, for no force is known; absolute values follow from one number that is given or the vehicle
+file's, which every estimate names. All releases of an axis are fitted at once, with an initial state each.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, Literal
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,380 +20,705 @@ from numpy.typing import NDArray
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
-from finssim.calibration.regression.coast_down import COASTING, coast_of, coast_result
-from finssim.calibration.regression.free_decay import BOTH, Decay, free_decay
+from finssim.calibration.motion.attitude_signal import attitude_samples
+from finssim.calibration.motion.signals import Motion, motion
+from finssim.calibration.motion.smoothing import without_spikes
 from finssim.calibration.regression.instruments import Run, simulate_axis
 from finssim.calibration.regression.plant_terms import Matrices, matrices
-from finssim.calibration.trials.trial import Trial
-from finssim.calibration.uncertainty import Evidence, correlated_samples, intervals, trial_covariance
+from finssim.calibration.trials.trial import NU, Trial
+from finssim.calibration.uncertainty import Evidence, correlated_samples, trial_covariance
+from finssim.geometry.rotations import quat_inverse_rotate, quat_to_euler
 from finssim.vehicles import AXES, Vehicle
 
-__all__ = ["buoyant_rise", "passive", "pooled"]
+__all__ = ["FreeMotion", "Release", "free_motion", "passive"]
 
 Array = NDArray[np.float64]
+Samples = tuple[Array, Array]
+"""Times [s] and values."""
 
-# One estimate from several trials that were fitted one by one.
+SWINGING = ("roll", "pitch")
+"""Axes that the weight rights."""
 
+FEWEST_SAMPLES = 20
 
-def pooled(values: Array, stds: Array, dof: Array) -> tuple[float, float, float]:
-    """Mean of estimates of several trials, weighted by their certainty and what they differ by beyond it.
+EXPLAINED = 0.2
+"""R² below which no drag explains the motion."""
 
-    The variance between trials is that of DerSimonian and Laird (1986).
+FEWEST_TRIALS = 4
+"""With fewer, trials are cut into blocks to estimate the spread."""
 
-    Args:
-        values: (n,)
-        stds: (n,)
-        dof: Degrees of freedom of the standard errors, (n,).
+LINEAR, QUADRATIC, BOTH = (True, False), (False, True), (True, True)
+"""Which of c1, c2 are fitted."""
 
-    Returns:
-        Mean and the two ends of its 95 % interval.
-    """
-    from scipy.stats import t
+SHAPES = {LINEAR: "linear", QUADRATIC: "quadratic", BOTH: "linear and quadratic"}
 
-    stds = np.maximum(stds, 1e-9 * np.abs(values) + 1e-300)
-    w = 1.0 / stds**2
-    mean = float(np.sum(w * values) / w.sum())
-    freedom = float(np.sum(np.where(np.isfinite(dof), dof, 1e6)))
-    excess = float(np.sum(w * (values - mean) ** 2)) - (len(values) - 1)
-    if len(values) > 1 and excess > 0.0:
-        between = excess / (w.sum() - np.sum(w**2) / w.sum())
-        w = 1.0 / (stds**2 + between)
-        mean, freedom = float(np.sum(w * values) / w.sum()), float(len(values) - 1)
-    half = float(t.ppf(0.975, max(freedom, 1.0)) / math.sqrt(w.sum()))
-    return mean, mean - half, mean + half
+USEFUL = 0.5
+"""Half width of an interval, as a part of the estimate, up to which it is written: better than a guess."""
 
+# Where a free motion begins and ends.
 
-def pooled_positive(values: Array, stds: Array, dof: Array) -> tuple[float, float, float]:
-    """`pooled` on logarithms where all values are positive, as those of what cannot be negative are."""
-    if not (values > 0.0).all():
-        return pooled(values, stds, dof)
-    mean, low, high = np.exp(np.clip(pooled(np.log(values), stds / values, dof), -500.0, 500.0))
-    return float(mean), float(low), float(high)
+SLOWEST, FASTEST = 0.05, 3.0
+"""Natural frequencies that are looked for [Hz]."""
 
+FEWEST_PERIODS = 1.5
+"""A decay has to last so long to count."""
 
-# From free decays of roll or pitch to estimates, changes of the vehicle file and findings.
+DRIFT_PERIODS = 2.0
+"""Where the equilibrium drifts, as while a manipulator moves, its straight pieces are so many periods long."""
 
-Of = Callable[[Array, Decay], float]
-"""A function of x = ln w2, c1, c2 and the decay."""
+FAINT = 4.0
+"""A swing below so many standard deviations of the rate's noise tells nothing."""
 
-SET = "hydrodynamics.calibrated"
+LEAST_SPEED = 0.03
+"""Speed at the release below which nothing coasts [m/s, rad/s]."""
 
-INERTIA = "kg m²"
+FALLS_TO = 0.7
+"""Part of its first speed to which a coast has to fall."""
 
+GROWS = 1.15
+"""Factor above the lowest speed so far at which something pushes again."""
 
-@dataclass(frozen=True, kw_only=True)
-class DecayResult:
-    """What the decays of one axis tell."""
-
-    estimates: list[Estimate]
-    changes: dict[str, Any]
-    """Dotted path -> value, of the vehicle file."""
-    findings: list[Finding]
+RISING, SHORTEST_RISE = 0.01, 3.0
+"""Vertical speed that counts as a rise [m/s] (published procedure), and how long it has to last [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Known:
-    """The number of the vehicle file that makes absolute values of the ratios."""
-
-    axis: str
-    assume: Literal["restoring", "inertia"]
-    k: float
-    """B z_b - W z_g [N m/rad]"""
-    m: float
-    """M_RB + M_A [kg m²]"""
-    rigid: float
-    """M_RB [kg m²]"""
-
-    def __post_init__(self) -> None:
-        if self.assume == "restoring" and self.k <= 0.0:
-            raise CalibrationError(
-                f"{self.axis}: the vehicle file has a stiffness of {self.k:.4g} N m/rad, expected one above 0: give "
-                "the centres of gravity and buoyancy, or assume the inertia"
-            )
-
-    @property
-    def said(self) -> str:
-        """For notes."""
-        if self.assume == "restoring":
-            return f"with the file's k = {self.k:.4g} N m/rad"
-        return f"with the file's inertia {self.m:.4g} {INERTIA}"
-
-    def inertia(self, x: Array, _: Decay) -> float:
-        """[kg m²]"""
-        return self.k / math.exp(x[0]) if self.assume == "restoring" else self.m
-
-    def path(self, family: str) -> str:
-        """Of the axis' own entry in a matrix of the vehicle file."""
-        i = AXES.index(self.axis)
-        return f"{SET}.{family}.{i}.{i}"
-
-
-def decay_result(
-    axis: str, decays: Sequence[Decay], plant: Matrices, assume: Literal["restoring", "inertia"]
-) -> DecayResult:
-    """Estimates of roll or pitch, pooled over its decays.
-
-    Args:
-        axis: `roll` or `pitch`.
-        decays: One or more.
-        plant: Of the vehicle file.
-        assume: Which of its numbers is right, as of `passive`.
-
-    Raises:
-        CalibrationError: The stiffness is to be right, and is not above 0.
-    """
-    i = AXES.index(axis)
-    rigid = float(plant.M_RB[i, i])
-    known = _Known(
-        axis=axis, assume=assume, k=float(plant.arm[2]), m=float(plant.M_RB[i, i] + plant.M_A[i, i]), rigid=rigid
-    )  # fmt: skip
-    swing = _swings(decays)
-    frequency = _positive(f"{axis}.natural_frequency", "rad/s", decays, lambda x, _: math.exp(0.5 * x[0]))
-    ratio = _positive(f"{axis}.damping_ratio", "-", decays, _damping_ratio, note=f"at {swing}")
-    whole = _positive(f"{axis}.m_eff", INERTIA, decays, known.inertia, note=known.said)
-    damping = [
-        _damping("d1", 1, "N m s", known.path("linear_damping"), decays, known, swing),
-        _damping("d2", 2, "N m s²", known.path("quadratic_damping"), decays, known, swing),
-    ]
-    changes: dict[str, Any] = {}
-    if ratio.identifiable and whole.identifiable:
-        changes |= {str(e.path): max(e.estimate, 0.0) for e in damping}
-    drifts = [finding("equilibrium_moved", d.trial, axis=axis) for d in decays if d.drift]
-    if assume == "inertia":
-        k = _stiffness(decays, known)
-        taken = replace(whole, identifiable=False)
-        return DecayResult(estimates=[frequency, ratio, taken, *damping, k], changes=changes, findings=drifts)
-    added, contradictions = _added_mass(whole, known)
-    if added.estimate > 0.0 and whole.identifiable:
-        changes[str(added.path)] = added.estimate
-    return DecayResult(
-        estimates=[frequency, ratio, whole, added, *damping], changes=changes, findings=contradictions + drifts
-    )  # fmt: skip
-
-
-def _swings(decays: Sequence[Decay]) -> str:
-    """The largest rates, for notes."""
-    swings = sorted(d.swing for d in decays)
-    if len(swings) > 1:
-        return f"swings of {swings[0]:.2g}-{swings[-1]:.2g} rad/s"
-    return f"a swing of {swings[0]:.2g} rad/s"
-
-
-def _damping_ratio(x: Array, d: Decay) -> float:
-    # A quadratic term counts as the linear one that takes the same energy out of the largest swing.
-    return float((x[1] + 8.0 / (3.0 * math.pi) * x[2] * d.swing) / (2.0 * math.exp(0.5 * x[0])))
-
-
-def _positive(
-    name: str, unit: str, decays: Sequence[Decay], of: Of, *, note: str = "", path: str | None = None
-) -> Estimate:
-    """A number that cannot be negative, pooled over the decays."""
-    value, low, high = pooled_positive(*_derived(decays, of))
-    sure = bool(np.isfinite([low, high]).all() and 0.5 * (high - low) <= 0.5 * abs(value))
-    return Estimate(
-        name=name, estimate=value, ci95=(low, high), unit=unit, identifiable=sure,
-        note=note if sure or note else "not known to half its size", path=path,
-    )  # fmt: skip
-
-
-def _damping(
-    name: str, j: int, unit: str, path: str, decays: Sequence[Decay], known: _Known, swing: str
-) -> Estimate:
-    """m c_j, pooled over the decays in which c_j was fitted."""
-    some = [d for d in decays if d.terms[j - 1]]
-    value, low, high, note = 0.0, math.nan, math.nan, f"{swing} need it not"
-    if some:
-        value, low, high = pooled(*_derived(some, lambda x, d: float(x[j]) * known.inertia(x, d)))
-        note = known.said
-    return Estimate(
-        name=f"{known.axis}.{name}", estimate=value, ci95=(low, high), unit=unit, identifiable=low > 0.0, note=note,
-        path=path,
-    )  # fmt: skip
-
-
-def _stiffness(decays: Sequence[Decay], known: _Known) -> Estimate:
-    """k = m w2 of a known inertia."""
-    return _positive(
-        f"{known.axis}.k", "N m/rad", decays, lambda x, _: known.m * math.exp(x[0]), note=known.said,
-        path="body.center_of_buoyancy.2",
-    )  # fmt: skip
-
-
-def _added_mass(whole: Estimate, known: _Known) -> tuple[Estimate, list[Finding]]:
-    """The inertia less the file's rigid one, and a finding where that is negative."""
-    rigid, (low, high) = known.rigid, whole.ci95
-    added = Estimate(
-        name=f"{known.axis}.added_mass", estimate=whole.estimate - rigid, ci95=(low - rigid, high - rigid),
-        unit=INERTIA, identifiable=whole.identifiable and low > rigid, note=known.said,
-        path=known.path("added_mass"),
-    )  # fmt: skip
-    if added.estimate > 0.0:
-        return added, []
-    return added, [
-        finding("inertia_below_rigid", known.axis, assumed=known.said, inertia=whole.estimate, rigid=rigid)
-    ]
-
-
-def _derived(decays: Sequence[Decay], of: Of) -> tuple[Array, Array, Array]:
-    """A function of every decay: its values, their standard errors and degrees of freedom, (n,) each."""
-    found = np.array([_of_one(d, of) for d in decays]).reshape(len(decays), 3)
-    return found[:, 0], found[:, 1], found[:, 2]
-
-
-def _of_one(decay: Decay, of: Of) -> tuple[float, float, float]:
-    x = np.array([math.log(decay.theta[0]), decay.theta[1], decay.theta[2]])
-    free = np.array([True, *decay.terms])
-    slope = np.zeros(3)
-    for j in np.flatnonzero(free):
-        h = 1e-6 * max(1.0, abs(x[j]))
-        step = np.zeros(3)
-        step[j] = h
-        slope[j] = (of(x + step, decay) - of(x - step, decay)) / (2.0 * h)
-    C = decay.covariance
-    matrix = np.where(C.alone.any(), C.local, C.trials)
-    variance = float(slope[free] @ matrix @ slope[free])
-    dof = float(np.min(C.dof[np.isfinite(C.dof)], initial=np.inf))
-    return float(of(x, decay)), math.sqrt(max(variance, 0.0)), dof
-
-
-# A vehicle let go under water: the terminal speed of its rise, and what the rise says of buoyancy.
-
-
-RISING = 0.01
-"""Vertical speed that counts as a rise [m/s] (published procedure)."""
-
-SHORTEST = 3.0
-"""[s]"""
-
-STEP = 0.02
-"""Of the simulation [s]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rise:
-    """z_dot_dot = e - c1 z_dot, or e - c2 |z_dot| z_dot; z up."""
+class Release:
+    """One trial from its release on."""
 
     trial: str
     begin: float
     """On the trial's clock [s]."""
     end: float
-    quadratic: bool
-    """Whether the drag is c2 (the better of the two; one rise cannot show both)."""
-    terminal_speed: float
-    """[m/s]"""
-    terminal_ci95: tuple[float, float]
-    excess_ratio: float
-    """e = (B - W) / m_eff [m/s²]."""
-    excess_ci95: tuple[float, float]
-    """Wide where the rise was steady from the start, for then only the terminal speed is known."""
-    t: Array
-    z: Array
-    """Fitted [m]."""
-    measured: Array
-    """[m]"""
+    rate: Samples
+    """Velocity of the axis [m/s, rad/s]; empty where it was not measured."""
+    travel: Samples
+    """Height, heading, or sine of roll or pitch [m, rad, -]; empty where it was not measured or tells nothing more."""
+    period: float = 0.0
+    """Of a swing [s]; 0 where nothing swings."""
+    pieces: int = 0
+    """Straight pieces of an equilibrium that drifts; 0 where it stays."""
+
+    @property
+    def t(self) -> Array:
+        """Times of all samples, those of `rate` first [s]."""
+        return np.concatenate([self.rate[0], self.travel[0]])
+
+    @property
+    def grid(self) -> Array:
+        """Times of the simulation [s]."""
+        step = self.period / 60.0 if self.period else min(0.05, (self.end - self.begin) / 100.0)
+        return np.linspace(self.begin, self.end, max(2, math.ceil((self.end - self.begin) / step) + 1))
+
+    @property
+    def own(self) -> int:
+        """Unknowns of this release alone: speed and place at its begin, knots of its equilibrium."""
+        placed = bool(len(self.travel[0])) or self.period > 0.0
+        return 1 + placed + (self.pieces + 1) * (self.period > 0.0 and len(self.travel[0]) > 0)
 
 
-def buoyant_rise(trial: Trial) -> Rise:
-    """Fit the longest rise of a trial without thrust.
-
-    Args:
-        trial: With `z` or `depth`.
+def _release(trial: Trial, axis: str, vehicle: Vehicle) -> Release:
+    """The free motion of one axis in a trial.
 
     Raises:
-        CalibrationError: Neither was measured, or nothing rises for 3 s.
+        CalibrationError: Nothing was measured of that axis, or it does not move freely.
     """
-    t, z = trial.series("z") if trial.has("z") else trial.series("depth")
-    z = z if trial.has("z") else -z
-    if len(t) < 20:
-        raise CalibrationError("neither z nor depth: nothing to see a rise in", trial.name)
-    begin, end = _longest_rise(t, z, trial.name)
-    inside = (t >= begin) & (t <= end)
-    t, z = t[inside], z[inside]
-    fits = [_fit(t, z, quadratic) for quadratic in (False, True)]
-    best = int(np.argmin([float(np.sum(r**2)) for _, r, _ in fits]))
-    x, r, J = fits[best]
-    correlated = correlated_samples(r)
-    blocks = max(6, int(len(r) / (4.0 * correlated)))
-    cut = np.array_split(np.arange(len(r)), min(blocks, 24))
-    k = 2
-    project = np.linalg.lstsq(J[:, k:], J[:, :k], rcond=1e-12)[0]
-    own = J[:, :k] - J[:, k:] @ project
-    variance = float(np.mean(r**2)) * correlated
-    covariance = trial_covariance(
-        Evidence(
-            names=("ln_speed", "ln_excess"),
-            normal=np.array([own[i].T @ own[i] for i in cut]) / variance,
-            score=np.array([-own[i].T @ r[i] for i in cut]) / variance,
-            unit="blocks",
-        )
-    )
-    ends = np.exp(np.clip(intervals(x[:k], covariance), -50.0, 50.0))
-    return Rise(
-        trial=trial.name,
-        begin=begin,
-        end=end,
-        quadratic=bool(best),
-        terminal_speed=float(np.exp(x[0])),
-        terminal_ci95=(float(ends[0, 0]), float(ends[0, 1])),
-        excess_ratio=float(np.exp(x[1])),
-        excess_ci95=(float(ends[1, 0]), float(ends[1, 1])),
-        t=t,
-        z=z + r,
-        measured=z,
-    )
+    moved = motion(trial, vehicle)
+    rate, travel = (_clean(samples) for samples in _samples(trial, axis, moved))
+    if max(len(rate[0]), len(travel[0])) < FEWEST_SAMPLES:
+        raise CalibrationError(f"the motion of {axis} is unknown: nothing to see of it", trial.name)
+    period = 0.0
+    if axis in SWINGING:
+        seen = rate if len(rate[0]) >= FEWEST_SAMPLES else (travel[0], np.gradient(travel[1], travel[0]))
+        begin, end, period = _ringing(seen, trial.name, axis)
+    elif axis == "heave":
+        begin, end = _rising(moved, trial.name)
+    else:
+        begin, end = _coasting(moved, axis, trial.name)
+    rate, travel = (_between(samples, begin, end) for samples in (rate, travel))
+    return Release(trial=trial.name, begin=begin, end=end, rate=rate, travel=travel, period=period)
 
 
-def _longest_rise(t: Array, z: Array, name: str) -> tuple[float, float]:
-    """The longest stretch in which the height over half a second grows faster than `RISING`."""
-    grid = np.arange(t[0], t[-1], 0.1)
-    height = np.interp(grid, t, z)
-    if len(height) > 5:
-        height = np.convolve(np.pad(height, 2, mode="edge"), np.full(5, 0.2), "valid")
-    up = np.gradient(height, 0.1) > RISING
+def _samples(trial: Trial, axis: str, moved: Motion) -> tuple[Samples, Samples]:
+    """Rate and travel as measured; a derived rate where neither is."""
+    i = AXES.index(axis)
+    rate, travel = trial.series(NU[i]), (np.empty(0), np.empty(0))
+    if axis == "heave":
+        t, height = trial.series("z") if trial.has("z") else trial.series("depth")
+        return travel, (t, height if trial.has("z") else -height)
+    t, q, measured = attitude_samples(trial)
+    if axis in SWINGING and axis in measured:
+        up = quat_inverse_rotate(q / np.linalg.norm(q, axis=1, keepdims=True), np.array([0.0, 0.0, 1.0]))
+        travel = (t, up[:, 1] if axis == "roll" else -up[:, 0])
+    elif axis == "yaw" and "yaw" in measured and not len(rate[0]):
+        travel = (t, np.unwrap(quat_to_euler(q)[2]))
+    elif axis not in SWINGING and not len(rate[0]):
+        known = np.isfinite(moved.nu[:, i])
+        rate = (moved.t[known], moved.nu[known, i])
+    return rate, travel
+
+
+def _clean(samples: Samples) -> Samples:
+    """Without spikes."""
+    good = without_spikes(samples[0], samples[1][:, None])
+    return samples[0][good], samples[1][good]
+
+
+def _between(samples: Samples, begin: float, end: float) -> Samples:
+    inside = (samples[0] >= begin) & (samples[0] <= end)
+    return samples[0][inside], samples[1][inside]
+
+
+def _ringing(rate: Samples, name: str, axis: str) -> tuple[float, float, float]:
+    """From the largest rate until the swing grows again or is lost in noise, and the period [s]."""
+    from scipy.signal import lombscargle
+
+    t, y = rate
+    smooth = np.convolve(np.pad(y, 1, mode="edge"), [0.25, 0.5, 0.25], "valid")
+    noise = float(np.median(np.abs(np.diff(y, 2)))) / 0.6745 / np.sqrt(6.0)
+    begin = float(t[int(np.argmax(np.abs(smooth)))])
+    after = (t >= begin) & (t <= begin + 20.0)
+    span = float(t[after][-1] - begin) if after.any() else 0.0
+    refusal = CalibrationError(
+        f"{axis} does not ring down: expected a release after which it swings freely for {FEWEST_PERIODS:g} periods or "
+        "more",
+        name,
+    )
+    if after.sum() < FEWEST_SAMPLES or span < 1.0:
+        raise refusal
+    frequencies = np.linspace(max(SLOWEST, 1.0 / span), FASTEST, 400)
+    fade = np.exp(-2.0 * (t[after] - begin) / span)  # the first swings stand out most
+    power = lombscargle(t[after], (smooth[after] - smooth[after].mean()) * fade, 2.0 * np.pi * frequencies)
+    period = 1.0 / float(frequencies[int(np.argmax(power))])
+    end, swing = begin, np.inf
+    while end + 0.5 * period <= t[-1] + 0.25 * period:
+        part = np.abs(smooth[(t >= end) & (t < end + 0.5 * period)])
+        if not len(part) or part.max() > 1.1 * swing or part.max() < FAINT * noise:
+            break
+        end, swing = end + 0.5 * period, max(float(part.max()), 1e-12)
+    if end - begin < FEWEST_PERIODS * period:
+        raise refusal
+    return begin, min(end, float(t[-1])), period
+
+
+def _coasting(moved: Motion, axis: str, name: str) -> tuple[float, float]:
+    """From the largest speed until something pushes again [s]."""
+    nu = moved.nu[:, AXES.index(axis)]
+    known = np.isfinite(nu)
+    noise = float(np.nan_to_num(moved.noise_std[AXES.index(axis)]))
+    t, speed = moved.t[known], np.abs(nu[known])
+    begin = int(np.argmax(speed)) if len(speed) else 0
+    after = speed[begin:]
+    floor = max(3.0 * noise, 0.02 * float(after.max(initial=0.0)))
+    pushed = np.flatnonzero(after > GROWS * np.minimum.accumulate(after) + floor)
+    end = begin + (int(pushed[0]) if len(pushed) else len(after)) - 1
+    slow = end - begin < FEWEST_SAMPLES or speed[begin] < max(LEAST_SPEED, 5.0 * noise)
+    if slow or speed[end] > FALLS_TO * speed[begin]:
+        raise CalibrationError(f"{axis} does not coast to a lower speed", name)
+    return float(t[begin]), float(t[end])
+
+
+def _rising(moved: Motion, name: str) -> tuple[float, float]:
+    """The longest stretch in which the height grows faster than `RISING` [s]."""
+    up = np.gradient(moved.position[:, 2], moved.t) > RISING
     edges = np.flatnonzero(np.diff(np.concatenate([[False], up, [False]]).astype(np.int8))).reshape(-1, 2)
-    longest = max(edges, key=lambda e: e[1] - e[0], default=(0, 0))
-    if (longest[1] - longest[0]) * 0.1 < SHORTEST:
+    begin, end = max(edges, key=lambda e: e[1] - e[0], default=(0, 1))
+    if moved.t[end - 1] - moved.t[begin] < SHORTEST_RISE:
         raise CalibrationError(
-            f"nothing rises faster than {RISING} m/s for {SHORTEST:g} s: expected a vehicle let go under water",
+            f"nothing rises faster than {RISING} m/s for {SHORTEST_RISE:g} s: expected a vehicle let go under water",
             name,
         )
-    return float(grid[longest[0]]), float(grid[longest[1] - 1])
+    return float(moved.t[begin]), float(moved.t[end - 1])
 
 
-def _fit(t: Array, z: Array, quadratic: bool) -> tuple[Array, Array, Array]:
-    """x = ln terminal speed, ln e, w(0), z(0); residuals fitted - measured [m]; their Jacobian."""
-    from scipy.optimize import least_squares
+# The fit of all releases of an axis.
 
-    grid = np.arange(t[0], t[-1] + STEP, STEP)
 
-    def run(x: Array) -> Array:
-        speed, e = np.exp(x[0]), np.exp(x[1])
-        one, none = np.ones_like(e), np.zeros_like(e)
-        theta = np.stack([one, none if quadratic else e / speed, e / speed**2 if quadratic else none, none])
-        runs = [
-            Run(np.full(len(grid) - 1, value), STEP, float(w), float(h))
-            for value, w, h in zip(e, x[2], x[3], strict=True)
+@dataclass(kw_only=True)
+class FreeMotion:
+    """Least squares of all releases of an axis: the simulated motion against the samples."""
+
+    axis: str
+    releases: tuple[Release, ...]
+    terms: tuple[bool, bool]
+    """Whether c1 and c2 are fitted."""
+    x: Array = field(init=False)
+    """ln w2 of a swing or ln e of a rise, the fitted ones of c1 and c2, then what each release has for itself."""
+
+    def __post_init__(self) -> None:
+        """Fit; every stream of every release gets the spread that it turns out to have."""
+        from scipy.optimize import least_squares
+
+        self.head = int(self.axis in (*SWINGING, "heave"))
+        self.shared = self.head + sum(self.terms)
+        self._at = np.cumsum([self.shared, *(r.own for r in self.releases)])
+        sizes = [len(values) for r in self.releases for _, values in (r.rate, r.travel)]
+        self._stream = np.repeat(np.arange(len(sizes)), sizes)
+        self.measured = np.concatenate(
+            [values for r in self.releases for _, values in (r.rate, r.travel)], dtype=float
+        )
+        scale = np.array([max(float(np.std(self._of(self.measured, s))), 1e-9) for s in range(len(sizes))])
+        x, low, high = self._start()
+        for _ in range(2):
+            solved = least_squares(
+                lambda x, scale=scale: self._residual(x) / scale[self._stream],
+                x,
+                lambda x, scale=scale: self._jacobian(x) / scale[self._stream, None],
+                bounds=(low, high),
+                x_scale="jac",
+            )
+            x = np.clip(solved.x, low + 1e-12, high - 1e-12)
+            residual = self._residual(x)
+            scale = np.array(
+                [max(float(np.sqrt(np.mean(self._of(residual, s) ** 2))), 1e-9) for s in range(len(sizes))]
+            )
+        self.x, self.scale, self.residual, self.slopes = x, scale, residual, self._jacobian(x)
+        self.correlated = np.array([correlated_samples(self._of(residual, s)) for s in range(len(sizes))])
+        self.covariance = trial_covariance(self._evidence())
+        # Blocks do not show by how much more than their noise a few releases differ; a fit of each does.
+        few = self.releases if 1 < len(self.releases) < FEWEST_TRIALS else ()
+        self.alone = [FreeMotion(axis=self.axis, releases=(one,), terms=self.terms) for one in few]
+
+    def _of(self, values: Array, stream: int) -> Array:
+        """Values of one stream; a zero where it is empty."""
+        own = values[self._stream == stream]
+        return own if len(own) else np.zeros(1)
+
+    def _start(self) -> tuple[Array, Array, Array]:
+        """Start and box."""
+        longest = max(r.end - r.begin for r in self.releases)
+        first = [_first(r) for r in self.releases]
+        speed = max(float(np.median(np.abs([nu for nu, _ in first]))), RISING)
+        rate = 2.0 / longest
+        head, wide = [], (2.0, 2.0)
+        if self.axis in SWINGING:
+            w = 2.0 * np.pi / float(np.median([r.period for r in self.releases]))
+            head, rate = [2.0 * math.log(w)], 0.1 * w
+        elif self.axis == "heave":
+            late = [_between(r.travel, 0.7 * r.end + 0.3 * r.begin, r.end) for r in self.releases]
+            speed = max(float(np.median([np.polyfit(*samples, 1)[0] for samples in late])), RISING)
+            head, wide, rate = [math.log(speed)], (6.0, 3.0), 1.0
+        drag = np.array([rate, rate / speed])[list(self.terms)]
+        own = [_own(r, nu, s) for r, (nu, s) in zip(self.releases, first, strict=True)]
+        x = np.concatenate([head, drag, *own])
+        low, high = np.full(len(x), -np.inf), np.full(len(x), np.inf)
+        low[: self.head], high[: self.head] = x[: self.head] - wide[0], x[: self.head] + wide[1]
+        low[self.head : self.shared] = 0.0
+        return x, low, high
+
+    def ratios(self, shared: Array) -> tuple[Array, Array, Array, Array]:
+        """w2 [1/s²], e [m/s²], c1 [1/s], c2 [1/m, 1/rad] of vectors that begin with the shared unknowns, (C, ...)."""
+        zero = np.zeros(len(shared))
+        head = np.exp(shared[:, 0]) if self.head else zero
+        drag = iter(shared[:, self.head : self.shared].T)
+        c1, c2 = (next(drag) if on else zero for on in self.terms)
+        return (zero, head, c1, c2) if self.axis == "heave" else (head, zero, c1, c2)
+
+    def _lines(self, points: Sequence[Array]) -> list[tuple[Array, Array]]:
+        """Rate and travel of every release on its grid, of vectors of shared and own unknowns (C, ...): (n, C) each."""
+        runs, thetas = list[Run](), []
+        for release, point in zip(self.releases, points, strict=True):
+            w2, e, c1, c2 = self.ratios(point)
+            grid, own = release.grid, point[:, self.shared :].T
+            push = e[:, None] + w2[:, None] * _equilibrium(release, grid, own[2:]).T
+            place = own[1] if release.own > 1 else np.zeros(len(point))
+            step = float(grid[1] - grid[0])
+            runs += [
+                Run(0.5 * (p[:-1] + p[1:]), step, float(v), float(s))
+                for p, v, s in zip(push, own[0], place, strict=True)
+            ]
+            thetas.append(np.stack([np.ones_like(w2), c1, c2, w2]))
+        nu, s = simulate_axis(np.concatenate(thetas, axis=1), runs)
+        cuts = np.cumsum([0, *(len(point) for point in points)])
+        return [
+            (np.stack(nu[a:b], axis=1), np.stack(s[a:b], axis=1))
+            for a, b in zip(cuts, cuts[1:], strict=False)
         ]
-        _, heights = simulate_axis(theta, runs)
-        return np.stack([np.interp(t, grid, h) for h in heights], axis=1)
 
-    def residual(x: Array) -> Array:
-        return np.asarray(run(x[:, None])[:, 0] - z)
+    def _predicted(self, points: Sequence[Array]) -> list[Array]:
+        """What the samples of every release would be, (n, C) each."""
+        out = []
+        for release, (nu, s) in zip(self.releases, self._lines(points), strict=True):
+            parts = [
+                [np.interp(at, release.grid, column) for column in line.T]
+                for at, line in ((release.rate[0], nu), (release.travel[0], s))
+            ]
+            out.append(np.concatenate([np.stack(part, axis=1) for part in parts]))
+        return out
 
-    def jacobian(x: Array) -> Array:
-        h = 1e-5
-        both = run(x[:, None] + h * np.concatenate([np.eye(4), -np.eye(4)], axis=1))
-        return np.asarray((both[:, :4] - both[:, 4:]) / (2.0 * h))
+    def _points(self, x: Array) -> list[Array]:
+        """Shared and own unknowns of every release, (1, ...) each."""
+        cuts = zip(self._at, self._at[1:], strict=False)
+        return [np.concatenate([x[: self.shared], x[a:b]])[None] for a, b in cuts]
 
-    late = t > t[-1] - 0.3 * (t[-1] - t[0])
-    speed = max(float(np.polyfit(t[late], z[late], 1)[0]), RISING)
-    early = t < t[0] + 0.2 * (t[-1] - t[0])
-    first = float(np.polyfit(t[early], z[early], 1)[0])
-    start = np.array([np.log(speed), np.log(speed), first, z[0]])
-    low = np.array([np.log(speed) - 3.0, np.log(speed) - 6.0, -np.inf, -np.inf])
-    high = np.array([np.log(speed) + 3.0, np.log(speed) + 6.0, np.inf, np.inf])
-    solved = least_squares(residual, start, jacobian, bounds=(low, high), x_scale="jac")
-    return solved.x, residual(solved.x), jacobian(solved.x)
+    def _residual(self, x: Array) -> Array:
+        return np.concatenate([p[:, 0] for p in self._predicted(self._points(x))]) - self.measured
+
+    def _jacobian(self, x: Array) -> Array:
+        """By central differences; what releases have for themselves is moved in all of them at once."""
+        steps = [1e-5 * np.maximum(np.abs(point[0]), 1e-2) for point in self._points(x)]
+        points = [
+            point + np.concatenate([np.diag(h), -np.diag(h)])
+            for point, h in zip(self._points(x), steps, strict=True)
+        ]
+        J, row = np.zeros((len(self.measured), len(x))), 0
+        predicted = self._predicted(points)
+        for g, (p, h) in enumerate(zip(predicted, steps, strict=True)):
+            slope = (p[:, : len(h)] - p[:, len(h) :]) / (2.0 * h)
+            rows = slice(row, row + len(p))
+            J[rows, : self.shared] = slope[:, : self.shared]
+            J[rows, self._at[g] : self._at[g + 1]] = slope[:, self.shared :]
+            row += len(p)
+        return J
+
+    def _evidence(self) -> Evidence:
+        """By release, or by blocks of time where there are few; what a release has for itself is eliminated."""
+        weight = 1.0 / (self.scale * np.sqrt(self.correlated))[self._stream]
+        J, r = self.slopes * weight[:, None], self.residual * weight
+        few = len(self.releases) < FEWEST_TRIALS
+        normal, score = [], []
+        for g, release in enumerate(self.releases):
+            rows = self._stream // 2 == g
+            shared, own = J[rows][:, : self.shared], J[rows][:, self._at[g] : self._at[g + 1]]
+            shared = shared - own @ np.linalg.lstsq(own, shared, rcond=1e-12)[0]
+            longest = float(self.correlated[2 * g : 2 * g + 2].max())
+            count = int(np.clip(rows.sum() / (4.0 * longest), 6, 24)) if few else 1
+            for block in np.array_split(np.argsort(release.t, kind="stable"), count):
+                normal.append(shared[block].T @ shared[block])
+                score.append(-shared[block].T @ r[rows][block])
+        names = (*("head",) * self.head, *(n for n, on in zip(("c1", "c2"), self.terms, strict=True) if on))
+        return Evidence(
+            names=names, normal=np.array(normal), score=np.array(score), unit="blocks" if few else "trials"
+        )
+
+    def criterion(self, full: FreeMotion) -> float:
+        """Schwarz' criterion, with as many samples as are independent by a fuller model."""
+        independent = np.bincount(self._stream, minlength=len(self.scale)) / full.correlated
+        return float(
+            2.0 * independent @ np.log(self.scale) + len(self.x) * np.log(max(independent.sum(), 2.0))
+        )
+
+    # What follows from it.
+
+    @property
+    def theta(self) -> tuple[float, float, float, float]:
+        """w2, e, c1 and c2; zero for what is not fitted."""
+        w2, e, c1, c2 = (float(value[0]) for value in self.ratios(self.x[None]))
+        return w2, e, c1, c2
+
+    def speeds(self) -> tuple[float, float]:
+        """Lowest that stands out of its noise, and highest fitted speed [m/s, rad/s]."""
+        lines = [np.abs(nu[:, 0]) for nu, _ in self._lines(self._points(self.x))]
+        top = max(float(line.max()) for line in lines)
+        low = min(float(line.min()) for line in lines)
+        return max(
+            low, 0.02 * top, 3.0 * float(self.scale[::2].min()) if len(self.releases[0].rate[0]) else 0.0
+        ), top
+
+    @property
+    def r2(self) -> float:
+        """Share of the variance of each release's samples that is explained, the mean over releases."""
+        parts = [2 * g + (not len(r.rate[0])) for g, r in enumerate(self.releases)]
+        spread = [float(np.var(self._of(self.measured, s))) for s in parts]
+        return float(np.mean(1.0 - self.scale[parts] ** 2 / np.maximum(spread, 1e-300)))
+
+    def interval(
+        self, of: Callable[[tuple[Array, ...]], Array], *, positive: bool = False
+    ) -> tuple[float, float, float]:
+        """A function of the ratios and the ends of its 95 % interval.
+
+        Where the intervals of a few releases one by one do not overlap, the mean of what they show, and its interval.
+
+        Args:
+            of: Of w2, e, c1 and c2, (C,) each -> (C,).
+            positive: Whether the interval is one of its logarithm.
+        """
+        from scipy.stats import norm, t
+
+        x = self.x[: self.shared]
+        h = 1e-6 * np.maximum(np.abs(x), 1e-3)
+        points = np.concatenate([x[None], x + np.diag(h), x - np.diag(h)])
+        values = np.asarray(of(self.ratios(points)), float)
+        value, n = float(values[0]), self.shared
+        slope = (values[1 : n + 1] - values[n + 1 :]) / (2.0 * h)
+        used = np.flatnonzero(slope)
+        C = self.covariance
+        matrix = np.maximum(C.local, C.trials) if C.alone[used].any() else C.trials
+        dof = float(np.min(C.dof[used], initial=np.inf))
+        quantile = t.ppf(0.975, dof) if math.isfinite(dof) else norm.ppf(0.975)
+        variance = float(slope[used] @ matrix[np.ix_(used, used)] @ slope[used])
+        half = float(quantile) * math.sqrt(variance) if math.isfinite(variance) else math.inf
+        alone = np.array([one.interval(of, positive=positive) for one in self.alone])
+        if len(alone) and alone[:, 1].max() > alone[:, 2].min():
+            value, n = float(np.mean(alone[:, 0])), len(alone)
+            half = float(t.ppf(0.975, n - 1) * np.std(alone[:, 0], ddof=1)) / math.sqrt(n)
+        if positive and value > 0.0:
+            factor = math.exp(min(half / value, 50.0))
+            return value, value / factor, value * factor
+        return value, value - half, value + half
+
+    def curves(self) -> list[Curve]:
+        """Measured and fitted of every release."""
+        out, unit = [], "m/s" if AXES.index(self.axis) < 3 else "rad/s"
+        place = {"heave": "height [m]", "yaw": "heading [rad]"}.get(self.axis, "sine of the angle [-]")
+        for g, release in enumerate(self.releases):
+            stream = 2 * g + (not len(release.rate[0]))
+            t, measured = release.rate if len(release.rate[0]) else release.travel
+            out.append(
+                Curve(
+                    title=f"{release.trial}: {self.axis} with the thrusters off", x_label="time [s]",
+                    y_label=f"velocity [{unit}]" if len(release.rate[0]) else place,
+                    x=t, measured=measured, fitted=measured + self._of(self.residual, stream),
+                )
+            )  # fmt: skip
+        return out
+
+
+def _first(release: Release) -> tuple[float, float]:
+    """Speed and place at the begin, from the first samples."""
+    rate, (at, travel) = release.rate[1], release.travel
+    place = float(travel[0]) if len(travel) else 0.0
+    if len(rate):
+        return float(rate[0]), place
+    few = slice(0, max(5, len(at) // 10))
+    return float(np.polyfit(at[few], travel[few], 1)[0]), place
+
+
+def _own(release: Release, nu: float, s: float) -> Array:
+    """Start of what a release has for itself."""
+    mean = float(np.mean(release.travel[1])) if len(release.travel[1]) else 0.0
+    return np.array([nu, s, *[mean] * (release.pieces + 1)][: release.own])
+
+
+def _equilibrium(release: Release, grid: Array, knots: Array) -> Array:
+    """Place to which a swing returns, straight between knots (k, C), (n, C); 0 where nothing swings."""
+    if not len(knots):
+        return np.zeros((len(grid), 1))
+    at = np.linspace(0.0, len(knots) - 1.0, len(grid))[:, None]
+    return np.asarray(np.clip(1.0 - np.abs(at - np.arange(len(knots))), 0.0, None) @ knots)
+
+
+def free_motion(
+    trials: Sequence[Trial],
+    axis: str,
+    vehicle: Vehicle,
+    *,
+    terms: tuple[bool, bool] | None = None,
+    refused: list[CalibrationError] | None = None,
+) -> list[FreeMotion]:
+    """The free motion of one axis over all trials that show one, with each kind of drag.
+
+    The drag is linear, quadratic or both by Schwarz' criterion, which also says where an equilibrium drifts.
+
+    Args:
+        trials: Passive ones.
+        axis: One of six: a decay of roll and pitch, a coast of surge, sway and yaw, a rise in heave.
+        vehicle: Gives the places of sensors.
+        terms: Whether to fit c1 and c2, in place of a choice.
+        refused: Takes why a trial shows nothing.
+
+    Returns:
+        The best of them first, the fullest last.
+
+    Raises:
+        CalibrationError: No trial shows one.
+    """
+    releases, errors = list[Release](), [] if refused is None else refused
+    for trial in trials:
+        try:
+            releases.append(_steady(_release(trial, axis, vehicle), axis))
+        except CalibrationError as error:
+            errors.append(error)
+    if not releases:
+        raise errors[-1] if errors else CalibrationError("no trials were given")
+    # A single rise cannot show both kinds of drag.
+    kinds = [terms] if terms else [LINEAR, QUADRATIC] if axis == "heave" else [LINEAR, QUADRATIC, BOTH]
+    fits = [FreeMotion(axis=axis, releases=tuple(releases), terms=kind) for kind in kinds]
+    best = min(fits, key=lambda fit: fit.criterion(fits[-1]))
+    if best.r2 < EXPLAINED:
+        errors += [CalibrationError(f"{axis} does not move as if left to itself", r.trial) for r in releases]
+        raise errors[-1]
+    return [best, *fits]
+
+
+def _steady(release: Release, axis: str) -> Release:
+    """The release, its equilibrium in pieces where one that stays explains it worse."""
+    pieces = int((release.end - release.begin) / (DRIFT_PERIODS * release.period)) if release.period else 0
+    if not pieces or not len(release.travel[0]):
+        return release
+    both = [
+        FreeMotion(axis=axis, releases=(one,), terms=LINEAR)
+        for one in (release, replace(release, pieces=pieces))
+    ]
+    return min(both, key=lambda fit: fit.criterion(both[-1])).releases[0]
+
+
+# From free motions to estimates, changes of the vehicle file and findings.
+
+SET = "hydrodynamics.calibrated"
+
+
+@dataclass(kw_only=True)
+class _Result:
+    """What the free motion of one axis shows."""
+
+    free: FreeMotion
+    full: FreeMotion
+    """With the fullest drag: for intervals of what was left out."""
+    plant: Matrices
+    known: float | None
+    """Effective inertia that is known [kg, kg m²]."""
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    changes: dict[str, Any] = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Name everything that the motion shows."""
+        axis = self.free.axis
+        self.i, self.linear = AXES.index(axis), AXES.index(axis) < 3
+        self.rigid = float(self.plant.M_RB[self.i, self.i])
+        self.file = self.rigid + float(self.plant.M_A[self.i, self.i])
+        self.k = float(self.plant.arm[2])
+        self.low, self.top = self.free.speeds()
+        self.unit = "kg" if self.linear else "kg m²"
+        stiff = axis in SWINGING and self.known is None and self.k > 0.0
+        m, source = (self.file, "the file's") if self.known is None else (self.known, "the given")
+        self.note = f"with {source} inertia {m:.4g} {self.unit}"
+        if stiff:
+            self.note = f"with the file's k = {self.k:.4g} N m/rad"
+        self.m = None if stiff else m
+        if axis in SWINGING:
+            self.swing(stiff)
+        elif axis == "heave":
+            self.rise()
+        if self.known is not None:
+            self.estimates[f"{axis}.m_eff"] = Estimate(
+                name=f"{axis}.m_eff", estimate=m, ci95=(m, m), unit=self.unit, identifiable=True, note="given"
+            )  # fmt: skip
+            self.changes[self.path("added_mass")] = m - self.rigid
+        if axis != "heave":
+            self.damping()
+        if any(release.pieces for release in self.free.releases):
+            moving = tuple(r.trial for r in self.free.releases if r.pieces)
+            self.findings += [finding("equilibrium_moved", trial, axis=axis) for trial in moving]
+
+    def inertia(self, ratios: tuple[Array, ...]) -> Array:
+        """Of the file's stiffness, or as known [kg, kg m²], (C,)."""
+        return self.k / ratios[0] if self.m is None else np.full(len(ratios[0]), self.m)
+
+    def path(self, family: str) -> str:
+        """Of the axis' own entry in a matrix of the vehicle file."""
+        return f"{SET}.{family}.{self.i}.{self.i}"
+
+    def add(
+        self,
+        name: str,
+        unit: str,
+        of: Callable[[tuple[Array, ...]], Array],
+        note: str = "",
+        path: str | None = None,
+    ) -> Estimate:
+        """A number that cannot be negative."""
+        value, low, high = self.free.interval(of, positive=True)
+        sure = bool(0.5 * (high - low) <= USEFUL * abs(value))
+        whole = name if name == "buoyancy_excess" else f"{self.free.axis}.{name}"
+        self.estimates[whole] = Estimate(
+            name=whole, estimate=value, ci95=(low, high), unit=unit, identifiable=sure,
+            note=note if sure or note else "not known to half its size", path=path,
+        )  # fmt: skip
+        return self.estimates[whole]
+
+    def swing(self, stiff: bool) -> None:
+        """Frequency, damping ratio, and the inertia of a known stiffness or the stiffness of a known inertia."""
+        self.add("natural_frequency", "rad/s", lambda r: np.sqrt(r[0]))
+        # A quadratic term counts as the linear one that takes the same energy out of the largest swing.
+        rubbed = 8.0 / (3.0 * math.pi) * self.top
+        note = f"at a swing of {self.top:.2g} rad/s"
+        self.add("damping_ratio", "-", lambda r: (r[2] + rubbed * r[3]) / (2.0 * np.sqrt(r[0])), note)
+        if not stiff:
+            self.add("k", "N m/rad", lambda r: self.inertia(r) * r[0], self.note, "body.center_of_buoyancy.2")
+            return
+        whole = self.add("m_eff", self.unit, self.inertia, self.note)
+        value, low, high = (x - self.rigid for x in (whole.estimate, *whole.ci95))
+        path, axis = self.path("added_mass"), self.free.axis
+        self.estimates[f"{axis}.added_mass"] = Estimate(
+            name=f"{axis}.added_mass", estimate=value, ci95=(low, high), unit=self.unit,
+            identifiable=whole.identifiable and low > 0.0, note=self.note, path=path,
+        )  # fmt: skip
+        if value <= 0.0:
+            self.findings.append(
+                finding(
+                    "inertia_below_rigid",
+                    axis,
+                    assumed=self.note,
+                    inertia=whole.estimate,
+                    rigid=self.rigid,
+                )
+            )
+        elif whole.identifiable:
+            self.changes[path] = value
+
+    def rise(self) -> None:
+        """Terminal speed, and the excess of buoyancy that the acceleration shows, which the file does not take over."""
+        shape = SHAPES[self.free.terms]
+        trials = ", ".join(r.trial for r in self.free.releases)
+        note = f"of a rise with {shape} drag: {trials}"
+        speed = (lambda r: r[1] / r[2]) if self.free.terms == LINEAR else (lambda r: np.sqrt(r[1] / r[3]))
+        self.add("terminal_speed", "m/s", speed, note)
+        words = f"from the acceleration, {self.note}"
+        excess = self.add("buoyancy_excess", "N", lambda r: self.file * r[1], words, "body.displaced_volume")
+        low, high = excess.ci95
+        fields: dict[str, Any] = {"file": self.plant.excess, "low": low, "high": high}
+        if self.plant.excess < 0.0 < low:
+            self.findings.append(finding("buoyancy_sign", "heave", **fields))
+        elif not low <= self.plant.excess <= high:
+            self.findings.append(finding("buoyancy_contradicted", "heave", **fields))
+
+    def damping(self) -> None:
+        """Drag over inertia, and the drag itself; both terms go to the vehicle file or none."""
+        free, top = self.free, self.top
+        per = ("m/s", "1/m") if self.linear else ("rad/s", "1/rad")
+        share = ""
+        if free.terms == BOTH:
+            quadratic = free.theta[3] * top / (free.theta[2] + free.theta[3] * top)
+            share = f", {quadratic:.0%} of it quadratic at the fastest"
+        speeds = f"speeds of {self.low:.2g}-{top:.2g} {per[0]}"
+        alone = "" if free.terms == BOTH else " alone"
+        note = f"{SHAPES[free.terms]} drag{alone} explains {speeds}{share}"
+        drag, low, high = free.interval(lambda r: self.inertia(r) * (r[2] + r[3] * top))
+        known = 0.5 * (high - low) <= USEFUL * drag
+        for j, (name, family) in enumerate((("d1", "linear_damping"), ("d2", "quadratic_damping"))):
+            unit = ("N s/m", "N s²/m²")[j] if self.linear else ("N m s", "N m s²")[j]
+            fit = free if free.terms[j] else self.full
+            for kind, of, words, path in (
+                (f"{name}/m_eff", lambda r, j=j: r[2 + j], note, None),
+                (name, lambda r, j=j: self.inertia(r) * r[2 + j], self.note, self.path(family)),
+            ):
+                value, low, high = fit.interval(of)
+                if not free.terms[j]:
+                    value = low = 0.0
+                whole = f"{free.axis}.{kind}"
+                self.estimates[whole] = Estimate(
+                    name=whole, estimate=value, ci95=(max(low, 0.0), high), path=path,
+                    unit=("1/s", per[1])[j] if path is None else unit, note=words,
+                    identifiable=bool(value > 0.0 and 0.5 * (high - max(low, 0.0)) <= USEFUL * value),
+                )  # fmt: skip
+                if path is not None and known:
+                    self.changes[path] = value
+
+    def quality(self, fits: Sequence[FreeMotion]) -> dict[str, float]:
+        """Figures of the fit, with the residual of either kind of drag."""
+        releases = self.free.releases
+        rmse = {fit.terms: float(np.sqrt(np.mean(fit.residual**2))) for fit in fits}
+        return {
+            "r2": self.free.r2,
+            "rmse": rmse[self.free.terms],
+            **{f"rmse_{SHAPES[kind]}": rmse[kind] for kind in (LINEAR, QUADRATIC)},
+            "trials": float(len(releases)),
+            "seconds": float(sum(r.end - r.begin for r in releases)),
+            "speed_low": self.low,
+            "speed_high": self.top,
+        }
 
 
 def passive(
@@ -399,57 +726,38 @@ def passive(
     vehicle: Vehicle,
     *,
     axes: Sequence[str] | None = None,
-    assume: Literal["restoring", "inertia"] = "restoring",
     known: Mapping[str, float] | None = None,
 ) -> Fit:
     """What trials without thrust tell.
 
     Args:
         trials: Each with one release.
-        vehicle: Gives the number that is taken as known.
+        vehicle: Gives what is taken as known: the stiffness k = B z_b - W z_g of roll and pitch, else M_RB + M_A.
         axes: All if None.
-        assume: `restoring`: the stiffness k = B z_b - W z_g of the file is right; `inertia`: its M_RB + M_A is.
-        known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²], for coasts.
+        known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²], in place of the file's numbers.
 
     Raises:
-        CalibrationError: No trial shows a decay or a rise.
+        CalibrationError: No trial shows a decay, a coast or a rise.
     """
     plant = matrices(vehicle)
     estimates: dict[str, Estimate] = {}
     changes: dict[str, Any] = {}
     quality: dict[str, dict[str, float]] = {}
-    findings, missing = list[Finding](), list[CalibrationError]()
-    curves, used = list[Curve](), set[str]()
-    for axis in ("roll", "pitch"):
-        decays = _decays(trials, axis, missing) if axes is None or axis in axes else []
-        if not decays:
+    findings, curves, refused, used = list[Finding](), list[Curve](), list[CalibrationError](), set[str]()
+    for axis in (a for a in AXES if axes is None or a in axes):
+        try:
+            chosen, *fits = free_motion(trials, axis, vehicle, refused=refused)
+        except CalibrationError:
             continue
-        found = decay_result(axis, decays, plant, assume)
-        estimates |= {e.name: e for e in found.estimates}
-        changes |= found.changes
-        findings += found.findings
-        quality[axis] = _decay_quality(decays)
-        curves += [_decay_curve(d) for d in decays]
-        used |= {d.trial for d in decays}
-    rises = _each(trials, buoyant_rise, missing) if axes is None or "heave" in axes else []
-    if rises:
-        risen = _rise_estimates(rises, plant)
-        estimates |= risen
-        findings += _contradictions(risen, plant)
-        curves += [_rise_curve(rise) for rise in rises]
-        used |= {rise.trial for rise in rises}
-    for axis in COASTING:
-        wanted = axes is None or axis in axes
-        coasts = _each(trials, partial(coast_of, axis=axis, vehicle=vehicle), missing) if wanted else []
-        if coasts:
-            coasted = coast_result(axis, coasts, vehicle, plant, known or {})
-            estimates |= {e.name: e for e in coasted.estimates}
-            changes |= coasted.changes
-            quality[axis] = coasted.quality
-            curves += coasted.curves
-            used |= {coast.trial for coast in coasts}
+        result = _Result(free=chosen, full=fits[-1], plant=plant, known=(known or {}).get(axis))
+        estimates |= result.estimates
+        changes |= result.changes
+        findings += result.findings
+        quality[axis] = result.quality(fits)
+        curves += chosen.curves()
+        used |= {release.trial for release in chosen.releases}
     if not estimates:
-        reasons = "; ".join(str(error) for error in missing if error.subject == trials[0].name)
+        reasons = "; ".join(str(error) for error in refused if error.subject == trials[0].name)
         others = f"; and {len(trials) - 1} trials more" if len(trials) > 1 else ""
         raise CalibrationError(
             f"no trial shows a free decay, a coast or a rise: {reasons or 'none was given'}{others}"
@@ -457,7 +765,7 @@ def passive(
     # That a trial shows one motion and not the others is no news.
     findings += [
         finding("unusable", error.subject, severity="care", reason=error.reason)
-        for error in missing
+        for error in refused
         if error.subject not in used
     ]
     return Fit(
@@ -470,94 +778,5 @@ def passive(
         findings=tuple(dict.fromkeys(findings)),
         curves=tuple(curves),
         trials={trial.name: trial.sha256 for trial in trials if trial.name in used},
-        settings={"assume": assume},
+        settings={"fix": {f"{axis}.m": m for axis, m in known.items()}} if known else {},
     )
-
-
-def _decays(trials: Sequence[Trial], axis: str, missing: list[CalibrationError]) -> list[Decay]:
-    """Those of one axis, all with the same kind of damping."""
-    decays: list[Decay] = _each(trials, partial(free_decay, axis=axis), missing)
-    if len({d.terms for d in decays}) > 1:  # one vehicle, one kind of damping
-        swinging = {d.trial for d in decays}
-        decays = [free_decay(trial, axis, terms=BOTH) for trial in trials if trial.name in swinging]
-    return decays
-
-
-def _decay_quality(decays: Sequence[Decay]) -> dict[str, float]:
-    return {
-        "r2": float(np.mean([d.r2 for d in decays])),
-        "trials": float(len(decays)),
-        "seconds": float(sum(d.end - d.begin for d in decays)),
-    }
-
-
-def _each(
-    trials: Sequence[Trial], find: Callable[[Trial], Any], missing: list[CalibrationError]
-) -> list[Any]:
-    """What is found in each trial; why one shows nothing goes to `missing`."""
-    found = []
-    for trial in trials:
-        try:
-            found.append(find(trial))
-        except CalibrationError as error:
-            missing.append(error)
-    return found
-
-
-def _rise_estimates(rises: list[Rise], plant: Matrices) -> dict[str, Estimate]:
-    """Pooled over the trials, on logarithms."""
-    m = float(plant.M_RB[2, 2] + plant.M_A[2, 2])
-    speed = _pooled([(r.terminal_speed, *r.terminal_ci95) for r in rises])
-    ratio = _pooled([(r.excess_ratio, *r.excess_ci95) for r in rises])
-    drag = ", ".join(f"{r.trial}: {'quadratic' if r.quadratic else 'linear'} drag" for r in rises)
-    found = [
-        Estimate(
-            name="heave.terminal_speed", estimate=speed[0], ci95=speed[1:], unit="m/s",
-            identifiable=speed[2] < 3.0 * speed[1], note=f"of a rise; {drag}",
-        ),
-        Estimate(
-            name="buoyancy_excess", estimate=m * ratio[0], ci95=(m * ratio[1], m * ratio[2]), unit="N",
-            identifiable=ratio[2] < 3.0 * ratio[1],
-            note=f"from the acceleration, with the file's mass and added mass in heave, {m:.4g} kg",
-            path="body.displaced_volume",
-        ),
-    ]  # fmt: skip
-    return {e.name: e for e in found}
-
-
-def _contradictions(found: dict[str, Estimate], plant: Matrices) -> list[Finding]:
-    """A finding where the file's excess of buoyancy, which a rise does not replace, lies outside the interval."""
-    excess = found.get("buoyancy_excess")
-    if excess is None or excess.ci95[0] <= plant.excess <= excess.ci95[1]:
-        return []
-    low, high = excess.ci95
-    fields = {"file": plant.excess, "low": low, "high": high}
-    sinks = plant.excess < 0.0 < low
-    return [
-        finding("buoyancy_sign", "heave", **fields)
-        if sinks
-        else finding("buoyancy_contradicted", "heave", **fields)
-    ]
-
-
-def _pooled(found: list[tuple[float, float, float]]) -> tuple[float, float, float]:
-    """Of estimates with 95 % intervals that are symmetric on logarithms."""
-    value, low, high = np.array(found).T
-    return pooled_positive(value, value * np.log(high / low) / (2.0 * 1.96), np.full(len(found), np.inf))
-
-
-def _decay_curve(d: Decay) -> Curve:
-    t, measured = d.rate_measured if len(d.rate_measured[0]) else d.sine_measured
-    line = d.rate if len(d.rate_measured[0]) else d.sine
-    return Curve(
-        title=f"{d.trial}: free decay of {d.axis}", x_label="time [s]",
-        y_label="rate [rad/s]" if line is d.rate else "sine of the angle [-]",
-        x=t, measured=measured, fitted=np.interp(t, d.t, line),
-    )  # fmt: skip
-
-
-def _rise_curve(rise: Rise) -> Curve:
-    return Curve(
-        title=f"{rise.trial}: rise", x_label="time [s]", y_label="height [m]", x=rise.t, measured=rise.measured,
-        fitted=rise.z,
-    )  # fmt: skip

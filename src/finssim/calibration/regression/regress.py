@@ -19,11 +19,10 @@ from finssim.calibration.regression.axis_estimates import (
     LARGE_DELAY,
     AxisResult,
     axis_result,
+    hydrostatics,
     late_velocity,
-    outside,
     quality,
     term_estimate,
-    trim,
     worthless,
 )
 from finssim.calibration.regression.axis_fit import TERMS, AxisData, informative
@@ -58,23 +57,14 @@ FAINT = 0.002
 """The same as a part of the weight: what a thousandth of the volume does matters little."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Coast:
-    """A stretch in which buoyancy and weight alone move a vehicle up or down."""
-
-    trial: str
-    begin: float
-    """On the trial's clock [s]."""
-    end: float
-    speed: float
-    """Mean over the last `STEADY` seconds, positive up [m/s]."""
-
-
-def coasts(data: AxisData) -> list[Coast]:
-    """Stretches without thrust at whose end the vehicle rises or sinks steadily.
+def coasts(data: AxisData) -> list[tuple[str, float]]:
+    """Stretches without thrust at whose end buoyancy and weight alone move the vehicle up or down.
 
     Args:
         data: Of heave.
+
+    Returns:
+        Trial, and mean speed over the last `STEADY` seconds, positive up [m/s], of each.
     """
     largest = max(float(np.abs(s.tau[np.isfinite(s.tau[:, 2]), 2]).max(initial=0.0)) for s in data.signals)
     found = []
@@ -88,14 +78,7 @@ def coasts(data: AxisData) -> list[Coast]:
             fading = abs(speed[e - 1]) < LEVEL * np.abs(speed[b:e][last]).max()
             same = np.sign(speed[b:e][last]) == np.sign(speed[e - 1])
             if t[-1] - t[0] >= STEADY and same.all() and not fading:
-                found.append(
-                    Coast(
-                        trial=s.name,
-                        begin=float(t[0]),
-                        end=float(t[-1]),
-                        speed=float(np.mean(speed[b:e][last])),
-                    )
-                )
+                found.append((s.name, float(np.mean(speed[b:e][last]))))
     return found
 
 
@@ -118,10 +101,8 @@ def buoyancy_estimate(data: AxisData, chosen: Selection, vehicle: Vehicle) -> tu
     both = bool((speeds > RISING).any() and (speeds < -RISING).any())
     findings = []
     if free:
-        fastest = max(free, key=lambda c: abs(c.speed))
-        note = (
-            f"{len(free)} coast{'s' if len(free) > 1 else ''} without thrust, up to {fastest.speed:+.3f} m/s"
-        )
+        fastest = max((speed for _, speed in free), key=abs)
+        note = f"{len(free)} coast{'s' if len(free) > 1 else ''} without thrust, up to {fastest:+.3f} m/s"
     elif both:
         note = "from driven motion up and down; no coast without thrust reached 0.01 m/s"
     else:
@@ -413,7 +394,7 @@ def regress(
     require_fittable(trials)
     driven = [trial for trial in trials if not trial.header.passive]
     prepared, findings = prepare(driven, vehicle)
-    chosen, plant, more = _fit_axes(
+    chosen, more = _fit_axes(
         prepared, vehicle, wanted, axes is not None, damping, known or {}, estimate, file_prior
     )
     findings += more
@@ -440,7 +421,9 @@ def regress(
             estimates[path] = found
             changes |= {str(found.path): found.estimate} if found.identifiable else {}
     used = {s.name for data, _ in chosen.values() for s in data.signals}
-    _hydrostatics(estimates, changes, vehicle, plant, findings)
+    still, notes = hydrostatics(estimates, vehicle)
+    changes |= still
+    findings += notes
     figures = {axis: result.quality for axis, result in results.items()}
     curves = [curve for result in results.values() for curve in result.curves]
     findings += late_velocity(figures, explained=[AXES[i] for i in told])
@@ -495,9 +478,9 @@ def _fit_axes(
     known: Mapping[str, float],
     estimate: Sequence[str],
     file_prior: bool,
-) -> tuple[dict[int, tuple[AxisData, Selection]], Matrices, list[Finding]]:
+) -> tuple[dict[int, tuple[AxisData, Selection]], list[Finding]]:
     """Data and model of every axis that can be fitted; couplings between axes use the estimates of the round before."""
-    file = plant = matrices(vehicle, estimate=estimate)
+    file = matrices(vehicle, estimate=estimate)
     findings = list[Finding]()
     waters = [matrices(vehicle, one.trial.header.water.density, estimate=estimate) for one in prepared]
     active = excited(prepared, vehicle) if prepared else np.zeros((0, 6), bool)
@@ -534,9 +517,8 @@ def _fit_axes(
         for i, (data, selection) in chosen.items():
             m, d1, d2 = selection.fit.theta[:3]
             if not worthless(data, quality(data, selection), selection):
-                plant = plant.with_axis(i, m - plant.M_RB[i, i], max(d1, 0.0), max(d2, 0.0))
                 waters = [w.with_axis(i, m - w.M_RB[i, i], max(d1, 0.0), max(d2, 0.0)) for w in waters]
-    return chosen, plant, findings
+    return chosen, findings
 
 
 def prior(data: AxisData, file: Matrices, file_prior: bool) -> dict[str, tuple[float, float]]:
@@ -569,36 +551,6 @@ def _same(before: AxisData, now: AxisData) -> bool:
     old = np.concatenate([rows.y for rows in before.rows])
     new = np.concatenate([rows.y for rows in now.rows])
     return len(old) == len(new) and float(np.std(new - old)) <= SETTLED * float(np.std(new))
-
-
-def _hydrostatics(
-    estimates: dict[str, Estimate],
-    changes: dict[str, Any],
-    vehicle: Vehicle,
-    plant: Matrices,
-    findings: list[Finding],
-) -> None:
-    """Buoyancy excess and stiffness as changes of volume and centre of buoyancy; weight and centre of gravity stay."""
-    volume = vehicle.body.displaced_volume
-    excess = estimates.get("buoyancy_excess")
-    if excess is not None and excess.identifiable:
-        volume = (vehicle.weight + excess.estimate) / (vehicle.water.density * vehicle.water.gravity)
-        changes["body.displaced_volume"] = float(volume)
-    buoyancy = vehicle.water.density * vehicle.water.gravity * volume
-    changes |= trim(estimates, buoyancy, vehicle.body.center_of_buoyancy)
-    found = [estimates[name] for name in ("roll.k", "pitch.k") if name in estimates]
-    stiffness = float(matrices(vehicle).arm[2])
-    found = [e for e in found if e.identifiable or (e.estimate > 0.0 and outside(stiffness, e.ci95))]
-    if not found:
-        return
-    half = np.array([0.5 * (e.ci95[1] - e.ci95[0]) for e in found])
-    value = np.array([e.estimate for e in found])
-    if len(found) == 2 and abs(value[0] - value[1]) > float(np.hypot(*half)):
-        findings.append(finding("stiffness_disagrees", roll=value[0], pitch=value[1]))
-    k = float(np.sum(value / half**2) / np.sum(1.0 / half**2))
-    reference = float(vehicle.hydrodynamic_set("calibrated").reference_point[2])
-    gravity_part = vehicle.weight * (float(vehicle.body.center_of_gravity[2]) - reference)
-    changes["body.center_of_buoyancy.2"] = reference + (k + gravity_part) / buoyancy
 
 
 def _correlation(chosen: dict[int, tuple[AxisData, Selection]]) -> tuple[Correlation | None, list[Finding]]:

@@ -22,12 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.motion.signals import Motion
+from finssim.calibration.motion.smoothing import without_spikes
 from finssim.calibration.regression.plant_terms import Matrices, known_wrench, unit_wrenches
-from finssim.calibration.regression.robust import local_outliers
 
 __all__ = ["Kernel", "Rows", "Signals", "axis_rows", "kernel", "signals", "simulated_columns"]
 
 Array = NDArray[np.float64]
+
+SLOW = 25.0
+"""Rate up to which what looks like a spike may be a turn [Hz]."""
 
 LONGEST_REPAIR = 3
 """Outliers in a row that are bridged by a straight line; longer runs break the record."""
@@ -188,8 +191,8 @@ def axis_rows(found: Signals, axis: int, kernels: Kernel) -> Rows | None:
     if sine is not None:
         good &= np.isfinite(sine)
     outlying = np.zeros(len(nu), bool)
-    for begin, end in _spans(good):
-        outlying[begin:end] = local_outliers(nu[begin:end], half_window=min(5, int(0.1 * found.rate)))
+    for begin, end in _spans(good) if found.rate > SLOW else ():
+        outlying[begin:end] = ~without_spikes(found.t[begin:end], nu[begin:end, None])
     nu, good = _bridge(nu, good, outlying)
     spans = [(b, e) for b, e in _spans(good) if e - b >= len(kernels.phi) + 2]
     if not spans:

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Estimate
 from finssim.calibration.regression.axis_estimates import BIAS_NOTE, CERTAIN
-from finssim.calibration.simulation.bordered import collect, huber
-from finssim.calibration.simulation.gauss_newton import Solution
 from finssim.calibration.simulation.parameters import Parameters
 from finssim.calibration.simulation.shooting import Shooting
+from finssim.calibration.simulation.solver import Solution, weights_of
 from finssim.calibration.uncertainty import Covariance, Evidence, intervals, trial_covariance
 from finssim.vehicles.terms import unit_of
 
@@ -45,18 +44,17 @@ class Confidence(NamedTuple):
 
 def confidence(problem: Shooting, solution: Solution) -> Confidence:
     """Evidence of theta, after initial states, offsets and trial biases are eliminated, and what follows from it."""
-    evidence = evidence_of(problem, solution)
+    evidence, P = evidence_of(problem, solution), problem.shared
     covariance = trial_covariance(evidence)
-    theta = solution.point.theta
-    scale = np.sqrt(np.maximum(np.diagonal(evidence.normal.sum(axis=0)), 1e-300))
-    normal = evidence.normal.sum(axis=0) / np.outer(scale, scale)
-    free = theta + np.linalg.lstsq(normal, evidence.score.sum(axis=0) / scale, rcond=1e-10)[0] / scale
-    at_bound = (theta <= problem.low) | (theta >= problem.high)
-    if not at_bound.any():
-        free = theta
+    theta, low, high = (part[:P] for part in (solution.point.theta, problem.low, problem.high))
+    free = theta
+    if ((theta <= low) | (theta >= high)).any():
+        normal, score = evidence.normal.sum(axis=0), evidence.score.sum(axis=0)
+        scale = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
+        free = theta + np.linalg.lstsq(normal / np.outer(scale, scale), score / scale, rcond=1e-10)[0] / scale
     ends = intervals(free, covariance)
     ends[:, 0], ends[:, 1] = np.minimum(ends[:, 0], theta), np.maximum(ends[:, 1], theta)
-    ends = np.clip(ends, problem.low[:, None], problem.high[:, None])
+    ends = np.clip(ends, low[:, None], high[:, None])
     unknown = ~np.isfinite(np.diagonal(covariance.local))
     ends[unknown] = [-np.inf, np.inf]
     return Confidence(evidence, covariance, free, ends)
@@ -64,52 +62,37 @@ def confidence(problem: Shooting, solution: Solution) -> Confidence:
 
 def evidence_of(problem: Shooting, solution: Solution) -> Evidence:
     """Normal matrices and scores by trial, or by blocks of rows where fewer than `FEWEST_TRIALS` excite an axis."""
-    linear, std, point = solution.linear, solution.std, solution.point
-    blocks = collect(linear, std, problem.edges, point.z, problem.prior_std)
-    weight = huber(linear.residual / std)[1] / std**2
-    # Derivatives with each segment's own unknowns projected out: what they leave of every sample.
-    gain = np.linalg.solve(blocks.zz, np.swapaxes(blocks.xz, 1, 2))
-    segment = problem.measured.segment
+    linear, P = solution.linear, problem.shared
+    weight = weights_of(linear.residual, solution.std)
+    # Derivatives without what each segment's own unknowns, and then the biases of trials, take up of every sample.
     slopes = linear.shared.copy()
-    for s in range(len(problem.edges) - 1):
-        rows = slice(problem.edges[s], problem.edges[s + 1])
-        slopes[rows] -= linear.own[rows] @ gain[s]
-    trial = problem.groups[segment]
-    P, (G, b) = len(point.theta), point.phi.shape
-    if b:
-        slopes = _without_biases(slopes, weight, trial, P, (G, b))
+    for s, (a, b) in enumerate(zip(problem.edges, problem.edges[1:], strict=False)):
+        prior = np.diag(problem.prior_std[s] ** -2.0)
+        slopes[a:b] = _without(slopes[a:b], linear.own[a:b], weight[a:b], prior)
+    biases = slopes[:, P:]
+    slopes = _without(slopes[:, :P], biases, weight, 1e-12 * np.eye(biases.shape[1]))
+    trial = problem.groups[problem.measured.segment]
     unit, group = "trials", trial
     if problem.few or len(np.unique(trial)) < FEWEST_TRIALS:
         unit, group = "blocks", _blocks(problem, trial)
-    labels, group = np.unique(group, return_inverse=True)
-    order = np.argsort(group, kind="stable")
-    edges = np.searchsorted(group[order], np.arange(len(labels) + 1))
-    normal, score = np.empty((len(labels), P, P)), np.empty((len(labels), P))
-    for g in range(len(labels)):
-        those = order[edges[g] : edges[g + 1]]
-        weighted = slopes[those].T * weight[those]
-        normal[g], score[g] = weighted @ slopes[those], weighted @ linear.residual[those]
+    parts = [np.flatnonzero(group == label) for label in np.unique(group)]
     # What is known beforehand is one more witness.
-    normal = np.concatenate([normal, np.diag(problem.prior_precision)[None]])
-    pull = problem.prior_precision * (problem.prior_mean - point.theta)
-    score = np.concatenate([score, pull[None]])
-    return Evidence(names=problem.names, normal=normal, score=score, unit=unit)
+    known = problem.prior_precision[:P]
+    pull = known * (problem.prior_mean - solution.point.theta)[:P]
+    normal = [(slopes[rows].T * weight[rows]) @ slopes[rows] for rows in parts]
+    score = [(slopes[rows].T * weight[rows]) @ linear.residual[rows] for rows in parts]
+    return Evidence(
+        names=problem.names[:P],
+        normal=np.array([*normal, np.diag(known)]),
+        score=np.array([*score, pull]),
+        unit=unit,
+    )
 
 
-def _without_biases(
-    slopes: Array, weight: Array, trial: NDArray[np.int64], P: int, shape: tuple[int, int]
-) -> Array:
-    """Derivatives by theta with the trial biases projected out too, (N, P)."""
-    out = slopes[:, :P].copy()
-    for g in range(shape[0]):
-        rows = trial == g
-        own = slopes[rows, P:]
-        if not rows.any():
-            continue
-        weighted = own.T * weight[rows]
-        normal = weighted @ own + 1e-12 * np.eye(shape[1])
-        out[rows] -= own @ np.linalg.solve(normal, weighted @ slopes[rows, :P])
-    return out
+def _without(slopes: Array, own: Array, weight: Array, prior: Array) -> Array:
+    """Derivatives less the best combination of others of the same rows, (n, P)."""
+    weighted = own.T * weight
+    return np.asarray(slopes - own @ np.linalg.solve(weighted @ own + prior, weighted @ slopes))
 
 
 def _blocks(problem: Shooting, trial: NDArray[np.int64]) -> NDArray[np.int64]:

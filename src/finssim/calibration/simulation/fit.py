@@ -15,14 +15,13 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.motion.signals import Motion
-from finssim.calibration.regression.axis_estimates import USEFUL, outside, trim
+from finssim.calibration.regression.axis_estimates import USEFUL, hydrostatics, outside
 from finssim.calibration.regression.selection import AKAIKE, DAMPING
-from finssim.calibration.simulation.bordered import CUT, huber
 from finssim.calibration.simulation.estimates import FEWEST_TRIALS, Confidence, confidence, estimates
-from finssim.calibration.simulation.gauss_newton import Point, Solution, solve
 from finssim.calibration.simulation.parameters import EXTRAS, Parameters
 from finssim.calibration.simulation.segments import Segment, Streams, segments, streams
 from finssim.calibration.simulation.shooting import Shooting
+from finssim.calibration.simulation.solver import CUT, Point, Solution, costs_of, solve
 from finssim.calibration.trials.inputs import require_axes, require_fittable
 from finssim.calibration.trials.trial import Trial
 from finssim.engine.plant_arrays import twist_shift
@@ -288,7 +287,7 @@ def fit_findings(
             out.append(finding("few_speeds", axis, low=low, high=high, unit=unit))
     P = len(p.names)
     for stream, late, (low, high) in zip(
-        problem.errors.streams, solution.point.theta[P:], found.interval[P:], strict=True
+        problem.errors.streams, solution.point.theta[P : problem.shared], found.interval[P:], strict=True
     ):
         if abs(late) > LATE and (low > 0.0 or high < 0.0):
             sense = "lags" if late > 0.0 else "leads"
@@ -313,128 +312,6 @@ class Clock:
 
 
 # The stages of a simulation-error fit: short segments first, then longer ones, then other choices of parameters.
-
-# A rough start where no regression gives one: an evolution strategy whose population are parallel worlds.
-
-FINE = 0.02
-"""Part of a coordinate's size around its bound where steps are linear; beyond, they are logarithmic."""
-
-
-def evolve(
-    cost: Callable[[Array], Array],
-    start: Array,
-    *,
-    sigma: float,
-    population: int,
-    generations: int,
-    seed: int,
-    tolerance: float = 1e-3,
-) -> tuple[Array, float]:
-    """Minimise by covariance matrix adaptation                                         (Hansen 2016, CMA-ES tutorial).
-
-    Args:
-        cost: Of many points at once, (n, P) -> (n,); infinite where a point has none.
-        start: First mean, (P,).
-        sigma: First standard deviation.
-        population: Points in a generation.
-        generations: At most.
-        seed: Of the draws.
-        tolerance: Standard deviation below which it stops.
-
-    Returns:
-        The best point seen, and its cost.
-    """
-    rng, n = np.random.default_rng(seed), len(start)
-    mu = population // 2
-    weights = np.log(mu + 0.5) - np.log(np.arange(1, mu + 1))
-    weights /= weights.sum()
-    mass = 1.0 / float(np.square(weights).sum())
-    c_path = (mass + 2.0) / (n + mass + 5.0)
-    damping = 1.0 + 2.0 * max(0.0, np.sqrt((mass - 1.0) / (n + 1.0)) - 1.0) + c_path
-    c_cum = (4.0 + mass / n) / (n + 4.0 + 2.0 * mass / n)
-    c_one = 2.0 / ((n + 1.3) ** 2 + mass)
-    c_mu = min(1.0 - c_one, 2.0 * (mass - 2.0 + 1.0 / mass) / ((n + 2.0) ** 2 + mass))
-    expected = np.sqrt(n) * (1.0 - 1.0 / (4.0 * n) + 1.0 / (21.0 * n * n))
-
-    mean, C, path_s, path_c = np.array(start, float), np.eye(n), np.zeros(n), np.zeros(n)
-    best, lowest = mean.copy(), float(cost(mean[None])[0])
-    for generation in range(generations):
-        values, vectors = np.linalg.eigh(C)
-        root = np.sqrt(np.maximum(values, 1e-20))
-        steps = (rng.standard_normal((population, n)) * root) @ vectors.T
-        costs = cost(mean + sigma * steps)
-        order = np.argsort(costs)
-        if costs[order[0]] < lowest:
-            best, lowest = mean + sigma * steps[order[0]], float(costs[order[0]])
-        chosen = steps[order[:mu]]
-        shift = weights @ chosen
-        mean = mean + sigma * shift
-        path_s = (1.0 - c_path) * path_s
-        path_s += np.sqrt(c_path * (2.0 - c_path) * mass) * (vectors @ ((vectors.T @ shift) / root))
-        length = float(np.linalg.norm(path_s))
-        steady = (
-            length / np.sqrt(1.0 - (1.0 - c_path) ** (2 * generation + 2))
-            < (1.4 + 2.0 / (n + 1.0)) * expected
-        )
-        path_c = (1.0 - c_cum) * path_c
-        if steady:
-            path_c += np.sqrt(c_cum * (2.0 - c_cum) * mass) * shift
-        C = (1.0 - c_one - c_mu) * C + c_one * np.outer(path_c, path_c) + c_mu * (chosen.T * weights) @ chosen
-        C = 0.5 * (C + C.T)
-        sigma *= float(np.exp(c_path / damping * (length / expected - 1.0)))
-        if sigma * root.max() < tolerance:
-            break
-    return best, lowest
-
-
-def coarse_search(
-    cost: Callable[[Array], Array],
-    start: Array,
-    low: Array,
-    high: Array,
-    scale: Array,
-    *,
-    population: int = 48,
-    generations: int = 25,
-    seed: int = 0,
-) -> tuple[Array, float]:
-    """Search a box over orders of magnitude.
-
-    A coordinate with a lower bound is searched in y = log(1 + (x - low) / (FINE scale)), the others in x / scale.
-
-    Args:
-        cost: Of many points at once, (n, P) -> (n,).
-        start: Where to begin, (P,).
-        low: Lower bounds, -inf where none, (P,).
-        high: Upper bounds, (P,).
-        scale: Sizes of the coordinates, (P,).
-        population: Points in a generation.
-        generations: At most.
-        seed: Of the draws.
-
-    Returns:
-        The best point seen, and its cost.
-    """
-    bounded = np.isfinite(low)
-    unit = FINE * scale
-    base = np.where(bounded, low, 0.0)
-
-    def inside(y: Array) -> Array:
-        grown = base + unit * np.expm1(np.clip(y, -50.0, 50.0))
-        return np.clip(np.where(bounded, grown, y * scale), low, high)
-
-    y = np.where(bounded, np.log1p(np.maximum(start - base, 0.0) / unit), start / scale)
-    best, lowest = evolve(
-        lambda points: cost(inside(points)),
-        y,
-        sigma=0.7,
-        population=population,
-        generations=generations,
-        seed=seed,
-        tolerance=0.03,
-    )
-    return inside(best), lowest
-
 
 # From a simulation-error fit to changes of the vehicle file: only what the trials determine.
 
@@ -488,18 +365,7 @@ def changes(
                 # Couplings are written where both axes are, and where the fit did away with them.
                 if i == j or (new[family][i, j] != old[i, j] and (j in rows or new[family][i, j] == 0.0)):
                     out[f"{base}.{family}.{i}.{j}"] = float(new[family][i, j])
-    water, body = p.vehicle.water, p.vehicle.body
-    volume = float(body.displaced_volume)
-    excess = found.get("buoyancy_excess")
-    if excess is not None and excess.identifiable:
-        volume = (p.vehicle.weight + excess.estimate) / (water.density * water.gravity)
-        out["body.displaced_volume"] = volume
-    stiff = [found[n] for n in ("roll.k", "pitch.k") if n in found]
-    before = p.expected[p.names.index("k")] if "k" in p.names else 0.0
-    stiff = [e for e in stiff if e.identifiable or (e.estimate > 0.0 and outside(before, e.ci95))]
-    if stiff:
-        out["body.center_of_buoyancy.2"] = float(p.buoyancy_height(stiff[0].estimate, volume))
-    out |= trim(found, water.density * water.gravity * volume, body.center_of_buoyancy)
+    out |= hydrostatics(found, p.vehicle)[0]
     for name, path in (("thrust_lag", "time_constant"), ("thrust_delay", "delay")):
         if name in found and found[name].identifiable:
             out[f"thrusters.*.{path}"] = max(found[name].estimate, 1e-4 if path == "time_constant" else 0.0)
@@ -555,6 +421,9 @@ ROUGH = 3.0
 """Residual, against a twentieth of the range, from which a coarse search comes first."""
 
 COARSE_SEGMENTS = 24
+
+FINE, REACH = 0.02, 20.0
+"""Parts of a coordinate's size: steps of the coarse search are linear up to one, and go no further than the other."""
 
 
 @dataclass
@@ -645,10 +514,8 @@ class Stages:
         old, x = before.problem.parameters, before.x
         base = self.base.replace(_matrices(old, x)) if full else self.base
         problem = self.problem(kinds, base, dict(zip(old.names, x, strict=True)), full)
-        point = problem.start()
-        late = len(problem.errors.streams)
-        theta = np.concatenate([point.theta[:-late], before.solution.point.theta[-late:]])
-        point = Point(theta, before.solution.point.phi, before.solution.point.z)
+        rest = before.solution.point.theta[len(old.names) :]
+        point = Point(np.concatenate([problem.parameters.start, rest]), before.solution.point.z)
         return self.finish(problem, point, 0.95, before.solution.std)
 
     def finish(self, problem: Shooting, point: Point, toward: float, std: Array | None = None) -> Stage:
@@ -724,29 +591,43 @@ class Stages:
         )
 
     def _rough(self, problem: Shooting, point: Point) -> Point:
-        """The start, or a better one from a coarse search over some of the segments."""
+        """The start, or a better one from a search of orders of magnitude over some of the segments."""
+        from scipy.optimize import differential_evolution
+
         every = max(1, len(self.segments) // COARSE_SEGMENTS)
         few = Shooting(
             self.segments[::every], problem.parameters, problem.measured.names, lagged=self.lagged[::every]
         )
-        size, own = few.size(), few.start()
-        P, late = len(problem.parameters.names), len(few.errors.streams)
+        size, own, p = few.size(), few.start(), problem.parameters
+        P = len(p.names)
 
         def cost(x: Array) -> Array:
-            theta = np.concatenate([x, np.zeros((len(x), late))], axis=1)
-            parts = (np.repeat(part[None], len(x), axis=0) for part in (own.phi, own.z))
-            loss = huber(few.residuals(Point(theta, *parts)) / size[:, None])[0].mean(axis=0)
-            return np.asarray(np.where(np.isfinite(loss), loss, np.inf))
+            """Mean loss of parameters (P, C), (C,)."""
+            theta = np.repeat(own.theta[None], x.shape[1], axis=0)
+            theta[:, :P] = x.T
+            points = Point(theta, np.repeat(own.z[None], x.shape[1], axis=0))
+            return costs_of(few, few.residuals(points), size, points) / len(size)
 
-        first = float(cost(point.theta[None, :P])[0])
-        if first < 0.5 * ROUGH**2:
+        if cost(point.theta[:P, None])[0] < 0.5 * ROUGH**2:
             return point
         self.say("coarse search", 0.2)
-        p = problem.parameters
-        best, lowest = coarse_search(cost, point.theta[:P], p.low, p.high, p.scale, seed=self.seed)
-        if not lowest < first:
-            return point
-        return Point(np.concatenate([best, point.theta[P:]]), point.phi, point.z)
+        # Straight from each bound on to a small part of a coordinate's size, in powers of ten beyond.
+        base, unit = np.where(np.isfinite(p.low), p.low, p.start), FINE * p.scale
+
+        def inside(y: Array) -> Array:
+            grown = base[:, None] + unit[:, None] * np.sign(y) * np.expm1(np.abs(y))
+            return np.clip(grown, p.low[:, None], p.high[:, None])
+
+        away = (point.theta[:P] - base) / unit
+        start = np.sign(away) * np.log1p(np.abs(away))
+        reach = np.log1p(REACH / FINE)
+        found = differential_evolution(
+            lambda y: cost(inside(y.reshape(P, -1))),
+            [(0.0 if np.isfinite(low) else -reach, max(reach, at + 1.0)) for low, at in zip(p.low, start, strict=True)],
+            popsize=max(5, 96 // P), maxiter=25, seed=self.seed, x0=start, polish=False, vectorized=True,
+            updating="deferred", tol=0.01,
+        )  # fmt: skip
+        return Point(np.concatenate([inside(found.x[:, None])[:, 0], point.theta[P:]]), point.z)
 
     def result(
         self,

@@ -1,4 +1,4 @@
-"""The fit of simulations to segments, as `gauss_newton` asks for it: finite differences are worlds."""
+"""The fit of simulations to segments, as `solver` asks for it: finite differences are worlds."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.simulation.bordered import Linear
-from finssim.calibration.simulation.gauss_newton import Point
 from finssim.calibration.simulation.parameters import LONGEST_DELAY, Parameters
 from finssim.calibration.simulation.rollout import Response, Rollouts
 from finssim.calibration.simulation.segments import CHANNELS, Segment
+from finssim.calibration.simulation.solver import CUT, Linear, Point
 from finssim.geometry.rotations import (
     quat_conjugate,
     quat_from_rotvec,
@@ -24,9 +23,6 @@ from finssim.vehicles import AXES
 __all__ = ["Shooting"]
 
 # What a simulation would have measured, against what was measured.
-
-CUT = 2.5
-"""Residual, in standard deviations, above which the weight falls (Huber 1964)."""
 
 ANGLES = ("roll", "pitch", "yaw")
 
@@ -350,7 +346,7 @@ FLOOR = 1e-4
 
 
 class Shooting:
-    """Residuals of segments under parameters, trial biases and initial states; satisfies `gauss_newton.Problem`.
+    """Residuals of segments under parameters, trial biases and initial states; satisfies `solver.Problem`.
 
     Attributes:
         axes_of_trials: Axes with a constant wrench that differs from trial to trial.
@@ -392,37 +388,47 @@ class Shooting:
         self.judged = len(parameters.names) - parameters.nuisances
         self.errors = SensorErrors(self.measured)
         far = np.full(len(self.errors.streams), LATEST)
-        self.low, self.high = np.append(parameters.low, -far), np.append(parameters.high, far)
+        self.axes_of_trials = tuple(a for a in AXES if a in trial_biases)
+        self._bias_rows = np.array([AXES.index(a) for a in self.axes_of_trials], int)
+        free = np.full((int(self.groups.max()) + 1) * len(self._bias_rows), np.inf)
+        self.low = np.concatenate([parameters.low, -far, -free])
+        self.high = np.concatenate([parameters.high, far, free])
         # Imposed axes have the file's inertia within a factor, the others within an order of magnitude: far from a
         # solution, over short segments, nothing else keeps them from infinity. Streams tell the same time to hundredths
         # of a second.
-        self.prior_mean = np.append(parameters.expected, 0.0 * far)
+        none = np.zeros(len(free))
+        self.prior_mean = np.concatenate([parameters.expected, 0.0 * far, none])
         imposed = np.arange(len(parameters.low)) >= self.judged
         wide = [VAGUE * (name != "thrust_scale" and not parameters.coupled) for name in parameters.names]
         size = np.where(imposed, 1.0, np.array(wide, float)) * parameters.scale
-        known = np.where(size > 0.0, 1.0 / np.maximum(size, 1e-300) ** 2, 0.0)
-        self.prior_precision = np.append(known, 0.0 * far + LATE_STD**-2.0)
+        known = np.where(size > 0.0, np.maximum(size, 1e-150) ** -2.0, 0.0)
+        self.prior_precision = np.concatenate([known, 0.0 * far + LATE_STD**-2.0, none])
         if "thrust_delay" in parameters.names:
             # A common lag of all streams is a delay of the thrust: the first stream is the clock then.
             self.prior_precision[len(parameters.names)] = EXACT_CLOCK**-2.0
         width = (len(segments), len(self.errors.std))
         self.prior_std = np.concatenate([self.states.std, np.broadcast_to(self.errors.std, width)], axis=1)
-        self.axes_of_trials = tuple(a for a in AXES if a in trial_biases)
-        self._bias_rows = np.array([AXES.index(a) for a in self.axes_of_trials], int)
         self.lagged = np.array([s.commanded for s in segments]) if lagged is None else lagged
         self._floor = FLOOR * self.measured.spread() + 1e-12
         self.first_noise = np.maximum(self.measured.roughness(), self._floor)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of theta: the parameters, then the lags of the streams [s]."""
-        return self.parameters.names + tuple(f"{stream}.late" for stream in self.errors.streams)
+        """Of theta: the parameters, the lags of the streams [s], then the biases of trial after trial [N, N m]."""
+        late = tuple(f"{stream}.late" for stream in self.errors.streams)
+        trials = range(int(self.groups.max()) + 1)
+        biases = tuple(f"{axis}.bias of trial {g}" for g in trials for axis in self.axes_of_trials)
+        return self.parameters.names + late + biases
+
+    @property
+    def shared(self) -> int:
+        """How many of theta are parameters or lags of streams."""
+        return len(self.parameters.names) + len(self.errors.streams)
 
     def start(self) -> Point:
         """The vehicle file's numbers, the measured initial states, no errors of sensors."""
-        theta = np.concatenate([self.parameters.start, np.zeros(len(self.errors.streams))])
-        G = int(self.groups.max()) + 1
-        return Point(theta, np.zeros((G, len(self.axes_of_trials))), np.zeros(self.prior_std.shape))
+        rest = np.zeros(len(self.low) - len(self.parameters.names))
+        return Point(np.concatenate([self.parameters.start, rest]), np.zeros(self.prior_std.shape))
 
     def residuals(self, points: Point) -> Array:
         """Measured minus predicted of several points, (N, C)."""
@@ -434,7 +440,7 @@ class Shooting:
 
     def _predicted(self, points: Point) -> tuple[Array, Array]:
         """What sensors without offsets would have read and its rate of change, (N, C) each."""
-        P = len(self.parameters.names)
+        P, C = len(self.parameters.names), len(points.theta)
         p = self.parameters.plants(points.theta[:, :P])
         fields = dict(p.fields)
         own = self.rollouts.own
@@ -443,22 +449,22 @@ class Shooting:
                 tail = (1,) * (own[name].ndim - 1)
                 mask = self.lagged.reshape(-1, *tail)
                 fields[name] = np.where(mask, values.reshape(-1, 1, *tail), own[name])
-        bias = np.repeat(p.bias, len(self.segments), axis=1)
+        extra = np.zeros((C, len(self.segments), 6))
         if len(self._bias_rows):
-            extra = np.zeros((len(points.phi), len(self.segments), 6))
-            extra[..., self._bias_rows] = points.phi[:, self.groups]
-            bias = bias + extra @ self.parameters.H
+            biases = points.theta[:, self.shared :].reshape(C, -1, len(self._bias_rows))
+            extra[..., self._bias_rows] = biases[:, self.groups]
         current = None
         if p.current is not None:
             current = p.current + np.stack([s.current for s in self.segments])
         response = self.rollouts.run(
             fields,
             initial=self.states.initial(points.z[..., : len(self.states.free)]),
-            disturbance=bias,
+            disturbance=p.bias + extra @ self.parameters.H,
             current=current,
-            candidates=len(points.theta),
+            candidates=C,
         )
-        return self.measured.predicted(response, self.errors.late(points.theta[:, P:]), current)
+        late = self.errors.late(points.theta[:, P : self.shared])
+        return self.measured.predicted(response, late, current)
 
     def linearise(self, point: Point) -> Linear:
         """Residuals and derivatives: central differences for what moves the vehicle, exact for what sensors add."""
@@ -472,10 +478,14 @@ class Shooting:
         slopes = np.nan_to_num(rise / wide)
         late, offset = self.errors.slopes(np.nan_to_num(rate[:, 0]))
         P, b = len(self.parameters.names), len(self._bias_rows)
+        # A bias moves its own trial alone: all of an axis were moved at once.
+        trial = self.groups[self.measured.segment]
+        own = trial[:, None] == np.arange(int(self.groups.max()) + 1)
+        biases = (own[:, :, None] * slopes[:, None, P : P + b]).reshape(len(slopes), -1)
         one = Point(*(part[:1] for part in points))
         return Linear(
             self._residual(one, value[:, :1])[:, 0],
-            np.concatenate([slopes[:, :P], late, slopes[:, P : P + b]], axis=1),
+            np.concatenate([slopes[:, :P], late, biases], axis=1),
             np.concatenate([slopes[:, P + b :], offset], axis=1),
         )
 
@@ -483,7 +493,7 @@ class Shooting:
         """The point, one on either side of it for every unknown that moves the vehicle, and their distances."""
         P, b, q = len(self.parameters.names), len(self._bias_rows), len(self.states.free)
         count = P + b + q
-        theta, phi, z = (np.repeat(part[None], 1 + 2 * count, axis=0) for part in point)
+        theta, z = (np.repeat(part[None], 1 + 2 * count, axis=0) for part in point)
         up, down = 1 + 2 * np.arange(count), 2 + 2 * np.arange(count)
         i = np.arange(P)
         step = RELATIVE_STEP * np.maximum(np.abs(point.theta[:P]), 0.25 * self.parameters.scale)
@@ -492,12 +502,12 @@ class Shooting:
         wide = [theta[up[:P], i] - theta[down[:P], i]]
         push = RELATIVE_STEP * np.diag(self.parameters.M_RB)[self._bias_rows]
         for k in range(b):
-            phi[up[P + k], :, k] += push[k]
-            phi[down[P + k], :, k] -= push[k]
+            theta[up[P + k], self.shared + k :: b] += push[k]
+            theta[down[P + k], self.shared + k :: b] -= push[k]
         for k, step_k in enumerate(self.states.steps):
             z[up[P + b + k], :, k] += step_k
             z[down[P + b + k], :, k] -= step_k
-        return Point(theta, phi, z), np.concatenate([*wide, 2.0 * push, 2.0 * self.states.steps])
+        return Point(theta, z), np.concatenate([*wide, 2.0 * push, 2.0 * self.states.steps])
 
     def growth(self, point: Point) -> Array:
         """Largest factor by which a small change of the initial velocity grows within each segment, (S,)."""
@@ -516,8 +526,8 @@ class Shooting:
 
     def hold_clocks(self, hold: bool) -> None:
         """Keep the lags of all streams at zero, or let them go: far from a solution they imitate inertia."""
-        P, far = len(self.parameters.names), 0.0 if hold else LATEST
-        self.low[P:], self.high[P:] = -far, far
+        late, far = slice(len(self.parameters.names), self.shared), 0.0 if hold else LATEST
+        self.low[late], self.high[late] = -far, far
 
     def size(self) -> Array:
         """What counts as a large residual of every sample far from a solution, (N,)."""

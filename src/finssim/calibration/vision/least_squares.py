@@ -17,8 +17,8 @@ from finssim.calibration.uncertainty import Evidence
 from finssim.geometry.rotations import quat_from_rotvec, quat_to_matrix
 
 __all__ = [
-    "Block", "Pose", "TukeyFit", "arrow_evidence", "arrow_step", "block_of", "descent", "huber_cost",
-    "huber_weight", "tukey",
+    "Block", "Pose", "TukeyFit", "arrow_evidence", "arrow_reduced", "arrow_step", "block_of", "boxed", "descent",
+    "huber_cost", "huber_weight", "tukey",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -75,6 +75,28 @@ def huber_weight(size: Array, limit: float) -> Array:
 def huber_cost(size: Array, limit: float) -> float:
     """Sum of squares of what is within a limit, growing linearly beyond."""
     return float(np.sum(np.where(size <= limit, size**2, limit * (2.0 * size - limit))))
+
+
+def boxed(normal: Array, right: Array, low: Array, high: Array) -> Array:
+    """Minimum of ½ xᵀ N x - gᵀ x in a box, by bounded-variable least squares; on a bound exactly.
+
+    Args:
+        normal: N, positive definite, in any units [-] and frame, (P, P).
+        right: g, (P,).
+        low: Below `high`, (P,).
+        high: (P,)
+    """
+    from scipy.optimize import lsq_linear
+
+    scale = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
+    L = np.linalg.cholesky(normal / np.outer(scale, scale) + 1e-9 * np.eye(len(scale)))
+    root = np.linalg.solve(L, right / scale)
+    free = np.linalg.solve(L.T, root) / scale
+    if ((free >= low) & (free <= high)).all():
+        return np.asarray(free)
+    solved = lsq_linear(L.T, root, (low * scale, high * scale), method="bvls")
+    inside = np.where(solved.active_mask < 0, low, np.where(solved.active_mask > 0, high, solved.x / scale))
+    return np.asarray(inside)
 
 
 class Pose(NamedTuple):
@@ -138,13 +160,22 @@ def arrow_step(blocks: Sequence[Block], damping: float) -> tuple[Array, list[Arr
         blocks: Normal equations of the groups.
         damping: What the diagonals grow by, as a part of themselves [-].
     """
-    solved = [_eliminated(block, damping) for block in blocks]
-    total = np.sum([reduced for reduced, _, _ in solved], axis=0)
-    right = np.sum([score for _, score, _ in solved], axis=0)
+    total, right, inners = arrow_reduced(blocks, damping)
     scale = np.sqrt(np.maximum(np.diagonal(total), 1e-300))
     step, *_ = np.linalg.lstsq(total / np.outer(scale, scale), right / scale, rcond=1e-13)
     step = step / scale
-    return step, [inner[:, -1] - inner[:, :-1] @ step for _, _, inner in solved]
+    return step, [inner[:, -1] - inner[:, :-1] @ step for inner in inners]
+
+
+def arrow_reduced(blocks: Sequence[Block], damping: float) -> tuple[Array, Array, list[Array]]:
+    """Normal matrix (P, P) and right side (P,) of the shared unknowns alone, and [abᵀ b] over bb of each group.
+
+    Args:
+        blocks: Normal equations of the groups.
+        damping: What the diagonals grow by, as a part of themselves [-].
+    """
+    reduced, right, inners = zip(*(_eliminated(block, damping) for block in blocks), strict=True)
+    return np.sum(reduced, axis=0), np.sum(right, axis=0), list(inners)
 
 
 def arrow_evidence(
