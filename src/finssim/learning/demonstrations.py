@@ -16,6 +16,7 @@ from minari.dataset.minari_storage import METADATA_FILE_NAME, MinariStorage
 from numpy.typing import NDArray
 
 from finssim.files import atomic_directory
+from finssim.yaml_file import json_value
 
 __all__ = ["DATASET_FILE", "DatasetError", "Demonstrations", "Episode", "about", "found_in", "load", "save"]
 
@@ -145,7 +146,7 @@ def about(place: str | Path) -> dict[str, Any]:
         raise DatasetError(
             f"{place}: not a data set of FinsSim: it does not say of which task and vehicle it is"
         )
-    described: dict[str, Any] = json.loads(found[OURS])
+    described: dict[str, Any] = json_value(found[OURS], DatasetError, str(place))
     return {**described, "episodes": found["total_episodes"], "steps": found["total_steps"]}
 
 
