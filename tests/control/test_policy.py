@@ -150,6 +150,7 @@ def test_a_missing_directory_or_file_is_named(folder):
         ({"format": 2}, "format is 2, but this version reads format 1"),
         ({"colour": "red"}, "colour: Extra inputs are not permitted"),
         ({"control_period": -0.1}, "control_period: Input should be greater than 0"),
+        ({"control_period": float("inf")}, "control_period: Input should be less than or equal to 10"),
         (
             {"action": {"mode": "wrench2"}},
             "action: size is None, expected a positive whole number",

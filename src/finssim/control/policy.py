@@ -103,7 +103,7 @@ class PolicyDescription(_Record):
     observation: ObservationSchema
     action: dict[str, Any]
     """The action mode, as its `describe()` gives it: at least `mode` (name), `size`, and its limits and scale."""
-    control_period: float = Field(gt=0.0)
+    control_period: float = Field(gt=0.0, le=10.0)
     """Time between two actions [s]."""
     memory: int = Field(default=0, ge=0)
     """Numbers that the network hands on to its next action, zeros at an episode's start; 0: it remembers nothing."""

@@ -419,7 +419,7 @@ def compare(
     measures: Annotated[Sequence[str], "--measure"] = (),
     vehicle: str = "finsrov",
     plant: str = "nominal",
-    trials: Annotated[int | None, (1, None)] = None,
+    trials: Annotated[int | None, (1, 100_000)] = None,
     seed: int = 42,
     say: Say = lambda part, what: None,
 ) -> dict[str, Any]:

@@ -417,7 +417,7 @@ def collect(
     *,
     task: str,
     out: Path,
-    episodes: Annotated[int | None, (1, None)] = None,
+    episodes: Annotated[int | None, (1, 1_000_000)] = None,
     vehicle: str = "finsrov",
     hydrodynamics: str = "calibrated",
     action: str | None = None,

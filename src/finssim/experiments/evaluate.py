@@ -304,7 +304,7 @@ def evaluate(
     plant: Sequence[str | Path] | str | Path = ("nominal",),
     observe: str | None = None,
     trajectories: Annotated[Sequence[str | Path], "--trajectory"] = (),
-    trials: Annotated[int | None, (1, None)] = None,
+    trials: Annotated[int | None, (1, 100_000)] = None,
     trim: bool = False,
     truth: Path | None = None,
     seed: int = 42,

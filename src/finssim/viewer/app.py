@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import socket
 import time
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
@@ -15,7 +16,7 @@ import numpy.typing as npt
 import viser
 
 from finssim.localization.pool import Pool
-from finssim.viewer.frame import Curve, Frame, Picture, Pose, Source, Stage
+from finssim.viewer.frame import Curve, Frame, Picture, Pose, Source, Stage, ViewError
 from finssim.viewer.shapes import box_edges, force_arrows, hull_of, line_of, tag_plates, wall_mesh, wxyz
 
 __all__ = ["LONGEST_TURN", "Playback", "View", "blank", "draw_picture", "legend_of", "plots_of"]
@@ -472,6 +473,16 @@ PLOT_PERIOD = 0.5
 """Between drawings of the plots [s]."""
 
 
+def _check_address(bind: str) -> None:
+    """Refuse an address that is not this machine's, at which viser would wait for ever."""
+    try:
+        family, *_, address = socket.getaddrinfo(bind, 0, type=socket.SOCK_STREAM)[0]
+        socket.create_server(address[:2], family=family).close()
+    except (OSError, UnicodeError) as error:
+        reason = (getattr(error, "strerror", None) or str(error)).partition(" (")[0]
+        raise ViewError(f"--bind {bind}: {reason}: give an address of this machine") from None
+
+
 class View:
     """A page that shows a source. `run` is its loop; `turn` one pass of it."""
 
@@ -494,6 +505,7 @@ class View:
             playing: Whether it runs from the start.
         """
         self.source, self.playback = source, Playback(source.duration, speed=speed, playing=playing)
+        _check_address(bind)
         with redirect_stdout(StringIO()):  # viser greets and says goodbye even where it is told not to
             self.server = viser.ViserServer(host=bind, port=port, label="FinsSim", verbose=False)
         self.scene = Scene(self.server, source.stage)

@@ -297,7 +297,7 @@ def _streams(streams: Sequence[StreamReport]) -> Table:
         table.add_column(name, justify="left" if name == "columns" else "right", overflow="fold")
     for s in streams:
         table.add_row(
-            _short(s.columns),
+            escape(_short(s.columns)),
             str(s.samples),
             f"{s.rate:.3g} Hz",
             f"{s.jitter:.0%}",
