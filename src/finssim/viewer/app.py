@@ -201,12 +201,17 @@ class Plot:
         self.title, self.curves = title, list(curves)
 
     def data(self, now: float) -> tuple[Array, ...]:
-        """Time, and for every curve all of it and the part up to a time [s]."""
-        time = self.curves[0].time
-        past = time <= now + 1e-9
+        """Time, and for every curve all of it and the part up to a time [s]; from where each has a value.
+
+        The browser's plot takes its scales from the first values, and draws nothing where one of these is NaN.
+        """
+        known = np.all([np.isfinite(curve.value) for curve in self.curves], axis=0)
+        begin = int(np.argmax(known))
+        time = self.curves[0].time[begin:]
+        past = time <= max(now, float(time[0])) + 1e-9
         columns = [time]
         for curve in self.curves:
-            columns += [curve.value, np.where(past, curve.value, np.nan)]
+            columns += [curve.value[begin:], np.where(past, curve.value[begin:], np.nan)]
         return tuple(np.ascontiguousarray(column, float) for column in columns)
 
     def series(self) -> tuple[Any, ...]:
