@@ -22,10 +22,8 @@ from finssim.geometry.rotations import (
     quat_to_matrix,
     wrap_angle,
 )
-from finssim.localization.detection.detector import detector
-from finssim.localization.detection.families import bitmap
-from finssim.localization.detection.region import RegionTracker
-from finssim.localization.detection.tags import tag_corners_b
+from finssim.localization.detection.detector import RegionTracker, detector
+from finssim.localization.detection.families import bitmap, tag_corners_b
 from finssim.localization.fusion.estimator import Estimator
 from finssim.localization.fusion.fuse_settings import site_of
 from finssim.localization.fusion.streams import DepthSample, ImuSample, VisionSample

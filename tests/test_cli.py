@@ -59,6 +59,7 @@ COMMANDS = [
     "sweep",
     "record",
     "record info",
+    "report",
     "record repair",
     "play",
     "view",

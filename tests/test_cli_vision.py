@@ -95,7 +95,7 @@ def test_camera_as_json_and_as_a_file(place, capsys):
     found = found_by(capsys, *CAMERA, "--board", "9x6", "--report", "report")
     assert found.keys() >= {
         *("kind", "parameters", "per_view", "rms_px", "held_out_rms_px", "views", "left_out", "findings"),
-        *("error95_px", "empty_edges", "correlation", "settings", "interrupted", "out", "provenance"),
+        *("error95_px", "empty_edges", "correlation", "settings", "out", "provenance"),
     }
     assert found["kind"] == "camera" and found["out"] == "camera.yaml"
     assert all(parameter.keys() == PARAMETER for parameter in found["parameters"].values())
@@ -284,7 +284,7 @@ def test_pool_as_json_and_as_a_file(surveyed, plain):
     found, pool = plain
     assert found.keys() >= {
         *("kind", "interface", "parameters", "residual", "held_out", "pinhole", "lens_fitted", "outliers"),
-        *("other_minima", "correlation", "findings", "settings", "inputs", "out", "provenance"),
+        *("correlation", "findings", "settings", "inputs", "out", "provenance"),
     }
     assert found["kind"] == "pool" and found["interface"] == "surface" and found["out"] == "plain.yaml"
     assert all(parameter.keys() == PARAMETER for parameter in found["parameters"].values())
@@ -475,7 +475,7 @@ def test_pool_refuses_in_a_sentence(surveyed, pool_files, capsys, words, sentenc
 
 @pytest.fixture(scope="session")
 def mount_files(tmp_path_factory):
-    """A pool, a FinsROV with its port where it is, and two logs: one wandering, one that turns on the spot."""
+    """A pool, a FinsROV with its port where it is, and a log."""
     folder = tmp_path_factory.mktemp("mounts")
     write_pool(POOL, folder / "pool.yaml")
     vehicle = load_vehicle("finsrov").replace(
@@ -483,8 +483,6 @@ def mount_files(tmp_path_factory):
     )
     write_vehicle(vehicle, folder / "vehicle.yaml")
     write_log(folder / "log", motion(seconds=16.0, rate=3.0), np.random.default_rng(1))
-    still = motion(seconds=16.0, rate=3.0, travel=0.0, tilt=0.02, heave=0.0)
-    write_log(folder / "spin", still, np.random.default_rng(2))
     (folder / "empty").mkdir()
     (folder / "thesis").mkdir()
     (folder / "thesis" / "thesis.tex").touch()
@@ -499,7 +497,6 @@ def mounting(mount_files, tmp_path, monkeypatch):
 
 
 MOUNT = ["calibrate", "mounts", "log", "--pool", "pool.yaml", "--vehicle", "vehicle.yaml", "--out"]
-SPIN = [word if word != "log" else "spin" for word in MOUNT]
 
 
 @pytest.mark.slow
@@ -535,26 +532,10 @@ def test_mounts_estimates_what_it_is_told(mounting, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("centre", [(0.0, 0.0), (0.05, -0.02)])
-def test_mounts_takes_the_point_about_which_the_vehicle_turns(mounting, capsys, centre):
-    """It is the body point beside which the tags are then found; as a table, with where it was written."""
-    words = ["--turns-about", f"{centre[0]},{centre[1]},0"]
-    assert finssim(*SPIN, mounting / "v.yaml", *words) == 0
-    out = " ".join(capsys.readouterr().out.split())
-    assert "tags.15.x" in out and f"written: {mounting / 'v.yaml'}" in out
-    for tag, truth in MOUNTS.items():
-        where = np.asarray(load_vehicle(mounting / "v.yaml").tags.mounts[tag].position)
-        np.testing.assert_allclose(where[:2], truth.t[:2] + centre, atol=0.004)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
         ([*MOUNT, "OUT", "--estimate", "camera"], "unknown estimate 'camera'; available: tags, sensors"),
-        ([*MOUNT, "OUT", "--turns-about", "0,0"], "--turns-about is '0,0', expected three lengths"),
-        ([*MOUNT, "OUT", "--turns-about", "a,b,c"], "--turns-about is 'a,b,c', expected three lengths"),
-        ([*MOUNT, "OUT", "--turns-about", "0,0,nan"], "--turns-about is '0,0,nan', expected three lengths"),
         ([*MOUNT, "OUT", "--vehicle", "bluerov2"], "has no tags"),
         ([*MOUNT, "OUT", "--vehicle", "finrov"], "did you mean 'finsrov'"),
         ([*MOUNT, "OUT", "--pool", "nowhere.yaml"], "nowhere.yaml"),

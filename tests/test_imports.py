@@ -125,13 +125,12 @@ HOMES = {
         "ros2/definitions.py",
     },
     "cv2": {
-        "calibration/vision/boards.py",
+        "calibration/vision/camera_fit.py",
         "calibration/vision/pool_search.py",
-        "localization/detection/detector_opencv.py",
         "localization/detection/pictures.py",
         "robot/pictures.py",
     },
-    "pupil_apriltags": {"localization/detection/detector_apriltag.py"},
+    "pupil_apriltags": {"localization/detection/families.py"},
     "serial": {"robot/link/transports.py"},
     "mcap": {
         "robot/recorder.py",

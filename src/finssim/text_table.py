@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-__all__ = ["EMPTY", "TextTable", "number", "read_text", "read_text_table", "text_table"]
+from finssim.files import atomic_write
+
+__all__ = [
+    "EMPTY",
+    "TextTable",
+    "csv_text",
+    "number",
+    "read_text",
+    "read_text_table",
+    "text_table",
+    "write_csv",
+]
 
 EMPTY = frozenset({"", "nan", "none", "null", "na", "n/a", "-", "--"})
 """Words for "no value", in lower case."""
@@ -151,3 +164,20 @@ def text_table(
         comments=[line.strip() for _, line in every if line.lstrip().startswith(comment)],
         unfinished=not text.endswith(("\n", "\r")),
     )
+
+
+def csv_text(names: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A table as CSV with a line of names."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([names, *rows])
+    return text.getvalue()
+
+
+def write_csv(path: str | os.PathLike[str], names: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a table as CSV with a line of names.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    with atomic_write(path) as temporary:
+        temporary.write_text(csv_text(names, rows), encoding="utf-8", newline="")

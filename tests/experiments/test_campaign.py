@@ -127,7 +127,6 @@ def test_a_key_names_everything_that_decides_the_result():
             {"severity": "hard"},
             {"camera": "corners"},
             {"fusion": False},
-            {"trim": True},
             {"position_noise": 0.05},
             {"yaw_noise": 0.1},
             {"vehicle": "bluerov2"},

@@ -15,7 +15,7 @@ from finssim.experiments.localization_experiment import (
     pictures,
 )
 from finssim.geometry.optics import project
-from finssim.localization.detection.tags import corners
+from finssim.localization.detection.families import corners
 
 SMALL = {"locations": (5, 4), "images": 20}
 

@@ -4,9 +4,7 @@ import json
 
 import numpy as np
 import pytest
-import torch
 from rich.console import Console
-from torch import nn
 
 from finssim.control import ControlError
 from finssim.control.modes import action_mode
@@ -24,6 +22,7 @@ from finssim.experiments.metrics import MEASURES, PAPER_T2, paper_t2_row
 from finssim.experiments.plants import load_plant
 from finssim.experiments.trials import T2_TRAJECTORIES, run_tracking
 from finssim.learning.export import export_policy
+from finssim.learning.network import Linear, Network
 from finssim.tasks import TrajectoryTracking
 from finssim.tasks.agents import agent_for
 from finssim.vehicles import load_vehicle
@@ -155,16 +154,12 @@ def test_ones_own_trajectory_is_followed(tmp_path):
         evaluate_controller("pid", NOMINAL, task="t2", trajectories=[own])
 
 
-def stiff_policy(folder):
+def stiff_policy(folder, errors):
     """A policy written by hand as one layer: thrust towards the reference and against velocity."""
-    layer = nn.Linear(30, 6)
-    with torch.no_grad():
-        layer.weight.zero_()
-        layer.bias.zero_()
-        for axis in range(3):
-            layer.weight[axis, axis], layer.weight[axis, 15 + axis] = 6.0, -2.0
-            layer.weight[axis, 12 + axis] = 4.0
-        layer.weight[5, 20] = -0.3
+    weight = np.zeros((30, 6))
+    for axis in range(3):
+        weight[axis, axis], weight[12 + axis, axis], weight[15 + axis, axis] = 6.0, 4.0, -2.0
+    weight[20, 5] = -0.3
     description = PolicyDescription(
         task="t2",
         observation=TASK.schema,
@@ -175,18 +170,16 @@ def stiff_policy(folder):
         seed=0,
         training={"randomization": None},
     )
-    return export_policy(nn.Sequential(layer), folder, description)
+    return export_policy(Network((Linear(weight, None),), errors=errors), folder, description)
 
 
-def test_a_trim_takes_out_what_a_current_leaves(tmp_path):
-    """In 0.10 m/s a policy without memory is pushed away by centimetres; with the integral in front of it, less."""
-    folder = stiff_policy(tmp_path / "stiff")
+def test_an_integral_takes_out_what_a_current_leaves(tmp_path):
+    """In 0.10 m/s a policy without memory is pushed away by centimetres; one that integrates its error is not."""
     options = {"task": "t2", "trajectories": ["broken"], "trials": 2}
-    plain, trimmed = (
-        evaluate_controller(folder, load_plant("current"), trim=trim, **options).result
-        for trim in (False, True)
+    plain, integrating = (
+        evaluate_controller(
+            stiff_policy(tmp_path / str(len(errors)), errors), load_plant("current"), **options
+        ).result
+        for errors in ((), TASK.errors)
     )
-    assert trimmed["horizontal_rmse_m"] < 0.6 * plain["horizontal_rmse_m"]
-    assert (plain["controller"]["trim"], trimmed["controller"]["trim"]["rate"]) == (None, 0.3)
-    with pytest.raises(EvaluationError, match="'pid' has an integral of its own"):
-        evaluate_controller("pid", NOMINAL, task="t2", trim=True)
+    assert integrating["horizontal_rmse_m"] < 0.6 * plain["horizontal_rmse_m"]

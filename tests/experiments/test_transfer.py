@@ -6,7 +6,7 @@ import pytest
 
 from finssim.experiments.ablation import ablation_tables
 from finssim.experiments.tables import html_of, markdown_of
-from finssim.experiments.transfer import T1, T2, row_figures, trained, transfer_experiment
+from finssim.experiments.transfer import T1, T2, row_figures, scores, trained, transfer_experiment
 
 pytestmark = pytest.mark.slow
 
@@ -99,6 +99,18 @@ def test_figures_count_stops_and_the_worst_pool():
     row = row_figures([made("x", 1, True, 0.02), made("x", 2, False, None)], T1.figures)
     assert (row["success"], row["trials"], row["stopped"], row["worst_success"]) == (1, 2, 1, 0)
     assert row["e_p_m"]["value"] == 0.02 and row["e_p_m"]["count"] == 1
+
+
+@pytest.mark.parametrize(("plants", "sentences"), [(2, 0), (3, 1)])
+def test_a_sentence_rests_on_three_plants_at_least(plants, sentences):
+    """With fewer there are numbers alone."""
+    by_row = {
+        name: [made(name, plant, True, error + 0.001 * plant) for plant in range(plants)]
+        for name, error in (("calibrated", 0.02), ("mesh", 0.05))
+    }
+    found = scores(T1, by_row)
+    assert found["differences"]["mesh"]["e_p_m"]["value"] == pytest.approx(0.03)
+    assert len(found["sentences"]) == sentences
 
 
 def test_the_ablation_says_which_way_each_module_moves(small):

@@ -6,6 +6,7 @@ import csv
 import hashlib
 import json
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,16 +14,21 @@ import torch
 import yaml
 from torch import nn
 
+import finssim
 from finssim.control.policy import (
     ObservationEntry,
     ObservationSchema,
     Policy,
     PolicyDescription,
+    PolicyError,
     VehicleIdentity,
 )
 from finssim.files import OutputError
-from finssim.learning.export import ExportError, export_policy
+from finssim.learning.export import ExportError, export_policy, save_policy
 from finssim.learning.recurrent import ACTIVATIONS
+from finssim.tasks import task_named
+from finssim.tasks.agents import agent_for
+from finssim.vehicles import load_vehicle
 
 
 def description(n: int = 16, m: int = 6) -> PolicyDescription:
@@ -167,3 +173,70 @@ def test_an_interrupted_export_leaves_the_earlier_policy(tmp_path, monkeypatch):
         export_policy(perceptron(nn.ReLU), folder, description())
     assert (folder / "policy.onnx").read_bytes() == before
     assert list(tmp_path.iterdir()) == [folder]
+
+
+def learned_elsewhere(library, worlds):
+    """A model of that library, as it begins, and what it does with observations (N, n)."""
+    n, m = worlds.observation_size, worlds.action_size
+    if library == "torch":
+        model = nn.Sequential(nn.Linear(n, 8), nn.Tanh(), nn.Linear(8, m))
+        return model, lambda x: model(torch.from_numpy(x)).detach().numpy()
+    if library == "rsl-rl":
+        pytest.importorskip("rsl_rl")
+        from rsl_rl.models import MLPModel
+        from tensordict import TensorDict
+
+        distribution = {"class_name": "GaussianDistribution", "init_std": 0.4, "std_type": "log"}
+        seen = TensorDict({"policy": torch.zeros(1, n)}, batch_size=[1])
+        actor = MLPModel(
+            seen, {"actor": ["policy"]}, "actor", m, [8, 8], "elu", distribution_cfg=distribution
+        )
+        runner = SimpleNamespace(alg=SimpleNamespace(actor=actor))
+        rows = lambda x: TensorDict({"policy": torch.from_numpy(x)}, batch_size=[len(x)])  # noqa: E731
+        return runner, lambda x: actor(rows(x)).detach().numpy()
+    import stable_baselines3
+
+    from finssim.learning.sb3 import Sb3VecEnv
+
+    options = {"buffer_size": 100} if library == "SAC" else {"n_steps": 8, "batch_size": 16}
+    model = getattr(stable_baselines3, library)(
+        "MlpPolicy", Sb3VecEnv(worlds), seed=1, device="cpu", **options
+    )
+    return model, lambda x: model.predict(x, deterministic=True)[0]
+
+
+@pytest.mark.parametrize("library", ["torch", "PPO", "SAC", "rsl-rl"])
+def test_what_is_learned_elsewhere_runs_everywhere(library, tmp_path):
+    """Written with its environment's task, vehicle, limits and scale; the robot's agent does what the model does."""
+    worlds = finssim.make("t1", worlds=2, vehicle="bluerov2_heavy", wrench_scale=0.5, seed=3)
+    model, act = learned_elsewhere(library, worlds)
+    folder = save_policy(model, worlds, tmp_path / "policy", steps=12)
+    vehicle = load_vehicle("bluerov2_heavy")
+    agent = agent_for(folder, vehicle, worlds.task)
+    assert agent.action == "wrench6" and np.allclose(agent.wrench_scale, 0.5)
+    x = np.random.default_rng(2).normal(size=(4, 16)).astype(np.float32)
+    np.testing.assert_allclose(agent.policy.act(x), np.clip(act(x), -1.0, 1.0), rtol=0, atol=1e-5)
+    training = agent.policy.description.training
+    assert training["steps"] == 12 and training["task"]["time_limit"] == 20.0
+    with pytest.raises(PolicyError, match="trained for vehicle bluerov2_heavy"):
+        agent_for(folder, load_vehicle("finsrov"), task_named("t1"))
+
+
+def test_what_cannot_be_written_is_refused(tmp_path):
+    """A model that scales what it sees by itself, one of another size, and what is no model."""
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    from finssim.learning.sb3 import Sb3VecEnv
+
+    worlds = finssim.make("t1", worlds=2, seed=3)
+    scaled = PPO("MlpPolicy", VecNormalize(Sb3VecEnv(worlds)), n_steps=8, batch_size=16, device="cpu")
+    for model, message in (
+        (scaled, "VecNormalize scales what it sees: train without it"),
+        (nn.Linear(15, 6), "does not take observations of 16 elements"),
+        (nn.Linear(16, 4), r"maps \(2, 16\) to \(2, 4\)"),
+        (print, "expected a torch module"),
+    ):
+        with pytest.raises(ExportError, match=message):
+            save_policy(model, worlds, tmp_path / "policy")
+    assert not list(tmp_path.iterdir())

@@ -7,7 +7,16 @@ from torch import nn
 
 from finssim.learning.export import write_graph
 from finssim.learning.layers import Adam, Arrays, Gru, Parameters, Row, Stack
-from finssim.learning.network import Activation, Cell, Linear, Network, first_memory
+from finssim.learning.network import (
+    INTEGRAL_LIMIT,
+    INTEGRAL_RATE,
+    Activation,
+    Cell,
+    Linear,
+    Network,
+    first_memory,
+    with_integrals,
+)
 from finssim.learning.recurrent import RecurrentNetwork, plain_network
 
 LIBRARIES = pytest.mark.parametrize("device", [None, "cpu"], ids=["numpy", "torch"])
@@ -95,7 +104,7 @@ def test_adam_is_torchs(device):
     np.testing.assert_allclose(arrays.numpy(row.values), theirs.detach().numpy(), rtol=0, atol=1e-6)
 
 
-def network(rng, history, last_action, cell, scaled):
+def network(rng, history, last_action, cell, scaled, errors=()):
     """A network of 4 observations and 3 actions, with weights from a hat."""
 
     def linear(inputs, outputs):
@@ -111,24 +120,34 @@ def network(rng, history, last_action, cell, scaled):
         last_action=3 if last_action else 0,
         observation_size=4,
         cell=Cell(cell, linear(inputs, 5 * gates[cell]), linear(5, 5 * gates[cell])) if cell else None,
+        errors=errors,
     )
 
 
 @pytest.mark.parametrize("scaled", [False, True])
 @pytest.mark.parametrize("cell", [None, "gru", "lstm"])
 @pytest.mark.parametrize(
-    ("history", "last_action"), [(0, False), (1, False), (3, False), (0, True), (2, True)]
+    ("history", "last_action", "errors"),
+    [
+        (0, False, ()),
+        (1, False, ()),
+        (3, False, ()),
+        (0, True, ()),
+        (2, True, ()),
+        (0, False, (2,)),
+        (1, True, (3, 0)),
+    ],
 )
-def test_onnxruntime_computes_what_the_arrays_do(history, last_action, cell, scaled):
+def test_onnxruntime_computes_what_the_arrays_do(history, last_action, errors, cell, scaled):
     """Step by step, each with the memory of its own step before; and so does torch on the same arrays."""
     import onnxruntime
 
     rng = np.random.default_rng(5)
-    ours = network(rng, history, last_action, cell, scaled)
+    ours = network(rng, history, last_action, cell, scaled, errors)
     session = onnxruntime.InferenceSession(write_graph(ours, 4, 3), providers=["CPUExecutionProvider"])
     memories = [first_memory(ours, 2), first_memory(ours, 2)]
     for _ in range(5):
-        x = rng.normal(size=(2, 4)).astype(np.float32)
+        x = rng.normal(size=(2, 4), scale=0.05 if errors else 1.0).astype(np.float32)
         given = {"observation": x} | ({} if memories[1] is None else {"memory": memories[1]})
         action, memories[0] = ours.step(x, memories[0])
         answer = session.run(None, given)
@@ -136,6 +155,19 @@ def test_onnxruntime_computes_what_the_arrays_do(history, last_action, cell, sca
         memories[1] = answer[1] if len(answer) > 1 else None
         if memories[0] is not None:
             np.testing.assert_allclose(memories[1], memories[0], rtol=0, atol=5e-6)
+
+
+def test_integrals_grow_near_the_goal_up_to_a_limit():
+    """By rate · e · exp(-(e / reach)²) a step, and are seen on top of the error; a way to go adds nothing."""
+    observation = np.array([[0.02, 5.0, -0.04], [1.0, 5.0, 0.0]])
+    seen, z = with_integrals(np, observation, np.zeros((2, 2)), (0, 2))
+    expected = INTEGRAL_RATE * np.array([[0.02 * np.exp(-0.25), -0.04 * np.exp(-1.0)], [0.0, 0.0]])
+    np.testing.assert_allclose(z, expected, rtol=1e-12, atol=1e-30)
+    np.testing.assert_allclose(seen[:, [0, 2]] - observation[:, [0, 2]], z, rtol=0, atol=1e-15)
+    assert seen[:, 1].tolist() == [5.0, 5.0]
+    for _ in range(20_000):
+        _, z = with_integrals(np, observation, z, (0, 2))
+    np.testing.assert_array_equal(z[0], [INTEGRAL_LIMIT, -INTEGRAL_LIMIT])
 
 
 def test_a_history_is_of_the_last_observations_newest_first():

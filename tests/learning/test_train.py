@@ -61,7 +61,7 @@ def test_the_policy_loads_for_what_it_was_trained_with(trained):
         mode=action_mode("wrench6", vehicle).describe(),
         control_period=0.1,
     )
-    action = policy.act(np.zeros((3, 16)))
+    action = policy.step(policy.reset(3), np.zeros((3, 16)))[0]
     assert action.shape == (3, 6) and np.abs(action).max() <= 1.0
 
 
@@ -350,7 +350,7 @@ def test_trajectory_tracking_is_trained_too(tmp_path):
     policy = Policy.load(
         folder, task={"name": "t2", "observation": TrajectoryTracking().schema.model_dump(mode="json")}
     )
-    assert policy.act(np.zeros((2, 30))).shape == (2, 6)
+    assert policy.step(policy.reset(2), np.zeros((2, 30)))[0].shape == (2, 6)
     training = yaml.safe_load((folder / "policy.yaml").read_text(encoding="utf-8"))["training"]
     assert training["discount"] == 0.9 and training["learner"] == "ppo"
     assert training["task"]["training_noise"]["position_std"] == 0.01

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from finssim.geometry.optics import Lens
+from finssim.localization import LocalizationError
 from finssim.localization.camera_file import load_camera, write_camera
-from finssim.localization.errors import LocalizationError
 
 NUMBERS = {"width": 640, "height": 480, "fx": 535.9, "fy": 536.2, "cx": 342.3, "cy": 235.6}
 FIVE = (-0.266, -0.0386, 0.00178, -0.00028, 0.238)

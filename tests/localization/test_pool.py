@@ -7,7 +7,7 @@ import pytest
 
 from finssim.geometry.optics import Camera, Interface, Layer, Lens
 from finssim.geometry.rotations import quat_from_rotvec
-from finssim.localization.errors import LocalizationError
+from finssim.localization import LocalizationError
 from finssim.localization.pool import Pool, load_pool, write_pool
 
 LENS = Lens(

@@ -15,7 +15,7 @@ from finssim.geometry.rotations import (
     quat_rotate,
     quat_to_matrix,
 )
-from finssim.localization.detection.tags import tag_corners_b
+from finssim.localization.detection.families import tag_corners_b
 from finssim.localization.pool import Pool
 from finssim.robot.messages import Picture, TagCorners, Telemetry
 from finssim.vehicles import load_vehicle

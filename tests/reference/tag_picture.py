@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from finssim.localization.detection.families import bitmap, family_named
-from finssim.localization.detection.tags import corners
+from finssim.localization.detection.families import bitmap, corners, family_named
 
 WHITE, BLACK = 210.0, 40.0
 

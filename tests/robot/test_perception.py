@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
-from finssim.localization.errors import LocalizationError
+from finssim.localization import LocalizationError
 from finssim.robot.messages import POSE, NavigationAid, Picture, TagCorners
 from finssim.robot.perception import Perception
 from finssim.vehicles import load_vehicle

@@ -13,7 +13,6 @@ from finssim.control.guidance import Station, goal_at
 from finssim.control.modes import Wrench4, Wrench6
 from finssim.control.pid import controller
 from finssim.control.policy import PolicyError
-from finssim.control.trim import Trim
 from finssim.experiments.pool_trial import NoisyInput
 from finssim.geometry.rotations import quat_from_euler
 from finssim.robot.goals import GoalError, check_reachable, guide_of, station_of
@@ -265,19 +264,6 @@ def test_a_goal_outside_the_workspace_is_refused():
     for place in ("0,0,0.2,0", "2.5,0,-0.5,0"):
         with pytest.raises(GoalError, match="outside the workspace"):
             check_reachable(station_of(place), VEHICLE)
-
-
-def test_a_trim_moves_what_a_policy_sees_until_it_is_reset(policy):
-    """The first decision sees one period of it, later ones more; a policy without one decides the same again."""
-    near = Station((0.25, 0.05, -0.38), 0.2)
-    plain, trimmed = make_pilot(policy(), VEHICLE), make_pilot(policy(), VEHICLE, trim=Trim(rate=1.0))
-    alone = plain.act(READING, near, 0.0)
-    first, second = (trimmed.act(READING, near, 0.1 * k) for k in range(2))
-    assert np.abs(first - alone).max() > 1e-4
-    np.testing.assert_allclose(second - alone, 2.0 * (first - alone), atol=1e-4)  # a linear network
-    assert trimmed.describe()["trim"]["rate"] == 1.0 and plain.describe()["trim"] is None
-    trimmed.reset()
-    np.testing.assert_array_equal(trimmed.act(READING, near, 0.0), first)
 
 
 def test_the_published_pid_has_a_profile_for_each_task():

@@ -222,7 +222,6 @@ def test_no_record_is_left_of_a_run_that_could_not_be_connected(capsys, tmp_path
         ),
         (("--policy", "pid", "--goal", "0,0,-0.5,0", "--lockstep", "--pictures", "none"), "leave --bind"),
         (("--policy", "pid", "--goal", "0,0,-0.5,0", "--task", "t9"), "unknown task 't9'"),
-        (("--policy", "pid", "--goal", "0,0,-0.5,0", "--trim"), "leave --trim out"),
     ],
 )
 def test_what_cannot_be_run_is_refused_in_a_sentence(capsys, pool_file, words, sentence):

@@ -49,7 +49,7 @@ def told(graph, tmp_path, **choices):
         ("sim", {}, "**", {"vehicle": "finsrov", "use_sim_time": True}),
         ("sim", {"start": "0,0,-1,0"}, "sim", {"use_sim_time": False, "start": "0,0,-1,0", "seed": 0}),
         ("sim", {"hydrodynamics": "mesh", "seed": 4}, "sim", {"hydrodynamics": "mesh", "seed": 4}),
-        ("sim", {"policy": "pid-paper", "trim": True}, "controller", {"policy": "pid-paper", "trim": True}),
+        ("sim", {"policy": "pid-paper"}, "controller", {"policy": "pid-paper"}),
         ("sim", {"goal": "0,0,-0.5,0"}, "controller", {"goal": "0,0,-0.5,0"}),
         ("sim", {"trajectory": "helix", "task": "t2"}, "controller", {"trajectory": "helix", "task": "t2"}),
         ("pool", {}, "virtual_pool", {"plant": "1", "severity": "realistic", "camera": "pictures"}),

@@ -9,7 +9,7 @@ import warp as wp
 import finssim
 from finssim.engine.randomize import Randomization
 from finssim.engine.ranges_file import Ranges
-from finssim.localization.fusion import position_filter, yaw_filter
+from finssim.localization.fusion import attitude, position_filter
 from finssim.tasks import Environment, EnvironmentSetupError, MeasurementNoise, StationKeeping
 from finssim.tasks.check import check_task
 from finssim.tasks.sensing import Sensing, grown, rate_known, value_gain, value_known
@@ -66,7 +66,7 @@ def yaw_between(q, p):
 
 
 def test_doubts_grow_and_shrink_as_in_the_filters_of_the_robot():
-    """Position and velocity of `position_filter`, yaw and bias of `yaw_filter` (whose bias has the other sign)."""
+    """Position and velocity of `position_filter`, yaw and bias of `attitude` (whose bias has the other sign)."""
     P, q, dt, R = np.array([0.03, 0.01, 0.2]), 0.05, 0.1, 0.004
     square = np.zeros((6, 6))
     square[:3, :3], square[3:, 3:] = np.eye(3) * P[0], np.eye(3) * P[2]
@@ -80,10 +80,10 @@ def test_doubts_grow_and_shrink_as_in_the_filters_of_the_robot():
         found = position_filter.innovation(there, H, np.ones(1), noise)
         after = position_filter.correct(there, found, H, noise)
         np.testing.assert_allclose(known(wp.vec3(*P), R), after.P[[0, 0, 3], [0, 3, 3]], rtol=1e-4)
-    yaw = yaw_filter.YawState(0.0, 0.0, P[0], -P[1], P[2])
-    after = yaw_filter.correct(yaw, yaw_filter.innovation(yaw, 1.0, R), R)
+    yaw = attitude.YawState(0.0, 0.0, P[0], -P[1], P[2])
+    after = attitude.correct(yaw, attitude.innovation(yaw, 1.0, R), R)
     np.testing.assert_allclose(value_gain(wp.vec3(*P), R), [after.yaw, -after.bias], rtol=1e-5)
-    after = yaw_filter.predict(yaw, 0.0, dt, yaw_filter.YawNoise(rate=0.0, bias_walk=math.sqrt(q)))
+    after = attitude.predict(yaw, 0.0, dt, attitude.YawNoise(rate=0.0, bias_walk=math.sqrt(q)))
     expected = [after.variance, -after.cross, after.bias_variance]
     np.testing.assert_allclose(grown(wp.vec3(*P), q, dt), expected, rtol=1e-5)
 

@@ -200,3 +200,15 @@ def test_a_reward_can_be_changed_without_touching_the_shared_one():
     """A variant is a new task."""
     variant = replace(TASK, reward=Reward(loss=99.0))
     assert TASK.reward.loss != 99.0 and variant.reward.loss == 99.0
+
+
+def test_errors_are_zero_where_the_task_wants_the_vehicle():
+    """At the goal; at a turned and shifted pose they are the offset's parts and the sine of the heading."""
+    env = environment(worlds=2)
+    level = np.array([0.0, 0.0, 0.0, 1.0])
+    turned = Rotation.from_euler("z", [[0.0], [0.3]]).as_quat()
+    seen = env.start([[0.2, 0.1, -0.5], [0.0, 0.0, -0.5]], level, [0.2, 0.1, -0.5], turned)
+    assert TASK.errors == (0, 1, 2, 4)
+    errors = seen[:, TASK.errors]
+    np.testing.assert_allclose(errors[0], 0.0, atol=SINGLE)
+    np.testing.assert_allclose(errors[1], [0.2 / 3.0, 0.1 / 3.0, 0.0, math.sin(0.3)], atol=SINGLE)

@@ -72,7 +72,9 @@ def write_body(
     )
     steiner = wp.dot(r_g, r_g) * wp.identity(3, dtype=float) - wp.outer(r_g, r_g)
     plant[w, v].mass = mass
-    plant[w, v].volume = x[w, v, wp.static(COLUMN["volume"])] * n.plant[0, v].volume
+    plant[w, v].volume = (
+        x[w, v, wp.static(COLUMN["volume"])] * x[w, v, wp.static(COLUMN["buoyancy"])] * n.plant[0, v].volume
+    )
     plant[w, v].r_g = r_g
     plant[w, v].r_b = n.plant[0, v].r_b + offset(x, w, v, wp.static(COLUMN["center_of_buoyancy.x"]))
     plant[w, v].inertia = x[w, v, wp.static(COLUMN["inertia"])] * I_n + mass * steiner

@@ -43,14 +43,13 @@ class Entry:
     """Of its random numbers, by which no other entry changes them."""
 
 
-def _table() -> Iterator[Entry | None]:
+def _table() -> Iterator[Entry]:
     yield from (Entry("mass"), Entry("volume"), Entry("inertia"))
     for center in ("center_of_gravity", "center_of_buoyancy"):
         yield from (Entry(f"{center}.{axis}", "m", 0.0) for axis in "xyz")
     for family in ("added_mass", "linear_damping", "quadratic_damping"):
         yield from (Entry(f"{family}.{axis}") for axis in ("all", *AXES))
-    yield None  # its stream was another entry's
-    yield from (Entry("mesh_drag"), Entry("thrust.all"))
+    yield from (Entry("buoyancy"), Entry("mesh_drag"), Entry("thrust.all"))
     for kind in ("thrust.each", "thrust.failure"):
         yield from (Entry(f"{kind}.{k}") for k in range(MAX_THRUSTERS))
     yield Entry("time_constant.all")
@@ -85,7 +84,7 @@ def _sensor_unit(name: str) -> str:
     )
 
 
-ENTRIES = [replace(entry, stream=i) for i, entry in enumerate(_table()) if entry is not None]
+ENTRIES = [replace(entry, stream=i) for i, entry in enumerate(_table())]
 """All entries; those of a vehicle's terms join them when ranges first name the term."""
 INDEX = {entry.name: i for i, entry in enumerate(ENTRIES)}
 WORLD = next(i for i, entry in enumerate(ENTRIES) if entry.world)
@@ -139,7 +138,7 @@ def drawn_entries(ranges: Ranges, thrusters: int = MAX_THRUSTERS) -> dict[str, D
 
 def _given(ranges: Ranges, thrusters: int) -> Iterator[tuple[str, Drawn | None]]:
     yield from ranges.terms.items()
-    for name in ("mass", "inertia", "mesh_drag", "added_time_constant", "delay", "added_delay",
+    for name in ("mass", "buoyancy", "inertia", "mesh_drag", "added_time_constant", "delay", "added_delay",
                  "command_jitter", "slew", "dead_zone", "added_dead_zone", "current", "vertical_current"):  # fmt: skip
         yield name, getattr(ranges, name)
     yield "volume", None if ranges.volume == "with_mass" else ranges.volume

@@ -15,7 +15,6 @@ from rich.console import Console
 
 from finssim.control.guidance import Guide
 from finssim.control.trajectories import load_trajectory
-from finssim.control.trim import Trim
 from finssim.experiments.campaign import progress_bar, write_json
 from finssim.experiments.figures import (
     COLORS,
@@ -48,7 +47,7 @@ from finssim.files import atomic_directory, plain_name
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.tasks import task_named
-from finssim.tasks.agents import PolicyAgent, agent_for
+from finssim.tasks.agents import agent_for
 from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = [
@@ -305,7 +304,6 @@ def evaluate(
     observe: str | None = None,
     trajectories: Annotated[Sequence[str | Path], "--trajectory"] = (),
     trials: Annotated[int | None, (1, 100_000)] = None,
-    trim: bool = False,
     truth: Path | None = None,
     seed: int = 42,
     out: Path | None = None,
@@ -336,7 +334,6 @@ def evaluate(
         trajectories (FILE|NAME): What t2 follows: straight, broken, ellipse, lemniscate (all four if not given),
             circle, figure_eight, helix, or a YAML or CSV file. May be given several times.
         trials: Trials in each plant; if not given, t1's eight setpoints for 60 s, or each trajectory, once.
-        trim: Put the integral of the position error in front of a policy.
         truth (TABLE): By which records are measured, in place of the robot's own estimate: a table (.csv, .parquet) of
             motion capture, t [s], x, y, z [m] and qx, qy, qz, qw or yaw [rad], or the truth file of finssim pool.
         seed: Seed of every random number; equal seeds give equal results.
@@ -356,7 +353,7 @@ def evaluate(
         raise EvaluationError(
             "one controller at a time, or records of one: give a single name, or .mcap files"
         )
-    simulated = {"--observe": observe, "--trials": trials, "--trim": trim or None}
+    simulated = {"--observe": observe, "--trials": trials}
     unheeded = [name for name, value in simulated.items() if value is not None]
     unheeded += ["--plant"] if tuple(plant) != ("nominal",) and plant != "nominal" else []
     if records and unheeded:
@@ -379,7 +376,6 @@ def evaluate(
                     record=place,
                     hydrodynamics=hydrodynamics,
                     trials=trials,
-                    trim=trim,
                     seed=seed,
                 )
             )
@@ -438,7 +434,6 @@ def evaluate_controller(
     hydrodynamics: str = "calibrated",
     trajectories: Sequence[str | Path] = (),
     trials: int | None = None,
-    trim: bool = False,
     seed: int = 42,
     record: Path | None = None,
 ) -> Evaluation:
@@ -447,7 +442,6 @@ def evaluate_controller(
     Args:
         hydrodynamics: Model, unless the plant names one.
         trials: How many; the eight setpoints, or the four trajectories, once if None.
-        trim: Put the integral of the position error (`control.trim`) in front of a policy.
         seed: Of what the plant draws.
         record: New folder for every state, command and thrust; none if None.
     """
@@ -461,9 +455,7 @@ def evaluate_controller(
     body = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
     the_task = task_named(task)
     guides = {"guides": [load_trajectory(x, vehicle=body) for x in trajectories]} if trajectories else {}
-    agent = agent_for(controller, body, the_task, Trim() if trim else None)
-    if trim and not isinstance(agent, PolicyAgent):
-        raise EvaluationError(f"'{controller}' has an integral of its own: trim a policy, or leave it out")
+    agent = agent_for(controller, body, the_task)
     with progress_bar(f"{trials} trials") as show:
         done = form.run(
             agent,

@@ -29,8 +29,7 @@ from finssim.geometry.optics import Camera, Interface, Lens, Projection, Status,
 from finssim.geometry.rotations import matrix_to_quat, quat_from_euler, quat_to_matrix
 from finssim.localization.camera_file import write_camera
 from finssim.localization.detection.detections import Detection, Frame, write_detections
-from finssim.localization.detection.families import bitmap
-from finssim.localization.detection.tags import corners, tag_corners_b
+from finssim.localization.detection.families import bitmap, corners, tag_corners_b
 from finssim.localization.pool import Pool, write_pool
 from finssim.localization.poses.methods import METHODS, Constraints
 from finssim.provenance import provenance
@@ -373,7 +372,7 @@ def calibrate(campaign: Campaign, seen: Sequence[Picture]) -> Calibrated:
     )
     fit = calibrate_pool(_observed(frames, rows), campaign.lens, settings)
     level = Interface.water(campaign.water_read, n_air=1.0, n_water=1.0)
-    straight = fit.pinhole.model.shifted(fit.seen.points.mean(axis=0))  # it was fitted about their middle
+    straight = fit.pinhole.model
     return Calibrated(
         Pool(fit.model.camera, fit.model.interface, record=pool_record(fit, {})),
         Pool(straight.camera, level),

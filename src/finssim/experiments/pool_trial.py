@@ -21,7 +21,6 @@ from finssim.control.guidance import Guide, Measured, Station, Track
 from finssim.control.pid import CONTROLLERS
 from finssim.control.policy import DESCRIPTION_FILE, NETWORK_FILE
 from finssim.control.trajectories import load_trajectory
-from finssim.control.trim import Trim
 from finssim.experiments import campaign
 from finssim.experiments.evaluate import Evaluation
 from finssim.experiments.metrics import T1_SETPOINTS, T1_START, in_room, summarize
@@ -173,8 +172,6 @@ class Job(campaign.Job):
     """pictures (drawn and searched for tags) or corners (of the tags, with noise)."""
     fusion: bool = True
     """Whether the controller sees the fused state, or what each sensor said last."""
-    trim: bool = False
-    """Whether an integral stands in front of the policy."""
     position_noise: float = 0.0
     """Added to what the controller sees, per axis [m]."""
     yaw_noise: float = 0.0
@@ -191,14 +188,20 @@ class Job(campaign.Job):
         """Everything that decides the result, with the contents of files in place of their names."""
         fields = asdict(self)
         fields.pop("row")
-        if self.controller not in CONTROLLERS:
-            fields["controller"] = {
-                name: hashlib.sha256((Path(self.controller) / name).read_bytes()).hexdigest()
-                for name in (DESCRIPTION_FILE, NETWORK_FILE)
-            }
+        fields["controller"] = files_of(self.controller)
         for name in ("vehicle", "pool_vehicle"):
             fields[name] = load_vehicle(fields[name]).sha256
         return fields
+
+
+def files_of(controller: str) -> Any:
+    """The SHA-256 of a policy's files by name; of a PID its name."""
+    if controller in CONTROLLERS:
+        return controller
+    return {
+        name: hashlib.sha256((Path(controller) / name).read_bytes()).hexdigest()
+        for name in (DESCRIPTION_FILE, NETWORK_FILE)
+    }
 
 
 def noise_seed(*words: Any) -> int:
@@ -293,7 +296,7 @@ def job_trial(job: Job, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotTrial,
         reference = guide.at(0.0)
         first = [*reference.position.tolist(), float(reference.yaw)]
     duration = guide.duration if math.isfinite(guide.duration) else job.duration
-    pilot: Pilot = make_pilot(job.controller, vehicle, task=job.task, trim=Trim() if job.trim else None)
+    pilot: Pilot = make_pilot(job.controller, vehicle, task=job.task)
     if job.position_noise or job.yaw_noise:
         pilot = NoisyInput(pilot, position_std=job.position_noise, yaw_std=job.yaw_noise, seed=seed)
     trial = RobotTrial(

@@ -75,7 +75,9 @@ def rows_of(ranges: Ranges, vehicle: Vehicle, hydrodynamics: str = "calibrated")
 
     rows = [
         *scaled("mass", p["mass"], "kg", "mass"),
-        *scaled("volume", p["volume"], "m³", "mass" if ranges.volume == "with_mass" else "volume"),
+        *scaled(
+            "volume", p["volume"], "m³", "mass" if ranges.volume == "with_mass" else "volume", "buoyancy"
+        ),
     ]
     for i, axis in enumerate(AXES[3:]):
         rows += scaled(f"inertia.{axis}", vehicle.body.inertia[i][i], "kg m²", "inertia")

@@ -33,7 +33,17 @@ from finssim.learning.train import train
 from finssim.provenance import provenance
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["MEASURES", "T1", "T2", "print_transfer", "t1", "t2", "transfer_experiment"]
+__all__ = [
+    "MEASURES",
+    "T1",
+    "T1_ROWS",
+    "T2",
+    "policies_of",
+    "print_transfer",
+    "t1",
+    "t2",
+    "transfer_experiment",
+]
 
 Results = Mapping[str, Sequence[Mapping[str, Any]]]
 """Row -> results of its trials."""
@@ -43,6 +53,10 @@ TRAINING_SHARE = 0.4
 INTERVALS = "intervals"
 """Stands for the ranges that the calibration's intervals give."""
 RANGES_FILE = "ranges.yaml"
+FEWEST_UNITS = 3
+"""Plants and seeds on which a sentence about a difference rests at least; below it there are numbers alone."""
+FORGETFUL = {"integral": False, "history": 0, "last_action": False}
+"""Settings of the learner, for policies as the paper's."""
 
 MEASURES = {
     "success_rate": ("the share of setpoints held", "held [points]", 100.0, "percentage points", ".0f"),
@@ -64,6 +78,8 @@ class Training:
     hydrodynamics: str = "calibrated"
     randomize: str | None = None
     """Name or file of ranges."""
+    remembers: bool = False
+    """Whether the policy has integrals of its errors and sees what it saw and did before; those of the paper do not."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +195,7 @@ def transfer_experiment(
         raise ValueError(f"plants is {plants}, seeds {seeds}: expected at least 1 of each")
     chosen = {name: spec.rows[name] for name in rows}
     places, run_seeds, folder = range(seed, seed + plants), range(seed, seed + seeds), Path(out)
-    policies = _policies(
+    policies = policies_of(
         chosen, run_seeds, folder, vehicle, steps, lambda part, what: say(TRAINING_SHARE * part, what)
     )
     if robot is not None:  # there is one plant, and nobody chose its severity
@@ -206,14 +222,14 @@ def transfer_experiment(
         "experiment": spec.name, "severity": severity, "camera": camera, "plants": list(places),
         "seeds": list(run_seeds), "targets": targets, "robot": robot and robot.title,
         "vehicle": {"name": body.name, "sha256": body.sha256},
-        **_scores(spec, by_row), "trials": results, "provenance": provenance(),
+        **scores(spec, by_row), "trials": results, "provenance": provenance(),
     }  # fmt: skip
     write_json(folder / f"{spec.name}.json", result, markdown_of(spec.shown(result)))
     spec.draw(by_row, folder)
     return result
 
 
-def _policies(
+def policies_of(
     rows: Mapping[str, Row],
     seeds: Sequence[int],
     folder: Path,
@@ -221,6 +237,7 @@ def _policies(
     steps: int | None,
     say: Say,
 ) -> dict[tuple[str, int], Path]:
+    """The policies of rows by training and seed, in `policies` of the folder; arguments as of `trained`."""
     trainings = list(dict.fromkeys(row.training for row in rows.values() if row.training))
     if any(training.randomize == INTERVALS for training in trainings):
         say(0.0, "identifying the vehicle, for the ranges of its intervals")
@@ -268,7 +285,8 @@ def trained(
         if not finished(place):
             train(
                 training.task, out=place, vehicle=vehicle, hydrodynamics=training.hydrodynamics,
-                randomize=training.randomize, seed=seed, steps=steps, console=Console(stderr=True, quiet=True),
+                randomize=training.randomize, seed=seed, steps=steps, settings={} if training.remembers else FORGETFUL,
+                console=Console(stderr=True, quiet=True),
             )  # fmt: skip
     return policies
 
@@ -286,7 +304,7 @@ def finished(place: Path, vehicle: Vehicle | None = None) -> bool:
         return False
 
 
-def _scores(spec: Spec, by_row: Results) -> dict[str, Any]:
+def scores(spec: Spec, by_row: Results) -> dict[str, Any]:
     """Figures of every row, all targets together and each alone; differences from the reference; sentences."""
     rows = {}
     for name, results in by_row.items():
@@ -308,8 +326,17 @@ def _scores(spec: Spec, by_row: Results) -> dict[str, Any]:
             name: {key: d and d.as_json() for key, d in of_row.items()}
             for name, of_row in differences.items()
         },
-        "sentences": [sentence(spec.rows[name].module, of_row) for name, of_row in differences.items()],
+        "sentences": [
+            sentence(spec.rows[name].module, of_row)
+            for name, of_row in differences.items()
+            if _units(by_row[name]) >= FEWEST_UNITS
+        ],
     }
+
+
+def _units(results: Sequence[Mapping[str, Any]]) -> int:
+    """How many pairs of plant and seed results rest on."""
+    return len({(r["job"]["plant"], r["job"]["seed"]) for r in results})
 
 
 def row_figures(results: Sequence[Mapping[str, Any]], figures: Mapping[str, Statistic]) -> dict[str, Any]:
@@ -399,8 +426,8 @@ def _listed(items: list[str]) -> str:
 
 DR = "hold_for_position"
 """The published ranges of station keeping."""
-TRIM = "An integral in front of the policy"
-POOL = "Randomisation made for a pool"
+INTEGRAL = "An integral of the errors"
+POOL = "Randomisation made for a pool, with an integral of the errors,"
 
 CALIBRATED = Training("calibrated")
 CALIBRATED_DR = Training("calibrated-dr", "t2", randomize=DR)
@@ -449,12 +476,16 @@ T1_ROWS: dict[str, Row] = {
     "pid": Row("PID, tuned from the model", None, None, "The tuned PID", "pid"),
     "calibrated-intervals": Row(
         "Calibrated + ranges of its intervals",
-        Training("calibrated-intervals", randomize=INTERVALS),
-        module="Randomisation within the calibration's intervals",
+        Training("calibrated-intervals", randomize=INTERVALS, remembers=True),
+        module="Randomisation within the calibration's intervals, with an integral of the errors,",
     ),
-    "calibrated-trim": Row("Calibrated, with trim", CALIBRATED, module=TRIM, changes={"trim": True}),
+    "calibrated-integral": Row(
+        "Calibrated, integrating", Training("calibrated-integral", remembers=True), module=INTEGRAL
+    ),
     "calibrated-pool": Row(
-        "Calibrated + pool ranges", Training("calibrated-pool", randomize="pool"), module=POOL
+        "Pool ranges, integrating",
+        Training("calibrated-pool", randomize="pool", remembers=True),
+        module=POOL,
     ),
 }
 """The paper's ten rows of station keeping in the order of its table, and ours beyond them."""
@@ -472,11 +503,15 @@ T2_ROWS: dict[str, Row] = {
     ),
     "pid": Row("PID, tuned from the model", None, None, "The tuned PID", "pid"),
     "pid-paper": Row("PID, published gains", None, "PID", "The published PID", "pid-paper"),
-    "calibrated-dr-trim": Row(
-        "Calibrated + DR, with trim", CALIBRATED_DR, module=TRIM, changes={"trim": True}
+    "calibrated-dr-integral": Row(
+        "Calibrated + DR, integrating",
+        Training("calibrated-dr-integral", "t2", randomize=DR, remembers=True),
+        module=INTEGRAL,
     ),
     "calibrated-pool": Row(
-        "Calibrated + pool ranges", Training("calibrated-pool", "t2", randomize="pool"), module=POOL
+        "Pool ranges, integrating",
+        Training("calibrated-pool", "t2", randomize="pool", remembers=True),
+        module=POOL,
     ),
 }
 """The paper's three rows of tracking, and ours beyond them."""

@@ -18,15 +18,36 @@ import yaml
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from finssim.control.policy import DESCRIPTION_FILE, NETWORK_FILE, Policy, PolicyDescription
+from finssim.control.modes import action_mode
+from finssim.control.policy import DESCRIPTION_FILE, NETWORK_FILE, Policy, PolicyDescription, VehicleIdentity
 from finssim.files import atomic_directory
-from finssim.learning.network import Activation, Cell, Linear, Network, asked, first_memory
+from finssim.learning.network import (
+    INTEGRAL_LIMIT,
+    INTEGRAL_RATE,
+    INTEGRAL_REACH,
+    Activation,
+    Cell,
+    Linear,
+    Network,
+    asked,
+    first_memory,
+)
 from finssim.provenance import provenance
+from finssim.tasks.environment import Environment
+from finssim.tasks.sensing import seen_with
 
 if TYPE_CHECKING:
     from torch import nn
 
-__all__ = ["CURVES_FILE", "EVALUATION_FILE", "ExportError", "export_policy", "write_graph"]
+__all__ = [
+    "CURVES_FILE",
+    "EVALUATION_FILE",
+    "ExportError",
+    "description_of",
+    "export_policy",
+    "save_policy",
+    "write_graph",
+]
 
 # Networks written out as ONNX, operator by operator: layers, with what they remember in front of them or none.
 #
@@ -47,32 +68,38 @@ def write_graph(network: Network, n: int, m: int) -> bytes:
     network = network.as_type(np.float32)
     graph, x = _Graph(), "observation"
     inputs, outputs = [("observation", n)], [("action", m)]
-    if network.mean is not None:
-        x = graph.node(
-            "Mul", [graph.node("Sub", [x, graph.weight(network.mean)]), graph.weight(network.scale)]
-        )
-    scaled, after, parts = x, [], {}
+    parts: dict[str, str] = {}
     if network.memory_size:
         inputs.append(("memory", network.memory_size))
         outputs.append(("memory_after", network.memory_size))
         sizes = {
+            "integral": len(network.errors),
             "past": max(network.history - 1, 0) * n,
             "oldest": n if network.history else 0,
             "last": network.last_action,
             "cell": network.cell.memory_size if network.cell else 0,
         }
         parts = graph.split("memory", {name: size for name, size in sizes.items() if size})
+    after, state = [], []
+    if network.errors:
+        x, integral = graph.integrals(network.errors, parts["integral"], n)
+        after = [integral]
+    if network.mean is not None:
+        x = graph.node(
+            "Mul", [graph.node("Sub", [x, graph.weight(network.mean)]), graph.weight(network.scale)]
+        )
+    scaled = x
     window = [parts[name] for name in ("past", "oldest", "last") if name in parts]
     y = graph.node("Concat", [x, *window], axis=1) if window else x
     if network.cell is not None:
-        y, state = graph.cell(network.cell, y, parts["cell"])
-        after = [state]
+        y, cell = graph.cell(network.cell, y, parts["cell"])
+        state = [cell]
     graph.stack(network.layers, y)
     if window:
         past = [scaled, *([parts["past"]] if "past" in parts else [])] if network.history else []
-        after = [*past, *(["action"] if network.last_action else []), *after]
-    if after:
-        graph.node("Concat", after, "memory_after", axis=1)
+        after += [*past, *(["action"] if network.last_action else [])]
+    if after + state:
+        graph.node("Concat", after + state, "memory_after", axis=1)
     return graph.file(inputs, outputs)
 
 
@@ -106,6 +133,19 @@ class _Graph:
         """y = x W + b."""
         bias = [] if layer.bias is None else [self.weight(layer.bias)]
         return self.node("Gemm", [x, self.weight(layer.weight), *bias])
+
+    def integrals(self, errors: Sequence[int], before: str, n: int) -> tuple[str, str]:
+        """The observation as the policy sees it and the integrals after, as of `with_integrals`."""
+        rate, steepness, low, high = (
+            self.weight(np.full((), value, np.float32))
+            for value in (INTEGRAL_RATE, -1.0 / INTEGRAL_REACH**2, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)
+        )
+        e = self.node("Gather", ["observation", self.weight(np.array(errors, np.int64))], axis=1)
+        near = self.node("Exp", [self.node("Mul", [steepness, self.node("Mul", [e, e])])])
+        gain = self.node("Mul", [rate, self.node("Mul", [e, near])])
+        z = self.node("Clip", [self.node("Add", [before, gain]), low, high])
+        where = np.eye(n, dtype=np.float32)[list(errors)]
+        return self.node("Add", ["observation", self.node("MatMul", [z, self.weight(where)])]), z
 
     def cell(self, cell: Cell, x: str, memory: str) -> tuple[str, str]:
         """One step of an LSTM or a GRU, as `Cell.step` has it: its outputs and its memory after."""
@@ -226,6 +266,90 @@ def export_policy(
             also(folder)
         _check_agreement(network, Policy.load(folder), tolerance)
     return Path(directory)
+
+
+def description_of(environment: Environment, **training: Any) -> PolicyDescription:
+    """What a policy directory says of the environment that its policy was trained in.
+
+    Args:
+        environment: Its task, vehicle, action mode and scale, model and ranges.
+        training: More of how it was trained, as plain data.
+    """
+    task, vehicle, ranges = environment.task, environment.nominal[0], environment.randomization
+    wrench = environment.action_mode.startswith("wrench")
+    scale = environment.wrench_scale.tolist() if wrench else 1.0
+    return PolicyDescription(
+        task=task.name,
+        observation=task.schema,
+        action=action_mode(environment.action_mode, vehicle, scale).describe(),
+        control_period=task.control_step,
+        vehicle=VehicleIdentity(name=vehicle.name, sha256=vehicle.sha256),
+        hydrodynamics=environment.simulator.hydrodynamics,
+        seed=environment.seed,
+        training={
+            **training,
+            "randomization": ranges.ranges.model_dump(mode="json") if ranges else None,
+            "observe": {**training.get("observe", {}), **seen_with(environment.noise, vehicle)},
+            "task": task.record(),
+            "agents": list(task.agents),
+        },
+    )
+
+
+def save_policy(model: Any, environment: Environment, directory: str | Path, **training: Any) -> Path:
+    """Write what another library has learnt, or a network of one's own, as a policy directory that runs everywhere.
+
+    Args:
+        model: Maps observations (N, n) to the mean action (N, m): a torch module, a `Network`, an algorithm of
+            Stable-Baselines3 (PPO, A2C, SAC) or a runner of RSL-RL.
+        environment: In which it was trained; of an adapter its `environment`.
+        directory: Folder to write; an earlier policy directory is replaced.
+        training: More of how it was trained, as plain data: learner, steps, ...
+
+    Returns:
+        The folder.
+
+    Raises:
+        ExportError: The model is of another kind, scales what it sees by itself, or does not fit the environment.
+        OutputError: The folder cannot be written.
+
+    Example:
+        save_policy(model, worlds.environment, "runs/mine", learner="sb3 by hand")
+    """
+    kind = f"{type(model).__module__}.{type(model).__qualname__}"
+    described = description_of(environment, **{"learner": kind, "complete": True, **training})
+    return export_policy(_mean_of(model, kind), directory, described)
+
+
+def _mean_of(model: Any, kind: str) -> nn.Module | Network:
+    """Observation to mean action, of what libraries call a model."""
+    if isinstance(model, Network):
+        return model
+    from torch import nn
+
+    if isinstance(model, nn.Module):
+        return model
+    if hasattr(model, "get_vec_normalize_env"):  # Stable-Baselines3
+        if model.get_vec_normalize_env() is not None:
+            raise ExportError(
+                f"{kind}: VecNormalize scales what it sees: train without it; the observations are of order one"
+            )
+        policy = model.policy
+        if hasattr(policy, "lstm_actor"):
+            raise ExportError(f"{kind}: has an LSTM: give RecurrentNetwork(lstm, layers) of its parts")
+        if hasattr(policy, "mlp_extractor"):
+            return nn.Sequential(policy.mlp_extractor.policy_net, policy.action_net)
+        if hasattr(policy, "actor") and hasattr(policy.actor, "latent_pi"):
+            return nn.Sequential(policy.actor.latent_pi, policy.actor.mu, nn.Tanh())
+    actor = getattr(getattr(model, "alg", None), "actor", None)  # RSL-RL
+    if isinstance(getattr(actor, "mlp", None), nn.Module):
+        if getattr(actor, "obs_normalization", False):
+            raise ExportError(f"{kind}: obs_normalization scales what it sees: train without it")
+        return nn.Sequential(*actor.mlp)
+    raise ExportError(
+        f"{kind}: expected a torch module, a Network, an algorithm of Stable-Baselines3 or a runner of RSL-RL: give "
+        "the module that maps observations to the mean action"
+    )
 
 
 def _onnx_bytes(network: nn.Module | Network, description: PolicyDescription) -> bytes:

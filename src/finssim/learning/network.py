@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
-__all__ = ["Activation", "Cell", "Linear", "Network", "advance_history", "asked", "first_memory"]
+__all__ = [
+    "Activation",
+    "Cell",
+    "Linear",
+    "Network",
+    "advance_history",
+    "asked",
+    "first_memory",
+    "with_integrals",
+]
 
 Array = Any
 """A NumPy array or a torch tensor."""
@@ -74,8 +84,9 @@ class Cell:
 class Network:
     """Observation to mean action: scaling, what is remembered, layers.
 
-    What it remembers is one row of numbers, zeros at an episode's start: the scaled observations of the last control
-    steps, newest first; the last action, limited to [-1, 1]; and the memory of its cell.
+    What it remembers is one row of numbers, zeros at an episode's start: integrals of the errors that it observes; the
+    scaled observations of the last control steps, newest first; the last action, limited to [-1, 1]; and the memory of
+    its cell.
     """
 
     layers: tuple[Linear | Activation, ...]
@@ -90,6 +101,8 @@ class Network:
     observation_size: int = 0
     """n; needed where there is a history."""
     cell: Cell | None = None
+    errors: tuple[int, ...] = ()
+    """Elements of the observation to which their integrals are added, see `with_integrals`."""
 
     @property
     def window_size(self) -> int:
@@ -99,7 +112,7 @@ class Network:
     @property
     def memory_size(self) -> int:
         """Numbers that it hands on from a control step to the next."""
-        return self.window_size + (self.cell.memory_size if self.cell else 0)
+        return len(self.errors) + self.window_size + (self.cell.memory_size if self.cell else 0)
 
     def step(self, observation: Array, memory: Array | None) -> tuple[Array, Array | None]:
         """Mean action (N, m), not limited, and the memory after.
@@ -108,18 +121,24 @@ class Network:
             observation: (N, n).
             memory: (N, `memory_size`); None where it remembers nothing.
         """
-        xp, k = _library(observation), self.window_size
-        x = observation if self.mean is None else (observation - self.mean) * self.scale
+        xp, i, k = _library(observation), len(self.errors), self.window_size
+        x, after = observation, []
+        if i:
+            x, integral = with_integrals(xp, observation, memory[:, :i], self.errors)
+            after, memory = [integral], memory[:, i:]
+        if self.mean is not None:
+            x = (x - self.mean) * self.scale
         y = x if not k else xp.concatenate([x, memory[:, :k]], 1)
-        after = []
+        state = []
         if self.cell is not None:
-            y, state = self.cell.step(y, memory[:, k:])
-            after = [state]
+            y, cell = self.cell.step(y, memory[:, k:])
+            state = [cell]
         for layer in self.layers:
             y = _linear(layer, y) if isinstance(layer, Linear) else _activate(xp, layer, y)
         if k:
             action = xp.clip(y, -1.0, 1.0) if self.last_action else None
-            after = [advance_history(xp, memory[:, :k], x, action, self.history), *after]
+            after.append(advance_history(xp, memory[:, :k], x, action, self.history))
+        after += state
         return y, (xp.concatenate(after, 1) if len(after) > 1 else after[0]) if after else None
 
     def as_type(self, kind: Any) -> Network:
@@ -150,6 +169,41 @@ def advance_history(xp: Any, window: Array, x: Array, action: Array | None, hist
     n = x.shape[1]
     past = [x, window[:, : (history - 1) * n]] if history else []
     return xp.concatenate([*past, *([] if action is None else [action])], 1)
+
+
+INTEGRAL_LIMIT = 0.1
+"""An integral changes what is observed by this at most, as the task scales it."""
+INTEGRAL_REACH = 0.04
+"""Errors far beyond this are hardly collected: a way to go is no disturbance."""
+INTEGRAL_RATE = 0.015
+"""Of the collected error in a control step: several seconds at ten a second, slow beside the policy's own answer."""
+
+
+def with_integrals(
+    xp: Any, observation: Array, integral: Array, errors: Sequence[int]
+) -> tuple[Array, Array]:
+    """An observation in which errors that last grow until the policy has done away with them.
+
+    For an error e and its integral z, in a control step:
+
+        z ← clip(z + rate · e · exp(-(e / reach)²), ±limit),    e ← e + z
+
+    Args:
+        xp: NumPy or torch.
+        observation: As the task defines it, (N, n).
+        integral: z before the step, (N, k).
+        errors: Which elements, k of them.
+
+    Returns:
+        The observation as the policy sees it, and z after the step.
+    """
+    index = list(errors)
+    e = observation[:, index]
+    z = integral + INTEGRAL_RATE * e * xp.exp(-((e / INTEGRAL_REACH) ** 2))
+    z = xp.clip(z, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)
+    seen = observation + 0.0
+    seen[:, index] = e + z
+    return seen, z
 
 
 def first_memory(network: Any, rows: int, device: str | None = None) -> Array | None:

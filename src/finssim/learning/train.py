@@ -11,13 +11,7 @@ from typing import Annotated, Any
 
 from rich.console import Console
 
-from finssim.control.modes import action_mode
-from finssim.control.policy import (
-    DESCRIPTION_FILE,
-    PolicyDescription,
-    VehicleIdentity,
-    plain_data,
-)
+from finssim.control.policy import DESCRIPTION_FILE, PolicyDescription, plain_data
 from finssim.engine.randomize import Randomization
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.learning.learners import learner_named
@@ -25,7 +19,6 @@ from finssim.quiet import start_warp
 from finssim.tasks import Environment, Task, make, task_named
 from finssim.tasks.environment import LevelPlan, climb
 from finssim.tasks.fitting import authority
-from finssim.tasks.sensing import seen_with
 from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["TrainingError", "settings_of_words", "train"]
@@ -118,9 +111,9 @@ def train(
     start_warp()
     mode_name = action or the_task.action
     scale = authority(chosen) if mode_name.startswith("wrench") else 1.0
-    mode = action_mode(mode_name, chosen, scale)
     side = Path(out).with_name(f"{Path(out).name}-training")
 
+    from finssim.learning.export import description_of
     from finssim.learning.held_evaluation import HELD_WORLDS, HeldEvaluation, held_seed
     from finssim.learning.layers import one_thread
     from finssim.learning.progress import TrainingView
@@ -146,26 +139,15 @@ def train(
         )
     if plan is not None:
         climb(environment, plan)
-    description = PolicyDescription(
-        task=the_task.name,
-        observation=the_task.schema,
-        action=mode.describe(),
-        control_period=the_task.control_step,
-        vehicle=VehicleIdentity(name=chosen.name, sha256=chosen.sha256),
-        hydrodynamics=hydrodynamics,
-        seed=seed,
-        training={
-            "learner": learner,
-            "algorithm": kind.what,
-            **asdict(values),
-            "device": device,
-            "randomization": randomization.ranges.model_dump(mode="json") if randomization else None,
-            "observe": {"name": observe, **seen_with(environment.noise, chosen)},
-            "task": the_task.record(),
-            "agents": list(the_task.agents),
-            "levels": asdict(plan) if plan else None,
-            "until": until,
-        },
+    description = description_of(
+        environment,
+        learner=learner,
+        algorithm=kind.what,
+        **asdict(values),
+        device=device,
+        observe={"name": observe},
+        levels=asdict(plan) if plan else None,
+        until=until,
     )
     began = time.perf_counter()
     with one_thread(), TrainingView(values.steps, console) as view, warnings.catch_warnings():

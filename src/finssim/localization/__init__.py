@@ -1,1 +1,7 @@
-"""Where the vehicle is: tags seen through the water, their pose, and its fusion with depth and inertia."""
+"""Where a vehicle is, by a camera above the pool: tags in pictures, poses through the water, and their fusion."""
+
+__all__ = ["LocalizationError"]
+
+
+class LocalizationError(ValueError):
+    """A camera, pool, detection or log that cannot be used; the message says what, where and what to do."""

@@ -16,9 +16,8 @@ import yaml
 from finssim.files import atomic_write
 from finssim.geometry.optics import Camera, Interface, Layer, OpticsError
 from finssim.geometry.rotations import quat_to_matrix
-from finssim.localization.camera_file import lens_from, lens_values, load_camera
-from finssim.localization.errors import LocalizationError
-from finssim.localization.fields import Fields
+from finssim.localization import LocalizationError
+from finssim.localization.camera_file import Fields, lens_from, lens_values, load_camera
 from finssim.yaml_file import read_mapping
 
 __all__ = ["Pool", "load_pool", "write_pool"]

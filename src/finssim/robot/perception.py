@@ -18,15 +18,13 @@ from finssim.geometry.rotations import (
     wrap_angle,
 )
 from finssim.localization.detection.detections import Detection, Frame
-from finssim.localization.detection.detector import detector
-from finssim.localization.detection.region import RegionTracker
+from finssim.localization.detection.detector import RegionTracker, detector
 from finssim.localization.fusion.attitude import height_above_origin
-from finssim.localization.fusion.estimator import Estimator
-from finssim.localization.fusion.fuse_detections import Fixes
+from finssim.localization.fusion.estimator import Estimator, Fixes, Health, health_of
 from finssim.localization.fusion.fuse_settings import Settings, settings_of, site_of
-from finssim.localization.fusion.health import Estimate, Health, health_of
 from finssim.localization.fusion.streams import (
     DepthSample,
+    Estimate,
     HeadingSample,
     ImuSample,
     Sample,
@@ -34,7 +32,8 @@ from finssim.localization.fusion.streams import (
     VisionSample,
 )
 from finssim.localization.pool import Pool
-from finssim.localization.poses.measurement import axes_of_up
+from finssim.localization.poses import axes_of_up
+from finssim.localization.poses.methods import TagLocator
 from finssim.robot.messages import (
     HEADING,
     POSE,
@@ -354,7 +353,6 @@ class Perception:
         mode: str = "constant-velocity",
         fusion: bool = True,
         settings: Settings | None = None,
-        library: str | None = None,
         let_in: Sequence[float] | None = None,
     ) -> None:
         """
@@ -365,19 +363,22 @@ class Perception:
             mode: Of the estimator: constant-velocity or error-state.
             fusion: False: no filter, for the ablation "without EKF" (`Unfused`).
             settings: Of the estimator; the vehicle file's noises if None.
-            library: That finds tags in pictures: apriltag or opencv; apriltag if None.
             let_in: x, y of where the vehicle begins, world frame [m]: the one fix that dead reckoning starts from.
                 None: something else tells where it is.
 
         Raises:
-            LocalizationError: Unknown method, mode or library; a vehicle without tags; a pool whose z is not up.
+            LocalizationError: Unknown method or mode; a vehicle without tags; a pool whose z is not up.
         """
         self.vehicle, self.pool = vehicle, pool
-        self.fixes = None if pool is None else Fixes(pool, vehicle, method=method, pixel_std=pool.pixel_std)
+        self.fixes = (
+            None
+            if pool is None
+            else Fixes(TagLocator(pool, vehicle.tags, method=method, pixel_std=pool.pixel_std))
+        )
         self.estimator = Estimator(settings or settings_of(vehicle), site_of(pool, vehicle), mode=mode)
         self.unfused = None if fusion else Unfused()
         self._aboard = Aboard(vehicle)
-        self._library, self._tracker = library, None if library is None else self._new_tracker(library)
+        self._tracker: RegionTracker | None = None
         self._frame = _WorldFrame(pool, self.estimator.site.up)
         self._omega, self._omega_time = (math.nan,) * 3, -math.inf
         self._rate = math.nan
@@ -518,13 +519,11 @@ class Perception:
         lens = self.pool.camera.lens
         if picture.image.dtype != np.uint8 or picture.image.shape != (lens.height, lens.width):
             return None
-        self._tracker = self._tracker or self._new_tracker(self._library)
+        if self._tracker is None:
+            tags = self.vehicle.tags
+            assert tags is not None  # the locator has refused such a vehicle
+            self._tracker = RegionTracker(detector(tags.family), set(tags.mounts))
         return self._tracker.detect(picture.image, time)
-
-    def _new_tracker(self, library: str | None) -> RegionTracker:
-        tags = self.vehicle.tags
-        assert tags is not None  # Fixes has refused such a vehicle
-        return RegionTracker(detector(tags.family, library=library), set(tags.mounts))
 
 
 class _WorldFrame:

@@ -21,8 +21,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from finssim.localization.detection.detector import detector
-from finssim.localization.detection.region import RegionTracker
+from finssim.localization.detection.detector import RegionTracker, detector
 from finssim.robot.link.frames import LinkError
 from finssim.robot.link.transports import host_port
 from finssim.robot.messages import Picture, TagCorners
@@ -558,7 +557,6 @@ class TagFinder:
         vehicle: Vehicle,
         *,
         size: tuple[int, int],
-        library: str | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Start looking.
@@ -567,14 +565,11 @@ class TagFinder:
             source: Where pictures come from; it belongs to the finder from now on.
             vehicle: Its tags are looked for.
             size: Rows and columns of the camera's pictures; others are passed on as they are, to be refused.
-            library: Detector: apriltag or opencv; apriltag if None.
             clock: The robot's [s].
         """
         assert vehicle.tags is not None
         self._source, self._size, self._clock = source, size, clock
-        self._tracker = RegionTracker(
-            detector(vehicle.tags.family, library=library), set(vehicle.tags.mounts)
-        )
+        self._tracker = RegionTracker(detector(vehicle.tags.family), set(vehicle.tags.mounts))
         self._found: deque[Picture] = deque(maxlen=WAITING)
         self._over = threading.Event()
         self.problem = ""

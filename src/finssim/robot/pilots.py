@@ -14,7 +14,6 @@ from finssim.control.guidance import Goal, Guide, Known, Measured, goal_at
 from finssim.control.modes import Wrench6, action_mode, mode_from_dict
 from finssim.control.pid import CONTROLLERS
 from finssim.control.policy import PolicyError, read_description
-from finssim.control.trim import Trim
 from finssim.vehicles import Vehicle
 
 if TYPE_CHECKING:
@@ -220,9 +219,8 @@ def make_pilot(
     task: str | None = None,
     agent: str | None = None,
     period: float | None = None,
-    trim: Trim | None = None,
 ) -> AgentPilot:
-    """A PID by its name, the policy of a directory, or a baseline of the task; only a policy takes a trim.
+    """A PID by its name, the policy of a directory, or a baseline of the task.
 
     Args:
         name_or_directory: Who.
@@ -231,7 +229,6 @@ def make_pilot(
             was trained for, and T1 of a PID.
         agent: Its place in a task of several; the first if None.
         period: Time between two decisions at which a policy would be asked [s]; None: its own.
-        trim: An integral in front of a policy, for a steady current or weight; none if None.
 
     Raises:
         PolicyError, ControlError: It does not fit the vehicle or the task, in one sentence.
@@ -255,7 +252,7 @@ def make_pilot(
     trained = read_description(Path(who))
     mode = mode_from_dict(trained.action, vehicle)
     seen = Observer(task or trained.task, vehicle, agent=agent, action=mode.name)
-    return AgentPilot(PolicyAgent(who, vehicle, seen.task, trim, period=period), vehicle, seen)
+    return AgentPilot(PolicyAgent(who, vehicle, seen.task, period=period), vehicle, seen)
 
 
 def _state(reading: Measured) -> tuple[Any, Any, Any]:

@@ -24,7 +24,6 @@ from finssim.control import ControlError
 from finssim.control.guidance import Station
 from finssim.control.pid import CONTROLLERS
 from finssim.control.policy import read_description
-from finssim.control.trim import Trim
 from finssim.geometry.rotations import quat_yaw, wrap_angle
 from finssim.localization.pool import load_pool
 from finssim.robot.goals import HeardGoal, check_reachable, guide_of, place_of
@@ -264,7 +263,6 @@ def run(
     messages: str = "",
     number: Annotated[int, (0, 1000)] = 0,
     vehicle: str = "finsrov",
-    trim: bool = False,
     let_in: str | None = None,
     mode: str | None = None,
     record: Path | None = None,
@@ -307,7 +305,6 @@ def run(
             the port five after --robot if not given.
         number: This vehicle's number among several under one camera: its tags' ids go on after those of the one before.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
-        trim: Put an integral in front of a policy, against a steady current or weight.
         let_in (X,Y): Where the vehicle begins, world frame [m], known to 5 cm: for dead reckoning by Doppler log and
             compass, where no camera and no position fix tells.
         mode (MODE): Estimator: constant-velocity or error-state. If not given: with --let-in error-state, else
@@ -333,7 +330,7 @@ def run(
                 "out"
             )
         return _run_team(
-            team, site=site, pool_file=pool_file, goal=goal, mode=mode, duration=duration, trim=trim, arm=arm,
+            team, site=site, pool_file=pool_file, goal=goal, mode=mode, duration=duration, arm=arm,
             task=task, vehicle=vehicle, robot=robot, bind=bind, messages=messages, record=record, as_json=as_json,
         )  # fmt: skip
     assert policy is not None
@@ -352,7 +349,7 @@ def run(
             highlight=False,
             markup=False,
         )
-    pilot = _pilot(policy, filed, task, trim, agent=agent, follows=trajectory is not None)
+    pilot = _pilot(policy, filed, task, agent=agent, follows=trajectory is not None)
     pool = None if file is None else load_pool(file)
     mode = mode or ("constant-velocity" if let_in is None else "error-state")
     perception = Perception(ours, pool, mode=mode, let_in=None if let_in is None else place_of(let_in))
@@ -411,7 +408,6 @@ def _run_team(
     goal: str | None,
     mode: str | None,
     duration: float | None,
-    trim: bool,
     arm: bool,
     **rest: Any,
 ) -> int:
@@ -425,7 +421,7 @@ def _run_team(
         "--duration": duration,
     }
     words = [word for name, x in options.items() if x is not None for word in (name, str(x))]
-    words += [name for name, on in (("--trim", trim), ("--arm", arm)) if on]
+    words += ["--arm"] if arm else []
     return run_team(team, words, **rest)
 
 
@@ -435,19 +431,15 @@ def _is_address(text: str) -> bool:
     return bool(host) and port.isdecimal()
 
 
-def _pilot(
-    policy: str, vehicle: Vehicle, task: str | None, trim: bool, *, agent: str | None, follows: bool
-) -> Pilot:
+def _pilot(policy: str, vehicle: Vehicle, task: str | None, *, agent: str | None, follows: bool) -> Pilot:
     """Who steers; a PID that follows a trajectory is that of T2."""
     if task is not None:
         from finssim.tasks.observer import fitted_task
 
         fitted_task(task, vehicle)  # refuses what is no task, or none for this vehicle
     if policy in CONTROLLERS:
-        if trim:
-            raise ControlError(f"{policy} has an integral of its own: leave --trim out")
         task = task or ("t2" if follows else None)
-    return make_pilot(policy, vehicle, task=task, agent=agent, trim=Trim() if trim else None)
+    return make_pilot(policy, vehicle, task=task, agent=agent)
 
 
 def _alone(pilot: Pilot) -> bool:

@@ -38,8 +38,6 @@ class Options:
     """(DIR|pid|pid-paper) A policy's directory, or pid, or pid-paper."""
     task: str | None = None
     """Task that the policy must have been trained for; its own if not given."""
-    trim: bool = False
-    """Put an integral in front of a policy, against a steady current or weight."""
     vehicle: str = "finsrov"
     """(NAME|FILE) Vehicle of the catalogue, or the path of a vehicle file."""
     namespace: str | None = None
@@ -115,7 +113,7 @@ def plan_of(graph: str, options: Options, pool_file: Path) -> Plan:
     if graph == "robot" and o.pool_file is None and not blind:
         raise Ros2Error("a robot needs its pool file: give --pool-file, or none where no camera looks")
     plan.set("/**", site=o.site, frame_prefix=f"{o.namespace}/" if o.namespace else None)
-    plan.set("controller", policy=o.policy, task=o.task, trim=o.trim, goal=o.goal, trajectory=o.trajectory)
+    plan.set("controller", policy=o.policy, task=o.task, goal=o.goal, trajectory=o.trajectory)
     plan.set("sim", start=o.start, hydrodynamics=o.hydrodynamics, seed=o.seed)
     _wire(plan, o)
     for node in ("camera", "localizer", "state_estimation"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -15,7 +14,6 @@ from finssim.control.guidance import Controller, Goal, Known
 from finssim.control.modes import mode_from_dict
 from finssim.control.pid import CONTROLLERS, controller_for
 from finssim.control.policy import DESCRIPTION_FILE, Policy
-from finssim.control.trim import Trim
 from finssim.engine import Recorder
 from finssim.tasks.baselines import BASELINES, baseline
 from finssim.tasks.environment import Environment
@@ -128,17 +126,15 @@ class PolicyAgent:
         directory: str | Path,
         vehicle: Vehicle,
         task: Task,
-        trim: Trim | None = None,
         *,
         period: float | None = None,
     ) -> None:
-        """Load a policy for the vehicle and task, with an integral in front of it or none.
+        """Load a policy for the vehicle and task.
 
         Args:
             directory: Of the policy.
             vehicle: It must be the very one that the policy was trained for.
             task: It must have been trained for.
-            trim: Integral, or none.
             period: Time between two decisions at which it would be asked [s]; None: its own.
 
         Raises:
@@ -152,22 +148,15 @@ class PolicyAgent:
         self.action = mode.name
         self.wrench_scale = mode.scale if mode.name.startswith("wrench") else 1.0
         self.policy = policy
-        self.trim = trim
         self.name = Path(directory).resolve().name
 
-    def reset(self, n: int) -> tuple[Any, Any]:
-        """Memory of the policy, if it has one, and shift of the trim."""
-        return self.policy.reset(n), self.trim.reset(n) if self.trim else None
+    def reset(self, n: int) -> Any:
+        """Memory of the policy, if it has one."""
+        return self.policy.reset(n)
 
     def act(self, memory: Any, readings: Readings, goal: Goal) -> tuple[NDArray[np.float32], Any]:
         """Actions for the environment's observations, a row for each agent of each world."""
-        observation = readings.observation
-        remembered, shift = memory
-        if self.trim is not None:
-            shift = self.trim.update(shift, readings, goal.position, self.period)
-            observation = self.trim.shown(observation, readings, shift, self.policy.description.observation)
-        action, remembered = self.policy.step(remembered, observation)
-        return action, (remembered, shift)
+        return self.policy.step(memory, readings.observation)
 
     def describe(self) -> dict[str, Any]:
         """Name, network, and what it was trained in."""
@@ -176,7 +165,6 @@ class PolicyAgent:
         return {
             "name": self.name,
             "kind": "policy",
-            "trim": asdict(self.trim) if self.trim else None,
             "action": self.action,
             "period_s": self.period,
             "hydrodynamics": d.hydrodynamics,
@@ -239,9 +227,9 @@ class BaselineAgent:
 
 
 def agent_for(
-    name_or_directory: str | Path, vehicle: Vehicle, task: Task, trim: Trim | None = None
+    name_or_directory: str | Path, vehicle: Vehicle, task: Task
 ) -> PolicyAgent | PidAgent | BaselineAgent:
-    """A PID or another baseline by its name, or the policy of a directory; only a policy takes a trim.
+    """A PID or another baseline by its name, or the policy of a directory.
 
     The PIDs of T1 and T2 are the robot's, which know state and goal; other baselines see what a policy sees.
 
@@ -252,7 +240,7 @@ def agent_for(
         return PidAgent(str(name_or_directory), vehicle, task.name)
     if str(name_or_directory) in BASELINES.get(task.name, {}):
         return BaselineAgent(str(name_or_directory), vehicle, task)
-    return PolicyAgent(name_or_directory, vehicle, task, trim)
+    return PolicyAgent(name_or_directory, vehicle, task)
 
 
 def expert_for(

@@ -43,6 +43,7 @@ class Environment:
     Attributes:
         task: What is done, fitted to the vehicles.
         agents: How many agents a world has.
+        nominal: The vehicles as their controllers know them.
         simulator: The worlds.
         arrays: Actions, observations, rewards and goals, as Warp arrays by world.
         drawing: What randomisation draws, how its ranges grow, and a log of it.
@@ -105,9 +106,9 @@ class Environment:
                 f"unknown action mode '{self.action_mode}'; available: {', '.join(ACTION_MODES)}"
             )
         vehicles = crew(vehicle, task, self.action_mode)
-        self._nominal = vehicles if nominal is None else crew(nominal, task, self.action_mode)
-        refuse_other_thrusters(vehicles, self._nominal)
-        self.task = task = task.fitted(self._nominal)
+        self.nominal = vehicles if nominal is None else crew(nominal, task, self.action_mode)
+        refuse_other_thrusters(vehicles, self.nominal)
+        self.task = task = task.fitted(self.nominal)
         longest = max((t.delay for one in vehicles for t in one.thrusters.values()), default=0.0)
         extra = randomization.simulator_arguments(longest, tether) if randomization else {"tether": tether}
         self.simulator = Simulator(
@@ -179,7 +180,7 @@ class Environment:
             self.task.add_command(self._step, batch)
         add_action(
             self.action_mode,
-            self._nominal,
+            self.nominal,
             self.simulator.command,
             self.arrays,
             self.agents,
@@ -298,7 +299,7 @@ class Environment:
 
     def change(self, task: Task) -> None:
         """Go on with other settings of the same task: the episodes that run end by them."""
-        self.task = task.fitted(self._nominal)
+        self.task = task.fitted(self.nominal)
         self._build()
 
     def _revive(self) -> None:

@@ -48,7 +48,9 @@ def target_drift(arrays: TaskArrays, w: int) -> wp.vec3:
 
 
 OBSERVATION = (
-    ObservationPart("target offset, body frame", 3, "m", scale=DISTANCE_SCALE, term="offset"),
+    ObservationPart(
+        "target offset, body frame", 3, "m", scale=DISTANCE_SCALE, term="offset", errors=(0, 1, 2)
+    ),
     ObservationPart("target velocity, body frame", 3, "m/s", scale=TARGET_SCALE, term=target_drift),
     ObservationPart("linear velocity, body frame", 3, "m/s", clip=VELOCITY_CLIP, term=linear_velocity),
     ObservationPart("angular velocity, body frame", 3, "rad/s", clip=VELOCITY_CLIP, term=turn_rates),

@@ -23,9 +23,8 @@ from finssim.engine.launch import Pipeline
 from finssim.engine.measured import Measurement
 from finssim.engine.packed import Packed
 from finssim.engine.state import HISTORY, State
-from finssim.localization.fusion.attitude import TiltGains
+from finssim.localization.fusion.attitude import TiltGains, YawNoise
 from finssim.localization.fusion.position_filter import Motion
-from finssim.localization.fusion.yaw_filter import YawNoise
 from finssim.physics.types import join
 from finssim.sensors import SensorSuite
 from finssim.sensors.depth import DepthArrays, DepthParameters

@@ -39,8 +39,10 @@ VELOCITY_CLIP = 2.0
 """Velocities are clipped here in the observation [m/s, rad/s]."""
 
 OBSERVATION = (
-    ObservationPart("goal offset, body frame", 3, "m", scale=DISTANCE_SCALE, term="offset"),
-    ObservationPart("goal rotation relative to the body, first two columns", 6, "1", term=goal_columns),
+    ObservationPart("goal offset, body frame", 3, "m", scale=DISTANCE_SCALE, term="offset", errors=(0, 1, 2)),
+    ObservationPart(
+        "goal rotation relative to the body, first two columns", 6, "1", term=goal_columns, errors=(1,)
+    ),
     ObservationPart("linear velocity, body frame", 3, "m/s", clip=VELOCITY_CLIP, term=linear_velocity),
     ObservationPart("angular velocity, body frame", 3, "rad/s", clip=VELOCITY_CLIP, term=turn_rates),
     ObservationPart("distance to the goal", 1, "m", scale=DISTANCE_SCALE, clip=1.0, term=length),

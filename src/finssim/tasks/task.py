@@ -40,6 +40,8 @@ class ObservationPart:
     """What gives the value, from what is measured: a float, or a vector of `size`. None in a task in plain torch."""
     index: int = 0
     """The term's argument `k`: of which team-mate, how far ahead, ..."""
+    errors: tuple[int, ...] = ()
+    """Which of its numbers are 0 where the task wants the vehicle: what an integral may collect."""
 
 
 class Batch(NamedTuple):
@@ -110,6 +112,14 @@ class Task:
     def observation_size(self) -> int:
         """Numbers in the observation of an agent."""
         return sum(part.size for part in self.observation)
+
+    @property
+    def errors(self) -> tuple[int, ...]:
+        """Elements of an agent's observation that are 0 where the task wants it, by the parts' `errors`."""
+        firsts = itertools.accumulate((part.size for part in self.observation), initial=0)
+        return tuple(
+            first + i for first, part in zip(firsts, self.observation, strict=False) for i in part.errors
+        )
 
     @property
     def schema(self) -> ObservationSchema:

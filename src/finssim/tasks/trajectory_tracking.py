@@ -99,6 +99,7 @@ OBSERVATION = (
             None,
             reference_offset,
             i,
+            errors=(0, 1, 2) if i == 0 else (),
         )
         for i in range(4)
     ),

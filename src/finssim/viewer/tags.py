@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from finssim.localization.detection.detector import detector
-from finssim.localization.detection.region import RegionTracker
+from finssim.localization.detection.detector import RegionTracker, detector
 from finssim.robot.messages import TagCorners
 from finssim.vehicles import Vehicle
 

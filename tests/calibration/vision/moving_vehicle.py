@@ -22,7 +22,7 @@ from finssim.geometry.rotations import (
     quat_to_rotvec,
 )
 from finssim.localization.detection.detections import Detection, Frame, write_detections
-from finssim.localization.detection.tags import corners
+from finssim.localization.detection.families import corners
 from finssim.localization.pool import Pool
 
 EDGE = 0.093

@@ -90,8 +90,6 @@ def test_a_report_has_its_pictures(pool):
         "fit.json",
         "map.png",
         "picture.png",
-        "outwards.png",
-        "held_out.png",
     }
     page = (pool / "report" / "report.html").read_text(encoding="utf-8")
     assert "camera_height" in page and "finssim calibrate pool" in page and "http" not in page

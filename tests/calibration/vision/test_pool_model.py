@@ -57,14 +57,6 @@ def test_a_plane_turns_about_the_reference_point():
     assert model.moved(step).depth == pytest.approx(model.depth, abs=1e-12)
 
 
-def test_a_shifted_frame_predicts_the_same_pixels():
-    camera, water = overhead(), Interface.water(1.0, tilt_y=0.01)
-    seen = survey(camera, water, FLOOR, 10)
-    model, by = PoolModel(camera, water, seen.points.mean(axis=0)), np.array([300.0, -20.0, 7.0])
-    same = model.shifted(by).predict(seen.points + by, seen.dry)
-    np.testing.assert_allclose(same, model.predict(seen.points, seen.dry), atol=1e-9)
-
-
 def test_a_lens_without_distortion_gets_room_for_it():
     bare = extended_lens(type(PLUMB_BOB)(640, 480, 500.0, 500.0, 320.0, 240.0, "plumb_bob", ()))
     assert bare.distortion == (0.0,) * 5

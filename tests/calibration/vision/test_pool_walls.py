@@ -7,7 +7,7 @@ import pytest
 
 from finssim.calibration.vision.pool_fit import calibrate_pool
 from finssim.calibration.vision.pool_model import Settings
-from finssim.calibration.vision.pool_refine import CAMERA
+from finssim.calibration.vision.pool_search import CAMERA
 from finssim.geometry.optics import Interface, Status, project
 from finssim.geometry.rotations import quat_from_rotvec, quat_to_matrix
 

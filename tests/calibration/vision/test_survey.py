@@ -19,6 +19,7 @@ def written(folder, text):
         "id,x,y,z\na,1.5,-0.25,0.5\n",
         "ID;X [mm];Y [mm];Z [mm]\na;1500;-250;500\n",
         "Point\tx_cm\ty_cm\tz_cm\na\t150\t-25\t50\n",
+        "id;x;y;z\na;1,5;-0,25;0,5\n",
         "# unit: mm\nname, World X, World Y, World Z\na, 1500, -250, 500\n",
         "\ufeffz(m),y(cm),x(mm),label\n0.5,-25,1500,a\n",
         "# id x y z\na 1.5 -0.25 0.5\n",
@@ -26,7 +27,7 @@ def written(folder, text):
     ],
 )
 def test_one_point_in_many_spellings(tmp_path, text):
-    """Case, order, separator and unit are the writer's."""
+    """Case, order, separator, decimal comma and unit are the writer's."""
     survey = read_survey(written(tmp_path, text))
     np.testing.assert_allclose(survey.points["a"].points, [[1.5, -0.25, 0.5]])
 

@@ -22,7 +22,7 @@ from finssim.calibration.vision.tag_mounts import (
     start_state,
 )
 from finssim.geometry.rotations import quat_conjugate, quat_from_euler, quat_rotate, quat_to_matrix
-from finssim.localization.detection.tags import corners
+from finssim.localization.detection.families import corners
 
 RIG = Rig(pool=POOL, corners_t=corners(EDGE), port=PORT, reference=15)
 TRUTH = MountState(reference=MOUNTS[15], others={16: MOUNTS[15].inverse.then(MOUNTS[16])}, poses=[])
@@ -48,9 +48,8 @@ def fitted(rocked):
 def test_derivatives_are_those_of_the_prediction(rocked):
     """Every column of the normal equations' right side against a numerical derivative of the cost."""
     some = [replace(m, corners=dict(m.corners)) for m in rocked[:3]]
-    rig = replace(RIG, centre=np.array([0.02, 0.01, 0.0]))
-    state, _ = start_state(rig, FILE, some)
-    rig = replace(rig, noise=Noise(pixel=1e3))  # no corner is far off
+    state, _ = start_state(RIG, FILE, some)
+    rig = replace(RIG, noise=Noise(pixel=1e3))  # no corner is far off
 
     def cost(s):
         pixels, _, rest = residuals(rig, s, some)
@@ -96,18 +95,6 @@ def test_a_level_vehicle_keeps_the_files_heading_and_place():
     assert yaw == pytest.approx(np.pi / 2, abs=1e-3)
     off = errors(fit, ("16.x", "16.y", "16.turn_z"))
     assert max(abs(off["16.x"]), abs(off["16.y"])) < 5e-4
-
-
-@pytest.mark.slow
-def test_a_known_centre_of_turning_gives_the_place():
-    """A level vehicle that turns on the spot about a body point it knows."""
-    spinning = motion(tilt=0.0, travel=0.0, heave=0.0)
-    rig = replace(RIG, centre=np.zeros(3))
-    fit = fit_mounts(rig, FILE, moments(spinning, np.random.default_rng(1)))
-    off = errors(fit, ("reference.x", "reference.y"))
-    # Which way the body's x axis points is still the file's: the place turns with it.
-    assert np.hypot(*off.values()) < 0.01
-    assert "reference.x" in fit.free and "reference.turn_z" in fit.frozen
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize, minimize_scalar
 
-from finssim.geometry.optics.projection import solve_stack
+from finssim.geometry.optics.rays import solve_stack
 
 STACKS = {
     "air, water": [1.0003, 1.333],

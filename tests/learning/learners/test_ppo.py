@@ -57,6 +57,7 @@ VARIANTS = [
     {"normalize": True, "history": 2, "last_action": True},
     {"memory": 8, "asymmetric": False},
     {"memory": 8, "history": 1, "normalize": True},
+    {"integral": False},
 ]
 
 

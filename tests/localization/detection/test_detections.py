@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import (
     COLUMNS,
     Detection,
@@ -13,7 +14,6 @@ from finssim.localization.detection.detections import (
     read_detections,
     write_detections,
 )
-from finssim.localization.errors import LocalizationError
 
 RING = np.array([[10.25, 20.5], [50.1, 21.0], [49.0, 61.0 / 3.0], [9.0, 60.0]])
 NUMBERS = ",".join(str(x) for x in RING.ravel().tolist())

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from finssim.localization import LocalizationError
 from finssim.localization.detection.pictures import pictures, read_picture, write_picture
-from finssim.localization.errors import LocalizationError
 
 RNG = np.random.default_rng(0)
 

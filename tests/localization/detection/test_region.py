@@ -5,8 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from finssim.localization.detection.detector import LIBRARIES, detector
-from finssim.localization.detection.region import RegionTracker, merged, region_around
+from finssim.localization.detection.detector import RegionTracker, detector, merged, region_around
 from reference.tag_picture import draw, pose_corners
 
 SHAPE = (360, 480)
@@ -25,10 +24,9 @@ def ring_at(u, v):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("library", LIBRARIES)
-def test_a_moving_tag_is_followed_in_regions_with_the_corners_of_a_whole_search(library):
+def test_a_moving_tag_is_followed_in_regions_with_the_corners_of_a_whole_search():
     """After the first picture only regions are searched, a fraction of the pixels, at 9 px per picture."""
-    find = detector("tag25h9", library=library)
+    find = detector("tag25h9")
     tracker = RegionTracker(find, [15, 16])
     for k in range(8):
         image = picture(k, t15=(100 + 9 * k, 80 + 4 * k), t16=(300 - 6 * k, 250.4))

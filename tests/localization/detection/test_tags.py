@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from finssim.localization.detection.tags import corners, tag_corners_b
+from finssim.localization.detection.families import corners, tag_corners_b
 from finssim.vehicles import load_vehicle
 
 

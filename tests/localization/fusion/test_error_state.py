@@ -18,14 +18,16 @@ from finssim.geometry.rotations import (
 from finssim.localization.fusion.error_state import (
     ErrorStateNoise,
     InertialState,
+    capped,
     correct,
     depth_model,
     error_innovation,
     position_model,
     predict,
+    restarted,
+    turned,
     yaw_model,
 )
-from finssim.localization.fusion.fuse_restart import capped, restarted, turned
 
 RUNS = 200
 NOISE = ErrorStateNoise(gyro=2e-3, accel=0.02, gyro_walk=2e-4, accel_walk=2e-3)

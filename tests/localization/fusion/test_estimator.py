@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from finssim.geometry.rotations import wrap_angle
-from finssim.localization.errors import LocalizationError
+from finssim.localization import LocalizationError
 from finssim.localization.fusion import position_filter
 from finssim.localization.fusion.attitude import up_of
 from finssim.localization.fusion.estimator import MODELS, Estimator

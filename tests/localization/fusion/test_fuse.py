@@ -11,17 +11,17 @@ import pytest
 from finssim.files import OutputError
 from finssim.geometry.optics import project
 from finssim.geometry.rotations import quat_conjugate, quat_rotate, quat_to_euler, quat_to_matrix, wrap_angle
+from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Detection, Frame, write_detections
-from finssim.localization.detection.tags import tag_corners_b
-from finssim.localization.errors import LocalizationError
+from finssim.localization.detection.families import tag_corners_b
 from finssim.localization.fusion.estimator import MODELS
 from finssim.localization.fusion.fuse import COLUMNS, fuse, run
 from finssim.localization.fusion.fuse_log import load_log
 from finssim.localization.fusion.fuse_settings import site_of
 from finssim.localization.fusion.streams import refusal
-from finssim.localization.locate.localize import write_rows as write_localized
+from finssim.localization.localize import write_rows as write_localized
 from finssim.localization.pool import load_pool
-from finssim.localization.poses.measurement import Constraints
+from finssim.localization.poses import Constraints
 from finssim.localization.poses.methods import METHODS
 from finssim.vehicles import load_vehicle
 from localization.fusion.hinsdale_log import hinsdale, write_table

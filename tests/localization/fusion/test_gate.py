@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from finssim.localization.fusion.gate import Gate, GateMemory, due, judge, remember
+from finssim.localization.fusion.fuse_constant_velocity import GateMemory, due, judge, remember
+from finssim.localization.fusion.fuse_settings import Gate
 
 
 @pytest.mark.parametrize("dimension", [1, 2, 3])

@@ -5,8 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from finssim.geometry.rotations import quat_to_euler, wrap_angle
-from finssim.localization.fusion.fuse_settings import Settings
-from finssim.localization.fusion.yaw_filter import (
+from finssim.localization.fusion.attitude import (
     YawNoise,
     YawState,
     capped,
@@ -16,6 +15,7 @@ from finssim.localization.fusion.yaw_filter import (
     restarted,
     yaw_rate,
 )
+from finssim.localization.fusion.fuse_settings import Settings
 from localization.fusion.known_streams import attitude, body_rates, yaw
 
 RUNS = 200

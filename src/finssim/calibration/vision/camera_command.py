@@ -15,9 +15,19 @@ from finssim.calibration.findings import finding
 from finssim.calibration.fit import Estimate
 from finssim.calibration.output.fit_figures import BLUE, GRAY, ORANGE, new_figure, png
 from finssim.calibration.output.fit_output import interval_text, number_text
-from finssim.calibration.output.publish import command_line, progress_bar, publish, refuse_places
-from finssim.calibration.vision.boards import Board, BoardView, board_found, parse_size, see_board
-from finssim.calibration.vision.camera_fit import COLUMNS, MODELS, ROWS, CameraFit, calibrate_camera
+from finssim.calibration.output.publish import command_line, publish, refuse_places
+from finssim.calibration.vision.camera_fit import (
+    COLUMNS,
+    MODELS,
+    ROWS,
+    Board,
+    BoardView,
+    CameraFit,
+    board_found,
+    calibrate_camera,
+    parse_size,
+    see_board,
+)
 from finssim.calibration.vision.report import (
     ExtraTable,
     Report,
@@ -64,7 +74,6 @@ def camera_record(fit: CameraFit) -> dict[str, Any]:
         "left_out": {view.name: view.left_out for view in fit.views if view.left_out},
         "findings": [one.as_json() for one in fit.findings],
         "settings": fit.settings,
-        "interrupted": fit.interrupted,
         "provenance": provenance(),
     }
 
@@ -144,7 +153,6 @@ def camera_pictures(fit: CameraFit) -> dict[str, tuple[str, bytes]]:
     drawn = {
         "coverage.png": ("Where corners were seen, and how well pixels are known there", _coverage(fit)),
         "residuals.png": ("Corners less what the lens predicts, enlarged", _residuals(fit)),
-        "views.png": ("Residual of every picture", _per_view(fit)),
     }
     return {name: (text, png(figure)) for name, (text, figure) in drawn.items()}
 
@@ -196,20 +204,6 @@ def _residuals(fit: CameraFit) -> Figure:
     return figure
 
 
-def _per_view(fit: CameraFit) -> Figure:
-    figure = new_figure(7.4, 1.0 + 0.2 * len(fit.views))
-    axes = figure.subplots()
-    rows = np.arange(len(fit.views))[::-1]
-    colors = [ORANGE if view.left_out else BLUE for view in fit.views]
-    axes.barh(rows, [view.rms for view in fit.views], color=colors, height=0.7)
-    axes.set_yticks(rows, [view.name for view in fit.views], fontsize=7)
-    axes.axvline(fit.held_out_rms, color="black", linewidth=0.8, linestyle="--", label="views held out")
-    axes.set_xlabel("rms of a corner's distance [px]; orange: left out")
-    axes.legend(fontsize=7, frameon=False)
-    axes.spines[["top", "right"]].set_visible(False)
-    return figure
-
-
 def run(
     images: Sequence[Path],
     *,
@@ -246,7 +240,6 @@ def run(
 
     Raises:
         CalibrationError, LocalizationError, OutputError: As they say; nothing is written then.
-        KeyboardInterrupt: After Ctrl-C, when the best until then has been written.
     """
     if model not in MODELS:
         raise CalibrationError(f"unknown lens model '{model}'; available: {', '.join(MODELS)}")
@@ -263,8 +256,7 @@ def run(
         raise CalibrationError(
             f"none of {len(without)} pictures shows a {chosen.words}: give --board or --charuco"
         )
-    with progress_bar() as progress:
-        fit = calibrate_camera(views, model=model, seed=seed, progress=progress)
+    fit = calibrate_camera(views, model=model, seed=seed)
     fit.settings.update(board=chosen.words, square=chosen.square)
     write_camera(out, fit.lens, {**camera_record(fit), "without_board": without})
     words = camera_report(fit)
@@ -276,8 +268,6 @@ def run(
         repeat = [command_line("camera", images, options)]
         words.write(report, camera_json(fit), camera_pictures(fit), repeat, {"Views": _views_table(fit)})
     publish(camera_json(fit, out) if as_json else None, words.show, (out, report))
-    if fit.interrupted:
-        raise KeyboardInterrupt
     return fit
 
 

@@ -1,9 +1,9 @@
-"""A camera's lens from pictures of a board: estimates, intervals, what the pictures do and do not cover."""
+"""A camera's lens from pictures of a board: the board's corners, the lens, intervals, what the pictures cover."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,35 +15,216 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Correlation, Estimate
 from finssim.calibration.uncertainty import Covariance, Evidence, intervals, trial_covariance
-from finssim.calibration.vision.boards import BoardView
-from finssim.calibration.vision.least_squares import (
-    Block,
-    Pose,
-    arrow_evidence,
-    arrow_step,
-    block_of,
-    descent,
-    huber_cost,
-    huber_weight,
-    linear_map,
-    pose_of_plane,
-)
-from finssim.geometry.optics import Lens, OpticsError
-from finssim.geometry.rotations import skew
+from finssim.calibration.vision.least_squares import Pose, arrow_evidence, block_of
+from finssim.geometry.optics import Lens
+from finssim.geometry.rotations import quat_from_rotvec, quat_to_matrix, skew
+from finssim.localization.poses.methods import plane_pose, refine_pose, through_lens
 
 __all__ = [
     "COLUMNS",
     "MODELS",
     "ROWS",
+    "Board",
+    "BoardView",
     "CameraFit",
-    "adjust",
+    "board_found",
     "calibrate_camera",
-    "evidence",
-    "lens_names",
-    "lens_vector",
-]  # fmt: skip
+    "parse_size",
+    "see_board",
+]
 
 Array = NDArray[np.float64]
+
+# Boards of known corners, and where a picture shows those corners.
+
+COMMON_SIZES = ((9, 6), (8, 6), (7, 6), (7, 5), (8, 5), (10, 7), (11, 8), (6, 4), (6, 5), (11, 7), (9, 7))
+"""Inner corners that are tried where nobody says how many the board has."""
+
+REFINE_SHARE = 0.35
+"""Half width of the window that refines a corner, in distances to its nearest neighbour: no other corner is in it."""
+
+WIDEST, NARROWEST = 11, 2
+"""Bounds of that half width [px]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Board:
+    """A flat chessboard or ChArUco board."""
+
+    columns: int
+    """Inner corners along x of a chessboard; squares of a ChArUco board."""
+    rows: int
+    """Along y."""
+    square: float
+    """Edge of a square [m]."""
+    marker: float | None = None
+    """Edge of a marker's black border [m]; None for a chessboard."""
+    dictionary: str = "DICT_5X5_100"
+    """Of the markers, as OpenCV calls it."""
+
+    def __post_init__(self) -> None:
+        least = 3 if self.marker is None else 2
+        if self.columns < least or self.rows < least:
+            raise CalibrationError(
+                f"the board has {self.columns}x{self.rows} {'corners' if self.marker is None else 'squares'}, "
+                f"expected at least {least} each way"
+            )
+        if not (math.isfinite(self.square) and self.square > 0.0):
+            raise CalibrationError(f"the square is {self.square:.4g} m, expected a length above 0")
+        if self.marker is not None and not 0.0 < self.marker < self.square:
+            raise CalibrationError(
+                f"the marker is {self.marker:.4g} m, expected more than 0 and less than the square's "
+                f"{self.square:.4g} m"
+            )
+
+    @property
+    def words(self) -> str:
+        """`chessboard of 9x6 inner corners, squares of 25 mm`."""
+        kind = "chessboard" if self.marker is None else "ChArUco board"
+        what = "inner corners" if self.marker is None else f"squares, markers of {1e3 * self.marker:g} mm"
+        return f"{kind} of {self.columns}x{self.rows} {what}, squares of {1e3 * self.square:g} mm"
+
+    @property
+    def corners(self) -> Array:
+        """Inner corners on the board, row by row, z = 0 [m], (n, 3)."""
+        less = 0 if self.marker is None else 1
+        x, y = np.meshgrid(np.arange(self.columns - less), np.arange(self.rows - less))
+        return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1) * self.square
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoardView:
+    """The corners that one picture shows."""
+
+    name: str
+    width: int
+    """Of the picture [px]."""
+    height: int
+    """Of the picture [px]."""
+    pixels: Array
+    """(n, 2); integer coordinates are pixel centres."""
+    points: Array
+    """The same corners on the board, board frame, z = 0 [m], (n, 3)."""
+
+
+def parse_size(words: str, option: str) -> tuple[int, int]:
+    """`9x6` as two numbers.
+
+    Raises:
+        CalibrationError: It reads otherwise.
+    """
+    parts = words.lower().replace("×", "x").split("x")
+    if len(parts) != 2 or not all(part.strip().isdigit() for part in parts):
+        raise CalibrationError(f"{option} is '{words}', expected columns x rows such as 9x6")
+    return int(parts[0]), int(parts[1])
+
+
+def see_board(image: NDArray[np.uint8], board: Board) -> tuple[Array, Array] | None:
+    """Find a board in a picture.
+
+    Args:
+        image: Gray, (h, w).
+        board: The board.
+
+    Returns:
+        Pixels (n, 2) and the corners on the board (n, 3) [m]; None if it is not seen. A chessboard is seen as a whole
+        or not at all, a ChArUco board in parts of at least 6 corners.
+
+    Raises:
+        CalibrationError: OpenCV has no such dictionary.
+    """
+    found = _chessboard(image, board.columns, board.rows) if board.marker is None else _charuco(image, board)
+    if found is None:
+        return None
+    pixels, index = found
+    return pixels, board.corners[index]
+
+
+def board_found(images: Iterable[tuple[str, NDArray[np.uint8]]], square: float) -> Board:
+    """The common chessboard that most of some pictures show.
+
+    Args:
+        images: Names and gray pictures; those after the first five are not looked at.
+        square: Edge of a square [m].
+
+    Raises:
+        CalibrationError: None is seen.
+    """
+    some = [image for _, image in zip(range(5), (picture for _, picture in images), strict=False)]
+    seen = {size: sum(_chessboard(image, *size) is not None for image in some) for size in COMMON_SIZES}
+    # A board shows smaller ones too: of those seen as often the largest is meant.
+    best = max(seen, key=lambda size: (seen[size], size[0] * size[1]))
+    if not seen[best]:
+        tried = ", ".join(f"{c}x{r}" for c, r in COMMON_SIZES)
+        raise CalibrationError(
+            f"no chessboard found in the first {len(some)} pictures (inner corners tried: {tried}): "
+            "give --board COLUMNSxROWS, or --charuco for a ChArUco board"
+        )
+    return Board(columns=best[0], rows=best[1], square=square)
+
+
+def _chessboard(image: NDArray[np.uint8], columns: int, rows: int) -> tuple[Array, NDArray[np.int64]] | None:
+    """Pixels and indices of all inner corners; two finders, for each misses boards that the other sees."""
+    import cv2
+
+    size = (columns, rows)
+    found, corners = cv2.findChessboardCorners(
+        image,
+        size,
+        flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK,
+    )
+    if not found:
+        found, corners = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+    if not found:
+        return None
+    pixels = np.asarray(corners, float).reshape(-1, 2)
+    return _refined(image, pixels), np.arange(columns * rows)
+
+
+def _refined(image: NDArray[np.uint8], pixels: Array) -> Array:
+    """Corners where the gradients around them say, each within a window that holds no other corner.
+
+    A window as wide as is usual pulls the corners of a small or oblique board towards their neighbours, by pixels.
+    """
+    import cv2
+
+    distance = np.linalg.norm(pixels[:, None] - pixels[None], axis=-1)
+    spacing = np.where(distance > 0.0, distance, np.inf).min(axis=1)
+    half = np.clip((REFINE_SHARE * spacing).astype(int), NARROWEST, WIDEST)
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3)
+    refined = pixels.copy()
+    for size in np.unique(half):
+        start = pixels[half == size].astype(np.float32).reshape(-1, 1, 2)
+        refined[half == size] = cv2.cornerSubPix(
+            image, start, (int(size), int(size)), (-1, -1), stop
+        ).reshape(-1, 2)
+    return refined
+
+
+def _charuco(image: NDArray[np.uint8], board: Board) -> tuple[Array, NDArray[np.int64]] | None:
+    """Pixels and indices of the corners between squares whose markers are read; refined like a chessboard's."""
+    import cv2
+
+    code = getattr(cv2.aruco, board.dictionary.upper(), None)
+    if not isinstance(code, int):
+        raise CalibrationError(
+            f"unknown dictionary '{board.dictionary}', expected one of OpenCV's such as DICT_5X5_100 or DICT_4X4_50"
+        )
+    drawn = cv2.aruco.CharucoBoard(
+        (board.columns, board.rows), board.square, board.marker, cv2.aruco.getPredefinedDictionary(code)
+    )
+    # Boards drawn before OpenCV 4.6 start with the other colour if rows are even.
+    for legacy in (False, True):
+        drawn.setLegacyPattern(legacy)
+        pixels, ids, _, _ = cv2.aruco.CharucoDetector(drawn).detectBoard(image)
+        if ids is not None and len(ids) >= 6:
+            index = np.asarray(ids).ravel().astype(np.int64)
+            at = np.asarray(pixels, float).reshape(-1, 2)
+            return _refined(image, at), index
+    return None
+
+
+# A lens and the poses of all boards, from the pixels of their corners.
 
 DISTORTION_NAMES = {
     "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
@@ -53,22 +234,16 @@ DISTORTION_NAMES = {
 
 MODELS = tuple(DISTORTION_NAMES)
 
-FOCAL_SHARES = np.geomspace(0.2, 4.0, 25)
-"""Focal lengths that are tried at the start, in widths of the image."""
-
-LEAST_FOCAL = 0.1
-"""Widths of the image below which a focal length makes no sense: level boards would let it shrink for ever."""
-
-HUBER = 2.0
-"""Residuals beyond this many standard deviations count linearly."""
-
-STEPS, POSE_STEPS, RESCALINGS = 100, 40, 6
-"""Most steps of a lens and of a pose, and how often the standard deviation is made anew."""
-
-STEADY = 0.01
-"""Relative change of that standard deviation with which it is good: it only decides which corners weigh less."""
+FOCAL_SHARES = (1.0 / math.pi, 0.6, 1.2)
+"""Focal lengths from which a fisheye is fitted, in widths of the image."""
 
 FEWEST_VIEWS = 4
+
+NO_LIMIT = 1e9
+"""Distance from which corners of a held-out board would count linearly: they are not judged [px]."""
+
+STRAY = 6.0
+"""Times the median residual of its view for a corner to be left out: it was taken for another."""
 
 OUTLIER = 2.0
 """Times the median residual of all views, at least, for a view to be left out; and beyond their usual spread."""
@@ -105,78 +280,6 @@ LARGE_ERROR = 1.0
 """Uncertainty somewhere in the picture that is spoken of [px]."""
 
 
-# Where a board stands before a camera: a closed form from viewing rays, then least squares on the pixels.
-
-
-def pose_from_rays(rays_c: Array, points_b: Array) -> Pose | None:
-    """Pose of a board in the optical frame (x right, y down, z along the view) from the rays its points are seen on.
-
-    Args:
-        rays_c: Optical frame, any length, (n, 3), n >= 4; more than 90 degrees off the axis is no trouble.
-        points_b: On z = 0 [m], (n, 3).
-
-    Returns:
-        The pose, or None if the points lie on one line.
-    """
-    centre = points_b[:, :2].mean(axis=0)
-    size = float(np.abs(points_b[:, :2] - centre).max())
-    H = linear_map(np.column_stack([(points_b[:, :2] - centre) / size, np.ones(len(points_b))]), rays_c)
-    if H is None:
-        return None
-    R, t = pose_of_plane(H)
-    return Pose(R, t * size - R[:, :2] @ centre)
-
-
-def pose_residuals(lens: Lens, pose: Pose, points_b: Array, pixels: Array) -> tuple[Array, Array]:
-    """Measured less predicted pixels (n, 2), NaN where the lens cannot, and the points in the optical frame (n, 3)."""
-    points_c = pose.at(points_b)
-    predicted, ok = lens.project(points_c)
-    return np.where(ok[:, None], pixels - predicted, np.nan), points_c
-
-
-def pose_jacobian(lens: Lens, pose: Pose, points_c: Array) -> Array:
-    """d pixel / d step of `Pose.stepped`, (n, 2, 6)."""
-    J = lens.project_jacobian(points_c)
-    return np.concatenate([-J @ skew(points_c - pose.t), J], axis=-1)
-
-
-def board_pose(lens: Lens, points_b: Array, pixels: Array, start: Pose | None = None) -> Pose | None:
-    """The pose with least squared pixel residuals.
-
-    Args:
-        lens: The lens.
-        points_b: On z = 0 [m], (n, 3).
-        pixels: Where they are seen, (n, 2).
-        start: Where to begin; from the rays if None.
-
-    Returns:
-        None if neither the rays nor the start lead to a pose before the camera.
-    """
-    if start is None:
-        rays, ok = lens.rays(pixels)
-        start = pose_from_rays(rays[ok], points_b[ok]) if ok.sum() >= 4 else None
-        if start is None:
-            return None
-
-    def cost(pose: Pose) -> float:
-        value = float(np.sum(pose_residuals(lens, pose, points_b, pixels)[0] ** 2))
-        return value if math.isfinite(value) else math.inf
-
-    def steps_from(pose: Pose) -> Callable[[float], Pose]:
-        residual, points_c = pose_residuals(lens, pose, points_b, pixels)
-        J = pose_jacobian(lens, pose, points_c).reshape(-1, 6)
-        N, g = J.T @ J, J.T @ residual.ravel()
-        return lambda damping: pose.stepped(np.linalg.solve(N + damping * np.diag(np.diagonal(N)), g))
-
-    if not math.isfinite(cost(start)):
-        return None
-    *_, (pose, _) = descent(start, cost, steps_from, rounds=POSE_STEPS, tolerance=1e-10)
-    return pose
-
-
-# A lens and the poses of all boards at once, from the pixels of their corners.
-
-
 @dataclass(frozen=True, kw_only=True)
 class Bundle:
     """A lens and one pose per view."""
@@ -185,7 +288,6 @@ class Bundle:
     poses: tuple[Pose, ...]
     residuals: tuple[Array, ...]
     """Measured less predicted, per view (n, 2) [px]."""
-    interrupted: bool = False
 
     @property
     def sigma(self) -> float:
@@ -213,128 +315,91 @@ def lens_vector(lens: Lens) -> Array:
     return np.array([lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion])
 
 
-def start(views: Sequence[BoardView], model: str) -> Lens:
-    """A lens without distortion, its centre in the middle, whose focal length suits the views best.
+def adjust(views: Sequence[BoardView], model: str) -> Bundle:
+    """The lens and the poses with least squared distances of all corners, by OpenCV.
 
     Raises:
-        CalibrationError: No focal length explains any view.
+        CalibrationError: OpenCV finds none.
     """
-    width, height = views[0].width, views[0].height
-    some = views[:: max(1, len(views) // 8)]
-    best, lowest = None, np.inf
-    for f in width * FOCAL_SHARES:
-        middle, straight = (0.5 * (width - 1), 0.5 * (height - 1)), (0.0,) * len(DISTORTION_NAMES[model])
-        lens = Lens(width, height, float(f), float(f), *middle, model, straight)
-        misfit = float(np.median([_misfit(lens, view) for view in some]))
-        if misfit < lowest:
-            best, lowest = lens, misfit
-    if best is None:
-        raise CalibrationError("no focal length explains the pictures: is the board as stated, and flat?")
-    return best
+    import cv2
 
-
-def _misfit(lens: Lens, view: BoardView) -> float:
-    rays, ok = lens.rays(view.pixels)
-    pose = pose_from_rays(rays, view.points) if ok.all() else None
-    if pose is None:
-        return math.inf
-    rms = _rms(pose_residuals(lens, pose, view.points, view.pixels)[0])
-    return rms if math.isfinite(rms) else math.inf
-
-
-def adjust(views: Sequence[BoardView], lens: Lens, poses: Sequence[Pose] | None = None) -> Bundle:
-    """Least squares over lens and poses, corners far from the others weighing less (Huber).
-
-    Without poses it begins from the lens's focal length alone, and frees the centre and the distortion one after the
-    other. Ctrl-C ends it with the best until then.
-
-    Raises:
-        CalibrationError: A view has no pose before the camera, which is named.
-    """
-    names = lens_names(lens.model)
-    stages = [names] if poses is not None else [("fx", "fy"), ("fx", "fy", "cx", "cy", "k1"), names]
-    bundle = _bundle(lens, poses if poses is not None else [_pose(lens, view) for view in views], views)
-    assert bundle is not None
-    for stage in stages:
-        free = np.array([name in stage for name in names])
-        for _ in range(RESCALINGS):
-            sigma = bundle.sigma
-            bundle = _minimise(bundle, views, free)
-            if bundle.interrupted:
-                return bundle
-            if stage != names or abs(bundle.sigma - sigma) < STEADY * sigma:
-                break
-    return bundle
-
-
-def _pose(lens: Lens, view: BoardView) -> Pose:
-    pose = board_pose(lens, view.points, view.pixels)
-    if pose is None:
-        raise CalibrationError(
-            f"{view.name}: no pose of the board explains its corners: leave the picture out"
-        )
-    return pose
-
-
-def _bundle(lens: Lens, poses: Sequence[Pose], views: Sequence[BoardView]) -> Bundle | None:
-    """With its residuals; None where the lens cannot see a corner."""
-    pairs = zip(poses, views, strict=True)
-    residuals = tuple(pose_residuals(lens, pose, view.points, view.pixels)[0] for pose, view in pairs)
-    if not all(np.isfinite(r).all() for r in residuals):
-        return None
-    return Bundle(lens=lens, poses=tuple(poses), residuals=residuals)
-
-
-def _minimise(bundle: Bundle, views: Sequence[BoardView], free: NDArray[np.bool_]) -> Bundle:
-    """Poses are eliminated view by view, the lens is solved for, then the poses; their weights have one scale."""
-    sigma = bundle.sigma
-
-    def cost(bundle: Bundle) -> float:
-        return huber_cost(np.linalg.norm(np.concatenate(bundle.residuals), axis=-1) / sigma, HUBER)
-
-    def steps_from(bundle: Bundle) -> Callable[[float], Bundle | None]:
-        blocks = _blocks(bundle, views, free, sigma)
-
-        def stepped(damping: float) -> Bundle | None:
-            step, moves = arrow_step(blocks, damping)
-            vector = lens_vector(bundle.lens)
-            vector[free] += step
-            fx, fy, cx, cy, *distortion = map(float, vector)
-            poses = [pose.stepped(move) for pose, move in zip(bundle.poses, moves, strict=True)]
-            try:
-                lens = replace(bundle.lens, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion))
-            except OpticsError:  # a focal length below zero, say
-                return None
-            if fx < LEAST_FOCAL * lens.width:
-                return None
-            return _bundle(lens, poses, views)
-
-        return stepped
-
+    size = (views[0].width, views[0].height)
+    solve, threads = _fisheye if model == "fisheye" else _perspective, cv2.getNumThreads()
     try:
-        for better, _ in descent(bundle, cost, steps_from, rounds=STEPS, tolerance=1e-9):
-            bundle = better
-    except KeyboardInterrupt:
-        return replace(bundle, interrupted=True)
-    return bundle
+        cv2.setNumThreads(1)  # with more, sums depend on which of them ends first
+        K, distortion, turns, shifts = solve(views, size, model)
+    except cv2.error as error:
+        raise CalibrationError(
+            f"no {model} lens explains the pictures: is the board as stated, and flat? ({error.err})"
+        ) from None
+    finally:
+        cv2.setNumThreads(threads)
+    fx, _, cx, _, fy, cy = map(float, np.ravel(K)[:6])
+    lens = Lens(*size, fx, fy, cx, cy, model, tuple(np.ravel(distortion)[: len(DISTORTION_NAMES[model])]))
+    poses = tuple(
+        Pose(quat_to_matrix(quat_from_rotvec(np.ravel(turn))), np.ravel(shift))
+        for turn, shift in zip(turns, shifts, strict=True)
+    )
+    residuals = tuple(_residual(lens, pose, view) for pose, view in zip(poses, views, strict=True))
+    return Bundle(lens=lens, poses=poses, residuals=residuals)
 
 
-def _blocks(bundle: Bundle, views: Sequence[BoardView], free: NDArray[np.bool_], sigma: float) -> list[Block]:
-    """Weighted normal equations of each view, for the lens and the view's pose."""
-    blocks = []
-    for view, pose, residual in zip(views, bundle.poses, bundle.residuals, strict=True):
-        points_c = pose.at(view.points)
-        root = np.sqrt(huber_weight(np.linalg.norm(residual, axis=-1), HUBER * sigma))[:, None, None] / sigma
-        A = (root * bundle.lens.parameter_jacobian(points_c)[..., free]).reshape(-1, int(free.sum()))
-        B = (root * pose_jacobian(bundle.lens, pose, points_c)).reshape(-1, 6)
-        blocks.append(block_of(A, B, (root[..., 0] * residual).ravel()))
-    return blocks
+def _perspective(views: Sequence[BoardView], size: tuple[int, int], model: str) -> tuple[Any, ...]:
+    import cv2
+
+    points, pixels = ([np.asarray(getattr(v, n), np.float32) for v in views] for n in ("points", "pixels"))
+    flags = cv2.CALIB_RATIONAL_MODEL if model == "rational" else 0
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-12)
+    return tuple(cv2.calibrateCamera(points, pixels, size, None, None, flags=flags, criteria=stop)[1:])
+
+
+def _fisheye(views: Sequence[BoardView], size: tuple[int, int], model: str) -> tuple[Any, ...]:
+    import cv2
+
+    points, pixels = ([np.asarray(getattr(v, n), float)[None] for v in views] for n in ("points", "pixels"))
+    names = cv2 if hasattr(cv2, "CALIB_RECOMPUTE_EXTRINSIC") else cv2.fisheye  # where OpenCV 4 has them
+    flags = names.CALIB_RECOMPUTE_EXTRINSIC | names.CALIB_FIX_SKEW | names.CALIB_USE_INTRINSIC_GUESS
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-12)
+    ends, refusal = [], None
+    for share in FOCAL_SHARES:
+        f = share * size[0]
+        K = np.array([[f, 0.0, 0.5 * (size[0] - 1)], [0.0, f, 0.5 * (size[1] - 1)], [0.0, 0.0, 1.0]])
+        try:
+            ends.append(
+                cv2.fisheye.calibrate(points, pixels, size, K, np.zeros(4), flags=flags, criteria=stop)
+            )
+        except cv2.error as error:
+            refusal = error
+    if refusal is not None and not ends:
+        raise refusal
+    return tuple(min(ends, key=lambda end: end[0])[1:])
+
+
+def _residual(lens: Lens, pose: Pose, view: BoardView) -> Array:
+    """Measured less predicted pixels, NaN where the lens cannot see, (n, 2)."""
+    return np.asarray(view.pixels - lens.project(pose.at(view.points))[0])
+
+
+def board_pose(lens: Lens, view: BoardView) -> Pose | None:
+    """The pose of a board with least squared residuals; None where none lies before the camera."""
+    rays, ok = lens.rays(view.pixels)
+    start = plane_pose(rays[ok], view.points[ok, :2]) if ok.sum() >= 4 else None
+    if start is None:
+        return None
+    pose = refine_pose(through_lens(lens), view.points, view.pixels, start[1], start[0], NO_LIMIT)
+    return None if pose is None else Pose(pose.rotation, pose.position)
 
 
 def evidence(bundle: Bundle, views: Sequence[BoardView]) -> Evidence:
     """What each view says about the lens once its own pose is taken out, for intervals that treat a view as one."""
-    names = lens_names(bundle.lens.model)
-    return arrow_evidence(_blocks(bundle, views, np.ones(len(names), bool), bundle.sigma), names, "views")
+    blocks = []
+    for view, pose, residual in zip(views, bundle.poses, bundle.residuals, strict=True):
+        points_c = pose.at(view.points)
+        J = bundle.lens.project_jacobian(points_c)
+        own = np.concatenate([-J @ skew(points_c - pose.t), J], axis=-1).reshape(-1, 6)
+        shared = bundle.lens.parameter_jacobian(points_c).reshape(len(own), -1)
+        blocks.append(block_of(*(x / bundle.sigma for x in (shared, own, residual.ravel()))))
+    return arrow_evidence(blocks, lens_names(bundle.lens.model), "views")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -379,7 +444,6 @@ class CameraFit:
     """How well pixels are known over the picture."""
     findings: tuple[Finding, ...]
     settings: dict[str, Any] = field(default_factory=dict)
-    interrupted: bool = False
 
     @property
     def used(self) -> tuple[View, ...]:
@@ -387,40 +451,27 @@ class CameraFit:
         return tuple(view for view in self.views if not view.left_out)
 
 
-def calibrate_camera(
-    views: Sequence[BoardView],
-    *,
-    model: str = "plumb_bob",
-    seed: int = 0,
-    progress: Callable[[float, str], None] | None = None,
-) -> CameraFit:
+def calibrate_camera(views: Sequence[BoardView], *, model: str = "plumb_bob", seed: int = 0) -> CameraFit:
     """Fit a lens to views of a board.
 
     Args:
-        views: From `finssim.calibration.vision.boards.see_board`; all of one size.
+        views: From `see_board`; all of one size.
         model: plumb_bob, rational or fisheye.
         seed: Of the split for the held-out error.
-        progress: Told the part done, 0 to 1, and a few words.
-
-    Returns:
-        The fit. Ctrl-C ends it with the best until then, marked as interrupted.
 
     Raises:
-        CalibrationError: Unknown model, fewer than four views, or pictures of several sizes, which are named.
+        CalibrationError: Unknown model, fewer than four views, pictures of several sizes, which are named, or corners
+            that no lens explains.
     """
-    told = progress or (lambda part, words: None)
     _check(views, model)
-    told(0.0, "focal length")
-    bundle = adjust(views, start(views, model))
+    bundle = adjust(views, model)
     _refuse_nonsense(bundle, views)
-    told(0.4, "outliers")
     used, bundle = _without_outliers(views, bundle)
-    some = [view for view, keep in zip(views, used, strict=True) if keep]
-    told(0.6, "held-out views")
-    held_out = math.nan if bundle.interrupted else _held_out(some, bundle, seed)
-    told(0.95, "intervals")
+    some = [_without_strays(view, bundle.residuals[i]) for i, view in enumerate(used)]
+    if sum(len(view.pixels) for view in some) < sum(len(view.pixels) for view in used):
+        bundle = adjust(some, model)
     covariance = trial_covariance(evidence(bundle, some))
-    every = _views(views, used, bundle)
+    every = _views(views, {view.name: i for i, view in enumerate(used)}, bundle)
     reach = lens_reach(bundle.lens, np.concatenate([view.pixels for view in some]), covariance)
     half = intervals(np.zeros(len(covariance.names)), covariance)[:, 1]
     estimates = _estimates(bundle.lens, half)
@@ -430,11 +481,10 @@ def calibrate_camera(
         correlation=correlation(covariance.names, covariance.local),
         views=every,
         rms=_rms(np.concatenate(bundle.residuals)),
-        held_out_rms=held_out,
+        held_out_rms=_held_out(some, model, seed),
         reach=reach,
         findings=camera_findings(bundle.lens, [v for v in every if not v.left_out], estimates, reach),
         settings={"model": model, "seed": seed},
-        interrupted=bundle.interrupted,
     )
 
 
@@ -458,15 +508,6 @@ def _check(views: Sequence[BoardView], model: str) -> None:
         )
 
 
-def _refuse_nonsense(bundle: Bundle, views: Sequence[BoardView]) -> None:
-    usual, limit = float(np.median(bundle.rms)), max(1.0, NONSENSE * views[0].width)
-    if usual > limit and not bundle.interrupted:
-        raise CalibrationError(
-            f"corners miss their places by {usual:.1f} px in the usual picture, expected below {limit:.1f} px: no lens "
-            "explains them: count the board's corners again, and see that it is flat and that the model suits the lens"
-        )
-
-
 def _outliers(rms: Array) -> NDArray[np.bool_]:
     log = np.log(np.maximum(rms, 1e-12))
     middle = np.median(log)
@@ -474,21 +515,34 @@ def _outliers(rms: Array) -> NDArray[np.bool_]:
     return np.asarray((log > middle + SPREAD * spread) & (log > middle + math.log(OUTLIER)))
 
 
-def _without_outliers(views: Sequence[BoardView], bundle: Bundle) -> tuple[list[bool], Bundle]:
-    """Leave out the worst view as long as it is far from the others, and fit again; which are used, and their fit."""
-    used = [True] * len(views)
-    most = min(int(MOST_LEFT_OUT * len(views)), len(views) - FEWEST_VIEWS)
-    for _ in range(most):
-        if bundle.interrupted or not _outliers(bundle.rms).any():
+def _refuse_nonsense(bundle: Bundle, views: Sequence[BoardView]) -> None:
+    usual, limit = float(np.median(bundle.rms)), max(1.0, NONSENSE * views[0].width)
+    if not usual <= limit:
+        raise CalibrationError(
+            f"corners miss their places by {usual:.1f} px in the usual picture, expected below {limit:.1f} px: no lens "
+            "explains them: count the board's corners again, and see that it is flat and that the model suits the lens"
+        )
+
+
+def _without_outliers(views: Sequence[BoardView], bundle: Bundle) -> tuple[list[BoardView], Bundle]:
+    """Leave out the worst view as long as it is far from the others, and fit again; the others, and their fit."""
+    used = list(views)
+    for _ in range(min(int(MOST_LEFT_OUT * len(views)), len(views) - FEWEST_VIEWS)):
+        if not _outliers(bundle.rms).any():
             break
-        worst = int(np.argmax(bundle.rms))
-        used[np.flatnonzero(used)[worst]] = False
-        poses = [pose for i, pose in enumerate(bundle.poses) if i != worst]
-        bundle = adjust([v for v, keep in zip(views, used, strict=True) if keep], bundle.lens, poses)
+        del used[int(np.argmax(bundle.rms))]
+        bundle = adjust(used, bundle.lens.model)
     return used, bundle
 
 
-def _held_out(views: Sequence[BoardView], bundle: Bundle, seed: int) -> float:
+def _without_strays(view: BoardView, residual: Array) -> BoardView:
+    """The view without corners that are far off among those of its own."""
+    size = np.linalg.norm(residual, axis=-1)
+    keep = size <= STRAY * max(float(np.median(size)), 1e-6)
+    return replace(view, pixels=view.pixels[keep], points=view.points[keep])
+
+
+def _held_out(views: Sequence[BoardView], model: str, seed: int) -> float:
     """Residual of views that the lens has not seen: each fold left out in turn, only the poses of its views fitted."""
     folds = min(FOLDS, len(views))
     if len(views) - math.ceil(len(views) / folds) < FEWEST_VIEWS - 1:
@@ -496,24 +550,22 @@ def _held_out(views: Sequence[BoardView], bundle: Bundle, seed: int) -> float:
     fold = np.random.default_rng(seed).permutation(len(views)) % folds
     residuals = []
     for k in range(folds):
-        rest = np.flatnonzero(fold != k).tolist()
-        lens = adjust([views[i] for i in rest], bundle.lens, [bundle.poses[i] for i in rest]).lens
-        for i in np.flatnonzero(fold == k).tolist():
-            pose = board_pose(lens, views[i].points, views[i].pixels, bundle.poses[i])
-            if pose is not None:
-                residuals.append(pose_residuals(lens, pose, views[i].points, views[i].pixels)[0])
+        lens = adjust([view for view, part in zip(views, fold, strict=True) if part != k], model).lens
+        for view in (view for view, part in zip(views, fold, strict=True) if part == k):
+            if (pose := board_pose(lens, view)) is not None:
+                residuals.append(_residual(lens, pose, view))
     return _rms(np.concatenate(residuals)) if residuals else math.nan
 
 
-def _views(views: Sequence[BoardView], used: Sequence[bool], bundle: Bundle) -> tuple[View, ...]:
-    poses, median, every = iter(bundle.poses), float(np.median(bundle.rms)), []
-    for view, keep in zip(views, used, strict=True):
-        pose = next(poses) if keep else board_pose(bundle.lens, view.points, view.pixels)
+def _views(views: Sequence[BoardView], used: Mapping[str, int], bundle: Bundle) -> tuple[View, ...]:
+    median, every = float(np.median(bundle.rms)), []
+    for view in views:
+        pose = bundle.poses[used[view.name]] if view.name in used else board_pose(bundle.lens, view)
         if pose is None:
             continue
-        residual, _ = pose_residuals(bundle.lens, pose, view.points, view.pixels)
+        residual = _residual(bundle.lens, pose, view)
         reason = f"its corners miss by {_rms(residual):.2f} px, those of the others by {median:.2f} px"
-        left_out = "" if keep else reason
+        left_out = "" if view.name in used else reason
         every.append(
             View(name=view.name, pixels=view.pixels, residuals=residual, pose=pose, left_out=left_out)
         )

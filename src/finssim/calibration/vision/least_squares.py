@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.uncertainty import Evidence
-from finssim.geometry.rotations import quat_from_rotvec, quat_to_matrix, skew
+from finssim.geometry.rotations import quat_from_rotvec, quat_to_matrix
 
 __all__ = [
     "Block", "Pose", "TukeyFit", "arrow_evidence", "arrow_step", "block_of", "descent", "huber_cost",
-    "huber_weight", "linear_map", "pose_of_plane", "tukey",
+    "huber_weight", "tukey",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -101,31 +101,6 @@ class Pose(NamedTuple):
     def stepped(self, step: Array) -> Pose:
         """After a small turn about the outer axes (3) and a shift (3)."""
         return Pose(quat_to_matrix(quat_from_rotvec(step[:3])) @ self.R, self.t + step[3:])
-
-
-def linear_map(points: Array, rays: Array) -> Array | None:
-    """M (3, k) with ray × M point = 0 in least squares, points before the eye  (Hartley and Zisserman 2004, §4.1).
-
-    Args:
-        points: Homogeneous, of the size of 1, (n, k).
-        rays: Of any length, (n, 3).
-
-    Returns:
-        Up to a scale, or None where the points leave it open.
-    """
-    rows = np.einsum("nij,nk->nijk", skew(rays), points).reshape(-1, 3 * points.shape[1])
-    _, values, vectors = np.linalg.svd(rows, full_matrices=False)
-    if values[-2] < 1e-9 * values[0]:
-        return None
-    M = vectors[-1].reshape(3, -1)
-    return np.asarray(M * np.sign(np.median(np.sum(rays * (points @ M.T), axis=1))))
-
-
-def pose_of_plane(H: Array) -> tuple[Array, Array]:
-    """R and t of H = [r_1 r_2 t] up to a positive scale."""
-    r1, r2, t = (H / (0.5 * (np.linalg.norm(H[:, 0]) + np.linalg.norm(H[:, 1])))).T
-    left, _, right = np.linalg.svd(np.column_stack([r1, r2, np.cross(r1, r2)]))
-    return np.asarray(left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right), np.asarray(t)
 
 
 class Block(NamedTuple):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,20 +22,20 @@ from finssim.calibration.output.publish import command_line, publish, refuse_pla
 from finssim.calibration.output.report import write_report
 from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.calibration.vision.least_squares import Pose
-from finssim.calibration.vision.mount_log import MountLog, read_mount_log
 from finssim.calibration.vision.sensor_mounts import (
     UNSURE_TURN,
     Attitude,
     DepthFit,
+    Gyro,
     ImuMounting,
     fit_depth,
     fit_imu_mounting,
     imu_clock,
-    turn_residual,
 )
 from finssim.calibration.vision.tag_mounts import (
     AXES,
     UNSURE_LENGTH,
+    Moment,
     MountFit,
     Rig,
     fit_mounts,
@@ -45,18 +46,189 @@ from finssim.geometry.rotations import (
     matrix_to_quat,
     quat_conjugate,
     quat_from_rotvec,
+    quat_inverse_rotate,
     quat_multiply,
     quat_to_matrix,
     quat_to_rotvec,
     skew,
 )
-from finssim.localization.detection.tags import corners
+from finssim.localization.detection.detections import most_certain, read_detections
+from finssim.localization.detection.families import corners
+from finssim.localization.fusion.attitude import TiltGains, follow, tilt_from
+from finssim.localization.fusion.fuse_log import Series, imu_columns, read_stream_table, series
 from finssim.localization.pool import Pool, load_pool
 from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["run"]
 
 Array = NDArray[np.float64]
+
+# A log folder of pictures, IMU and depth, laid out as moments of a moving vehicle.
+
+DETECTIONS, IMU, DEPTH = "detections.csv", "imu.csv", "depth.csv"
+LONGEST_AGE = 0.3
+"""A sensor is asked at an exposure only between two samples that are no further apart [s]."""
+
+SETTLING = 5.0
+"""Until the tilt of gyro and accelerometer has forgotten its start [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MountLog:
+    """What a folder holds."""
+
+    pictures: tuple[tuple[float, Mapping[int, Array]], ...]
+    """Time of the exposure [s] and tag -> pixels of its corners (4, 2), in order of time."""
+    up: Series | None
+    """Direction of up in body axes."""
+    gyro: Gyro | None
+    """In the sensor's own axes."""
+    turning: Series | None
+    """Angular rate about the vertical, by gyro and `up` [rad/s]."""
+    depth: Series | None
+    """[m]"""
+    sha256: str
+    """Of the files read."""
+    findings: tuple[Finding, ...]
+    """What was left out or is missing."""
+
+    def moments(self, imu_offset: float = 0.0) -> tuple[Moment, ...]:
+        """The pictures with tilt and depth at their time.
+
+        Args:
+            imu_offset: To be added to the IMU's times [s].
+        """
+        return tuple(
+            Moment(
+                time=time,
+                corners=corners,
+                up=_up_at(self.up, time - imu_offset),
+                depth=_depth_at(self.depth, time),
+            )
+            for time, corners in self.pictures
+        )
+
+
+def _up_at(up: Series | None, time: float) -> Array | None:
+    found = None if up is None else up.at(time)
+    return found / np.linalg.norm(found) if isinstance(found, np.ndarray) else None
+
+
+def _depth_at(depth: Series | None, time: float) -> float | None:
+    found = None if depth is None else depth.at(time)
+    return float(found[0]) if isinstance(found, np.ndarray) else None
+
+
+def read_mount_log(folder: str | Path, pool: Pool, vehicle: Vehicle) -> MountLog:
+    """Read `detections.csv`, and of `imu.csv` and `depth.csv` what is there.
+
+    Times are of one clock; a picture's is its stamp, from which the pool's latency is taken. As for `finssim fuse`, the
+    IMU's `p q r`, `ax ay az` and attitude are the body's, with its mount in the vehicle file; `gyro_x ...` and
+    `accel_x ...` are in its own axes, and so is then the attitude. Without an attitude the tilt is made from both.
+
+    Raises:
+        CalibrationError, LocalizationError: A file is missing or cannot be used.
+    """
+    folder = Path(folder)
+    if not (folder / DETECTIONS).is_file():
+        raise CalibrationError(
+            f"{folder}: no {DETECTIONS} in it: give a folder with {DETECTIONS}, {IMU}, {DEPTH}"
+        )
+    remarks: list[str] = []
+    frames = read_detections(folder / DETECTIONS, remarks)
+    findings = [finding("as_read", remark=remark) for remark in remarks]
+    time = np.array([frame.time for frame in frames]) - pool.latency
+    if not np.isfinite(time).all():
+        raise CalibrationError(f"{folder / DETECTIONS}: pictures without a time: add a column 'time' [s]")
+    up, gyro, turning = _read_imu(folder / IMU, vehicle, findings)
+    pictures = tuple(
+        (float(time[i]), {d.tag: np.asarray(d.corners, float) for d in most_certain(frames[i].detections)})
+        for i in np.argsort(time, kind="stable")
+    )
+    depth = _read_depth(folder / DEPTH, findings)
+    files = [folder / name for name in (DETECTIONS, IMU, DEPTH) if (folder / name).is_file()]
+    sha256 = hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+    return MountLog(
+        pictures=pictures,
+        up=up,
+        gyro=gyro,
+        turning=turning,
+        depth=depth,
+        sha256=sha256,
+        findings=tuple(findings),
+    )
+
+
+def _read_imu(
+    path: Path, vehicle: Vehicle, findings: list[Finding]
+) -> tuple[Series | None, Gyro | None, Series | None]:
+    """Up in body axes, the gyro in its own, and the angular rate about the vertical."""
+    if not path.is_file():
+        findings.append(finding("imu_missing", file=IMU))
+        return None, None, None
+    table = read_stream_table(path)
+    findings += [finding("as_read", remark=note) for note in table.notes]
+    sensor = vehicle.sensors.imu
+    mount = np.array([0.0, 0.0, 0.0, 1.0] if sensor is None else sensor.orientation)
+    omega, force, up, _ = imu_columns(table, sensor)
+    rated = bool(np.isfinite(omega).all(axis=1).any())
+    rate = series("rate", table.t, omega, math.inf, where=str(path)) if rated else None
+    gyro = None
+    if rate is not None and len(rate.t) > 2:
+        gyro = Gyro(t=rate.t, rate=quat_inverse_rotate(mount, rate.values))
+    if up is None and rated and np.isfinite(force).any():
+        up = _tilt(table.t, omega, force, vehicle.water.gravity)
+        findings.append(finding("attitude_made", file=IMU))
+    if up is None or not np.isfinite(up).any():
+        findings.append(finding("tilt_unknown", file=IMU))
+        return None, gyro, None
+    tilt = series("attitude", table.t, up, LONGEST_AGE, where=str(path))
+    if gyro is None or rate is None or len(tilt.t) < 2:
+        return tilt, gyro, None
+    within = (rate.t >= tilt.t[0]) & (rate.t <= tilt.t[-1])
+    t, about = rate.t[within], np.zeros(int(within.sum()))
+    for i in range(3):
+        about += rate.values[within, i] * np.interp(t, tilt.t, tilt.values[:, i])
+    turning = series("turning", t, about[:, None], math.inf, where=str(path)) if len(t) > 2 else None
+    return tilt, gyro, turning
+
+
+def _tilt(t: Array, omega: Array, force: Array, gravity: float) -> Array:
+    """Up from gyro and accelerometer, (m, 3); NaN until the filter has settled and after a gap.
+
+    It runs twice: the first time learns the gyro's bias, with which the second starts.
+    """
+    gains, bias = TiltGains(gravity=gravity), np.zeros(3)
+    up = np.full((len(t), 3), np.nan)
+    for _ in range(2):
+        tilt, since, last = None, 0.0, 0.0
+        for i in np.flatnonzero(np.isfinite(omega).all(axis=1)):
+            if tilt is None or t[i] - last > gains.longest_gap:
+                if not np.isfinite(force[i]).all():
+                    continue
+                tilt, since = replace(tilt_from(force[i]), bias=bias), t[i]
+            else:
+                tilt = follow(tilt, omega[i], force[i], t[i] - last, gains)
+            last = t[i]
+            up[i] = tilt.up if t[i] - since >= SETTLING else np.nan
+        bias = bias if tilt is None else tilt.bias
+    return up
+
+
+def _read_depth(path: Path, findings: list[Finding]) -> Series | None:
+    if not path.is_file():
+        findings.append(finding("depth_missing", file=DEPTH))
+        return None
+    table = read_stream_table(path)
+    findings += [finding("as_read", remark=note) for note in table.notes]
+    if not table.has("depth"):
+        raise CalibrationError(
+            f"{path}: no column 'depth': add the depth of the pressure port [m], positive down"
+        )
+    return series("depth", table.t, table.columns("depth"), LONGEST_AGE, where=str(path))
+
+
+# The mounts, as estimates and as numbers of the vehicle file.
 
 ESTIMATES = ("tags", "sensors")
 
@@ -189,7 +361,6 @@ def calibrate_mounts(
     *,
     name: str,
     estimate: str = "tags",
-    centre: Sequence[float] | None = None,
     seed: int = 0,
 ) -> Fit:
     """Where tags sit in the body, or how IMU and pressure port do, with everything that the motion tells.
@@ -201,7 +372,6 @@ def calibrate_mounts(
         name: Of the recording.
         estimate: `tags`: IMU and pressure port are right in the file, tags are written. `sensors`: the tag that is seen
             most is right in the file; the IMU's orientation, the port's height and the other tags are written.
-        centre: Body point that stays in place while the vehicle turns on the spot [m], if the recording is of that.
         seed: Recorded; nothing here is random.
 
     Raises:
@@ -229,7 +399,6 @@ def calibrate_mounts(
         corners_t=corners(tags.edge),
         port=np.zeros(3) if depth is None else np.asarray(depth.position, float),
         reference=reference_tag(log.moments(), mounts),
-        centre=None if centre is None else np.asarray(centre, float),
     )
     clock = _clock(rig, mounts, log)
     sure = clock is not None and clock.identifiable and not clock.ci95[0] <= 0.0 <= clock.ci95[1]
@@ -244,9 +413,7 @@ def calibrate_mounts(
         rows, changes = rows + of_tilt, changes | written
     if isinstance(imu, ImuMounting):
         rows += [row for row in imu.estimates.values() if "turn" not in row.name]
-        held_out = math.degrees(_turns_held_out(found, log, imu))
-        turns = _figures(math.degrees(imu.residual), imu.rejected, imu.windows, held_out)
-        quality["turns of the gyro [deg]"] = turns
+        quality["turns of the gyro [deg]"] = _figures(math.degrees(imu.residual), imu.rejected)
     rows += [clock] if clock is not None else []
     pressure = _pressure(rig, found, mounts) if estimate == "sensors" else None
     if pressure is not None:
@@ -311,24 +478,6 @@ def _imu(
         return error
 
 
-def _turns_held_out(found: MountFit, log: MountLog, imu: ImuMounting) -> float:
-    """Disagreement of the second half's turns with the mounting of the first, robust rms [rad]; NaN if it is short."""
-    assert log.gyro is not None
-    every = _attitude(found)
-    half, window = len(every.t) // 2, _window(every)
-    first, second = (
-        Attitude(t=every.t[part], quaternion=every.quaternion[part])
-        for part in (slice(None, half), slice(half, None))
-    )
-    options = {"start": imu.orientation, "time_offset": imu.time_offset}
-    try:
-        return turn_residual(
-            fit_imu_mounting(first, log.gyro, window=window, **options), second, log.gyro, window=window
-        )
-    except CalibrationError:
-        return math.nan
-
-
 def _pressure(rig: Rig, found: MountFit, mounts: Mapping[int, Pose]) -> DepthFit | None:
     """Depths by the pixels alone, with the mounts found, against what the sensor said."""
     reading = {moment.time: moment.depth for moment in found.moments if moment.depth is not None}
@@ -373,17 +522,6 @@ def _curves(found: MountFit) -> tuple[Curve, ...]:
     return tuple(curves)
 
 
-def _three(text: str) -> tuple[float, ...]:
-    """A point from `x,y,z`."""
-    try:
-        numbers = tuple(float(word) for word in text.split(","))
-    except ValueError:
-        numbers = ()
-    if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
-        raise CalibrationError(f"--turns-about is '{text}', expected three lengths such as 0,0,-0.08")
-    return numbers
-
-
 def run(
     log: Path,
     *,
@@ -391,7 +529,6 @@ def run(
     vehicle: str,
     out: Path,
     estimate: str = "tags",
-    turns_about: str | Sequence[float] | None = None,
     report: Path | None = None,
     seed: int = 0,
     as_json: bool = False,
@@ -406,7 +543,6 @@ def run(
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         out (FILE): Vehicle file to write (.yaml).
         estimate (WHAT): tags: the sensors are right in the vehicle file; sensors: the tag seen most is.
-        turns_about (X,Y,Z): Body point that stays in place while the vehicle turns on the spot: x,y,z [m].
         report (DIR): Directory for the report and its pictures.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
@@ -417,21 +553,16 @@ def run(
     Raises:
         CalibrationError, LocalizationError, VehicleError, OutputError: As they say; nothing is written then.
     """
-    if isinstance(turns_about, str):
-        turns_about = _three(turns_about)
     refuse_places(out, report, "vehicle")
     where, body = load_pool(pool), load_vehicle(vehicle)
     recording = read_mount_log(log, where, body)
-    fit = calibrate_mounts(
-        recording, where, body, name=Path(log).name, estimate=estimate, centre=turns_about, seed=seed
-    )
+    fit = calibrate_mounts(recording, where, body, name=Path(log).name, estimate=estimate, seed=seed)
     after = calibrated(fit)
     findings = all_findings(fit, after)
     write_vehicle(after, out)
     if report is not None:
         options = {"pool": pool, "vehicle": vehicle, "out": out, "estimate": estimate, "seed": seed}
-        point = None if turns_about is None else ",".join(f"{x:g}" for x in turns_about)
-        command = command_line("mounts", [log], {**options, "turns_about": point})
+        command = command_line("mounts", [log], options)
         write_report(fit, report, after, command=command, findings=findings, out=out)
 
     def show(console: Console) -> None:

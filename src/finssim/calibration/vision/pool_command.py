@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Estimate
-from finssim.calibration.output.fit_figures import BLUE, ORANGE, draw_correlation, new_figure, png
+from finssim.calibration.output.fit_figures import draw_correlation, new_figure, png
 from finssim.calibration.output.publish import command_line, publish, refuse_places
 from finssim.calibration.vision.pool_fit import PoolFit, calibrate_pool, doubted
 from finssim.calibration.vision.pool_model import Settings
-from finssim.calibration.vision.pool_refine import HeldOut, rms
+from finssim.calibration.vision.pool_search import HeldOut, rms
 from finssim.calibration.vision.report import (
     AS_GIVEN,
     Report,
@@ -26,7 +26,6 @@ from finssim.calibration.vision.report import (
     draw_arrows,
     picture_axes,
     plain,
-    plain_axes,
 )
 from finssim.calibration.vision.survey import Observations, observe, observe_combined, read_survey
 from finssim.geometry.optics import Layer
@@ -69,7 +68,6 @@ def pool_json(
         inputs: File -> SHA-256 of what the fit was made from.
     """
     settings = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(fit.settings).items()}
-    minima = [{"residual_ratio": plain(ratio), "camera_clearance": plain(at)} for ratio, at in fit.minima]
     return {
         "kind": "pool",
         "interface": "surface" if fit.surface else "wall",
@@ -82,7 +80,6 @@ def pool_json(
         },
         "lens_fitted": list(fit.lens_fitted),
         "outliers": fit.outliers,
-        "other_minima": minima,
         "correlation": correlation_json(fit.correlation, 4),
         "findings": [one.as_json() for one in fit.findings],
         "settings": settings,
@@ -173,11 +170,7 @@ def pool_pictures(fit: PoolFit) -> dict[str, tuple[str, bytes]]:
     drawn = {
         "map.png": ("Where each pixel's ray meets the point's plane, less the surveyed point", _map(fit)),
         "picture.png": ("Measured less predicted pixels, enlarged", _picture(fit)),
-        "outwards.png": ("Residual against the angle from the plane's normal", _outwards(fit)),
     }
-    if fit.held_out is not None:
-        text = "Errors at points held out, refraction beside straight lines"
-        drawn["held_out.png"] = (text, _held_out(fit))
     if len(fit.correlation.names) > 1:
         drawn["correlation.png"] = ("Correlation of the errors", draw_correlation(fit.correlation))
     return {name: (text, png(figure)) for name, (text, figure) in drawn.items()}
@@ -202,44 +195,6 @@ def _picture(fit: PoolFit) -> Figure:
     axes = figure.subplots()
     draw_arrows(axes, fit.seen.pixels, fit.residual, fit.used, "px", 1.0)
     picture_axes(axes, lens)
-    return figure
-
-
-def _outwards(fit: PoolFit) -> Figure:
-    """Length of the residuals of both models against the direction of the ray in the air."""
-    figure = new_figure(7.4, 3.8)
-    axes = figure.subplots()
-    rays, ok = fit.model.camera.lens.rays(fit.seen.pixels)
-    cosine = np.abs((rays @ np.asarray(fit.model.camera.R_pc).T) @ fit.model.interface.normal)
-    angle, good = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))), ok & fit.used
-    both = ((fit.pinhole_residual, ORANGE, "straight lines"), (fit.residual, BLUE, "refraction"))
-    for residual, color, name in both:
-        size = np.maximum(np.linalg.norm(residual[good], axis=1), 1e-3)
-        axes.semilogy(angle[good], size, ".", color=color, markersize=4, alpha=0.6, label=name)
-    axes.set(
-        xlabel="angle between the ray in the air and the plane's normal [degrees]", ylabel="residual [px]"
-    )
-    axes.legend(fontsize=8, frameon=False)
-    plain_axes(axes)
-    return figure
-
-
-def _held_out(fit: PoolFit) -> Figure:
-    """Share of held-out points within an error, for both models."""
-    figure = new_figure(7.4, 3.8)
-    axes = figure.subplots()
-    both = ((fit.held_out, BLUE, "refraction"), (fit.pinhole_held_out, ORANGE, "straight lines"))
-    for held_out, color, name in both:
-        if held_out is None:
-            continue
-        size = 100.0 * np.linalg.norm(held_out.points, axis=1)
-        size = np.sort(size[np.isfinite(size)])
-        share = 100.0 * np.arange(1, len(size) + 1) / max(len(size), 1)
-        axes.semilogx(np.maximum(size, 1e-3), share, color=color, label=name)
-    axes.set(xlabel="error in the water, at the point's own depth [cm]", ylabel="points within [%]")
-    axes.set_ylim(0.0, 101.0)
-    axes.legend(fontsize=8, frameon=False)
-    plain_axes(axes, "both")
     return figure
 
 

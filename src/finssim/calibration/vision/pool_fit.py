@@ -25,22 +25,24 @@ from finssim.calibration.vision.pool_model import (
     extended_lens,
     lens_std,
     residuals,
-    shifted_settings,
     solve,
 )
-from finssim.calibration.vision.pool_refine import (
+from finssim.calibration.vision.pool_search import (
+    UP,
+    Found,
     HeldOut,
     Noise,
     Refined,
     Whitener,
     error_vectors,
     held_out,
+    prior_of,
     refine,
     rms,
+    search,
     surprise,
     touched,
 )
-from finssim.calibration.vision.pool_search import UP, Found, prior_of, search
 from finssim.calibration.vision.report import AS_GIVEN
 from finssim.calibration.vision.survey import Observations
 from finssim.geometry.optics import Lens
@@ -65,22 +67,19 @@ STEPS = np.array([1e-5] * 3 + [1e-6] * 5 + [1e-5, 1e-5, 1e-6, 1e-3, 1e-3, 1e-6, 
 """Of the derivatives by the parameters."""
 
 
-def estimates(
-    fit: Refined, surface: bool, settings: Settings, centre: Array
-) -> tuple[dict[str, Estimate], Correlation]:
+def estimates(fit: Refined, surface: bool, settings: Settings) -> tuple[dict[str, Estimate], Correlation]:
     """Table of estimates, and the correlation of their errors, without what was not fitted.
 
     Args:
-        fit: In the frame of the middle of the points.
+        fit: The fit.
         surface: The plane is a water surface.
-        settings: Options, in the same frame.
-        centre: The middle of the points in the survey's frame [m].
+        settings: Options.
     """
-    table, quantile = _quantities(fit.model, surface, centre), float(student.ppf(0.975, fit.dof))
+    table, quantile = _quantities(fit.model, surface), float(student.ppf(0.975, fit.dof))
     G = np.zeros((len(table), len(NAMES)))
     for k in np.flatnonzero(fit.active):
         step = STEPS[k] * np.eye(len(NAMES))[k]
-        ends = (_quantities(fit.model.moved(s), surface, centre).values() for s in (step, -step))
+        ends = (_quantities(fit.model.moved(s), surface).values() for s in (step, -step))
         after, before = (np.array([value for _, value in end]) for end in ends)
         G[:, k] = (after - before) / (2.0 * STEPS[k])
     V = G @ fit.covariance @ G.T
@@ -93,19 +92,17 @@ def estimates(
     return rows, correlation(names, V[np.ix_(moved, moved)])
 
 
-def _quantities(model: PoolModel, surface: bool, centre: Array) -> dict[str, tuple[str, float]]:
+def _quantities(model: PoolModel, surface: bool) -> dict[str, tuple[str, float]]:
     """Name -> unit and value of everything that is told."""
     camera, lens, n = model.camera, model.camera.lens, model.interface.normal
-    rows = dict(
-        zip(("camera_x", "camera_y", "camera_z"), (("m", x) for x in camera.position + centre), strict=True)
-    )
+    rows = dict(zip(("camera_x", "camera_y", "camera_z"), (("m", x) for x in camera.position), strict=True))
     angles = np.degrees(quat_to_euler(np.asarray(camera.orientation)))
     rows |= dict(
         zip(("camera_roll", "camera_pitch", "camera_yaw"), (("deg", x) for x in angles), strict=True)
     )
     if surface:
         rows["camera_height"] = ("m", model.clearance)
-        rows["water_height"] = ("m", float(model.interface.height(0.0, 0.0) + centre[2]))
+        rows["water_height"] = ("m", float(model.interface.height(*model.reference[:2])))
         rows["tilt_x"], rows["tilt_y"] = (("deg", np.degrees(np.arctan2(x, abs(n[2])))) for x in n[:2])
     else:
         rows["camera_distance"], rows["point_distance"] = ("m", model.clearance), ("m", model.depth)
@@ -144,9 +141,6 @@ NARROW = np.radians(20.0)
 ONE_DEPTH = 0.02
 """Spread of depths, over the distance to the camera, below which they count as one."""
 
-SAME_PLACE = 0.005
-"""Two places of the plane nearer than this are one [m]."""
-
 CERTAIN = 0.999
 """Share of the marks above the water that are taken for such."""
 
@@ -159,19 +153,17 @@ def advice(
     surface: bool,
     settings: Settings,
     table: Mapping[str, Estimate],
-    minima: Sequence[tuple[float, float]],
     touching: Sequence[str],
     contradicted: Sequence[Finding],
 ) -> Iterator[Finding]:
     """Findings for the user, the gravest first.
 
     Args:
-        fit: In the frame of `seen`.
+        fit: The fit.
         seen: All rows.
         surface: The plane is a water surface.
-        settings: Options, in the same frame.
+        settings: Options.
         table: Estimates.
-        minima: Other places where the search came to rest.
         touching: What the plane came to rest against.
         contradicted: On measurements that the pixels contradict.
     """
@@ -182,10 +174,6 @@ def advice(
     yield from _conflicts(fit, surface, settings)
     yield from _numbers(fit, seen)
     yield from _left_out(fit, seen, surface)
-    place = table["camera_height" if surface else "camera_distance"]
-    close = [at for ratio, at in minima if ratio < 1.1 and abs(at - place.estimate) > SAME_PLACE]
-    if close and not place.identifiable:
-        yield finding("other_place", other=close[0], chosen=place.estimate)
 
 
 def _place(
@@ -324,8 +312,6 @@ class PoolFit:
     """Groups of `FITTED` that the lens gave up."""
     findings: tuple[Finding, ...]
     """The gravest first, then what is merely worth knowing."""
-    minima: tuple[tuple[float, float], ...]
-    """Other places where the search came to rest: residual over that of the best, clearance of the camera [m]."""
     touching: tuple[str, ...]
     """Places of the survey, or the camera, that the plane came to rest against: it can pass neither."""
 
@@ -365,26 +351,24 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
     settings = settings or Settings()
     if seen.dry.all():
         raise CalibrationError("every point is marked dry: at least 4 must be under water")
-    centre = seen.points[~seen.dry].mean(axis=0)
-    here, told = seen.shifted(-centre), shifted_settings(settings, -centre)
-    found = search(here, extended_lens(lens), told)
+    found = search(seen, extended_lens(lens), settings)
     notes = list(seen.findings)
-    fit = _best_lens(here, found, told, notes)
+    fit = _best_lens(seen, found, settings, notes)
     level = abs(float(fit.model.interface.normal[2])) > np.cos(LEVEL)
     if level and not found.surface and settings.interface == "auto" and settings.plane is None:
         found, notes = replace(found, surface=True), list(seen.findings)
-        fit = _best_lens(here, found, told, notes)
-    fit = _released(here, told, fit, notes)
+        fit = _best_lens(seen, found, settings, notes)
+    fit = _released(seen, settings, fit, notes)
     if found.surface and fit.model.interface.normal[2] < 0.0:
         notes.append(finding("camera_below"))
-    pinhole = _pinhole(here, found, told, fit)
+    pinhole = _pinhole(seen, found, settings, fit)
     normal = UP if found.surface else fit.model.interface.normal
-    parts = [held_out(f, here, settings.folds, settings.seed, normal) for f in (fit, pinhole)]
-    table, errors = estimates(fit, found.surface, told, centre)
-    touching = touched(fit, here)
-    contradicted = _contradicted(here, told, fit)
+    parts = [held_out(f, seen, settings.folds, settings.seed, normal) for f in (fit, pinhole)]
+    table, errors = estimates(fit, found.surface, settings)
+    touching = touched(fit, seen)
+    contradicted = _contradicted(seen, settings, fit)
     return PoolFit(
-        model=fit.model.shifted(centre),
+        model=fit.model,
         surface=found.surface,
         settings=settings,
         estimates=table,
@@ -392,65 +376,64 @@ def calibrate_pool(seen: Observations, lens: Lens, settings: Settings | None = N
         seen=seen,
         used=fit.used,
         noise=fit.noise,
-        residual=residuals(fit.model, here)[0],
-        error=error_vectors(fit.model, here, normal),
+        residual=residuals(fit.model, seen)[0],
+        error=error_vectors(fit.model, seen, normal),
         held_out=parts[0],
         pinhole=pinhole,
-        pinhole_residual=residuals(pinhole.model, here)[0],
+        pinhole_residual=residuals(pinhole.model, seen)[0],
         pinhole_held_out=parts[1],
         lens_fitted=_lens_groups(fit.active),
         findings=(
-            *advice(fit, here, found.surface, told, table, found.minima, touching, contradicted),
+            *advice(fit, seen, found.surface, settings, table, touching, contradicted),
             *notes,
         ),
-        minima=found.minima,
         touching=touching,
     )
 
 
 def _refined(
-    here: Observations, model: PoolModel, told: Settings, active: NDArray[np.bool_], prior: Prior
+    seen: Observations, model: PoolModel, settings: Settings, active: NDArray[np.bool_], prior: Prior
 ) -> Refined:
-    pixel, survey = told.pixel_sigma or 0.4, max(told.survey_sigma, 1e-7)
-    noise = Noise(pixel=pixel, survey=survey, survey_yaw=told.survey_yaw_sigma)
-    return refine(model, here, active, prior, noise, pixel_known=told.pixel_sigma is not None)
+    pixel, survey = settings.pixel_sigma or 0.4, max(settings.survey_sigma, 1e-7)
+    noise = Noise(pixel=pixel, survey=survey, survey_yaw=settings.survey_yaw_sigma)
+    return refine(model, seen, active, prior, noise, pixel_known=settings.pixel_sigma is not None)
 
 
-def _best_lens(here: Observations, found: Found, told: Settings, notes: list[Finding]) -> Refined:
+def _best_lens(seen: Observations, found: Found, settings: Settings, notes: list[Finding]) -> Refined:
     """The fit as asked; where nobody asked, the lens is fitted as far as held-out points get better by it."""
-    start = replace(found.model, interface=replace(found.model.interface, index_far=told.index))
+    start = replace(found.model, interface=replace(found.model.interface, index_far=settings.index))
 
     def fitted(model: PoolModel, active: NDArray[np.bool_]) -> Refined:
-        stds = lens_std(told, model.camera.lens.width)
-        return _refined(here, model, told, active, prior_of(model, start, told, found.surface, stds))
+        stds = lens_std(settings, model.camera.lens.width)
+        return _refined(seen, model, settings, active, prior_of(model, start, settings, found.surface, stds))
 
-    best = fitted(found.model, active_names(told))
-    if told.fit is not None:
+    best = fitted(found.model, active_names(settings))
+    if settings.fit is not None:
         return best
     normal = UP if found.surface else best.model.interface.normal
-    error = _generalisation(best, here, told, normal)
+    error = _generalisation(best, seen, settings, normal)
     for extra in LENS_STEPS:
-        active = active_names(told, extra)
-        if 2 * len(here) < 3 * active.sum() or not np.isfinite(error):
+        active = active_names(settings, extra)
+        if 2 * len(seen) < 3 * active.sum() or not np.isfinite(error):
             break
         try:
             other = fitted(best.model, active)
         except (CalibrationError, np.linalg.LinAlgError):
             continue
-        further = _generalisation(other, here, told, normal)
+        further = _generalisation(other, seen, settings, normal)
         if further < BETTER * error:
             best, error = other, further
-    if groups := _lens_groups(best.active & ~active_names(told)):
+    if groups := _lens_groups(best.active & ~active_names(settings)):
         notes.append(finding("lens_refitted", groups=groups))
     return best
 
 
-def _generalisation(fit: Refined, here: Observations, told: Settings, normal: Array) -> float:
+def _generalisation(fit: Refined, seen: Observations, settings: Settings, normal: Array) -> float:
     """Held-out error in the picture [px], rows that the fit left out counted as far as they lie."""
-    out = held_out(fit, here, told.folds, told.seed, normal)
+    out = held_out(fit, seen, settings.folds, settings.seed, normal)
     if out is None:
         return float("nan")
-    left = residuals(fit.model, here.subset(~fit.used))[0]
+    left = residuals(fit.model, seen.subset(~fit.used))[0]
     return rms(np.concatenate([out.pixels, np.clip(left, -20.0, 20.0)]))
 
 
@@ -459,11 +442,11 @@ def _lens_groups(active: NDArray[np.bool_]) -> tuple[str, ...]:
     return tuple(group for group, name in named.items() if active[NAMES.index(name)])
 
 
-def _released(here: Observations, told: Settings, fit: Refined, notes: list[Finding]) -> Refined:
+def _released(seen: Observations, settings: Settings, fit: Refined, notes: list[Finding]) -> Refined:
     """Let the surface tilt freely where the pixels contradict a level one and nobody set how level it is."""
-    if not np.isfinite(fit.prior.tilt_std) or told.tilt_sigma is not None or not fit.active[6]:
+    if not np.isfinite(fit.prior.tilt_std) or settings.tilt_sigma is not None or not fit.active[6]:
         return fit
-    free = _without(here, told, fit, replace(fit.prior, tilt_std=np.inf))
+    free = _without(seen, settings, fit, replace(fit.prior, tilt_std=np.inf))
     assert fit.prior.normal is not None
     if free is None or not _leans(free, fit.prior.normal):
         return fit
@@ -479,11 +462,11 @@ def _leans(free: Refined, normal: Array) -> bool:
     return lean < MOST_LEAN and error < lean / 3.0
 
 
-def _contradicted(here: Observations, told: Settings, fit: Refined) -> list[Finding]:
+def _contradicted(seen: Observations, settings: Settings, fit: Refined) -> list[Finding]:
     """A finding where the pixels by themselves put the plane elsewhere than it was measured."""
-    if not told.known_depth or not fit.active[NAMES.index("depth")]:
+    if not settings.known_depth or not fit.active[NAMES.index("depth")]:
         return []
-    free = _without(here, told, fit, replace(fit.prior, depth_std=np.inf))
+    free = _without(seen, settings, fit, replace(fit.prior, depth_std=np.inf))
     if free is None:
         return []
     by = 1000.0 * (free.model.depth - fit.prior.depth)
@@ -491,22 +474,22 @@ def _contradicted(here: Observations, told: Settings, fit: Refined) -> list[Find
     return [finding("plane_contradicted", distance=abs(by), sense=sense)]
 
 
-def _without(here: Observations, told: Settings, fit: Refined, loose: Prior) -> Refined | None:
+def _without(seen: Observations, settings: Settings, fit: Refined, loose: Prior) -> Refined | None:
     """The fit with a prior loosened, where the pixels contradict that prior; else None."""
     try:
-        free = _refined(here, fit.model, told, fit.active, loose)
+        free = _refined(seen, fit.model, settings, fit.active, loose)
     except (CalibrationError, np.linalg.LinAlgError):
         return None
-    held = solve(free.model, here.subset(free.used), free.whiten, fit.active, fit.prior)
+    held = solve(free.model, seen.subset(free.used), free.whiten, fit.active, fit.prior)
     return free if 2.0 * (held.cost - free.cost) > DOUBT else None
 
 
-def _pinhole(here: Observations, found: Found, told: Settings, fit: Refined) -> Refined:
+def _pinhole(seen: Observations, found: Found, settings: Settings, fit: Refined) -> Refined:
     """Straight lines fitted to the same rows, as plain calibrations do."""
     model = replace(found.pinhole, camera=replace(found.pinhole.camera, lens=fit.model.camera.lens))
     active = fit.active & np.array([name in NAMES[:6] or name in NAMES[10:] for name in NAMES])
     prior = replace(fit.prior, normal=None, depth=np.nan, depth_std=np.inf, index_std=np.inf)
-    part = here.subset(fit.used)
+    part = seen.subset(fit.used)
     alike = Noise(pixel=1.0, survey=1e-7, survey_yaw=1e-7)
     end = solve(model, part, Whitener(np.zeros((len(part), 2, 3)), part, alike), active, prior).model
     alike = replace(alike, pixel=max(0.05, rms(residuals(end, part)[0]) / np.sqrt(2.0)))
@@ -565,17 +548,17 @@ def doubted(fit: PoolFit, lens: Lens, *, lens_told: bool = True) -> PoolFit:
 
 def _refuse_depth(fit: PoolFit) -> None:
     """Refuse a plane told so far from the points that the camera, seen through it, would be between."""
-    told, option = _told_depth(fit)
+    depth, option = _measured_depth(fit)
     camera = fit.pinhole.model
     apparent = abs(float(fit.model.interface.normal @ (camera.camera.position - camera.reference)))
-    if told > TOO_DEEP * fit.model.interface.index_far * apparent:
+    if depth > TOO_DEEP * fit.model.interface.index_far * apparent:
         raise CalibrationError(
-            f"{option} puts the plane {told:.3g} m from the points, but by the pixels the camera is only about "
+            f"{option} puts the plane {depth:.3g} m from the points, but by the pixels the camera is only about "
             f"{apparent:.3g} m from them: check its unit (metres) and the survey's; nothing is written"
         )
 
 
-def _told_depth(fit: PoolFit) -> tuple[float, str]:
+def _measured_depth(fit: PoolFit) -> tuple[float, str]:
     """Distance of the plane from the middle of the points under water as it was measured [m], and by which option."""
     settings, middle = fit.settings, fit.seen.points[~fit.seen.dry].mean(axis=0)
     if settings.water_height is not None:

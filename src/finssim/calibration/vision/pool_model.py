@@ -20,7 +20,7 @@ from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_to
 
 __all__ = [
     "LENS_NAMES", "NAMES", "PoolModel", "Prior", "Settings", "Solution", "active_names", "clearances",
-    "extended_lens", "lens_std", "normal_equations", "residuals", "shifted_settings", "solve",
+    "extended_lens", "lens_std", "normal_equations", "residuals", "solve",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -128,16 +128,6 @@ class PoolModel:
             interface=replace(
                 plane, normal=normal, offset=offset, index_far=float(plane.index_far + step[9])
             ),
-        )
-
-    def shifted(self, vector: Array) -> PoolModel:
-        """The same model in a frame whose origin is at `-vector` of this one: everything moves by `vector` [m]."""
-        plane = self.interface
-        return replace(
-            self,
-            camera=replace(self.camera, position=self.camera.position + vector),
-            interface=replace(plane, offset=float(plane.offset - plane.normal @ vector)),
-            reference=self.reference + vector,
         )
 
     def _optical(self, points: Array) -> Array:
@@ -299,16 +289,6 @@ class Settings:
         assert self.plane is not None
         length = float(np.linalg.norm(self.plane[:3]))
         return np.array(self.plane[:3]) / length, self.plane[3] / length
-
-
-def shifted_settings(settings: Settings, vector: Array) -> Settings:
-    """The same in a frame in which every point lies `vector` further [m]."""
-    if settings.water_height is not None:
-        return replace(settings, water_height=settings.water_height + float(vector[2]))
-    if settings.plane is not None:
-        n, b = np.array(settings.plane[:3]), settings.plane[3]
-        return replace(settings, plane=(*map(float, n), float(b - n @ vector)))
-    return settings
 
 
 def active_names(settings: Settings, extra: tuple[str, ...] = ()) -> NDArray[np.bool_]:

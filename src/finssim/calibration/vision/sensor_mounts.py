@@ -27,8 +27,6 @@ from finssim.geometry.rotations import (
 )
 
 __all__ = [
-    "SALT",
-    "UNSURE_TURN",
     "Attitude",
     "DepthFit",
     "Gyro",
@@ -36,11 +34,9 @@ __all__ = [
     "fit_depth",
     "fit_imu_mounting",
     "imu_clock",
-    "level_from_rest",
-    "rotation_between",
-    "turn_pairs",
     "turn_residual",
-]  # fmt: skip
+    "rotation_between",
+]
 
 Array = NDArray[np.float64]
 
@@ -404,24 +400,6 @@ def turn_residual(
     size = np.linalg.norm(residual, axis=1)
     usual = size < 4.0 * np.median(size)
     return float(np.sqrt(np.mean(size[usual] ** 2)))
-
-
-def level_from_rest(up_b: Array, force_s: Array, start: ArrayLike) -> tuple[Array, Array]:
-    """Orientation from the accelerometer at rest: gravity tells the tilt of the mounting, and not its turn about it.
-
-    Args:
-        up_b: Direction of up in body axes, (n, 3).
-        force_s: Accelerometer at the same times, sensor axes [m/s²], (n, 3).
-        start: Orientation so far, sensor to body, xyzw, (4,); kept about the axis that all rests share.
-
-    Returns:
-        Orientation, sensor to body, xyzw (4,), and its information about the body axes for unit noise of a direction,
-        Σ -S(u)², (3, 3): singular along up if the vehicle always rested alike.
-    """
-    felt = force_s / np.linalg.norm(force_s, axis=-1, keepdims=True)
-    q = rotation_between(up_b, felt, start=start)
-    S = skew(up_b)
-    return q, np.asarray(-np.sum(S @ S, axis=0))
 
 
 def imu_clock(attitude: Attitude, up_p: Array, t: Array, vertical_rate: Array) -> Estimate | None:

@@ -16,10 +16,10 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.trials.units import UNITS
 from finssim.geometry.rotations import quat_from_euler, quat_rotate
+from finssim.localization import LocalizationError
+from finssim.localization.camera_file import Fields
 from finssim.localization.detection.detections import Frame, most_certain, read_detections
-from finssim.localization.detection.tags import corners
-from finssim.localization.errors import LocalizationError
-from finssim.localization.fields import Fields
+from finssim.localization.detection.families import corners
 from finssim.text_table import TextTable, read_text, read_text_table, text_table
 from finssim.text_table import number as _number
 from finssim.yaml_file import read_mapping
@@ -171,6 +171,8 @@ def _table(path: str, text: TextTable, default: str | None) -> Table:
         raise CalibrationError(f"{path}: two columns mean '{twice[0]}': leave one of them")
     united = default is not None or any(unit in METRES for _, unit in heads)
     cells = text.rows
+    if text.decimal_comma:
+        cells = [[w.replace(",", ".") if text.number(w) is not None else w for w in row] for row in cells]
     factors = [
         _factor(name, unit, default, [c[k] for c in cells if k < len(c)])
         for k, (name, unit) in enumerate(heads)
@@ -432,10 +434,6 @@ class Observations:
             arm=self.arm[index],
             dry=self.dry[index],
         )
-
-    def shifted(self, vector: Array) -> Observations:
-        """The same in a frame in which every point lies `vector` further [m]."""
-        return replace(self, points=self.points + vector)
 
 
 def observe(inputs: Sequence[Path], survey: Survey, *, family: str | None = None) -> Observations:

@@ -38,29 +38,14 @@ from finssim.geometry.rotations import (
 )
 from finssim.localization.pool import Pool
 
-__all__ = [
-    "AXES",
-    "UNSURE_LENGTH",
-    "Moment",
-    "MountFit",
-    "MountState",
-    "Noise",
-    "Rig",
-    "change",
-    "fit_mounts",
-    "moment_blocks",
-    "moved",
-    "reference_tag",
-    "residuals",
-    "start_state",
-]  # fmt: skip
+__all__ = ["AXES", "UNSURE_LENGTH", "Moment", "MountFit", "Rig", "fit_mounts", "reference_tag", "residuals"]
 
 Array = NDArray[np.float64]
 
 AXES = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
 """Of a small motion of a tag: about the outer axes [rad], and along them [m]."""
 
-SENSORS = ("imu.turn_x", "imu.turn_y", "imu.turn_z", "depth.offset", "centre.x", "centre.y")
+SENSORS = ("imu.turn_x", "imu.turn_y", "imu.turn_z", "depth.offset")
 """Shared unknowns that are not of tags."""
 
 HUBER = 3.0
@@ -91,8 +76,6 @@ class Noise:
     """Of roll and pitch [rad]."""
     depth: float = 0.01
     """[m]"""
-    centre: float = 0.02
-    """Of the place of the centre while turning on the spot [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,8 +89,6 @@ class Rig:
     """Pressure port, body frame [m], (3,)."""
     reference: int
     """The reference tag."""
-    centre: Array | None = None
-    """Body point that stays where it is while the vehicle turns on the spot [m], (3,); None if it does not."""
     noise: Noise = field(default_factory=Noise)
 
     @property
@@ -130,8 +111,6 @@ class MountState:
     """Turn of the IMU's body axes into the body, (3, 3)."""
     depth_offset: float = 0.0
     """Reading less true depth [m]."""
-    centre: Array = field(default_factory=lambda: np.zeros(2))
-    """Where the centre stays, pool x and y [m], (2,)."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -156,7 +135,6 @@ def moved(state: MountState, shared: Array, own: Sequence[Array]) -> MountState:
         poses=[pose.stepped(step) for pose, step in zip(state.poses, own, strict=True)],
         imu_turn=quat_to_matrix(quat_from_rotvec(shared[tail : tail + 3])) @ state.imu_turn,
         depth_offset=state.depth_offset + float(shared[tail + 3]),
-        centre=state.centre + shared[tail + 4 :],
     )
 
 
@@ -220,7 +198,7 @@ def _corner_rows(rig: Rig, state: MountState, pose: Pose, tag: int, J: Array) ->
 
 
 def _others(rig: Rig, state: MountState, pose: Pose, moment: Moment) -> list[tuple[Array, Array, Array]]:
-    """Whitened rows of IMU, depth and centre: shared, own, residual."""
+    """Whitened rows of IMU and depth: shared, own, residual."""
     n, noise, tail = rig.pool.interface.normal, rig.noise, len(state.names) - len(SENSORS)
     rows = []
 
@@ -237,10 +215,6 @@ def _others(rig: Rig, state: MountState, pose: Pose, moment: Moment) -> list[tup
         predicted = -(n @ (pose.t + arm) + rig.pool.interface.offset) + state.depth_offset
         off = np.array([moment.depth - predicted])
         add(noise.depth, tail + 3, np.ones((1, 1)), (n @ skew(arm))[None], -n[None], off)
-    if rig.centre is not None:
-        arm, across = pose.R @ rig.centre, np.eye(3)[:2]
-        off = state.centre - across @ (pose.t + arm)
-        add(noise.centre, tail + 4, -np.eye(2), -across @ skew(arm), across, off)
     return rows
 
 
@@ -378,7 +352,6 @@ def change(before: MountState, after: MountState, free: Sequence[str]) -> Array:
     for tag, pose in before.others.items():
         total += [turn(pose.R, after.others[tag].R), after.others[tag].t - pose.t]
     total += [turn(before.imu_turn, after.imu_turn), np.array([after.depth_offset - before.depth_offset])]
-    total.append(after.centre - before.centre)
     every = np.concatenate(total)
     return every[[before.names.index(name) for name in free]]
 
@@ -551,10 +524,9 @@ def _wanted(rig: Rig, state: MountState, moments: Sequence[Moment], estimate: st
     others = _of_others(state)
     if estimate == "sensors":
         return (*others, *SENSORS[: 3 if up else 0], *SENSORS[3 : 4 if depth else 3])
-    across = (depth and up) or rig.centre is not None
-    told = {"turn_x": up, "turn_y": up, "turn_z": up, "z": depth, "x": across, "y": across}
+    told = {"turn_x": up, "turn_y": up, "turn_z": up, "z": depth, "x": depth and up, "y": depth and up}
     wanted = [f"reference.{axis}" for axis, is_told in told.items() if is_told]
-    return (*wanted, *others, *(SENSORS[4:] if rig.centre is not None else ()))
+    return (*wanted, *others)
 
 
 def _of_others(state: MountState) -> tuple[str, ...]:
@@ -579,7 +551,6 @@ def _least_told(free: Sequence[str], half: Array) -> str | None:
     """The unknown that is least told, by its half width in its own unit, if it is not told well enough."""
     limits = np.array([UNSURE_ANGLE if "turn" in name else UNSURE_LENGTH for name in free])
     ratio = np.where(np.isfinite(half), half, np.inf) / limits
-    ratio[[name.startswith("centre.") for name in free]] = 0.0
     worst = int(np.argmax(ratio))
     return free[worst] if ratio[worst] > 1.0 else None
 

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.optics.errors import OpticsError
+from finssim.geometry.optics.lens import OpticsError
 
 __all__ = ["Interface", "Layer"]
 

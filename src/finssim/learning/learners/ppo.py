@@ -20,7 +20,7 @@ from typing import Any
 from finssim.learning.layers import Adam, Array, Arrays, Gru, Parameters, Row, Stack
 from finssim.learning.learners.acting import ActingLearner
 from finssim.learning.learners.task_settings import applied
-from finssim.learning.network import Activation, Cell, Linear, Network, advance_history
+from finssim.learning.network import Activation, Cell, Linear, Network, advance_history, with_integrals
 from finssim.learning.served import age_episodes
 from finssim.tasks import Environment, Task
 
@@ -64,6 +64,8 @@ class PpoSettings:
     """Observations of earlier control steps that the policy sees beside the newest."""
     last_action: bool = False
     """Whether the policy sees what it did last."""
+    integral: bool = True
+    """Whether to the task's `errors`, where it names some, their integrals are added, so that none lasts."""
     memory: int = 0
     """Units of a GRU in front of the policy's hidden layers, which remembers what cannot be seen; 0: none."""
     asymmetric: bool = True
@@ -126,6 +128,8 @@ class Ppo(ActingLearner):
         self._optimizers = [Adam(p, A, s.largest_gradient) for p in (self._policy, self._value)]
         self._mean, self._variance, self._seen = A.zeros(n), A.zeros(n) + 1.0, 0
         self._memory = A.zeros(self._rows, self._window + s.memory)
+        self._errors = e.task.errors if s.integral else ()
+        self._integral = A.zeros(self._rows, len(self._errors))
         self._x = A.empty(s.rollout + 1, self._rows, inputs)
         """What the policy saw."""
         self._c = self._x if judged == inputs else A.empty(s.rollout + 1, self._rows, judged)
@@ -157,7 +161,8 @@ class Ppo(ActingLearner):
         A, s = self.arrays, self.settings
         sigma = A.xp.exp(self.noise.values)
         for t in range(s.rollout):
-            x, self._x[t], h, judged = self._look(self._observation, self._drawn)
+            observation, integral = self._integrated(self._observation)
+            x, self._x[t], h, judged = self._look(observation, self._drawn)
             if self._c is not self._x:
                 self._c[t] = judged
             action, noise = self._u[t], A.noise(self._noise)
@@ -166,10 +171,17 @@ class Ppo(ActingLearner):
             action += self.actor(self._x[t] if h is None else h)
             self._action[:] = action
             self._remember(x, action, h)
+            self._integral[:] = integral
             self.environment.advance()
             self.tally.look()
             self._close(t)
-        self._c[s.rollout] = self._look(self._observation, self._drawn)[3]
+        self._c[s.rollout] = self._look(self._integrated(self._observation)[0], self._drawn)[3]
+
+    def _integrated(self, observation: Array) -> tuple[Array, Array]:
+        """The observation with the errors' integrals in it, and these after the step."""
+        if not self._errors:
+            return observation, self._integral
+        return with_integrals(self.arrays.xp, observation, self._integral, self._errors)
 
     def _look(self, observation: Array, drawn: Array | None) -> tuple[Array, Array, Array | None, Array]:
         """The scaled observation, what the policy sees, what its GRU makes of that, and what the critic sees."""
@@ -200,10 +212,11 @@ class Ppo(ActingLearner):
             A.xp.broadcast_to(mask[:, None], (e.worlds, e.agents)).reshape(-1)
             for mask in (truncated & ~terminated, done)
         )
-        value = self.critic(self._look(self._final, self._final_drawn)[3])[:, 0]
+        value = self.critic(self._look(self._integrated(self._final)[0], self._final_drawn)[3])[:, 0]
         self._r[t] += self.settings.discount * A.xp.where(late, value, 0.0 * value)
         self._go[t] = A.xp.where(done, 0.0 * value, 0.0 * value + 1.0)
         self._memory *= self._go[t][:, None]
+        self._integral *= self._go[t][:, None]
 
     # Advantage
 
@@ -330,6 +343,7 @@ class Ppo(ActingLearner):
         scaling = {"mean": A.copy(self._mean), "scale": self._scale} if s.normalize else {}
         return Network(
             tuple(layers[:-1]),
+            errors=self._errors,
             history=s.history,
             last_action=self.environment.action_size if s.last_action else 0,
             observation_size=self.environment.observation_size,
@@ -340,6 +354,7 @@ class Ppo(ActingLearner):
     def _numbers(self) -> dict[str, Array]:
         """Arrays that decide what comes next."""
         numbers = {"mean": self._mean, "variance": self._variance, "memory": self._memory}
+        numbers["integral"] = self._integral
         for name, optimizer in zip(("policy", "value"), self._optimizers, strict=True):
             numbers[name] = optimizer.parameters.values
             numbers |= {f"{name}_mean": optimizer.mean, f"{name}_square": optimizer.square}

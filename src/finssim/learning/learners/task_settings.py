@@ -58,7 +58,12 @@ RANDOMIZED: Table = {
         "on-policy": {"steps": 3_000_000},
         "sb3-sac": {"steps": 800_000, "memory": 800_000},
     },
-    "t2": {"ppo": {"steps": 1_000_000}, "on-policy": {"steps": 2_000_000}},
+    # What it saw and did in the last steps tells how this vehicle answers: thrust, lag, and how late the state comes.
+    "t1": {"ppo": {"steps": 2_000_000, "history": 2, "last_action": True}},
+    "t2": {
+        "ppo": {"steps": 2_000_000, "history": 2, "last_action": True},
+        "on-policy": {"steps": 2_000_000},
+    },
     "t3": {"ppo": {"steps": 1_500_000}},
     "docking": {"ppo": {"steps": 2_000_000}},
     "pursuit": {"ppo": {"steps": 1_500_000}, "on-policy": {"steps": 2_500_000}},

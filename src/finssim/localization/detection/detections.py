@@ -7,7 +7,6 @@ picture without tags is a row whose cells after `image` are empty.
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from collections.abc import Iterable, Mapping
@@ -17,9 +16,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from finssim.files import atomic_write
-from finssim.localization.errors import LocalizationError
-from finssim.text_table import read_text_table
+from finssim.localization import LocalizationError
+from finssim.text_table import TextTable, read_text_table, write_csv
 
 __all__ = ["Detection", "Frame", "most_certain", "read_detections", "write_detections"]
 
@@ -94,16 +92,15 @@ def write_detections(frames: Iterable[Frame], path: str | Path) -> None:
     Raises:
         OutputError: The file cannot be written.
     """
-    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        for frame in frames:
-            head = [_cell(frame.time), frame.image]
-            for found in frame.detections:
-                pixels = [_cell(x) for x in np.asarray(found.corners, float).ravel().tolist()]
-                writer.writerow([*head, found.tag, *pixels, _cell(found.margin), found.hamming, found.family])
-            if not frame.detections:
-                writer.writerow(head + [""] * (len(COLUMNS) - 2))
+    rows: list[list[object]] = []
+    for frame in frames:
+        head: list[object] = [_cell(frame.time), frame.image]
+        for found in frame.detections:
+            pixels = [_cell(x) for x in np.asarray(found.corners, float).ravel().tolist()]
+            rows.append([*head, found.tag, *pixels, _cell(found.margin), found.hamming, found.family])
+        if not frame.detections:
+            rows.append(head + [""] * (len(COLUMNS) - 2))
+    write_csv(path, COLUMNS, rows)
 
 
 def read_detections(path: str | Path, notes: list[str] | None = None) -> list[Frame]:
@@ -138,71 +135,47 @@ def read_detections(path: str | Path, notes: list[str] | None = None) -> list[Fr
         rows = rows if whole else rows[:-1]
     pictures: dict[tuple[str, str], tuple[float, str, list[Detection]]] = {}
     for line, cells in rows:
-        row = _row(cells, columns, len(header), f"{path}: line {line}")
-        if table.decimal_comma:
-            row.cells = {name: cell.replace(",", ".") for name, cell in row.cells.items()}
-        key = row.cells.get("image", ""), row.cells.get("time", "")
+        where = f"{path}: line {line}"
+        if len(cells) < len(header) or any(cells[len(header) :]):
+            raise LocalizationError(
+                f"{where}: {len(cells)} cells, expected the {len(header)} of the column names: correct or "
+                "remove the line"
+            )
+        row = {name: cells[i] for name, i in columns.items()}
+        key = row.get("image", ""), row.get("time", "")
         if key not in pictures:
-            pictures[key] = (row.number("time") if key[1] else math.nan, key[0], [])
-        if not row.blank:
-            pictures[key][2].append(row.detection())
+            time = _number(table, row, "time", where) if key[1] else math.nan
+            pictures[key] = (time, key[0], [])
+        if any(cell for name, cell in row.items() if name not in ("time", "image")):
+            pictures[key][2].append(_detection(table, row, where))
     return [Frame(time, image, tuple(found)) for time, image, found in pictures.values()]
 
 
-@dataclass
-class _Row:
-    """One line of the file by our column names."""
-
-    cells: dict[str, str]
-    where: str
-
-    @property
-    def blank(self) -> bool:
-        """Whether it only says that the picture holds no tag."""
-        return not any(cell for name, cell in self.cells.items() if name not in ("time", "image"))
-
-    def number(self, name: str) -> float:
-        """A finite number."""
-        cell = self.cells[name]
-        try:
-            value = float(cell)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise LocalizationError(
-                f"{self.where}: {name} is '{cell[:40]}', expected a finite number: correct or remove the line"
-            )
-        return value
-
-    def whole(self, name: str, default: int | None = None) -> int:
-        """A whole number that is not negative."""
-        if default is not None and not self.cells.get(name):
-            return default
-        value = self.number(name)
-        if value != int(value) or value < 0:
-            raise LocalizationError(
-                f"{self.where}: {name} is {self.cells[name]}, expected a whole number from 0"
-            )
-        return int(value)
-
-    def detection(self) -> Detection:
-        """The tag it tells of."""
-        pixels = [self.number(f"{axis}{i}") for i in range(4) for axis in "uv"]
-        return Detection(
-            tag=self.whole("tag"),
-            corners=np.array(pixels).reshape(4, 2),
-            margin=self.number("margin") if self.cells.get("margin") else math.nan,
-            hamming=self.whole("hamming", 0),
-            family=self.cells.get("family", ""),
-        )
+def _detection(table: TextTable, row: Mapping[str, str], where: str) -> Detection:
+    pixels = [_number(table, row, f"{axis}{i}", where) for i in range(4) for axis in "uv"]
+    return Detection(
+        tag=_whole(table, row, "tag", where),
+        corners=np.array(pixels).reshape(4, 2),
+        margin=_number(table, row, "margin", where) if row.get("margin") else math.nan,
+        hamming=_whole(table, row, "hamming", where) if row.get("hamming") else 0,
+        family=row.get("family", ""),
+    )
 
 
-def _row(cells: list[str], columns: Mapping[str, int], width: int, where: str) -> _Row:
-    if len(cells) < width or any(cells[width:]):
+def _number(table: TextTable, row: Mapping[str, str], name: str, where: str) -> float:
+    value = table.number(row[name])
+    if value is None or not math.isfinite(value):
         raise LocalizationError(
-            f"{where}: {len(cells)} cells, expected the {width} of the column names: correct or remove the line"
+            f"{where}: {name} is '{row[name][:40]}', expected a finite number: correct or remove the line"
         )
-    return _Row({name: cells[i] for name, i in columns.items()}, where)
+    return value
+
+
+def _whole(table: TextTable, row: Mapping[str, str], name: str, where: str) -> int:
+    value = _number(table, row, name, where)
+    if value != int(value) or value < 0:
+        raise LocalizationError(f"{where}: {name} is {row[name]}, expected a whole number from 0")
+    return int(value)
 
 
 def _columns(header: list[str], where: str) -> dict[str, int]:

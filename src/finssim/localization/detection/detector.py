@@ -1,9 +1,10 @@
-"""Finding tags in a picture: two libraries behind one interface, with the same corners in the same convention."""
+"""Finding tags in a picture, their corners to a few hundredths of a pixel, and both in a stream of pictures."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -12,12 +13,14 @@ import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
-from finssim.localization.detection import detector_apriltag, detector_opencv
-from finssim.localization.detection.detections import Detection
-from finssim.localization.detection.families import FAMILIES, bitmap, family_named
-from finssim.localization.errors import LocalizationError
+from finssim.localization import LocalizationError
+from finssim.localization.detection.detections import Detection, most_certain
+from finssim.localization.detection.families import EDGES, bitmap, family_named, find_tags
 
-__all__ = ["LIBRARIES", "Detector", "Library", "Region", "detector", "fit_tag"]
+__all__ = ["REFINEMENTS", "Detector", "RegionTracker", "SearchCounts", "detector"]
+
+Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.uint8]
 
 # A tag as it should look in a picture, and how its gray changes as it moves, blurs or brightens.
 
@@ -334,9 +337,6 @@ def _through(H: Array, points: Array) -> Array:
     return np.asarray(p[:2] / p[2])
 
 
-Array = npt.NDArray[np.float64]
-Image = npt.NDArray[np.uint8]
-
 Region = tuple[int, int, int, int]
 """Part of a picture: left, top, right, bottom [px], right and bottom just outside."""
 
@@ -344,23 +344,8 @@ LEAST_CORRELATION = 0.7
 """Of a picture with the tag that a library says is there; below it there is none."""
 
 
-@dataclass(frozen=True)
-class Library:
-    """One library that finds tags."""
-
-    find: Callable[[Image, str, str, int], list[Detection]]
-    """Picture, family, refinement and most corrected bits -> tags."""
-    refinements: tuple[str, ...]
-    """Its own ways to place corners."""
-    before_fit: str
-    """The one from which our fit starts."""
-
-
-LIBRARIES: Mapping[str, Library] = {
-    "apriltag": Library(detector_apriltag.find, tuple(detector_apriltag.REFINEMENTS), "edges"),
-    "opencv": Library(detector_opencv.find, tuple(detector_opencv.REFINEMENTS), "subpix"),
-}
-"""Name -> library."""
+REFINEMENTS = ("fit", *EDGES)
+"""How corners are placed."""
 
 
 @dataclass(frozen=True)
@@ -368,7 +353,6 @@ class Detector:
     """Finds the tags of one family. Made by `detector`."""
 
     family: str
-    library: str
     refine: str
     gamma: float
     max_hamming: int
@@ -396,13 +380,12 @@ class Detector:
         if left >= right or top >= bottom:
             return []
         part = gray[top:bottom, left:right]
-        library = LIBRARIES[self.library]
-        if self.refine != "fit":
+        if self.refine == "fit":
+            found = find_tags(part, self.family, "edges", self.max_hamming)
+        else:
             light = _linear(part, self.gamma)
             bytes_ = part if light is part else np.rint(light).astype(np.uint8)
-            found = library.find(bytes_, self.family, self.refine, self.max_hamming)
-        else:
-            found = library.find(part, self.family, library.before_fit, self.max_hamming)
+            found = find_tags(bytes_, self.family, self.refine, self.max_hamming)
         corner = np.array([left, top], float)
         moved = [replace(d, corners=d.corners + corner) for d in found]
         return self._fitted(gray, moved) if self.refine == "fit" else moved
@@ -420,38 +403,27 @@ class Detector:
         return fitted
 
 
-def detector(
-    family: str, *, library: str | None = None, refine: str = "fit", gamma: float = 1.0, max_hamming: int = 1
-) -> Detector:
+def detector(family: str, *, refine: str = "fit", gamma: float = 1.0, max_hamming: int = 1) -> Detector:
     """A detector of one family.
 
     Args:
         family: Such as `tag25h9` or `tagStandard41h12`.
-        library: `apriltag` or `opencv`; None: `apriltag`, which has every family.
-        refine: How corners are placed: `fit` lays the whole known tag over the picture (the most accurate); else what
-            the library has: `edges`, `none` (apriltag); `none`, `subpix`, `contour`, `apriltag` (opencv).
+        refine: How corners are placed: `fit` lays the whole known tag over the picture (the most accurate); `edges` are
+            AprilTag's own, `none` those that it starts from.
         gamma: Encoding of the picture, gray ~ light^(1/gamma): 2.2 for what most cameras deliver, 1 for raw sensors. It
             matters because a blurred edge of encoded gray lies in the black by up to half a pixel.
         max_hamming: Most bits that may be corrected.
 
     Raises:
-        LocalizationError: Unknown family, library or refinement, one that does not go with the other, or a gamma out of
-            range.
+        LocalizationError: Unknown family or refinement, or a gamma out of range.
     """
-    name = family_named(family).name
-    chosen = library or "apriltag"
-    if chosen not in LIBRARIES:
-        raise LocalizationError(f"unknown library '{chosen}'; available: {', '.join(LIBRARIES)}")
-    if chosen == "opencv" and not FAMILIES[name].opencv:
-        raise LocalizationError(f"OpenCV has no {name}: use the library 'apriltag'")
-    ways = ("fit", *LIBRARIES[chosen].refinements)
-    if refine not in ways:
-        raise LocalizationError(f"unknown refinement '{refine}' of {chosen}; available: {', '.join(ways)}")
+    if refine not in REFINEMENTS:
+        raise LocalizationError(f"unknown refinement '{refine}'; available: {', '.join(REFINEMENTS)}")
     if not 0.2 <= gamma <= 5.0:
         raise LocalizationError(
             f"gamma is {gamma}, expected 0.2 to 5: 1 for linear pictures, 2.2 for most cameras"
         )
-    return Detector(name, chosen, refine, float(gamma), int(max_hamming))
+    return Detector(family_named(family).name, refine, float(gamma), int(max_hamming))
 
 
 def _clipped(region: Region | None, gray: Image) -> Region:
@@ -468,3 +440,194 @@ def _linear(gray: Image, gamma: float) -> npt.NDArray[Any]:
         return gray
     table = 255.0 * (np.arange(256) / 255.0) ** gamma
     return np.asarray(table.astype(np.float32)[gray])
+
+
+# Tags of a stream of pictures, searched first where they are expected: a few percent of the picture, at its rate.
+
+BESIDE = 0.6
+"""White that a tag needs around it to be found, and a change of its pose [edges]."""
+LEAST = 8.0
+"""Smallest padding [px]."""
+PER_LOSS = 0.5
+"""Growth of the padding with every picture in which the tag was not found [edges]."""
+MOST_LOST = 30
+"""Pictures after which a lost tag is searched in the whole picture alone."""
+AHEAD = 1.5
+"""Regions reach from the last place of a tag, should it have stopped, to this many times its motion since."""
+SIGMAS = 3.0
+"""Standard deviations of a prediction that the padding takes in."""
+
+
+@dataclass
+class SearchCounts:
+    """What a tracker did."""
+
+    pictures: int = 0
+    regions: int = 0
+    """Parts of pictures that were searched."""
+    whole: int = 0
+    """Pictures that were searched entirely."""
+    found: int = 0
+    """Tags, summed over pictures."""
+    recovered: int = 0
+    """Tags that only the search of the whole picture found."""
+    pixels: int = 0
+    """Searched, summed over pictures."""
+    pixels_given: int = 0
+    """Of all pictures."""
+
+    @property
+    def share(self) -> float:
+        """Searched part of all pixels; above 1 where whole pictures were searched after regions."""
+        return self.pixels / max(self.pixels_given, 1)
+
+
+@dataclass
+class _Seen:
+    """The last that is known of a tag."""
+
+    corners: Array
+    time: float
+    velocity: Array = field(default_factory=lambda: np.zeros(2))
+    """Of the centre [px/s]."""
+    lost: int = 0
+    """Pictures since."""
+
+
+class RegionTracker:
+    """Detects tags picture after picture; remembers where they were and how they moved."""
+
+    def __init__(
+        self, detector: Detector, tags: Collection[int] | None = None, *, search_every: int = 15
+    ) -> None:
+        """
+        Args:
+            detector: Finds tags in a picture or a part of it.
+            tags: Ids that are looked for, others are left out; None: all that there are.
+            search_every: Pictures between searches of the whole one while a tag is missing (always, where `tags` is
+                None). If none is found at all, the whole picture is searched at once.
+        """
+        self.counts = SearchCounts()
+        self._detector = detector
+        self._tags = None if tags is None else frozenset(tags)
+        self._search_every = search_every
+        self._seen: dict[int, _Seen] = {}
+        self._since_whole = search_every
+        self._last_time = math.nan
+
+    def detect(
+        self,
+        image: npt.NDArray[np.uint8],
+        time: float = math.nan,
+        *,
+        predicted: Mapping[int, npt.ArrayLike] | None = None,
+        predicted_std: float = 5.0,
+    ) -> list[Detection]:
+        """Tags in the next picture, each id once.
+
+        Args:
+            image: Gray, (h, w).
+            time: Of the picture [s]; pictures without a time count as one second apart.
+            predicted: Tag id -> corners where a filter expects it [px], (4, 2); the others are expected between
+                their last places and where their velocity takes them.
+            predicted_std: Standard deviation of those corners [px].
+
+        Raises:
+            LocalizationError: The picture is not one of gray bytes.
+        """
+        now = time if math.isfinite(time) else (0.0 if math.isnan(self._last_time) else self._last_time + 1.0)
+        self.counts.pictures += 1
+        self.counts.pixels_given += image.size
+        regions = merged(self._regions(now, predicted or {}, predicted_std))
+        found = [d for region in regions for d in self._search(image, region)]
+        here = {d.tag for d in found}
+        self._since_whole += 1
+        due = self._since_whole >= self._search_every and self._incomplete(here)
+        if not here or due:
+            found += self._search(image, None)
+            self._since_whole = 0
+            self.counts.recovered += len({d.tag for d in found} - here)
+        best = most_certain(found)
+        self._remember(best, now)
+        self.counts.found += len(best)
+        return best
+
+    def _incomplete(self, here: set[int]) -> bool:
+        return self._tags is None or not self._tags <= here
+
+    def _search(self, image: npt.NDArray[np.uint8], region: Region | None) -> list[Detection]:
+        height, width = image.shape
+        left, top, right, bottom = region or (0, 0, width, height)
+        inside = max(min(right, width) - max(left, 0), 0) * max(min(bottom, height) - max(top, 0), 0)
+        self.counts.pixels += inside
+        self.counts.whole += region is None
+        self.counts.regions += region is not None
+        found = self._detector.detect(image, region)
+        return [d for d in found if self._tags is None or d.tag in self._tags]
+
+    def _regions(
+        self, now: float, predicted: Mapping[int, npt.ArrayLike], predicted_std: float
+    ) -> list[Region]:
+        regions = []
+        for tag in sorted(self._seen.keys() | predicted.keys()):
+            seen = self._seen.get(tag)
+            lost = seen.lost if seen else 0
+            if tag in predicted:
+                corners = np.asarray(predicted[tag], float)
+                if np.isfinite(corners).all():
+                    regions.append(region_around(corners, SIGMAS * predicted_std, lost))
+            elif seen and lost <= MOST_LOST:
+                ahead = seen.corners + AHEAD * seen.velocity * (now - seen.time)
+                regions.append(region_around(np.vstack([seen.corners, ahead]), 0.0, lost))
+        return regions
+
+    def _remember(self, found: list[Detection], now: float) -> None:
+        for seen in self._seen.values():
+            seen.lost += 1
+        for tag in found:
+            before = self._seen.get(tag.tag)
+            velocity = np.zeros(2)
+            if before is not None and before.lost <= 3 and now > before.time:
+                velocity = (tag.corners - before.corners).mean(axis=0) / (now - before.time)
+            self._seen[tag.tag] = _Seen(tag.corners, now, velocity)
+        self._last_time = now
+
+
+def region_around(corners: Array, uncertainty: float = 0.0, lost: int = 0) -> Region:
+    """The part of a picture in which a tag is searched.
+
+    Args:
+        corners: Where it is expected [px], (n, 2).
+        uncertainty: Distance by which it may lie elsewhere [px].
+        lost: Pictures since it was last found.
+    """
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    edge = float(np.linalg.norm(corners[1] - corners[0]) + np.linalg.norm(corners[2] - corners[1])) / 2.0
+    padding = max(LEAST, BESIDE * edge) + uncertainty + PER_LOSS * lost * edge
+    left, top = np.floor(low - padding).astype(int).tolist()
+    right, bottom = (np.ceil(high + padding).astype(int) + 1).tolist()
+    return left, top, right, bottom
+
+
+def merged(regions: list[Region]) -> list[Region]:
+    """The same places in regions of which no two overlap: those that do become one around both."""
+    apart: list[Region] = []
+    for region in regions:
+        joined = region
+        while True:
+            touching = next((other for other in apart if _overlap(joined, other)), None)
+            if touching is None:
+                break
+            apart.remove(touching)
+            joined = (
+                min(joined[0], touching[0]),
+                min(joined[1], touching[1]),
+                max(joined[2], touching[2]),
+                max(joined[3], touching[3]),
+            )
+        apart.append(joined)
+    return apart
+
+
+def _overlap(a: Region, b: Region) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]

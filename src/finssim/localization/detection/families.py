@@ -1,17 +1,93 @@
-"""AprilTag families: the cells of every tag, as AprilTag 3 prints them."""
+"""AprilTags by AprilTag 3: their families and cells, where a picture shows them, and their corners in space."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from threading import Lock
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from finssim.localization.detection.detector_apriltag import family_table
-from finssim.localization.errors import LocalizationError
+from finssim.geometry.rotations import quat_rotate
+from finssim.localization import LocalizationError
+from finssim.localization.detection.detections import Detection
+from finssim.vehicles.equipment import Tags
 
-__all__ = ["FAMILIES", "Family", "bitmap", "family_named", "printable"]
+__all__ = [
+    "EDGES", "FAMILIES", "bitmap", "corners", "family_named", "find_tags", "printable", "tag_corners_b",
+]  # fmt: skip
+
+# Tags found by AprilTag 3, through pupil-apriltags, in our conventions.
+
+Image = npt.NDArray[np.uint8]
+
+EDGES = {"edges": 1, "none": 0}
+"""Name -> the library's `refine_edges`."""
+
+_ONE_AT_A_TIME = Lock()
+"""The library keeps its memory in the detector, and ctypes lets other threads run meanwhile."""
+
+
+def find_tags(image: Image, family: str, refine: str, max_hamming: int) -> list[Detection]:
+    """Tags of a family in a picture.
+
+    Args:
+        image: Gray, (h, w).
+        family: Name of the family.
+        refine: One of `EDGES`.
+        max_hamming: Most bits that may be corrected.
+    """
+    # The library looks at squares whose sides are read two pixels around: a picture of a few pixels has none.
+    if min(image.shape) < 16:
+        return []
+    with _ONE_AT_A_TIME:
+        found = _library(family, refine).detect(np.ascontiguousarray(image))
+    return [
+        Detection(
+            tag=int(tag.tag_id),
+            # Counter-clockwise from the bottom left, pixel centres at half integers.
+            corners=np.asarray(tag.corners[::-1] - 0.5),
+            margin=float(tag.decision_margin),
+            hamming=int(tag.hamming),
+            family=family,
+        )
+        for tag in found
+        if tag.hamming <= max_hamming
+    ]
+
+
+@cache
+def family_table(family: str) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Code words of a family, first bit highest, and column and row of each bit's cell from the measured edge's corner.
+
+    Cells outside the measured edge have negative places, or such beyond it.
+    """
+    table = _library(family, "edges").tag_families[family].contents
+    codes = np.array(table.codes[: table.ncodes], np.uint64)
+    x, y = (
+        np.array(bits[: table.nbits], np.uint32).view(np.int32).astype(np.int64)
+        for bits in (table.bit_x, table.bit_y)
+    )
+    return codes, x, y
+
+
+@cache
+def _library(family: str, refine: str) -> Any:
+    """The library's detector, made once.
+
+    It is never destroyed: pupil-apriltags frees the family before the detector that still refers to it, which
+    corrupts memory.
+    """
+    import pupil_apriltags
+
+    class Kept(pupil_apriltags.Detector):  # type: ignore[misc]
+        def __del__(self) -> None:
+            pass
+
+    return Kept(families=family, nthreads=1, quad_decimate=1.0, refine_edges=EDGES[refine])
+
 
 Cells = npt.NDArray[np.uint8]
 
@@ -30,8 +106,6 @@ class Family:
     """Number of ids."""
     distance: int
     """Bits in which two tags differ at least."""
-    opencv: str = ""
-    """Name of the family's dictionary in cv2.aruco; empty where OpenCV has none."""
 
     @property
     def outside(self) -> int:
@@ -42,9 +116,9 @@ class Family:
 FAMILIES = {
     family.name: family
     for family in (
-        Family("tag16h5", 6, 6, 30, 5, "DICT_APRILTAG_16h5"),
-        Family("tag25h9", 7, 7, 35, 9, "DICT_APRILTAG_25h9"),
-        Family("tag36h11", 8, 8, 587, 11, "DICT_APRILTAG_36h11"),
+        Family("tag16h5", 6, 6, 30, 5),
+        Family("tag25h9", 7, 7, 35, 9),
+        Family("tag36h11", 8, 8, 587, 11),
         Family("tagStandard41h12", 9, 5, 2115, 12),
     )
 }
@@ -104,3 +178,32 @@ def printable(family: str, tag: int, *, pixels_per_cell: int = 40, margin: float
     """
     cells = np.kron(bitmap(family, tag), np.full((pixels_per_cell, pixels_per_cell), 255, np.uint8))
     return np.pad(cells, round(margin * pixels_per_cell), constant_values=255)
+
+
+# Corners of a tag: on its own plate and on the vehicle that carries it.
+
+Array = npt.NDArray[np.float64]
+
+_SIGNS = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
+
+
+def corners(edge: float) -> Array:
+    """Corners of the black border in the tag frame [m], (4, 3).
+
+    Tag frame: x to the right and y up in the printed image, z out of the printed side. Order: top-left, top-right,
+    bottom-right, bottom-left as printed.
+
+    Args:
+        edge: Length of an edge of the border [m]; for tagStandard41h12 of the line where its black ring meets
+            the white square inside, as AprilTag 3 measures it.
+    """
+    return np.asarray(edge * _SIGNS)
+
+
+def tag_corners_b(tags: Tags) -> dict[int, Array]:
+    """Corners of a vehicle's tags in the body frame [m]: tag id -> (4, 3), in the order of `corners`."""
+    flat = corners(tags.edge)
+    return {
+        tag: np.asarray(np.asarray(mount.position) + quat_rotate(np.asarray(mount.orientation), flat))
+        for tag, mount in tags.mounts.items()
+    }

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.files import atomic_write
-from finssim.localization.errors import LocalizationError
+from finssim.localization import LocalizationError
 from finssim.text_table import read_text_table
 
-__all__ = ["PICTURE_FILES", "VIDEO_FILES", "pictures", "read_picture", "write_picture"]
+__all__ = ["PICTURE_FILES", "pictures", "read_picture", "write_picture"]
 
 Image = npt.NDArray[np.uint8]
 Timed = tuple[float, str, Image]

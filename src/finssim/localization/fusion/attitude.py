@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -15,15 +16,10 @@ import numpy.typing as npt
 from finssim.geometry.rotations import quat_from_rotvec, quat_rotate, quat_to_matrix, skew
 
 __all__ = [
-    "Tilt",
-    "TiltGains",
-    "follow",
-    "height_above_origin",
-    "in_body_axes",
-    "roll_pitch",
-    "tilt_from",
-    "up_of",
-]
+    "Tilt", "TiltGains", "YawInnovation", "YawNoise", "YawState", "capped", "correct", "follow",
+    "height_above_origin", "in_body_axes", "innovation", "predict", "restarted", "roll_pitch", "tilt_from",
+    "up_of", "yaw_rate",
+]  # fmt: skip
 
 Array = npt.NDArray[np.float64]
 
@@ -116,3 +112,145 @@ def follow(tilt: Tilt, omega: npt.ArrayLike, accel: npt.ArrayLike, dt: float, ga
     up = (quat_to_matrix(quat_from_rotvec(-dt * turn)) @ tilt.up[..., None])[..., 0]
     length = np.sqrt(np.sum(up * up, axis=-1, keepdims=True))
     return Tilt(up / length, np.asarray(tilt.bias - gains.integral * error * dt))
+
+
+# Yaw from the gyro, corrected by what the camera sees (paper, eq. 15), with the gyro's bias as a second state.
+#
+# Pure functions of plain numbers or, but for restarts and caps, of arrays of them. Yaw is left positive, about the
+# vertical.
+
+Number: TypeAlias = Any
+"""A float, or an array with one for each run: the formulas take both, and plain floats cost a tenth."""
+
+
+@dataclass(frozen=True)
+class YawState:
+    """What the filter knows."""
+
+    yaw: Number
+    """[rad], in [-pi, pi)."""
+    bias: Number
+    """What the gyro shows too much of yaw rate [rad/s]."""
+    variance: Number
+    """Of yaw [rad²]."""
+    cross: Number
+    """Covariance of yaw and bias [rad²/s]."""
+    bias_variance: Number
+    """[rad²/s²]"""
+
+    @property
+    def P(self) -> Array:
+        """Covariance of yaw and bias, (..., 2, 2)."""
+        P = np.array([[self.variance, self.cross], [self.cross, self.bias_variance]])
+        return np.moveaxis(P, (0, 1), (-2, -1))
+
+
+@dataclass(frozen=True)
+class YawNoise:
+    """Errors of the yaw rate."""
+
+    rate: float = 1e-3
+    """Noise density of the rate [rad/s/√Hz]."""
+    bias_walk: float = 2e-5
+    """Of its bias [rad/s²/√Hz]."""
+
+
+@dataclass(frozen=True)
+class YawInnovation:
+    """What a measured yaw says that the prediction did not."""
+
+    residual: Number
+    """The short way round [rad]."""
+    S: Number
+    """Its variance [rad²]."""
+    mahalanobis: Number
+    """Squared."""
+
+
+def yaw_rate(q: float, r: float, roll: float, pitch: float) -> float:
+    """Rate of yaw from body rates.
+
+    psi_dot = (q sin φ + r cos φ) / cos θ
+
+    Body rates are p = φ_dot - ψ_dot sin θ, q = θ_dot cos φ + ψ_dot sin φ cos θ, r = -θ_dot sin φ + ψ_dot cos φ cos θ
+    for R = R_z(ψ) R_y(θ) R_x(φ), whichever way z points: the formula is that of Fossen's axes, and in ours r, q and ψ
+    turn left, nose down and left. The rate p about body x does not enter.
+
+    Args:
+        q: Angular rate about body y [rad/s].
+        r: Angular rate about body z [rad/s].
+        roll: φ [rad].
+        pitch: θ [rad]; not near ±90 degrees, where yaw is not defined.
+    """
+    return (q * math.sin(roll) + r * math.cos(roll)) / math.cos(pitch)
+
+
+def predict(state: YawState, rate: Number, dt: float, noise: YawNoise) -> YawState:
+    """Yaw a time later.
+
+    ψ <- ψ + (ω_z - b) dt,  P <- F P F' + Q,  F = [1 -dt; 0 1]                         (paper, eq. 15)
+
+    Args:
+        state: Before.
+        rate: Rate of yaw as measured [rad/s].
+        dt: Time that passes [s].
+        noise: Errors of the rate.
+    """
+    w, doubt = noise.bias_walk**2, state.bias_variance
+    return YawState(
+        _wrapped(state.yaw + (rate - state.bias) * dt),
+        state.bias,
+        state.variance + dt * (dt * doubt - 2.0 * state.cross + noise.rate**2) + w * dt**3 / 3.0,
+        state.cross - dt * doubt - 0.5 * w * dt**2,
+        doubt + w * dt,
+    )
+
+
+def innovation(state: YawState, yaw: Number, variance: Number) -> YawInnovation:
+    """Compare a measured yaw [rad] of that variance [rad²] with the prediction."""
+    residual = _wrapped(yaw - state.yaw)
+    S = state.variance + variance
+    return YawInnovation(residual, S, residual**2 / S)
+
+
+def correct(state: YawState, found: YawInnovation, variance: Number) -> YawState:
+    """The state after a measured yaw, in Joseph's form.
+
+    ψ <- ψ + K (ψ_vis - ψ),  K = P / (P + R), and likewise the bias                     (paper, eq. 15)
+    """
+    K, L = state.variance / found.S, state.cross / found.S
+    # P <- [1-K 0; -L 1] P [1-K 0; -L 1]' + R [K L]' [K L]
+    kept = 1.0 - K
+    cross = state.cross - L * state.variance
+    return YawState(
+        _wrapped(state.yaw + K * found.residual),
+        state.bias + L * found.residual,
+        kept * kept * state.variance + variance * K * K,
+        kept * cross + variance * K * L,
+        state.bias_variance - L * (state.cross + cross) + variance * L * L,
+    )
+
+
+def restarted(state: YawState, yaw: float, variance: float, bias_std: float) -> YawState:
+    """Start yaw at a measurement; the bias is kept, with at least the doubt it had at power-on if `bias_std` > 0.
+
+    Args:
+        state: Before.
+        yaw: Measured [rad].
+        variance: Of `yaw` [rad²].
+        bias_std: Of the gyro's bias at power-on [rad/s].
+    """
+    return YawState(_wrapped(yaw), state.bias, variance, 0.0, max(state.bias_variance, bias_std**2))
+
+
+def capped(state: YawState, variance: float) -> YawState:
+    """Yaw no less certain than `variance` [rad²]: its row and column are scaled down together."""
+    scale = math.sqrt(min(1.0, variance / state.variance))
+    return YawState(
+        state.yaw, state.bias, state.variance * scale * scale, state.cross * scale, state.bias_variance
+    )
+
+
+def _wrapped(angle: Number) -> Number:
+    """The same angle in [-pi, pi) [rad]."""
+    return (angle + math.pi) % math.tau - math.pi

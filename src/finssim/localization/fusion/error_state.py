@@ -1,4 +1,6 @@
-"""Error-state filter with the IMU's acceleration: pure functions over a leading `...` batch.
+"""Fusion with the IMU's acceleration: the error-state filter, and the model that runs it behind its gates.
+
+Predictions, models and corrections are pure functions over a leading `...` batch.
 
 Nominal state: position and velocity of the IMU in the pool frame, attitude, gyro bias, accelerometer bias. Error state
 (15): [δp, δv, δθ, δb_g, δb_a], with the attitude error in pool axes, R = exp([δθ]x) R̂.
@@ -11,30 +13,50 @@ With a Doppler log or a compass it has five more (20): [δb_c, δs, δb_v], thei
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.rotations import cross, quat_from_rotvec, quat_multiply, quat_to_matrix, skew
-from finssim.localization.fusion.changed import changed
+from finssim.geometry.rotations import (
+    cross,
+    matrix_to_quat,
+    quat_from_euler,
+    quat_from_rotvec,
+    quat_multiply,
+    quat_to_matrix,
+    skew,
+    wrap_angle,
+)
+from finssim.localization.fusion.attitude import roll_pitch
+from finssim.localization.fusion.fuse_constant_velocity import (
+    GYRO_HOLD,
+    ConstantVelocity,
+    GateMemory,
+    Track,
+    judge,
+    judge_carried,
+    motion_of,
+    vision_covariance,
+)
+from finssim.localization.fusion.fuse_settings import Settings, Site
 from finssim.localization.fusion.position_filter import Motion, process_noise, transition
+from finssim.localization.fusion.streams import (
+    DepthSample,
+    Estimate,
+    HeadingSample,
+    ImuSample,
+    Outcome,
+    VelocitySample,
+    VisionSample,
+    changed,
+)
+from finssim.localization.poses import axes_of_up
 
-__all__ = [
-    "AIDED",
-    "ErrorStateNoise",
-    "InertialState",
-    "correct",
-    "depth_model",
-    "drift",
-    "error_innovation",
-    "heading_model",
-    "position_model",
-    "predict",
-    "velocity_model",
-    "yaw_model",
-]
+__all__ = ["ErrorState"]
 
 Array = npt.NDArray[np.float64]
 
@@ -285,3 +307,405 @@ def correct(state: InertialState, residual: Array, H: Array, R: Array, gain: Arr
         0.5 * (covariance + np.swapaxes(covariance, -1, -2)),
         state.extra + d[..., 15:],
     )
+
+
+# What happens to an error state besides prediction and correction: restarts, stops, bounds. One state each.
+
+
+def restarted(
+    state: InertialState, axes: list[int], value: Array, R: Array, speed_std: float
+) -> InertialState:
+    """Forget position and velocity of some axes, 0 to 2, and start them at a measurement.
+
+    Args:
+        state: Before.
+        axes: Position axes to restart.
+        value: Their positions [m], (n,).
+        R: Covariance of `value` [m²], (n, n).
+        speed_std: Standard deviation of the velocity per axis [m/s].
+    """
+    rows = axes + [axis + 3 for axis in axes]
+    p, v, covariance = state.p.copy(), state.v.copy(), state.covariance.copy()
+    covariance[rows, :] = 0.0
+    covariance[:, rows] = 0.0
+    p[axes], v[axes] = value, 0.0
+    covariance[np.ix_(axes, axes)] = R
+    covariance[rows[len(axes) :], rows[len(axes) :]] = speed_std**2
+    return changed(state, p=p, v=v, covariance=covariance)
+
+
+def stopped(state: InertialState, axes: list[int]) -> InertialState:
+    """Stop some axes: their velocity becomes zero, and what it was becomes doubt about it."""
+    rows = [axis + 3 for axis in axes]
+    v, covariance = state.v.copy(), state.covariance.copy()
+    covariance[rows, rows] += v[axes] ** 2
+    v[axes] = 0.0
+    return changed(state, v=v, covariance=covariance)
+
+
+def parted(state: InertialState, axes: list[int], walk: float) -> InertialState:
+    """Some positions told apart from all other errors, and their variances grown by `walk` [m²]."""
+    covariance = state.covariance.copy()
+    own = covariance[np.ix_(axes, axes)] + walk * np.eye(len(axes))
+    covariance[axes, :] = 0.0
+    covariance[:, axes] = 0.0
+    covariance[np.ix_(axes, axes)] = own
+    return changed(state, covariance=covariance)
+
+
+def turned(state: InertialState, angle: float, variance: float) -> InertialState:
+    """Turn the attitude about the pool's z by `angle` [rad], and forget what was known of it."""
+    covariance = state.covariance.copy()
+    covariance[8, :] = 0.0
+    covariance[:, 8] = 0.0
+    covariance[8, 8] = variance
+    return changed(
+        state, q=quat_multiply(quat_from_rotvec(np.array([0.0, 0.0, angle])), state.q), covariance=covariance
+    )
+
+
+def capped(state: InertialState, variance: float, tilt: float) -> InertialState:
+    """The state with bounded doubt: rows and columns beyond are scaled down together.
+
+    Args:
+        state: Before.
+        variance: Largest of a position [m²].
+        tilt: Largest standard deviation of roll and pitch [rad].
+    """
+    d = np.diagonal(state.covariance)
+    limit = np.array([variance] * 3 + [np.inf] * 3 + [tilt**2] * 2 + [10.0] + [np.inf] * (len(d) - 9))
+    if np.all(d <= limit):
+        return state
+    scale = np.sqrt(np.minimum(1.0, limit / np.maximum(d, 1e-300)))
+    return changed(state, covariance=state.covariance * scale[:, None] * scale[None, :])
+
+
+# Fusion with the IMU's acceleration: the error-state filter behind the same gates, states and timings.
+
+TILT_CAP = 0.5
+"""Doubt of roll and pitch does not grow beyond this [rad]."""
+
+
+GATES = ("vision", "yaw", "depth", "velocity", "heading")
+"""Streams in the order of their gates."""
+TIMED = ("vision", "depth", "velocity")
+"""Those whose latest believed measurement's time counts."""
+
+
+@dataclass(frozen=True)
+class InertialTrack:
+    """All that the filter knows; nothing else remembers."""
+
+    before: Track
+    """The constant-velocity filters, from which this one starts once every sensor has spoken."""
+    inertial: InertialState | None = None
+    time: float = math.nan
+    omega: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Latest angular rate, body frame [rad/s]."""
+    force: tuple[float, float, float] | None = None
+    """Latest specific force, body frame [m/s²]."""
+    vision_time: float | None = None
+    depth_time: float | None = None
+    imu_time: float | None = None
+    velocity_time: float | None = None
+    gates: tuple[GateMemory, ...] = (GateMemory(),) * 5
+    """Their memories, in the order of `GATES`."""
+    roll: float = 0.0
+    pitch: float = 0.0
+
+
+class ErrorState:
+    """The filter of one vehicle: pure functions of `InertialTrack`, with settings and site fixed."""
+
+    def __init__(self, settings: Settings, site: Site) -> None:
+        """
+        Args:
+            settings: What can be tuned.
+            site: What of pool and vehicle is needed.
+        """
+        self.settings, self.site = settings, site
+        self._before = ConstantVelocity(settings, site)
+        self._up = np.array(site.up)
+        self._gravity = -site.gravity * self._up
+        self._body, self._port = -np.array(site.imu), np.array(site.depth_port) - np.array(site.imu)
+        self._log = np.array(site.dvl) - np.array(site.imu)
+        self._noise = ErrorStateNoise(
+            settings.gyro.rate,
+            settings.accel_noise,
+            settings.gyro.bias_walk,
+            settings.accel_bias_walk,
+            settings.aids.velocity_walk if settings.aids else 0.0,
+        )
+        self._drifts = {slow: motion_of(settings, slow, False) for slow in (False, True)}
+
+    def start(self) -> InertialTrack:
+        """The state before any sample: nothing is known."""
+        return InertialTrack(self._before.start())
+
+    def imu(self, track: InertialTrack, sample: ImuSample) -> tuple[InertialTrack, tuple[Outcome, ...]]:
+        """Take in a rate and a specific force."""
+        if sample.force is None:
+            return track, (Outcome("imu", "no acceleration"),)
+        if track.inertial is None:
+            before, outcomes = self._before.imu(track.before, sample)
+            track = changed(
+                track,
+                before=before,
+                omega=sample.omega,
+                force=sample.force,
+                imu_time=sample.time,
+                roll=before.roll,
+                pitch=before.pitch,
+            )
+            return self._begun(track, sample.time), outcomes
+        heard = track.imu_time is not None and sample.time - track.imu_time <= GYRO_HOLD
+        if heard and track.force is not None:  # the step's mean, rather than what it began with
+            omega, force = _mean(track.omega, sample.omega), _mean(track.force, sample.force)
+            track = self._until(changed(track, omega=omega, force=force), sample.time)
+        else:
+            track = self._until(track, sample.time)
+        track = changed(track, omega=sample.omega, force=sample.force, imu_time=sample.time)
+        return track, (Outcome("imu", "accepted"),)
+
+    def depth(self, track: InertialTrack, sample: DepthSample) -> tuple[InertialTrack, tuple[Outcome, ...]]:
+        """Take in a depth."""
+        if track.inertial is None:
+            before, outcomes = self._before.depth(track.before, sample)
+            return self._begun(changed(track, before=before), sample.time), outcomes
+        track, state = self._at(track, sample.time)
+        height, H = depth_model(state, self._port, self._up, self.site.offset)
+        residual, R = -sample.depth - height, np.array([[self.settings.depth_std**2]])
+        speed = self.settings.speed_std
+
+        def restart(state: InertialState) -> InertialState:
+            return restarted(state, [2], state.p[2:] + residual / self._up[2], R, speed)
+
+        track, outcome = self._measured(track, "depth", sample.time, residual, H, R, residual, speed, restart)
+        return self._kept(track), (outcome,)
+
+    def vision(self, track: InertialTrack, sample: VisionSample) -> tuple[InertialTrack, tuple[Outcome, ...]]:
+        """Take in a fix of the camera."""
+        if track.inertial is None:
+            before, outcomes = self._before.vision(track.before, sample)
+            return self._begun(changed(track, before=before), sample.time), outcomes
+        R, speed = vision_covariance(sample, self.settings), self.settings.speed_std
+        track, state = self._at(track, sample.time)
+        position, H = position_model(state, self._body)
+        fix = np.array(sample.position)
+        off, R_xy = fix - position[:2], R[:2, :2]
+
+        def restart(state: InertialState) -> InertialState:
+            return restarted(state, [0, 1], state.p[:2] + off, R_xy, speed)
+
+        track, seen = self._measured(track, "vision", sample.time, off, H[:2], R_xy, fix, speed, restart)
+        if sample.yaw is None or track.inertial is None:
+            return self._kept(track), (seen,)
+        yaw, H = yaw_model(track.inertial)
+        residual, R_yaw = wrap_angle(np.array([sample.yaw]) - yaw), R[2:, 2:]
+        # Flipped yaws agree with one another as distances from the prediction, which turns with the vehicle.
+        carried = track.imu_time is not None and sample.time - track.imu_time <= GYRO_HOLD
+
+        def turn(state: InertialState) -> InertialState:
+            return turned(state, float(residual[0]), float(R_yaw[0, 0]))
+
+        track, turn_outcome = self._measured(
+            track, "yaw", sample.time, residual, H, R_yaw, residual, 0.05, turn, carried=carried
+        )
+        return self._kept(track), (seen, turn_outcome)
+
+    def velocity(
+        self, track: InertialTrack, sample: VelocitySample
+    ) -> tuple[InertialTrack, tuple[Outcome, ...]]:
+        """Take in a velocity over the floor."""
+        aids = self.settings.aids
+        if track.inertial is None or aids is None:
+            before, outcomes = self._before.velocity(track.before, sample)
+            return changed(track, before=before), outcomes
+        track, state = self._at(track, sample.time)
+        expected, H = velocity_model(state, np.array(track.omega), self._log)
+        seen, R = np.array(sample.velocity), aids.velocity_std**2 * np.eye(3)
+        track, outcome = self._measured(track, "velocity", sample.time, seen - expected, H, R, seen, 1.0)
+        return self._kept(track), (outcome,)
+
+    def heading(
+        self, track: InertialTrack, sample: HeadingSample
+    ) -> tuple[InertialTrack, tuple[Outcome, ...]]:
+        """Take in a heading."""
+        aids = self.settings.aids
+        if track.inertial is None or aids is None:
+            before, outcomes = self._before.heading(track.before, sample)
+            return self._begun(changed(track, before=before), sample.time), outcomes
+        track, state = self._at(track, sample.time)
+        expected, H = heading_model(state)
+        residual, R = wrap_angle(np.array([sample.yaw]) - expected), np.array([[aids.heading_std**2]])
+        track, outcome = self._measured(track, "heading", sample.time, residual, H, R, residual, 0.05)
+        return self._kept(track), (outcome,)
+
+    def _measured(
+        self,
+        track: InertialTrack,
+        stream: str,
+        time: float,
+        residual: Array,
+        H: Array,
+        R: Array,
+        value: Array,
+        drift: float,
+        restart: Callable[[InertialState], InertialState] | None = None,
+        *,
+        carried: bool | None = None,
+    ) -> tuple[InertialTrack, Outcome]:
+        """The track after a measurement that its gate has judged; without a restart a run of refused ones corrects."""
+        state, k = track.inertial, GATES.index(stream)
+        assert state is not None
+        squared, gain = error_innovation(state, residual, H, R)
+        distance, gate, memory = float(squared), self.settings.gate, track.gates[k]
+        if carried is None:
+            verdict, memory = judge(gate, memory, time, value, R, distance, drift)
+        else:
+            apart, variance = float(residual[0]), float(R[0, 0])
+            verdict, memory = judge_carried(gate, memory, time, apart, variance, distance, drift, carried)
+        if verdict == "accepted" or (verdict == "reacquired" and restart is None):
+            state = correct(state, residual, H, R, gain)
+        elif verdict == "reacquired" and restart is not None:
+            state = restart(state)
+        gates = (*track.gates[:k], memory, *track.gates[k + 1 :])
+        believed = {f"{stream}_time": time} if verdict != "gate" and stream in TIMED else {}
+        track = changed(track, inertial=state, gates=gates, **believed)
+        return track, Outcome(stream, verdict, distance, len(residual))
+
+    def _at(self, track: InertialTrack, time: float) -> tuple[InertialTrack, InertialState]:
+        """The track at a time, and what its filter knows then."""
+        track = self._until(track, time)
+        assert track.inertial is not None
+        return track, track.inertial
+
+    def estimate(self, track: InertialTrack, time: float) -> Estimate:
+        """The state at a time [s], not before its own."""
+        if track.inertial is None:
+            return self._before.estimate(track.before, time)
+        track, state = self._at(track, time)
+        T, x = self._to_body(state, np.array(track.omega))
+        aided = _aided(track)
+        old = aided is None or time - aided > self.settings.hold
+        if old:
+            x[3:5] = 0.0
+        yaw, H = yaw_model(state)
+        rates = quat_to_matrix(state.q) @ (np.array(track.omega) - state.gyro_bias)
+        return Estimate(
+            time=time,
+            x=x,
+            P=T @ state.covariance @ T.T,
+            yaw=float(yaw[0]),
+            yaw_variance=float((H @ state.covariance @ H.T)[0, 0]) + track.gates[1].doubt,
+            yaw_rate=float(H[0, 6:9] @ rates),
+            roll=track.roll,
+            pitch=track.pitch,
+            vision_time=track.vision_time,
+            depth_time=track.depth_time,
+            imu_time=track.imu_time,
+            velocity_time=track.velocity_time,
+        )
+
+    def _to_body(self, state: InertialState, omega: Array) -> tuple[Array, Array]:
+        """Jacobian (6, n) of the body origin's position and velocity, and their values (6,)."""
+        position, H = position_model(state, self._body)
+        R = quat_to_matrix(state.q)
+        swing = R @ cross(omega - state.gyro_bias, self._body)
+        T = np.zeros((6, H.shape[-1]))
+        T[:3] = H
+        T[3:, 3:6] = np.eye(3)
+        return T, np.concatenate([position, state.v + swing])
+
+    def _begun(self, track: InertialTrack, time: float) -> InertialTrack:
+        """Start the filter once position, yaw, depth and tilt are known."""
+        before, s = track.before, self.settings
+        if track.force is None or None in (before.vision_time, before.yaw_seen, before.depth_time):
+            return track
+        known = self._before.estimate(before, time)
+        level = quat_from_euler(known.roll, known.pitch, known.yaw)
+        from_level = axes_of_up(self.site.up)
+        R = from_level @ quat_to_matrix(level)
+        q = quat_multiply(matrix_to_quat(from_level), level)
+        extra = 0 if s.aids is None else AIDED
+        covariance = np.zeros((15 + extra, 15 + extra))
+        covariance[:6, :6] = known.P
+        covariance[6:9, 6:9] = np.diag([s.tilt_std**2, s.tilt_std**2, known.yaw_variance])
+        covariance[9:15, 9:15] = np.diag([s.bias_std**2] * 3 + [s.accel_bias_std**2] * 3)
+        if s.aids is not None:
+            a = s.aids
+            covariance[15:, 15:] = np.diag(
+                np.square([a.heading_bias, a.velocity_scale, *[a.velocity_bias] * 3])
+            )
+            if before.compass:  # yaw is then what the compass said, less its offset
+                covariance[8, 8] += a.heading_bias**2
+                covariance[8, 15] = covariance[15, 8] = -(a.heading_bias**2)
+        state = InertialState(
+            known.x[:3] - R @ self._body,
+            known.x[3:],
+            q,
+            np.zeros(3),
+            np.zeros(3),
+            covariance,
+            np.zeros(extra),
+        )
+        gates = (*before.gates, GateMemory(1), GateMemory(1))
+        track = changed(track, inertial=state, time=time, vision_time=before.vision_time, gates=gates)
+        return self._kept(changed(track, depth_time=before.depth_time))
+
+    def _until(self, track: InertialTrack, time: float) -> InertialTrack:
+        """The track at a time; velocity without news is drawn to rest, and then the position stands still."""
+        s, then = self.settings, track.time
+        if time <= then:
+            return track
+        aided = _aided(track)
+        cuts = [] if aided is None else [aided + limit for limit in (s.coast, s.hold)]
+        heard = -math.inf if track.imu_time is None else track.imu_time + GYRO_HOLD
+        ends = [*sorted({cut for cut in (*cuts, heard) if then < cut < time}), time]
+        state = track.inertial
+        assert state is not None
+        for until in ends:
+            middle = 0.5 * (then + until)
+            age = math.inf if aided is None else middle - aided
+            state = self._step(state, track, until - then, blind=middle > heard, age=age)
+            then = until
+        return self._kept(changed(track, inertial=capped(state, s.largest_variance, TILT_CAP), time=time))
+
+    def _step(
+        self, state: InertialState, track: InertialTrack, dt: float, *, blind: bool, age: float
+    ) -> InertialState:
+        s, lost = self.settings, age > self.settings.hold
+        if lost:
+            state = stopped(state, [0, 1])
+        if blind or track.force is None:
+            return drift(state, dt, self._drifts[age > s.coast], s.blind_rate)
+        omega, force = np.array(track.omega), np.array(track.force)
+        after = predict(state, omega, force, dt, self._noise, self._gravity)
+        if age <= s.coast:
+            return after
+        if (
+            lost
+        ):  # the place is no longer told by the accelerometer, only that the vehicle may be anywhere near
+            walk = 2.0 * s.speed_std**2 / s.decay * dt
+            after = parted(changed(after, p=np.append(state.p[:2], after.p[2])), [0, 1], walk)
+        H = np.eye(len(after.covariance))[3:5]
+        R = np.eye(2) * s.speed_std**2 / (s.decay * dt)
+        residual = -after.v[:2]
+        gain = error_innovation(after, residual, H, R)[1]
+        return correct(after, residual, H, R, gain)
+
+    def _kept(self, track: InertialTrack) -> InertialTrack:
+        """The track with roll and pitch read from its attitude."""
+        assert track.inertial is not None
+        roll, pitch = roll_pitch(self._up @ quat_to_matrix(track.inertial.q))
+        return changed(track, roll=float(roll), pitch=float(pitch))
+
+
+def _aided(track: InertialTrack) -> float | None:
+    """Time of the latest fix or Doppler velocity [s]; None before the first."""
+    told = [t for t in (track.vision_time, track.velocity_time) if t is not None]
+    return max(told) if told else None
+
+
+def _mean(a: tuple[float, float, float], b: tuple[float, float, float]) -> tuple[float, float, float]:
+    return 0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]), 0.5 * (a[2] + b[2])

@@ -2,382 +2,286 @@
 
 from __future__ import annotations
 
+import bisect
 import math
-from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
-from finssim.geometry.rotations import (
-    cross,
-    matrix_to_quat,
-    quat_from_euler,
-    quat_multiply,
-    quat_to_matrix,
-    wrap_angle,
-)
-from finssim.localization.errors import LocalizationError
-from finssim.localization.fusion import error_state, fuse_restart
-from finssim.localization.fusion.attitude import roll_pitch
-from finssim.localization.fusion.changed import changed
-from finssim.localization.fusion.error_state import ErrorStateNoise, InertialState
+from finssim.localization import LocalizationError
+from finssim.localization.detection.detections import Frame
+from finssim.localization.fusion.attitude import height_above_origin
+from finssim.localization.fusion.error_state import ErrorState
 from finssim.localization.fusion.fuse_constant_velocity import (
-    GYRO_HOLD,
     ConstantVelocity,
-    Track,
-    motion_of,
-    vision_covariance,
 )
+from finssim.localization.fusion.fuse_log import counted, rows_of
 from finssim.localization.fusion.fuse_settings import Settings, Site
-from finssim.localization.fusion.gate import GateMemory, judge, judge_carried
-from finssim.localization.fusion.health import Estimate, Health, Outcome, health_of
 from finssim.localization.fusion.streams import (
     DepthSample,
-    HeadingSample,
-    ImuSample,
+    Estimate,
+    Outcome,
     Sample,
-    VelocitySample,
     VisionSample,
     refusal,
 )
-from finssim.localization.fusion.timeline import Surroundings, Timeline
-from finssim.localization.poses.measurement import axes_of_up
+from finssim.localization.poses import Constraints
+from finssim.localization.poses.methods import TagLocator
 
-__all__ = ["MODELS", "Estimator", "Model"]
+__all__ = ["MODELS", "MODES", "Estimator", "Fixes", "Health", "health_of"]
 
-# Fusion with the IMU's acceleration: the error-state filter behind the same gates, states and timings.
+S = TypeVar("S")
 
-Array = npt.NDArray[np.float64]
+# Samples in the order of their times, so that one that comes late is put where it belongs.
 
-TILT_CAP = 0.5
-"""Doubt of roll and pitch does not grow beyond this [rad]."""
+_RANK = {"imu": 0, "depth": 1, "vision": 2, "heading": 3, "velocity": 4}
+"""Order of samples of one time, so that delivery decides nothing."""
+SAME = 1e-7
+"""Stamps nearer than this are the same [s]."""
 
 
 @dataclass(frozen=True)
-class InertialTrack:
-    """All that the filter knows; nothing else remembers."""
+class Surroundings:
+    """What the other sensors said at the time of a picture."""
 
-    before: Track
-    """The constant-velocity filters, from which this one starts once every sensor has spoken."""
-    inertial: InertialState | None = None
-    time: float = math.nan
-    omega: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Latest angular rate, body frame [rad/s]."""
-    force: tuple[float, float, float] | None = None
-    """Latest specific force, body frame [m/s²]."""
-    vision_time: float | None = None
-    depth_time: float | None = None
-    imu_time: float | None = None
-    velocity_time: float | None = None
-    gates: tuple[GateMemory, ...] = (GateMemory(),) * 5
-    """Memories of the gates of position, yaw, depth, Doppler velocity and compass."""
-    roll: float = 0.0
-    pitch: float = 0.0
+    roll: float
+    """[rad]; NaN where no IMU sample is near."""
+    pitch: float
+    depth: float
+    """Of the pressure port [m]; NaN where no sample is near."""
 
 
-class ErrorState:
-    """The filter of one vehicle: pure functions of `InertialTrack`, with settings and site fixed."""
+class Timeline(Generic[S]):
+    """Samples of the last `horizon` seconds with the state after each; `S` is any immutable state."""
 
-    def __init__(self, settings: Settings, site: Site) -> None:
+    def __init__(self, start: S, horizon: float) -> None:
         """
         Args:
-            settings: What can be tuned.
-            site: What of pool and vehicle is needed.
+            start: State before any sample.
+            horizon: How far back a late sample is still taken [s].
         """
-        self.settings, self.site = settings, site
-        self._before = ConstantVelocity(settings, site)
-        self._up = np.array(site.up)
-        self._gravity = -site.gravity * self._up
-        self._body, self._port = -np.array(site.imu), np.array(site.depth_port) - np.array(site.imu)
-        self._log = np.array(site.dvl) - np.array(site.imu)
-        self._noise = ErrorStateNoise(
-            settings.gyro.rate,
-            settings.accel_noise,
-            settings.gyro.bias_walk,
-            settings.accel_bias_walk,
-            settings.aids.velocity_walk if settings.aids else 0.0,
-        )
-        self._drifts = {slow: motion_of(settings, slow, False) for slow in (False, True)}
+        self.horizon = horizon
+        self._before = start
+        """State before the oldest sample that is kept."""
+        self._closed = -math.inf
+        """Time up to which samples have been forgotten [s]."""
+        self._keys: list[tuple[float, int]] = []
+        self._samples: list[Sample] = []
+        self._states: list[S] = []
+        self._outcomes: list[tuple[Outcome, ...]] = []
 
-    def start(self) -> InertialTrack:
-        """The state before any sample: nothing is known."""
-        return InertialTrack(self._before.start())
+    @property
+    def head(self) -> float:
+        """Time of the newest sample [s]; -inf before the first."""
+        return self._keys[-1][0] if self._keys else -math.inf
 
-    def imu(self, track: InertialTrack, sample: ImuSample) -> tuple[InertialTrack, tuple[Outcome, ...]]:
-        """Take in a rate and a specific force."""
-        if sample.force is None:
-            return track, (Outcome("imu", "no acceleration"),)
-        if track.inertial is None:
-            before, outcomes = self._before.imu(track.before, sample)
-            track = changed(
-                track,
-                before=before,
-                omega=sample.omega,
-                force=sample.force,
-                imu_time=sample.time,
-                roll=before.roll,
-                pitch=before.pitch,
-            )
-            return self._begun(track, sample.time), outcomes
-        heard = track.imu_time is not None and sample.time - track.imu_time <= GYRO_HOLD
-        if heard and track.force is not None:  # the step's mean, rather than what it began with
-            omega, force = _mean(track.omega, sample.omega), _mean(track.force, sample.force)
-            track = self._until(changed(track, omega=omega, force=force), sample.time)
-        else:
-            track = self._until(track, sample.time)
-        track = changed(track, omega=sample.omega, force=sample.force, imu_time=sample.time)
-        return track, (Outcome("imu", "accepted"),)
+    @property
+    def state(self) -> S:
+        """State after the newest sample."""
+        return self._states[-1] if self._states else self._before
 
-    def depth(self, track: InertialTrack, sample: DepthSample) -> tuple[InertialTrack, tuple[Outcome, ...]]:
-        """Take in a depth."""
-        if track.inertial is None:
-            before, outcomes = self._before.depth(track.before, sample)
-            return self._begun(changed(track, before=before), sample.time), outcomes
-        s, track = self.settings, self._until(track, sample.time)
-        assert track.inertial is not None
-        height, H = error_state.depth_model(track.inertial, self._port, self._up, self.site.offset)
-        residual, R = -sample.depth - height, np.array([[s.depth_std**2]])
-        distance, gain = error_state.error_innovation(track.inertial, residual, H, R)
-        verdict, memory = judge(
-            s.gate, track.gates[2], sample.time, residual, R, float(distance), s.speed_std
-        )
-        state = track.inertial
-        if verdict == "accepted":
-            state = error_state.correct(state, residual, H, R, gain)
-        elif verdict == "reacquired":
-            state = fuse_restart.restarted(state, [2], state.p[2:] + residual / self._up[2], R, s.speed_std)
-        then = track.depth_time if verdict == "gate" else sample.time
-        gates = (*track.gates[:2], memory, *track.gates[3:])
-        track = self._kept(changed(track, inertial=state, depth_time=then, gates=gates))
-        return track, (Outcome("depth", verdict, float(distance), 1),)
+    def state_at(self, time: float) -> S:
+        """State after the last sample not later than `time` [s], of those remembered."""
+        k = bisect.bisect_right(self._keys, (time + SAME, len(_RANK)))
+        return self._states[k - 1] if k else self._before
 
-    def vision(self, track: InertialTrack, sample: VisionSample) -> tuple[InertialTrack, tuple[Outcome, ...]]:
-        """Take in a fix of the camera."""
-        if track.inertial is None:
-            before, outcomes = self._before.vision(track.before, sample)
-            return self._begun(changed(track, before=before), sample.time), outcomes
-        R = vision_covariance(sample, self.settings)
-        track, seen = self._fixed(self._until(track, sample.time), sample, R[:2, :2])
-        if sample.yaw is None:
-            return self._kept(track), (seen,)
-        track, turned = self._turned(track, sample, R[2:, 2:])
-        return self._kept(track), (seen, turned)
+    def refusal(self, sample: Sample) -> str | None:
+        """`too late` or `duplicate`, or None where the sample has a place."""
+        if sample.time < max(self.head - self.horizon, self._closed):
+            return "too late"
+        k = bisect.bisect_left(self._keys, (sample.time - SAME, 0))
+        while k < len(self._keys) and self._keys[k][0] <= sample.time + SAME:
+            if self._samples[k].stream == sample.stream:
+                return "duplicate"
+            k += 1
+        return None
 
-    def velocity(
-        self, track: InertialTrack, sample: VelocitySample
-    ) -> tuple[InertialTrack, tuple[Outcome, ...]]:
-        """Take in a velocity over the floor."""
-        s = self.settings
-        if track.inertial is None or s.aids is None:
-            before, outcomes = self._before.velocity(track.before, sample)
-            return changed(track, before=before), outcomes
-        track = self._until(track, sample.time)
-        state = track.inertial
-        assert state is not None
-        expected, H = error_state.velocity_model(state, np.array(track.omega), self._log)
-        seen, R = np.array(sample.velocity), s.aids.velocity_std**2 * np.eye(3)
-        distance, gain = error_state.error_innovation(state, seen - expected, H, R)
-        verdict, memory = judge(s.gate, track.gates[3], sample.time, seen, R, float(distance), 1.0)
-        if (
-            verdict != "gate"
-        ):  # what the log says of velocity is believed in the end, whatever was thought before
-            state = error_state.correct(state, seen - expected, H, R, gain)
-        then = track.velocity_time if verdict == "gate" else sample.time
-        gates = (*track.gates[:3], memory, track.gates[4])
-        track = self._kept(changed(track, inertial=state, velocity_time=then, gates=gates))
-        return track, (Outcome("velocity", verdict, float(distance), 3),)
+    def insert(
+        self, sample: Sample, apply: Callable[[S, Sample], tuple[S, tuple[Outcome, ...]]]
+    ) -> tuple[list[tuple[Outcome, ...]], list[tuple[Outcome, ...]]]:
+        """Put a sample in its place and run everything after it again.
 
-    def heading(
-        self, track: InertialTrack, sample: HeadingSample
-    ) -> tuple[InertialTrack, tuple[Outcome, ...]]:
-        """Take in a heading."""
-        s = self.settings
-        if track.inertial is None or s.aids is None:
-            before, outcomes = self._before.heading(track.before, sample)
-            return self._begun(changed(track, before=before), sample.time), outcomes
-        track = self._until(track, sample.time)
-        state = track.inertial
-        assert state is not None
-        expected, H = error_state.heading_model(state)
-        residual, R = wrap_angle(np.array([sample.yaw]) - expected), np.array([[s.aids.heading_std**2]])
-        distance, gain = error_state.error_innovation(state, residual, H, R)
-        verdict, memory = judge(s.gate, track.gates[4], sample.time, residual, R, float(distance), 0.05)
-        if verdict != "gate":
-            state = error_state.correct(state, residual, H, R, gain)
-        track = changed(track, inertial=state, gates=(*track.gates[:4], memory))
-        return self._kept(track), (Outcome("heading", verdict, float(distance), 1),)
+        Args:
+            sample: One that `refusal` lets pass.
+            apply: State and sample -> state after it and what became of it.
 
-    def estimate(self, track: InertialTrack, time: float) -> Estimate:
-        """The state at a time [s], not before its own."""
-        if track.inertial is None:
-            return self._before.estimate(track.before, time)
-        track = self._until(track, time)
-        state = track.inertial
-        assert state is not None
-        T, x = self._to_body(state, np.array(track.omega))
-        aided = _aided(track)
-        old = aided is None or time - aided > self.settings.hold
-        if old:
-            x[3:5] = 0.0
-        yaw, H = error_state.yaw_model(state)
-        rates = quat_to_matrix(state.q) @ (np.array(track.omega) - state.gyro_bias)
-        return Estimate(
-            time=time,
-            x=x,
-            P=T @ state.covariance @ T.T,
-            yaw=float(yaw[0]),
-            yaw_variance=float((H @ state.covariance @ H.T)[0, 0]) + track.gates[1].doubt,
-            yaw_rate=float(H[0, 6:9] @ rates),
-            roll=track.roll,
-            pitch=track.pitch,
-            vision_time=track.vision_time,
-            depth_time=track.depth_time,
-            imu_time=track.imu_time,
-            velocity_time=track.velocity_time,
+        Returns:
+            Outcomes that no longer hold, and those that hold instead.
+        """
+        key = (sample.time, _RANK[sample.stream])
+        k = bisect.bisect_right(self._keys, key)
+        self._keys.insert(k, key)
+        self._samples.insert(k, sample)
+        gone = self._outcomes[k:]
+        state = self._states[k - 1] if k else self._before
+        states, outcomes = [], []
+        for item in self._samples[k:]:
+            state, outcome = apply(state, item)
+            states.append(state)
+            outcomes.append(outcome)
+        self._states[k:], self._outcomes[k:] = states, outcomes
+        self._forget()
+        return gone, outcomes
+
+    def _forget(self) -> None:
+        """Drop what is older than the horizon; the state after it stays."""
+        k = bisect.bisect_left(self._keys, (self.head - self.horizon, 0))
+        if k < 32:  # in batches: a list loses its front at the cost of its length
+            return
+        self._before, self._closed = self._states[k - 1], self._keys[k - 1][0]
+        del self._keys[:k], self._samples[:k], self._states[:k], self._outcomes[:k]
+
+    def depth_at(self, time: float, longest: float) -> float:
+        """Depth at a time, in a straight line between two samples or the nearest one within `longest` [m]; or NaN."""
+        near = [self._samples[i] for i in self._around(time, "depth")]
+        return _between([(s.time, s.depth) for s in near if isinstance(s, DepthSample)], time, longest)
+
+    def tilt_at(
+        self, time: float, longest: float, tilt: Callable[[S], tuple[float, float]]
+    ) -> tuple[float, float]:
+        """Roll and pitch at a time, likewise, from the states after the IMU's samples [rad]."""
+        near = [(self._keys[i][0], *tilt(self._states[i])) for i in self._around(time, "imu")]
+        return (
+            _between([(t, roll) for t, roll, _ in near], time, longest),
+            _between([(t, pitch) for t, _, pitch in near], time, longest),
         )
 
-    def _to_body(self, state: InertialState, omega: Array) -> tuple[Array, Array]:
-        """Jacobian (6, n) of the body origin's position and velocity, and their values (6,)."""
-        position, H = error_state.position_model(state, self._body)
-        R = quat_to_matrix(state.q)
-        swing = R @ cross(omega - state.gyro_bias, self._body)
-        T = np.zeros((6, H.shape[-1]))
-        T[:3] = H
-        T[3:, 3:6] = np.eye(3)
-        return T, np.concatenate([position, state.v + swing])
-
-    def _begun(self, track: InertialTrack, time: float) -> InertialTrack:
-        """Start the filter once position, yaw, depth and tilt are known."""
-        before, s = track.before, self.settings
-        if track.force is None or None in (before.vision_time, before.yaw_seen, before.depth_time):
-            return track
-        known = self._before.estimate(before, time)
-        level = quat_from_euler(known.roll, known.pitch, known.yaw)
-        from_level = axes_of_up(self.site.up)
-        R = from_level @ quat_to_matrix(level)
-        q = quat_multiply(matrix_to_quat(from_level), level)
-        extra = 0 if s.aids is None else error_state.AIDED
-        covariance = np.zeros((15 + extra, 15 + extra))
-        covariance[:6, :6] = known.P
-        covariance[6:9, 6:9] = np.diag([s.tilt_std**2, s.tilt_std**2, known.yaw_variance])
-        covariance[9:15, 9:15] = np.diag([s.bias_std**2] * 3 + [s.accel_bias_std**2] * 3)
-        if s.aids is not None:
-            a = s.aids
-            covariance[15:, 15:] = np.diag(
-                np.square([a.heading_bias, a.velocity_scale, *[a.velocity_bias] * 3])
-            )
-            if before.compass:  # yaw is then what the compass said, less its offset
-                covariance[8, 8] += a.heading_bias**2
-                covariance[8, 15] = covariance[15, 8] = -(a.heading_bias**2)
-        state = InertialState(
-            known.x[:3] - R @ self._body,
-            known.x[3:],
-            q,
-            np.zeros(3),
-            np.zeros(3),
-            covariance,
-            np.zeros(extra),
-        )
-        gates = (*before.gates, GateMemory(1), GateMemory(1))
-        track = changed(track, inertial=state, time=time, vision_time=before.vision_time, gates=gates)
-        return self._kept(changed(track, depth_time=before.depth_time))
-
-    def _fixed(self, track: InertialTrack, sample: VisionSample, R: Array) -> tuple[InertialTrack, Outcome]:
-        s, state = self.settings, track.inertial
-        assert state is not None
-        position, H = error_state.position_model(state, self._body)
-        seen = np.array(sample.position)
-        residual, H = seen - position[:2], H[:2]
-        distance, gain = error_state.error_innovation(state, residual, H, R)
-        verdict, memory = judge(s.gate, track.gates[0], sample.time, seen, R, float(distance), s.speed_std)
-        if verdict == "accepted":
-            state = error_state.correct(state, residual, H, R, gain)
-        elif verdict == "reacquired":
-            state = fuse_restart.restarted(state, [0, 1], state.p[:2] + residual, R, s.speed_std)
-        then = track.vision_time if verdict == "gate" else sample.time
-        track = changed(track, inertial=state, vision_time=then, gates=(memory, *track.gates[1:]))
-        return track, Outcome("vision", verdict, float(distance), 2)
-
-    def _turned(self, track: InertialTrack, sample: VisionSample, R: Array) -> tuple[InertialTrack, Outcome]:
-        s, state = self.settings, track.inertial
-        assert state is not None
-        yaw, H = error_state.yaw_model(state)
-        residual = wrap_angle(np.array([sample.yaw]) - yaw)
-        distance, gain = error_state.error_innovation(state, residual, H, R)
-        carried = track.imu_time is not None and sample.time - track.imu_time <= GYRO_HOLD
-        apart, variance = float(residual[0]), float(R[0, 0])
-        verdict, memory = judge_carried(
-            s.gate, track.gates[1], sample.time, apart, variance, float(distance), 0.05, carried
-        )
-        if verdict == "accepted":
-            state = error_state.correct(state, residual, H, R, gain)
-        elif verdict == "reacquired":
-            state = fuse_restart.turned(state, float(residual[0]), float(R[0, 0]))
-        track = changed(track, inertial=state, gates=(track.gates[0], memory, *track.gates[2:]))
-        return track, Outcome("yaw", verdict, float(distance), 1)
-
-    def _until(self, track: InertialTrack, time: float) -> InertialTrack:
-        """The track at a time; velocity without news is drawn to rest, and then the position stands still."""
-        s, then = self.settings, track.time
-        if time <= then:
-            return track
-        aided = _aided(track)
-        cuts = [] if aided is None else [aided + limit for limit in (s.coast, s.hold)]
-        heard = -math.inf if track.imu_time is None else track.imu_time + GYRO_HOLD
-        ends = [*sorted({cut for cut in (*cuts, heard) if then < cut < time}), time]
-        state = track.inertial
-        assert state is not None
-        for until in ends:
-            middle = 0.5 * (then + until)
-            age = math.inf if aided is None else middle - aided
-            state = self._step(state, track, until - then, blind=middle > heard, age=age)
-            then = until
-        return self._kept(
-            changed(track, inertial=fuse_restart.capped(state, s.largest_variance, TILT_CAP), time=time)
-        )
-
-    def _step(
-        self, state: InertialState, track: InertialTrack, dt: float, *, blind: bool, age: float
-    ) -> InertialState:
-        s, lost = self.settings, age > self.settings.hold
-        if lost:
-            state = fuse_restart.stopped(state, [0, 1])
-        if blind or track.force is None:
-            return error_state.drift(state, dt, self._drifts[age > s.coast], s.blind_rate)
-        omega, force = np.array(track.omega), np.array(track.force)
-        after = error_state.predict(state, omega, force, dt, self._noise, self._gravity)
-        if age <= s.coast:
-            return after
-        if (
-            lost
-        ):  # the place is no longer told by the accelerometer, only that the vehicle may be anywhere near
-            walk = 2.0 * s.speed_std**2 / s.decay * dt
-            after = fuse_restart.parted(changed(after, p=np.append(state.p[:2], after.p[2])), [0, 1], walk)
-        H = np.eye(len(after.covariance))[3:5]
-        R = np.eye(2) * s.speed_std**2 / (s.decay * dt)
-        residual = -after.v[:2]
-        gain = error_state.error_innovation(after, residual, H, R)[1]
-        return error_state.correct(after, residual, H, R, gain)
-
-    def _kept(self, track: InertialTrack) -> InertialTrack:
-        """The track with roll and pitch read from its attitude."""
-        assert track.inertial is not None
-        roll, pitch = roll_pitch(self._up @ quat_to_matrix(track.inertial.q))
-        return changed(track, roll=float(roll), pitch=float(pitch))
+    def _around(self, time: float, stream: str) -> list[int]:
+        """Where the last sample of a stream before a time and the first not before it stand, as far as there are."""
+        k = bisect.bisect_left(self._keys, (time, -1))
+        before = next((i for i in range(k - 1, -1, -1) if self._samples[i].stream == stream), None)
+        after = next((i for i in range(k, len(self._keys)) if self._samples[i].stream == stream), None)
+        return [i for i in (before, after) if i is not None]
 
 
-def _aided(track: InertialTrack) -> float | None:
-    """Time of the latest fix or Doppler velocity [s]; None before the first."""
-    told = [t for t in (track.vision_time, track.velocity_time) if t is not None]
-    return max(told) if told else None
+def _between(points: list[tuple[float, float]], time: float, longest: float) -> float:
+    """Value at a time of points in the order of their times; NaN where none is within `longest`."""
+    k = bisect.bisect_left(points, (time, -math.inf))
+    earlier = points[k - 1] if k and time - points[k - 1][0] <= longest else None
+    later = points[k] if k < len(points) and points[k][0] - time <= longest else None
+    if earlier and later:
+        share = (time - earlier[0]) / max(later[0] - earlier[0], 1e-12)
+        return earlier[1] + share * (later[1] - earlier[1])
+    nearest = earlier or later
+    return nearest[1] if nearest else math.nan
 
 
-def _mean(a: tuple[float, float, float], b: tuple[float, float, float]) -> tuple[float, float, float]:
-    return 0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]), 0.5 * (a[2] + b[2])
+# What the estimator says of itself: vision state, ages, readiness, and what it refused and why.
+
+MODES = ("uninitialized", "fresh", "coast", "hold", "lost")
 
 
-S = TypeVar("S")
+@dataclass(frozen=True)
+class Health:
+    """Condition of the estimator at one time."""
+
+    ready: bool
+    """Initialized, every sensor fresh, vision fresh or coasting, and the variances within the settings' limits."""
+    initialized: bool
+    vision_mode: str
+    """One of `MODES`."""
+    vision_fresh: bool
+    imu_fresh: bool
+    depth_fresh: bool
+    age_vision: float
+    """[s]; NaN before the first."""
+    age_imu: float
+    age_depth: float
+    reject_reason: str
+    """Stream and reason of the latest refusal; empty before the first."""
+    mahalanobis: dict[str, float]
+    """Squared distance of each stream's latest measurement."""
+    position_covariance: tuple[float, ...]
+    """Diagonal, position then velocity, (6,)."""
+    yaw_covariance: float
+    velocity_world: tuple[float, ...]
+    """World axes [m/s]."""
+    counts: dict[str, dict[str, int]] = field(default_factory=dict)
+    """Stream -> verdict -> samples."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values, numbers that are not known as None."""
+        return {
+            "vision_source": "overhead_tags",
+            **{name: _plain(value) for name, value in self.__dict__.items()},
+        }
+
+
+def mode_of(age: float, settings: Settings) -> str:
+    """The vision state at that age of vision [s]; NaN: there was none."""
+    if math.isnan(age):
+        return "uninitialized"
+    for mode, limit in (("fresh", settings.fresh), ("coast", settings.coast), ("hold", settings.hold)):
+        if age <= limit + 1e-9:
+            return mode
+    return "lost"
+
+
+def health_of(
+    estimate: Estimate,
+    settings: Settings,
+    site: Site,
+    latest: dict[str, float],
+    reason: str,
+    counts: dict[str, dict[str, int]],
+) -> Health:
+    """The condition that goes with an estimate.
+
+    Args:
+        estimate: The estimate.
+        settings: Limits of ages and variances.
+        site: Turns velocities into world axes.
+        latest: Squared Mahalanobis distance of each stream's latest measurement.
+        reason: Stream and reason of the latest refusal.
+        counts: Stream -> verdict -> samples.
+    """
+    vision, imu, depth = (
+        math.nan if then is None else estimate.time - then
+        for then in (estimate.vision_time, estimate.imu_time, estimate.depth_time)
+    )
+    told = [t for t in (estimate.vision_time, estimate.velocity_time) if t is not None]
+    mode = mode_of(
+        estimate.time - max(told) if told and estimate.vision_time is not None else vision, settings
+    )
+    variances = estimate.P.diagonal().tolist()
+    vx, vy, vz = estimate.x[3:].tolist()
+    imu_fresh, depth_fresh = imu <= settings.imu_fresh + 1e-9, depth <= settings.depth_fresh + 1e-9
+    known = all(map(math.isfinite, (*variances[:3], estimate.yaw_variance)))
+    sure = known and max(variances[:3]) <= settings.ready_position
+    return Health(
+        ready=sure
+        and estimate.yaw_variance <= settings.ready_yaw
+        and imu_fresh
+        and depth_fresh
+        and mode in ("fresh", "coast"),
+        initialized=known,
+        vision_mode=mode,
+        vision_fresh=mode == "fresh",
+        imu_fresh=imu_fresh,
+        depth_fresh=depth_fresh,
+        age_vision=vision,
+        age_imu=imu,
+        age_depth=depth,
+        reject_reason=reason,
+        mahalanobis=dict(latest),
+        position_covariance=tuple(variances),
+        yaw_covariance=estimate.yaw_variance,
+        velocity_world=tuple(a * vx + b * vy + c * vz for a, b, c in site.R_wp),
+        counts={stream: dict(verdicts) for stream, verdicts in counts.items()},
+    )
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
 
 STREAMS = ("imu", "depth", "vision", "yaw", "velocity", "heading")
 AGREED = 10
@@ -386,24 +290,9 @@ UNHEARD = 10.0
 """Silence that is taken for one where samples tell no arrival [s]."""
 
 
-class Model(Protocol[S]):
-    """What moves a state from sample to sample: pure functions of it."""
-
-    settings: Settings
-    site: Site
-
-    def start(self) -> S: ...
-    def imu(self, track: S, sample: ImuSample) -> tuple[S, tuple[Outcome, ...]]: ...
-    def depth(self, track: S, sample: DepthSample) -> tuple[S, tuple[Outcome, ...]]: ...
-    def vision(self, track: S, sample: VisionSample) -> tuple[S, tuple[Outcome, ...]]: ...
-    def velocity(self, track: S, sample: VelocitySample) -> tuple[S, tuple[Outcome, ...]]: ...
-    def heading(self, track: S, sample: HeadingSample) -> tuple[S, tuple[Outcome, ...]]: ...
-    def estimate(self, track: S, time: float) -> Estimate:
-        """The state at a time [s]."""
-
-
 MODELS: dict[str, Any] = {"constant-velocity": ConstantVelocity, "error-state": ErrorState}
-"""Name -> model, made from settings and site."""
+"""Name -> model, made from settings and site: `start`, `estimate`, and for each stream a pure function from a track and
+a sample to the track after it and what became of the sample."""
 
 
 class Estimator:
@@ -547,3 +436,52 @@ class Estimator:
         verdicts[verdict] = verdicts.get(verdict, 0) + step
         if not verdicts[verdict]:
             del verdicts[verdict]
+
+
+# Pictures with tags as fixes, with the depth and tilt that the estimator knows at their exposure.
+
+
+class Fixes:
+    """Makes a fix of each picture."""
+
+    def __init__(self, locator: TagLocator) -> None:
+        """
+        Args:
+            locator: Measures the poses.
+        """
+        self._locate = locator
+
+    def fix(self, frame: Frame, estimator: Estimator) -> VisionSample | str:
+        """The fix of one picture, or why there is none.
+
+        Args:
+            frame: The picture's tags; its stamp is that of its arrival.
+            estimator: Knows depth and tilt at the exposure, of the samples that have arrived.
+        """
+        if not math.isfinite(frame.time):
+            return "time not finite"
+        if not frame.detections:
+            return "no tag"
+        time = frame.time - self._locate.pool.latency
+        constraints = self._constraints(time, estimator)
+        if constraints is None and self._locate.needs_height:
+            return "no depth or tilt"
+        found = self._locate(frame.detections, constraints)
+        if not found.ok:
+            return counted(found.reason)
+        R = np.asarray(found.covariance, float)
+        return VisionSample(time, (found.x, found.y), found.yaw, rows_of(0.5 * (R + R.T)), frame.time)
+
+    def _constraints(self, time: float, estimator: Estimator) -> Constraints | None:
+        near, site = estimator.at(time), estimator.site
+        if math.isnan(near.depth) or math.isnan(near.roll) or math.isnan(near.pitch):
+            return None
+        lever = height_above_origin(site.depth_port, near.roll, near.pitch)
+        return Constraints(
+            z_b=-near.depth - site.offset - lever,
+            z_std=estimator.settings.depth_std,
+            roll=near.roll,
+            pitch=near.pitch,
+            up=site.up,
+            port=site.depth_port,
+        )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from collections import Counter
@@ -16,19 +15,18 @@ import numpy.typing as npt
 
 from finssim.files import atomic_write, refuse_unwritable
 from finssim.geometry.rotations import wrap_angle
+from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Frame
-from finssim.localization.errors import LocalizationError
-from finssim.localization.fusion.estimator import Estimator
-from finssim.localization.fusion.fuse_detections import NO_TAGS, Fixes, check_method
-from finssim.localization.fusion.fuse_log import Log, NoFix, load_log
+from finssim.localization.fusion.estimator import MODES, Estimator, Fixes, Health
+from finssim.localization.fusion.fuse_log import Log, NoFix, StreamTable, load_log, series
 from finssim.localization.fusion.fuse_settings import settings_of, site_of
-from finssim.localization.fusion.fuse_table import StreamTable
-from finssim.localization.fusion.health import MODES, Estimate, Health
-from finssim.localization.fusion.streams import Sample
+from finssim.localization.fusion.streams import Estimate, Sample
 from finssim.localization.pool import Pool, load_pool
+from finssim.localization.poses.methods import TagLocator, check_method
+from finssim.text_table import write_csv
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["COLUMNS", "Run", "fuse", "run", "write_rows"]
+__all__ = ["Run", "fuse", "run"]
 
 # The table that the fusion writes, and its summary.
 
@@ -72,11 +70,7 @@ def write_rows(rows: Sequence[Sequence[Any]], out: Path) -> None:
     Raises:
         OutputError: It cannot be written.
     """
-    with atomic_write(out) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        for row in rows:
-            writer.writerow([_cell(value) for value in row])
+    write_csv(out, COLUMNS, ([_cell(value) for value in row] for row in rows))
 
 
 def _cell(value: Any) -> Any:
@@ -124,20 +118,19 @@ def error_figures(rows: Sequence[Sequence[Any]], truth: StreamTable) -> dict[str
     Returns:
         State (and `all`) -> samples, rms_x, rms_y, rms_z, p95_horizontal [m], rms_yaw [rad], for what the truth has.
     """
-    values = np.array([[float(cell) for cell in row[:9]] for row in rows])
-    t, states = values[:, 0], np.array([row[COLUMNS.index("state")] for row in rows])
-    order = np.argsort(truth.t, kind="stable")
-    at = truth.t[order]
-    k = np.clip(np.searchsorted(at, t), 1, max(len(at) - 1, 1))
-    covered = (t >= at[0]) & (t <= at[-1]) & (at[np.minimum(k, len(at) - 1)] - at[k - 1] <= GAP)
+    ours = np.array([[float(row[k]) for k in (0, 1, 2, 3, 9)] for row in rows])
+    states = np.array([row[COLUMNS.index("state")] for row in rows])
+    names = [name for name in ("x", "y", "z", "yaw") if truth.has(name)]
+    if not names:
+        return {}
+    surveyed = series("truth", truth.t, truth.columns(*names), GAP, where=truth.name)
+    if "yaw" in names:
+        surveyed.values[:, -1] = np.unwrap(surveyed.values[:, -1])
+    known, covered = surveyed.between(ours[:, 0])
     errors = {}
-    for name, column in (("x", 1), ("y", 2), ("z", 3), ("yaw", 9)):
-        if truth.has(name):
-            known = truth.numbers[name][order]
-            known = np.interp(t, at, np.unwrap(known) if name == "yaw" else known)
-            ours = np.array([float(row[column]) for row in rows])
-            e = wrap_angle(ours - known) if name == "yaw" else ours - known
-            errors[name] = np.where(covered, e, np.nan)
+    for name, true in zip(names, known.T, strict=True):
+        e = ours[:, 1 + ("x", "y", "z", "yaw").index(name)] - true
+        errors[name] = np.where(covered, wrap_angle(e) if name == "yaw" else e, np.nan)
     figures = {}
     for state in ("all", *MODES[1:]):
         chosen = covered if state == "all" else covered & (states == state)
@@ -290,9 +283,9 @@ def fuse(
         raise LocalizationError(
             "mode error-state needs accelerations with gravity (ax, ay, az beside p, q, r): use constant-velocity"
         )
-    if log.frames and vehicle.file_tags is None:  # defaults are for the virtual world
-        raise LocalizationError(NO_TAGS)
-    fixes = Fixes(pool, vehicle, method=method, pixel_std=pixel_std) if log.frames else None
+    fixes = None
+    if log.frames:  # default tags are for the virtual world
+        fixes = Fixes(TagLocator(pool, vehicle.file_tags, method=method, pixel_std=pixel_std))
     deliveries = _deliveries(log)
     found = Run()
     try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -11,32 +11,226 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
-from finssim.localization.fusion import position_filter, yaw_filter
+from finssim.localization.fusion import attitude, position_filter
 from finssim.localization.fusion.attitude import (
     Tilt,
     TiltGains,
+    YawNoise,
+    YawState,
     follow,
     height_above_origin,
     roll_pitch,
     tilt_from,
+    yaw_rate,
 )
-from finssim.localization.fusion.changed import changed
-from finssim.localization.fusion.fuse_settings import Settings, Site
-from finssim.localization.fusion.gate import GateMemory, judge, judge_carried
-from finssim.localization.fusion.health import Estimate, Outcome
+from finssim.localization.fusion.fuse_settings import Gate, Settings, Site
 from finssim.localization.fusion.position_filter import Motion, PositionState
 from finssim.localization.fusion.streams import (
     DepthSample,
+    Estimate,
     HeadingSample,
     ImuSample,
+    Outcome,
     VelocitySample,
     VisionSample,
+    changed,
 )
-from finssim.localization.fusion.yaw_filter import YawNoise, YawState, yaw_rate
 
-__all__ = ["ConstantVelocity", "Track", "motion_of", "vision_covariance"]
+__all__ = [
+    "GYRO_HOLD", "ConstantVelocity", "GateMemory", "Track", "judge", "judge_carried", "motion_of", "vision_covariance",
+]  # fmt: skip
 
 Array = npt.NDArray[np.float64]
+
+# Gates: which measurements are believed, and when a run of disbelieved ones has been right all along.
+
+LONGEST_SUPPORT = 200
+"""Believed measurements that are counted."""
+
+OUTVOTED = 6
+"""A state that a gyro carries gives way to a run of refused measurements with this part of its own support."""
+
+
+@dataclass(frozen=True)
+class Suspects:
+    """Memory of a gate: refused measurements that agree with one another."""
+
+    since: float
+    """Time of the first [s]."""
+    time: float
+    """Time of the latest [s]."""
+    value: tuple[float, ...]
+    """The latest."""
+    covariance: tuple[tuple[float, ...], ...]
+    """Its covariance."""
+    hits: int = 1
+    """How many agree."""
+    misses: int = 0
+    """Refused measurements in between that agree with none of them."""
+
+
+def remember(
+    suspects: Suspects | None, time: float, value: Array, covariance: Array, drift: float, gate: Gate
+) -> Suspects:
+    """The memory with one more refused measurement.
+
+    It belongs to the run if its distance to the run's latest is within their covariances and what the quantity may
+    have moved meanwhile. A run that more measurements contradict than support is given up for the newest.
+
+    Args:
+        suspects: The memory so far; None after a measurement that was believed.
+        time: Of the measurement [s].
+        value: The measurement, (n,).
+        covariance: Its covariance, (n, n).
+        drift: How fast the quantity may change [units/s].
+        gate: The gate.
+    """
+    rows = tuple(tuple(float(c) for c in row) for row in covariance)
+    fresh = Suspects(time, time, tuple(float(v) for v in value), rows)
+    if suspects is None:
+        return fresh
+    difference = value - np.array(suspects.value)
+    moved = (drift * (time - suspects.time)) ** 2
+    S = covariance + np.array(suspects.covariance) + moved * np.eye(len(value))
+    if float(difference @ np.linalg.solve(S, difference)) <= gate.limit(len(value)):
+        return Suspects(suspects.since, time, fresh.value, rows, suspects.hits + 1, suspects.misses)
+    if suspects.misses + 1 > suspects.hits:
+        return fresh
+    return replace(suspects, misses=suspects.misses + 1)
+
+
+def due(suspects: Suspects, gate: Gate) -> bool:
+    """Whether the run has lasted long enough, and is numerous enough, to take over."""
+    if math.isinf(gate.reacquire_after):
+        return False
+    # A microsecond of slack: stamps are sums of periods.
+    long = suspects.time - suspects.since >= gate.reacquire_after - 1e-6
+    return long and suspects.hits >= gate.reacquire_samples
+
+
+@dataclass(frozen=True)
+class Rival:
+    """What a state that was taken over said, kept alive in case that it was right."""
+
+    offset: float
+    """From what is believed now [units of the measurement]."""
+    held: int
+    """Measurements that supported it."""
+    won: int
+    """Measurements that support what is believed now."""
+
+
+@dataclass(frozen=True)
+class GateMemory:
+    """All that a gate remembers."""
+
+    support: int = 0
+    """Measurements believed since the state was last started from one; counted up to `reacquire_samples`."""
+    suspects: Suspects | None = None
+    believed: int = 0
+    """The same, counted up to `LONGEST_SUPPORT`."""
+    rival: Rival | None = None
+
+    @property
+    def doubt(self) -> float:
+        """Variance that a rival, or a run of refused measurements, adds to that of the state [units²]."""
+        if self.rival is not None:
+            return self.rival.offset**2 * self.rival.held / (self.rival.held + self.rival.won)
+        if self.suspects is not None and self.suspects.hits > 1:
+            return self.suspects.value[0] ** 2 * self.suspects.hits / (self.suspects.hits + self.believed)
+        return 0.0
+
+
+def judge(
+    gate: Gate,
+    memory: GateMemory,
+    time: float,
+    value: Array,
+    covariance: Array,
+    distance: float,
+    drift: float,
+) -> tuple[str, GateMemory]:
+    """Whether a measurement is believed, and the gate's memory after it.
+
+    A state that was started from one measurement is no surer than that one: until `reacquire_samples` others have
+    supported it, a run takes over as soon as it outnumbers its support.
+
+    Args:
+        gate: The gate.
+        memory: What it remembers; support 0 where there is no state yet.
+        time: Of the measurement [s].
+        value: What is compared among refused measurements, (n,).
+        covariance: Of `value`, (n, n).
+        distance: Squared Mahalanobis distance of the measurement from its prediction [-].
+        drift: How fast `value` may change [units/s].
+
+    Returns:
+        `initialized` for the first, `accepted`, `gate` where it is refused, or `reacquired` where it ends a run that
+        takes over; and the memory.
+    """
+    if memory.support == 0:
+        return "initialized", GateMemory(1)
+    if distance <= gate.limit(len(value)):
+        return "accepted", GateMemory(min(memory.support + 1, gate.reacquire_samples))
+    suspects = remember(memory.suspects, time, value, covariance, drift, gate)
+    outvoted = memory.support < gate.reacquire_samples and suspects.hits > memory.support
+    if due(suspects, gate) or (outvoted and math.isfinite(gate.reacquire_after)):
+        return "reacquired", GateMemory(min(suspects.hits, gate.reacquire_samples))
+    return "gate", GateMemory(memory.support, suspects)
+
+
+def judge_carried(
+    gate: Gate,
+    memory: GateMemory,
+    time: float,
+    residual: float,
+    variance: float,
+    distance: float,
+    drift: float,
+    carried: bool,
+) -> tuple[str, GateMemory]:
+    """As `judge`, for the distance of a measurement from a state that another sensor carries on, as a gyro does yaw.
+
+    Between two measurements the state is right to a fraction of a degree, so that a jump is the measurement's error, or
+    the state was wrong all along. What has been believed for long gives way only to a run of a sixth of its support,
+    and is kept as a rival: a measurement that agrees with a rival of more support brings it back at once.
+
+    Args:
+        gate: The gate.
+        memory: What it remembers.
+        time: Of the measurement [s].
+        residual: Measurement less prediction [units].
+        variance: Of the measurement [units²].
+        distance: Squared Mahalanobis distance of the measurement from its prediction [-].
+        drift: How fast residuals that agree may change [units/s].
+        carried: Whether that other sensor speaks; `judge` has to do where it does not.
+    """
+    value, R = np.array([residual]), np.array([[variance]])
+    if not carried:
+        return judge(gate, memory, time, value, R, distance, drift)
+    rival = memory.rival
+    refused = memory.support > 0 and distance > gate.limit(1)
+    if refused and rival is not None and rival.held >= rival.won and math.isfinite(gate.reacquire_after):
+        S = max(residual**2 / distance, variance)
+        if (residual - rival.offset) ** 2 / S <= gate.limit(1):
+            back = Rival(-residual, rival.won, rival.held)
+            return "reacquired", GateMemory(gate.reacquire_samples, None, rival.held, back)
+    verdict, after = judge(gate, memory, time, value, R, distance, drift)
+    if verdict == "reacquired":
+        hits = memory.suspects.hits + 1 if memory.suspects is not None else 1
+        if hits * OUTVOTED < memory.believed:
+            suspects = remember(memory.suspects, time, value, R, drift, gate)
+            return "gate", GateMemory(memory.support, suspects, memory.believed, rival)
+        return verdict, GateMemory(after.support, None, hits, Rival(-residual, memory.believed, hits))
+    if verdict == "gate":
+        return verdict, GateMemory(after.support, after.suspects, memory.believed, rival)
+    believed = min(memory.believed + 1, LONGEST_SUPPORT)
+    if rival is not None:
+        rival = Rival(rival.offset, rival.held, rival.won + 1) if rival.won < 2 * rival.held else None
+    return verdict, GateMemory(after.support, None, believed, rival)
+
+
+# The filters behind these gates.
 
 GYRO_HOLD = 0.3
 """The last rate of the gyro is held this long where samples are missing [s]."""
@@ -44,6 +238,8 @@ YAW_CAP = 10.0
 """Doubt of yaw does not grow beyond this variance [rad²]: far past a full circle."""
 STEEPEST = math.radians(80.0)
 """Pitch beyond which the gyro tells no yaw rate."""
+GATES = ("vision", "yaw", "depth")
+"""Streams in the order of their gates."""
 TAKEN, STEEP = (Outcome("imu", "accepted"),), (Outcome("imu", "steep"),)
 
 
@@ -70,8 +266,8 @@ class Track:
     velocity_time: float | None = None
     compass: bool = False
     """Whether yaw is what a compass says, offset included."""
-    gates: tuple[GateMemory, GateMemory, GateMemory] = (GateMemory(), GateMemory(), GateMemory())
-    """Memories of the gates of position, yaw and depth."""
+    gates: tuple[GateMemory, ...] = (GateMemory(),) * 3
+    """Memories of the gates, in the order of `GATES`."""
 
 
 class ConstantVelocity:
@@ -123,28 +319,22 @@ class ConstantVelocity:
         lever = height_above_origin(site.depth_port, track.roll, track.pitch)
         z = np.array([-sample.depth - site.offset - lever])
         R = np.array([[s.depth_std**2]])
-        found = position_filter.innovation(track.position, self._H_depth, z, R)
-        verdict, memory = judge(
-            s.gate, track.gates[2], sample.time, z, R, float(found.mahalanobis), s.speed_std
-        )
-        if verdict == "accepted":
-            position = position_filter.correct(track.position, found, self._H_depth, R)
-        elif verdict == "gate":
-            position = track.position
-        else:
-            x, y = track.position.x[:2]
-            height = (z - site.up[0] * x - site.up[1] * y) / site.up[2]
-            position = position_filter.restarted(track.position, [2], height, R, s.speed_std)
-        then = track.depth_time if verdict == "gate" else sample.time
-        track = changed(track, position=position, depth_time=then, gates=(*track.gates[:2], memory))
-        return track, (Outcome("depth", verdict, float(found.mahalanobis), 1),)
+        x = track.position.x
+
+        def height() -> Array:
+            return np.asarray((z - site.up[0] * x[0] - site.up[1] * x[1]) / site.up[2])
+
+        track, outcome = self._placed(track, "depth", sample.time, z, self._H_depth, R, [2], height)
+        return track, (outcome,)
 
     def vision(self, track: Track, sample: VisionSample) -> tuple[Track, tuple[Outcome, ...]]:
         """Take in a fix of the camera: x and y, and yaw if it has one."""
         R = vision_covariance(sample, self.settings)
-        track = changed(self._positioned(track, sample.time), yaw=self._yaw_at(track, sample.time))
-        track = changed(track, yaw_time=_later(track.yaw_time, sample.time))
-        track, seen = self._fixed(track, sample, R[:2, :2])
+        track, z = (
+            self._turned_to(self._positioned(track, sample.time), sample.time),
+            np.array(sample.position),
+        )
+        track, seen = self._placed(track, "vision", sample.time, z, _H_VISION, R[:2, :2], [0, 1], lambda: z)
         if sample.yaw is None:
             return track, (seen,)
         track, turned = self._turned(track, sample.time, sample.yaw, float(R[2, 2]))
@@ -155,8 +345,7 @@ class ConstantVelocity:
         """Take in a velocity over the floor, turned into the pool frame by the heading so far."""
         if track.yaw_seen is None or self.settings.aids is None:
             return track, (Outcome("velocity", "no heading"),)
-        track = changed(self._positioned(track, sample.time), yaw=self._yaw_at(track, sample.time))
-        track = changed(track, yaw_time=_later(track.yaw_time, sample.time))
+        track = self._turned_to(self._positioned(track, sample.time), sample.time)
         R_pb = quat_to_matrix(quat_from_euler(track.roll, track.pitch, track.yaw.yaw))
         z = R_pb @ np.array(sample.velocity)
         turned = track.yaw.variance * float(z @ z) + self.settings.aids.velocity_bias**2
@@ -171,8 +360,7 @@ class ConstantVelocity:
         aids = self.settings.aids
         if aids is None:
             return track, (Outcome("heading", "no compass"),)
-        track = changed(track, yaw=self._yaw_at(track, sample.time))
-        track = changed(track, yaw_time=_later(track.yaw_time, sample.time))
+        track = self._turned_to(track, sample.time)
         variance = aids.heading_std**2 + aids.heading_bias**2
         track, turned = self._turned(track, sample.time, sample.yaw, variance)
         # Its offset is in every sample: many of them know no better than one.
@@ -208,25 +396,35 @@ class ConstantVelocity:
             velocity_time=track.velocity_time,
         )
 
-    def _fixed(self, track: Track, sample: VisionSample, R: Array) -> tuple[Track, Outcome]:
-        s, z = self.settings, np.array(sample.position)
-        found = position_filter.innovation(track.position, _H_VISION, z, R)
-        verdict, memory = judge(
-            s.gate, track.gates[0], sample.time, z, R, float(found.mahalanobis), s.speed_std
-        )
+    def _placed(
+        self,
+        track: Track,
+        stream: str,
+        time: float,
+        z: Array,
+        H: Array,
+        R: Array,
+        axes: list[int],
+        restart: Callable[[], Array],
+    ) -> tuple[Track, Outcome]:
+        """The track after a fix or a depth that its gate has judged; `restart` is where the axes begin anew."""
+        s, k = self.settings, GATES.index(stream)
+        found = position_filter.innovation(track.position, H, z, R)
+        distance = float(found.mahalanobis)
+        verdict, memory = judge(s.gate, track.gates[k], time, z, R, distance, s.speed_std)
+        position = track.position
         if verdict == "accepted":
-            position = position_filter.correct(track.position, found, _H_VISION, R)
-        elif verdict == "gate":
-            position = track.position
-        else:
-            position = position_filter.restarted(track.position, [0, 1], z, R, s.speed_std)
-        then = track.vision_time if verdict == "gate" else sample.time
-        track = changed(track, position=position, vision_time=then, gates=(memory, *track.gates[1:]))
-        return track, Outcome("vision", verdict, float(found.mahalanobis), 2)
+            position = position_filter.correct(position, found, H, R)
+        elif verdict != "gate":
+            position = position_filter.restarted(position, axes, restart(), R, s.speed_std)
+        gates = (*track.gates[:k], memory, *track.gates[k + 1 :])
+        believed = {} if verdict == "gate" else {f"{stream}_time": time}
+        track = changed(track, position=position, gates=gates, **believed)
+        return track, Outcome(stream, verdict, distance, len(z))
 
     def _turned(self, track: Track, time: float, seen: float, variance: float) -> tuple[Track, Outcome]:
         s = self.settings
-        found = yaw_filter.innovation(track.yaw, seen, variance)
+        found = attitude.innovation(track.yaw, seen, variance)
         # Flipped yaws agree with one another as distances from the prediction, which turns with the vehicle.
         carried = track.imu_time is not None and time - track.imu_time <= GYRO_HOLD
         distance = float(found.mahalanobis)
@@ -234,11 +432,11 @@ class ConstantVelocity:
             s.gate, track.gates[1], time, float(found.residual), variance, distance, 0.05, carried
         )
         if verdict == "accepted":
-            yaw = yaw_filter.correct(track.yaw, found, variance)
+            yaw = attitude.correct(track.yaw, found, variance)
         elif verdict == "gate":
             yaw = track.yaw
         else:
-            yaw = yaw_filter.restarted(track.yaw, seen, variance, s.bias_std)
+            yaw = attitude.restarted(track.yaw, seen, variance, s.bias_std)
         then = track.yaw_seen if verdict == "gate" else time
         gates = (track.gates[0], memory, track.gates[2])
         track = changed(track, yaw=yaw, yaw_seen=then, gates=gates)
@@ -279,6 +477,9 @@ class ConstantVelocity:
         position = position_filter.capped(position, s.largest_variance)
         return changed(track, position=position, position_time=time)
 
+    def _turned_to(self, track: Track, time: float) -> Track:
+        return changed(track, yaw=self._yaw_at(track, time), yaw_time=_later(track.yaw_time, time))
+
     def _yaw_at(self, track: Track, time: float) -> YawState:
         """Yaw at a time: the latest rate held, and none where the gyro has been silent for too long."""
         s, then = self.settings, track.yaw_time
@@ -288,12 +489,12 @@ class ConstantVelocity:
         heard = -math.inf if track.imu_time is None or track.rate is None else track.imu_time + GYRO_HOLD
         for until in _steps(then, time, (heard,)):
             if until <= heard + 1e-12 and track.rate is not None:
-                yaw = yaw_filter.predict(yaw, track.rate, until - then, s.gyro)
+                yaw = attitude.predict(yaw, track.rate, until - then, s.gyro)
             else:
                 noise = YawNoise(rate=s.blind_rate, bias_walk=s.gyro.bias_walk)
-                yaw = yaw_filter.predict(yaw, yaw.bias, until - then, noise)
+                yaw = attitude.predict(yaw, yaw.bias, until - then, noise)
             then = until
-        return yaw_filter.capped(yaw, YAW_CAP) if yaw.variance > YAW_CAP else yaw
+        return attitude.capped(yaw, YAW_CAP) if yaw.variance > YAW_CAP else yaw
 
 
 _H_VISION = np.eye(6)[:2]

@@ -6,23 +6,198 @@ import math
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.rotations import quat_conjugate, quat_from_euler, quat_multiply, quat_to_euler
+from finssim.geometry.rotations import quat_inverse_rotate
+from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Frame, read_detections
-from finssim.localization.errors import LocalizationError
-from finssim.localization.fusion.attitude import in_body_axes
-from finssim.localization.fusion.fuse_table import StreamTable, read_stream_table
+from finssim.localization.fusion.attitude import in_body_axes, roll_pitch, up_of
 from finssim.localization.fusion.streams import DepthSample, ImuSample, Sample, VisionSample
+from finssim.text_table import EMPTY, TextTable, read_text_table
 from finssim.vehicles import Vehicle
+from finssim.vehicles.equipment import Imu
 
-__all__ = ["Log", "NoFix", "counted", "load_log"]
+__all__ = [
+    "Log", "NoFix", "Series", "StreamTable", "counted", "imu_columns", "load_log", "read_stream_table", "rows_of",
+    "series",
+]  # fmt: skip
+
+# Reading the tables of a log: columns of numbers by name, empty cells as NaN.
 
 Array = npt.NDArray[np.float64]
 
-RATES, FORCE, QUATERNION = ("p", "q", "r"), ("ax", "ay", "az"), ("qx", "qy", "qz", "qw")
+TIME = ("t", "time", "time_s", "timestamp", "stamp", "seconds")
+WORDS = ("image", "status", "reason")
+"""Columns that are words even where they look like numbers."""
+QUATERNION = ("qx", "qy", "qz", "qw")
+TRUTH = {"true": 1.0, "yes": 1.0, "false": 0.0, "no": 0.0}
+
+
+@dataclass
+class StreamTable:
+    """One table of a log."""
+
+    name: str
+    """As messages call it."""
+    t: Array
+    """Times, (n,), as they stand in the file [s]."""
+    numbers: dict[str, Array]
+    """Column, in lower case -> values, (n,)."""
+    words: dict[str, list[str]]
+    """Columns that hold words."""
+    notes: list[str] = field(default_factory=list)
+
+    def has(self, *names: str) -> bool:
+        """Whether all these columns hold a number somewhere."""
+        return all(name in self.numbers and np.isfinite(self.numbers[name]).any() for name in names)
+
+    def columns(self, *names: str) -> Array:
+        """Columns side by side, (n, len(names))."""
+        return np.stack([self.numbers[name] for name in names], axis=-1)
+
+    def angle(self, name: str) -> Array:
+        """A column of angles in radians, or of degrees with `_deg` in its name [rad]; NaN where there is none."""
+        if name in self.numbers:
+            return self.numbers[name]
+        if f"{name}_deg" in self.numbers:
+            return np.asarray(np.radians(self.numbers[f"{name}_deg"]))
+        return np.full(len(self.t), math.nan)
+
+    def up(self) -> Array | None:
+        """Unit vectors upwards in the axes whose attitude the table holds, (n, 3); None where it holds none.
+
+        Raises:
+            LocalizationError: Quaternions are not of unit length, or angles exceed a turn.
+        """
+        if self.has(*QUATERNION):
+            q = self.columns(*QUATERNION)
+            length = np.linalg.norm(q, axis=1, keepdims=True)
+            near = np.abs(length - 1.0) < 0.05
+            if not near.any():
+                raise LocalizationError(
+                    f"{self.name}: qx, qy, qz, qw are not of unit length: expected body to world"
+                )
+            return quat_inverse_rotate(np.where(near, q / length, np.nan), np.array([0.0, 0.0, 1.0]))
+        roll, pitch = self.angle("roll"), self.angle("pitch")
+        if not (np.isfinite(roll).any() and np.isfinite(pitch).any()):
+            return None
+        if np.nanmax(np.abs([roll, pitch])) > 2.0 * math.pi:
+            raise LocalizationError(
+                f"{self.name}: roll or pitch exceeds a turn: expected radians, or columns roll_deg, pitch_deg"
+            )
+        return up_of(roll, pitch)
+
+
+# Samples over time, read at times between them and nowhere else.
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Samples in the order of their times."""
+
+    what: str
+    """Such as `depth`, as messages call it."""
+    t: Array
+    """[s], rising, (n,)."""
+    values: Array
+    """(n, k)"""
+    longest_gap: float
+    """Nothing is interpolated between samples further apart than this [s]."""
+
+    def between(self, times: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
+        """The values at some times [s], in a straight line between two samples, (m, k), and whether they are known."""
+        k = np.clip(np.searchsorted(self.t, times), 1, max(len(self.t) - 1, 1))
+        late = np.minimum(k, len(self.t) - 1)
+        near = self.t[late] - self.t[k - 1] <= self.longest_gap
+        columns = [np.interp(times, self.t, column) for column in self.values.T]
+        return np.column_stack(columns), (times >= self.t[0]) & (times <= self.t[-1]) & near
+
+    def at(self, time: float) -> Array | str:
+        """The values at a time [s], in a straight line between two samples, (k,); or why they are not known there."""
+        if not np.isfinite(time):
+            return f"no {self.what} at the exposure: the picture has no time stamp"
+        first, last = float(self.t[0]), float(self.t[-1])
+        if not first <= time <= last:
+            return f"no {self.what} at the exposure: {time:.3f} s is outside the file's {first:.3f} to {last:.3f} s"
+        k = int(np.searchsorted(self.t, time))
+        if self.t[k] == time:
+            return np.asarray(self.values[k])
+        gap = float(self.t[k] - self.t[k - 1])
+        if gap > self.longest_gap:
+            return f"no {self.what} at the exposure: its samples around {time:.3f} s are {gap:.2f} s apart"
+        share = (time - self.t[k - 1]) / gap
+        return np.asarray((1.0 - share) * self.values[k - 1] + share * self.values[k])
+
+
+def series(what: str, t: Array, values: Array, longest_gap: float, *, where: str) -> Series:
+    """Sort samples by time and leave out those without any number; of equal times the last is taken.
+
+    Raises:
+        LocalizationError: None is left.
+    """
+    order = np.argsort(t, kind="stable")
+    t, values = t[order], values[order]
+    good = np.isfinite(t) & np.isfinite(values).any(axis=1)
+    t, values = t[good], values[good]
+    if not len(t):
+        raise LocalizationError(f"{where}: no row holds a time and a {what}: expected numbers")
+    last = np.append(t[1:] > t[:-1], True)
+    return Series(what, t[last], values[last], longest_gap)
+
+
+def read_stream_table(path: str | Path, *, timed: bool = True) -> StreamTable:
+    """The columns of a CSV file with a line of names; separated by commas, semicolons or tabs; # begins a comment.
+
+    A last line that a crash cut short is left out, and so are others of the wrong length.
+
+    Args:
+        path: The file.
+        timed: Refuse a table without a column of times; else they are NaN.
+
+    Raises:
+        LocalizationError: Unreadable, without names, without a column of times, or without rows.
+    """
+    text = read_text_table(path, LocalizationError)
+    names = [name.lower() for name in text.names]
+    time = next((name for name in TIME if name in names), None)
+    if (timed and time is None) or len(set(names)) < len(names):
+        raise LocalizationError(
+            f"{path}: expected a line of different column names with t, such as t,depth; found "
+            f"'{','.join(names)[:60]}'"
+        )
+    rows = text.rows
+    whole = [row for row in rows if len(row) == len(names)]
+    table = StreamTable(str(path), np.full(len(whole), np.nan), {}, {})
+    if len(whole) < len(rows):
+        table.notes.append(
+            f"{Path(path).name}: {len(rows) - len(whole)} rows do not have {len(names)} cells and were left out"
+        )
+    if not whole:
+        raise LocalizationError(f"{path}: holds no rows: give a table with samples")
+    for name, cells in zip(names, zip(*whole, strict=True), strict=True):
+        values = [_number(cell, text) for cell in cells]
+        no_numbers = all(math.isnan(v) for v in values) and any(c.lower() not in EMPTY for c in cells)
+        if no_numbers or name in WORDS:
+            table.words[name] = list(cells)
+        else:
+            table.numbers[name] = np.array(values, float)
+    if time is not None and time not in table.numbers:
+        raise LocalizationError(f"{path}: column '{time}' holds no numbers: write times in seconds")
+    if time is not None:
+        table.t = table.numbers.pop(time)
+    return table
+
+
+def _number(cell: str, text: TextTable) -> float:
+    """The number in a cell; NaN where there is none. Infinities stay: the estimator refuses and counts them."""
+    value = text.number(cell)
+    return TRUTH.get(cell.lower(), math.nan) if value is None else value
+
+
+RATES, FORCE = ("p", "q", "r"), ("ax", "ay", "az")
 SENSOR_RATES, SENSOR_FORCE = ("gyro_x", "gyro_y", "gyro_z"), ("accel_x", "accel_y", "accel_z")
 """Names that say that the numbers are in the IMU's own axes."""
 HELD = 0.5
@@ -118,55 +293,70 @@ def _present(name: str, table: StreamTable) -> bool:
     return table.has("depth") if name == "depth" else table.has("x", "y")
 
 
-def _imu(
-    table: StreamTable, vehicle: Vehicle, log: Log, *, latency: float, imu_axes: str | None
-) -> list[Sample]:
-    sensor = vehicle.sensors.imu
+class ImuColumns(NamedTuple):
+    """What a table holds of an IMU, in body axes; NaN where a row has none."""
+
+    omega: Array
+    """Angular rate [rad/s], (n, 3)."""
+    force: Array
+    """Specific force [m/s²], (n, 3)."""
+    up: Array | None
+    """Unit vectors upwards, (n, 3); None without an attitude."""
+    mount: Array
+    """Axes of the columns to body axes, xyzw, (4,)."""
+
+
+def imu_columns(table: StreamTable, sensor: Imu | None, axes: str | None = None) -> ImuColumns:
+    """The columns of an IMU, turned into body axes where they are in its own.
+
+    Args:
+        table: The table.
+        sensor: How the IMU is mounted.
+        axes: `body` or `sensor`; None: `gyro_x`, `accel_x`, ... are the sensor's, `p`, `ax`, ... the body's.
+
+    Raises:
+        LocalizationError: Columns are in the sensor's axes, whose mount is not known; or no attitude can be so.
+    """
     own = table.has(*SENSOR_RATES) and not table.has(*RATES)
-    turned = imu_axes == "sensor" or (own and imu_axes is None)
+    turned = axes == "sensor" or (own and axes is None)
     if turned and sensor is None:
         raise LocalizationError(
             f"{table.name}: rates in the IMU's axes, but the vehicle file has no sensors.imu.orientation: add it"
         )
-    mount = np.array(sensor.orientation) if turned and sensor is not None else np.array([0.0, 0.0, 0.0, 1.0])
-    omega = in_body_axes(table.columns(*(SENSOR_RATES if own else RATES)), mount)
-    names = SENSOR_FORCE if table.has(*SENSOR_FORCE) else FORCE
-    force = in_body_axes(table.columns(*names), mount) if table.has(*names) else np.full(omega.shape, np.nan)
+    mount = np.array(sensor.orientation if turned and sensor is not None else (0.0, 0.0, 0.0, 1.0), float)
+    found = [np.full((len(table.t), 3), np.nan)] * 2
+    forces = SENSOR_FORCE if table.has(*SENSOR_FORCE) else FORCE
+    for i, names in enumerate((SENSOR_RATES if own else RATES, forces)):
+        if table.has(*names):
+            found[i] = in_body_axes(table.columns(*names), mount)
+    up = table.up()
+    return ImuColumns(found[0], found[1], None if up is None else in_body_axes(up, mount), mount)
+
+
+def _imu(
+    table: StreamTable, vehicle: Vehicle, log: Log, *, latency: float, imu_axes: str | None
+) -> list[Sample]:
+    sensor = vehicle.sensors.imu
+    omega, force, up, _ = imu_columns(table, sensor, imu_axes)
     size = float(np.nanmedian(np.linalg.norm(force, axis=1))) if np.isfinite(force).any() else math.nan
     if size < 0.5 * vehicle.water.gravity:
         log.notes.append(f"accelerations of {size:.2g} m/s² hold no gravity and were left out")
         force = np.full(omega.shape, np.nan)
-    tilt = _tilt(table, mount)
+    tilt = np.full((len(omega), 2), np.nan) if up is None else np.stack(roll_pitch(up), axis=-1)
     rows = np.flatnonzero(~np.isnan(omega).any(axis=1))
     if len(rows) > 1:  # an attitude that was logged in rows of its own is carried on to the next rate
         tilt = _carried(table.t, tilt)
     arrival = _arrival(table, 0.0 if sensor is None else sensor.latency)
     return [
         ImuSample(
-            float(table.t[k]),
-            (float(omega[k, 0]), float(omega[k, 1]), float(omega[k, 2])),
-            None
-            if np.isnan(force[k]).any()
-            else (float(force[k, 0]), float(force[k, 1]), float(force[k, 2])),
-            None if np.isnan(tilt[k]).any() else (float(tilt[k, 0]), float(tilt[k, 1])),
-            float(arrival[k]),
+            time=float(table.t[k]),
+            omega=_three(omega[k]),
+            force=None if np.isnan(force[k]).any() else _three(force[k]),
+            tilt=None if np.isnan(tilt[k]).any() else (float(tilt[k, 0]), float(tilt[k, 1])),
+            arrival=float(arrival[k]),
         )
         for k in rows
     ]
-
-
-def _tilt(table: StreamTable, mount: Array) -> Array:
-    """Roll and pitch of the body in each row [rad], (n, 2); NaN where the row has none."""
-    if table.has(*QUATERNION):
-        q = table.columns(*QUATERNION)
-    elif table.has("roll", "pitch"):
-        q = quat_from_euler(table.numbers["roll"], table.numbers["pitch"], 0.0)
-    else:
-        return np.full((len(table.t), 2), np.nan)
-    length = np.linalg.norm(q, axis=1, keepdims=True)
-    q = np.where(np.abs(length - 1.0) < 0.05, q / np.where(length > 0.0, length, 1.0), np.nan)
-    roll, pitch, _ = quat_to_euler(quat_multiply(q, quat_conjugate(mount)))
-    return np.stack([roll, pitch], axis=-1)
 
 
 def _carried(t: Array, values: Array) -> Array:
@@ -190,7 +380,7 @@ def _vision(
     table: StreamTable, vehicle: Vehicle, log: Log, *, latency: float, imu_axes: str | None
 ) -> list[Sample]:
     xy = table.columns("x", "y")
-    yaw = _angle(table, "yaw")
+    yaw = table.angle("yaw")
     usable = ~np.isnan(xy).any(axis=1)
     if "status" in table.words:
         usable &= np.array([word.lower() == "ok" for word in table.words["status"]])
@@ -202,11 +392,11 @@ def _vision(
     time = table.numbers["exposure"] if table.has("exposure") else table.t - latency
     return [
         VisionSample(
-            float(time[k]),
-            (float(xy[k, 0]), float(xy[k, 1])),
-            None if math.isnan(yaw[k]) else float(yaw[k]),
-            None if np.isnan(covariance[k]).any() else _rows(covariance[k]),
-            float(arrival[k]),
+            time=float(time[k]),
+            position=(float(xy[k, 0]), float(xy[k, 1])),
+            yaw=None if math.isnan(yaw[k]) else float(yaw[k]),
+            covariance=None if np.isnan(covariance[k]).any() else rows_of(covariance[k]),
+            arrival=float(arrival[k]),
         )
         for k in rows
     ]
@@ -217,7 +407,7 @@ def _covariance(table: StreamTable) -> Array:
     if not table.has("std_x", "std_y"):
         return np.full((len(table.t), 3, 3), np.nan)
     none = np.full(len(table.t), math.radians(180.0))  # a fix without yaw does not use its variance
-    std_yaw = _angle(table, "std_yaw")
+    std_yaw = table.angle("std_yaw")
     std = np.column_stack([table.columns("std_x", "std_y"), np.where(np.isnan(std_yaw), none, std_yaw)])
     R: Array = (std * np.abs(std))[:, :, None] * np.eye(3)  # a negative deviation stays no covariance
     for i, j, name in ((0, 1, "cov_xy"), (0, 2, "cov_xyaw"), (1, 2, "cov_yyaw")):
@@ -229,15 +419,6 @@ def _covariance(table: StreamTable) -> Array:
 def counted(reason: str) -> str:
     """A reason without its particulars, for counting."""
     return re.split(r"[:(]", reason, maxsplit=1)[0].strip() or "refused"
-
-
-def _angle(table: StreamTable, name: str) -> Array:
-    """A column of angles in radians, or of degrees with `_deg` in its name; NaN where there is none."""
-    if name in table.numbers:
-        return table.numbers[name]
-    if f"{name}_deg" in table.numbers:
-        return np.radians(table.numbers[f"{name}_deg"])
-    return np.full(len(table.t), math.nan)
 
 
 def _arrival(table: StreamTable, latency: float) -> Array:
@@ -256,5 +437,11 @@ def _thinned(rows: npt.NDArray[np.intp], values: Array, stream: str, log: Log) -
     return np.asarray(rows[new])
 
 
-def _rows(R: Array) -> tuple[tuple[float, float, float], ...]:
-    return tuple((float(row[0]), float(row[1]), float(row[2])) for row in R)
+def _three(values: Array) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def rows_of(R: Array) -> tuple[tuple[float, float, float], ...]:
+    """The rows of a matrix (3, 3) as plain numbers."""
+    return tuple(_three(row) for row in R)

@@ -4,20 +4,44 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import chdtri
 
-from finssim.localization.errors import LocalizationError
-from finssim.localization.fusion.gate import Gate
+from finssim.localization import LocalizationError
+from finssim.localization.fusion.attitude import YawNoise
 from finssim.localization.fusion.position_filter import Motion
-from finssim.localization.fusion.yaw_filter import YawNoise
 from finssim.localization.pool import Pool
 from finssim.vehicles import Vehicle
 
-__all__ = ["PROFILES", "Aids", "Settings", "Site", "settings_of", "site_of"]
+__all__ = ["PROFILES", "Aids", "Gate", "Settings", "Site", "settings_of", "site_of"]
 
 Array = npt.NDArray[np.float64]
+
+
+@lru_cache(maxsize=64)
+def _quantile(dimension: int, probability: float) -> float:
+    return float(chdtri(dimension, 1.0 - probability))
+
+
+@dataclass(frozen=True)
+class Gate:
+    """What a squared Mahalanobis distance may be, and when a run of refused measurements takes over."""
+
+    probability: float = 0.999
+    """Share of honest measurements that pass."""
+    fixed: float | None = None
+    """One limit for every dimension, in place of the chi-square quantile; the published software has 9."""
+    reacquire_after: float = 1.0
+    """A run of refused measurements that agree with one another takes over after this long [s]; inf: never."""
+    reacquire_samples: int = 5
+    """And after this many of them."""
+
+    def limit(self, dimension: int) -> float:
+        """Largest squared Mahalanobis distance that passes, for a measurement of that many numbers."""
+        return self.fixed if self.fixed is not None else _quantile(dimension, self.probability)
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,224 @@
-"""A pose from the tags of one picture, by several methods."""
+"""What one picture says about the vehicle's pose, and what is known of it beforehand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from finssim.geometry.rotations import matrix_to_quat
+from finssim.localization.detection.detections import Detection, most_certain
+
+__all__ = [
+    "Constraints", "Correspondences", "Measurement", "axes_of_up", "correspondences", "refused", "tilt_matrix",
+]  # fmt: skip
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Constraints:
+    """Height and tilt of the vehicle, from pressure and inertia.
+
+    They refer to the vertical `up`. Where the survey's z axis is not quite that of gravity, up is the normal of the
+    water; then `z_b` is the height of the body origin along it, up . t_pb.
+    """
+
+    z_b: float
+    """Height of the body origin in the pool frame, measured along `up` [m]."""
+    z_std: float = 0.01
+    """Standard deviation of the height of `port` [m]."""
+    roll: float = 0.0
+    """[rad]"""
+    pitch: float = 0.0
+    """[rad], positive nose down."""
+    tilt_std: float = math.radians(0.5)
+    """Standard deviation of roll and of pitch [rad]."""
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Unit vector against gravity, pool frame."""
+    port: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Body point whose height was measured [m]: an error of tilt also moves the origin relative to it."""
+    shared_pixel_std: float = 0.0
+    """Error that all corners of a picture share, per axis [px]: waves, the camera's pose."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """Pose of the vehicle from one picture, pool frame; NaN where it was refused."""
+
+    method: str
+    """A key of `METHODS`."""
+    ok: bool
+    reason: str
+    """Why it was refused; empty when it was not."""
+    position: Array
+    """t_pb: body origin [m], (3,)."""
+    rotation: Array
+    """R_pb: body to pool, (3, 3)."""
+    covariance: Array
+    """Of (x, y, yaw) [m, m, rad], (3, 3)."""
+    residual_px: float
+    """Root mean square distance of the corners used from where the pose puts them [px]."""
+    tags: tuple[int, ...] = ()
+    """Tags used."""
+    corners: int = 0
+    """Corners used."""
+    rejected: Mapping[str, int] = field(default_factory=dict)
+    """Corners not used, by reason."""
+    iterations: int = 0
+    medium: str = ""
+    """Where the corners are: `water`, `air` or `both`."""
+    pose_covariance: Array | None = None
+    """Of position and a turn about pool axes [m, rad], (6, 6), from methods that measure all six."""
+
+    @property
+    def x(self) -> float:
+        """[m]"""
+        return float(self.position[0])
+
+    @property
+    def y(self) -> float:
+        """[m]"""
+        return float(self.position[1])
+
+    @property
+    def z(self) -> float:
+        """[m]"""
+        return float(self.position[2])
+
+    @property
+    def yaw(self) -> float:
+        """Heading of the body's x axis about the pool's z axis [rad], in [-pi, pi]."""
+        return math.atan2(self.rotation[1, 0], self.rotation[0, 0])
+
+    @property
+    def pitch(self) -> float:
+        """[rad], positive nose down."""
+        return math.atan2(-self.rotation[2, 0], math.hypot(self.rotation[2, 1], self.rotation[2, 2]))
+
+    @property
+    def roll(self) -> float:
+        """[rad]"""
+        return math.atan2(self.rotation[2, 1], self.rotation[2, 2])
+
+    @property
+    def quaternion(self) -> Array:
+        """q_pb, xyzw, (4,)."""
+        return matrix_to_quat(self.rotation)
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations of x, y [m] and yaw [rad], (3,)."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance)))
+
+
+def refused(
+    method: str, reason: str, rejected: Mapping[str, int] | None = None, *, tags: tuple[int, ...] = ()
+) -> Measurement:
+    """The measurement that is none, and why."""
+    position, matrix = np.full(3, np.nan), np.full((3, 3), np.nan)
+    return Measurement(
+        method, False, reason, position, matrix, matrix, math.nan, tags, 0, dict(rejected or {})
+    )
+
+
+def tilt_matrix(roll: float, pitch: float) -> Array:
+    """R_y(pitch) R_x(roll) of angles [rad], (3, 3)."""
+    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
+    return np.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
+
+
+def axes_of_up(up: npt.ArrayLike) -> Array:
+    """R_pg: a frame g with z along `up`, turned as little as possible from the pool frame, (3, 3).
+
+    Straight upside down it is a half turn about x.
+    """
+    x, y, z = (float(a) for a in np.asarray(up, float))
+    if z < -1.0 + 1e-12:
+        return np.diag([1.0, -1.0, -1.0])
+    k = 1.0 / (1.0 + z)
+    return np.array([[1.0 - k * x * x, -k * x * y, x], [-k * x * y, 1.0 - k * y * y, y], [-x, -y, z]])
+
+
+# Which corner of the vehicle each corner in a picture is.
+
+UNKNOWN_TAG = "unknown tag"
+TWICE = "tag seen twice"
+NO_SQUARE = "corners not clockwise"
+SMALLEST = 4.0
+"""[px²]: a tag 2 px wide."""
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """Corners with their places, four in a row for each tag."""
+
+    pixels: Array
+    """(n, 2)"""
+    points_b: Array
+    """Body frame [m], (n, 3)."""
+    tags: tuple[int, ...]
+    """Tag of each four corners."""
+    rejected: Mapping[str, int]
+    """Corners left aside, by reason."""
+
+    @property
+    def why_too_few(self) -> str:
+        """The sentence for a picture without any corner of the vehicle."""
+        if NO_SQUARE in self.rejected:
+            return (
+                "the corners of no known tag run clockwise around a square: expected top-left, top-right, "
+                "bottom-right, bottom-left of the print"
+            )
+        if UNKNOWN_TAG in self.rejected:
+            return "no tag of the vehicle among those seen"
+        return "no tag seen"
+
+
+def correspondences(detections: Iterable[Detection], tags_b: Mapping[int, Array]) -> Correspondences:
+    """Pair the tags of a picture with those of a vehicle.
+
+    Tags that the vehicle has not are counted, and so are those whose corners do not run clockwise around a convex
+    quadrangle, as those of a tag seen from its printed side do; of an id seen twice the more certain one is taken.
+
+    Args:
+        detections: Tags of one picture.
+        tags_b: Tag id -> corners in the body frame [m], (4, 3), as `tag_corners_b`.
+    """
+    found = list(detections)
+    known = [detection for detection in found if detection.tag in tags_b]
+    rejected: dict[str, int] = {}
+    if len(known) < len(found):
+        rejected[UNKNOWN_TAG] = 4 * (len(found) - len(known))
+    square = [detection for detection in known if _clockwise(detection.corners)]
+    if len(square) < len(known):
+        rejected[NO_SQUARE] = 4 * (len(known) - len(square))
+        known = square
+    if len({detection.tag for detection in known}) < len(known):
+        best = {detection.tag: detection for detection in reversed(most_certain(known))}
+        rejected[TWICE] = 4 * (len(known) - len(best))
+        known = list(best.values())
+    if not known:
+        return Correspondences(np.empty((0, 2)), np.empty((0, 3)), (), rejected)
+    return Correspondences(
+        np.concatenate([detection.corners for detection in known]),
+        np.concatenate([tags_b[detection.tag] for detection in known]),
+        tuple(detection.tag for detection in known),
+        rejected,
+    )
+
+
+def _clockwise(corners: Array) -> bool:
+    """Whether each corner turns right, by at least `SMALLEST` twice the area of its triangle, as seen with v down."""
+    if np.shape(corners) != (4, 2):
+        return False
+    (a, b), (c, d), (e, f), (g, h) = np.asarray(corners, float).tolist()
+    return bool(
+        (c - a) * (f - d) - (d - b) * (e - c) > SMALLEST
+        and (e - c) * (h - f) - (f - d) * (g - e) > SMALLEST
+        and (g - e) * (b - h) - (h - f) * (a - g) > SMALLEST
+        and (a - g) * (d - b) - (b - h) * (c - a) > SMALLEST
+    )

@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from finssim.geometry.optics import Camera, back_project, project, projection_jacobians
+from finssim.geometry.optics import Camera, Lens, back_project, projection_jacobians
 from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_to_matrix, quat_to_rotvec, skew
+from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Detection
+from finssim.localization.detection.families import tag_corners_b
 from finssim.localization.pool import Pool
-from finssim.localization.poses.correspondences import Correspondences, correspondences
-from finssim.localization.poses.measurement import Constraints, Measurement, axes_of_up, refused, tilt_matrix
+from finssim.localization.poses import (
+    Constraints,
+    Correspondences,
+    Measurement,
+    axes_of_up,
+    correspondences,
+    refused,
+    tilt_matrix,
+)
 from finssim.localization.poses.planar_fit import WORST, planar_fit
-from finssim.localization.poses.pose_refinement import RefinedPose, See, refine_pose
-from finssim.localization.poses.pose_start import mirrored, tag_poses
+from finssim.vehicles.equipment import Tags
 
 __all__ = [
     "METHODS",
@@ -26,11 +34,267 @@ __all__ = [
     "Constraints",
     "Measurement",
     "Method",
-    "pinhole",
-    "pinhole_depth",
-    "refractive_bundle",
-    "weighted_fit",
+    "TagLocator",
+    "check_method",
+    "plane_pose",
+    "refine_pose",
+    "through_lens",
 ]
+
+Array = npt.NDArray[np.float64]
+
+# Poses to start from: of a flat board from the rays to its points, without regard to water.
+
+
+def plane_pose(rays: Array, points: Array) -> tuple[Array, Array] | None:
+    """R and t of a plane before an eye, from the rays on which its points are seen.
+
+    Least squares of ray x H point = 0 with H = [r_1 r_2 t] up to a positive scale (Hartley and Zisserman 2004, 4.1).
+
+    Args:
+        rays: Of any length and direction, frame of the eye [-], (n, 3), n >= 4.
+        points: On the plane, its own frame [m], (n, 2).
+
+    Returns:
+        R (3, 3) and t [m] (3,) of the plane in the frame of the eye; None where the points lie on one line.
+    """
+    centre = points.mean(axis=0)
+    size = float(np.abs(points - centre).max())
+    flat = np.column_stack([(points - centre) / size, np.ones(len(points))])
+    rows = np.einsum("nij,nk->nijk", skew(rays), flat).reshape(-1, 9)
+    if not np.isfinite(rows).all():
+        return None
+    _, values, vectors = np.linalg.svd(rows, full_matrices=False)
+    if values[-2] < 1e-9 * values[0]:
+        return None
+    H = vectors[-1].reshape(3, 3)
+    H = H * np.sign(np.median(np.sum(rays * (flat @ H.T), axis=1)))
+    r1, r2, t = (H / (0.5 * (np.linalg.norm(H[:, 0]) + np.linalg.norm(H[:, 1])))).T
+    U, _, Vt = np.linalg.svd(np.column_stack([r1, r2, np.cross(r1, r2)]))
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return np.asarray(R), np.asarray(t * size - R[:, :2] @ centre)
+
+
+def tag_poses(rays_p: Array, centre_p: Array, points_b: Array) -> list[tuple[Array, Array]]:
+    """Both poses of a body that one tag on it shows, without regard to water.
+
+    Seen from far, a flat tag looks the same with its attitude mirrored at the line of sight, which gives the other.
+
+    Args:
+        rays_p: Unit rays to its corners, pool frame [-], (4, 3).
+        centre_p: C_p: camera, pool frame [m], (3,).
+        points_b: Its corners, body frame [m], (4, 3).
+
+    Returns:
+        t_pb and R_pb of each; none where the corners show no square.
+    """
+    x, y = points_b[1] - points_b[0], points_b[0] - points_b[3]
+    x, z = x / np.linalg.norm(x), np.cross(x, y)
+    z = z / np.linalg.norm(z)
+    R_bt, t_bt = np.stack([x, np.cross(z, x), z], axis=1), points_b.mean(axis=0)
+    pose = plane_pose(rays_p, ((points_b - t_bt) @ R_bt)[:, :2])
+    if pose is None:
+        return []
+    R_pb, sight = pose[0] @ R_bt.T, pose[1] / np.linalg.norm(pose[1])
+    return [(centre_p + pose[1] - R @ t_bt, R) for R in (R_pb, mirrored(R_pb, sight, z))]
+
+
+def mirrored(R_pb: Array, sight_p: Array, normal_b: Array) -> Array:
+    """The other attitude in which something flat looks the same from far.
+
+    Args:
+        R_pb: The one, (3, 3).
+        sight_p: Unit vector along the line of sight, pool frame [-], (3,).
+        normal_b: Unit normal of the flat thing, body frame [-], (3,).
+    """
+    return (
+        (np.eye(3) - 2.0 * np.outer(sight_p, sight_p))
+        @ R_pb
+        @ (np.eye(3) - 2.0 * np.outer(normal_b, normal_b))
+    )
+
+
+# A pose with all six degrees of freedom that puts a body's points where the pixels are.
+
+See = Callable[[Array], tuple[Array, Array, npt.NDArray[np.bool_]]]
+"""Points, pool frame (n, 3) -> pixels (n, 2), derivatives by the point (n, 2, 3), and which are seen (n,)."""
+Known = Callable[[Array, Array, Array], tuple[Array, Array]]
+"""t_pb, R_pb and a shift of the picture [px] -> misses of what is known (m,) and derivatives (m, 8), [px]."""
+
+_STILL = 1e-10
+"""A step that lowers the cost by less than this [px²] is the last,"""
+_STILL_SHARE = 1e-6
+"""or by less than this share of it: a thousandth of the misses, and of a standard deviation."""
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedPose:
+    """A minimum of the misses."""
+
+    position: Array
+    """t_pb [m], (3,)."""
+    rotation: Array
+    """R_pb, (3, 3)."""
+    shift: Array
+    """Of the whole picture [px], (2,); zero without prior knowledge."""
+    cost: float
+    """Sum of Huber's rho over the points, and of the squares of what is known [px²]."""
+    missed: Array
+    """Distance of each point from its pixel [px], (n,)."""
+    H: Array
+    """Weighted J'J by position, a turn about pool axes and, with prior knowledge, the shift, (6, 6) or (8, 8)."""
+    curvature: Array
+    """What steps are made with: H, with prior knowledge without what lies along the miss of far points, where Huber's
+    rho does not curve."""
+    g: Array
+    """Slope of half the cost, (6,) or (8,)."""
+    iterations: int = 0
+    converged: bool = False
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of `missed` [px]."""
+        return math.sqrt(float(self.missed @ self.missed) / len(self.missed))
+
+    def covariance(self, pixel_std: float) -> Array:
+        """Of position and a turn about pool axes, (6, 6); where nothing else is known it is enlarged where the misses
+        exceed the noise by far."""
+        factor = 1.0
+        if len(self.H) == 6:
+            dof = max(2 * len(self.missed) - 6, 1)
+            k = 2.0 / (9.0 * dof)
+            quantile = dof * (1.0 - k + 2.326 * math.sqrt(k)) ** 3
+            factor = max(1.0, float(self.missed @ self.missed) / pixel_std**2 / quantile)
+        scale = 1.0 / np.sqrt(np.diagonal(self.H))
+        inverse = np.linalg.pinv(self.H * scale[:, None] * scale, hermitian=True) * scale[:, None] * scale
+        return np.asarray(inverse[:6, :6] * (pixel_std**2 * factor))
+
+
+def refine_pose(
+    see: See,
+    points_b: Array,
+    pixels: Array,
+    position: Array,
+    rotation: Array,
+    huber: float,
+    *,
+    known: Known | None = None,
+    most_steps: int = 50,
+) -> RefinedPose | None:
+    """Levenberg and Marquardt's method on the reprojection error, with analytic Jacobians and Huber's rho.
+
+    The damping follows Nielsen (1999), "Damping parameter in Marquardt's method".
+
+    Args:
+        see: Where points appear.
+        points_b: Body frame [m], (n, 3).
+        pixels: (n, 2).
+        position: t_pb to start from, pool frame [m], (3,).
+        rotation: R_pb to start from, (3, 3).
+        huber: Distance [px] from which on Huber's rho grows linearly.
+        known: What else counts; then a shift of the whole picture is sought too.
+        most_steps: Give up after so many.
+
+    Returns:
+        The minimum, or None where the start cannot be seen.
+    """
+
+    def at(position: Array, rotation: Array, shift: Array) -> RefinedPose | None:
+        return _linearised(see, points_b, pixels, huber, known, position, rotation, shift)
+
+    now = at(position, rotation, np.zeros(2))
+    if now is None:
+        return None
+    share = _STILL_SHARE if known is None else 0.0
+    damping, growth, converged, steps = 1e-3 if known is None else 1e-6, 2.0, False, 0
+    while steps < most_steps and not converged and damping < 1e12:
+        steps += 1
+        D = damping * np.maximum(np.diagonal(now.H), 1e-12)
+        step = np.linalg.solve(now.curvature + np.diag(D), -now.g)
+        promised = float(-(step @ now.g) + step @ (D * step))
+        converged = promised < max(_STILL, share * now.cost)
+        turn = quat_to_matrix(quat_from_rotvec(step[3:6]))
+        shift = now.shift + step[6:] if known else now.shift
+        then = at(now.position + step[:3], turn @ now.rotation, shift)
+        gain = -1.0 if then is None else (now.cost - then.cost) / max(promised, 1e-300)
+        if then is not None and gain >= 0.0:
+            now = then
+            # Nielsen's rule: the damping stays where steps keep half of what they promise, in flat valleys.
+            damping, growth = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-12), 2.0
+        else:
+            damping, growth = damping * growth, 2.0 * growth
+    return replace(now, iterations=steps, converged=converged)
+
+
+def _linearised(
+    see: See,
+    points_b: Array,
+    pixels: Array,
+    huber: float,
+    known: Known | None,
+    position: Array,
+    rotation: Array,
+    shift: Array,
+) -> RefinedPose | None:
+    arms = points_b @ rotation.T
+    found, by_point, seen = see(arms + position)
+    if not seen.all():
+        return None
+    miss = found + shift - pixels
+    missed = np.sqrt(np.sum(miss * miss, axis=1))
+    parts = [by_point, -by_point @ skew(arms)]
+    if known is not None:
+        parts.append(np.broadcast_to(np.eye(2), (len(miss), 2, 2)))
+    J = np.concatenate(parts, axis=-1)
+    far = missed > huber
+    weight = np.where(far, huber / np.maximum(missed, huber), 1.0)
+    cost = float(np.where(far, huber * (2.0 * missed - huber), missed * missed).sum())
+    weighted = (weight[:, None, None] * J).reshape(-1, J.shape[-1])
+    H, g = weighted.T @ J.reshape(-1, J.shape[-1]), weighted.T @ miss.ravel()
+    curvature = H
+    if known is not None:
+        # From nearby Newton's curvature is quicker; from afar, where most of the points are, weights alone are safer.
+        along = np.where(far, np.sqrt(weight) / np.maximum(missed, huber), 0.0)[:, None] * miss
+        flat = np.einsum("ij,ijk->ik", along, J)
+        r, K = known(position, rotation, shift)
+        cost, g, H = cost + float(r @ r), g + K.T @ r, H + K.T @ K
+        curvature = H - flat.T @ flat
+    return RefinedPose(position, rotation, shift, cost, missed, H, curvature, g)
+
+
+def through_lens(lens: Lens, R: Array | None = None, position: Array | None = None) -> See:
+    """What tells where points appear without water: in the optical frame, or in one in which the camera has a pose.
+
+    Args:
+        lens: Of the camera.
+        R: Optical axes to those of the points, (3, 3).
+        position: Of the camera in their frame [m], (3,).
+    """
+    R, position = np.eye(3) if R is None else R, np.zeros(3) if position is None else position
+
+    def see(points: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+        points_c = (points - position) @ R
+        pixels, seen = lens.project(points_c)
+        return pixels, lens.project_jacobian(points_c) @ R.T, seen
+
+    return see
+
+
+def through_water(pool: Pool) -> See:
+    """What tells where points appear: bent at the interface, or straight where they are on the camera's side of it."""
+    camera, interface = pool.camera, pool.interface
+    straight = through_lens(camera.lens, camera.R_pc, camera.position)
+
+    def see(points_p: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+        of = projection_jacobians(camera, interface, points_p)
+        pixels, by_point = of.projection.pixels, of.point
+        in_air = interface.distance(points_p) > 0.0
+        if in_air.any():
+            pixels[in_air], by_point[in_air], _ = straight(points_p[in_air])
+        return pixels, by_point, np.asarray(np.isfinite(pixels).all(axis=1))
+
+    return see
+
 
 # Which of several poses that explain a picture is the vehicle's.
 
@@ -111,26 +375,28 @@ def choose(minima: list[RefinedPose], constraints: Constraints | None, pixel_std
     return Choice(minima[first], minima[second], float(scored[second] - scored[first]))
 
 
-def measured(method: str, choice: Choice, pairs: Correspondences, pixel_std: float) -> Measurement:
-    """The measurement that the best pose is."""
-    pose, whole = choice.best, choice.covariance(pixel_std)
+def measured(
+    method: str, pose: RefinedPose, covariance: Array, pairs: Correspondences, medium: str = ""
+) -> Measurement:
+    """The measurement that a pose is, with its covariance (6, 6)."""
+    x, y, z = pose.rotation[:, 0]
     rows = np.zeros((3, 6))
     rows[0, 0] = rows[1, 1] = 1.0
-    rows[2, 3:] = pose.yaw_by_turn
+    rows[2, 3:] = np.array([-x * z, -y * z, x * x + y * y]) / (x * x + y * y)
     return Measurement(
-        method,
-        True,
-        "",
-        pose.position,
-        pose.rotation,
-        rows @ whole @ rows.T,
-        pose.rms,
-        pairs.tags,
-        len(pairs.pixels),
-        pairs.rejected,
-        pose.iterations,
-        "",
-        whole,
+        method=method,
+        ok=True,
+        reason="",
+        position=pose.position,
+        rotation=pose.rotation,
+        covariance=rows @ covariance @ rows.T,
+        residual_px=pose.rms,
+        tags=pairs.tags,
+        corners=len(pairs.pixels),
+        rejected=pairs.rejected,
+        iterations=pose.iterations,
+        medium=medium,
+        pose_covariance=covariance,
     )
 
 
@@ -181,7 +447,8 @@ def pinhole(
     minima = pinhole_poses(pairs, pool.camera, pixel_std)
     if not minima:
         return refused(method, "the corners show no pose", pairs.rejected, tags=pairs.tags)
-    return measured(method, choose(minima, constraints, pixel_std), pairs, pixel_std)
+    choice = choose(minima, constraints, pixel_std)
+    return measured(method, choice.best, choice.covariance(pixel_std), pairs)
 
 
 def pinhole_depth(
@@ -207,16 +474,9 @@ def pinhole_poses(pairs: Correspondences, camera: Camera, pixel_std: float) -> l
         four = slice(4 * i, 4 * i + 4)
         if seen[four].all():
             starts += tag_poses(rays_p[four], camera.position, pairs.points_b[four])
-    return minima_from(_straight(camera), pairs, starts, 2.5 * pixel_std)
-
-
-def _straight(camera: Camera) -> See:
-    def see(points_p: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
-        points_c = (points_p - camera.position) @ camera.R_pc
-        pixels, seen = camera.lens.project(points_c)
-        return pixels, camera.lens.project_jacobian(points_c) @ camera.R_pc.T, seen
-
-    return see
+    return minima_from(
+        through_lens(camera.lens, camera.R_pc, camera.position), pairs, starts, 2.5 * pixel_std
+    )
 
 
 # All six degrees of freedom from tags through the water: neither depth nor inertia is needed.
@@ -258,7 +518,7 @@ def refractive_bundle(
     reason = _doubt(choice, pixel_std)
     if reason:
         return refused(method, reason, pairs.rejected, tags=pairs.tags)
-    return measured(method, choice, pairs, pixel_std)
+    return measured(method, choice.best, choice.covariance(pixel_std), pairs)
 
 
 def _doubt(choice: Choice, pixel_std: float) -> str:
@@ -325,23 +585,6 @@ def _deepened(seen: RefinedPose, pairs: Correspondences, pool: Pool) -> tuple[Ar
     return np.asarray(middle_p - R @ middle_b), np.asarray(R)
 
 
-def through_water(pool: Pool) -> See:
-    """What tells where points appear: bent at the interface, or straight where they are on the camera's side of it."""
-    camera, interface = pool.camera, pool.interface
-
-    def see(points_p: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
-        in_air = interface.distance(points_p) > 0.0
-        pixels = project(camera, interface, points_p).pixels
-        by_point = projection_jacobians(camera, interface, points_p).point
-        if in_air.any():
-            points_c = (points_p[in_air] - camera.position) @ camera.R_pc
-            pixels[in_air] = camera.lens.project(points_c)[0]
-            by_point[in_air] = camera.lens.project_jacobian(points_c) @ camera.R_pc.T
-        return pixels, by_point, np.asarray(np.isfinite(pixels).all(axis=1))
-
-    return see
-
-
 # All six degrees of freedom from corners, depth and tilt together, each trusted as far as it is sure.
 
 METHOD = "refractive-weighted"
@@ -350,8 +593,6 @@ HUBER = 2.5
 SUREST = 1e-6
 """What is given as exact is held as tightly as this [m, rad, px]."""
 MOST_STEPS = 30
-STILL = 1e-8
-"""A step that changes chi² by less is the last."""
 
 
 def weighted_fit(
@@ -383,141 +624,50 @@ def weighted_fit(
     if constraints is None or not start.ok:
         return refused(METHOD, start.reason, start.rejected, tags=start.tags)
     pairs = correspondences([d for d in found if d.tag in start.tags], tags_b)
-    see = through_water(pool)
-    now = _evaluate(see, pairs.points_b, pairs.pixels, constraints, pixel_std, _State.at(start))
-    damping, converged, steps = 1e-6, False, 0
-    while now is not None and steps < MOST_STEPS and not converged and damping < 1e9:
-        steps += 1
-        step = np.linalg.solve(now.curvature + damping * np.diag(np.diagonal(now.H)), -now.g)
-        converged = bool(-(step @ now.g) < STILL)
-        then = _evaluate(see, pairs.points_b, pairs.pixels, constraints, pixel_std, now.state.moved(step))
-        if then is not None and (converged or then.cost <= now.cost):
-            now, damping = then, max(0.1 * damping, 1e-12)
-        else:
-            damping *= 10.0
-    if now is None or not converged:
-        return refused(METHOD, f"did not converge in {steps} steps", start.rejected, tags=start.tags)
-    return _measured(now, start, steps)
-
-
-@dataclass(frozen=True, eq=False)
-class _State:
-    position: Array
-    rotation: Array
-    shift: Array
-    """Of the whole picture [px], (2,)."""
-
-    @classmethod
-    def at(cls, start: Measurement) -> _State:
-        return cls(start.position, start.rotation, np.zeros(2))
-
-    def moved(self, step: npt.NDArray[np.floating[Any]]) -> _State:
-        turn = quat_to_matrix(quat_from_rotvec(step[3:6]))
-        return _State(self.position + step[:3], turn @ self.rotation, self.shift + step[6:])
-
-
-@dataclass(frozen=True, eq=False)
-class _Point:
-    state: _State
-    cost: float
-    H: Array
-    """Weighted J'J by position, turn about pool axes and shift, (8, 8)."""
-    curvature: Array
-    """H without what lies along the miss of far corners, where Huber's rho does not curve."""
-    g: Array
-    missed: Array
-    """[px]"""
-
-
-def _evaluate(
-    see: See, points_b: Array, pixels: Array, known: Constraints, pixel_std: float, state: _State
-) -> _Point | None:
-    arms = points_b @ state.rotation.T
-    found, by_point, seen = see(arms + state.position)
-    if not seen.all():
-        return None
-    miss = (found + state.shift - pixels) / pixel_std
-    J = np.empty((len(pixels), 2, 8))
-    J[:, :, :3], J[:, :, 3:6], J[:, :, 6:] = by_point, -by_point @ skew(arms), np.eye(2)
-    J /= pixel_std
-    size = np.sqrt(np.sum(miss * miss, axis=1))
-    far = size > HUBER
-    weight = np.where(far, HUBER / np.maximum(size, HUBER), 1.0)
-    cost = float(np.where(far, HUBER * (2.0 * size - HUBER), size * size).sum())
-    weighted = (weight[:, None, None] * J).reshape(-1, 8)
-    along = np.where(far, np.sqrt(weight) / np.maximum(size, HUBER), 0.0)[:, None] * miss
-    flat = np.einsum("ij,ijk->ik", along, J)
-    H, g = weighted.T @ J.reshape(-1, 8), weighted.T @ miss.ravel()
-    curvature = H - flat.T @ flat
-    r, K = _known(known, state)
-    prior = K.T @ K
-    return _Point(state, cost + float(r @ r), H + prior, curvature + prior, g + K.T @ r, pixel_std * size)
-
-
-def _known(known: Constraints, state: _State) -> tuple[Array, Array]:
-    """Misses of height, tilt and shift in standard deviations, (6,), and their derivatives, (6, 8)."""
-    up = np.asarray(known.up, float)
-    port = state.rotation @ np.asarray(known.port, float)
-    level = tilt_matrix(known.roll, known.pitch)
-    height = known.z_b + float((level @ np.asarray(known.port, float))[2])  # of the port, as it was measured
-    m = level[2]
-    up_b = state.rotation.T @ up
-    r, K = np.zeros(6), np.zeros((6, 8))
-    r[0] = up @ (state.position + port) - height
-    K[0, :3], K[0, 3:6] = up, np.cross(port, up)
-    r[1:4] = np.cross(up_b, m)
-    K[1:4, 3:6] = -skew(m) @ state.rotation.T @ skew(up)
-    r[4:], K[4:, 6:] = state.shift, np.eye(2)
-    std = np.maximum([known.z_std, *3 * [known.tilt_std], *2 * [known.shared_pixel_std]], SUREST)
-    return r / std, K / std[:, None]
-
-
-def _measured(point: _Point, start: Measurement, steps: int) -> Measurement:
-    whole = np.asarray(np.linalg.inv(point.H)[:6, :6], float)
-    x, y, z = point.state.rotation[:, 0]
-    rows = np.zeros((3, 6))
-    rows[0, 0] = rows[1, 1] = 1.0
-    rows[2, 3:] = np.array([-x * z, -y * z, x * x + y * y]) / (x * x + y * y)
-    return Measurement(
-        METHOD,
-        True,
-        "",
-        point.state.position,
-        point.state.rotation,
-        rows @ whole @ rows.T,
-        float(np.sqrt(np.mean(point.missed**2))),
-        start.tags,
-        len(point.missed),
-        start.rejected,
-        steps,
-        start.medium,
-        whole,
+    pose = refine_pose(
+        through_water(pool),
+        pairs.points_b,
+        pairs.pixels,
+        start.position,
+        start.rotation,
+        HUBER * pixel_std,
+        known=_known(constraints, pixel_std),
+        most_steps=MOST_STEPS,
     )
+    if pose is None or not pose.converged:
+        steps = 0 if pose is None else pose.iterations
+        return refused(METHOD, f"did not converge in {steps} steps", start.rejected, tags=start.tags)
+    pairs = replace(pairs, rejected=start.rejected)
+    return measured(METHOD, pose, pose.covariance(pixel_std), pairs, start.medium)
 
 
-Array = npt.NDArray[np.float64]
+def _known(constraints: Constraints, pixel_std: float) -> Known:
+    """Misses of height, tilt and shift, (6,), and their derivatives, in pixels: over their deviations, times that of a
+    pixel."""
+    up, port_b = np.asarray(constraints.up, float), np.asarray(constraints.port, float)
+    level = tilt_matrix(constraints.roll, constraints.pitch)
+    height, m = constraints.z_b + float((level @ port_b)[2]), level[2]  # of the port, as it was measured
+    std = [constraints.z_std, *3 * [constraints.tilt_std], *2 * [constraints.shared_pixel_std]]
+    scale = pixel_std / np.maximum(std, SUREST)
+
+    def known(position: Array, rotation: Array, shift: Array) -> tuple[Array, Array]:
+        port = rotation @ port_b
+        r, K = np.zeros(6), np.zeros((6, 8))
+        r[0] = up @ (position + port) - height
+        K[0, :3], K[0, 3:6] = up, np.cross(port, up)
+        r[1:4] = np.cross(rotation.T @ up, m)
+        K[1:4, 3:6] = -skew(m) @ rotation.T @ skew(up)
+        r[4:], K[4:, 6:] = shift, np.eye(2)
+        return r * scale, K * scale[:, None]
+
+    return known
 
 
-class Method(Protocol):
-    """What a method is: a pure function that refuses bad measurements with a reason and raises nothing for them."""
-
-    def __call__(
-        self,
-        detections: Iterable[Detection],
-        pool: Pool,
-        tags_b: Mapping[int, Array],
-        constraints: Constraints | None,
-        pixel_std: float,
-    ) -> Measurement:
-        """
-        Args:
-            detections: Tags of one picture.
-            pool: Camera and water.
-            tags_b: Tag id -> corners in the body frame [m], (4, 3).
-            constraints: What is known of height and tilt, or None.
-            pixel_std: Standard deviation of a corner, per axis [px].
-        """
-
+Method: TypeAlias = Callable[
+    [Iterable[Detection], Pool, Mapping[int, Array], Constraints | None, float], Measurement
+]
+"""Tags of one picture, pool, tag id -> corners in the body frame [m] (4, 3), what is known of height and tilt, standard
+deviation of a corner per axis [px] -> the measurement; it refuses a bad picture with a reason and raises nothing."""
 
 METHODS: dict[str, Method] = {
     "refractive": planar_fit,
@@ -528,3 +678,46 @@ METHODS: dict[str, Method] = {
 }
 NEEDS_DEPTH = frozenset({"refractive", "refractive-weighted", "pinhole-depth"})
 """Methods that refuse to work without constraints."""
+
+
+def check_method(method: str) -> None:
+    """Refuse a word that is no name of `METHODS`.
+
+    Raises:
+        LocalizationError: It is none; the sentence lists them.
+    """
+    if method not in METHODS:
+        raise LocalizationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
+
+
+class TagLocator:
+    """Measures poses of one vehicle before one camera by one method; it remembers nothing of them."""
+
+    def __init__(
+        self, pool: Pool, tags: Tags | None, *, method: str = "refractive", pixel_std: float = 0.5
+    ) -> None:
+        """
+        Args:
+            pool: Camera and water.
+            tags: Of the vehicle; None is refused.
+            method: A name of `METHODS`.
+            pixel_std: Standard deviation of a corner, per axis [px].
+
+        Raises:
+            LocalizationError: Unknown method, a vehicle without tags, or no error at all.
+        """
+        check_method(method)
+        if tags is None:
+            raise LocalizationError(
+                "the vehicle file has no tags: add a section tags: with family, edge and mounts"
+            )
+        if not (math.isfinite(pixel_std) and pixel_std > 0.0):
+            raise LocalizationError(
+                f"pixel_std is {pixel_std}, expected the error of a corner in pixels, such as 0.3"
+            )
+        self.pool, self.method, self.needs_height = pool, method, method in NEEDS_DEPTH
+        self.tags_b, self.family, self._pixel_std = tag_corners_b(tags), tags.family, pixel_std
+
+    def __call__(self, detections: Iterable[Detection], constraints: Constraints | None) -> Measurement:
+        """The pose in one picture, or why there is none."""
+        return METHODS[self.method](detections, self.pool, self.tags_b, constraints, self._pixel_std)

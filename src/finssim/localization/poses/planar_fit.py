@@ -13,10 +13,17 @@ import numpy.typing as npt
 from finssim.geometry.optics import Status, back_project, count_rejections
 from finssim.localization.detection.detections import Detection
 from finssim.localization.pool import Pool
-from finssim.localization.poses.correspondences import Correspondences, correspondences
-from finssim.localization.poses.measurement import Constraints, Measurement, axes_of_up, refused, tilt_matrix
+from finssim.localization.poses import (
+    Constraints,
+    Correspondences,
+    Measurement,
+    axes_of_up,
+    correspondences,
+    refused,
+    tilt_matrix,
+)
 
-__all__ = ["corner_points", "planar_fit", "rigid_fit"]
+__all__ = ["WORST", "planar_fit"]
 
 # A rigid motion in the plane that lays one set of points on another, measured in pixels.
 

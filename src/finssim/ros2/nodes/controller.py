@@ -33,7 +33,7 @@ class Controller(RobotNode):
         self.sends("command", "path", "policy", "event", "diagnostics")
         safety = self.vehicle.safety
         policy, task = self.parameter("policy", "pid"), self.parameter("task", "")
-        self.modes = Modes(self, policy, task, self.parameter("trim", False))
+        self.modes = Modes(self, policy, task)
         self.bridge = RemoteBridge(self, lambda: f"{self.get_name()}/{self.modes.switch.mode}")
         self.state = RemoteState(self, safety.state_timeout if safety else STATE_TIMEOUT)
         nowhere = Station((0.0, 0.0, 0.0), 0.0)

@@ -18,7 +18,7 @@ from finssim.geometry.rotations import (
 from finssim.localization.fusion.estimator import Estimator
 from finssim.localization.fusion.streams import VisionSample
 from finssim.localization.pool import Pool
-from finssim.localization.poses.measurement import axes_of_up
+from finssim.localization.poses import axes_of_up
 from finssim.ros2.nodes.conversions import xyz, xyzw
 
 __all__ = ["FixFrame"]

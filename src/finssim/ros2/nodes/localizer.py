@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 
 from finssim.localization.detection.detections import Frame
-from finssim.localization.detection.detector import detector
-from finssim.localization.detection.region import RegionTracker
-from finssim.localization.fusion.estimator import Estimator
-from finssim.localization.fusion.fuse_detections import Fixes
+from finssim.localization.detection.detector import RegionTracker, detector
+from finssim.localization.fusion.estimator import Estimator, Fixes
 from finssim.localization.fusion.streams import VisionSample
 from finssim.localization.pool import load_pool
 from finssim.robot.messages import Picture, TagCorners
@@ -36,9 +34,9 @@ class Localizer(RobotNode):
         self.perception = Perception(self.vehicle, self.pool, method=method)
         self.perception.fixes = self.fixes = _Kept(self.perception.fixes)
         self.frame = FixFrame(self.pool, self.perception.estimator)
-        tags, library = self.vehicle.tags, self.parameter("detector", "apriltag")
+        tags = self.vehicle.tags
         assert tags is not None  # Perception has refused such a vehicle
-        self._tracker = RegionTracker(detector(tags.family, library=library), set(tags.mounts))
+        self._tracker = RegionTracker(detector(tags.family), set(tags.mounts))
         self.verdicts: Counter[str] = Counter()
         self.sequence = 0
         self.sends("fix", "tags", "diagnostics", "event")

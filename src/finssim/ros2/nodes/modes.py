@@ -13,7 +13,6 @@ from finssim.control import ControlError
 from finssim.control.guidance import Guide, Measured
 from finssim.control.pid import CONTROLLERS
 from finssim.control.policy import NETWORK_FILE
-from finssim.control.trim import Trim
 from finssim.robot.pilots import AgentPilot, ModeSwitch, WrenchPilot, make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.ros2.nodes.conversions import wrench_of
@@ -30,13 +29,12 @@ STALE = 0.5
 class Modes:
     """PIDs by name, `policy` where a directory was given, and `teleop`: the topic `wrench_cmd`."""
 
-    def __init__(self, node: RobotNode, policy: str, task: str, trim: bool) -> None:
+    def __init__(self, node: RobotNode, policy: str, task: str) -> None:
         """
         Args:
             node: That hears wrenches.
             policy: A PID's name or a policy's directory, to begin with.
             task: That the policy must have been trained for; empty: its own.
-            trim: Put an integral in front of a policy.
 
         Raises:
             PolicyError, ControlError: It does not fit the vehicle.
@@ -46,9 +44,7 @@ class Modes:
         pilots: dict[str, Any] = {name: make_pilot(name, node.filed) for name in CONTROLLERS}
         self._policy: AgentPilot | None = None
         if policy not in pilots:
-            pilots["policy"] = self._policy = make_pilot(
-                policy, node.filed, task=task or None, trim=Trim() if trim else None
-            )
+            pilots["policy"] = self._policy = make_pilot(policy, node.filed, task=task or None)
         pilots["teleop"] = WrenchPilot(self._newest, node.vehicle)
         self._pilots = {name: _Timed(pilot) for name, pilot in pilots.items()}
         self.switch = ModeSwitch(self._pilots, policy if policy in pilots else "policy")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from finssim.localization.fusion.health import Health
+from finssim.localization.fusion.estimator import Health
 from finssim.localization.pool import load_pool
 from finssim.robot.goals import place_of
 from finssim.robot.perception import Perception

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from finssim.geometry.rotations import quat_from_euler
+from finssim.localization import LocalizationError, localize
 from finssim.localization.detection.detections import Frame, write_detections
 from finssim.localization.detection.families import printable
-from finssim.localization.errors import LocalizationError
-from finssim.localization.locate import localize
-from finssim.localization.locate.localize_known import known_of
+from finssim.localization.localize import known_of
 from finssim.localization.pool import write_pool
 from finssim.localization.poses.methods import METHODS, NEEDS_DEPTH
 from finssim.vehicles import load_vehicle

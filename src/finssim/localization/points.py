@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import re
@@ -18,9 +16,9 @@ import numpy.typing as npt
 
 from finssim.files import atomic_write, refuse_unwritable
 from finssim.geometry.optics import Status, back_project, count_rejections, plane_jacobian, project
-from finssim.localization.errors import LocalizationError
+from finssim.localization import LocalizationError
 from finssim.localization.pool import load_pool
-from finssim.text_table import text_table
+from finssim.text_table import csv_text, read_text, text_table, write_csv
 
 __all__ = ["run_backproject", "run_project"]
 
@@ -67,15 +65,21 @@ def read_points(path: Path, wanted: Sequence[str], optional: Sequence[str] = ())
         LocalizationError: A column is missing, or cells are not numbers: the lines are named.
     """
     where = "standard input" if str(path) == "-" else str(path)
-    table = text_table(_text(path, where), names=(), spaces=None)
+    text = sys.stdin.read() if str(path) == "-" else read_text(path, LocalizationError)[0]
+    table = text_table(text, names=(), spaces=None)
     if not table.texts:
         raise LocalizationError(f"{where}: holds no rows, expected columns {', '.join(wanted)}")
     rows = list(zip(table.lines, table.rows, strict=True))
-    first = rows[0][1]
-    if all(_number(cell) is not None for cell in first):
-        names = _bare(first, wanted, optional, where)
+    names = rows[0][1]
+    if all(table.number(cell) is not None for cell in names):
+        if not len(wanted) <= len(names) <= len(wanted) + len(optional):
+            raise LocalizationError(
+                f"{where}: has {len(names)} columns without a header, expected {', '.join(wanted)}: name the columns "
+                "in the first line"
+            )
+        names = [*wanted, *optional][: len(names)]
     else:
-        names, rows = first, rows[1:]
+        rows = rows[1:]
     plain = [_plain(name) for name in names]
     for name in (*wanted, *optional):
         if plain.count(name) > 1 or (name in wanted and name not in plain):
@@ -85,76 +89,27 @@ def read_points(path: Path, wanted: Sequence[str], optional: Sequence[str] = ())
                 f"{', '.join(wanted)} in the first line"
             )
     places = {name: plain.index(name) for name in (*wanted, *optional) if name in plain}
-    _refuse_bad_rows(rows, names, places, where)
-    numbers = {name: np.array([_number(row[k]) for _, row in rows], float) for name, k in places.items()}
-    return PointTable(where, names, [row for _, row in rows], numbers)
-
-
-def table_text(names: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table as CSV."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([names, *rows])
-    return text.getvalue()
-
-
-def write_table(path: Path | None, text: str) -> None:
-    """Write text to a file, or to the standard output if there is none.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
-    if path is None:
-        sys.stdout.write(text)
-        return
-    with atomic_write(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-
-
-def _text(path: Path, where: str) -> str:
-    if str(path) == "-":
-        return sys.stdin.read()
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise LocalizationError(f"{where}: is not text, expected a CSV table") from None
-
-
-def _number(cell: str) -> float | None:
-    try:
-        value = float(cell if "." in cell else cell.replace(",", "."))
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
-
-
-def _plain(name: str) -> str:
-    return _UNIT.sub("", name.strip().lower())
-
-
-def _bare(first: list[str], wanted: Sequence[str], optional: Sequence[str], where: str) -> list[str]:
-    if not len(wanted) <= len(first) <= len(wanted) + len(optional):
-        raise LocalizationError(
-            f"{where}: has {len(first)} columns without a header, expected {', '.join(wanted)}: name the columns "
-            "in the first line"
-        )
-    return [*wanted, *optional][: len(first)]
-
-
-def _refuse_bad_rows(
-    rows: Sequence[tuple[int, list[str]]], names: list[str], places: dict[str, int], where: str
-) -> None:
+    numbers: dict[str, list[float]] = {name: [] for name in places}
     bad = []
     for line, row in rows:
         if len(row) != len(names):
             bad.append(f"line {line} has {len(row)} cells, expected {len(names)}")
             continue
-        for name, k in places.items():
-            if _number(row[k]) is None:
-                bad.append(f"line {line}: {name} is '{row[k]}', expected a number")
-                break
+        values = {name: table.number(row[k]) for name, k in places.items()}
+        wrong = next((name for name, x in values.items() if x is None or not math.isfinite(x)), None)
+        if wrong is not None:
+            bad.append(f"line {line}: {wrong} is '{row[places[wrong]]}', expected a number")
+        for name, value in values.items():
+            numbers[name].append(math.nan if value is None else value)
     if bad:
         more = f"; and {len(bad) - _BAD_ROWS_NAMED} more lines" if len(bad) > _BAD_ROWS_NAMED else ""
         raise LocalizationError(f"{where}: {'; '.join(bad[:_BAD_ROWS_NAMED])}{more}")
+    columns = {name: np.array(values, float) for name, values in numbers.items()}
+    return PointTable(where, names, [row for _, row in rows], columns)
+
+
+def _plain(name: str) -> str:
+    return _UNIT.sub("", name.strip().lower())
 
 
 Array = npt.NDArray[np.float64]
@@ -300,7 +255,10 @@ def _give(
     rejected = count_rejections(status)
     good = len(status) - sum(rejected.values())
     if out is not None or not as_json:
-        write_table(out, table_text(names, rows))
+        if out is None:
+            sys.stdout.write(csv_text(names, rows))
+        else:
+            write_csv(out, names, rows)
     if as_json:
         summary: dict[str, Any] = {"command": command, "rows": len(status), "ok": good}
         summary["rejected"] = {name.lower(): n for name, n in rejected.items()}

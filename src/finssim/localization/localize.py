@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
-import re
 import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path, PurePath
 from typing import Any
@@ -22,20 +20,182 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from finssim.files import atomic_write, refuse_unwritable
 from finssim.geometry.optics import Lens
 from finssim.geometry.rotations import wrap_angle
+from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Frame, read_detections
+from finssim.localization.detection.detector import Detector, RegionTracker, detector
 from finssim.localization.detection.families import family_named
-from finssim.localization.detection.tags import tag_corners_b
-from finssim.localization.errors import LocalizationError
-from finssim.localization.locate.localize_known import Known, known_of
-from finssim.localization.locate.series import Series, series
+from finssim.localization.fusion.attitude import roll_pitch, up_of
+from finssim.localization.fusion.fuse_log import Series, counted, read_stream_table, series
 from finssim.localization.pool import Pool, load_pool
-from finssim.localization.poses.measurement import Measurement, refused
-from finssim.localization.poses.methods import METHODS, NEEDS_DEPTH
+from finssim.localization.poses import Constraints, Measurement, refused
+from finssim.localization.poses.methods import NEEDS_DEPTH, TagLocator
 from finssim.provenance import provenance
-from finssim.text_table import read_text_table
+from finssim.text_table import write_csv
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["COLUMNS", "Locator", "Run", "run", "write_rows"]
+__all__ = ["Locator", "Run", "run"]
+
+Array = npt.NDArray[np.float64]
+
+# What is known of the vehicle's height and tilt at the exposure of a picture, from files or from one number.
+
+LEVEL_STD = math.radians(2.0)
+"""Tilt of a vehicle of which nobody says how it leans [rad]."""
+TILT_STD = math.radians(0.5)
+"""Error of an IMU's roll and pitch [rad]."""
+DEPTH_STD = 0.01
+"""Error of a depth where the vehicle file has no sensor [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Sources of height and tilt."""
+
+    base: Constraints
+    """All that does not change: vertical, port, standard deviations."""
+    surface: float
+    """Height of the still surface along `base.up`, from the pool's origin [m]."""
+    depth: Series | float | None
+    """Of the pressure port below the surface, positive down [m]."""
+    up: Series | None
+    """Unit vector upwards in the body frame; None: level."""
+    assumed: tuple[str, ...]
+    """Sentences on what was assumed."""
+
+    @property
+    def settings(self) -> dict[str, float]:
+        """Standard deviations, as plain values."""
+        return {
+            "depth_std": self.base.z_std,
+            "tilt_std_deg": math.degrees(self.base.tilt_std),
+            "shared_pixel_std": self.base.shared_pixel_std,
+        }
+
+    def at(self, time: float, *, needs_height: bool) -> Constraints | str | None:
+        """Height and tilt at a time [s], or why they are not known; None where nothing is known nor needed.
+
+        z_b = surface - depth - e3 . R_y(θ) R_x(φ) P_port, along the vertical.
+        """
+        if not needs_height and self.up is None:
+            return None
+        roll, pitch = 0.0, 0.0
+        if self.up is not None:
+            up_b = self.up.at(time)
+            if isinstance(up_b, str):
+                return up_b if needs_height else None
+            roll, pitch = (float(angle) for angle in roll_pitch(up_b))
+        depth = self.depth.at(time) if isinstance(self.depth, Series) else self.depth
+        if isinstance(depth, str):
+            if needs_height:
+                return depth
+            depth = None
+        below = math.nan if depth is None else float(np.ravel(depth)[0])
+        lever = float(up_of(roll, pitch) @ np.array(self.base.port))
+        return replace(self.base, z_b=self.surface - below - lever, roll=roll, pitch=pitch)
+
+
+def known_of(
+    pool: Pool,
+    vehicle: Vehicle,
+    *,
+    depth: str | float | Path | None,
+    imu: str | Path | None,
+    depth_std: float | None = None,
+    tilt_std: float | None = None,
+    shared_pixel_std: float = 0.0,
+    longest_gap: float = 1.0,
+) -> Known:
+    """Read the sources.
+
+    Args:
+        pool: Where the water is. Where its plane is a surface, depth and tilt are relative to it; where it is a wall,
+            to the world frame of the pool file.
+        vehicle: Where its pressure port is and how well that measures.
+        depth: File with columns t, depth, or one number [m], or None.
+        imu: File with columns t and roll, pitch or qx, qy, qz, qw, or None.
+        depth_std: Standard deviation of the depth [m]; None: that of the vehicle file's sensor.
+        tilt_std: Of roll and pitch [rad]; None: 0.5 degrees with an IMU, 2 degrees without.
+        shared_pixel_std: Error that all corners share [px].
+        longest_gap: Nothing is interpolated between samples further apart [s].
+
+    Raises:
+        LocalizationError: A file without the columns, or a number that is none.
+    """
+    up, surface = _vertical(pool)
+    sensor = vehicle.sensors.depth
+    port = (0.0, 0.0, 0.0) if sensor is None else tuple(float(x) for x in sensor.position)
+    known_std = DEPTH_STD if sensor is None else math.hypot(sensor.noise_std, sensor.bias_initial)
+    base = Constraints(
+        math.nan,
+        z_std=_spread("depth_std", depth_std, known_std),
+        tilt_std=_spread("tilt_std", tilt_std, LEVEL_STD if imu is None else TILT_STD),
+        up=up,
+        port=(port[0], port[1], port[2]),
+        shared_pixel_std=_spread("shared_pixel_std", shared_pixel_std, 0.0),
+    )
+    assumed = []
+    if imu is None:
+        spread = math.degrees(base.tilt_std)
+        assumed.append(f"no --imu: the vehicle is taken as level, give or take {spread:.1f} degrees")
+    if sensor is None and depth is not None:
+        assumed.append(f"{vehicle.name} has no depth sensor: the depth is taken as that of the body origin")
+    return Known(base, surface, _depth(depth, longest_gap), _tilt(imu, longest_gap), tuple(assumed))
+
+
+def _vertical(pool: Pool) -> tuple[tuple[float, float, float], float]:
+    """The unit vector upwards, pool frame, and the height of the still surface along it.
+
+    It is the plane's own normal where that is within 45 degrees of the world's z axis: water is level, surveys are
+    nearly so.
+    """
+    T_pw = pool.T_pw
+    if float(T_pw[:3, 2] @ pool.interface.normal) > math.sqrt(0.5):
+        x, y, z = (float(a) for a in pool.interface.normal)
+        return (x, y, z), -float(pool.interface.offset)
+    x, y, z = (float(a) for a in T_pw[:3, 2])
+    return (x, y, z), float(T_pw[:3, 2] @ T_pw[:3, 3])
+
+
+def _depth(depth: str | float | Path | None, longest_gap: float) -> Series | float | None:
+    if depth is None:
+        return None
+    try:
+        number = float(str(depth))
+    except ValueError:
+        table = read_stream_table(str(depth))
+        if not table.has("depth"):
+            raise LocalizationError(
+                f"{depth}: no column 'depth' with numbers: expected t [s] and depth [m], positive down"
+            ) from None
+        return series("depth", table.t, table.columns("depth"), longest_gap, where=str(depth))
+    if not math.isfinite(number):
+        raise LocalizationError(
+            f"depth is {depth}, expected metres below the surface, or a file with t, depth"
+        )
+    return number
+
+
+def _tilt(imu: str | Path | None, longest_gap: float) -> Series | None:
+    """Up in the body frame, whose straight line between rows is how a vehicle leans."""
+    if imu is None:
+        return None
+    table = read_stream_table(imu)
+    up = table.up()
+    if up is None:
+        raise LocalizationError(
+            f"{imu}: no attitude: expected columns roll, pitch [rad] or qx, qy, qz, qw; of gyro and accelerometer "
+            "alone `finssim fuse` makes one"
+        )
+    return series("attitude", table.t, up, longest_gap, where=str(imu))
+
+
+def _spread(name: str, value: float | None, default: float) -> float:
+    if value is None:
+        return default
+    if not (math.isfinite(value) and value >= 0.0):
+        raise LocalizationError(f"{name} is {value}, expected a standard deviation that is not negative")
+    return float(value)
+
 
 # Poses of a vehicle from the tags of one picture after the other, with what else is known at each exposure.
 
@@ -63,47 +223,32 @@ class Locator:
             family: Of the tags; None: that of the vehicle file.
 
         Raises:
-            LocalizationError: Unknown method, no depth where it needs one, a vehicle without tags, or no error at all.
+            LocalizationError: As of `TagLocator`, or no depth where the method needs one.
         """
-        if method not in METHODS:
-            raise LocalizationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
-        if method in NEEDS_DEPTH and known.depth is None:
+        self._locate = TagLocator(pool, vehicle.file_tags, method=method, pixel_std=pixel_std)
+        if self._locate.needs_height and known.depth is None:
             raise LocalizationError(
                 f"method {method} needs --depth FILE (columns t, depth) or --depth METRES, the depth of the pressure "
                 "port; --method refractive-6dof does without"
             )
-        tags = vehicle.file_tags
-        if tags is None:
-            raise LocalizationError(
-                f"{vehicle.name}: the vehicle file has no tags: add a section tags: with family, edge and mounts"
-            )
-        if not (math.isfinite(pixel_std) and pixel_std > 0.0):
-            raise LocalizationError(
-                f"pixel_std is {pixel_std}, expected the error of a corner in pixels, such as 0.3"
-            )
-        self.known, self.family = known, family_named(family or tags.family).name
-        self._pool, self._method, self._pixel_std = pool, method, pixel_std
-        self._tags_b = tag_corners_b(tags)
-
-    @property
-    def tags(self) -> tuple[int, ...]:
+        self.known, self.tags = known, tuple(self._locate.tags_b)
         """Ids of the vehicle's tags."""
-        return tuple(self._tags_b)
+        self.family = family_named(family or self._locate.family).name
 
     def locate(self, frame: Frame) -> Measurement:
         """The pose in one picture, or why there is none."""
+        locate = self._locate
         seen = [found for found in frame.detections if _name(found.family) in ("", self.family)]
-        needs_height = self._method in NEEDS_DEPTH
         constraints = None
         if seen:
-            known = self.known.at(frame.time - self._pool.latency, needs_height=needs_height)
+            known = self.known.at(frame.time - locate.pool.latency, needs_height=locate.needs_height)
             if isinstance(known, str):
-                return refused(self._method, known)
+                return refused(locate.method, known)
             constraints = known
         elif frame.detections:
             other = ", ".join(sorted({found.family for found in frame.detections}))
-            return refused(self._method, f"no tag of family {self.family} seen: {other}")
-        return METHODS[self._method](seen, self._pool, self._tags_b, constraints, self._pixel_std)
+            return refused(locate.method, f"no tag of family {self.family} seen: {other}")
+        return locate(seen, constraints)
 
 
 @cache
@@ -134,11 +279,7 @@ def write_rows(rows: Sequence[Row], out: Path) -> None:
     Raises:
         OutputError: The file cannot be written.
     """
-    with atomic_write(out) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        for frame, found in rows:
-            writer.writerow(_cells(frame, found))
+    write_csv(out, COLUMNS, (_cells(frame, found) for frame, found in rows))
 
 
 def _cells(frame: Frame, found: Measurement) -> list[Any]:
@@ -156,7 +297,7 @@ def _cells(frame: Frame, found: Measurement) -> list[Any]:
 def summary_of(rows: Sequence[Row]) -> dict[str, Any]:
     """Figures of a run, as plain values."""
     located = [found for _, found in rows if found.ok]
-    reasons = Counter(_short(found.reason) for _, found in rows if not found.ok)
+    reasons = Counter(counted(found.reason) for _, found in rows if not found.ok)
     rejected: Counter[str] = Counter()
     for _, found in rows:
         rejected.update(found.rejected)
@@ -193,20 +334,11 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _short(reason: str) -> str:
-    """A reason without its particulars, for counting."""
-    return re.split(r"[:(]", reason, maxsplit=1)[0].strip()
-
-
 def _median(values: list[float]) -> float | None:
     return float(np.median(values)) if values else None
 
 
 # How far measured positions are from surveyed ones.
-
-Array = npt.NDArray[np.float64]
-
-TIMES = ("t", "time", "time_s", "timestamp")
 
 
 class Truth:
@@ -258,51 +390,18 @@ def load_truth(path: str | Path, longest_gap: float = 1.0) -> Truth:
     """Read a table with columns x, y [m], and image or t [s], and yaw [rad] or yaw_deg where it is known; pool frame.
 
     Raises:
-        LocalizationError: Unreadable, without these columns, or with a cell that is no number; names file and line.
+        LocalizationError: Unreadable, or without these columns.
     """
-    table = read_text_table(path, LocalizationError)
-    names = [name.lower() for name in table.names]
-    time = next((name for name in TIMES if name in names), None)
-    if not {"x", "y"} <= set(names) or (time is None and "image" not in names):
-        raise LocalizationError(
-            f"{path}: columns {','.join(names)[:80]}, expected image or t, x, y and perhaps yaw"
-        )
-    by_image: dict[str, Array] = {}
-    times, values = [], []
-    for number, row in zip(table.lines, table.rows, strict=True):
-        cells = dict(zip(names, row, strict=False))
-        value = _value(cells, f"{path}: line {number}")
-        if cells.get("image"):
-            by_image[PurePath(cells["image"]).name] = value
-        if time and cells.get(time):
-            times.append(_number(cells[time], time, f"{path}: line {number}"))
-            values.append(value)
-    by_time = (
-        series("truth", np.array(times), np.array(values), longest_gap, where=str(path)) if times else None
-    )
-    return Truth(by_image, by_time)
-
-
-def _value(cells: dict[str, str], where: str) -> Array:
-    yaw = math.nan
-    if cells.get("yaw"):
-        yaw = _number(cells["yaw"], "yaw", where)
-    elif cells.get("yaw_deg"):
-        yaw = math.radians(_number(cells["yaw_deg"], "yaw_deg", where))
-    x, y = (_number(cells.get(name, ""), name, where) for name in "xy")
-    return np.array([x, y, math.cos(yaw), math.sin(yaw)])
-
-
-def _number(cell: str, name: str, where: str) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise LocalizationError(
-            f"{where}: {name} is '{cell[:40]}', expected a finite number: correct or remove it"
-        )
-    return value
+    table = read_stream_table(path, timed=False)
+    timed = bool(np.isfinite(table.t).any())
+    if not table.has("x", "y") or not (timed or "image" in table.words):
+        columns = ",".join((*table.words, *table.numbers))[:80]
+        raise LocalizationError(f"{path}: columns {columns}, expected image or t, x, y and perhaps yaw")
+    yaw = table.angle("yaw")
+    values = np.column_stack([table.columns("x", "y"), np.cos(yaw), np.sin(yaw)])
+    images = zip(table.words.get("image", ()), values, strict=False)
+    by_image = {PurePath(name).name: value for name, value in images if name and np.isfinite(value[:2]).all()}
+    return Truth(by_image, series("truth", table.t, values, longest_gap, where=str(path)) if timed else None)
 
 
 # Pictures with the tags found in them: from pictures and videos, or from detection files.
@@ -311,24 +410,12 @@ TABLES = (".csv", ".tsv", ".txt")
 """Suffixes of detection files."""
 
 
-@dataclass(frozen=True)
-class Seeing:
-    """How tags are found in pictures; see `detector`."""
-
-    family: str
-    tags: tuple[int, ...] = ()
-    """Those looked for in videos, near where they were a picture before."""
-    library: str | None = None
-    refine: str = "fit"
-    gamma: float = 1.0
-    times: Path | None = None
-    """File with the time stamps of the pictures."""
-
-
 def frames_of(
     inputs: Sequence[Path],
     lens: Lens,
-    seeing: Seeing,
+    find: Detector,
+    tags: tuple[int, ...],
+    times: Path | None,
     notes: list[str],
 ) -> tuple[Iterator[Frame], int | None]:
     """Frames one after the other, and how many there will be where that is known.
@@ -336,7 +423,9 @@ def frames_of(
     Args:
         inputs: Pictures, folders of them, videos or detection files.
         lens: Of the camera: pictures of another size are refused.
-        seeing: How tags are found in pictures.
+        find: Finds tags in pictures.
+        tags: Those looked for in videos, near where they were a picture before.
+        times: File with the time stamps of the pictures.
         notes: Takes one sentence on each thing that was left out.
 
     Raises:
@@ -352,22 +441,21 @@ def frames_of(
     if tables:
         frames = [frame for path in tables for frame in read_detections(path, notes)]
         return iter(frames), len(frames)
-    return _seen(inputs, lens, seeing, notes), _count(inputs)
+    return _seen(inputs, lens, find, tags, times, notes), _count(inputs)
 
 
 def _seen(
     inputs: Sequence[Path],
     lens: Lens,
-    seeing: Seeing,
+    find: Detector,
+    tags: tuple[int, ...],
+    times: Path | None,
     notes: list[str],
 ) -> Iterator[Frame]:
-    from finssim.localization.detection.detector import detector
     from finssim.localization.detection.pictures import pictures
-    from finssim.localization.detection.region import RegionTracker
 
-    find = detector(seeing.family, library=seeing.library, refine=seeing.refine, gamma=seeing.gamma)
     film, tracker = "", None
-    for time, name, image in pictures(list(inputs), times=seeing.times, tell=notes.append):
+    for time, name, image in pictures(list(inputs), times=times, tell=notes.append):
         if image.shape != (lens.height, lens.width):
             raise LocalizationError(
                 f"{name}: {image.shape[1]} x {image.shape[0]} pixels, expected {lens.width} x {lens.height} as the "
@@ -378,7 +466,7 @@ def _seen(
             yield Frame(time, name, tuple(find.detect(image)))
             continue
         if tracker is None or of_film != film:
-            film, tracker = of_film, RegionTracker(find, seeing.tags or None)
+            film, tracker = of_film, RegionTracker(find, tags or None)
         yield Frame(time, name, tuple(tracker.detect(image, time)))
 
 
@@ -415,7 +503,6 @@ def run(
     imu: str | Path | None = None,
     method: str = "refractive",
     family: str | None = None,
-    library: str | None = None,
     refine: str = "fit",
     gamma: float = 1.0,
     times: str | Path | None = None,
@@ -440,8 +527,7 @@ def run(
         imu (FILE): Table with columns t and roll, pitch [rad] or qx, qy, qz, qw; level if not given.
         method (METHOD): refractive, refractive-weighted, refractive-6dof, pinhole-depth or pinhole.
         family (NAME): Family of the tags; that of the vehicle file if not given.
-        library (NAME): Detector: apriltag or opencv.
-        refine (WAY): How corners are placed: fit, or a way of the library.
+        refine (WAY): How corners are placed: fit, or AprilTag's own edges or none.
         gamma: Encoding of the pictures: 1 linear, 2.2 video.
         times (FILE): Table with columns image, time [s], where names of pictures hold none.
         pixel_std: Error of a detected corner, per axis [px]; what the pool's calibration found, else 0.5, if not given.
@@ -477,11 +563,10 @@ def run(
     pixel_std = site.pixel_std if pixel_std is None else pixel_std
     locator = Locator(site, body, known, method=method, pixel_std=pixel_std, family=family)
     surveyed = None if truth is None else load_truth(truth, longest_gap)
-    seeing = Seeing(
-        locator.family, locator.tags, library, refine, gamma, None if times is None else Path(times)
-    )
+    find = detector(locator.family, refine=refine, gamma=gamma)
+    stamps = None if times is None else Path(times)
     notes: list[str] = []
-    frames, count = frames_of(paths, site.camera.lens, seeing, notes)
+    frames, count = frames_of(paths, site.camera.lens, find, locator.tags, stamps, notes)
     found = _measure(frames, count, locator)
     write_rows(found.rows, out)
     found.summary = {

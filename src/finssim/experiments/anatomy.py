@@ -1,0 +1,306 @@
+"""`finssim experiment anatomy`: how wrong may one thing about the vehicle be until a controller no longer holds?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from rich.console import Console
+
+from finssim.experiments import campaign
+from finssim.experiments.campaign import Say, choice, run_jobs, write_json
+from finssim.experiments.evaluate import evaluate_controller
+from finssim.experiments.figures import COLORS, clean, new_figure, save_figure
+from finssim.experiments.plants import Plant, load_plant
+from finssim.experiments.pool_trial import files_of
+from finssim.experiments.statistics import Interval, bootstrap
+from finssim.experiments.tables import Shown, figure_text, markdown_of, print_shown
+from finssim.experiments.transfer import T1_ROWS, policies_of
+from finssim.provenance import provenance
+from finssim.vehicles import load_vehicle
+
+__all__ = ["CAUSES", "anatomy", "print_anatomy"]
+
+TRAINING_SHARE = 0.3
+"""Of the progress bar."""
+HELD = 0.9
+"""A row tolerates what leaves it this share of its trials, and everything milder."""
+RESULT_FILE = "anatomy.json"
+LEAST = 0.1
+"""Errors below this are drawn as this [mm]."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One thing that is wrong, by growing amounts."""
+
+    title: str
+    unit: str
+    amounts: tuple[float, ...]
+    """From none on."""
+    plant: Callable[[float], Mapping[str, Any]]
+    """Amount -> the plant's keys."""
+
+
+def _ranges(**entries: Any) -> dict[str, Any]:
+    return {"ranges": {"name": "anatomy", **entries}}
+
+
+def _fixed(value: float) -> list[float]:
+    return [value, value]
+
+
+def _drag(a: float) -> dict[str, Any]:
+    return _ranges(linear_damping={"all": _fixed(1.0 + a)}, quadratic_damping={"all": _fixed(1.0 + a)})
+
+
+CAUSES: Mapping[str, Cause] = {
+    "lag": Cause("motors slower by", "s", (0.0, 0.1, 0.2, 0.4, 0.6, 0.8), lambda a: {"extra_time_constant": a}),
+    "delay": Cause("commands later by", "s", (0.0, 0.1, 0.2, 0.3, 0.4, 0.6), lambda a: {"extra_delay": a}),
+    "weak": Cause("thrust less by", "%", (0.0, 15.0, 30.0, 45.0, 60.0, 75.0),
+                  lambda a: _ranges(thrust={"all": _fixed(1.0 - a / 100.0)})),
+    "strong": Cause("thrust more by", "%", (0.0, 25.0, 50.0, 100.0, 150.0, 200.0),
+                    lambda a: _ranges(thrust={"all": _fixed(1.0 + a / 100.0)})),
+    "asymmetry": Cause("each thruster off by up to", "%", (0.0, 10.0, 20.0, 30.0, 40.0, 60.0),
+                       lambda a: _ranges(thrust={"each": [1.0 - a / 100.0, 1.0 + a / 100.0]})),
+    "drag": Cause("drag more by", "%", (0.0, 50.0, 100.0, 200.0, 300.0, 400.0), lambda a: _drag(a / 100.0)),
+    "slippery": Cause("drag less by", "%", (0.0, 20.0, 40.0, 60.0, 80.0, 95.0), lambda a: _drag(-a / 100.0)),
+    "added-mass": Cause("added mass more by", "%", (0.0, 25.0, 50.0, 100.0, 150.0, 200.0),
+                        lambda a: _ranges(added_mass={"all": _fixed(1.0 + a / 100.0)})),
+    "mass": Cause("heavier, in trim, by", "%", (0.0, 15.0, 30.0, 60.0, 100.0, 150.0),
+                  lambda a: _ranges(mass=_fixed(1.0 + a / 100.0), volume="with_mass")),
+    "ballast": Cause("too much ballast, of its weight", "%", (0.0, 2.0, 4.0, 8.0, 12.0, 16.0),
+                     lambda a: _ranges(buoyancy=_fixed(1.0 - a / 100.0))),
+    "current": Cause("current of", "m/s", (0.0, 0.05, 0.1, 0.15, 0.2, 0.3), lambda a: _ranges(current=_fixed(a))),
+    "noise": Cause("position noise of", "cm", (0.0, 2.0, 5.0, 10.0, 15.0, 20.0),
+                   lambda a: {"noise": {"position_std": a / 100.0}} if a else {}),
+    "latency": Cause("state known late by", "s", (0.0, 0.1, 0.2, 0.3, 0.4, 0.6),
+                     lambda a: {"noise": {"delay": a}} if a else {}),
+}  # fmt: skip
+"""What may be wrong, by name."""
+ROWS = (
+    "calibrated", "calibrated-dr", "no-lag", "mesh", "simplified", "calibrated-integral", "calibrated-pool",
+    "pid-paper", "pid",
+)  # fmt: skip
+"""Rows of station keeping that differ in who steers."""
+FOREIGN = "foreign"
+"""The plant in which all of it is wrong at once, another in each trial."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job(campaign.Job):
+    """Trials of one controller in one plant."""
+
+    row: str
+    target: str
+    """Name of the cause."""
+    plant: int
+    """Number of its amount."""
+    seed: int
+    controller: str
+    vehicle: str
+    trials: int
+    water: Plant
+
+    def described(self) -> dict[str, Any]:
+        """Everything that decides the result."""
+        return {
+            "controller": files_of(self.controller), "vehicle": load_vehicle(self.vehicle).sha256,
+            "plant": self.water.model_dump(mode="json"), "trials": self.trials, "seed": self.seed,
+        }  # fmt: skip
+
+
+def play(job: Job, _: Path) -> dict[str, Any]:
+    """Success, error [m] and settling time [s] of each trial; None where there is none."""
+    done = evaluate_controller(
+        job.controller, job.water, vehicle=job.vehicle, trials=job.trials, seed=job.seed
+    ).result
+    return {key: [trial[key] for trial in done["per_trial"]] for key in ("success", "e_p_m", "t_s_s")}
+
+
+def anatomy(
+    *,
+    out: Path,
+    causes: Annotated[Sequence[str] | None, ","] = None,
+    rows: Annotated[Sequence[str] | None, ","] = None,
+    seeds: Annotated[int, (1, 1000)] = 3,
+    seed: int = 1,
+    trials: Annotated[int, (1, None)] = 16,
+    vehicle: str = "finsrov",
+    steps: Annotated[int | None, (1, None)] = None,
+    processes: Annotated[int | None, (1, None)] = None,
+    say: Say = lambda part, what: None,
+) -> dict[str, Any]:
+    """How wrong may one thing be? Controllers of T1 in plants where it is wrong by growing amounts, and all at once.
+
+    Example: finssim experiment anatomy --causes lag,current --rows calibrated,pid --seeds 1 --out anatomy
+
+    Args:
+        out (DIR): Directory for JSON, Markdown, figure, policies and trials; one that was interrupted goes on.
+        causes (NAMES): What is wrong, separated by commas; everything if not given.
+        rows (NAMES): Rows of experiment t1 that differ in who steers, separated by commas; all of them if not given.
+        seeds: Trainings of each policy.
+        seed: Seed of every random number; equal seeds give equal results.
+        trials: Of each policy in each plant, the published setpoints in turn; ten times as many in all at once.
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        steps: Control steps to learn from, all worlds together; what the task needs if not given.
+        processes: Plants at once; as many as processors if not given.
+        say: Told the share that is done and what comes next.
+
+    Returns:
+        `causes`: cause -> row -> figures at every amount; `foreign`: row -> figures; the jobs are in the directory.
+    """
+    chosen, names = list(causes or CAUSES), list(rows or ROWS)
+    for known, kind, given in ((CAUSES, "cause", chosen), (ROWS, "row", names)):
+        for name in given:
+            choice(known, name, kind, ValueError)
+    folder, run_seeds = Path(out), range(seed, seed + seeds)
+    policies = policies_of(
+        {name: T1_ROWS[name] for name in names}, run_seeds, folder, vehicle, steps,
+        lambda part, what: say(TRAINING_SHARE * part, what),
+    )  # fmt: skip
+    plants = {
+        (name, k): Plant(name=f"{name}-{k}", **CAUSES[name].plant(amount))
+        for name in chosen
+        for k, amount in enumerate(CAUSES[name].amounts)
+    }
+    plants[FOREIGN, 0] = load_plant(FOREIGN)
+    jobs = [
+        Job(
+            row=row, target=name, plant=k, seed=s, water=water, vehicle=vehicle,
+            controller=str(policies[training.name, s]) if training else T1_ROWS[row].controller,
+            trials=trials * (10 if name == FOREIGN else 1),
+        )
+        for (name, k), water in plants.items()
+        for row in names
+        for training in [T1_ROWS[row].training]
+        for s in run_seeds
+    ]  # fmt: skip
+    results = run_jobs(
+        jobs, folder / "trials", play, processes=processes,
+        say=lambda part, what: say(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, what),
+    )  # fmt: skip
+    played: dict[tuple[str, str, int], dict[int, dict[str, Any]]] = {}
+    for job, one in zip(jobs, results, strict=True):
+        played.setdefault((job.row, job.target, job.plant), {})[job.seed] = one
+    body = load_vehicle(vehicle)
+    result = {
+        "experiment": "anatomy", "vehicle": {"name": body.name, "sha256": body.sha256}, "trials": trials,
+        "seeds": list(run_seeds), "rows": {name: T1_ROWS[name].title for name in names},
+        "causes": {
+            name: {
+                "title": CAUSES[name].title, "unit": CAUSES[name].unit, "amounts": list(CAUSES[name].amounts),
+                "rows": {
+                    row: [_figures(played[row, name, k]) for k in range(len(CAUSES[name].amounts))] for row in names
+                },
+            }
+            for name in chosen
+        },
+        FOREIGN: {row: _figures(played[row, FOREIGN, 0]) for row in names},
+        "provenance": provenance(),
+    }  # fmt: skip
+    write_json(folder / RESULT_FILE, result, "\n".join(map(markdown_of, tables_of(result))))
+    draw(result, folder / "anatomy.png")
+    return result
+
+
+def _figures(by_seed: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
+    """Success, median error and mean settling time over all trials, with intervals from redrawing trials."""
+    out: dict[str, Any] = {}
+    for key, statistic in (("success", np.mean), ("e_p_m", np.median), ("t_s_s", np.mean)):
+        x = np.array([value for one in by_seed.values() for value in one[key] if value is not None], float)
+        if len(x) == 0:
+            out[key] = None
+            continue
+        low, high = bootstrap(lambda random, x=x, f=statistic: f(x[random.integers(len(x), size=len(x))]))
+        out[key] = Interval(float(statistic(x)), float(low), float(high), len(x)).as_json()
+    return out
+
+
+def tolerated(cause: Mapping[str, Any], row: str) -> float | None:
+    """The largest amount at which a row still holds `HELD` of its trials, and at all smaller ones; None: not even 0."""
+    most = None
+    for amount, figures in zip(cause["amounts"], cause["rows"][row], strict=True):
+        if figures["success"]["value"] < HELD:
+            break
+        most = float(amount)
+    return most
+
+
+def tables_of(result: Mapping[str, Any]) -> list[Shown]:
+    """What each row tolerates of each cause; and the plant in which all is wrong."""
+    rows, vehicle = result["rows"], result["vehicle"]
+    about = f"{vehicle['name']} {vehicle['sha256'][:12]}, seeds: {len(result['seeds'])}, setpoints in turn"
+    lines = []
+    for cause in result["causes"].values():
+        found = [tolerated(cause, row) for row in rows]
+        cells = ["none" if x is None else f"{x:g}{'+' * (x == cause['amounts'][-1])}" for x in found]
+        lines.append([f"{cause['title']} [{cause['unit']}]", *cells])
+    heads = ("held", "e_p, median [mm]", "t_s, mean [s]")
+    foreign = [
+        [title, *(figure_text(result[FOREIGN][row][key], form, factor) for key, form, factor in
+                  (("success", ".3f", 1.0), ("e_p_m", ".2f", 1000.0), ("t_s_s", ".2f", 1.0)))]
+        for row, title in rows.items()
+    ]  # fmt: skip
+    return [
+        Shown(
+            title="What is tolerated (T1)", headline=f"T1 with one thing wrong, {about}",
+            heads=["wrong", *rows], rows=lines,
+            note=f"the largest amount at which {100.0 * HELD:.0f} % of the trials hold, there and at all smaller ones; "
+            "+: the largest that was tried. The rest of the plant is as the file has it, the state exact.",
+        ),
+        Shown(
+            title="Everything wrong at once", headline=f"T1 in the plant '{FOREIGN}', another in each trial, {about}",
+            heads=["", *heads], rows=foreign,
+            note="in brackets 95 % from a bootstrap of the trials of these trainings; times to settle are of those "
+            "that hold.",
+        ),
+    ]  # fmt: skip
+
+
+def print_anatomy(result: Mapping[str, Any], console: Console) -> None:
+    """Print its tables."""
+    for shown in tables_of(result):
+        print_shown(shown, console)
+
+
+def draw(result: Mapping[str, Any], path: Path) -> None:
+    """Error against the amount, a panel for each cause and a line for each row; hollow where too few trials hold."""
+    causes, rows = result["causes"], result["rows"]
+    across = min(4, len(causes))
+    down = math.ceil(len(causes) / across)
+    heading = f"median error with one thing wrong; hollow: fewer than {100.0 * HELD:.0f} % of the trials hold"
+    figure = new_figure(3.0 * across, 2.3 * down + 0.9, heading)
+    panels = figure.subplots(down, across, squeeze=False, sharey=True).ravel()
+    for axes, cause in zip(panels, causes.values(), strict=False):
+        for i, (row, title) in enumerate(rows.items()):
+            figures, color = cause["rows"][row], COLORS[i % len(COLORS)]
+            errors = [
+                max(1000.0 * one["e_p_m"]["value"], LEAST) if one["e_p_m"] else math.nan for one in figures
+            ]
+            axes.plot(
+                cause["amounts"],
+                errors,
+                "-" if i < len(COLORS) else "--",
+                linewidth=1.3,
+                color=color,
+                label=title,
+            )
+            for amount, error, one in zip(cause["amounts"], errors, figures, strict=True):
+                inside = color if one["success"]["value"] >= HELD else "white"
+                axes.plot(amount, error, "o", markersize=4, color=color, markerfacecolor=inside)
+        axes.set_xlabel(f"{cause['title']} [{cause['unit']}]", fontsize=8)
+        axes.set_yscale("log")
+        clean(axes)
+    for axes in panels[len(causes) :]:
+        axes.set_axis_off()
+    for axes in panels[::across]:
+        axes.set_ylabel("e_p [mm]", fontsize=8)
+    figure.legend(
+        *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8, frameon=False
+    )
+    save_figure(figure, path)

@@ -1,0 +1,131 @@
+"""`finssim report`: the tables of pages, made of the results of experiments, so that nobody types a figure."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from finssim.experiments import anatomy
+from finssim.experiments.tables import Shown, markdown_table
+from finssim.experiments.transfer import T1, T2
+from finssim.files import atomic_write
+
+__all__ = ["ReportError", "filled", "report"]
+
+TABLES: Mapping[str, Callable[[Mapping[str, Any]], Sequence[Shown]]] = {
+    "t1": lambda result: [T1.shown(result)],
+    "t2": lambda result: [T2.shown(result)],
+    "anatomy": anatomy.tables_of,
+}
+"""Experiment -> the tables of its result."""
+
+BLOCK = re.compile(r"<!-- finssim report: (?P<what>.*?) -->\n(?P<old>.*?)<!-- end -->", re.DOTALL)
+
+
+class ReportError(ValueError):
+    """A page asks for a table that the results do not hold."""
+
+
+def report(
+    results: Sequence[Path],
+    *,
+    into: Annotated[Sequence[Path], "--into"],
+    check: bool = False,
+) -> int:
+    """Fill the tables of Markdown pages with what experiments have measured.
+
+    A page has a table where it says <!-- finssim report: t1 --> and <!-- end -->; after the name may stand table=2 (the
+    second of the result), columns=0,1,3, rows=calibrated;paper: calibrated (names as the table has them) and sentences.
+
+    Example: finssim report results/t1.json results/anatomy.json --into docs/experiments.md --into README.md
+
+    Args:
+        results (FILE.json...): Results of experiments t1, t2 and anatomy.
+        into (PAGE.md): Page whose tables are filled. May be given several times.
+        check: Change nothing; exit status 1 where a page does not say what the results do.
+
+    Raises:
+        ReportError: A file is no result of such an experiment, or a page asks for what there is not.
+    """
+    known = dict(map(_read, results))
+    stale = []
+    for page in into:
+        text = page.read_text(encoding="utf-8")
+        new = filled(text, known, str(page))
+        if new == text:
+            continue
+        stale.append(page)
+        if not check:
+            with atomic_write(page) as temporary:
+                temporary.write_text(new, encoding="utf-8")
+    for page in stale:
+        print(f"{page}: {'does not say what the results do' if check else 'filled'}")
+    return int(check and bool(stale))
+
+
+def _read(path: Path) -> tuple[str, Mapping[str, Any]]:
+    """The experiment of a result file, and the result."""
+    try:
+        result = json.loads(path.read_text(encoding="utf-8"))
+        name = result["experiment"]
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise ReportError(f"{path}: is no result of an experiment ({error})") from None
+    if name not in TABLES:
+        raise ReportError(f"{path}: is of experiment '{name}', expected one of {', '.join(TABLES)}")
+    return name, result
+
+
+def filled(page: str, results: Mapping[str, Mapping[str, Any]], name: str) -> str:
+    """A page with its tables made anew.
+
+    Args:
+        page: Its text.
+        results: Experiment -> result.
+        name: Of the page, for what is refused.
+
+    Raises:
+        ReportError: It asks for what there is not.
+    """
+
+    def made(found: re.Match[str]) -> str:
+        experiment, *options = found["what"].split(" ", 1)
+        try:
+            if experiment not in results:
+                raise ReportError(f"no result of '{experiment}' was given")
+            text = _table(TABLES[experiment](results[experiment]), options[0] if options else "")
+        except ReportError as error:
+            raise ReportError(f"{name}: <!-- finssim report: {found['what']} -->: {error}") from None
+        return f"<!-- finssim report: {found['what']} -->\n{text}\n<!-- end -->"
+
+    return BLOCK.sub(made, page)
+
+
+def _table(tables: Sequence[Shown], options: str) -> str:
+    chosen = dict(re.findall(r"(table|columns|rows)=((?:[^=]*?)(?=\s+\w+=|\s+sentences|$))", options))
+    number = int(chosen.get("table", "1"))
+    if not 1 <= number <= len(tables):
+        raise ReportError(f"table {number}: the result has {len(tables)}")
+    shown = tables[number - 1]
+    if "rows" in chosen:
+        by_name = {row[0].strip(): row for row in shown.rows}
+        names = chosen["rows"].split(";")
+        missing = [row for row in names if row not in by_name]
+        if missing:
+            raise ReportError(f"no row '{missing[0]}'; there are: {'; '.join(by_name)}")
+        shown = replace(shown, rows=[by_name[row] for row in names])
+    if "columns" in chosen:
+        columns = [int(word) for word in chosen["columns"].split(",")]
+        if max(columns) >= len(shown.heads):
+            raise ReportError(f"no column {max(columns)}: the table has 0 to {len(shown.heads) - 1}")
+        shown = replace(
+            shown,
+            heads=[shown.heads[k] for k in columns],
+            rows=[[row[k] for k in columns] for row in shown.rows],
+        )
+    rows = [[row[0].strip(), *row[1:]] for row in shown.rows]
+    sentences = "".join(f"\n- {line}" for line in shown.sentences) if options.endswith("sentences") else ""
+    return markdown_table(shown.heads, rows) + (f"\n{sentences}" if sentences else "")

@@ -1,1 +1,0 @@
-"""What the commands run that take pictures, points and pixels."""

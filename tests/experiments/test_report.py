@@ -1,0 +1,89 @@
+"""`finssim report`: what a page is filled with, what it asks for in vain, and the pages that ship."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from finssim.experiments.report import ReportError, filled, report
+
+ROOT = Path(__file__).parents[2]
+RESULTS = sorted((ROOT / "results").glob("*.json"))
+PAGES = (ROOT / "README.md", ROOT / "docs" / "experiments.md", ROOT / "docs" / "learning.md")
+
+
+def figures(value):
+    return {
+        key: {"value": value, "ci95": [value, value], "count": 8} for key in ("success", "e_p_m", "t_s_s")
+    }
+
+
+ANATOMY = {
+    "experiment": "anatomy",
+    "vehicle": {"name": "finsrov", "sha256": "0" * 64},
+    "seeds": [1],
+    "rows": {"a": "Row A", "b": "Row B"},
+    "causes": {
+        "lag": {
+            "title": "slower by",
+            "unit": "s",
+            "amounts": [0.0, 0.1],
+            "rows": {"a": [figures(1.0), figures(0.5)], "b": [figures(1.0), figures(1.0)]},
+        }
+    },
+    "foreign": {"a": figures(0.5), "b": figures(1.0)},
+}
+
+
+def test_the_pages_that_ship_say_what_the_results_do():
+    """Every figure of their tables comes out of `results/`."""
+    assert RESULTS and report(RESULTS, into=PAGES, check=True) == 0
+    assert all("<!-- finssim report: " in page.read_text(encoding="utf-8") for page in PAGES)
+
+
+def test_a_block_is_filled_and_the_rest_stays(tmp_path):
+    """All of a table, or the rows and columns that the page names; a second time nothing changes."""
+    page, result = tmp_path / "page.md", tmp_path / "anatomy.json"
+    result.write_text(json.dumps(ANATOMY))
+    page.write_text(
+        "before\n<!-- finssim report: anatomy -->\nold\n<!-- end -->\nbetween\n"
+        "<!-- finssim report: anatomy table=2 columns=0,1 rows=Row B;Row A -->\n<!-- end -->\nafter\n"
+    )
+    assert report([result], into=[page], check=True) == 1 and "old" in page.read_text()
+    assert report([result], into=[page]) == 0
+    assert page.read_text() == (
+        "before\n<!-- finssim report: anatomy -->\n| wrong | a | b |\n| --- | --: | --: |\n"
+        "| slower by [s] | 0 | 0.1+ |\n<!-- end -->\nbetween\n"
+        "<!-- finssim report: anatomy table=2 columns=0,1 rows=Row B;Row A -->\n|  | held |\n| --- | --: |\n"
+        "| Row B | 1.000 [1.000, 1.000] |\n| Row A | 0.500 [0.500, 0.500] |\n<!-- end -->\nafter\n"
+    )
+    assert report([result], into=[page], check=True) == 0
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        ("t1", "no result of 't1' was given"),
+        ("anatomy table=3", "table 3: the result has 2"),
+        ("anatomy rows=Row C", "no row 'Row C'; there are: slower by"),
+        ("anatomy columns=0,7", "no column 7: the table has 0 to 2"),
+    ],
+)
+def test_what_there_is_not_is_refused(what, message):
+    """With the page and what it asks for."""
+    with pytest.raises(ReportError, match=f"^page: <!-- finssim report: {what} -->: {message}"):
+        filled(f"<!-- finssim report: {what} -->\n<!-- end -->", {"anatomy": ANATOMY}, "page")
+
+
+def test_a_file_that_is_no_result_is_refused(tmp_path):
+    """And what it is instead."""
+    page = shutil.copy(ROOT / "README.md", tmp_path / "page.md")
+    for text, message in (
+        ("no", "is no result"),
+        ("[]", "is no result"),
+        ('{"experiment": "soak"}', "'soak', expected"),
+    ):
+        (tmp_path / "x.json").write_text(text)
+        with pytest.raises(ReportError, match=message):
+            report([tmp_path / "x.json"], into=[Path(page)])
