@@ -1,7 +1,7 @@
 """How well and how fast tags are found: `python benchmarks/detection.py [accuracy] [speed] [--json FILE] [--count 60]`.
 
 Parts:
-    accuracy  every library and refinement on drawn tags whose corners are known: share found, bias, error
+    accuracy  every refinement on drawn tags whose corners are known: share found, bias, error
     speed     processor time on pictures of 1280x720 with two tags: the whole picture, and regions around the tags
 
 Drawn are tags of 20 to 45 px at random places, turns and tilts, blurred, with noise of 2.5 gray levels and a white
@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from finssim.localization.detection.detector import LIBRARIES, Detector, detector
+from finssim.localization.detection.detector import REFINEMENTS, Detector, RegionTracker, detector
 from finssim.localization.detection.families import FAMILIES
-from finssim.localization.detection.region import RegionTracker
 from reference.tag_picture import draw, pose_corners
 
 CASES = [(20.0, 0.5), (20.0, 1.0), (30.0, 0.5), (30.0, 1.0), (45.0, 0.5), (45.0, 1.0)]
@@ -50,36 +49,24 @@ def main() -> None:
         arguments.json.write_text(json.dumps(results, indent=1), encoding="utf-8")
 
 
-def ways(family: str) -> Iterator[Detector]:
-    """Every library and refinement that finds a family."""
-    for name, library in LIBRARIES.items():
-        if name == "opencv" and not FAMILIES[family].opencv:
-            continue
-        for refine in ("fit", *library.refinements):
-            yield detector(family, library=name, refine=refine)
-
-
 def accuracy(count: int) -> list[dict[str, Any]]:
     """Rows of share found and errors."""
     rows = []
-    print(
-        f"{'family':17} {'edge':>4} {'blur':>4}  {'library':9}{'refine':9} found   rms  |bias|  outward [px]"
-    )
+    print(f"{'family':17} {'edge':>4} {'blur':>4}  {'refine':9} found   rms  |bias|  outward [px]")
     for family in ("tag25h9", "tag36h11", "tagStandard41h12"):
         for edge, blur in CASES:
             pictures = list(drawn(family, edge, blur, count))
-            for way in ways(family):
+            for way in (detector(family, refine=refine) for refine in REFINEMENTS):
                 row = {
                     "family": family,
                     "edge": edge,
                     "blur": blur,
-                    "library": way.library,
                     "refine": way.refine,
                 }
                 row |= measured(way, pictures)
                 rows.append(row)
                 print(
-                    f"{family:17} {edge:4.0f} {blur:4.1f}  {way.library:9}{way.refine:9} {row['found']:4.0%} "
+                    f"{family:17} {edge:4.0f} {blur:4.1f}  {way.refine:9} {row['found']:4.0%} "
                     f"{row['rms']:6.3f} {row['bias']:6.3f} {row['outward']:+7.3f}"
                 )
     return rows
@@ -128,9 +115,9 @@ def speed() -> list[dict[str, Any]]:
     """Processor time per picture, the best of several rounds [ms]."""
     rows = []
     pictures = [moving(k) for k in range(8)]
-    print(f"{'library':9}{'refine':9} whole [ms]  regions [ms]  ratio  pixels searched")
-    for name, refine in [("apriltag", "fit"), ("apriltag", "edges"), ("opencv", "fit"), ("opencv", "subpix")]:
-        find = detector("tag25h9", library=name, refine=refine)
+    print(f"{'refine':9} whole [ms]  regions [ms]  ratio  pixels searched")
+    for refine in ("fit", "edges"):
+        find = detector("tag25h9", refine=refine)
         whole = best(lambda find=find: [find.detect(picture) for picture in pictures]) / len(pictures)
         tracker = RegionTracker(find, [15, 16])
         tracker.detect(pictures[0], 0.0)
@@ -142,10 +129,8 @@ def speed() -> list[dict[str, Any]]:
 
         regions = best(follow) / 14
         share = (tracker.counts.pixels - before) / ((tracker.counts.pictures - 1) * pictures[0].size)
-        rows.append(
-            {"library": name, "refine": refine, "whole_ms": whole, "regions_ms": regions, "share": share}
-        )
-        print(f"{name:9}{refine:9} {whole:9.1f} {regions:12.2f} {whole / regions:8.1f} {share:10.1%}")
+        rows.append({"refine": refine, "whole_ms": whole, "regions_ms": regions, "share": share})
+        print(f"{refine:9} {whole:9.1f} {regions:12.2f} {whole / regions:8.1f} {share:10.1%}")
     return rows
 
 
