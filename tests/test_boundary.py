@@ -35,6 +35,7 @@ def fail(kind: str, number: int = 0):
         "output": OutputError("cannot write x: the disk is full"),
         "system": FileNotFoundError(2, "No such file or directory", "plant.yaml"),
         "fault-key": KeyError("x"),
+        "memory": MemoryError("Unable to allocate 83.7 TiB"),
     }
     if kind in errors:
         raise errors[kind]
@@ -49,6 +50,7 @@ def other():
     ("words", "sentence"),
     [
         (["fail", "refused"], "minnow.yaml: mass is -1, expected above 0"),
+        (["fail", "memory"], "not enough memory: Unable to allocate 83.7 TiB: ask for less"),
         (["fail", "output"], "cannot write x: the disk is full"),
         (["fail", "system"], "plant.yaml: No such file or directory"),
         (["fale", "x"], "No such command 'fale'. Did you mean 'fail'?"),

@@ -176,6 +176,7 @@ HYDRODYNAMICS = ["calibrate", "hydrodynamics", "TRIALS", "--vehicle", "finsrov"]
         (["calibrate", "thruster", "nowhere.csv", "--vehicle", "bluerov2", "--out", "v.yaml"], "nowhere.csv"),
         (["replay", "TRIALS", "--vehicle", "finsrov", "--hydrodynamics", "fosen"], "fosen"),
         (["replay", "TRIALS", "--vehicle", "finsrov", "--horizon", "-1"], "horizon is -1 s"),
+        (["replay", "TRIALS", "--vehicle", "finsrov", "--horizon", "1e-300"], "expected 0.1 to 60 s"),
         (["experiment", "replay", "--seeds", "0", "--out", "x"], "Invalid value for '--seeds'"),
         (["experiment", "replay", "--out", "/proc/x/y"], "write elsewhere"),
     ],

@@ -10,7 +10,7 @@ import typer
 from typer.main import get_command
 
 from finssim import boundary, command_line
-from finssim.cli import COMMANDS
+from finssim.cli import COMMANDS, app
 from finssim.command_line import Experiment, command_app, read
 
 SOURCE = '''
@@ -144,3 +144,12 @@ def test_every_option_has_help():
 
     assert isinstance(app, typer.Typer)
     walk(get_command(app), [])
+
+
+@pytest.mark.parametrize("number", ["nan", "inf", "-inf", "1e300", "1e10"])
+def test_a_number_without_bounds_is_a_quantity(capsys, tmp_path, number):
+    """Not infinite, and not larger than any; nothing is written."""
+    words = ["simulate", "--vehicle", "finsrov", "--command", "surge=5", "--out", str(tmp_path / "run.csv")]
+    assert boundary.run(app, [*words, "--duration", number]) == 2
+    assert f"'--duration': {float(number):g} is not a number from -1e+09 to 1e+09" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

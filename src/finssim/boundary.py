@@ -20,9 +20,10 @@ INTERRUPTED = 130
 def run(app: typer.Typer, arguments: Sequence[str]) -> int:
     """Run a command and turn what it refuses into one sentence on standard error.
 
-    A refusal is a usage error, an error of the system (OSError), an extra that is not installed, or an exception raised
-    by FinsSim's own code to refuse an input (ValueError, with its families). Any other exception is a fault of FinsSim
-    and keeps its traceback. With FINSSIM_DEBUG=1 in the environment, every error keeps its traceback.
+    A refusal is a usage error, an error of the system (OSError), too little memory, an extra that is not installed, or
+    an exception raised by FinsSim's own code to refuse an input (ValueError, with its families). Any other exception is
+    a fault of FinsSim and keeps its traceback. With FINSSIM_DEBUG=1 in the environment, every error keeps its
+    traceback.
 
     Args:
         app: The commands.
@@ -58,6 +59,8 @@ def refusal(error: Exception) -> str | None:
         return _missing_extra(error)
     if isinstance(error, OSError):
         return _system_error(error)
+    if isinstance(error, MemoryError):
+        return f"not enough memory: {error or 'something asked for is too large'}: ask for less"
     if isinstance(error, ValueError) and (
         _is_ours(type(error).__module__) or _raised_by_us(error.__traceback__)
     ):

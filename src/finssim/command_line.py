@@ -51,6 +51,8 @@ MAKERS = {
 }
 """Name of an annotation -> function or dataclass that makes it; its options stand in place of the parameter."""
 SEEDS = (0, 2**31 - 1)
+LARGEST = 1e9
+"""Of a number on the command line, whatever its unit."""
 SETTINGS: dict[str, Any] = {"rich_markup_mode": None, "add_completion": False}
 JSON = "Print one JSON object instead of tables."
 
@@ -106,9 +108,16 @@ class Option:
         return inspect.Parameter(self.name, where, default=default, annotation=Annotated[kind, info])
 
     def value(self, given: Any) -> Any:
-        """What the function is called with."""
+        """What the function is called with.
+
+        Raises:
+            BadParameter: A number without bounds that is not finite, or beyond any quantity.
+        """
         if given is None:
             return self.default
+        if isinstance(given, float) and not abs(given) <= LARGEST:
+            expected = f"{given:g} is not a number from {-LARGEST:g} to {LARGEST:g}."
+            raise typer.BadParameter(expected, param_hint=f"'--{self.name.replace('_', '-')}'")
         return tuple(word.strip() for word in given.split(",")) if "," in self.notes else given
 
 

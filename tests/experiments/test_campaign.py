@@ -10,7 +10,7 @@ from signal import SIGINT, SIGKILL, SIGTERM
 
 import pytest
 
-from finssim.experiments.campaign import run_jobs
+from finssim.experiments.campaign import ResultError, keep_result, kept_result, run_jobs
 from finssim.experiments.pool_trial import Job
 from reference import played
 
@@ -46,6 +46,23 @@ def test_what_is_finished_is_not_played_again(tmp_path):
     )
     assert marks(tmp_path) == ["P01", "P02", "P03"]
     assert told[-1] == 1.0 and shown == [("P03", True)]
+
+
+def test_a_result_that_was_changed_is_not_gone_on_with(tmp_path):
+    """It reads as it was written, numbers of 70 bits too; a digit, a key or a half of it missing is refused."""
+    path, result = tmp_path / "P01.json", {"e_p": 0.1 + 0.2, "seed": 2**70, "target": ["P01", None]}
+    keep_result(path, result)
+    assert kept_result(path) == result
+    text = path.read_text()
+    for changed, reason in (
+        (text.replace("P01", "P02"), "is not as it was written: remove it"),
+        (text.replace("seed", "sead"), "is not as it was written"),
+        (text[:20], "not valid JSON"),
+        ("{}", "expected a JSON object with the key 'sha256'"),
+    ):
+        path.write_text(changed)
+        with pytest.raises(ResultError, match=reason):
+            kept_result(path)
 
 
 @pytest.mark.slow

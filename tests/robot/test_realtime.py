@@ -95,6 +95,28 @@ def test_a_late_step_is_an_overrun_and_shifts_no_deadline():
 
 
 @pytest.mark.slow
+def test_what_was_decided_before_a_standstill_is_not_sent_after_it():
+    """Stopped for 9 s within a step, as by SIGSTOP: on waking no frame turns a thruster, and the run is in fault."""
+    world, enabled, said = Acted(), {}, []
+    runtime = world.runtime()
+    step = runtime.step
+
+    def stopped(now, *what):
+        made = step(now, *what)
+        world.now += 9.0 if runtime.counters.steps == 90 else 0.0
+        return made
+
+    def show(runtime):
+        enabled[runtime.counters.steps] = [command.enable for command in world.commands()]
+        said.append(runtime.bridge.reason)
+
+    runtime.step = stopped
+    world.run(runtime, until=lambda r: r.counters.steps == 92, show=show)
+    assert [enabled[k] for k in (89, 90, 91)] == [[True], [], [False]]
+    assert said[-1] == "the clock jumped by +9.00 s"
+
+
+@pytest.mark.slow
 def test_until_ends_the_run():
     """After the tenth step."""
     world = Acted()

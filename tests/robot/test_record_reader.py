@@ -80,17 +80,46 @@ def test_a_repaired_record_is_whole(run, tmp_path):
     assert repair_record(mended, tmp_path / "again.mcap") == []
 
 
-def test_a_flipped_bit_is_noticed(run, tmp_path):
-    """A chunk whose checksum is wrong ends what is read, and a sentence says so."""
+def chunks(path):
+    """Where the chunks begin, and their lengths."""
+    with path.open("rb") as file:
+        found = make_reader(file).get_summary().chunk_indexes
+    return [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in found]
+
+
+@pytest.mark.parametrize("number", [0, 4])
+@pytest.mark.parametrize("at", ["data", "length", "kind"])
+def test_a_flipped_bit_costs_its_chunk_alone(run, tmp_path, number, at):
+    """Whatever of a chunk it breaks, the messages of all others are read, and a sentence says what is missing."""
     damaged, mended = tmp_path / "damaged.mcap", tmp_path / "mended.mcap"
-    data = bytearray(run.read_bytes())
-    with run.open("rb") as file:
-        chunk = make_reader(file).get_summary().chunk_indexes[4]
-    data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0x10
+    data, places = bytearray(run.read_bytes()), chunks(run)
+    begin, length = places[number]
+    data[begin + {"data": length // 2, "length": 4, "kind": 0}[at]] ^= 0x10
     damaged.write_bytes(data)
     (note,) = repair_record(damaged, mended)
-    assert "damaged and was read up to there" in note
-    assert 0 < len(depths(mended)) < 400
+    assert "damaged" in note and "in 1 place cannot be read and are left out" in note
+    read, written = depths(mended), depths(run)
+    assert depths(damaged) == read == [depth for depth in written if depth in read]
+    assert len(written) - len(read) == pytest.approx(len(written) / len(places), rel=0.6)
+    with open_record(mended) as record:
+        assert not record.cut and "finsrov.yaml" in record.files
+
+
+def test_a_broken_index_costs_nothing(run, tmp_path):
+    damaged, data = tmp_path / "damaged.mcap", bytearray(run.read_bytes())
+    data[-100] ^= 0x10
+    damaged.write_bytes(data)
+    assert depths(damaged) == depths(run)
+    assert repair_record(damaged, tmp_path / "mended.mcap") == [
+        "damaged.mcap is damaged: its index cannot be read"
+    ]
+
+
+def test_a_record_is_not_repaired_into_itself(run):
+    before = run.read_bytes()
+    with pytest.raises(RecordError, match="cannot be repaired into itself: give another file"):
+        repair_record(run, run.parent / "." / run.name)
+    assert run.read_bytes() == before
 
 
 @pytest.mark.parametrize("data", [b"", b"\x89MCA", b"t,x\n0,1\n"])

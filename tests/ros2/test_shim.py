@@ -413,7 +413,7 @@ def test_a_half_sourced_ros_is_found_out_by_importing(tmp_path):
 def test_ours_can_be_asked_for(tmp_path):
     """PLATFORM_ROS=dds, even beside a real one."""
     run = chosen(tmp_path, "", PLATFORM_ROS="dds", ROS_DOMAIN_ID="7")
-    assert run.stdout.split()[0] == "dds" and "domain 7, loopback only, as jazzy" in run.stderr
+    assert run.stdout.split()[0] == "dds" and "domain 7, sends on the loopback alone" in run.stderr
 
 
 @pytest.mark.slow

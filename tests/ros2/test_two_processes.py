@@ -155,7 +155,7 @@ def test_a_parameter_file_and_a_new_name_reach_the_other_process(node, tmp_path)
     assert (got[0].force.tolist(), got[0].names, got[0].source) == ([2.5], ["b", "c"], "/peer/renamed")
     node.destroy_subscription(subscription)
     status, text = finish(process)
-    assert status == 0 and "loopback only" in text
+    assert status == 0 and "sends on the loopback alone" in text
 
 
 def test_data_flows_between_releases(node):

@@ -64,6 +64,12 @@ def test_a_section_may_give_the_origin_of_everything_inside(tmp_path):
     assert vehicle.origin_of("water.density").origin == "measured"
 
 
+def test_an_axis_in_four_digits_is_a_unit_vector(tmp_path):
+    """cos 45° is given as 0.7071; it is scaled to length 1."""
+    axis = load(tmp_path, MINNOW.replace("axis: [0, 0, 1]", "axis: [0, 0.7071, 0.7071]")).thrusters["up"].axis
+    assert axis == pytest.approx([0.0, 0.5**0.5, 0.5**0.5], abs=1e-15)
+
+
 def test_a_number_without_origin_is_refused(tmp_path):
     message = refusal(tmp_path, "origin: measured\nsource: kitchen scale\n", "")
     assert message.startswith("water: density has no origin: write {value: 1000.0, origin: measured")

@@ -87,3 +87,13 @@ def test_plots_show_the_past_in_full():
     assert whole.tolist() == [0, 1, 2, 3, 4] and np.isnan(past).tolist() == [False] * 3 + [True] * 2
     assert len(first.series()) == len(first.data(2.0)) == 5
     assert legend_of([first, second]).count("■") == 2
+
+
+def test_a_plot_begins_where_all_its_curves_have_values():
+    """The first estimate comes later than the first distance to the goal; the browser draws nothing from a NaN on."""
+    time, late = np.arange(4.0), np.array([np.nan, 2.0, 3.0, 4.0])
+    curves = [Curve("position", "to the goal", time, time), Curve("position", "of the estimate", time, late)]
+    (plot,) = plots_of(curves)
+    data = plot.data(0.0)
+    assert [column[0] for column in data] == [1.0, 1.0, 1.0, 2.0, 2.0]
+    assert all(len(column) == 3 for column in data)

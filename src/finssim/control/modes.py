@@ -191,8 +191,12 @@ def mode_from_dict(description: Mapping[str, Any], vehicle: Any) -> Thruster8 | 
 
 def _same(recorded: Any, here: Any) -> bool:
     if isinstance(here, list) and here and isinstance(here[0], float):
-        same_length = isinstance(recorded, Sequence) and len(recorded) == len(here)
-        return same_length and bool(np.allclose(recorded, here, rtol=1e-6, atol=1e-12))
+        numbers = isinstance(recorded, list) and all(isinstance(value, int | float) for value in recorded)
+        return (
+            numbers
+            and len(recorded) == len(here)
+            and bool(np.allclose(recorded, here, rtol=1e-6, atol=1e-12))
+        )
     return bool(recorded == here)
 
 

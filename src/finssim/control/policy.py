@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from finssim.yaml_file import first_problem, read_mapping
 
 __all__ = [
     "DESCRIPTION_FILE",
@@ -102,7 +103,7 @@ class PolicyDescription(_Record):
     observation: ObservationSchema
     action: dict[str, Any]
     """The action mode, as its `describe()` gives it: at least `mode` (name), `size`, and its limits and scale."""
-    control_period: float = Field(gt=0.0)
+    control_period: float = Field(gt=0.0, le=10.0)
     """Time between two actions [s]."""
     memory: int = Field(default=0, ge=0)
     """Numbers that the network hands on to its next action, zeros at an episode's start; 0: it remembers nothing."""
@@ -153,20 +154,13 @@ def read_description(folder: Path) -> PolicyDescription:
     path = folder / DESCRIPTION_FILE
     if not folder.is_dir():
         raise PolicyError(f"{folder}: no such policy directory: give the folder that `finssim train` wrote")
-    try:
-        data = yaml.safe_load(read_file(path).decode("utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise PolicyError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
-    if not isinstance(data, dict):
-        raise PolicyError(f"{path}: holds {type(data).__name__}, expected a mapping")
+    data = read_mapping(path, PolicyError, such_as="task: t1")
     if data.get("format") != FORMAT:
         raise PolicyError(f"{path}: format is {data.get('format')!r}, but this version reads format {FORMAT}")
     try:
         return PolicyDescription.model_validate(data)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise PolicyError(f"{path}: {where}: {first['msg']}") from error
+        raise PolicyError(f"{path}: {first_problem(error)}") from error
 
 
 def plain_data(value: Any) -> Any:

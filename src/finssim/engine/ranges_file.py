@@ -39,6 +39,8 @@ MOST_WAVES = 8
 """Most waves that may be drawn for a world: every one costs time in every step."""
 LONGEST = 2.0
 """Longest delay that may be drawn, of a command or of what is seen [s]."""
+FASTEST_WATER = 10.0
+"""[m/s]"""
 
 
 class RangesError(ValueError):
@@ -72,6 +74,14 @@ def _count(pair: tuple[int, int]) -> tuple[int, int]:
 def _short(drawn: Any) -> Any:
     if bounds_of(drawn)[1] > LONGEST:
         raise ValueError(f"reaches {bounds_of(drawn)[1]:g} s, expected at most {LONGEST:g} s")
+    return drawn
+
+
+def _swimmable(drawn: Any) -> Any:
+    if max(map(abs, bounds_of(drawn))) > FASTEST_WATER:
+        raise ValueError(
+            f"reaches {max(map(abs, bounds_of(drawn))):g} m/s, expected at most {FASTEST_WATER:g} m/s"
+        )
     return drawn
 
 
@@ -239,9 +249,9 @@ class Ranges(Part):
     dead_zone: Scale = ONE
     added_dead_zone: Scale = NONE
     """To either side [N]."""
-    current: Scale = NONE
+    current: Annotated[Scale, AfterValidator(_swimmable)] = NONE
     """Horizontal speed [m/s], in a random direction."""
-    vertical_current: Interval = NONE
+    vertical_current: Annotated[Interval, AfterValidator(_swimmable)] = NONE
     """Upwards [m/s]."""
     current_drift: DriftRanges | None = None
     waves: WaveRanges | None = None

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from finssim.engine.plant_arrays import SimulatorError
 from finssim.files import atomic_write
 from finssim.provenance import provenance
+from finssim.yaml_file import read_json
 
 if TYPE_CHECKING:
     import pandas
@@ -148,5 +149,5 @@ def read_run(folder: str | Path) -> "pandas.DataFrame":
     if not (folder / ABOUT).is_file() or not parts:
         raise SimulatorError(f"{folder} holds no recorded run: expected {ABOUT} and part-*.parquet in it")
     table = pandas.concat([pandas.read_parquet(part) for part in parts], ignore_index=True)
-    table.attrs = json.loads((folder / ABOUT).read_text())
+    table.attrs = read_json(folder / ABOUT, SimulatorError, such_as="vehicles")
     return table

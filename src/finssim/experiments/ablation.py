@@ -12,12 +12,13 @@ from rich.console import Console
 
 from finssim.experiments import localization_experiment as localization
 from finssim.experiments import replay_experiment as replay
-from finssim.experiments.campaign import Say, write_json
+from finssim.experiments.campaign import ResultError, Say, write_json
 from finssim.experiments.tables import Shown, figure_text, html_of, html_row, markdown_of, print_shown
 from finssim.experiments.transfer import MEASURES, T1, T2, Spec, played_in, transfer_experiment
 from finssim.files import atomic_write
 from finssim.page import html_page, html_picture, html_table
 from finssim.provenance import provenance
+from finssim.yaml_file import read_json
 
 __all__ = ["ablation", "everything", "print_ablation", "print_everything"]
 
@@ -160,8 +161,7 @@ def everything(
                 seed=seed,
                 say=lambda part, what: say(begun + 0.1 * part, f"{name}: {what}"),
             )
-        result: dict[str, Any] = json.loads((folder / file).read_text(encoding="utf-8"))
-        return result
+        return read_json(folder / file, ResultError, such_as="provenance")
 
     results = {
         "localization": once(

@@ -22,6 +22,7 @@ from rich.progress import Progress
 
 from finssim.files import atomic_write
 from finssim.quiet import start_warp
+from finssim.yaml_file import json_value, read_json
 
 __all__ = [
     "Job",
@@ -96,6 +97,10 @@ def choice(known: Mapping[str, Any] | Sequence[str], name: str, kind: str, error
         raise error(f"unknown {kind} '{name}'; available: {', '.join(known)}")
 
 
+class ResultError(ValueError):
+    """A result that was kept cannot be gone on with; the message is one sentence."""
+
+
 def write_json(path: Path, result: Mapping[str, Any], page: str | None = None) -> None:
     """Write a result, and beside it, ending in .md, the page that a person reads."""
     with atomic_write(path) as temporary:
@@ -103,6 +108,29 @@ def write_json(path: Path, result: Mapping[str, Any], page: str | None = None) -
     if page is not None:
         with atomic_write(path.with_suffix(".md")) as temporary:
             temporary.write_text(page, encoding="utf-8")
+
+
+def keep_result(path: Path, result: Mapping[str, Any]) -> None:
+    """Write a result that a later call goes on with, with its digest."""
+    write_json(path, {**result, "sha256": _digest(result)})
+
+
+def kept_result(path: Path) -> dict[str, Any]:
+    """A result that `keep_result` wrote.
+
+    Raises:
+        ResultError: It is not as it was written.
+    """
+    result = read_json(path, ResultError, such_as="sha256")
+    if result.pop("sha256") != _digest(result):
+        raise ResultError(f"{path}: is not as it was written: remove it, and it is made again")
+    return result
+
+
+def _digest(result: Mapping[str, Any]) -> str:
+    """SHA-256 of what a reader of the result gets."""
+    read = json_value(json.dumps(result), ResultError, "result")
+    return hashlib.sha256(json.dumps(read, sort_keys=True).encode()).hexdigest()
 
 
 class Job:
@@ -164,7 +192,7 @@ def run_jobs(
         for left, ((_, job), future) in zip(reversed(range(len(missing))), played, strict=True):
             show(job, future.result())
             say(1.0 - left / len(files), f"{left} trials left")
-    return [json.loads(files[key].read_text(encoding="utf-8")) for key in keys]
+    return [kept_result(files[key]) for key in keys]
 
 
 def run_in_turn(
@@ -191,7 +219,7 @@ def run_in_turn(
             if result is None:
                 continue
             show(job, _write(key, job, folder, result))
-        results.append(json.loads(file.read_text(encoding="utf-8")))
+        results.append(kept_result(file))
     return results
 
 
@@ -263,5 +291,5 @@ def _play_one(keyed: tuple[str, Job], folder: Path, play: Play) -> dict[str, Any
 def _write(key: str, job: Job, folder: Path, played: Mapping[str, Any]) -> dict[str, Any]:
     """Write KEY.json of a result, with its job."""
     result = {"key": key, "job": {**job.described(), "row": job.row, "target": job.target}, **played}
-    write_json(folder / f"{key}.json", result)
+    keep_result(folder / f"{key}.json", result)
     return result

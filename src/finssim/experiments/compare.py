@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from finssim.control.policy import Policy, PolicyDescription
-from finssim.experiments.campaign import Say, write_json
+from finssim.experiments.campaign import Say, keep_result, kept_result, write_json
 from finssim.experiments.evaluate import evaluate_controller
 from finssim.experiments.figures import COLORS, clean, new_figure, save_figure
 from finssim.experiments.plants import Plant, load_plant
@@ -202,12 +201,12 @@ def _trials(run: Run, folder: Path, plant: Plant, *, vehicle: str, **options: An
     }
     path = folder / f"{run.place.resolve().name}-{run.description.files['policy.onnx'][:10]}.json"
     if path.is_file():
-        kept = json.loads(path.read_text(encoding="utf-8"))
+        kept = kept_result(path)
         if kept["about"] == about:
             return list(kept["result"]["per_trial"])
     task = run.description.task
     result = evaluate_controller(run.place, plant, task=task, vehicle=vehicle, **options).result
-    write_json(path, {"about": about, "result": result})
+    keep_result(path, {"about": about, "result": result})
     return list(result["per_trial"])
 
 
@@ -420,7 +419,7 @@ def compare(
     measures: Annotated[Sequence[str], "--measure"] = (),
     vehicle: str = "finsrov",
     plant: str = "nominal",
-    trials: Annotated[int | None, (1, None)] = None,
+    trials: Annotated[int | None, (1, 100_000)] = None,
     seed: int = 42,
     say: Say = lambda part, what: None,
 ) -> dict[str, Any]:

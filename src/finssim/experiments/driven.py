@@ -26,6 +26,7 @@ from finssim.provenance import provenance
 from finssim.robot.goals import station_of
 from finssim.robot.record_messages import STATES
 from finssim.robot.record_reader import Record, open_record
+from finssim.robot.record_show import events_of
 from finssim.tasks.observer import Observer
 from finssim.vehicles import Vehicle, load_vehicle
 
@@ -114,10 +115,7 @@ def read_drive(path: Path, vehicle: Vehicle) -> Drive:
         _check(record, vehicle)
         teleop = record.metadata.get("command") == TELEOP
         columns = {name: {e.time: e.message for e in record.messages((name,))} for name in TOPICS}
-        told = [
-            (e.time, json.loads(e.message.data))
-            for e in (record.messages(("events",)) if record.topic("events") in record.topics else ())
-        ]
+        told = [(event["time"], event) for event in events_of(record)]
     steps = np.array(sorted(columns["thruster_state"]))
     numbers = dict(zip(steps.tolist(), _stretches(steps, columns, _helm(steps, told, teleop)), strict=True))
     whole = [t for t in sorted(columns["thruster_cmd"]) if all(t in columns[name] for name in TOPICS)]
@@ -158,7 +156,7 @@ def _helm(steps: Array, told: list[tuple[float, Any]], teleop: bool) -> NDArray[
     """Whether the one who is to be learnt from steers at each step: of a drive by hand the person."""
     if not teleop:
         return np.ones(len(steps), dtype=np.bool_)
-    changes = [(t, event["text"] == PERSON) for t, event in told if event.get("kind") == "mode"]
+    changes = [(t, event["text"] == PERSON) for t, event in told if event["kind"] == "mode"]
     times = np.array([-math.inf, *(t for t, _ in changes)])
     # A press changes who decides from the next step on.
     index = np.searchsorted(times, steps, side="left") - 1
@@ -184,7 +182,7 @@ def _stretches(
 def _start(told: list[tuple[float, Any]]) -> tuple[float, str]:
     """When the guide's time began, and the guide's name."""
     return next(
-        ((t, str(event["text"])) for t, event in told if event.get("kind") == "trial_start"), (math.nan, "")
+        ((t, str(event["text"])) for t, event in told if event["kind"] == "trial_start"), (math.nan, "")
     )
 
 
@@ -419,7 +417,7 @@ def collect(
     *,
     task: str,
     out: Path,
-    episodes: Annotated[int | None, (1, None)] = None,
+    episodes: Annotated[int | None, (1, 1_000_000)] = None,
     vehicle: str = "finsrov",
     hydrodynamics: str = "calibrated",
     action: str | None = None,

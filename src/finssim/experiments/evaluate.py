@@ -303,7 +303,7 @@ def evaluate(
     plant: Sequence[str | Path] | str | Path = ("nominal",),
     observe: str | None = None,
     trajectories: Annotated[Sequence[str | Path], "--trajectory"] = (),
-    trials: Annotated[int | None, (1, None)] = None,
+    trials: Annotated[int | None, (1, 100_000)] = None,
     truth: Path | None = None,
     seed: int = 42,
     out: Path | None = None,

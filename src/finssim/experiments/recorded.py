@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -43,6 +42,7 @@ from finssim.vehicles import Vehicle
 from finssim.viewer.frame import ViewError
 from finssim.viewer.sources.alignment import offset_between
 from finssim.viewer.sources.series import PoseSeries
+from finssim.yaml_file import json_value
 
 __all__ = ["RecordedError", "RecordedTrial", "measured_records", "read_record"]
 
@@ -390,7 +390,7 @@ def _pilot(path: Path) -> dict[str, Any]:
     with open_record(path) as record:
         text = record.metadata.get("pilot", "{}")
     try:
-        return dict(json.loads(text))
+        return dict(json_value(text, RecordedError, str(path)))
     except (ValueError, TypeError):
         raise RecordedError(
             f"{path}: its 'pilot' is '{text[:60]}', expected a mapping: not a record of ours"

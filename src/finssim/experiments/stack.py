@@ -14,11 +14,11 @@ from rich.console import Console
 
 from finssim.control.guidance import Guide
 from finssim.control.trajectories import TRAJECTORIES
+from finssim.experiments.campaign import keep_result, kept_result
 from finssim.experiments.plants import load_plant
 from finssim.experiments.recorded import follows
 from finssim.experiments.tables import console_table, figure_text
 from finssim.experiments.trials import EpisodeError, run_episodes, summarize_episodes
-from finssim.files import atomic_write
 from finssim.pool.camera import PoolCamera
 from finssim.pool.draw_plant import draw_plant
 from finssim.pool.plant_spec import Severity
@@ -153,8 +153,7 @@ def play(
         rows.append({"trial": k, **{name: x if np.isfinite(x) else None for name, x in measured.items()}})
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
-            with atomic_write(out / ROWS) as path:
-                path.write_text(json.dumps({**about, "episodes": rows}, indent=1) + "\n", encoding="utf-8")
+            keep_result(out / ROWS, {**about, "episodes": rows})
         show(f"episode {k + 1} of {episodes}: success {measured.get('success', float('nan')):g}")
     agent, nominal = make_pilot(policy, body, task=task).agent, load_plant("nominal")
     batch = run_episodes(
@@ -172,7 +171,7 @@ def _kept(out: Path | None, about: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Episodes of an earlier run with the same settings."""
     if out is None or not (out / ROWS).is_file():
         return []
-    data = json.loads((out / ROWS).read_text(encoding="utf-8"))
+    data = kept_result(out / ROWS)
     return list(data["episodes"]) if {**about, "episodes": data.get("episodes")} == data else []
 
 

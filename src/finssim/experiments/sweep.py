@@ -23,7 +23,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from rich.console import Console
 
-from finssim.experiments.campaign import progress_bar, spread, write_json
+from finssim.experiments.campaign import keep_result, kept_result, progress_bar, spread, write_json
 from finssim.experiments.compare import MEASURES
 from finssim.experiments.evaluate import evaluate_controller
 from finssim.experiments.plants import load_plant
@@ -290,9 +290,7 @@ def sweep(
     """
     jobs, runs, began = load_sweep(file).jobs(), out / "runs", time.perf_counter()
     files = {job.key: runs / job.key / ROW_FILE for job in jobs}
-    rows = {
-        key: json.loads(path.read_text(encoding="utf-8")) for key, path in files.items() if path.is_file()
-    }
+    rows = {key: kept_result(path) for key, path in files.items() if path.is_file()}
     missing = [job for job in jobs if job.key not in rows]
     screen = Console(stderr=True)
     played = _here(missing, processes) if address is None else _on_cluster(missing, address)
@@ -328,7 +326,7 @@ def _keep(job: Job, outcome: Any, runs: Path) -> dict[str, Any]:
     with atomic_directory(runs / job.key, replaces=ROW_FILE) as folder:
         with tarfile.open(fileobj=packed, mode="r:gz") as archive:
             archive.extractall(folder, filter="data")
-        (folder / ROW_FILE).write_text(json.dumps(row, indent=1) + "\n", encoding="utf-8")
+        keep_result(folder / ROW_FILE, row)
     return row
 
 

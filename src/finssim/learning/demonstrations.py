@@ -8,18 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import minari
 import numpy as np
-from gymnasium import spaces
-from minari.data_collector import EpisodeBuffer
-from minari.dataset.minari_storage import METADATA_FILE_NAME, MinariStorage
 from numpy.typing import NDArray
 
 from finssim.files import atomic_directory
+from finssim.yaml_file import json_value
 
 __all__ = ["DATASET_FILE", "DatasetError", "Demonstrations", "Episode", "about", "found_in", "load", "save"]
 
-DATASET_FILE = METADATA_FILE_NAME
+DATASET_FILE = "metadata.json"
+"""Which marks a data set of Minari."""
 OURS = "finssim"
 """Key of the metadata under which stands what was demonstrated: task, vehicle, expert, seed, provenance."""
 
@@ -74,6 +72,10 @@ def save(out: str | Path, episodes: Sequence[Episode], described: Mapping[str, A
     """
     if not episodes:
         raise DatasetError("no episode to write: none ended")
+    import minari
+    from gymnasium import spaces
+    from minari.dataset.minari_storage import MinariStorage
+
     n, m = episodes[0].observation.shape[1], episodes[0].action.shape[1]
     with atomic_directory(out, replaces=DATASET_FILE) as folder:
         storage = MinariStorage.new(
@@ -96,7 +98,9 @@ def save(out: str | Path, episodes: Sequence[Episode], described: Mapping[str, A
     return Path(out)
 
 
-def _buffers(episodes: Iterable[Episode]) -> Iterable[EpisodeBuffer]:
+def _buffers(episodes: Iterable[Episode]) -> Iterable[Any]:
+    from minari.data_collector import EpisodeBuffer
+
     for i, episode in enumerate(episodes):
         steps = len(episode.action)
         ends = np.zeros((2, steps), dtype=np.bool_)
@@ -118,6 +122,8 @@ def load(place: str | Path) -> Demonstrations:
     Raises:
         DatasetError: There is none, or it was not made by FinsSim.
     """
+    import minari
+
     described = about(place)
     dataset = minari.MinariDataset(Path(place))
     rows = [(e.observations, e.actions, float(np.sum(e.rewards))) for e in dataset.iterate_episodes()]
@@ -137,6 +143,8 @@ def about(place: str | Path) -> dict[str, Any]:
     Raises:
         DatasetError: There is none, or it was not made by FinsSim.
     """
+    from minari.dataset.minari_storage import MinariStorage
+
     try:
         found = MinariStorage.read_raw_metadata(Path(place))
     except (ValueError, OSError) as error:
@@ -145,7 +153,7 @@ def about(place: str | Path) -> dict[str, Any]:
         raise DatasetError(
             f"{place}: not a data set of FinsSim: it does not say of which task and vehicle it is"
         )
-    described: dict[str, Any] = json.loads(found[OURS])
+    described: dict[str, Any] = json_value(found[OURS], DatasetError, str(place))
     return {**described, "episodes": found["total_episodes"], "steps": found["total_steps"]}
 
 

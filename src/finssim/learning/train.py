@@ -39,8 +39,8 @@ def train(
     randomize: str | Path | None = None,
     observe: str = "training",
     seed: int = 42,
-    worlds: Annotated[int | None, (1, None)] = None,
-    steps: Annotated[int | None, (1, None)] = None,
+    worlds: Annotated[int | None, (1, 10_000_000)] = None,
+    steps: Annotated[int | None, (1, 1_000_000_000_000)] = None,
     until: float | None = None,
     settings: Annotated[Mapping[str, Any] | Sequence[str], "--set"] = (),
     resume: bool = False,
@@ -163,7 +163,9 @@ def train(
             loop.resume(checkpoint)
             view.go_on(loop.learner.steps)
         elif resume:
-            console.print(f"no checkpoint in {side} yet: starting from the beginning", soft_wrap=True)
+            console.print(
+                f"no checkpoint in {side} yet: starting from the beginning", soft_wrap=True, markup=False
+            )
         stopped = loop.run()
     place = (interrupted or _place_beside(Path(out), side)) if stopped else Path(out)
     _finish(loop, place, stopped, console, place if stopped else shown or place, time.perf_counter() - began)
@@ -213,7 +215,8 @@ def _finish(loop: Any, place: Path, stopped: bool, console: Console, where: Path
         loop.learner.network(), place, after(loop.description, done, not stopped), curves=loop.curves
     )
     what = "policy so far" if stopped else "policy"
-    console.print(f"{what}: {where}  ({done:,} steps in {took:.1f} s)", highlight=False, soft_wrap=True)
+    told = f"{what}: {where}  ({done:,} steps in {took:.1f} s)"
+    console.print(told, highlight=False, soft_wrap=True, markup=False)
     if stopped:
         raise KeyboardInterrupt
 

@@ -12,6 +12,8 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.yaml_file import json_value
+
 __all__ = ["Truth", "TruthError", "TruthWriter", "read_truth"]
 
 Array = NDArray[np.float64]
@@ -106,7 +108,7 @@ def read_truth(path: str | Path) -> Truth:
     """
     try:
         data = Path(path).read_bytes()
-        header = json.loads(data[: data.index(b"\n")])
+        header = json_value(data[: data.index(b"\n")], TruthError, str(path))
         if header["format"] != FORMAT:
             raise KeyError
     except OSError as error:

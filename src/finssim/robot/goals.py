@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import yaml
 
 from finssim.control.guidance import Guide, Reference, Station, Track
 from finssim.geometry.rotations import quat_rotate, quat_yaw
 from finssim.vehicles import Vehicle
+from finssim.yaml_file import read_mapping
 
 __all__ = ["GoalError", "HeardGoal", "check_reachable", "guide_of", "place_of", "station_of"]
 
@@ -119,11 +119,7 @@ def check_reachable(guide: Guide, vehicle: Vehicle) -> None:
 
 
 def _goal_in(path: Path) -> list[object]:
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise GoalError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
-    goal = data.get("goal") if isinstance(data, dict) else None
+    goal = read_mapping(path, GoalError, such_as="goal: [x, y, z, yaw_deg]").get("goal")
     if not isinstance(goal, list):
         raise GoalError(f"{path}: no goal in it: write goal: [x, y, z, yaw_deg]")
     return goal

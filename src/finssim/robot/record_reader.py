@@ -45,10 +45,12 @@ def repair_record(path: Path, out: Path) -> list[str]:
         What was found damaged, one sentence each; none of a record that is well.
 
     Raises:
-        RecordError: Not an MCAP file.
+        RecordError: Not an MCAP file, or the same as `out`.
         OutputError: `out` cannot be written.
     """
     refuse_foreign(path)
+    if out.resolve() == path.resolve():
+        raise RecordError(f"{path}: cannot be repaired into itself: give another file with --out")
     notes: list[str] = []
     with whole_mcap(path, notes) as whole, atomic_write(out) as temporary:
         write_whole(whole, temporary, notes)
@@ -106,7 +108,7 @@ class _Copier:
             self.channels[record.id] = self.writer.register_channel(
                 record.topic, record.message_encoding, self.schemas[record.schema_id], record.metadata
             )
-        elif isinstance(record, records.Message):
+        elif isinstance(record, records.Message) and record.channel_id in self.channels:
             self.writer.add_message(
                 self.channels[record.channel_id],
                 record.log_time,
@@ -199,7 +201,13 @@ class Record:
                 raise RecordError(
                     f"{self.path}: {channel.topic} is of the unknown type {schema.name}: leave it out"
                 )
-            yield Entry(time, channel.topic, schema.name, types().deserialize_cdr(message.data, schema.name))
+            try:
+                decoded = types().deserialize_cdr(message.data, schema.name)
+            except Exception as error:  # rosbags has no class of its own for what a message's bytes break
+                raise RecordError(
+                    f"{self.path}: a message of {channel.topic} at {time:.3f} s is no {schema.name}: {error}"
+                ) from None
+            yield Entry(time, channel.topic, schema.name, decoded)
 
     def _known(self, topic: str) -> str:
         if topic not in self.topics:

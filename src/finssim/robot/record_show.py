@@ -16,6 +16,7 @@ import numpy as np
 
 from finssim.robot.record_messages import RecordError
 from finssim.robot.record_reader import Entry, Record, open_record
+from finssim.yaml_file import json_value
 
 __all__ = [
     "TopicInfo",
@@ -105,7 +106,7 @@ def events_of(record: Record) -> list[dict[str, Any]]:
     found = []
     for entry in record.messages([topic]) if topic in record.topics else ():
         try:
-            event = json.loads(entry.message.data)
+            event = json_value(entry.message.data, RecordError, "event")
         except ValueError:
             continue
         if isinstance(event, dict) and "kind" in event:

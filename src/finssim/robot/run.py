@@ -18,6 +18,7 @@ from typing import Annotated, Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from finssim.control import ControlError
 from finssim.control.guidance import Station
@@ -127,7 +128,7 @@ def show(told: dict[str, Any], console: Console) -> None:
         "faults": "; ".join(told["faults"]) or "none",
     }
     for name, value in rows.items():
-        table.add_row(name, value)
+        table.add_row(name, Text(value))
     console.print(table)
 
 
@@ -260,7 +261,7 @@ def run(
     site: str | None = None,
     team: str | None = None,
     messages: str = "",
-    number: Annotated[int, (0, None)] = 0,
+    number: Annotated[int, (0, 1000)] = 0,
     vehicle: str = "finsrov",
     let_in: str | None = None,
     mode: str | None = None,
@@ -346,6 +347,7 @@ def run(
             f"{ours.name}: {', '.join(ours.defaults)} are defaults, fit for the virtual world; give a real vehicle "
             "its own in the file",
             highlight=False,
+            markup=False,
         )
     pilot = _pilot(policy, filed, task, agent=agent, follows=trajectory is not None)
     pool = None if file is None else load_pool(file)
@@ -505,7 +507,8 @@ class _Watch:
         if now - self._waits_since >= MUTE:
             self._told = True
             self._console.print(
-                f"no telemetry from {self._robot} yet: is it on, and does it know this end's address?"
+                f"no telemetry from {self._robot} yet: is it on, and does it know this end's address?",
+                markup=False,
             )
 
     def over(self, runtime: Runtime) -> bool:

@@ -76,8 +76,11 @@ def run_realtime(
             while not interrupted() and (now := clock()) - start < duration:
                 frames = [(now, data) for data in transport.receive()]
                 heard = mates.receive() if mates is not None else ()
-                for data in runtime.step(now, frames, pictures.receive(now) if pictures else (), heard):
-                    transport.send(data)
+                made = runtime.step(now, frames, pictures.receive(now) if pictures else (), heard)
+                # Where the process stood still within the step, what it decided is old; the next step will see that.
+                if clock() - now < runtime.bridge.settings.command_timeout:
+                    for data in made:
+                        transport.send(data)
                 for data in runtime.told if mates is not None else ():
                     mates.send(data)
                 runtime.sent(clock())

@@ -22,6 +22,7 @@ from finssim.provenance import provenance
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.task import Task
+from finssim.yaml_file import json_value
 
 __all__ = ["LOOK", "Drawing", "LogError", "Schedule", "read_draws"]
 
@@ -346,7 +347,7 @@ def read_draws(path: str | Path) -> DrawnEpisodes:
             data = {name: file[name] for name in file.files}
         words = {name: tuple(map(str, data[name])) for name in ("names", "units")}
         numbers = {name: data[name] for name in (*COUNTS, *OUTCOMES, "values")}
-        return DrawnEpisodes(**words, **numbers, about=json.loads(str(data["about"])))
+        return DrawnEpisodes(**words, **numbers, about=json_value(str(data["about"]), LogError, str(path)))
     except FileNotFoundError:
         raise LogError(f"{path}: no such file") from None
     except (KeyError, OSError, ValueError) as error:

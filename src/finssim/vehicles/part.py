@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, model_validator
 from pydantic_core import PydanticCustomError
 
-UNIT_TOLERANCE = 1e-6
+UNIT_TOLERANCE = 1e-3
 SYMMETRY_TOLERANCE = 1e-3
 """Asymmetry accepted as rounding of printed digits, relative to the largest entry."""
 

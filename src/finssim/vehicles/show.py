@@ -69,6 +69,7 @@ def print_vehicle(vehicle: Vehicle, console: Console, picture: Path | None = Non
         f"\n{vehicle.name}  {vehicle.path or ''}\nsha256 {vehicle.sha256}\n"
         f"numbers: {', '.join(f'{count} {origin}' for origin, count in counts.most_common())}    {_LEGEND}\n",
         highlight=False,
+        markup=False,
     )
     for record in vehicle.calibrations:
         console.print(f"calibrated: {record.sentence()}", highlight=False, markup=False)
@@ -87,11 +88,11 @@ def print_vehicle(vehicle: Vehicle, console: Console, picture: Path | None = Non
         from finssim.vehicles.picture import draw_vehicle  # Matplotlib is slow to import
 
         draw_vehicle(vehicle, picture)
-        console.print(f"thruster layout: {picture}")
+        console.print(f"thruster layout: {picture}", markup=False)
 
 
 def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False, title_style="bold")
+    table = Table(title=Text(title, "bold"), title_justify="left", box=None, pad_edge=False)
     for index, column in enumerate(columns):
         table.add_column(Text(column), justify="left" if index == 0 else "right")
     return table

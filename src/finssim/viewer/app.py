@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import socket
 import time
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
@@ -15,7 +16,7 @@ import numpy.typing as npt
 import viser
 
 from finssim.localization.pool import Pool
-from finssim.viewer.frame import Curve, Frame, Picture, Pose, Source, Stage
+from finssim.viewer.frame import Curve, Frame, Picture, Pose, Source, Stage, ViewError
 from finssim.viewer.shapes import box_edges, force_arrows, hull_of, line_of, tag_plates, wall_mesh, wxyz
 
 __all__ = ["LONGEST_TURN", "Playback", "View", "blank", "draw_picture", "legend_of", "plots_of"]
@@ -200,12 +201,17 @@ class Plot:
         self.title, self.curves = title, list(curves)
 
     def data(self, now: float) -> tuple[Array, ...]:
-        """Time, and for every curve all of it and the part up to a time [s]."""
-        time = self.curves[0].time
-        past = time <= now + 1e-9
+        """Time, and for every curve all of it and the part up to a time [s]; from where each has a value.
+
+        The browser's plot takes its scales from the first values, and draws nothing where one of these is NaN.
+        """
+        known = np.all([np.isfinite(curve.value) for curve in self.curves], axis=0)
+        begin = int(np.argmax(known))
+        time = self.curves[0].time[begin:]
+        past = time <= max(now, float(time[0])) + 1e-9
         columns = [time]
         for curve in self.curves:
-            columns += [curve.value, np.where(past, curve.value, np.nan)]
+            columns += [curve.value[begin:], np.where(past, curve.value[begin:], np.nan)]
         return tuple(np.ascontiguousarray(column, float) for column in columns)
 
     def series(self) -> tuple[Any, ...]:
@@ -472,6 +478,16 @@ PLOT_PERIOD = 0.5
 """Between drawings of the plots [s]."""
 
 
+def _check_address(bind: str) -> None:
+    """Refuse an address that is not this machine's, at which viser would wait for ever."""
+    try:
+        family, *_, address = socket.getaddrinfo(bind, 0, type=socket.SOCK_STREAM)[0]
+        socket.create_server(address[:2], family=family).close()
+    except (OSError, UnicodeError) as error:
+        reason = (getattr(error, "strerror", None) or str(error)).partition(" (")[0]
+        raise ViewError(f"--bind {bind}: {reason}: give an address of this machine") from None
+
+
 class View:
     """A page that shows a source. `run` is its loop; `turn` one pass of it."""
 
@@ -494,6 +510,7 @@ class View:
             playing: Whether it runs from the start.
         """
         self.source, self.playback = source, Playback(source.duration, speed=speed, playing=playing)
+        _check_address(bind)
         with redirect_stdout(StringIO()):  # viser greets and says goodbye even where it is told not to
             self.server = viser.ViserServer(host=bind, port=port, label="FinsSim", verbose=False)
         self.scene = Scene(self.server, source.stage)

@@ -105,6 +105,7 @@ WRONG = {
     ),
     "pitch rate turned": ("surge", {"q": negative}, "rate_sign", {"column": "q", "other": "pitch"}),
     "yaw turned": ("yaw", {"yaw": negative}, "rate_sign", {"column": "r", "other": "yaw"}),
+    "speed in mm/s": ("surge", {"u": lambda y: 1000.0 * y}, "speed_unit", {"column": "u"}),
     "rate in degrees": ("yaw", {"r": np.degrees}, "degrees", {"column": "r"}),
     "roll in degrees": ("roll", {"roll": np.degrees}, "degrees", {"column": "roll"}),
     "heave turned": ("heave", {"w": negative}, "rate_sign", {"column": "w", "other": "z"}),

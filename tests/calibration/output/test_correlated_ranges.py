@@ -99,8 +99,8 @@ def test_a_fit_that_says_more_than_it_can_know_is_widened():
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        ("{", "not JSON: give the fit.json"),
-        ("{}", "expected the fit.json of a calibration's report"),
+        ("{", "not valid JSON"),
+        ("{}", "expected a JSON object with the key 'parameters'"),
         ('{"parameters": {}, "correlation": null}', "the fit tells no added mass, damping or thrust"),
     ],
 )

@@ -5,10 +5,11 @@ import pytest
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.trials.header import Header
-from finssim.calibration.trials.inputs import applied_wrench, drive
+from finssim.calibration.trials.inputs import applied_wrench, drive, implausible, require_fittable
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import Vehicle, load_vehicle
 
+FINSROV = load_vehicle("finsrov")
 RPM = 60.0 / (2.0 * np.pi)
 
 
@@ -271,3 +272,24 @@ def test_inputs_have_an_end(after, last, ends, pushes):
         assert np.isnan(tau[t > 4.2]).all()
     else:
         assert (np.abs(tau[t > 4.5]).max() > 1.0) == bool(pushes)
+
+
+@pytest.mark.parametrize(
+    ("speed", "passive", "code"),
+    [
+        (0.3, False, None),
+        (300.0, True, "speed_unit"),
+        (5.0, False, "speed_beyond"),
+        (2.5, False, "energy"),
+        (5.0, True, None),
+    ],
+)
+def test_what_no_vehicle_can_have_done_is_not_fitted(speed, passive, code):
+    """mm/s taken for m/s; five times the terminal speed; energy that thrust of 1 N over 0.8 s cannot give to 12 kg."""
+    slow = np.full(40, 0.0)
+    given = {"tau_x": slow + 1.0} if not passive else {}
+    made = trial({"u": np.linspace(0.0, speed, 40), "v": slow, "w": slow, **given}, passive=passive)
+    assert [one.code for one in implausible(made, FINSROV)] == ([code] if code else [])
+    if code:
+        with pytest.raises(CalibrationError, match="made: "):
+            require_fittable([made], FINSROV)

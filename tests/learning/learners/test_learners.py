@@ -165,6 +165,9 @@ def test_unknown_names_are_refused():
     [
         ("steps", "0", "setting steps is '0', expected 1 or more"),
         ("hidden", ["64", "0"], "expected 1 or more"),
+        ("learning_rate", "-1", "setting learning_rate is '-1', expected a number of 0 or more"),
+        ("discount", "1.5", "setting discount is '1.5', expected a number from 0 to 1"),
+        ("hidden", "1000000000000", "expected 1 or more, at most 1000000000"),
         ("learning_rate", "nan", "setting learning_rate is 'nan', expected a finite number"),
     ],
 )

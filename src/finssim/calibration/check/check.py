@@ -25,7 +25,7 @@ from finssim.calibration.motion.attitude_signal import (
 from finssim.calibration.motion.signals import Motion, motion
 from finssim.calibration.motion.smoothing import longest_step, smooth
 from finssim.calibration.motion.synchronisation import Offset, stream_offsets
-from finssim.calibration.trials.inputs import Drive, drive
+from finssim.calibration.trials.inputs import Drive, drive, implausible
 from finssim.calibration.trials.trial import COLUMNS, NU, TAU, Array, Trial, column_of
 from finssim.calibration.trials.trial_files import load_trial, trials_at
 from finssim.geometry.rotations import quat_rotate, quat_to_euler
@@ -297,7 +297,7 @@ def _streams(streams: Sequence[StreamReport]) -> Table:
         table.add_column(name, justify="left" if name == "columns" else "right", overflow="fold")
     for s in streams:
         table.add_row(
-            _short(s.columns),
+            escape(_short(s.columns)),
             str(s.samples),
             f"{s.rate:.3g} Hz",
             f"{s.jitter:.0%}",
@@ -778,9 +778,6 @@ WITH = 0.7
 FEWEST = 25
 """Points of a grid with motion that a comparison needs."""
 
-FASTEST_TURN = 15.0
-"""No vehicle turns faster [rad/s]."""
-
 DEGREES = 57.3
 
 DRIFTS = 0.2
@@ -802,10 +799,6 @@ def unit_findings(trial: Trial) -> list[Finding]:
         jumps = np.abs(np.diff(yaw))
         if np.abs(yaw).max() > 2.5 * np.pi and (np.any(np.abs(jumps - 360.0) < 30.0) or not trial.has("r")):
             found.append(_degrees("yaw", float(np.abs(yaw).max()), "rad"))
-    for name in ("p", "q", "r"):
-        _, y = trial.series(name)
-        if len(y) and np.percentile(np.abs(y), 99.0) > FASTEST_TURN:
-            found.append(_degrees(name, float(np.percentile(np.abs(y), 99.0)), "rad/s"))
     return found
 
 
@@ -1228,6 +1221,7 @@ def _one(trial: Trial, given: Vehicle | None) -> TrialReport:
         sha256=trial.sha256,
     )
     vehicle = given or _own_vehicle(trial, findings)
+    findings += implausible(trial, vehicle)
     if vehicle is None:
         return replace(report, findings=tuple(findings))
     inputs, axes = _motion_of(trial, vehicle, findings)

@@ -111,6 +111,8 @@ def multisine(
         raise CalibrationError(
             f"band is {low:g} to {high:g} Hz, expected rising, above 0 and up to {0.2 * RATE:g} Hz"
         )
+    if not 0.0 < duration <= LONGEST:
+        raise CalibrationError(f"duration is {duration:g} s, expected above 0 and at most {LONGEST:g} s")
     harmonics = np.arange(math.ceil(low * duration - 1e-9), math.floor(high * duration + 1e-9) + 1)
     if len(harmonics) < 3 * len(peaks):
         raise CalibrationError(
@@ -170,6 +172,8 @@ KINDS = ("published", "validation", "multisine")
 
 RATE = 50.0
 """Of the commands [Hz]."""
+LONGEST = 3600.0
+"""Of a multi-sine [s]."""
 
 STEP_SEQUENCE = (("rest", 1.0), ("baseline", 1.0), ("excitation", 9.0), ("coast", 2.0), ("rest", 1.0))
 """Pre-zero, baseline, hold, rest, post-zero of the published procedure, by our phase words [s]."""

@@ -304,7 +304,7 @@ def trials_of(
         CalibrationError: A rate, column, input or profile that cannot be.
     """
     profile = _profile(noise)
-    every = round(1.0 / (rate * recording.step))
+    every = round(1.0 / (rate * recording.step)) if rate > 0.0 else 0
     if every < 1 or abs(every * recording.step * rate - 1.0) > 1e-6:
         raise CalibrationError(
             f"rate is {rate:g} Hz, expected {1.0 / recording.step:g} Hz over a whole number"

@@ -26,6 +26,7 @@ from finssim.mcap_metadata import mcap_metadata
 from finssim.mcap_repair import whole_mcap
 from finssim.vehicles import VehicleError, catalogue_vehicle, load_vehicle
 from finssim.vehicles.part import did_you_mean
+from finssim.yaml_file import json_value
 
 __all__ = ["FORMATS", "Format", "import_logs", "import_trials", "print_folders", "read_trials"]
 
@@ -92,7 +93,7 @@ def spoken_events(topic: str, said: Iterable[tuple[float, str]], start: float) -
     times, phase, arming = [start], [""], ["disarmed"]
     for time, text in said:
         try:
-            event = json.loads(text)
+            event = json_value(text, CalibrationError, topic)
             kind, word = str(event["kind"]), str(event.get("text", ""))
         except (ValueError, KeyError, TypeError, AttributeError):
             continue  # somebody else's words
@@ -114,7 +115,7 @@ def recorded_header(path: Path) -> tuple[dict[str, Any], list[Finding]]:
     """
     about = mcap_metadata(path, "finssim")
     try:
-        told = dict(json.loads(about.get("trial", "{}")))
+        told = dict(json_value(about.get("trial", "{}"), CalibrationError, path.name))
     except (ValueError, TypeError):
         raise CalibrationError(
             f"{path.name}: the record's 'trial' is {about['trial']!r}, expected a mapping"
@@ -300,7 +301,7 @@ def bag_files(path: Path) -> list[Path]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, list[Finding]]]:
-    from rosbags.highlevel import AnyReader, AnyReaderError
+    from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
     repairs: list[str] = []
@@ -312,7 +313,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, list[Finding]]]:
         try:
             reader = AnyReader(parts, default_typestore=get_typestore(Stores.LATEST))
             reader.open()
-        except (AnyReaderError, AssertionError, OSError) as error:
+        except Exception as error:  # what is damaged shows in whatever layer of rosbags meets it
             raise CalibrationError(
                 f"{path}: cannot be opened as a bag: {error or 'damaged'}: for a damaged .db3 try sqlite3's .recover"
             ) from None
@@ -338,18 +339,29 @@ def _columns(reader: Any, topic: str, kind: str, source: SourceMap) -> dict[str,
 def _thruster_columns(reader: Any, topic: str, kind: str) -> dict[str, ColumnSource]:
     """Columns that the first message of a topic names."""
     connections = [c for c in reader.connections if c.topic == topic]
-    for connection, _, raw in reader.messages(connections=connections):
-        return thruster_columns(kind, reader.deserialize(raw, connection.msgtype))
+    for _, message in _messages(reader, connections):
+        return thruster_columns(kind, message)
     return {}
+
+
+def _messages(reader: Any, connections: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+    """When messages were received [ns], and what they hold; a damaged bag breaks in whatever layer reads it."""
+    raws = iter(reader.messages(connections=connections))
+    while True:
+        try:
+            connection, received, raw = next(raws)
+            message = reader.deserialize(raw, connection.msgtype)
+        except StopIteration:
+            return
+        except Exception as error:
+            raise CalibrationError(f"{connections[0].topic}: the bag is damaged: {error}") from None
+        yield received, message
 
 
 def _events(reader: Any) -> list[Stream]:
     """What the events of our own records say."""
     connections = [c for c in reader.connections if c.topic.endswith("/events") and c.msgtype == WORDS]
-    said = (
-        (time * 1e-9, reader.deserialize(raw, c.msgtype).data)
-        for c, time, raw in reader.messages(connections=connections)
-    )
+    said = ((time * 1e-9, message.data) for time, message in _messages(reader, connections))
     stream = spoken_events("events", said, reader.start_time * 1e-9) if connections else None
     return [] if stream is None else [stream]
 

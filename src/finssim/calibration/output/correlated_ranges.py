@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +15,7 @@ from finssim.calibration.errors import CalibrationError
 from finssim.engine.ranges_file import load_ranges
 from finssim.files import atomic_write
 from finssim.vehicles import AXES, HydrodynamicSet, Vehicle, load_vehicle
+from finssim.yaml_file import read_json
 
 __all__ = ["Normal", "correlated_normals", "write_correlated_ranges"]
 
@@ -133,11 +133,9 @@ def write_correlated_ranges(fit: Path, vehicle: Vehicle, out: Path) -> None:
     """
     if out.suffix not in (".yaml", ".yml"):
         raise CalibrationError(f"{out} ends in '{out.suffix}', expected .yaml: name a ranges file to write")
+    data = read_json(fit, CalibrationError, such_as="parameters")
     try:
-        data = json.loads(fit.read_text(encoding="utf-8"))
         normals, untold, (names, R) = correlated_normals(data, vehicle)
-    except (json.JSONDecodeError, UnicodeDecodeError):
-        raise CalibrationError(f"{fit}: not JSON: give the fit.json of a calibration's report") from None
     except CalibrationError as error:
         raise CalibrationError(f"{fit}: {error}") from None
     ranges = {entry: normal.as_range() for entry, normal in normals.items()}

@@ -391,7 +391,7 @@ def regress(
     wanted = _wanted(axes)
     if damping not in DAMPING:
         raise CalibrationError(f"unknown damping '{damping}'; available: {', '.join(DAMPING)}")
-    require_fittable(trials)
+    require_fittable(trials, vehicle)
     driven = [trial for trial in trials if not trial.header.passive]
     prepared, findings = prepare(driven, vehicle)
     chosen, more = _fit_axes(

@@ -359,7 +359,7 @@ def _padded(values: NDArray[np.float32], rows: int) -> Array:
     return out
 
 
-LONGEST_HORIZON = 60.0
+SHORTEST_HORIZON, LONGEST_HORIZON = 0.1, 60.0
 """[s]"""
 
 
@@ -455,9 +455,9 @@ def replay(
         CalibrationError: A model or horizon that cannot be, or no trial could be replayed.
     """
     models = check_models(vehicle, [hydrodynamics] if isinstance(hydrodynamics, str) else list(hydrodynamics))
-    if horizon is not None and not 0.0 < horizon <= LONGEST_HORIZON:
+    if horizon is not None and not SHORTEST_HORIZON <= horizon <= LONGEST_HORIZON:
         raise CalibrationError(
-            f"horizon is {horizon:g} s, expected above 0 and at most {LONGEST_HORIZON:g} s"
+            f"horizon is {horizon:g} s, expected {SHORTEST_HORIZON:g} to {LONGEST_HORIZON:g} s"
         )
     if not trials:
         raise CalibrationError("no trial to replay: give at least one")

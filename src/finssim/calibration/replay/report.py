@@ -372,14 +372,14 @@ Rows = list[list[str]]
 
 def print_replay(replay: Replay, console: Console) -> None:
     """Print NRMSE by axis and model, the trials, and what could not be scored."""
-    console.print(_headline(replay), highlight=False)
+    console.print(_headline(replay), highlight=False, markup=False)
     _print_table(console, *_axis_table(replay))
     if replay.ahead:
         console.print(
             "error ahead, relative to the span; in brackets the skill against persistence", highlight=False
         )
         _print_table(console, *_ahead_table(replay))
-    console.print(f"NRMSE of {_label(replay.models[0])} by trial", highlight=False)
+    console.print(f"NRMSE of {_label(replay.models[0])} by trial", highlight=False, markup=False)
     _print_table(console, *_trial_table(replay))
     for sentence in _remarks(replay):
         console.print(sentence, highlight=False, markup=False)
@@ -518,7 +518,7 @@ def _print_table(console: Console, heads: Sequence[str], rows: Rows) -> None:
     for k, head in enumerate(heads):
         table.add_column(Text(head), justify="left" if k == 0 else "right", no_wrap=k == 0)
     for row in rows:
-        table.add_row(*row, style="bold" if row[0].startswith("aggregate") else None)
+        table.add_row(*map(Text, row), style="bold" if row[0].startswith("aggregate") else None)
     console.print(table)
 
 

@@ -767,7 +767,7 @@ def _check(
     damping: str,
     estimate: Sequence[str],
 ) -> None:
-    require_fittable(trials)
+    require_fittable(trials, vehicle)
     require_axes(axes)
     if damping not in DAMPING:
         raise CalibrationError(f"unknown damping '{damping}'; available: {', '.join(DAMPING)}")

@@ -16,6 +16,8 @@ from finssim.calibration.trials.trial import INPUT_PREFIXES, TAU, Trial
 from finssim.geometry.rotations import skew
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.vehicles import AXES, Vehicle
+from finssim.vehicles.capability import terminal_speeds
+from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.part import did_you_mean
 
 __all__ = ["Drive", "applied_wrench", "delivered", "drive", "thruster_motors", "widest_step", "wrench_motors"]
@@ -23,11 +25,26 @@ __all__ = ["Drive", "applied_wrench", "delivered", "drive", "thruster_motors", "
 # What every fit asks of the trials and axes that it is given.
 
 
-def require_fittable(trials: Sequence[Trial]) -> None:
+FASTEST = 20.0
+"""No vehicle moves faster [m/s]."""
+FASTEST_TURN = 15.0
+"""Nor turns faster [rad/s]."""
+BEYOND = 5.0
+"""Times the speed that a vehicle file gives at full thrust, or the work of the thrust, beyond which no error of that
+file explains a log."""
+ADRIFT = 1.0
+"""Speed that water, waves and hands may give to a vehicle [m/s]."""
+
+
+def require_fittable(trials: Sequence[Trial], vehicle: Vehicle) -> None:
     """Refuse trials that no fit may use.
 
+    Args:
+        trials: All that were given.
+        vehicle: The one that made them.
+
     Raises:
-        CalibrationError: There are none, two share a name, or one is held out.
+        CalibrationError: There are none, two share a name, one is held out, or no vehicle can have moved so.
     """
     if not trials:
         raise CalibrationError("no trials were given, expected at least one to fit")
@@ -40,6 +57,56 @@ def require_fittable(trials: Sequence[Trial]) -> None:
             raise CalibrationError(
                 f"{trial.name}: its header says that it is held out: fit on other trials and replay this one"
             )
+        for one in implausible(trial, vehicle):
+            raise CalibrationError(f"{trial.name}: {one}")
+
+
+def implausible(trial: Trial, vehicle: Vehicle | None = None) -> list[Finding]:
+    """What no vehicle can have done: speeds, and speeds or kinetic energy beyond what its thrust can give.
+
+    Args:
+        trial: As it was read.
+        vehicle: The one that made it; None: only what holds for all is looked at.
+    """
+    fastest = {name: _fastest(trial, name) for name in ("u", "v", "w", "p", "q", "r")}
+    limits = dict.fromkeys("uvw", FASTEST) | dict.fromkeys("pqr", FASTEST_TURN)
+    found = [
+        finding("speed_unit", column=name, value=speed)
+        if name in "uvw"
+        else finding("degrees", column=name, value=speed, unit="rad/s")
+        for name, speed in fastest.items()
+        if speed > limits[name]
+    ]
+    if found or vehicle is None or trial.header.passive:
+        return found
+    if isinstance(vehicle.hydrodynamics.get("calibrated"), HydrodynamicSet):
+        for name, reach in zip("uvw", terminal_speeds(vehicle)[:3].tolist(), strict=True):
+            if 0.0 < reach and BEYOND * reach + ADRIFT < fastest[name]:
+                found.append(finding("speed_beyond", column=name, value=fastest[name], reach=reach))
+    return found or _unearned(trial, vehicle)
+
+
+def _fastest(trial: Trial, name: str) -> float:
+    """99th percentile of a speed; 0 where there is none."""
+    values = np.abs(trial.series(name)[1])
+    return float(np.percentile(values, 99.0)) if len(values) else 0.0
+
+
+def _unearned(trial: Trial, vehicle: Vehicle) -> list[Finding]:
+    """Kinetic energy of the mass alone, E = m |v|² / 2, that the work of the inputs, ∫ |τ · v| dt, does not explain."""
+    if not trial.has("u", "v", "w"):
+        return []
+    try:
+        inputs = drive(trial, vehicle)
+    except CalibrationError:
+        return []  # whoever needs the inputs says what is missing
+    v = np.column_stack([np.interp(inputs.t, *trial.series(name)) for name in "uvw"])
+    tau = np.nan_to_num(applied_wrench(inputs, vehicle, inputs.t)[:, :3])
+    power = np.abs(np.sum(tau * v, axis=1))
+    work = float(np.sum(power[:-1] * np.diff(inputs.t)))
+    square = np.percentile(np.sum(v * v, axis=1), 99.0)
+    energy, free = (0.5 * vehicle.body.mass * float(s) for s in (square, np.sum(v[0] ** 2) + ADRIFT**2))
+    return [finding("energy", energy=energy, work=work)] if energy > BEYOND * (work + free) else []
 
 
 def require_axes(axes: Sequence[str] | None) -> None:

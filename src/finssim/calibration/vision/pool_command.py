@@ -225,7 +225,7 @@ def run(
     edge: float | None = None,
     family: str | None = None,
     latency: float = 0.0,
-    folds: Annotated[int, (2, None)] = 5,
+    folds: Annotated[int, (2, 1000)] = 5,
     seed: int = 0,
     as_json: bool = False,
 ) -> PoolFit:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from finssim.calibration.findings import Finding, sentences
 from finssim.calibration.fit import Correlation, Estimate
@@ -74,8 +75,10 @@ class Report:
             table.add_column(heading, justify="right" if heading == "estimate" else "left", overflow="fold")
         for estimate in self.estimates:
             if estimate.note != AS_GIVEN:
-                table.add_row(*self.cells(estimate), style="" if estimate.identifiable else "yellow")
-        console.print(self.headline, highlight=False)
+                table.add_row(
+                    *map(Text, self.cells(estimate)), style="" if estimate.identifiable else "yellow"
+                )
+        console.print(self.headline, highlight=False, markup=False)
         console.print(table)
         lines = [f"  {sentence}" for sentence in self.summary] + [f"- {note}" for note in self.notes]
         for line in lines:

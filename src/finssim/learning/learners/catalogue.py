@@ -161,6 +161,12 @@ LEARNERS: dict[str, LearnerKind] = {
 
 MAY_BE_ZERO = ("warm_up", "clone_passes", "expert_rounds", "history", "memory")
 """Settings that count what may be left out; of all others there is at least one."""
+MOST = 10**9
+"""Of anything that is counted."""
+SIGNED = ("log_std", "entropy")
+"""Numbers that may be negative."""
+SHARES = ("discount", "gae_lambda", "smoothing")
+"""Numbers from 0 to 1."""
 
 
 def learner_named(name: str) -> LearnerKind:
@@ -188,10 +194,13 @@ def _fitting(settings: Any, name: str, value: Any) -> Any:
         ) from error
     least = 0 if name in MAY_BE_ZERO else 1
     counts = fitting if kind is tuple else (fitting,) if kind is int else ()
-    if any(count < least for count in counts):
-        raise LearningError(f"setting {name} is {value!r}, expected {least} or more")
+    if any(not least <= count <= MOST for count in counts):
+        raise LearningError(f"setting {name} is {value!r}, expected {least} or more, at most {MOST}")
     if kind is float and not math.isfinite(fitting):
         raise LearningError(f"setting {name} is {value!r}, expected a finite number")
+    if kind is float and name not in SIGNED and not 0.0 <= fitting <= (1.0 if name in SHARES else math.inf):
+        expected = "from 0 to 1" if name in SHARES else "of 0 or more"
+        raise LearningError(f"setting {name} is {value!r}, expected a number {expected}")
     return fitting
 
 

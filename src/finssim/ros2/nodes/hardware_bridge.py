@@ -78,7 +78,8 @@ class HardwareBridge(RobotNode):
         now = self.now()
         self.intake.take(now, [(now, data) for data in self.transport.receive()])
         command = self.bridge.tick(now)
-        self.transport.send(encode_command(command))
+        if self.now() - now < self.bridge.settings.command_timeout:  # else the process stood still meanwhile
+            self.transport.send(encode_command(command))
         self.topics.tell(now, normalised=command.normalised, shaft_speed=self.shafts)
 
     def _tell(self) -> None:

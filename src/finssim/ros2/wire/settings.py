@@ -22,6 +22,9 @@ LOOPBACK = (
 )
 """Cyclone's configuration for this machine alone: the loopback interface has no multicast, so peers are asked."""
 
+LOOPBACK_WORDS = "sends on the loopback alone, listens on every address"
+"""Cyclone binds what it receives on to all addresses, whatever interface it is given."""
+
 
 @dataclass(frozen=True)
 class WireSettings:
@@ -56,7 +59,7 @@ def wire_settings(environ: Mapping[str, str] = os.environ, domain: int | None = 
         return WireSettings(
             number, None, "the network interface that Cyclone DDS chooses", distro_of(environ)
         )
-    return WireSettings(number, LOOPBACK, "loopback only", distro_of(environ))
+    return WireSettings(number, LOOPBACK, LOOPBACK_WORDS, distro_of(environ))
 
 
 def _domain(text: str) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import tempfile
 from collections import defaultdict
@@ -27,7 +26,7 @@ from finssim.viewer.sources.alignment import offset_between
 from finssim.viewer.sources.series import HEADING, POSITION, PoseSeries, Series, errors_between
 from finssim.viewer.stages import box_of
 from finssim.viewer.tags import TagLook
-from finssim.yaml_file import read_mapping
+from finssim.yaml_file import json_value, read_mapping
 
 __all__ = ["RecordSource"]
 
@@ -228,15 +227,20 @@ def _thinned(path: Array) -> Array:
 
 def _event(text: str) -> str:
     try:
-        event = json.loads(text)
+        event = json_value(text, ViewError, "event")
     except ValueError:
         return text
     return f"{event.get('kind', '')}: {event.get('text', '')}" if isinstance(event, dict) else text
 
 
 def _tags_in(text: str) -> tuple[TagCorners, ...]:
-    tags = json.loads(text).get("tags", [])
-    return tuple(TagCorners(int(tag["id"]), np.asarray(tag["corners"], float)) for tag in tags)
+    try:
+        tags = json_value(text, ViewError, "tags")["tags"]
+        return tuple(
+            TagCorners(int(tag["id"]), np.asarray(tag["corners"], float).reshape(4, 2)) for tag in tags
+        )
+    except (ValueError, KeyError, TypeError, OverflowError):
+        return ()  # somebody else's words
 
 
 def _pool_of(record: Record) -> Pool | None:
