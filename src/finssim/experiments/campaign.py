@@ -121,7 +121,10 @@ def kept_result(path: Path) -> dict[str, Any]:
     Raises:
         ResultError: It is not as it was written.
     """
-    result = read_json(path, ResultError, such_as="sha256")
+    try:
+        result = read_json(path, ResultError, such_as="sha256")
+    except ResultError as error:
+        raise ResultError(f"{error}: remove it, and it is made again") from None
     if result.pop("sha256") != _digest(result):
         raise ResultError(f"{path}: is not as it was written: remove it, and it is made again")
     return result
