@@ -65,7 +65,7 @@ def expected_plant(x, vehicle):
     dead = [t.c_plus * (t.dead_rpm_plus * rpm) ** 2 if t.domain == "speed" else 0.0 for t in thrusters]
     return {
         "mass": mass,
-        "volume": x("volume") * body.displaced_volume,
+        "volume": x("volume") * x("buoyancy") * body.displaced_volume,
         "r_g": r_g,
         "r_b": r_b,
         "inertia": x("inertia") * np.array(body.inertia)

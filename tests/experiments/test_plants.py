@@ -20,8 +20,19 @@ FINSROV = load_vehicle("finsrov")
 
 
 def test_the_plants_of_the_protocol_ship():
-    """Nominal, randomised, current, waves, noise, sensors, lag, and the other two models."""
-    expected = ["current", "lag", "mesh", "noise", "nominal", "randomised", "sensors", "simplified", "waves"]
+    """Nominal, randomised, foreign, current, waves, noise, sensors, lag, and the other two models."""
+    expected = [
+        "current",
+        "foreign",
+        "lag",
+        "mesh",
+        "noise",
+        "nominal",
+        "randomised",
+        "sensors",
+        "simplified",
+        "waves",
+    ]
     assert available_plants() == expected
     assert all(load_plant(name).title for name in expected)
 

@@ -137,8 +137,6 @@ def train(
         raise TrainingError(
             f"until is {until}, but task '{the_task.name}' has no metric 'success': leave until out"
         )
-    if plan is not None:
-        climb(environment, plan)
     description = description_of(
         environment,
         learner=learner,
@@ -149,6 +147,8 @@ def train(
         levels=asdict(plan) if plan else None,
         until=until,
     )
+    if plan is not None:
+        climb(environment, plan)
     began = time.perf_counter()
     with one_thread(), TrainingView(values.steps, console) as view, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*mini-batch.*")  # a last small batch does no harm
