@@ -32,7 +32,7 @@ FASTEST_TURN = 15.0
 BEYOND = 5.0
 """Times the speed that a vehicle file gives at full thrust, or the work of the thrust, beyond which no error of that
 file explains a log."""
-FEW = 95.0
+FEW = 97.0
 """Percentile of a speed that is looked at: another unit shows in all samples, wild ones are left to the fit."""
 ADRIFT = 1.0
 """Speed that water, waves and hands may give to a vehicle [m/s]."""
