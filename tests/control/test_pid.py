@@ -8,56 +8,23 @@ import numpy as np
 import pytest
 
 from finssim.control import ControlError
+from finssim.control.controllers import CONTROLLERS, controller
 from finssim.control.guidance import Goal, tracking_error
-from finssim.control.pid import CONTROLLERS, AxisModel, Pid, controller, place_poles
-from finssim.geometry.frames import FROM_CONTROLLER
+from finssim.control.pid import AxisModel, Pid, place_poles
 from finssim.geometry.rotations import (
     quat_from_euler,
     quat_from_yaw,
     quat_inverse_rotate,
     quat_multiply,
     quat_rotate,
-    quat_to_euler,
-    quat_yaw,
-    wrap_angle,
 )
 from finssim.vehicles import catalogue, load_vehicle
-
-SETPOINTS = np.array(
-    [
-        (1, -0.5, 0.3, 0), (1, -0.5, -0.3, -90), (-1, -0.5, -0.3, 90), (-1, -0.5, 0.3, 180),
-        (1, -0.8, 0.3, 0), (1, -0.8, -0.3, 0), (-1, -0.8, -0.3, 90), (-1, -0.8, 0.3, 180),
-    ]
-)  # fmt: skip
-"""Published station-keeping setpoints in the paper's controller frame: x, y (up), z (left), heading [deg]."""
-T1 = Goal(
-    FROM_CONTROLLER.vector(SETPOINTS[:, :3]), quat_from_yaw(FROM_CONTROLLER.yaw(np.radians(SETPOINTS[:, 3])))
-)
+from reference.holding import T1, at_rest, run, settling_time
 
 
 @pytest.fixture(scope="module")
 def vehicle():
     return load_vehicle("finsrov")
-
-
-def at_rest(position, quaternion, nu=None):
-    return type(
-        "State", (), {"position": position, "quaternion": quaternion, "nu": np.zeros(6) if nu is None else nu}
-    )
-
-
-def run(pid, plant, goal, seconds, noise=None):
-    """Errors over time: distance on each axis [m], heading [rad], tilt [rad], (steps, worlds, 5); and the memory."""
-    memory, log = pid.reset(len(plant.p)), []
-    for _ in range(round(seconds / pid.period)):
-        measured = plant.measured if noise is None else noise(plant.measured)
-        tau, memory = pid.command(memory, measured, goal)
-        plant.advance(pid.allocator.allocate(tau)[0], pid.period)
-        true = plant.measured
-        heading = wrap_angle(quat_yaw(true.quaternion) - quat_yaw(goal.quaternion))
-        tilt = np.max(np.abs(quat_to_euler(true.quaternion)[:2]), axis=0)
-        log.append(np.column_stack([true.position - goal.position, heading, tilt]))
-    return np.array(log), memory
 
 
 @pytest.fixture(scope="module")
@@ -69,14 +36,6 @@ def held(vehicle, pool):
         return run(Pid.from_vehicle(vehicle, period=period), pool(vehicle, 8, **water), T1, 60.0)
 
     return run_once
-
-
-def settling_time(log, period, hold=10.0):
-    """When each world first stays within 0.10 m per axis and 10 degrees for `hold` seconds; infinite if never."""
-    inside = (np.abs(log[..., :3]) <= 0.10).all(-1) & (np.abs(log[..., 3]) <= math.radians(10.0))
-    n = round(hold / period)
-    held = np.lib.stride_tricks.sliding_window_view(inside, n, axis=0).all(-1)
-    return np.where(held.any(0), held.argmax(0) * period, np.inf)
 
 
 # -- gains ----------------------------------------------------------------------------------------------------

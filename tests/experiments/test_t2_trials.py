@@ -7,8 +7,9 @@ import pytest
 from rich.console import Console
 
 from finssim.control import ControlError
+from finssim.control.controllers import controller_for
 from finssim.control.modes import action_mode
-from finssim.control.pid import PAPER_PROFILE, TRAJECTORY_PROFILE, controller_for
+from finssim.control.pid import PAPER_PROFILE, TRAJECTORY_PROFILE
 from finssim.control.policy import PolicyDescription, VehicleIdentity
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.experiments.evaluate import (

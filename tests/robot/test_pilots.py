@@ -9,9 +9,9 @@ import yaml
 from onnx import TensorProto, helper, numpy_helper
 
 from finssim.control import ControlError
+from finssim.control.controllers import controller
 from finssim.control.guidance import Station, goal_at
 from finssim.control.modes import Wrench4, Wrench6
-from finssim.control.pid import controller
 from finssim.control.policy import PolicyError
 from finssim.experiments.pool_trial import NoisyInput
 from finssim.geometry.rotations import quat_from_euler

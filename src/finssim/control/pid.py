@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from finssim.control import ControlError
 from finssim.control.allocation import Allocator
-from finssim.control.guidance import Controller, Goal, Measured, tracking_error, velocity_at
+from finssim.control.guidance import Goal, Measured, tracking_error, velocity_at
 from finssim.geometry.frames import FROM_CONTROLLER, TO_CONTROLLER
 from finssim.geometry.rotations import cross, quat_inverse_rotate, quat_rotate, quat_yaw, wrap_angle
 from finssim.vehicles import HydrodynamicSet, Vehicle
 from finssim.vehicles.body import moved_to_origin
 
 __all__ = [
-    "CONTROLLERS",
     "PAPER_PROFILE",
     "TRAJECTORY_PROFILE",
     "AxisModel",
@@ -30,8 +28,6 @@ __all__ = [
     "Pid",
     "PidMemory",
     "axis_model",
-    "controller",
-    "controller_for",
     "place_poles",
 ]
 
@@ -68,6 +64,18 @@ class AxisModel:
             nu: Velocity of the wrench reference, body frame [m/s, rad/s], (..., 6).
         """
         return np.asarray(self.linear_damping + self.quadratic_damping * np.abs(np.asarray(nu, float)))
+
+    def terminal_speed(self, tau: Array) -> Array:
+        """Positive root of d1 v + d2 v^2 = tau, infinite without damping [m/s, rad/s], (6,).
+
+        Args:
+            tau: Magnitude of the wrench on every axis, body frame [N, N m], (6,).
+        """
+        d1, d2 = self.linear_damping, self.quadratic_damping
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(
+                np.where(d1 + d2 > 0.0, 2.0 * tau / (d1 + np.sqrt(d1**2 + 4.0 * d2 * tau)), np.inf)
+            )
 
     def coriolis(self, nu: npt.ArrayLike) -> Array:
         """C(nu) nu of the diagonal inertia, Munk moment included [N, N m], (..., 6).
@@ -263,7 +271,7 @@ class Pid:
             )
         gains = Gains(*(np.where(able, gain, 0.0) for gain in (placed.kp, placed.kd, placed.rate)))
 
-        cruise = CRUISE * _terminal_speed(model.linear_damping, model.quadratic_damping, limits)
+        cruise = CRUISE * model.terminal_speed(limits)
         braking = gains.kd - model.inertia * gains.rate + model.damping(cruise)
         reach = np.divide(braking * cruise, gains.kp, out=np.full(6, np.inf), where=gains.kp > 0.0)
         return cls(
@@ -338,12 +346,6 @@ class Pid:
         lever = lever - self.weight * (self.center_of_gravity - self.reference)
         force, moment = np.broadcast_arrays((self.weight - self.buoyancy) * up, -cross(lever, up_goal))
         return np.concatenate([force, moment], axis=-1)
-
-
-def _terminal_speed(d1: Array, d2: Array, tau: Array) -> Array:
-    """Positive root of d1 v + d2 v^2 = tau, infinite without damping, (6,)."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.where(d1 + d2 > 0.0, 2.0 * tau / (d1 + np.sqrt(d1**2 + 4.0 * d2 * tau)), np.inf))
 
 
 # The published controller of the paper's vehicle, as its configuration files state it: profile `pid-paper`.
@@ -488,35 +490,3 @@ class PaperPid:
         heading_deg = np.degrees(heading)
         heading_deg = np.where(np.abs(heading_deg) < self.profile.yaw_dead_band, 0.0, heading_deg)
         return np.stack(np.broadcast_arrays(y, x, z, heading_deg), axis=-1)
-
-
-# The pose controllers by name.
-
-
-CONTROLLERS: dict[str, Callable[..., Controller]] = {
-    "pid": Pid.from_vehicle,
-    "pid-paper": PaperPid.from_vehicle,
-}
-"""Makers `(vehicle, hydrodynamics="calibrated", period=...) -> Controller` by name."""
-
-
-def controller(name: str, vehicle: Vehicle, **options: Any) -> Controller:
-    """The controller of that name for a vehicle; options are its maker's (`hydrodynamics`, `period`).
-
-    Raises:
-        ControlError: No such controller, or an option it refuses.
-    """
-    if name not in CONTROLLERS:
-        raise ControlError(f"unknown controller '{name}'; available: {', '.join(CONTROLLERS)}")
-    return CONTROLLERS[name](vehicle, **options)
-
-
-def controller_for(task: str, name: str, vehicle: Vehicle, **options: Any) -> Controller:
-    """The controller of that name as a task's baseline: `pid-paper` has a published profile of its own for t2.
-
-    Raises:
-        ControlError: As `controller`.
-    """
-    if (task, name) == ("t2", "pid-paper"):
-        options = {"profile": TRAJECTORY_PROFILE, **options}
-    return controller(name, vehicle, **options)

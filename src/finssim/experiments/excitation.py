@@ -23,9 +23,9 @@ from finssim.calibration.importers.dispatch import print_folders, read_trials
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import load_trial, load_trials, write_trial
 from finssim.control import ControlError
+from finssim.control.controllers import controller
 from finssim.control.guidance import Goal, Guide, Measured, Station, goal_at
 from finssim.control.modes import Wrench6
-from finssim.control.pid import controller
 from finssim.experiments.campaign import Job, Say, Show, progress_bar, run_jobs
 from finssim.experiments.on_robot import (
     Attendant,

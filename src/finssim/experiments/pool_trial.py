@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from finssim.control.controllers import CONTROLLERS
 from finssim.control.guidance import Guide, Measured, Station, Track
-from finssim.control.pid import CONTROLLERS
 from finssim.control.policy import DESCRIPTION_FILE, NETWORK_FILE
 from finssim.control.trajectories import load_trajectory
 from finssim.experiments import campaign

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.control import ControlError
+from finssim.control.controllers import CONTROLLERS
 from finssim.control.guidance import Goal, Guide, Known, Measured, goal_at
 from finssim.control.modes import Wrench6, action_mode, mode_from_dict
-from finssim.control.pid import CONTROLLERS
 from finssim.control.policy import PolicyError, read_description
 from finssim.vehicles import Vehicle
 

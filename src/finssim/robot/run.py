@@ -21,8 +21,8 @@ from rich.table import Table
 from rich.text import Text
 
 from finssim.control import ControlError
+from finssim.control.controllers import CONTROLLERS
 from finssim.control.guidance import Station
-from finssim.control.pid import CONTROLLERS
 from finssim.control.policy import read_description
 from finssim.geometry.rotations import quat_yaw, wrap_angle
 from finssim.localization.pool import load_pool

@@ -10,9 +10,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.control.controllers import CONTROLLERS, controller_for
 from finssim.control.guidance import Controller, Goal, Known
 from finssim.control.modes import mode_from_dict
-from finssim.control.pid import CONTROLLERS, controller_for
 from finssim.control.policy import DESCRIPTION_FILE, Policy
 from finssim.engine import Recorder
 from finssim.tasks.baselines import BASELINES, baseline

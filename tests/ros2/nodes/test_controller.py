@@ -17,9 +17,9 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
+from finssim.control.controllers import controller
 from finssim.control.guidance import Station, goal_at
 from finssim.control.modes import Wrench6
-from finssim.control.pid import controller
 from finssim.robot.robot import Reading
 from finssim.ros2.nodes.controller import Controller
 from finssim.ros2.nodes.conversions import force_of, nanoseconds

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.control import ControlError
+from finssim.control.controllers import CONTROLLERS
 from finssim.control.guidance import Guide, Measured
-from finssim.control.pid import CONTROLLERS
 from finssim.control.policy import NETWORK_FILE
 from finssim.robot.pilots import AgentPilot, ModeSwitch, WrenchPilot, make_pilot
 from finssim.robot.runtime import Runtime

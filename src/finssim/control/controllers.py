@@ -1,0 +1,43 @@
+"""The pose controllers by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from finssim.control import ControlError
+from finssim.control.guidance import Controller
+from finssim.control.lqr import Lqr
+from finssim.control.pid import TRAJECTORY_PROFILE, PaperPid, Pid
+from finssim.vehicles import Vehicle
+
+__all__ = ["CONTROLLERS", "controller", "controller_for"]
+
+CONTROLLERS: dict[str, Callable[..., Controller]] = {
+    "pid": Pid.from_vehicle,
+    "pid-paper": PaperPid.from_vehicle,
+    "lqr": Lqr.from_vehicle,
+}
+"""Makers `(vehicle, hydrodynamics="calibrated", period=...) -> Controller` by name."""
+
+
+def controller(name: str, vehicle: Vehicle, **options: Any) -> Controller:
+    """The controller of that name for a vehicle; options are its maker's (`hydrodynamics`, `period`).
+
+    Raises:
+        ControlError: No such controller, or an option it refuses.
+    """
+    if name not in CONTROLLERS:
+        raise ControlError(f"unknown controller '{name}'; available: {', '.join(CONTROLLERS)}")
+    return CONTROLLERS[name](vehicle, **options)
+
+
+def controller_for(task: str, name: str, vehicle: Vehicle, **options: Any) -> Controller:
+    """The controller of that name as a task's baseline: `pid-paper` has a published profile of its own for t2.
+
+    Raises:
+        ControlError: As `controller`.
+    """
+    if (task, name) == ("t2", "pid-paper"):
+        options = {"profile": TRAJECTORY_PROFILE, **options}
+    return controller(name, vehicle, **options)
