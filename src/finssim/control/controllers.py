@@ -13,10 +13,25 @@ from finssim.vehicles import Vehicle
 
 __all__ = ["CONTROLLERS", "controller", "controller_for"]
 
+
+def _nmpc(vehicle: Vehicle, **options: Any) -> Controller:
+    """`nmpc`, whose solver is an extra.
+
+    Raises:
+        ControlError: CasADi is not installed, or as `Nmpc.from_vehicle`.
+    """
+    try:
+        from finssim.control.nmpc import Nmpc
+    except ModuleNotFoundError as error:
+        raise ControlError(f"nmpc needs {error.name}: pip install finssim[mpc]") from None
+    return Nmpc.from_vehicle(vehicle, **options)
+
+
 CONTROLLERS: dict[str, Callable[..., Controller]] = {
     "pid": Pid.from_vehicle,
     "pid-paper": PaperPid.from_vehicle,
     "lqr": Lqr.from_vehicle,
+    "nmpc": _nmpc,
 }
 """Makers `(vehicle, hydrodynamics="calibrated", period=...) -> Controller` by name."""
 
