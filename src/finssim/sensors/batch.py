@@ -112,7 +112,7 @@ class SensorBatch:
         self.set(vehicle, **{**values, **self.derived(entry, site)})
 
     def derived(self, entry: Any, site: Surroundings) -> dict[str, float]:
-        """Parameters that the vehicle file does not give as they are, or that replace what it gives; none by default."""
+        """Parameters that the file does not give as they are, or that replace what it gives; none by default."""
         return {}
 
     def numpy(self) -> dict[str, NDArray[Any]]:
