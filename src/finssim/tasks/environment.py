@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from finssim.engine import Pool, Simulator, TetherLine, Water
 from finssim.engine.randomize import Randomization
 from finssim.tasks.actions import ACTION_MODES, action_size, add_action
-from finssim.tasks.arrays import task_arrays
 from finssim.tasks.drawing import Drawing
 from finssim.tasks.given import (
     GREATEST_SEED,
@@ -119,15 +118,11 @@ class Environment:
         self.worlds, self.agents, self.device = worlds, len(task.agents), self.simulator.device
         self.action_size = action_size(self.action_mode, len(vehicles[0].thrusters))
         """Numbers in the action of an agent."""
-        self.arrays = task_arrays(
-            worlds, self.agents, len(task.others), task.observation_size, self.action_size, self.device,
-            len(task.totals), len(task.earnings),
-        )  # fmt: skip
+        self.arrays = task.arrays(worlds, self.action_size, self.device)
         if self.simulator.dock is not None:
             # The dock is the goal: the same memory.
             self.arrays.funnel = funnel = self.simulator.funnel
             self.arrays.goal_position, self.arrays.goal_quaternion = funnel.position, funnel.quaternion
-        task.allocate(self.arrays, worlds, self.device)
         self.wrench_scale = np.broadcast_to(np.asarray(wrench_scale, dtype=float), (6,))
         self.noise = noise or MeasurementNoise()
         self.randomization = randomization
