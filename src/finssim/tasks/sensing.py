@@ -295,13 +295,13 @@ def begin(
         lasting[2] = -r.gauge.bias[w, v]
     imu = r.imu_errors[w, v]
     up = wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
-    felt = wp.normalize(imu.gravity * up + wp.quat_rotate(imu.q_bs, r.imu.accel_bias[w, v]))
+    felt = wp.normalize(imu.gravity * up + wp.quat_rotate(imu.orientation, r.imu.accel_bias[w, v]))
     arrays.position[w, v] = x + wp.vec3(px[0], py[0], pz[0]) + lasting
     arrays.quaternion[w, v] = wp.normalize(about_z(turn[0]) * q * turned_by(wp.cross(felt, up)))
     nu = state.velocity[w, v]
     e.velocity[w, v] = wp.quat_rotate(q, wp.vec3(nu[0], nu[1], nu[2])) + wp.vec3(px[1], py[1], pz[1])
-    e.bias[w, v] = wp.quat_rotate(imu.q_bs, r.imu.gyro_bias[w, v]) - turn[1] * up
-    e.rate[w, v] = wp.quat_rotate(imu.q_bs, r.imu.gyro[w, v]) - e.bias[w, v]
+    e.bias[w, v] = wp.quat_rotate(imu.orientation, r.imu.gyro_bias[w, v]) - turn[1] * up
+    e.rate[w, v] = wp.quat_rotate(imu.orientation, r.imu.gyro[w, v]) - e.bias[w, v]
     e.plane[w, v] = known.plane
     e.height[w, v] = known.height
     e.yaw[w, v] = known.yaw
@@ -311,10 +311,10 @@ def begin(
 def go_on(r: Readings, arrays: TaskArrays, e: Estimates, dt: float, w: int, v: int):
     """The state a control step later: the gyro turns it, the accelerometer says where up is, velocity goes on."""
     imu = r.imu_errors[w, v]
-    rate = wp.quat_rotate(imu.q_bs, r.imu.gyro[w, v]) - e.bias[w, v]
+    rate = wp.quat_rotate(imu.orientation, r.imu.gyro[w, v]) - e.bias[w, v]
     q = arrays.quaternion[w, v] * turned_by(0.5 * dt * (rate + e.rate[w, v]))
     if r.imu_samples.fresh[w, v]:
-        force = wp.quat_rotate(imu.q_bs, r.imu.accel[w, v])
+        force = wp.quat_rotate(imu.orientation, r.imu.accel[w, v])
         size = wp.max(wp.length(force), 1.0e-6)
         off = (size - imu.gravity) / TILT_TOLERANCE
         up = wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
@@ -407,8 +407,8 @@ def take_depth(r: Readings, arrays: TaskArrays, e: Estimates, step: int, dt: flo
         z = e.past_position[w, v, k][2]
         q = e.past_quaternion[w, v, k]
     gauge = r.gauge_errors[w, v]
-    off = -r.gauge.depth[w, v] - wp.quat_rotate(q, gauge.r)[2] - z
-    R = counted(gauge.noise, gauge.quantum)
+    off = -r.gauge.depth[w, v] - wp.quat_rotate(q, gauge.position)[2] - z
+    R = counted(gauge.noise_std, gauge.quantisation)
     K = value_gain(e.height[w, v], R) * off
     e.height[w, v] = value_known(e.height[w, v], R)
     shift(
@@ -427,9 +427,9 @@ def take_velocity(r: Readings, arrays: TaskArrays, e: Estimates, step: int, dt: 
         speed = e.past_velocity[w, v, k]
         q = e.past_quaternion[w, v, k]
     dvl = r.dvl_errors[w, v]
-    own = wp.quat_rotate(dvl.q_bs, r.dvl.velocity[w, v]) - wp.cross(e.rate[w, v], dvl.r)
+    own = wp.quat_rotate(dvl.orientation, r.dvl.velocity[w, v]) - wp.cross(e.rate[w, v], dvl.position)
     off = wp.quat_rotate(q, own) - speed
-    R = counted(dvl.noise, dvl.quantum) + dvl.turn_on * dvl.turn_on
+    R = counted(dvl.noise_std, dvl.quantisation) + dvl.bias_initial * dvl.bias_initial
     A = rate_gain(e.plane[w, v], R)
     B = rate_gain(e.height[w, v], R)
     e.plane[w, v] = rate_known(e.plane[w, v], R)
