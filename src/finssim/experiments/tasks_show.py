@@ -18,7 +18,7 @@ from finssim.control.modes import Thruster8, action_mode
 from finssim.experiments.tables import console_table
 from finssim.tasks import TASKS
 from finssim.tasks import terms as library
-from finssim.tasks.baselines import BASELINES
+from finssim.tasks.agents import BASELINES
 from finssim.tasks.given import crew
 from finssim.tasks.make import task_named
 from finssim.tasks.sensing import Sensing, seen_with

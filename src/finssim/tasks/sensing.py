@@ -11,7 +11,7 @@ A measurement that comes late is compared with the estimate of its own time and 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -563,10 +563,9 @@ class SensingBatch:
             vehicles=count,
         )  # fmt: skip
 
-    def arrays(self) -> Iterator[tuple[str, Any]]:
-        """Structs of all that decides what is seen next, by name; parameters that `suite` was given are not in it."""
-        yield "estimates", self.estimates
-        yield "readings", self.readings
+    def structs(self) -> dict[str, Any]:
+        """All that decides what is seen next, by name; parameters that `suite` was given are not in it."""
+        return {"estimates": self.estimates, "readings": self.readings}
 
 
 def _aboard(vehicle: Vehicle, sensing: Sensing, dt: float) -> Any:
