@@ -365,22 +365,14 @@ class TorchTask(Task):
 
     def _begin(self, w: Worlds, arrays: TaskArrays) -> None:
         given, start = arrays.answers, self.reset(w)
-        upright = w.full((0.0, 0.0, 0.0, 1.0))
-        each = upright if len(self.vehicles) == 1 else upright[:, None].expand(-1, len(self.vehicles), -1)
-        self._answer("reset: position", start.position, given.position)
-        self._answer(
-            "reset: quaternion", each if start.quaternion is None else start.quaternion, given.quaternion
-        )
-        for name, value, out in (
-            ("velocity", start.velocity, given.velocity),
-            ("goal_position", start.goal_position, given.goal_position),
-        ):
-            if value is None:
-                out.zero_()
-            else:
+        for name in ("position", "quaternion", "velocity", "goal_position", "goal_quaternion"):
+            value, out = getattr(start, name), getattr(given, name)
+            if value is not None:
                 self._answer(f"reset: {name}", value, out)
-        goal = upright if start.goal_quaternion is None else start.goal_quaternion
-        self._answer("reset: goal_quaternion", goal, given.goal_quaternion)
+            elif name.endswith("quaternion"):
+                out.fill_(wp.quat(0.0, 0.0, 0.0, 1.0))
+            else:
+                out.zero_()
         unknown = start.memory.keys() - self.memory.keys()
         if unknown:
             raise EnvironmentSetupError(
