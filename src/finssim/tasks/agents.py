@@ -100,7 +100,12 @@ class WrenchPid:
 
 
 def part_of_limits(tau: Array, limits: Array) -> NDArray[np.float32]:
-    """A wrench as a part of each axis' limit, 0 where there is none, (..., 6)."""
+    """A wrench as a part of each axis' limit, 0 where there is none, (..., 6).
+
+    Args:
+        tau: Wrench, body frame [N, N m], (..., 6).
+        limits: Largest of each axis [N, N m], (6,).
+    """
     return np.divide(tau, limits, out=np.zeros_like(tau), where=limits > 0.0).astype(np.float32)
 
 

@@ -352,9 +352,12 @@ def take_fix(
             came += 1.0
     if came == 0.0:
         return
-    true = state.history[(at - 1) % wp.static(HISTORY), w, v]
-    x = wp.vec3(true[0], true[1], true[2])
-    q = wp.quat(true[3], true[4], true[5], true[6])
+    x = state.position[w, v]
+    q = state.quaternion[w, v]
+    if at < step:
+        true = state.history[(at - 1) % wp.static(HISTORY), w, v]
+        x = wp.vec3(true[0], true[1], true[2])
+        q = wp.quat(true[3], true[4], true[5], true[6])
     k = at % e.position.shape[2]
     begun = sample_key(seed, FIX, w, v, state.episode[w], 0)
     fewer = 1.0 / wp.sqrt(came)
