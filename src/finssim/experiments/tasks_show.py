@@ -14,7 +14,7 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from finssim.control.modes import Thruster8, action_mode
+from finssim.control.modes import AXES, action_mode
 from finssim.experiments.tables import console_table
 from finssim.tasks import TASKS
 from finssim.tasks import terms as library
@@ -142,18 +142,9 @@ def _told(task: Task, term: Any) -> str:
 def _action(mode: str, vehicle: Vehicle) -> dict[str, Any]:
     """What 1 and -1 of every component stand for."""
     chosen = action_mode(mode, vehicle)
-    if isinstance(chosen, Thruster8):
-        ends = [
-            (low * k, high * k) for low, high, k in zip(chosen.lower, chosen.upper, chosen.scale, strict=True)
-        ]
-        units = ["N"] * len(ends)
-    else:
-        most = [chosen.limits[axis] * chosen.scale[axis] for axis in chosen.axes]
-        ends = [(-x, x) for x in most]
-        units = ["N" if axis < 3 else "N m" for axis in chosen.axes]
     components = [
-        {"name": label, "low": low, "high": high, "unit": unit}
-        for label, (low, high), unit in zip(chosen.labels, ends, units, strict=True)
+        {"name": label, "low": low, "high": high, "unit": "N m" if label in AXES[3:] else "N"}
+        for label, low, high in zip(chosen.labels, *(x.tolist() for x in chosen.ends), strict=True)
     ]
     return {"mode": mode, "size": len(components), "components": components}
 

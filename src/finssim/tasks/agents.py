@@ -629,7 +629,7 @@ class PolicyAgent:
         mode = mode_from_dict(policy.description.action, vehicle)
         self.period = policy.description.control_period
         self.action = mode.name
-        self.wrench_scale = mode.scale if mode.name.startswith("wrench") else 1.0
+        self.wrench_scale = mode.scale if mode.wrench else 1.0
         self.policy = policy
         self.name = Path(directory).resolve().name
 

@@ -11,9 +11,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from finssim.control.modes import MODES
 from finssim.engine import Pool, Simulator, TetherLine, Water
 from finssim.engine.randomize import Randomization
-from finssim.tasks.actions import ACTION_MODES, action_size, add_action
+from finssim.tasks.actions import add_action
 from finssim.tasks.drawing import Drawing
 from finssim.tasks.given import (
     GREATEST_SEED,
@@ -100,9 +101,9 @@ class Environment:
         """
         self.action_mode, self.seed = action or task.action, checked_seed(seed)
         self.crash_directory, self.auto_reset = crash_directory, auto_reset
-        if self.action_mode not in ACTION_MODES:
+        if self.action_mode not in MODES:
             raise EnvironmentSetupError(
-                f"unknown action mode '{self.action_mode}'; available: {', '.join(ACTION_MODES)}"
+                f"unknown action mode '{self.action_mode}'; available: {', '.join(MODES)}"
             )
         vehicles = crew(vehicle, task, self.action_mode)
         self.nominal = vehicles if nominal is None else crew(nominal, task, self.action_mode)
@@ -116,7 +117,7 @@ class Environment:
             dock=task.dock(), device=device, threads=threads, seed=self.seed, **extra,
         )  # fmt: skip
         self.worlds, self.agents, self.device = worlds, len(task.agents), self.simulator.device
-        self.action_size = action_size(self.action_mode, len(vehicles[0].thrusters))
+        self.action_size = len(MODES[self.action_mode].labels(vehicles[0]))
         """Numbers in the action of an agent."""
         self.arrays = task.arrays(worlds, self.action_size, self.device)
         if self.simulator.dock is not None:

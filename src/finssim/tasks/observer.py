@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from finssim.control import ControlError
 from finssim.control.guidance import Guide, Measured, Reference, Track
+from finssim.control.modes import MODES
 from finssim.control.policy import ObservationSchema
 from finssim.engine.launch import Pipeline
 from finssim.engine.state import State
 from finssim.geometry.rotations import quat_from_yaw, quat_inverse_rotate, quat_rotate
 from finssim.physics.types import vec6
-from finssim.tasks.actions import action_size
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError, crew
 from finssim.tasks.make import task_named
@@ -90,8 +90,8 @@ class Observer:
             raise ControlError(f"task '{task.name}' has no '{agent}'; its agents: {', '.join(task.agents)}")
         self.schema: ObservationSchema = task.schema
         self._place = task.vehicles.index(self.agent)
-        thrusters = len(crew(vehicle, task, action or task.action)[0].thrusters)
-        self._action_size = action_size(action or task.action, thrusters)
+        mode = action or task.action
+        self._action_size = len(MODES[mode].labels(crew(vehicle, task, mode)[0]))
         self._guide: Guide | None = None
         self._build(task)
 
