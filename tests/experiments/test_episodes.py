@@ -11,8 +11,7 @@ from finssim.experiments.evaluate import evaluate
 from finssim.experiments.plants import load_plant
 from finssim.experiments.trials import EpisodeError, run_episodes, summarize_episodes
 from finssim.tasks import TASKS, Environment, task_named
-from finssim.tasks.agents import agent_for
-from finssim.tasks.baselines import BASELINES
+from finssim.tasks.agents import BASELINES, agent_for
 from finssim.vehicles import load_vehicle
 
 FINSROV, NOMINAL = load_vehicle("finsrov"), load_plant("nominal")

@@ -17,7 +17,8 @@ from rich.text import Text
 from finssim.control.modes import AXES, action_mode
 from finssim.experiments.tables import console_table
 from finssim.tasks import TASKS
-from finssim.tasks.baselines import BASELINES
+from finssim.tasks import terms as library
+from finssim.tasks.agents import BASELINES
 from finssim.tasks.given import crew
 from finssim.tasks.make import task_named
 from finssim.tasks.sensing import Sensing, seen_with
@@ -130,10 +131,11 @@ def _observation(task: Task) -> list[dict[str, Any]]:
 
 
 def _told(task: Task, term: Any) -> str:
-    """What is written of a term, or of what is shared under its name."""
+    """What is written of a term, or of what is shared under its name; an expression itself."""
     if isinstance(term, str):
         terms = task.terms()
-        term = {**terms.shared, **terms.seen}[term]
+        named = {**terms.shared, **terms.seen}.get(term, getattr(library, term, None))
+        return term.replace("wp.", "") if named is None else _told(task, named)
     return " ".join((inspect.getdoc(term.func) or "").split()) if term is not None else ""
 
 

@@ -234,8 +234,7 @@ def make_pilot(
     Raises:
         PolicyError, ControlError: It does not fit the vehicle or the task, in one sentence.
     """
-    from finssim.tasks.agents import TASKS_OF_PIDS, BaselineAgent, PidAgent, PolicyAgent
-    from finssim.tasks.baselines import BASELINES
+    from finssim.tasks.agents import BASELINES, TASKS_OF_PIDS, BaselineAgent, PidAgent, PolicyAgent
     from finssim.tasks.observer import Observer
 
     who = str(name_or_directory)

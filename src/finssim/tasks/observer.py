@@ -19,7 +19,7 @@ from finssim.engine.launch import Pipeline
 from finssim.engine.state import State
 from finssim.geometry.rotations import quat_from_yaw, quat_inverse_rotate, quat_rotate
 from finssim.physics.types import vec6
-from finssim.tasks.arrays import TaskArrays, task_arrays
+from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError, crew
 from finssim.tasks.make import task_named
 from finssim.tasks.reference import fill_table
@@ -226,11 +226,7 @@ def one_world(task: Task, action_size: int) -> tuple[State, TaskArrays]:
         action_size: Numbers in the action of a vehicle.
     """
     device, vehicles = wp.get_device("cpu"), len(task.vehicles)
-    arrays = task_arrays(
-        1, len(task.agents), len(task.others), task.observation_size, action_size, device, len(task.totals),
-        len(task.earnings),
-    )  # fmt: skip
-    task.allocate(arrays, 1, device)
+    arrays = task.arrays(1, action_size, device)
     dock = task.dock()
     if dock is not None:
         arrays.funnel = funnel = dock.struct(1, vehicles, device)
