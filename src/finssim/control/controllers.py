@@ -11,19 +11,12 @@ from finssim.control.lqr import Lqr
 from finssim.control.pid import TRAJECTORY_PROFILE, PaperPid, Pid
 from finssim.vehicles import Vehicle
 
-__all__ = ["CONTROLLERS", "controller", "controller_for"]
+__all__ = ["CONTROLLERS", "COSTLY", "controller", "controller_for"]
 
 
 def _nmpc(vehicle: Vehicle, **options: Any) -> Controller:
-    """`nmpc`, whose solver is an extra.
+    from finssim.control.nmpc import Nmpc  # takes CasADi, an extra
 
-    Raises:
-        ControlError: CasADi is not installed, or as `Nmpc.from_vehicle`.
-    """
-    try:
-        from finssim.control.nmpc import Nmpc
-    except ModuleNotFoundError as error:
-        raise ControlError(f"nmpc needs {error.name}: pip install finssim[mpc]") from None
     return Nmpc.from_vehicle(vehicle, **options)
 
 
@@ -34,6 +27,8 @@ CONTROLLERS: dict[str, Callable[..., Controller]] = {
     "nmpc": _nmpc,
 }
 """Makers `(vehicle, hydrodynamics="calibrated", period=...) -> Controller` by name."""
+COSTLY = ("nmpc",)
+"""Of these, what takes an extra and a second to make: nobody makes it without being asked for it by name."""
 
 
 def controller(name: str, vehicle: Vehicle, **options: Any) -> Controller:

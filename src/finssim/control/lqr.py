@@ -133,7 +133,7 @@ class Lqr:
         tau = np.clip(
             steady + body.accelerating_wrench(q, goal) + feedback, -body.wrench_limits, body.wrench_limits
         )
-        achieved = self.allocator.achieved(self.allocator.allocate(tau)[0])
+        achieved = self.allocator.achieved(self.allocator.allocate(tau))
 
         queue = np.concatenate([memory.queue[..., 1:, :], achieved[..., None, :]], axis=-2)
         arriving = memory.queue[..., 0, :]

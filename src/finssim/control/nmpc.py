@@ -167,9 +167,7 @@ class Nmpc:
             state = np.asarray(self.advance(state, under_way, w)).ravel()
             first = state if k == 0 else first
         hold = self.body.holding_wrench(q_goal, q_goal)
-        steady, _ = self.allocator.allocate(
-            hold - np.concatenate([quat_inverse_rotate(q_goal, force), moment])
-        )
+        steady = self.allocator.allocate(hold - np.concatenate([quat_inverse_rotate(q_goal, force), moment]))
         ahead = self.delays * self.period
         target = p_goal + ahead * v_goal + 0.5 * ahead**2 * a_goal
         plan = np.tile(np.concatenate([state, steady]), HORIZON + 1)[: memory.plan.size]
@@ -293,12 +291,13 @@ def _problem(vehicle: Vehicle, advance: Any, limits: Array, period: float) -> tu
     for k in range(HORIZON):
         variables += [states[k], thrusts[k]]
         constraints.append(states[k + 1] - advance(states[k], thrusts[k], w))
-        low.append(zero), high.append(zero)
+        equal = [zero]
         if k == 0:
             constraints.append(states[0] - start)
-            low.append(zero), high.append(zero)
+            equal = [zero, zero]
         constraints.append(thrusts[k])
-        low.append(lower), high.append(upper)
+        low += [*equal, lower]
+        high += [*equal, upper]
         total += cost(states[k], k * period) + ca.sumsqr((thrusts[k] - steady) / reach)
     variables.append(states[-1])
     total += FINAL * cost(states[-1], HORIZON * period)

@@ -271,7 +271,7 @@ def _step(plant: Plant, vehicle: Vehicle, axis: int, level: float) -> tuple[floa
     """Terminal speed and time constant."""
     tau = np.zeros(6)
     tau[axis] = level
-    force, _ = Allocator.from_vehicle(vehicle).allocate(tau)
+    force = Allocator.from_vehicle(vehicle).allocate(tau)
     speeds = [t.speed(f) for t, f in zip(vehicle.thrusters.values(), force, strict=True)]
     _ride(plant, axis, np.zeros(len(speeds)), REST)
     plant.nu[:] = 0.0

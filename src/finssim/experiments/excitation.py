@@ -23,9 +23,9 @@ from finssim.calibration.importers.dispatch import print_folders, read_trials
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import load_trial, load_trials, write_trial
 from finssim.control import ControlError
+from finssim.control.allocation import Allocator
 from finssim.control.controllers import controller
 from finssim.control.guidance import Goal, Guide, Measured, Station, goal_at
-from finssim.control.modes import Wrench6
 from finssim.experiments.campaign import Job, Say, Show, progress_bar, run_jobs
 from finssim.experiments.on_robot import (
     Attendant,
@@ -111,7 +111,7 @@ class ProgrammePilot:
             )
         self.period, self._rate, self._room = period, rate, room
         self._ascent, self._ascent_time = ascent_speed, ascent_time
-        self._mode = Wrench6.from_vehicle(vehicle)
+        self._allocator = Allocator.from_vehicle(vehicle)
         self._limits = np.asarray(vehicle.wrench_limits, float)
         kept = HELD_IN_TURNS if "yaw" in axes else HELD
         self._driven = [AXES.index(axis) for axis in axes]  # type: ignore[arg-type]
@@ -141,14 +141,14 @@ class ProgrammePilot:
         self.finished = self.finished or row >= len(self._phase)
         if self.finished:
             self.phase = ""
-            return np.zeros(self._mode.allocator.thrusters)
+            return np.zeros(self._allocator.thrusters)
         self.phase = str(self._phase[row])
         tau = self._tau[row].copy()
         if self._hold is not None:
             goal = self._beside(goal_at(guide, t), reading)
             wanted, self._memory = self._hold.command(self._memory, reading, goal)
             tau[self._held] = wanted[self._held]
-        return self._mode.allocator.allocate(np.clip(tau, -self._limits, self._limits))[0]
+        return self._allocator.allocate(np.clip(tau, -self._limits, self._limits))
 
     def _beside(self, goal: Goal, reading: Measured) -> Goal:
         """The goal moved along the excited axes to where the vehicle is.

@@ -114,7 +114,7 @@ def simulate(
     tau = parse_wrench(command)
     chosen = load_vehicle(vehicle)
     allocator = Allocator.from_vehicle(chosen)
-    thrust, _ = allocator.allocate(tau)
+    thrust = allocator.allocate(tau)
     simulator = Simulator(chosen, hydrodynamics=hydrodynamics, control_step=CONTROL_STEP, device=device)
     with atomic_write(out) as table, atomic_write(f"{out}.json") as origin:
         rows = _run(simulator, thrust, depth, steps=round(duration / CONTROL_STEP))

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.control import ControlError
-from finssim.control.controllers import CONTROLLERS
+from finssim.control.controllers import CONTROLLERS, COSTLY
 from finssim.control.guidance import Guide, Measured
 from finssim.control.policy import NETWORK_FILE
 from finssim.robot.pilots import AgentPilot, ModeSwitch, WrenchPilot, make_pilot
@@ -41,7 +41,9 @@ class Modes:
         """
         self._node = node
         self._wrench, self._wrench_at = np.zeros(6), -math.inf
-        pilots: dict[str, Any] = {name: make_pilot(name, node.filed) for name in CONTROLLERS}
+        pilots: dict[str, Any] = {
+            name: make_pilot(name, node.filed) for name in CONTROLLERS if name == policy or name not in COSTLY
+        }
         self._policy: AgentPilot | None = None
         if policy not in pilots:
             pilots["policy"] = self._policy = make_pilot(policy, node.filed, task=task or None)
