@@ -28,8 +28,7 @@ from finssim.control.guidance import Station
 from finssim.experiments.metrics import T1_SETPOINTS, T1_START
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.pool import VirtualPool, draw_plant
-from finssim.pool.camera import PoolCamera
-from finssim.pool.site import camera_of
+from finssim.pool.camera import PoolCamera, camera_of
 from finssim.quiet import start_warp
 from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime

@@ -13,8 +13,7 @@ from finssim.geometry.rotations import quat_from_yaw
 from finssim.learning.demonstrations import load
 from finssim.learning.learners import learner_named
 from finssim.pool import draw_plant
-from finssim.pool.camera import PoolCamera
-from finssim.pool.site import camera_of
+from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.pilots import AgentPilot

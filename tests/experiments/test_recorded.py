@@ -17,11 +17,9 @@ from finssim.experiments.recorded import RecordedError, read_record
 from finssim.experiments.stack import site_of
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.pool import draw_plant
-from finssim.pool.camera import PoolCamera
-from finssim.pool.site import camera_of
+from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.task_site import Referee
-from finssim.pool.truth import read_truth
-from finssim.pool.virtual_pool import VirtualPool
+from finssim.pool.virtual_pool import VirtualPool, read_truth
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.pilots import make_pilot
 from finssim.robot.recorder import Recorder

@@ -8,8 +8,7 @@ import pytest
 
 from finssim import boundary
 from finssim.cli import app
-from finssim.learning.collect import collect, record_episodes
-from finssim.learning.demonstrations import DatasetError, about, load, save
+from finssim.learning.demonstrations import DatasetError, about, collect, load, record_episodes, save
 from finssim.tasks import Environment, make, task_named
 from finssim.tasks.agents import AgentError, expert_for
 from finssim.vehicles import load_vehicle

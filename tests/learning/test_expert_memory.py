@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from finssim.learning.expert_memory import memory_from, memory_numbers
 from finssim.learning.resume import read_state, write_state
 from finssim.tasks import TASKS, make
-from finssim.tasks.agents import BASELINES, baseline
+from finssim.tasks.agents import BASELINES, baseline, memory_from, memory_leaves
 
 
 @pytest.mark.slow
@@ -18,6 +17,6 @@ def test_every_baselines_memory_survives(task, tmp_path):
     seen = environment.arrays.observation.numpy().reshape(3 * environment.agents, -1)
     fresh = who.reset(len(seen))
     _, memory = who.act(fresh, seen)
-    write_state({"memory": memory_numbers(memory)}, tmp_path / "state")
+    write_state({"memory": memory_leaves(memory)}, tmp_path / "state")
     again = memory_from(read_state(tmp_path / "state")["memory"], fresh)
     assert np.array_equal(who.act(again, seen)[0], who.act(memory, seen)[0])

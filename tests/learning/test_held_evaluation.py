@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 import finssim
-from finssim.learning.held_evaluation import HeldEvaluation, held_seed
+from finssim.learning.episodes import HeldEvaluation, held_seed
 from finssim.learning.resume import random_state
 from reference.guess import BEST, Guess, GuessTogether
 

@@ -4,8 +4,8 @@ import io
 
 from rich.console import Console
 
-from finssim.learning import progress
-from finssim.learning.progress import TrainingView, summary
+from finssim.learning import training_loop
+from finssim.learning.training_loop import TrainingView, summary
 
 ROW = {"steps": 0, "steps_per_s": 50_000, "mean_return": 1.25, "held": 0.5}
 
@@ -13,7 +13,7 @@ ROW = {"steps": 0, "steps_per_s": 50_000, "mean_return": 1.25, "held": 0.5}
 def lines(monkeypatch, steps, begun=0):
     """What is printed when the clock shows a second more at every look."""
     ticks = iter(range(1000))
-    monkeypatch.setattr(progress.time, "perf_counter", lambda: float(next(ticks)))
+    monkeypatch.setattr(training_loop.time, "perf_counter", lambda: float(next(ticks)))
     console = Console(file=io.StringIO(), width=200)
     view = TrainingView(1000, console)
     if begun:

@@ -13,8 +13,8 @@ import finssim
 from finssim.control.guidance import Station
 from finssim.control.modes import action_mode
 from finssim.control.policy import Policy, PolicyError
+from finssim.learning.episodes import HeldEvaluation
 from finssim.learning.export import ExportError
-from finssim.learning.held_evaluation import HeldEvaluation
 from finssim.learning.learners import learner_named
 from finssim.learning.recurrent import RecurrentNetwork
 from finssim.robot.pilots import make_pilot

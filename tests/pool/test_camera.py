@@ -7,9 +7,8 @@ import pytest
 
 from finssim.geometry.rotations import quat_from_euler
 from finssim.localization.detection.detector import detector
-from finssim.pool.camera import PoolCamera
+from finssim.pool.camera import CameraSettings, PoolCamera, camera_of
 from finssim.pool.plant_spec import PlantSpecError
-from finssim.pool.site import CameraSettings, camera_of
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")

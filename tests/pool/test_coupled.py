@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from finssim.pool.coupled import CoupledMatrix, PrincipalAxes
+from finssim.pool.plant_spec import CoupledMatrix, PrincipalAxes
 
 small = st.floats(-0.3, 0.3)
 positive = st.floats(0.01, 100.0)

@@ -5,9 +5,8 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from finssim.pool.current import Gyre, circulation_at, gyre
-from finssim.pool.plant_spec import Basin
-from finssim.pool.water_spec import Circulation, Eddy
+from finssim.pool.plant import Gyre, circulation_at, gyre
+from finssim.pool.plant_spec import Basin, Circulation, Eddy
 
 EDDIES = (
     Eddy(cells=1, speed=0.03, unsteadiness=0.3, period=60.0, phase=0.4),

@@ -5,8 +5,7 @@ import pytest
 
 from finssim.pool import SPREADS, PlantSpecError, draw_plant
 from finssim.pool.plant import Plant
-from finssim.pool.plant_spec import Basin
-from finssim.pool.water_spec import Circulation
+from finssim.pool.plant_spec import Basin, Circulation
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")

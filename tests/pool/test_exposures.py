@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from finssim.pool.exposures import Mail, Shutter
+from finssim.pool.positioning import Mail, Shutter
 
 SETTINGS = {"rate": 30.0, "exposure": 0.006, "latency": 0.045, "jitter": 0.0, "dropout": 0.0, "seed": 1}
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from finssim.pool.faults import NUMBERS, FaultError, Faults
+from finssim.pool.virtual_pool import NUMBERS, FaultError, Faults
 from finssim.robot.link.frames import TELEMETRY, Decoder, encode_telemetry, forms
 from finssim.robot.messages import Telemetry
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from finssim.pool import draw_plant
-from finssim.pool.firmware import Firmware
-from finssim.pool.motors import RPM
-from finssim.pool.sensors import Sample
+from finssim.pool.firmware import Firmware, Sample
+from finssim.pool.plant import RPM
 from finssim.robot.link.frames import (
     HOST,
     Decoder,

@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 
 from finssim.pool import draw_plant
-from finssim.pool.losses import induced_shares
-from finssim.pool.plant import Plant
-from finssim.pool.plant_spec import Basin, Propellers
-from finssim.pool.water_spec import Circulation
+from finssim.pool.plant import Plant, induced_shares
+from finssim.pool.plant_spec import Basin, Circulation, Propellers
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.pool import draw_plant
-from finssim.pool.motors import RPM
-from finssim.pool.plant import Plant
+from finssim.pool.plant import RPM, Plant
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")

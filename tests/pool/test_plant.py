@@ -7,8 +7,7 @@ from finssim.engine import Pool, Simulator
 from finssim.geometry.rotations import quat_to_matrix
 from finssim.pool import draw_plant
 from finssim.pool.plant import Plant
-from finssim.pool.plant_spec import Basin, Battery
-from finssim.pool.water_spec import BuoyancyDrift, Circulation
+from finssim.pool.plant_spec import Basin, Battery, BuoyancyDrift, Circulation
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from finssim.geometry.optics import Camera, Interface, project
-from finssim.pool.rippled_view import RippledView
-from finssim.pool.site import paper_lens
+from finssim.pool.camera import paper_lens
+from finssim.pool.corner_camera import RippledView
 from finssim.sensors.overhead_camera import Ripples
 from finssim.sensors.overhead_camera.surface import waves_of
 

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from finssim.pool import draw_plant
+from finssim.pool.firmware import PoolSensors
 from finssim.pool.plant import Plant
-from finssim.pool.plant_spec import Instruments
-from finssim.pool.sensors import PoolSensors
-from finssim.pool.water_spec import Circulation
+from finssim.pool.plant_spec import Circulation, Instruments
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")

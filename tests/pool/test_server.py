@@ -13,10 +13,10 @@ import pytest
 
 from finssim.localization.pool import load_pool
 from finssim.pool.draw_plant import draw_plant
+from finssim.pool.fleet import Fleet
 from finssim.pool.run import make_plan, memory_of
 from finssim.pool.server import LockstepServer, serve_realtime
-from finssim.pool.truth import read_truth
-from finssim.pool.virtual_pool import VirtualPool
+from finssim.pool.virtual_pool import VirtualPool, read_truth
 from finssim.robot.goals import station_of
 from finssim.robot.link.frames import Decoder, LinkError
 from finssim.robot.link.transports import UdpTransport, memory_pair
@@ -115,6 +115,11 @@ def world(**options):
     return VirtualPool(FINSROV, draw_plant(FINSROV, 1, "nominal"), **options)
 
 
+def alone(**options):
+    """It, as all that is in the water."""
+    return Fleet({"it": world(**options)})
+
+
 def telemetry(datagrams):
     """Telemetry frames among what came."""
     decoder = Decoder()
@@ -124,7 +129,7 @@ def telemetry(datagrams):
 def test_a_pool_keeps_real_time():
     """Two seconds of the clock are two seconds of the pool, with 100 telemetry frames a second."""
     clock, (pool, robot) = Clock(), memory_pair()
-    pace = serve_realtime(world(), pool, duration=2.0, clock=clock, wait=clock.wait)
+    pace = serve_realtime(alone(), {"it": pool}, duration=2.0, clock=clock, wait=clock.wait)
     assert clock.now == pytest.approx(102.0, abs=0.01) and pace.duration == 2.0 and pace.given_up == 0.0
     assert len(telemetry(robot.receive())) == pytest.approx(200, abs=3)
 
@@ -140,7 +145,7 @@ def test_a_pool_that_was_stopped_does_not_catch_up():
             clock.now += 5.0
         return False
 
-    pace = serve_realtime(world(), pool, duration=1.0, clock=clock, wait=clock.wait, until=pause)
+    pace = serve_realtime(alone(), {"it": pool}, duration=1.0, clock=clock, wait=clock.wait, until=pause)
     assert pace.given_up == pytest.approx(5.0, abs=0.02) and "gave up 5.0" in pace.sentence
     assert len(telemetry(robot.receive())) == pytest.approx(100, abs=3)
 
@@ -157,7 +162,9 @@ def test_pictures_carry_the_time_of_the_machine():
 
     clock, (pool, _) = Clock(), memory_pair()
     eye = plan.camera.camera()
-    pace = serve_realtime(world(camera=eye), pool, sink=Sink(), duration=1.0, clock=clock, wait=clock.wait)
+    pace = serve_realtime(
+        alone(camera=eye), {"it": pool}, sinks=[Sink()], duration=1.0, clock=clock, wait=clock.wait
+    )
     assert pace.pictures == len(Sink.times) >= 27
     assert all(0.0 <= now - came < 0.01 and 100.0 < came < 101.1 for came, now in Sink.times)
 

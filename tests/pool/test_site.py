@@ -7,8 +7,8 @@ import pytest
 
 from finssim.geometry.optics import Status, project
 from finssim.localization.pool import load_pool, write_pool
+from finssim.pool.camera import CameraSettings, camera_of, true_site
 from finssim.pool.plant_spec import Basin, PlantSpecError
-from finssim.pool.site import CameraSettings, camera_of, true_site
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 from finssim.experiments.open_water import swim, way_of
-from finssim.pool.camera import PoolCamera
-from finssim.pool.draw_plant import draw_plant
+from finssim.pool.camera import PoolCamera, camera_of
+from finssim.pool.draw_plant import OPEN, draw_plant, positioning_of, site_of
 from finssim.pool.plant_spec import PlantSpec, PlantSpecError
 from finssim.pool.positioning import POSITIONING, Positioning
 from finssim.pool.run import make_plan
-from finssim.pool.site import camera_of
-from finssim.pool.sites import OPEN, positioning_of, site_of
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.link.frames import Decoder
 from finssim.robot.messages import HEADING, POSE, POSITION, VELOCITY, NavigationAid

@@ -12,7 +12,7 @@ from finssim.cli import app
 from finssim.control import ControlError
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.experiments.stack import BATCH, site_of
-from finssim.pool.medium import Medium
+from finssim.pool.fleet import Medium
 from finssim.robot.pilots import AgentPilot
 from finssim.tasks import TASKS, task_named
 from finssim.tasks.agents import BASELINES

@@ -6,10 +6,8 @@ import warp as wp
 
 from finssim.physics.types import vec6
 from finssim.pool import draw_plant
-from finssim.pool.plant import Plant
-from finssim.pool.plant_spec import Basin
-from finssim.pool.tether import Slack, dragged_line, slack_line, slack_pull
-from finssim.pool.water_spec import Circulation, Eddy, HullDrag, SlackTether
+from finssim.pool.plant import Plant, Slack, dragged_line, slack_line, slack_pull
+from finssim.pool.plant_spec import Basin, Circulation, Eddy, HullDrag, SlackTether
 from finssim.vehicles import load_vehicle
 
 TETHER = SlackTether(

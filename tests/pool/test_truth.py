@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from finssim.pool.truth import FLUSH, TruthError, TruthWriter, read_truth
+from finssim.pool.virtual_pool import FLUSH, TruthError, TruthWriter, read_truth
 
 THRUSTERS = ("a", "b")
 
@@ -47,7 +47,7 @@ def test_a_killed_writer_leaves_all_but_the_last_records(tmp_path):
     """kill -9 loses at most what was not yet handed to the system."""
     script = (
         "import sys, time, numpy as np\n"
-        "from finssim.pool.truth import TruthWriter\n"
+        "from finssim.pool.virtual_pool import TruthWriter\n"
         "w = TruthWriter(sys.argv[1], ('a',), {})\n"
         "for i in range(475): w.write(0.01 * i, [np.zeros(20, dtype=np.float32)])\n"
         "print('written', flush=True); time.sleep(60)\n"

@@ -5,7 +5,7 @@ import pytest
 
 from finssim.geometry.rotations import quat_inverse_rotate, quat_rotate
 from finssim.pool import VirtualPool, draw_plant, read_truth
-from finssim.pool.motors import RPM
+from finssim.pool.plant import RPM
 from finssim.pool.plant_spec import Instruments
 from finssim.pool.virtual_pool import PoolClockError
 from finssim.robot.link.frames import Decoder, encode_command

@@ -7,11 +7,9 @@ from dataclasses import replace
 
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.localization.pool import write_pool
-from finssim.pool.camera import PoolCamera
-from finssim.pool.draw_plant import draw_plant
+from finssim.pool.camera import PoolCamera, camera_of
+from finssim.pool.draw_plant import draw_plant, positioning_of, site_of
 from finssim.pool.server import LockstepServer
-from finssim.pool.site import camera_of
-from finssim.pool.sites import positioning_of, site_of
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.quiet import start_warp
 from finssim.robot.wiring import Wiring

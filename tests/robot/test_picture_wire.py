@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from finssim.pool.picture_wire import SharedMemorySender, UdpSender
+from finssim.pool.pictures import SharedMemorySender, UdpSender
 from finssim.robot.link.frames import LinkError
 from finssim.robot.messages import Picture, TagCorners
 from finssim.robot.pictures import (
@@ -205,7 +205,7 @@ def test_shared_memory_outlives_either_side():
     key = name()
     script = (
         "import sys, time, numpy as np\n"
-        "from finssim.pool.picture_wire import SharedMemorySender\n"
+        "from finssim.pool.pictures import SharedMemorySender\n"
         "from finssim.robot.messages import Picture\n"
         "camera = SharedMemorySender(sys.argv[1], slots=4, slot_bytes=8192)\n"
         "i = 0\n"

@@ -11,9 +11,9 @@ from rich.console import Console
 
 from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.geometry.rotations import quat_to_matrix
+from finssim.pool.camera import camera_of
 from finssim.pool.draw_plant import draw_plant
 from finssim.pool.plant_spec import Basin, basin_of
-from finssim.pool.site import camera_of
 from finssim.vehicles import catalogue, load_vehicle
 from finssim.vehicles.defaults import DEFAULTS
 from finssim.vehicles.show import print_vehicle

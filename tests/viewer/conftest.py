@@ -8,9 +8,8 @@ import pytest
 
 from finssim.control.guidance import Station
 from finssim.localization.pool import write_pool
-from finssim.pool.camera import PoolCamera
+from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.draw_plant import draw_plant
-from finssim.pool.site import camera_of
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.pilots import make_pilot

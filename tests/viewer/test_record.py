@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.pool.truth import read_truth
+from finssim.pool.virtual_pool import read_truth
 from finssim.robot.record_reader import open_record
 from finssim.vehicles import VehicleError
 from finssim.viewer.frame import ViewError

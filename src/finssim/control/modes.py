@@ -18,6 +18,7 @@ import warp as wp
 
 from finssim.control import ControlError
 from finssim.control.allocation import AllocationData, RowLaunch, allocate, allocation_data, axis_weights
+from finssim.control.policy import first_difference, plain_data
 from finssim.physics.types import MAX_THRUSTERS, vec6, vec8
 
 __all__ = [
@@ -35,6 +36,10 @@ __all__ = [
 Array = npt.NDArray[np.float64]
 
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+
+
+TOLERANCE = 1e-6
+"""Relative difference between limits that are computed anew and those that a policy's directory holds."""
 
 
 class ModeKind(NamedTuple):
@@ -265,21 +270,9 @@ def mode_from_dict(description: Mapping[str, Any], vehicle: Any) -> ActionMode:
             something else.
     """
     mode = action_mode(str(description.get("mode")), vehicle, description.get("scale", 1.0))
-    for key, here in mode.describe().items():
-        if not _same(description.get(key), here):
-            raise ControlError(
-                f"{mode.name}: {key} was {description.get(key)} and is {here} on {vehicle.name}: "
-                "use the vehicle file that the policy was trained with"
-            )
+    here = mode.describe()
+    recorded = plain_data({key: description.get(key) for key in here})
+    difference = first_difference(recorded, here, mode.name, tolerance=TOLERANCE)
+    if difference:
+        raise ControlError(f"{difference}: use the vehicle file that the policy was trained with")
     return mode
-
-
-def _same(recorded: Any, here: Any) -> bool:
-    if isinstance(here, list) and here and isinstance(here[0], float):
-        numbers = isinstance(recorded, list) and all(isinstance(value, int | float) for value in recorded)
-        return (
-            numbers
-            and len(recorded) == len(here)
-            and bool(np.allclose(recorded, here, rtol=1e-6, atol=1e-12))
-        )
-    return bool(recorded == here)

@@ -174,21 +174,29 @@ def plain_data(value: Any) -> Any:
     return value
 
 
-def first_difference(trained: Any, given: Any, path: str) -> str | None:
-    """Where two pieces of plain data first differ, as "PATH is A in the policy and B here", or None."""
+def first_difference(trained: Any, given: Any, path: str, tolerance: float = 1e-9) -> str | None:
+    """Where two pieces of plain data first differ, as "PATH is A in the policy and B here", or None.
+
+    Args:
+        trained: What the policy has.
+        given: What there is.
+        path: Name of both.
+        tolerance: Relative difference of numbers that is none [-].
+    """
     if isinstance(trained, dict) and isinstance(given, dict):
         for key in [*trained, *(key for key in given if key not in trained)]:
             if key not in trained or key not in given:
                 return f"{path}.{key} is {'only' if key in trained else 'not'} in the policy"
-            difference = first_difference(trained[key], given[key], f"{path}.{key}")
+            difference = first_difference(trained[key], given[key], f"{path}.{key}", tolerance)
             if difference:
                 return difference
         return None
     if isinstance(trained, list) and isinstance(given, list) and len(trained) == len(given):
         pairs = enumerate(zip(trained, given, strict=True))
-        return next((d for i, (a, b) in pairs if (d := first_difference(a, b, f"{path}[{i}]"))), None)
+        found = (first_difference(a, b, f"{path}[{i}]", tolerance) for i, (a, b) in pairs)
+        return next(filter(None, found), None)
     numbers = isinstance(trained, int | float) and isinstance(given, int | float)
-    if trained == given or (numbers and math.isclose(trained, given, rel_tol=1e-9)):
+    if trained == given or (numbers and math.isclose(trained, given, rel_tol=tolerance)):
         return None
     return f"{path} is {trained!r} in the policy and {given!r} here"
 

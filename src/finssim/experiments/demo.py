@@ -69,12 +69,10 @@ from finssim.learning.train import train
 from finssim.localization.detection.detector import detector
 from finssim.page import html_page, html_picture, html_table
 from finssim.pool import PlantSpec, draw_plant
-from finssim.pool.camera import PoolCamera
-from finssim.pool.exposures import Exposure
+from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.plant import Plant
-from finssim.pool.plant_spec import Basin
-from finssim.pool.site import camera_of
-from finssim.pool.water_spec import BuoyancyDrift, Circulation
+from finssim.pool.plant_spec import Basin, BuoyancyDrift, Circulation
+from finssim.pool.positioning import Exposure
 from finssim.quiet import start_warp
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.capability import level_speed, terminal_speed

@@ -20,8 +20,8 @@ from finssim.control.trajectories import PUBLISHED_NAMES, TRAJECTORIES, load_tra
 from finssim.experiments.campaign import progress_bar
 from finssim.experiments.tables import console_table
 from finssim.geometry.rotations import quat_yaw
-from finssim.learning.collect import collect as collect_episodes
 from finssim.learning.demonstrations import Episode, about, found_in, save
+from finssim.learning.demonstrations import collect as collect_episodes
 from finssim.provenance import provenance
 from finssim.robot.goals import station_of
 from finssim.robot.record_messages import STATES

@@ -17,7 +17,7 @@ from finssim.experiments.campaign import Say, choice, write_json
 from finssim.experiments.tables import console_table
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.pool import PlantSpec, VirtualPool, draw_plant, read_truth
-from finssim.pool.sites import positioning_of, site_of
+from finssim.pool.draw_plant import positioning_of, site_of
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.robot.lockstep import run_lockstep

@@ -49,8 +49,7 @@ from finssim.files import atomic_write
 from finssim.geometry.rotations import quat_from_yaw, quat_multiply, quat_yaw
 from finssim.localization.pool import Pool
 from finssim.pool import Truth, VirtualPool, draw_plant, read_truth
-from finssim.pool.camera import PoolCamera
-from finssim.pool.site import camera_of
+from finssim.pool.camera import PoolCamera, camera_of
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.robot.goals import check_reachable

@@ -34,7 +34,7 @@ from finssim.geometry.rotations import (
     quat_yaw,
 )
 from finssim.pool.task_site import Referee
-from finssim.pool.truth import read_truth
+from finssim.pool.virtual_pool import read_truth
 from finssim.robot.record_reader import open_record
 from finssim.tasks import Task
 from finssim.tasks.observer import fitted_task

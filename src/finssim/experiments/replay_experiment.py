@@ -32,7 +32,7 @@ from finssim.experiments.plants import PlantError
 from finssim.experiments.statistics import RESAMPLES, SEED, bootstrap
 from finssim.experiments.tables import console_table, markdown_table
 from finssim.files import atomic_directory, refuse_unwritable
-from finssim.pool.coupled import CoupledMatrix, Section, Three
+from finssim.pool.plant_spec import CoupledMatrix, Section, Three
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.vehicles import Vehicle, load_vehicle

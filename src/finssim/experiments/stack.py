@@ -19,11 +19,10 @@ from finssim.experiments.plants import load_plant
 from finssim.experiments.recorded import follows
 from finssim.experiments.tables import console_table, figure_text
 from finssim.experiments.trials import EpisodeError, run_episodes, summarize_episodes
-from finssim.pool.camera import PoolCamera
+from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.draw_plant import draw_plant
+from finssim.pool.draw_plant import site_of as plant_at
 from finssim.pool.plant_spec import Severity
-from finssim.pool.site import camera_of
-from finssim.pool.sites import site_of as plant_at
 from finssim.pool.task_site import TaskSite
 from finssim.robot.pilots import make_pilot
 from finssim.tasks import Task

@@ -11,15 +11,31 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from finssim.learning.served import one_agent, served
-from finssim.learning.spaces import action_space, observation_space
 from finssim.tasks import TASKS, Environment, EnvironmentSetupError, Task
 
-__all__ = ["Env", "VectorEnv"]
+__all__ = ["Env", "VectorEnv", "action_space", "observation_space"]
+
+
+# Gymnasium's spaces of an environment's observations and actions.
+
+
+def observation_space(environment: Environment) -> spaces.Box:
+    """Bounds of one world's observation: each part's clip, or none."""
+    parts = environment.task.observation
+    high = np.concatenate([np.full(part.size, np.inf if part.clip is None else part.clip) for part in parts])
+    return spaces.Box(-high.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+
+
+def action_space(environment: Environment) -> spaces.Box:
+    """One world's action: each component in [-1, 1]."""
+    return spaces.Box(-1.0, 1.0, shape=(environment.action_size,), dtype=np.float32)
+
 
 Observation = NDArray[np.float32]
 

@@ -9,8 +9,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
+from finssim.learning.gymnasium_env import action_space, observation_space
 from finssim.learning.served import served
-from finssim.learning.spaces import action_space, observation_space
 from finssim.tasks import Environment, EnvironmentSetupError, Task
 
 __all__ = ["PettingZooEnv"]

@@ -1,15 +1,16 @@
-"""Torch's networks as they are learnt elsewhere: one that remembers, and any of them as a plain `Network`."""
+"""Torch's networks: as learners begin with them, one that remembers, and any of them as a plain `Network`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import nn
 
 from finssim.learning.network import Activation, Cell, Linear, Network
 
-__all__ = ["RecurrentNetwork", "plain_network"]
+__all__ = ["RecurrentNetwork", "plain_network", "stack"]
 
 ACTIVATIONS = {nn.Tanh: "Tanh", nn.ReLU: "Relu", nn.ELU: "Elu", nn.Identity: "Identity"}
 """Activations with one ONNX operator of the same meaning."""
@@ -70,3 +71,18 @@ def _layers(module: nn.Module) -> Iterable[nn.Module]:
             yield from _layers(child)
     else:
         yield module
+
+
+def stack(inputs: int, hidden: Sequence[int], outputs: int, last_gain: float) -> nn.Sequential:
+    """Linear layers with ELU between them: orthogonal weights of gain √2, `last_gain` in the last, and no bias.
+
+    A small last gain lets a policy begin at action 0 whatever it sees.
+    """
+    layers: list[nn.Module] = []
+    sizes = [inputs, *hidden, outputs]
+    for i, (a, b) in enumerate(zip(sizes, sizes[1:], strict=False)):
+        linear, last = nn.Linear(a, b), i == len(hidden)
+        nn.init.orthogonal_(linear.weight, gain=last_gain if last else math.sqrt(2.0))
+        nn.init.zeros_(linear.bias)
+        layers += [linear] if last else [linear, nn.ELU()]
+    return nn.Sequential(*layers)

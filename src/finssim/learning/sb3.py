@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
+from finssim.learning.gymnasium_env import action_space, observation_space
 from finssim.learning.served import age_episodes, served
-from finssim.learning.spaces import action_space, observation_space
 from finssim.tasks import Environment, Task
 
 __all__ = ["Sb3VecEnv"]

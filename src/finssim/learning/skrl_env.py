@@ -10,8 +10,8 @@ import torch
 from gymnasium import spaces
 from skrl.envs.wrappers.torch import MultiAgentEnvWrapper, Wrapper
 
+from finssim.learning.gymnasium_env import action_space, observation_space
 from finssim.learning.served import age_episodes, served
-from finssim.learning.spaces import action_space, observation_space
 from finssim.learning.tensors import Tensors
 from finssim.tasks import Environment, Task
 

@@ -113,11 +113,10 @@ def train(
     scale = authority(chosen) if mode_name.startswith("wrench") else 1.0
     side = Path(out).with_name(f"{Path(out).name}-training")
 
+    from finssim.learning.episodes import HELD_WORLDS, HeldEvaluation, held_seed
     from finssim.learning.export import description_of
-    from finssim.learning.held_evaluation import HELD_WORLDS, HeldEvaluation, held_seed
     from finssim.learning.layers import one_thread
-    from finssim.learning.progress import TrainingView
-    from finssim.learning.training_loop import Loop, last_checkpoint
+    from finssim.learning.training_loop import Loop, TrainingView, last_checkpoint
 
     checkpoint = last_checkpoint(side) if resume else None
     randomized = randomization is not None

@@ -1,10 +1,8 @@
 """The virtual pool: the vehicle, its motor controller and its room, behind the wires that a real one has."""
 
-from finssim.pool.draw_plant import draw_plant
+from finssim.pool.draw_plant import SPREADS, draw_plant
 from finssim.pool.plant_spec import PlantSpec, PlantSpecError, load_plant_spec
-from finssim.pool.spread import SPREADS
-from finssim.pool.truth import Truth, TruthError, read_truth
-from finssim.pool.virtual_pool import VirtualPool
+from finssim.pool.virtual_pool import Truth, TruthError, VirtualPool, read_truth
 
 __all__ = [
     "SPREADS",

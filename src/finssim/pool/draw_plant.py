@@ -3,24 +3,229 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.pool.plant_spec import PlantSpec, PlantSpecError, Severity, basin_of
-from finssim.pool.share import hull_share, less_share, panel_drag, steady_share
-from finssim.pool.spread import SPREADS, Spread
+from finssim.geometry.mesh import face_geometry
+from finssim.pool.plant_spec import (
+    Basin,
+    Circulation,
+    PlantSpec,
+    PlantSpecError,
+    Propellers,
+    Severity,
+    Swell,
+    basin_of,
+    by_severity,
+)
+from finssim.pool.positioning import POSITIONING, Positioning
 from finssim.vehicles import Vehicle
-from finssim.vehicles.defaults import room
+from finssim.vehicles.defaults import SITES, room
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 
-__all__ = ["draw_plant"]
+__all__ = [
+    "SPREADS", "Spread", "cruise", "draw_plant", "hull_share", "less_share", "panel_drag", "positioning_of", "site_of",
+    "steady_share",
+]  # fmt: skip
+
+
+# How far the plants of each severity lie from the vehicle file.
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How far a plant of one severity lies from the vehicle file: ±, uniform, unless a name says otherwise."""
+
+    hydrodynamics: float
+    """Of every diagonal entry of added mass and damping [-]."""
+    center: float
+    """Of the points where they are diagonal, per axis [m]."""
+    tilt_deg: float
+    """Of the axes in which they are [deg]."""
+    hull_share: float
+    """Part of the drag, on the axis where it is largest, that the hull's panels make [-]."""
+    own_share: float
+    """Of the vehicle's speed that enters its propellers [-]."""
+    induced_share: float
+    """Of a neighbour's jet [-]."""
+    deduction: tuple[float, float]
+    """Least and most of the thrust [-]."""
+    thrust: float
+    """Of each propeller's thrust, in each direction [-]."""
+    motor: float
+    """Of each motor's lag, delay and slowest speed [-]."""
+    fade: float
+    """Of the battery in a quarter of an hour [-]."""
+    resistance: float
+    """Of the battery [ohm]."""
+    mass: float
+    """[kg]"""
+    gravity_offset: tuple[float, float]
+    """Least and most distance of the centre of gravity from where the file has it [m]."""
+    buoyancy: float
+    """Amplitude of its drift [g]."""
+    current: tuple[float, float]
+    """Least and most of the pool's circulation [m/s]; none at 0."""
+    tether_weight: float
+    """[N/m]"""
+    tether: tuple[float, float]
+    """Shortest and longest [m]; none at 0."""
+    noise: float
+    """Factor on the file's instrument noise [-]."""
+    pressure_drift: float
+    """[m/√s]"""
+    crystal: float
+    """[ppm]"""
+
+
+SPREADS: dict[Severity, Spread] = by_severity(
+    Spread,
+    hydrodynamics=(0.0, 0.1, 0.2),
+    center=(0.0, 0.012, 0.025),
+    tilt_deg=(0.0, 3.0, 6.0),
+    hull_share=(0.0, 0.1, 0.2),
+    own_share=(0.0, 0.4, 0.7),
+    induced_share=(0.0, 0.05, 0.1),
+    deduction=((0.0, 0.0), (0.02, 0.06), (0.04, 0.12)),
+    thrust=(0.0, 0.15, 0.25),
+    motor=(0.0, 0.2, 0.35),
+    fade=(0.0, 0.04, 0.08),
+    resistance=(0.0, 0.03, 0.06),
+    mass=(0.0, 0.012, 0.025),
+    gravity_offset=((0.0, 0.0), (0.003, 0.006), (0.006, 0.012)),
+    buoyancy=(0.0, 4.0, 8.0),
+    current=((0.0, 0.0), (0.02, 0.04), (0.04, 0.08)),
+    tether=((0.0, 0.0), (4.4, 5.0), (3.9, 4.5)),
+    tether_weight=(0.0, 0.015, 0.03),
+    noise=(0.5, 1.0, 1.5),
+    pressure_drift=(0.0, 2.0e-4, 4.0e-4),
+    crystal=(0.0, 30.0, 60.0),
+)
+"""What a careful laboratory would have, and about twice that."""
+
+
+# How much of a vehicle's steady drag its panels and its propellers make, by axis: so that damping keeps the rest.
+
 
 Array = NDArray[np.float64]
 
+CRUISE = 0.4
+"""Part of the largest wrench at which the shares are taken: between hovering and full speed [-]."""
 
-STREAM = 20261122
+LARGEST = 2.0 / 3.0
+"""Largest part of a damping coefficient that is taken out [-]."""
+
+SKIN = 0.02
+"""Skin drag over form drag, as in the published mesh set [-]."""
+
+
+def cruise(vehicle: Vehicle) -> tuple[Array, Array]:
+    """Steady wrench and velocity of each axis alone at `CRUISE`, by the file's damping.
+
+    Returns:
+        Wrench [N, N m] and velocity [m/s, rad/s], (6,) each; zeros where an axis is not controlled or not damped.
+    """
+    hydro: Any = vehicle.hydrodynamics["calibrated"]
+    d1, d2 = np.diag(hydro.linear_damping), np.diag(hydro.quadratic_damping)
+    F = CRUISE * np.asarray(vehicle.wrench_limits)
+    # d2 v² + d1 v = F, by the root that stays exact without d2.
+    root = d1 + np.sqrt(d1 * d1 + 4.0 * d2 * F)
+    v = np.divide(2.0 * F, root, out=np.zeros(6), where=root > 0.0)
+    return F, v
+
+
+def panel_drag(vehicle: Vehicle) -> Array:
+    """Drag of the hull's panels when cruising along each axis, with C_form = 1 [N, N m], (6,); zeros without a hull."""
+    if vehicle.hull is None:
+        return np.zeros(6)
+    _, v = cruise(vehicle)
+    hydro: Any = vehicle.hydrodynamics["calibrated"]
+    normal, area, middle = face_geometry(*vehicle.hull_mesh())
+    half = 0.5 * vehicle.water.density
+    drag = np.zeros(6)
+    arm = middle - np.asarray(hydro.reference_point)
+    for axis in range(6):
+        if axis < 3:
+            flow = np.zeros_like(middle)
+            flow[:, axis] = -v[axis]
+        else:
+            flow = -np.cross(np.eye(3)[axis - 3] * v[axis], arm)
+        across = np.sum(normal * flow, axis=1)
+        v_t = flow - across[:, None] * normal
+        skin = SKIN * np.linalg.norm(v_t, axis=1)[:, None] * v_t
+        pull = half * area[:, None] * (np.maximum(-across, 0.0)[:, None] * flow + skin)
+        total = pull.sum(axis=0) if axis < 3 else np.cross(arm, pull).sum(axis=0)
+        drag[axis] = -total[axis % 3]
+    return drag
+
+
+def hull_share(vehicle: Vehicle, share: float, drag: Array) -> dict[str, float]:
+    """Coefficients with which the panels make a share of the file's drag, on the driven axis where that is largest.
+
+    Args:
+        vehicle: Its file.
+        share: Of the drag when cruising [-].
+        drag: As from `panel_drag`.
+    """
+    F, _ = cruise(vehicle)
+    largest = np.max(np.divide(drag, F, out=np.zeros(6), where=F > 0.0), initial=0.0)
+    form = float(f"{share / largest:.6g}") if largest > 0.0 else 0.0
+    return {"form_drag": form, "skin_drag": float(f"{SKIN * form:.6g}")}
+
+
+def steady_share(vehicle: Vehicle, panels: Array, propellers: Mapping[str, float], deduction: float) -> Array:
+    """What panels and propellers take when cruising, by axis [N, N m], (6,).
+
+    The propellers' part is the thrust lost to their own motion through the water, T V / (J0 n D), see `losses`, and to
+    the thrust deduction: a file's damping was fitted to thrusts measured on a bench, so it holds both.
+
+    Args:
+        vehicle: Its file.
+        panels: Drag of the panels, by axis [N, N m], (6,).
+        propellers: Keys of `Propellers`.
+        deduction: Mean of the thrust deduction [-].
+    """
+    F, v = cruise(vehicle)
+    p = Propellers.model_validate(propellers)
+    thrusters = list(vehicle.thrusters.values())
+    B = vehicle.thruster_matrix()
+    axis = np.array([t.axis for t in thrusters])
+    place = np.array([t.position for t in thrusters])
+    taken = panels.copy()
+    for i in np.flatnonzero(v > 0.0):
+        T = np.linalg.pinv(B) @ (F[i] * np.eye(6)[i])
+        speed = np.array([abs(t.speed(f)) for t, f in zip(thrusters, T, strict=True)])
+        motion = np.eye(3)[i] if i < 3 else np.cross(np.eye(3)[i - 3], place)
+        own = v[i] * np.sum(axis * motion, axis=1)
+        stall = p.advance_at_zero_thrust * p.diameter / (2.0 * math.pi) * np.maximum(speed, 20.0)
+        taken[i] += B[i] @ (np.abs(T) * p.own_share * own / stall)
+    return np.where(v > 0.0, taken + deduction * F, 0.0)
+
+
+def less_share(vehicle: Vehicle, D1: Array, D2: Array, taken: Array) -> tuple[Array, Array]:
+    """Damping that is left when a part of the drag is made by something else; a third always stays.
+
+    Args:
+        vehicle: Its file.
+        D1: Linear [N s/m, N m s], (6, 6).
+        D2: Quadratic [N s²/m², N m s²], (6, 6).
+        taken: Drag when cruising, by axis [N, N m], (6,): out of the linear part first.
+
+    Returns:
+        D1 and D2 with smaller diagonals.
+    """
+    _, v = cruise(vehicle)
+    first = np.minimum(taken, LARGEST * np.diag(D1) * v)
+    second = np.minimum(taken - first, LARGEST * np.diag(D2) * v * v)
+    safe = np.where(v > 0.0, v, 1.0)
+    return D1 - np.diag(first / safe), D2 - np.diag(second / safe**2)
+
+
+DRAWN = 20261122
 """Sets the draws of plants apart from everything else that a seed starts."""
 
 
@@ -50,7 +255,7 @@ def draw_plant(vehicle: Vehicle, seed: int, severity: Severity = "realistic") ->
             "add it to the file to put the vehicle into a pool"
         )
     spread = SPREADS[severity]
-    draw = _Draw(np.random.default_rng([seed, STREAM]))
+    draw = _Draw(np.random.default_rng([seed, DRAWN]))
     sections: dict[str, Any] = {
         "title": f"{vehicle.name}, {severity} plant {seed}",
         "severity": severity,
@@ -199,3 +404,67 @@ def _tether(vehicle: Vehicle, spread: Spread, draw: _Draw) -> dict[str, Any] | N
         "length": length,
         "wet_weight": weight,
     }
+
+
+# Where a vehicle swims: pool, tank or open water, and how it learns where it is there.
+
+
+TANK, OPEN = (
+    Basin(length=size[0], width=size[1], depth=size[2]) for size in SITES.values() if size is not None
+)
+STREAM = {"nominal": 0.0, "realistic": 0.1, "hard": 0.25}
+"""Current of open water by severity [m/s]."""
+SWELL = {"nominal": 0.0, "realistic": 0.05, "hard": 0.15}
+"""Amplitude of the longest of its three waves [m]."""
+
+
+def site_of(name: str, spec: PlantSpec) -> PlantSpec:
+    """The plant at a site: the vehicle as it is built, in other water.
+
+    Args:
+        name: pool, tank (10 m x 6 m, 5 m deep, still but for the pool's own eddies) or open-water (20 m deep, without
+            walls that it could meet or a tether, with a stream and three waves by severity).
+        spec: Drawn for the pool.
+
+    Raises:
+        PlantSpecError: There is no such site, or the vehicle has no room in it.
+    """
+    if name not in SITES:
+        raise PlantSpecError(f"unknown site '{name}'; available: {', '.join(SITES)}")
+    if name == "pool":
+        return spec
+    if name == "tank":
+        if spec.basin.length > TANK.length:
+            raise PlantSpecError(
+                f"{spec.vehicle} needs {spec.basin.length:.1f} m, the tank has {TANK.length:g} m: take open-water"
+            )
+        return spec.model_copy(update={"basin": TANK, "tether": None})
+    random = np.random.default_rng([spec.seed, 0x5EA])
+    towards, speed = float(random.uniform(-math.pi, math.pi)), STREAM[spec.severity]
+    waves = tuple(
+        Swell(
+            amplitude=SWELL[spec.severity] * share,
+            wavelength=length,
+            heading=towards + float(random.uniform(-0.5, 0.5)),
+            phase=float(random.uniform(-math.pi, math.pi)),
+        )
+        for share, length in ((1.0, 12.0), (0.5, 7.0), (0.3, 4.0))
+        if SWELL[spec.severity]
+    )
+    stream = (speed * math.cos(towards), speed * math.sin(towards), 0.0)
+    return spec.model_copy(
+        update={"basin": OPEN, "tether": None, "circulation": Circulation(stream=stream, waves=waves)}
+    )
+
+
+def positioning_of(name: str, seed: int) -> Positioning | None:
+    """The positioning system of that name; None for `none`.
+
+    Raises:
+        PlantSpecError: There is no such system.
+    """
+    if name == "none":
+        return None
+    if name not in POSITIONING:
+        raise PlantSpecError(f"unknown positioning '{name}'; available: none, {', '.join(POSITIONING)}")
+    return Positioning(POSITIONING[name], seed)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
-from finssim.pool.attitude import AttitudeFilter
-from finssim.pool.motors import RPM
-from finssim.pool.plant_spec import PlantSpec
-from finssim.pool.sensors import Sample
+from finssim.pool.plant import RPM, Plant, captured
+from finssim.pool.plant_spec import Instruments, PlantSpec
 from finssim.robot.link.frames import (
     DEBUG_ECHO,
     MCU,
@@ -20,10 +23,206 @@ from finssim.robot.link.frames import (
     encode_command,
     encode_echo,
 )
-from finssim.robot.messages import CommandEcho, Telemetry, ThrusterCommand
+from finssim.robot.messages import HEADING, VELOCITY, CommandEcho, NavigationAid, Telemetry, ThrusterCommand
+from finssim.sensors import SensorSuite
 from finssim.vehicles import Vehicle
 
-__all__ = ["Firmware"]
+__all__ = ["AttitudeFilter", "Firmware", "PoolSensors", "Sample"]
+
+
+# The instruments aboard: the simulator's IMU and pressure gauge, sampled on the motor controller's clock.
+
+
+IMU_ERRORS = (
+    "gyro_noise_density",
+    "gyro_bias_walk",
+    "gyro_bias_initial",
+    "accel_noise_density",
+    "accel_bias_walk",
+    "accel_bias_initial",
+)
+
+
+class Sample(NamedTuple):
+    """What the motor controller has read at one time."""
+
+    gyro: tuple[float, float, float]
+    """IMU frame [rad/s]."""
+    accel: tuple[float, float, float]
+    """Specific force, IMU frame [m/s²]."""
+    depth: float
+    """Of the pressure port, positive down [m]."""
+    pressure: float
+    """Absolute [Pa]."""
+
+
+class PoolSensors:
+    """IMU and pressure gauge of one plant; `sample` reads both once per period of the IMU."""
+
+    def __init__(self, plant: Plant, seed: int) -> None:
+        """Switch them on: turn-on biases are drawn.
+
+        Args:
+            plant: What they measure.
+            seed: Of their errors.
+        """
+        self.period = 1.0 / plant.vehicle.sensors.imu.rate  # type: ignore[union-attr]
+        """Between samples [s]."""
+        vehicle = with_instruments(plant.vehicle, plant.spec.instruments)
+        key = int(np.random.SeedSequence([seed, 72]).generate_state(1)[0] >> 1)
+        floor = plant.spec.basin.depth
+        suite = SensorSuite(vehicle, worlds=1, control_step=self.period, seed=key, floor_depth=floor)
+        state = plant.simulator.state
+        self._state = SimpleNamespace(
+            position=state.position,
+            quaternion=state.quaternion,
+            velocity=state.velocity,
+            acceleration=state.acceleration,
+            steps=wp.zeros(1, dtype=int, device="cpu"),
+            episode=wp.zeros(1, dtype=int, device="cpu"),
+        )
+        suite.reset(self._state)
+        self._update, self._suite = captured(lambda: suite.update(self._state)), suite
+        self._count: Any = self._state.steps.numpy()
+
+        def view(readings: Any) -> Any:
+            return readings.numpy()[0]
+
+        imu, gauge = suite.imu, suite.depth
+        assert imu is not None and gauge is not None  # draw_plant refuses a vehicle without them
+        self._gyro, self._accel = view(imu.gyro)[0], view(imu.accel)[0]
+        self._depth, self._pressure = view(gauge.depth), view(gauge.pressure)
+        self._aids = [
+            (kind, view(batch.fresh), view(batch.stamp), np.atleast_2d(view(reading)))
+            for kind, batch, reading in (
+                (VELOCITY, suite.dvl, suite.dvl and suite.dvl.velocity),
+                (HEADING, suite.compass, suite.compass and suite.compass.heading),
+            )
+            if batch is not None
+        ]
+        self._sent = 0
+
+    def sample(self) -> Sample:
+        """Read both; the gauge gives its newest sample that has arrived."""
+        self._count[0] += 1
+        self._update()
+        return Sample(
+            tuple(self._gyro.tolist()),
+            tuple(self._accel.tolist()),
+            float(self._depth[0]),
+            float(self._pressure[0]),
+        )
+
+    def aids(self) -> list[NavigationAid]:
+        """What Doppler log and compass have delivered at the newest `sample`."""
+        found = []
+        for kind, fresh, stamp, reading in self._aids:
+            if not fresh[0]:
+                continue
+            values = [*reading[0].tolist(), 0.0, 0.0]
+            age = max(float(self._count[0]) * self.period - float(stamp[0]), 0.0)
+            self._sent += 1
+            found.append(
+                NavigationAid(self._sent & 0xFFFF, kind, age, (values[0], values[1], values[2]), (0.0, 0.0))
+            )
+        return found
+
+
+def with_instruments(vehicle: Vehicle, instruments: Instruments) -> Vehicle:
+    """The vehicle with the errors that its instruments have in this plant.
+
+    The IMU's latency is left out: it is the time between a sample and its frame, which the firmware takes.
+    """
+    factor = instruments.noise
+    imu, gauge = vehicle.sensors.imu, vehicle.sensors.depth
+    assert imu is not None and gauge is not None
+    scaled = {name: factor * getattr(imu, name) for name in IMU_ERRORS}
+    walk = float(np.hypot(factor * gauge.bias_walk, instruments.pressure_drift))
+    drifting = {
+        "noise_std": factor * gauge.noise_std,
+        "bias_initial": factor * gauge.bias_initial,
+        "bias_walk": walk,
+    }
+    sensors = vehicle.sensors.model_copy(
+        update={
+            "imu": imu.model_copy(update={**scaled, "latency": 0.0}),
+            "depth": gauge.model_copy(update=drifting),
+        }
+    )
+    return vehicle.model_copy(update={"sensors": sensors})
+
+
+# The motor controller's attitude filter: gyroscope integrated, tilt from the accelerometer, yaw left to drift.
+
+
+Three = tuple[float, float, float]
+
+
+class AttitudeFilter:
+    """Complementary filter on the rotation group (Mahony, Hamel and Pflimlin 2008, explicit form), without a compass.
+
+    With up the accelerometer's direction and R the estimate: e = up × Rᵀ z, b_dot = -ki e, q_dot = ½ q (ω - b + kp e).
+    Plain floats: at this size NumPy would cost ten times as much.
+    """
+
+    def __init__(self, gain: float, integral: float, gravity: float) -> None:
+        """Start without a sample.
+
+        Args:
+            gain: kp [1/s].
+            integral: ki [1/s²].
+            gravity: [m/s²]; specific forces far from it are not used.
+        """
+        self.gain, self.integral, self.gravity = gain, integral, gravity
+        self.bias: Three = (0.0, 0.0, 0.0)
+        """Of the gyroscope, as estimated [rad/s]; its vertical part cannot be seen and stays about 0."""
+        self._q: tuple[float, float, float, float] | None = None
+
+    @property
+    def quaternion(self) -> tuple[float, float, float, float]:
+        """IMU frame to level world, xyzw; identity before the first sample."""
+        w, x, y, z = self._q or (1.0, 0.0, 0.0, 0.0)
+        return x, y, z, w
+
+    def update(self, gyro: Three, accel: Three, dt: float) -> None:
+        """Take one sample.
+
+        Args:
+            gyro: IMU frame [rad/s].
+            accel: Specific force, IMU frame [m/s²].
+            dt: Since the last [s].
+        """
+        if self._q is None:
+            self._q = _level(accel)
+            return
+        w, x, y, z = self._q
+        p, q, r = (rate - bias for rate, bias in zip(gyro, self.bias, strict=True))
+        length = math.sqrt(accel[0] ** 2 + accel[1] ** 2 + accel[2] ** 2)
+        if 0.7 * self.gravity < length < 1.3 * self.gravity:
+            ax, ay, az = accel[0] / length, accel[1] / length, accel[2] / length
+            ux, uy, uz = 2.0 * (x * z - w * y), 2.0 * (w * x + y * z), w * w - x * x - y * y + z * z
+            ex, ey, ez = ay * uz - az * uy, az * ux - ax * uz, ax * uy - ay * ux
+            k = self.integral * dt
+            self.bias = (self.bias[0] - k * ex, self.bias[1] - k * ey, self.bias[2] - k * ez)
+            p, q, r = p + self.gain * ex, q + self.gain * ey, r + self.gain * ez
+        h = 0.5 * dt
+        w, x, y, z = (
+            w + h * (-x * p - y * q - z * r),
+            x + h * (w * p + y * r - z * q),
+            y + h * (w * q - x * r + z * p),
+            z + h * (w * r + x * q - y * p),
+        )
+        norm = math.sqrt(w * w + x * x + y * y + z * z)
+        self._q = (w / norm, x / norm, y / norm, z / norm)
+
+
+def _level(accel: Three) -> tuple[float, float, float, float]:
+    """Attitude at yaw 0 in which a specific force points upwards, wxyz."""
+    roll = math.atan2(accel[1], accel[2])
+    pitch = math.atan2(-accel[0], math.hypot(accel[1], accel[2]))
+    cr, sr, cp, sp = math.cos(roll / 2), math.sin(roll / 2), math.cos(pitch / 2), math.sin(pitch / 2)
+    return cr * cp, sr * cp, cr * sp, -sr * sp
+
 
 Array = NDArray[np.float64]
 

@@ -2,15 +2,69 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import heapq
+import random
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from itertools import count
 
-from finssim.pool.medium import Medium
+import numpy as np
+from numpy.typing import NDArray
+
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.messages import Picture
 from finssim.robot.runtime import Runtime
+from finssim.tasks.communication import Communication
 
-__all__ = ["Fleet", "one_picture"]
+__all__ = ["Fleet", "Medium", "one_picture"]
+
+
+# What vehicles send each other, on its way through the water: late by the way, and sometimes lost, as in training.
+
+
+Array = NDArray[np.float64]
+
+
+class Medium:
+    """Brings a datagram to everybody else; which are lost follows from the seed and the order of sending."""
+
+    def __init__(
+        self,
+        positions: Callable[[], Mapping[str, Array]],
+        communication: Communication | None = None,
+        seed: int = 0,
+    ) -> None:
+        """
+        Args:
+            positions: Where everybody is, by name, world frame [m], (3,).
+            communication: Speed of sound, processing time and loss; None: everything arrives at once.
+            seed: Of what is lost.
+        """
+        self._positions, self._communication = positions, communication
+        self._random = random.Random(f"medium {seed}")
+        self._order = count()
+        self._under_way: dict[str, list[tuple[float, int, bytes]]] = {name: [] for name in positions()}
+
+    def send(self, now: float, sender: str, datagram: bytes, *, lossless: bool = False) -> None:
+        """Put a datagram into the water at a time [s]; one that is `lossless` is on a cable."""
+        places, c = self._positions(), self._communication
+        for name, under_way in self._under_way.items():
+            if name == sender:
+                continue
+            arrival = now
+            if c is not None and not lossless:
+                if self._random.random() < c.loss:
+                    continue
+                way = float(np.linalg.norm(places[name] - places[sender]))
+                arrival += way / c.speed_of_sound + c.processing
+            heapq.heappush(under_way, (arrival, next(self._order), datagram))
+
+    def receive(self, now: float, name: str) -> list[bytes]:
+        """What has reached somebody by a time [s], in the order of arrival."""
+        under_way, out = self._under_way[name], []
+        while under_way and under_way[0][0] <= now + 1e-9:
+            out.append(heapq.heappop(under_way)[2])
+        return out
 
 
 class Fleet:

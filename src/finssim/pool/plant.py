@@ -9,21 +9,415 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.engine import Pool, Simulator, Water, Wave
+from finssim.engine import Pool, Simulator, TetherLine, Water, Wave
 from finssim.engine.plant_arrays import NO_LIMIT
 from finssim.physics.hydrostatics import submerged_fraction
 from finssim.physics.kinematics import up_in_body
+from finssim.physics.motors import thrust_of_speed
 from finssim.physics.terms.composed import layout
-from finssim.physics.types import join, mat66, vec6, vec8
-from finssim.pool.current import Gyre, circulation_at, gyre
-from finssim.pool.losses import PropellerBank, delivered_thrust, propeller_bank
-from finssim.pool.motors import MotorBank, motor_bank, turn_motors
-from finssim.pool.plant_spec import PlantSpec, PlantSpecError
-from finssim.pool.tether import Slack, dragged_line, slack_line, slack_pull
+from finssim.physics.types import angular, join, linear, mat66, vec6, vec8
+from finssim.pool.plant_spec import Basin, Circulation, PlantSpec, PlantSpecError, SlackTether
 from finssim.vehicles import Vehicle
 from finssim.vehicles.hydrodynamics import MeshSet
 
+# The pool's own circulation: eddies in a box, still at the walls, that come and go slowly.
+
+
+@wp.struct
+class Gyre:
+    """The circulation, by mode."""
+
+    count: int
+    length: float  # [m]
+    width: float  # [m]
+    depth: float  # [m]
+    floor_share: float
+    stream: wp.vec3  # the same everywhere [m/s]
+    cells: wp.array(dtype=float)
+    speed: wp.array(dtype=float)  # signed by the sense of rotation [m/s]
+    unsteadiness: wp.array(dtype=float)
+    rate: wp.array(dtype=float)  # [rad/s]
+    phase: wp.array(dtype=float)
+
+
+@wp.func
+def circulation_at(gyre: Gyre, position: wp.vec3, t: float) -> wp.vec3:
+    """Velocity of the water, world frame [m/s].
+
+    From the stream function psi = A sin(πX) sin(cπX) sin²(πY), with X and Y from wall to wall and c cells:
+    (u, v) = (∂psi/∂y, -∂psi/∂x) is free of divergence, and both components vanish at all four walls. The speed along y
+    is largest for c = 1 at A π / length, that along x at A π / width.
+
+    Args:
+        gyre: The circulation.
+        position: World frame [m].
+        t: Time [s].
+
+    Returns:
+        The stream, and horizontally what the eddies add to it within the walls.
+    """
+    X = position[0] / gyre.length + 0.5
+    Y = position[1] / gyre.width + 0.5
+    if X <= 0.0 or X >= 1.0 or Y <= 0.0 or Y >= 1.0:
+        return gyre.stream
+    sx = wp.sin(wp.pi * X)
+    cx = wp.cos(wp.pi * X)
+    sy = wp.sin(wp.pi * Y)
+    cy = wp.cos(wp.pi * Y)
+    height = wp.clamp(1.0 + position[2] / gyre.depth, 0.0, 1.0)
+    share = gyre.floor_share + (1.0 - gyre.floor_share) * height
+    u = float(0.0)
+    v = float(0.0)
+    for i in range(gyre.count):
+        c = gyre.cells[i]
+        sc = wp.sin(c * wp.pi * X)
+        cc = wp.cos(c * wp.pi * X)
+        now = gyre.speed[i] * (1.0 + gyre.unsteadiness[i] * wp.sin(gyre.rate[i] * t + gyre.phase[i]))
+        # A is chosen so that the larger of the two components has the mode's speed.
+        A = now * wp.min(gyre.width, gyre.length / c) / wp.pi
+        u += A * sx * sc * (2.0 * wp.pi / gyre.width) * sy * cy
+        v -= A * (wp.pi / gyre.length) * (cx * sc + c * sx * cc) * sy * sy
+    return gyre.stream + share * wp.vec3(u, v, 0.0)
+
+
+def gyre(circulation: Circulation, basin: Basin, device: Any = "cpu") -> Gyre:
+    """The struct that kernels take."""
+    out = Gyre()
+    modes = circulation.eddies
+    out.count = len(modes)
+    out.length, out.width, out.depth = basin.length, basin.width, basin.depth
+    out.floor_share, out.stream = circulation.floor_share, wp.vec3(*circulation.stream)
+    return with_arrays(
+        out,
+        device,
+        cells=[m.cells for m in modes],
+        speed=[m.sense * m.speed for m in modes],
+        unsteadiness=[m.unsteadiness for m in modes],
+        rate=[2.0 * math.pi / m.period for m in modes],
+        phase=[m.phase for m in modes],
+    )
+
+
+# What a hull, its motion and the neighbouring jets take from a propeller's thrust.
+
+
 Array = NDArray[np.float64]
+
+
+def with_arrays(struct: Any, device: Any = "cpu", **columns: Any) -> Any:
+    """Give a struct its arrays of numbers, by name; one 0 where there are none."""
+    for name, values in columns.items():
+        numbers = np.asarray(values if len(values) else [0.0], dtype=np.float32)
+        setattr(struct, name, wp.array(numbers, dtype=float, device=device))
+    return struct
+
+
+SLOWEST = 3.0
+"""Below this propeller speed the loss of thrust is taken as at it [1/s]: there is hardly any thrust to lose."""
+
+
+@wp.struct
+class PropellerBank:
+    """All propellers, in canonical order."""
+
+    count: int
+    axis: wp.array(dtype=wp.vec3)
+    place: wp.array(dtype=wp.vec3)  # body frame [m]
+    c_plus: wp.array(dtype=float)  # as built, less the thrust deduction [N s²/rad²]
+    c_minus: wp.array(dtype=float)
+    own_share: float
+    share: wp.array2d(dtype=float)  # part of neighbour j's induced speed that enters propeller k
+    stall: float  # J0 D / 2π: inflow at which a shaft speed gives no thrust, per shaft speed [m]
+    disc: float  # 2 ρ times the disc's area [kg/m]
+
+
+@wp.func
+def delivered_thrust(propellers: PropellerBank, speed: wp.array(dtype=float), nu_r: vec6) -> vec8:
+    """Thrust that reaches the vehicle, T = T_bollard (1 - V / (J0 n D)), by propeller [N].
+
+    The inflow V is a share of the vehicle's own speed along the thrust, v·a sign T, and what the neighbours' jets add:
+    their induced speed sqrt(|T| / 2 ρ A), by momentum theory, falling with distance.
+
+    Args:
+        propellers: All of them.
+        speed: Shaft speeds [rad/s], (n,).
+        nu_r: Velocity relative to the water, body frame [m/s, rad/s].
+    """
+    bollard = vec8()
+    for k in range(propellers.count):
+        bollard[k] = thrust_of_speed(speed[k], propellers.c_plus[k], propellers.c_minus[k])
+    T = vec8()
+    for k in range(propellers.count):
+        V = float(0.0)
+        for j in range(propellers.count):
+            V += propellers.share[k, j] * wp.sqrt(wp.abs(bollard[j]) / propellers.disc)
+        own = wp.dot(propellers.axis[k], linear(nu_r) + wp.cross(angular(nu_r), propellers.place[k]))
+        V += propellers.own_share * wp.sign(bollard[k]) * own
+        slowest = wp.static(2.0 * math.pi * SLOWEST)
+        loss = V / (propellers.stall * wp.max(wp.abs(speed[k]), slowest))
+        T[k] = bollard[k] * (1.0 - wp.clamp(loss, -1.0, 1.0))
+    return T
+
+
+def induced_shares(vehicle: Vehicle, spec: PlantSpec) -> Array:
+    """Part of neighbour j's induced speed that enters propeller k, (n, n)."""
+    p = spec.propellers
+    place = np.array([t.position for t in vehicle.thrusters.values()])
+    distance = np.linalg.norm(place[:, None] - place, axis=-1)
+    return np.asarray(
+        p.induced_share * np.exp(-distance / p.induced_reach) * (1.0 - np.eye(len(vehicle.thrusters)))
+    )
+
+
+def propeller_bank(vehicle: Vehicle, spec: PlantSpec, device: Any = "cpu") -> PropellerBank:
+    """The propellers of a vehicle as one plant has them."""
+    told = list(vehicle.thrusters.values())
+    true = [spec.thrusters[name] for name in vehicle.thruster_names]
+    bank = PropellerBank()
+    bank.count = len(told)
+    bank.axis = wp.array(np.array([t.axis for t in told]), dtype=wp.vec3, device=device)
+    bank.place = wp.array(np.array([t.position for t in told]), dtype=wp.vec3, device=device)
+    built = list(zip(told, true, strict=True))
+    with_arrays(
+        bank,
+        device,
+        c_plus=[t.c_plus * b.gain_plus * (1.0 - b.deduction) for t, b in built],
+        c_minus=[t.c_minus * b.gain_minus * (1.0 - b.deduction) for t, b in built],
+        share=induced_shares(vehicle, spec),
+    )
+    bank.own_share = spec.propellers.own_share
+    bank.stall = spec.propellers.advance_at_zero_thrust * spec.propellers.diameter / (2.0 * math.pi)
+    bank.disc = 2.0 * vehicle.water.density * 0.25 * math.pi * spec.propellers.diameter**2
+    return bank
+
+
+# The pull of a slack tether: none until it is nearly straight. Its drag and weight are the engine's `TetherLine`.
+
+
+@wp.struct
+class Slack:
+    """A line that pulls only near its full length; a stiffness of 0 means none."""
+
+    anchor: wp.vec3  # world frame [m]
+    attachment: wp.vec3  # body frame [m]
+    start: float  # distance at which the pull sets in [m]
+    stretch: float  # from there to straight [m]
+    stiffness: float  # when straight [N/m]
+
+
+@wp.func
+def slack_pull(line: Slack, position: wp.vec3, q: wp.quat) -> vec6:
+    """Wrench of the line on the vehicle about its origin, body frame [N, N m].
+
+    With e the distance beyond the start and s the stretch to straight: F = k e²/(2 s) for e < s, then k (e - s/2). The
+    pull derives from a potential, so over a closed path it does no work.
+
+    Args:
+        line: The line.
+        position: Body origin, world frame [m].
+        q: Attitude, body to world.
+    """
+    if line.stiffness <= 0.0:
+        return vec6()
+    along = line.anchor - position - wp.quat_rotate(q, line.attachment)
+    distance = wp.length(along)
+    e = distance - line.start
+    if e <= 0.0:
+        return vec6()
+    pull = line.stiffness * wp.where(e < line.stretch, 0.5 * e * e / line.stretch, e - 0.5 * line.stretch)
+    force = wp.quat_rotate_inv(q, along * (pull / distance))
+    return join(force, wp.cross(line.attachment, force))
+
+
+def slack_line(tether: SlackTether | None) -> Slack:
+    """The struct that kernels take."""
+    line = Slack()
+    if tether is not None:
+        line.anchor, line.attachment = wp.vec3(*tether.anchor), wp.vec3(*tether.attachment)
+        line.stretch = tether.slack_share * tether.length
+        line.start = tether.length - line.stretch
+        line.stiffness = tether.stiffness
+    return line
+
+
+def dragged_line(tether: SlackTether | None) -> TetherLine | None:
+    """Drag and weight of the line, for the engine."""
+    if tether is None:
+        return None
+    return TetherLine(
+        anchor=tether.anchor,
+        attachment=tether.attachment,
+        diameter=tether.diameter,
+        drag_coefficient=tether.drag_coefficient,
+        wet_weight=tether.wet_weight,
+    )
+
+
+# Motors, their battery, and the speed loop that the firmware runs for each: Warp functions over all motors at once.
+
+
+RPM = 2.0 * math.pi / 60.0
+"""One turn a minute [rad/s]."""
+
+FILTER = 0.02
+"""Time constant of the measured speed in the derivative term [s]."""
+
+
+@wp.struct
+class MotorBank:
+    """Parameters and memory of all motors, in canonical order; speeds are canonical too (positive pushes forward)."""
+
+    count: int
+    alpha: wp.array(dtype=float)  # 1 - exp(-motor step / time constant)
+    delay: wp.array(dtype=int)  # motor steps from throttle to shaft
+    full: wp.array(dtype=float)  # steady speed at full throttle on a full battery [rad/s]
+    dead_plus: wp.array(dtype=float)  # slowest speed that turns the shaft [rad/s]
+    dead_minus: wp.array(dtype=float)  # as a magnitude
+
+    full_voltage: float  # [V]
+    fade: float
+    fade_time: float  # [s]
+    resistance: float  # [ohm]
+    motor_power: float  # at full speed [W]
+    idle_current: float  # [A]
+
+    loop_steps: int  # motor steps between runs of the loop
+    loop_period: float  # [s]
+    scale: wp.array(dtype=float)  # speed that the firmware believes full throttle gives [rad/s]
+    model_alpha: wp.array(dtype=float)  # of the response that the firmware expects, per run of the loop
+    kp: float
+    ki: float  # [1/s]
+    kd: float  # [s]
+    noise: float  # of one speed measurement [rad/s]
+    quantum: float  # [rad/s]
+
+    target: wp.array(dtype=float)  # [rad/s]
+    speed: wp.array(dtype=float)  # true shaft speed [rad/s]
+    measured: wp.array(dtype=float)  # newest measurement [rad/s]
+    smooth: wp.array(dtype=float)  # for the derivative
+    expected: wp.array(dtype=float)  # response that the firmware expects [rad/s]
+    integral: wp.array(dtype=float)
+    throttle: wp.array(dtype=float)  # newest, -1 to 1
+    line: wp.array2d(dtype=float)  # throttles on their way
+    electric: wp.array(dtype=float)  # battery voltage [V], current [A]
+
+
+@wp.func
+def throttle_of(motors: MotorBank, k: int, noise: float) -> float:
+    """One run of the speed loop of motor k: feed-forward plus PID on the deviation from the expected response.
+
+    Args:
+        motors: All motors; memory of motor k is written.
+        k: Which motor.
+        noise: A standard normal number.
+
+    Returns:
+        Throttle, -1 to 1.
+    """
+    measured = motors.speed[k] + motors.noise * noise
+    if motors.speed[k] == 0.0:
+        measured = 0.0  # a shaft that stands gives no pulses to count
+    if motors.quantum > 0.0:
+        measured = motors.quantum * wp.round(measured / motors.quantum)
+    motors.measured[k] = measured
+    before = motors.smooth[k]
+    motors.smooth[k] = before + (motors.loop_period / wp.static(FILTER)) * (measured - before)
+    target = motors.target[k]
+    if target == 0.0:
+        motors.integral[k] = 0.0
+        motors.expected[k] = measured
+        return 0.0
+    scale = motors.scale[k]
+    expected = motors.expected[k] + motors.model_alpha[k] * (target - motors.expected[k])
+    motors.expected[k] = expected
+    error = (expected - measured) / scale
+    rate = (motors.smooth[k] - before) / (motors.loop_period * scale)
+    u = target / scale + motors.kp * error + motors.integral[k] - motors.kd * rate
+    # Integrate only while the throttle is free to follow.
+    if wp.abs(u) < 1.0 or u * error < 0.0:
+        motors.integral[k] = motors.integral[k] + motors.ki * motors.loop_period * error
+    # A motor that is told to turn one way is never driven the other way: reversing is for the target to say.
+    return wp.clamp(u, wp.where(target > 0.0, 0.0, -1.0), wp.where(target > 0.0, 1.0, 0.0))
+
+
+@wp.func
+def steady_speed(motors: MotorBank, k: int, throttle: float, voltage: float) -> float:
+    """Speed at which motor k settles [rad/s]: throttle times voltage, and none below the slowest that turns."""
+    speed = throttle * motors.full[k] * voltage / motors.full_voltage
+    if speed < motors.dead_plus[k] and speed > -motors.dead_minus[k]:
+        return 0.0
+    return speed
+
+
+@wp.func
+def turn_motors(motors: MotorBank, tick: int, dt: float, noise: wp.uint32):
+    """One motor step of every motor: speed loop when due, delay line, first-order lag.
+
+    Args:
+        motors: All motors; their memory is written.
+        tick: Motor steps since the start.
+        dt: Motor step [s], for the battery's fade.
+        noise: Random state of this step.
+    """
+    power = float(0.0)
+    slots = motors.line.shape[1]
+    age = wp.min(float(tick) * dt / motors.fade_time, 1.0)
+    rest = motors.full_voltage * (1.0 - motors.fade * age)
+    voltage = rest - motors.resistance * motors.electric[1]
+    for k in range(motors.count):
+        if tick % motors.loop_steps == 0:
+            motors.throttle[k] = throttle_of(motors, k, wp.randn(noise))
+        motors.line[k, tick % slots] = motors.throttle[k]
+        late = motors.line[k, (tick + slots - motors.delay[k]) % slots]
+        goal = steady_speed(motors, k, late, voltage)
+        speed = motors.speed[k] + motors.alpha[k] * (goal - motors.speed[k])
+        if goal == 0.0 and wp.abs(speed) < 1.0:
+            speed = 0.0  # friction stops a shaft for good
+        motors.speed[k] = speed
+        part = wp.abs(speed) / motors.full[k]
+        power += motors.motor_power * part * part * part
+    motors.electric[0] = voltage
+    motors.electric[1] = motors.idle_current + power / voltage
+
+
+def motor_bank(vehicle: Vehicle, spec: PlantSpec, dt: float, device: Any = "cpu") -> MotorBank:
+    """Motors at rest.
+
+    Args:
+        vehicle: As its file has it: what the firmware believes.
+        spec: As it is.
+        dt: Motor step [s].
+        device: Warp device.
+    """
+    true = [spec.thrusters[name] for name in vehicle.thruster_names]
+    told = list(vehicle.thrusters.values())
+    firmware = spec.firmware
+    bank = MotorBank()
+    n = bank.count = len(true)
+    bank.loop_steps = max(1, round(firmware.loop_period / dt))
+    bank.loop_period = bank.loop_steps * dt
+    delay = [round(t.delay / dt) for t in true]
+    lag = np.array([t.time_constant + t.delay for t in told])
+    arrays = {
+        "alpha": 1.0 - np.exp(-dt / np.array([t.time_constant for t in true])),
+        "full": [t.full_rpm * RPM for t in true],
+        "dead_plus": [t.dead_rpm_plus * RPM for t in true],
+        "dead_minus": [t.dead_rpm_minus * RPM for t in true],
+        "scale": [max(t.rpm_max, -t.rpm_min) * RPM / firmware.feed_forward for t in told],
+        "model_alpha": 1.0 - np.exp(-bank.loop_period / lag),
+        **{name: np.zeros(n) for name in ("target", "speed", "measured", "smooth", "expected")},
+        **{name: np.zeros(n) for name in ("integral", "throttle")},
+        "electric": [spec.battery.full_voltage, spec.battery.idle_current],
+    }
+    with_arrays(bank, device, **arrays)
+    bank.delay = wp.array(delay, dtype=int, device=device)
+    bank.line = wp.zeros((n, max(delay) + 1), dtype=float, device=device)
+    for name in ("full_voltage", "fade", "fade_time", "resistance", "motor_power", "idle_current"):
+        setattr(bank, name, getattr(spec.battery, name))
+    bank.kp, bank.ki, bank.kd = firmware.gain, firmware.integral_gain, firmware.derivative_gain
+    bank.noise, bank.quantum = firmware.rpm_noise * RPM, firmware.rpm_quantum * RPM
+    return bank
+
 
 LONGEST_STEP = 0.005
 """Longest physics step [s]."""
@@ -290,11 +684,9 @@ def _hidden(vehicle: Vehicle, spec: PlantSpec) -> Hidden:
     hidden.half_height = vehicle.body.surface_half_height
     drift = spec.buoyancy
     hidden.drifts = len(drift.grams)
-    columns = {
-        "drift": [0.001 * g * vehicle.water.gravity for g in drift.grams],
-        "drift_rate": [2.0 * math.pi / period for period in drift.periods],
-        "drift_phase": list(drift.phases),
-    }
-    for name, values in columns.items():
-        setattr(hidden, name, wp.array(values or [0.0], dtype=float, device="cpu"))
-    return hidden
+    return with_arrays(
+        hidden,
+        drift=[0.001 * g * vehicle.water.gravity for g in drift.grams],
+        drift_rate=[2.0 * math.pi / period for period in drift.periods],
+        drift_phase=drift.phases,
+    )

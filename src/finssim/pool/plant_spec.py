@@ -2,26 +2,238 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, TypeVar, get_args
 
+import numpy as np
 import yaml
-from pydantic import Field, ValidationError, field_validator
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from finssim.engine.plant_arrays import twist_shift
 from finssim.files import atomic_write
-from finssim.pool.coupled import Section, Three
-from finssim.pool.water_spec import AddedMass, BuoyancyDrift, Circulation, Damping, HullDrag, SlackTether
+from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import POOL, room
 from finssim.yaml_file import read_mapping
 
-__all__ = ["Basin", "PlantSpec", "PlantSpecError", "Severity", "basin_of", "load_plant_spec"]
+__all__ = [
+    "AddedMass",
+    "Basin",
+    "BuoyancyDrift",
+    "Circulation",
+    "CoupledMatrix",
+    "Damping",
+    "Eddy",
+    "HullDrag",
+    "PlantSpec",
+    "PlantSpecError",
+    "PrincipalAxes",
+    "Section",
+    "Severity",
+    "Six",
+    "SlackTether",
+    "Three",
+    "basin_of",
+    "load_plant_spec",
+]
+
+
+# Coefficients that hold about some point in tilted axes: how a matrix that couples all axes stays physical.
+
+
+Array = NDArray[np.float64]
+Six = tuple[float, float, float, float, float, float]
+Three = tuple[float, float, float]
+
+
+class Section(BaseModel):
+    """A frozen part of a plant file: unknown keys and numbers that are not finite are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class PrincipalAxes(Section):
+    """A point of the body and axes there."""
+
+    center: Three
+    """Body frame [m]."""
+    tilt_deg: Three
+    """Roll, pitch, yaw of the axes in the body [deg]."""
+
+    def to_axes(self) -> Array:
+        """T with x = T nu: the twist at the point, in the tilted axes, from that of the body origin; (6, 6)."""
+        tilt = quat_to_matrix(quat_from_euler(*np.radians(self.tilt_deg)))
+        return np.asarray(np.kron(np.eye(2), tilt.T) @ twist_shift(self.center))
+
+
+class CoupledMatrix(PrincipalAxes):
+    """A 6x6 matrix that is diagonal about some point in some axes."""
+
+    diagonal: Six
+    """[kg, kg m²] or [N s/m, N m s]; above 0."""
+
+    def matrix(self) -> Array:
+        """About the body origin, body axes: Tᵀ diag T; positive definite for a positive diagonal, (6, 6)."""
+        T = self.to_axes()
+        return np.asarray(T.T @ np.diag(self.diagonal) @ T)
+
+
+# What a plant's file says of the water and of the forces on the hull.
+
+
+Rows = tuple[Six, Six, Six, Six, Six, Six]
+
+
+class AddedMass(PrincipalAxes):
+    """M_A = Tᵀ A T, with T from the body origin to these axes."""
+
+    matrix: Rows
+    """A, symmetric [kg, kg m, kg m²]."""
+
+    @model_validator(mode="after")
+    def _physical(self) -> AddedMass:
+        A = np.array(self.matrix)
+        if not np.allclose(A, A.T, rtol=0.0, atol=1e-9 * np.abs(A).max(initial=1.0)):
+            raise ValueError("matrix is not symmetric: added mass is an energy, give a symmetric matrix")
+        if np.linalg.eigvalsh(A)[0] < -1e-9:
+            raise ValueError("matrix has a negative eigenvalue, expected positive semidefinite")
+        return self
+
+    def about_origin(self) -> Array:
+        """M_A about the body origin, (6, 6)."""
+        T = self.to_axes()
+        return np.asarray(T.T @ np.array(self.matrix) @ T)
+
+
+class Damping(PrincipalAxes):
+    """tau_D = -Tᵀ [D1 x + D2 (|x| x)], x = T nu_r: dissipative for every velocity."""
+
+    linear: Rows
+    """D1 [N s/m, N s, N m s]."""
+    quadratic: Rows
+    """D2 [N s²/m², ..., N m s²]."""
+
+    @model_validator(mode="after")
+    def _dissipative(self) -> Damping:
+        D1, D2 = np.array(self.linear), np.array(self.quadratic)
+        if np.linalg.eigvalsh(D1 + D1.T)[0] < -1e-9:
+            raise ValueError("linear adds energy: its symmetric part has a negative eigenvalue")
+        # |x_i| x_j² <= (|x_i|³ + 2 |x_j|³) / 3, so these margins suffice for x · D2 (|x| x) >= 0.
+        off = np.abs(D2 - np.diag(np.diag(D2)))
+        if np.any(np.diag(D2) - off.sum(axis=1) / 3.0 - 2.0 * off.sum(axis=0) / 3.0 < -1e-9):
+            raise ValueError("quadratic may add energy: an off-diagonal entry is too large for its diagonal")
+        return self
+
+
+class HullDrag(Section):
+    """Drag of the hull mesh's panels (paper, eq. 4), besides the damping."""
+
+    form_drag: float = Field(default=0.0, ge=0.0)
+    skin_drag: float = Field(default=0.0, ge=0.0)
+
+
+class BuoyancyDrift(Section):
+    """Bubbles, warming air and soaking foam: slow changes of buoyancy, a sum of sines."""
+
+    grams: tuple[float, ...] = ()
+    """Amplitude of each [g]."""
+    periods: tuple[float, ...] = ()
+    """[s]"""
+    phases: tuple[float, ...] = ()
+    """[rad]"""
+
+    @model_validator(mode="after")
+    def _same_length(self) -> BuoyancyDrift:
+        if not len(self.grams) == len(self.periods) == len(self.phases):
+            raise ValueError("grams, periods and phases differ in length: give each sine all three")
+        if any(period <= 0.0 for period in self.periods):
+            raise ValueError("periods must exceed 0 s")
+        return self
+
+
+class SlackTether(Section):
+    """A line that hangs slack and pulls only when it is nearly straight."""
+
+    anchor: Three
+    """Where it leaves the pool's edge, world frame [m]."""
+    attachment: Three
+    """On the vehicle, body frame [m]."""
+    length: float = Field(gt=0.0)
+    """[m]"""
+    stiffness: float = Field(default=15.0, ge=0.0)
+    """Of its last stretch before it is straight [N/m]."""
+    slack_share: float = Field(default=0.08, gt=0.0, lt=1.0)
+    """The pull sets in at (1 - slack_share) length [-]."""
+    diameter: float = Field(default=0.004, gt=0.0)
+    """[m]"""
+    drag_coefficient: float = Field(default=0.5, ge=0.0)
+    """Of a cylinder; less than 1.2, since a slack line follows only in part."""
+    wet_weight: float = 0.0
+    """[N/m]; negative floats."""
+
+
+class Eddy(Section):
+    """One mode of the pool's circulation: `cells` eddies side by side along x."""
+
+    cells: int = Field(ge=1, le=4)
+    speed: float = Field(ge=0.0, le=0.5)
+    """Largest, at the surface [m/s]."""
+    unsteadiness: float = Field(ge=0.0, le=1.0)
+    """Part of the speed that comes and goes [-]."""
+    period: float = Field(gt=0.0)
+    """[s]"""
+    phase: float
+    """[rad]"""
+    sense: Literal[-1, 1] = 1
+    """1: anticlockwise from above."""
+
+
+class Swell(Section):
+    """One linear wave."""
+
+    amplitude: float = Field(ge=0.0)
+    """Half the height from trough to crest [m]."""
+    wavelength: float = Field(gt=0.0)
+    """[m]"""
+    heading: float = 0.0
+    """Direction of travel, from world x towards y [rad]."""
+    phase: float = 0.0
+    """[rad]"""
+
+
+class Circulation(Section):
+    """The current: eddies that vanish at the walls, and in open water a stream and waves."""
+
+    stream: Three = (0.0, 0.0, 0.0)
+    """The same everywhere, world frame [m/s]."""
+    waves: tuple[Swell, ...] = ()
+    eddies: tuple[Eddy, ...] = ()
+    floor_share: float = Field(default=0.5, ge=0.0, le=1.0)
+    """Speed at the floor over that at the surface [-]."""
+
 
 Severity = Literal["nominal", "realistic", "hard"]
+T = TypeVar("T")
 
 
 class PlantSpecError(ValueError):
     """A plant file that cannot be used, or a vehicle that the plant does not fit."""
+
+
+def by_severity(kind: Callable[..., T], **columns: tuple[Any, Any, Any]) -> dict[Severity, T]:
+    """A kind of settings for each severity.
+
+    Args:
+        kind: Makes one.
+        columns: A setting by name: nominal, realistic, hard.
+    """
+    severities: tuple[Severity, ...] = get_args(Severity)
+    return {
+        severity: kind(**{name: column[i] for name, column in columns.items()})
+        for i, severity in enumerate(severities)
+    }
 
 
 class Basin(Section):

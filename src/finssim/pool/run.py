@@ -18,16 +18,12 @@ import numpy as np
 from finssim.control.guidance import Station
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.localization.pool import Pool, write_pool
-from finssim.pool.camera import PoolCamera
-from finssim.pool.draw_plant import draw_plant
+from finssim.pool.camera import PoolCamera, camera_of
+from finssim.pool.draw_plant import draw_plant, positioning_of, site_of
 from finssim.pool.fleet import Fleet
-from finssim.pool.picture_process import CameraPlan, PictureProcess, PictureWire
-from finssim.pool.picture_wire import PictureSink, UdpSender
+from finssim.pool.pictures import CameraPlan, PictureProcess, PictureSink, PictureWire, UdpSender
 from finssim.pool.plant_spec import Basin, PlantSpec, PlantSpecError, Severity, load_plant_spec
-from finssim.pool.server import LockstepServer, serve_realtime
-from finssim.pool.site import camera_of
-from finssim.pool.sites import positioning_of, site_of
-from finssim.pool.task_server import MediumServer, serve_fleet
+from finssim.pool.server import LockstepServer, MediumServer, serve_realtime
 from finssim.pool.task_site import TaskSite
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.goals import station_of
@@ -260,10 +256,12 @@ def _serve_team(
             _say(f"messages: {_name(messages.address)}")
         longest = math.inf if duration is None else duration
         tell = partial(_tell_episode, made)
-        took = serve_fleet(made, transports, messages, sinks=sinks, duration=longest, until=asked, over=tell)
+        pace = serve_realtime(
+            made, transports, messages, sinks=sinks, duration=longest, until=asked, over=tell
+        )
     if not made.over:
         _tell_episode(made)
-    _say(f"ended after {took:.1f} s")
+    _say(f"ended after {pace.duration:.1f} s")
 
 
 def _playing(
@@ -436,9 +434,9 @@ def _realtime(
         if eye is not None:
             where = f"shm:{wire.memory}" if wire.memory else f"{_name(wire.bind)}, for {_name(wire.peer)}"
             _say(f"pictures: {where}")
-        pace = serve_realtime(
-            world, transport, sink=sink, camera=drawn, duration=duration, until=lambda _: asked()
-        )
+        site, sinks = Fleet({plan.vehicle.name: world}), [] if sink is None else [sink]
+        transports = {plan.vehicle.name: transport}
+        pace = serve_realtime(site, transports, sinks=sinks, camera=drawn, duration=duration, until=asked)
         _say(pace.sentence)
         if drawn is not None and drawn.dropped:
             _say(drawn.complaint)
@@ -455,7 +453,7 @@ def _camera(plan: PoolPlan, wire: PictureWire) -> tuple[PictureProcess | None, P
 
 
 @contextmanager
-def _stoppable(*, at_once: bool = False) -> Iterator[Callable[[], bool]]:
+def _stoppable(*, at_once: bool = False) -> Iterator[Callable[..., bool]]:
     """Let Ctrl-C and SIGTERM ask for the end, or end a wait at once; gives whether they did. The second ends all."""
     asked = False
     before: dict[int, Any] = {}
@@ -469,7 +467,7 @@ def _stoppable(*, at_once: bool = False) -> Iterator[Callable[[], bool]]:
     for number in (signal.SIGINT, signal.SIGTERM):
         before[number] = signal.signal(number, stop)
     try:
-        yield lambda: asked
+        yield lambda *_: asked
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -1,18 +1,18 @@
-"""A virtual pool for a robot in another process: in real time on its wires, or in lock-step over TCP."""
+"""A virtual pool for robots in other processes: in real time, a port for each, or in lock-step over TCP."""
 
 from __future__ import annotations
 
 import math
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from finssim.pool.picture_wire import PictureSink
+from finssim.pool.fleet import Fleet, Medium, one_picture
+from finssim.pool.pictures import PictureSink, bound_socket
 from finssim.pool.virtual_pool import PoolClockError, VirtualPool
-from finssim.robot.link.frames import LinkError
 from finssim.robot.link.transports import Transport
 from finssim.robot.lockstep import (
     LockstepError,
@@ -21,8 +21,11 @@ from finssim.robot.lockstep import (
     encode_refusal,
     receive,
 )
+from finssim.robot.messages import Picture
+from finssim.robot.team import decode_track
 
-__all__ = ["LockstepServer", "Pace", "serve_realtime"]
+__all__ = ["LockstepServer", "MediumServer", "Pace", "serve_realtime"]
+
 
 TICK = 0.003
 """Between looks at the wire [s]."""
@@ -63,53 +66,6 @@ class Pace:
         )
 
 
-def serve_realtime(
-    world: VirtualPool,
-    transport: Transport,
-    *,
-    sink: PictureSink | None = None,
-    camera: Clocked | None = None,
-    duration: float = math.inf,
-    until: Callable[[Pace], bool] | None = None,
-    clock: Callable[[], float] = time.monotonic,
-    wait: Callable[[float], None] = time.sleep,
-) -> Pace:
-    """Let a pool live in real time until the time is over or `until` says so.
-
-    Args:
-        world: The pool, at time 0.
-        transport: To the robot, from the motor controller's end.
-        sink: Takes the pictures that the world's own camera makes.
-        camera: One that sends its pictures itself.
-        duration: How long [s].
-        until: Ends it where it says so; asked at every tick.
-        clock: This machine's clock [s].
-        wait: Waits so long [s].
-    """
-    pace, start = Pace(), clock()
-    while world.time < duration and not (until is not None and until(pace)):
-        now = clock()
-        behind = now - start - world.time
-        if behind > MOST_BEHIND:
-            pace.given_up += behind - TICK
-            start += behind - TICK
-        if camera is not None:
-            camera.start = start
-        sent = transport.receive()
-        delivery = world.exchange(min(now - start, duration), sent)
-        for _, frame in delivery.frames:
-            transport.send(frame)
-        for picture in delivery.pictures if sink is not None else ():
-            sink.send(replace(picture, time=start + picture.time), clock())
-            pace.pictures += 1
-        pace.received, pace.sent = pace.received + len(sent), pace.sent + len(delivery.frames)
-        pace.duration = world.time
-        done = clock() - start
-        pace.late = max(pace.late, done - world.time) if pace.duration > 1.0 else pace.late
-        wait(max(TICK - (done - world.time), 0.0))
-    return pace
-
-
 class LockstepServer:
     """A pool whose clock goes on as far as its one robot asks, and ends when the robot leaves."""
 
@@ -122,16 +78,7 @@ class LockstepServer:
         Raises:
             LinkError: It cannot be bound.
         """
-        self._listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            self._listener.bind(address)
-        except OSError as problem:
-            self._listener.close()
-            raise LinkError(
-                f"cannot bind {address[0]}:{address[1]} ({problem.strerror or problem}): "
-                "end the program that has it, or give another port"
-            ) from None
+        self._listener = bound_socket(socket.SOCK_STREAM, address)
         self._listener.listen(1)
         self.address: tuple[str, int] = self._listener.getsockname()
 
@@ -167,3 +114,122 @@ class LockstepServer:
     def close(self) -> None:
         """Stop listening."""
         self._listener.close()
+
+
+RATE = 60.0
+"""Steps a second of the software of vehicles that the task commands [Hz]."""
+LARGEST = 2048
+"""Bytes taken of a datagram."""
+
+
+class MediumServer:
+    """A medium's end for robots in other processes: who sends under a name is answered under it."""
+
+    def __init__(self, address: tuple[str, int], medium: Medium, names: tuple[str, ...]) -> None:
+        """Listen.
+
+        Args:
+            address: Host and port; port 0 takes a free one (see `address`).
+            medium: That carries the messages.
+            names: Who may send.
+
+        Raises:
+            LinkError: It cannot be bound.
+        """
+        self._medium, self._names = medium, frozenset(names)
+        self._robots: dict[str, tuple[str, int]] = {}
+        self._socket = bound_socket(socket.SOCK_DGRAM, address)
+        self._socket.setblocking(False)
+        self.address: tuple[str, int] = self._socket.getsockname()
+
+    def poll(self, now: float) -> None:
+        """Take what has come and send what has arrived, at the site's clock [s]."""
+        with suppress(BlockingIOError, ConnectionError):
+            while True:
+                data, sender = self._socket.recvfrom(LARGEST)
+                heard = decode_track(data, now)
+                if heard is not None and heard[0] in self._names:
+                    self._robots[heard[0]] = sender
+                    self._medium.send(now, heard[0], data)
+        for name in self._names:  # what reaches a robot that has not spoken yet is lost
+            for data in self._medium.receive(now, name):
+                if name in self._robots:
+                    with suppress(OSError):
+                        self._socket.sendto(data, self._robots[name])
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._socket.close()
+
+
+def serve_realtime(
+    site: Fleet,
+    transports: Mapping[str, Transport],
+    messages: MediumServer | None = None,
+    *,
+    sinks: Sequence[PictureSink] = (),
+    camera: Clocked | None = None,
+    duration: float = math.inf,
+    until: Callable[[Pace], bool] = lambda pace: False,
+    over: Callable[[], None] = lambda: None,
+    clock: Callable[[], float] = time.monotonic,
+    wait: Callable[[float], None] = time.sleep,
+) -> Pace:
+    """Let a site live in real time until the time is over or `until` says so.
+
+    Args:
+        site: With robots in other processes, at time 0.
+        transports: To the robot of each of these vehicles, by name, from the motor controllers' end.
+        messages: Between the robots; None: they tell each other nothing.
+        sinks: Take the one camera's pictures, one for each robot.
+        camera: One that sends its pictures itself.
+        duration: How long [s].
+        until: Ends it where it says so; asked at every tick.
+        over: Called once, when the site says that it is over; it lives on.
+        clock: This machine's clock [s].
+        wait: Waits so long [s].
+    """
+    pace, start, now = Pace(), clock(), 0.0
+    sent: dict[str, list[bytes]] = {name: [] for name in site.runtimes}
+    frames: dict[str, list[tuple[float, bytes]]] = {name: [] for name in site.runtimes}
+    steps, told = 0, False
+    while now < duration and not until(pace):
+        behind = clock() - start - now
+        if behind > MOST_BEHIND:
+            pace.given_up += behind - TICK
+            start += behind - TICK
+        if camera is not None:
+            camera.start = start
+        now = min(max(clock() - start, now), duration)
+        pictures: list[Picture] = []
+        for name, transport in transports.items():
+            received = transport.receive()
+            delivery = site.worlds[name].exchange(now, received)
+            pictures += delivery.pictures
+            for _, frame in delivery.frames:
+                transport.send(frame)
+            pace.received, pace.sent = pace.received + len(received), pace.sent + len(delivery.frames)
+        for picture in one_picture(pictures):
+            for sink in sinks:
+                sink.send(replace(picture, time=start + picture.time), clock())
+                pace.pictures += 1
+        due = now * RATE >= steps + 1
+        for name, runtime in site.runtimes.items():
+            delivery = site.worlds[name].exchange(now, sent[name])
+            sent[name], frames[name] = [], frames[name] + list(delivery.frames)
+            if due and site.medium is not None:
+                sent[name] = runtime.step(now, frames[name], (), site.medium.receive(now, name))
+                frames[name] = []
+                for datagram in runtime.told:
+                    site.medium.send(now, name, datagram)
+        steps = math.floor(now * RATE)
+        if messages is not None:
+            messages.poll(now)
+        site.turn(now, due)
+        if site.over and not told:
+            told = True
+            over()
+        pace.duration, done = now, clock() - start
+        pace.late = max(pace.late, done - now) if now > 1.0 else pace.late
+        wait(max(TICK - (done - now), 0.0))
+    return pace

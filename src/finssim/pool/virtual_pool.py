@@ -3,33 +3,269 @@
 from __future__ import annotations
 
 import heapq
+import json
+import logging
 import random
+import struct
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Protocol
+from typing import Any, BinaryIO, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.pool.faults import Faults
-from finssim.pool.firmware import Firmware
-from finssim.pool.motors import RPM
-from finssim.pool.plant import Plant
+from finssim.pool.firmware import Firmware, PoolSensors
+from finssim.pool.plant import RPM, Plant
 from finssim.pool.plant_spec import PlantSpec
 from finssim.pool.positioning import Positioning
-from finssim.pool.sensors import PoolSensors
-from finssim.pool.truth import TruthWriter
-from finssim.robot.link.frames import encode_navigation
-from finssim.robot.messages import Delivery, Picture
+from finssim.robot.link.frames import TELEMETRY, crc16_modbus, encode_navigation, encode_telemetry, forms
+from finssim.robot.messages import Delivery, Picture, Telemetry
 from finssim.vehicles import Vehicle
+from finssim.yaml_file import json_value
 
-__all__ = ["Camera", "PoolClockError", "PoseAt", "VirtualPool"]
+__all__ = [
+    "Camera",
+    "FaultError",
+    "Faults",
+    "PoolClockError",
+    "PoseAt",
+    "Truth",
+    "TruthError",
+    "TruthWriter",
+    "VirtualPool",
+    "read_truth",
+]
+
+
+# The truth file: what really happened in the pool, written as it happens, for scoring afterwards alone.
+
 
 Array = NDArray[np.float64]
+
+FORMAT = "finssim-truth-1"
+
+FLUSH = 50
+"""Records after which they are handed to the system: half a second at 100 a second is lost at most."""
+
+log = logging.getLogger(__name__)
+
+
+class TruthError(ValueError):
+    """A file that is no truth file."""
+
+
+class Truth(NamedTuple):
+    """A truth file's records, by time."""
+
+    header: dict[str, Any]
+    """Vehicle, its digest, plant, severity, seed and thruster names."""
+    time: Array
+    """[s], (k,)"""
+    position: Array
+    """Body origin, world frame [m], (k, 3)."""
+    quaternion: Array
+    """Body to world, xyzw, (k, 4)."""
+    nu: Array
+    """Body frame [m/s, rad/s], (k, 6)."""
+    shaft_rpm: Array
+    """Canonical order [rpm], (k, n)."""
+    thrust: Array
+    """Delivered, canonical order [N], (k, n)."""
+    voltage: Array
+    """Of the battery [V], (k,)."""
+    current: Array
+    """Velocity of the water at the body, world frame [m/s], (k, 3)."""
+
+
+class TruthWriter:
+    """Appends records of fixed length after one line of JSON: a file that was cut off anywhere still opens.
+
+    A full disk ends the file, with a warning, and not the pool: the vehicle must not stop for a log.
+    """
+
+    def __init__(self, path: str | Path, thrusters: Sequence[str], header: dict[str, Any]) -> None:
+        """Start a file.
+
+        Args:
+            path: Where; an earlier file there is replaced.
+            thrusters: Names in canonical order.
+            header: What a reader should know besides.
+        """
+        self.path = Path(path)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._file: BinaryIO | None = self.path.open("wb")
+        self._count = 0
+        line = json.dumps({"format": FORMAT, "thrusters": list(thrusters), **header})
+        self._file.write(line.encode() + b"\n")
+        self._file.flush()
+
+    def write(self, time: float, values: Iterable[NDArray[np.float32]]) -> None:
+        """Append one record.
+
+        Args:
+            time: [s]
+            values: Position, quaternion, nu, shaft rpm, thrust, voltage and current, in this order; float32.
+        """
+        if self._file is None:
+            return
+        try:
+            self._file.write(struct.pack("<d", time) + b"".join([v.tobytes() for v in values]))
+            self._count += 1
+            if self._count % FLUSH == 0:
+                self._file.flush()
+        except OSError as error:
+            log.warning("%s: the truth ends at %.2f s: %s", self.path, time, error.strerror or error)
+            self._file = None
+
+    def close(self) -> None:
+        """Write out what is left."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+
+def read_truth(path: str | Path) -> Truth:
+    """The records of a truth file, up to its last whole one.
+
+    Raises:
+        TruthError: It is not there or no truth file.
+    """
+    try:
+        data = Path(path).read_bytes()
+        header = json_value(data[: data.index(b"\n")], TruthError, str(path))
+        if header["format"] != FORMAT:
+            raise KeyError
+    except OSError as error:
+        raise TruthError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except (ValueError, KeyError, TypeError):
+        raise TruthError(f"{path}: is no truth file: give one that 'finssim pool --truth' wrote") from None
+    n = len(header["thrusters"])
+    fields = {
+        "position": 3,
+        "quaternion": 4,
+        "nu": 6,
+        "shaft_rpm": n,
+        "thrust": n,
+        "voltage": 1,
+        "current": 3,
+    }
+    layout = np.dtype([("time", "<f8"), *((name, "<f4", (size,)) for name, size in fields.items())])
+    body = data[data.index(b"\n") + 1 :]
+    table = np.frombuffer(body, dtype=layout, count=len(body) // layout.itemsize)
+    columns = {name: table[name].astype(float) for name in fields}
+    columns["voltage"] = columns["voltage"][:, 0]
+    return Truth(header=header, time=table["time"].astype(float), **columns)
+
+
+# Faults of the wire and of the instruments, switched on by experiments: what a robot must survive.
+
+
+REORDERED = 0.025
+"""How much later a frame that is overtaken arrives [s]: behind the two that follow it at 100 Hz."""
+
+PROBABILITIES = ("drop", "drop_commands", "corrupt", "reorder", "duplicate")
+NUMBERS = {f.name: f.values for f in TELEMETRY.payload if f.code == "f"}
+"""Telemetry fields that can be NaN, and how many values each has (0: one per motor output)."""
+SPOILABLE = {*NUMBERS, *(f"{name}.{i}" for name, values in NUMBERS.items() for i in range(values or 8))}
+
+
+class FaultError(ValueError):
+    """A fault that cannot be: a probability out of range, a field that no frame has."""
+
+
+@dataclass
+class Faults:
+    """What is wrong at present; every field may be changed at any time, all draws come from the seed."""
+
+    seed: int = 0
+    drop: float = 0.0
+    """Chance that a frame from the vehicle is lost."""
+    drop_commands: float = 0.0
+    """Chance that a frame to the vehicle is lost."""
+    corrupt: float = 0.0
+    """Chance that a frame has one to eight bits turned over."""
+    reorder: float = 0.0
+    """Chance that a frame is overtaken by those behind it."""
+    duplicate: float = 0.0
+    """Chance that a frame comes twice."""
+    freeze_sensors: bool = False
+    """Instruments stand still; sequence numbers and clock go on."""
+    nan_field: str = ""
+    """Telemetry field sent as NaN, `depth` or an element of one, `gyro.2`; none if empty."""
+    _frozen: Telemetry | None = None
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name in PROBABILITIES and not (isinstance(value, int | float) and 0.0 <= value <= 1.0):
+            raise FaultError(f"{name} is {value!r}, expected a probability from 0 to 1")
+        if name == "nan_field" and value and str(value) not in SPOILABLE:
+            raise FaultError(
+                f"telemetry has no number '{value}': give one of {', '.join(NUMBERS)}, or an element as in gyro.2"
+            )
+        super().__setattr__(name, value)
+
+    def __post_init__(self) -> None:
+        self._random = random.Random(f"faults {self.seed}")
+
+    def lost(self, commands: bool = False) -> bool:
+        """Whether the next frame is lost."""
+        return self._happens(self.drop_commands if commands else self.drop)
+
+    def _happens(self, probability: float) -> bool:
+        return probability > 0.0 and self._random.random() < probability
+
+    def encode(self, telemetry: Telemetry) -> bytes:
+        """Frame of a snapshot, with instruments frozen and fields spoiled as asked."""
+        if not self.freeze_sensors:
+            self._frozen = None
+        else:
+            held = self._frozen = self._frozen or telemetry
+            telemetry = replace(
+                telemetry,
+                quaternion=held.quaternion,
+                gyro=held.gyro,
+                accel=held.accel,
+                depth=held.depth,
+                pressure=held.pressure,
+                motor_rpm=held.motor_rpm,
+            )
+        frame = encode_telemetry(telemetry)
+        return (
+            frame if not self.nan_field else _with_nan(frame, self.nan_field, len(telemetry.motor_rpm or ()))
+        )
+
+    def arrivals(self, time: float, frame: bytes) -> list[tuple[float, bytes]]:
+        """When [s] and how a frame that should arrive at a time [s] does so: lost, twice, late, with wrong bits."""
+        if self.lost():
+            return []
+        if self._happens(self.corrupt):
+            spoiled = bytearray(frame)
+            for bit in self._random.sample(range(8 * len(frame)), self._random.randint(1, 8)):
+                spoiled[bit // 8] ^= 1 << (bit % 8)
+            frame = bytes(spoiled)
+        if self._happens(self.reorder):
+            time += REORDERED
+        copies = 2 if self._happens(self.duplicate) else 1
+        return [(time, frame)] * copies
+
+
+def _with_nan(frame: bytes, name: str, outputs: int) -> bytes:
+    """The frame with one field NaN, or one element of it, and a right CRC: no checksum tells a controller's NaN."""
+    field, _, element = name.partition(".")
+    body = bytearray(frame[len(TELEMETRY.magic) : -2])
+    at = 0
+    for entry in forms(TELEMETRY, outputs)[0].fields:
+        size, values = struct.calcsize("<" + entry.code), entry.values or outputs
+        if entry.name == field:
+            for i in [int(element)] if element else range(values):
+                struct.pack_into("<f", body, at + i * size, float("nan"))
+        at += size * values
+    return TELEMETRY.magic + bytes(body) + struct.pack("<H", crc16_modbus(bytes(body)))
+
+
 PoseAt = Callable[[float], tuple[Array, Array]]
 """Time [s] -> position (3,) and quaternion xyzw (4,) of the body in the world."""
 

@@ -37,7 +37,7 @@ __all__ = [
     "EchoWatch",
     "Event",
     "EventLog",
-    "FollowWatch",
+    "Lasting",
     "StateWatch",
     "Supervision",
     "TelemetryWatch",
@@ -366,6 +366,28 @@ class TelemetryWatch:
                 self._changed[sensor] = now
 
 
+class Lasting:
+    """How long something has been so at every look."""
+
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """As if it had never been so."""
+        self._since, self._until = math.inf, -math.inf
+
+    def look(self, now: float, so: bool) -> None:
+        """Whether it is so now [s]."""
+        if so:
+            self._since, self._until = min(self._since, now), now
+        else:
+            self.forget()
+
+    def longer(self, limit: float, now: float | None = None) -> bool:
+        """Whether it has been so for longer than `limit` [s], until `now`, or until the last look if None."""
+        return (self._until if now is None else now) - self._since > limit
+
+
 class EchoWatch:
     """What the motor controller made of the commands."""
 
@@ -376,8 +398,8 @@ class EchoWatch:
         """As before the first echo."""
         self._count: int | None = None
         self._mcu_ms = 0
-        self.rejected_since = math.inf
-        self.rejected_until = -math.inf
+        self.rejected = Lasting()
+        """Whether commands are refused."""
 
     def accept(self, now: float, echo: CommandEcho, armed: bool) -> str:
         """Takes an echo; "restarted" if its count of commands began again, "rejected" if it refused one, else ""."""
@@ -390,37 +412,9 @@ class EchoWatch:
         self._count, self._mcu_ms = echo.command_count, echo.mcu_ms
         if restarted:
             return "restarted"
-        if not armed or echo.accepted:
-            self.rejected_since = math.inf
-            return ""
-        self.rejected_since = min(self.rejected_since, now)
-        self.rejected_until = now
-        return "rejected"
-
-    def rejecting(self, limit: float) -> bool:
-        """Whether every command was refused for longer than `limit` [s]."""
-        return self.rejected_until - self.rejected_since > limit
-
-
-class FollowWatch:
-    """Whether the motors follow the commands, as the status bits of the telemetry tell: frames may be lost unseen."""
-
-    def __init__(self) -> None:
-        self.forget()
-
-    def forget(self) -> None:
-        """As if they did."""
-        self._since, self._until = math.inf, -math.inf
-
-    def accept(self, now: float, flags: int, armed: bool) -> None:
-        """Takes status bits, and whether commands were enabled; those of a firmware that sets none say nothing."""
-        if not armed or flags & FOLLOWS or not flags & TOLD:
-            return self.forget()
-        self._since, self._until = min(self._since, now), now
-
-    def deaf(self, limit: float) -> bool:
-        """Whether they have not followed for longer than `limit` [s]."""
-        return self._until - self._since > limit
+        refused = armed and not echo.accepted
+        self.rejected.look(now, refused)
+        return "rejected" if refused else ""
 
 
 class TiltWatch:
@@ -436,11 +430,8 @@ class TiltWatch:
         self._cosine = math.cos(min(limit, math.pi)) if math.isfinite(limit) else -math.inf
         self._duration = duration
         self._level = tuple(float(part) for part in np.asarray(level, float))
-        self._since = math.inf
-
-    def forget(self) -> None:
-        """As if the vehicle had been level."""
-        self._since = math.inf
+        self._tilted = Lasting()
+        self.forget = self._tilted.forget
 
     def accept(self, now: float, quaternion: npt.ArrayLike) -> None:
         """Takes an attitude, given frame to world, xyzw, of any length, (4,)."""
@@ -448,11 +439,11 @@ class TiltWatch:
         a, b, c = self._level
         square = x * x + y * y + z * z + w * w
         up = 2.0 * (x * z - w * y) * a + 2.0 * (y * z + w * x) * b + (square - 2.0 * (x * x + y * y)) * c
-        self._since = min(self._since, now) if up < self._cosine * square else math.inf
+        self._tilted.look(now, up < self._cosine * square)
 
     def over(self, now: float) -> bool:
         """Whether it lasted too long."""
-        return now - self._since > self._duration
+        return self._tilted.longer(self._duration, now)
 
 
 class StateWatch:
@@ -625,7 +616,7 @@ class Supervision:
         self.settings = settings
         self.commander = Commander(len(vehicle.thrusters), settings.command_timeout)
         self.telemetry = TelemetryWatch(outputs, settings.telemetry_timeout)
-        self.echo, self.follow = EchoWatch(), FollowWatch()
+        self.echo, self.deaf = EchoWatch(), Lasting()
         self.state = StateWatch(settings.state_timeout, settings.vision_modes)
         imu = vehicle.sensors.imu
         level = UP if imu is None else quat_inverse_rotate(imu.orientation, UP)
@@ -639,7 +630,7 @@ class Supervision:
 
     def forget(self) -> None:
         """As before the first message."""
-        for watch in (self.commander, self.telemetry, self.echo, self.follow, self.state):
+        for watch in (self.commander, self.telemetry, self.echo, self.deaf, self.state):
             watch.forget()
         for tilt in self.tilts.values():
             tilt.forget()
@@ -648,7 +639,8 @@ class Supervision:
         """Takes a well-formed message that came while `armed`, or not; "restarted" if the controller began anew."""
         news = self.telemetry.accept(now, message)
         if news != "old":
-            self.follow.accept(now, message.flags, armed)
+            # Frames may be lost unseen; a firmware that sets no status bits says nothing of it.
+            self.deaf.look(now, armed and bool(message.flags & TOLD) and not message.flags & FOLLOWS)
             self.tilts["telemetry"].accept(now, message.quaternion)
         return news if news == "restarted" else ""
 
@@ -669,9 +661,9 @@ class Supervision:
         frozen = self.telemetry.frozen(now, limits.frozen_limit)
         if frozen:
             return f"telemetry is frozen: the {frozen} has repeated its numbers for {limits.frozen_limit:g} s"
-        if self.echo.rejecting(limits.reject_limit):
+        if self.echo.rejected.longer(limits.reject_limit):
             return f"the motor controller has refused every command for {limits.reject_limit:g} s"
-        if self.follow.deaf(limits.reject_limit):
+        if self.deaf.longer(limits.reject_limit):
             return f"the motor controller has not followed any command for {limits.reject_limit:g} s"
         for source, tilt in self.tilts.items():
             if tilt.over(now):
@@ -756,7 +748,7 @@ class Bridge:
             return why
         self._commander.forget()
         self._watchdogs.echo.forget()
-        self._watchdogs.follow.forget()
+        self._watchdogs.deaf.forget()
         self._armed_at = self._clock.now
         self._enter("armed", "", f"armed by {source}")
         return ""

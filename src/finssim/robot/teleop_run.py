@@ -64,8 +64,23 @@ def drive(
         clock: [s]
         wait: Waits so long [s].
     """
-    operator, switch = _crew(vehicle, device, other, 1.0 / rate)
-    runtime = _robot(vehicle, switch, pool, recorder, guide or Station((0.0, 0.0, 0.0), 0.0))
+
+    def swap() -> None:
+        if other is not None:
+            switch.select("other" if switch.mode == "person" else "person")
+
+    operator = Operator(device, swap=swap)
+    person = WrenchPilot(operator.wrench, vehicle, period=1.0 / rate)
+    switch = ModeSwitch({"person": person, **({} if other is None else {"other": other})})
+    runtime = Runtime(
+        vehicle,
+        pool,
+        switch,
+        guide or Station((0.0, 0.0, 0.0), 0.0),
+        perception=Unlocated(vehicle) if pool is None else Perception(vehicle, pool),
+        bridge=Bridge(vehicle, BridgeSettings.of(vehicle, need_reading=False)),
+        recorder=recorder,
+    )
 
     def turn(running: Runtime) -> bool:
         if running.reading is not None:
@@ -81,30 +96,6 @@ def drive(
         runtime, transport, pictures, rate=rate, duration=duration, until=turn, clock=clock, wait=wait
     )
     return runtime
-
-
-def _robot(
-    vehicle: Vehicle, pilot: Pilot, pool: Pool | None, recorder: Recorder | None, guide: Guide
-) -> Runtime:
-    """A robot that a person may arm without a state; never armed by itself."""
-    perception = Unlocated(vehicle) if pool is None else Perception(vehicle, pool)
-    bridge = Bridge(vehicle, BridgeSettings.of(vehicle, need_reading=False))
-    return Runtime(vehicle, pool, pilot, guide, perception=perception, bridge=bridge, recorder=recorder)
-
-
-def _crew(
-    vehicle: Vehicle, device: Device, other: Pilot | None, period: float
-) -> tuple[Operator, ModeSwitch]:
-    """The person, and the switch between person and controller, which the person's mode button turns."""
-
-    def swap() -> None:
-        if other is not None:
-            switch.select("other" if switch.mode == "person" else "person")
-
-    operator = Operator(device, swap=swap)
-    person = WrenchPilot(operator.wrench, vehicle, period=period)
-    switch = ModeSwitch({"person": person, **({} if other is None else {"other": other})})
-    return operator, switch
 
 
 def run(

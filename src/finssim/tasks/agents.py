@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
@@ -45,7 +45,8 @@ from finssim.vehicles import Vehicle, load_vehicle
 __all__ = [
     "BASELINES", "NOWHERE", "Agent", "AgentError", "Baseline", "BaselineAgent", "BaselineError", "ConsensusFormation",
     "FormationPursuit", "Known", "LeadPursuit", "PidAgent", "PolicyAgent", "Readings", "StationPid", "TargetPid",
-    "TrackingPid", "WorldReadings", "agent_for", "baseline", "expert_for", "restarted", "rollout",
+    "TrackingPid", "WorldReadings", "agent_for", "baseline", "expert_for", "memory_from",
+    "memory_leaves", "restarted", "rollout",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -492,6 +493,39 @@ def baseline(task: str, name: str, vehicle: Vehicle | str = "finsrov") -> Baseli
     return have[name](vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle))
 
 
+def memory_leaves(memory: Any) -> list[Any]:
+    """The arrays of a baseline's memory, which is arrays in tuples or dataclasses, in their order; of None none."""
+    if memory is None or isinstance(memory, np.ndarray):
+        return [] if memory is None else [memory]
+    if is_dataclass(memory) and not isinstance(memory, type):
+        memory = tuple(getattr(memory, field.name) for field in fields(memory))
+    if not isinstance(memory, tuple):
+        raise TypeError(
+            f"memory of a baseline is a {type(memory).__name__}, expected arrays in tuples or dataclasses"
+        )
+    return [leaf for part in memory for leaf in memory_leaves(part)]
+
+
+def memory_from(leaves: Iterable[Any], fresh: Any) -> Any:
+    """The memory that `memory_leaves` took apart.
+
+    Args:
+        leaves: What it gave.
+        fresh: A memory of the same baseline, whose classes are taken.
+    """
+    rest = iter(leaves)
+
+    def made(part: Any) -> Any:
+        if part is None or isinstance(part, np.ndarray):
+            return None if part is None else next(rest)
+        if is_dataclass(part) and not isinstance(part, type):
+            return replace(part, **{field.name: made(getattr(part, field.name)) for field in fields(part)})
+        parts = [made(child) for child in part]
+        return type(part)(*parts) if hasattr(part, "_fields") else tuple(parts)
+
+    return made(fresh)
+
+
 def restarted(memory: Any, fresh: Any, mask: NDArray[Any]) -> Any:
     """A baseline's memory after some episodes started over.
 
@@ -503,20 +537,9 @@ def restarted(memory: Any, fresh: Any, mask: NDArray[Any]) -> Any:
     Returns:
         The rows of `fresh` where mask is true, those of `memory` elsewhere.
     """
-    if memory is None:
-        return None
-    if isinstance(memory, np.ndarray):
-        return np.where(mask.reshape(-1, *[1] * (memory.ndim - 1)), fresh, memory)
-    if is_dataclass(memory) and not isinstance(memory, type):
-        names = [field.name for field in fields(memory)]
-        return replace(
-            memory, **{name: restarted(getattr(memory, name), getattr(fresh, name), mask) for name in names}
-        )
-    if isinstance(memory, tuple):
-        rows = [restarted(old, new, mask) for old, new in zip(memory, fresh, strict=True)]
-        return type(memory)(*rows) if hasattr(memory, "_fields") else tuple(rows)
-    raise TypeError(
-        f"memory of a baseline is a {type(memory).__name__}, expected arrays in tuples or dataclasses"
+    pairs = zip(memory_leaves(memory), memory_leaves(fresh), strict=True)
+    return memory_from(
+        [np.where(mask.reshape(-1, *[1] * (old.ndim - 1)), new, old) for old, new in pairs], fresh
     )
 
 

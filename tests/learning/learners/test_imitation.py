@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from finssim.learning.collect import collect
-from finssim.learning.demonstrations import Episode, save
+from finssim.learning.demonstrations import Episode, collect, save
 from finssim.learning.learners import LearningError, learner_named
 from finssim.learning.resume import read_state, write_state
 from finssim.tasks import make, task_named

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import finssim
-from finssim.learning.held_evaluation import HeldEvaluation
+from finssim.learning.episodes import HeldEvaluation
 from finssim.learning.learners import LEARNERS, LearningError, learner_named
 from finssim.learning.network import Network, asked, first_memory
 from finssim.learning.resume import read_state, write_state

@@ -11,7 +11,7 @@ import warp as wp
 import finssim
 from finssim.control.policy import Policy
 from finssim.engine.state import State
-from finssim.learning.held_evaluation import HeldEvaluation
+from finssim.learning.episodes import HeldEvaluation
 from finssim.learning.layers import Arrays
 from finssim.learning.learners import learner_named
 from finssim.learning.learners.ppo import Ppo

@@ -4,8 +4,8 @@ import sys
 
 import pytest
 
-from finssim.learning.learners import LEARNERS, learner_named, task_settings
-from finssim.learning.learners.task_settings import ON_POLICY, RANDOMIZED, SETTINGS, own_settings
+from finssim.learning.learners import LEARNERS, base, learner_named
+from finssim.learning.learners.base import ON_POLICY, RANDOMIZED, SETTINGS, own_settings
 from finssim.tasks import TASKS, task_named
 from reference.guess import Guess
 
@@ -14,8 +14,8 @@ def test_the_tasks_own_lines_outrank_the_others(monkeypatch):
     """Every task, then the task; `on-policy`, then the learner; plain, then randomised."""
     plain = {"*": {"on-policy": {"a": 1, "b": 1}}, "t1": {"on-policy": {"b": 2, "c": 2}, "rsl-rl": {"c": 3}}}
     drawn = {"*": {"on-policy": {"a": 4, "b": 4}}, "t1": {"on-policy": {"d": 5}}}
-    monkeypatch.setattr(task_settings, "SETTINGS", plain)
-    monkeypatch.setattr(task_settings, "RANDOMIZED", drawn)
+    monkeypatch.setattr(base, "SETTINGS", plain)
+    monkeypatch.setattr(base, "RANDOMIZED", drawn)
     assert own_settings("other", "sb3-sac", True) == {}
     assert own_settings("other", "sb3-ppo", False) == {"a": 1, "b": 1}
     assert own_settings("other", "sb3-ppo", True) == {"a": 4, "b": 4}

@@ -18,8 +18,7 @@ from rclpy.node import Node
 
 from finssim.geometry.rotations import quat_from_euler, quat_to_matrix, quat_yaw
 from finssim.localization.pool import write_pool
-from finssim.pool.camera import PoolCamera
-from finssim.pool.site import camera_of
+from finssim.pool.camera import PoolCamera, camera_of
 from finssim.robot.messages import Picture
 from finssim.robot.robot import Reading
 from finssim.ros2.nodes.conversions import nanoseconds, tags_of, xyz, xyzw

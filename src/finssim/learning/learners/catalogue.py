@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Protocol
 
-from finssim.learning.learners.task_settings import own_settings
+from finssim.learning.learners.base import own_settings
 from finssim.tasks import Environment, Task
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class LearnerKind:
     """A learner that can be made: call it for one."""
 
     module: str
-    """Where its class and `settings_for` are."""
+    """Where its class is."""
     name: str
     """Its class."""
     what: str
@@ -80,7 +80,7 @@ class LearnerKind:
         """
         learner = next(name for name, kind in LEARNERS.items() if kind == self)
         own = own_settings(task.name, learner, randomized)
-        chosen = self._module().settings_for(task, self.name, own=own, worlds=worlds, steps=steps)
+        chosen = getattr(self._module(), self.name).settings_for(task, own, worlds, steps)
         return replace(
             chosen, **{name: _fitting(chosen, name, value) for name, value in (changes or {}).items()}
         )
@@ -126,8 +126,8 @@ class LearnerKind:
 
 LEARNERS: dict[str, LearnerKind] = {
     "ppo": LearnerKind("ppo", "Ppo", "PPO of our own, NumPy on a processor and torch on a GPU"),
-    "sb3-ppo": LearnerKind("sb3_ppo", "Sb3Ppo", "PPO of Stable-Baselines3"),
-    "sb3-sac": LearnerKind("sb3_sac", "Sb3Sac", "SAC of Stable-Baselines3"),
+    "sb3-ppo": LearnerKind("sb3", "Sb3Ppo", "PPO of Stable-Baselines3"),
+    "sb3-sac": LearnerKind("sb3", "Sb3Sac", "SAC of Stable-Baselines3"),
     "sb3-recurrent-ppo": LearnerKind(
         "sb3_recurrent_ppo",
         "Sb3RecurrentPpo",

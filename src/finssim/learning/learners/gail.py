@@ -9,13 +9,12 @@ import torch
 from torch import nn
 
 from finssim.learning.learners.imitation import demonstrations_for
-from finssim.learning.learners.networks import stack
-from finssim.learning.learners.task_settings import applied
 from finssim.learning.learners.torchrl_ppo import TorchRlPpo, TorchRlSettings
+from finssim.learning.recurrent import stack
 from finssim.learning.tensors import Tensors
-from finssim.tasks import Environment, Task
+from finssim.tasks import Environment
 
-__all__ = ["Gail", "GailSettings", "settings_for"]
+__all__ = ["Gail", "GailSettings"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,11 +37,6 @@ class GailSettings(TorchRlSettings):
     discriminator_hidden: tuple[int, ...] = (64, 64)
     gradient_penalty: float = 1.0
     """Weight of its squared slope at the demonstrations (Mescheder et al. 2018): the reward must not become a cliff."""
-
-
-def settings_for(task: Task, learner: str = "Gail", **given: Any) -> GailSettings:
-    """The settings of a training; `given` as `task_settings.applied` takes it."""
-    return applied(GailSettings(), **given)
 
 
 class Discriminator(nn.Module):
@@ -83,6 +77,8 @@ class JudgedTensors(Tensors):
 class Gail(TorchRlPpo):
     """Generative adversarial imitation."""
 
+    Settings = GailSettings
+    rollout_samples = 0
     settings: GailSettings
 
     def __init__(

@@ -10,17 +10,15 @@ import torch
 from torch import nn
 
 from finssim.learning.demonstrations import Demonstrations, load
-from finssim.learning.expert_memory import memory_from, memory_numbers
-from finssim.learning.learners.acting import ActingLearner
+from finssim.learning.learners.base import ActingLearner
 from finssim.learning.learners.catalogue import LearningError
-from finssim.learning.learners.networks import stack
-from finssim.learning.learners.task_settings import applied
+from finssim.learning.recurrent import stack
 from finssim.learning.served import age_episodes
 from finssim.learning.tensors import Tensors
-from finssim.tasks import Environment, Task
-from finssim.tasks.agents import NOWHERE, Known, expert_for, restarted
+from finssim.tasks import Environment
+from finssim.tasks.agents import NOWHERE, Known, expert_for, memory_from, memory_leaves, restarted
 
-__all__ = ["Bc", "Dagger", "demonstrations_for", "settings_for"]
+__all__ = ["Bc", "Dagger", "demonstrations_for"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,11 +65,6 @@ class DaggerSettings:
     """At the start; falls linearly to zero."""
     weight_decay: float = 1.0e-5
     hidden: tuple[int, ...] = (64, 64)
-
-
-def settings_for(task: Task, learner: str, **given: Any) -> BcSettings | DaggerSettings:
-    """The settings of a training; `given` as `task_settings.applied` takes it."""
-    return applied(BcSettings() if learner == "Bc" else DaggerSettings(), **given)
 
 
 def demonstrations_for(environment: Environment, place: str) -> Demonstrations:
@@ -154,6 +147,7 @@ class _Cloner(ActingLearner):
 class Bc(_Cloner):
     """Behaviour cloning."""
 
+    Settings = BcSettings
     settings: BcSettings
 
     def __init__(
@@ -177,6 +171,7 @@ class Bc(_Cloner):
 class Dagger(_Cloner):
     """Dataset aggregation."""
 
+    Settings = DaggerSettings
     settings: DaggerSettings
 
     def __init__(
@@ -236,7 +231,7 @@ class Dagger(_Cloner):
             **super().learned(),
             "observation": self._observation,
             "action": self._action,
-            "memory": memory_numbers(self._memory),
+            "memory": memory_leaves(self._memory),
             "rounds": self._rounds,
         }
 

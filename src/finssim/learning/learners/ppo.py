@@ -13,18 +13,16 @@ Where time ends an episode, the value of its last observation follows; where the
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from finssim.learning.layers import Adam, Array, Arrays, Gru, Parameters, Row, Stack
-from finssim.learning.learners.acting import ActingLearner
-from finssim.learning.learners.task_settings import applied
+from finssim.learning.learners.base import ActingLearner
 from finssim.learning.network import Activation, Cell, Linear, Network, advance_history, with_integrals
 from finssim.learning.served import age_episodes
-from finssim.tasks import Environment, Task
+from finssim.tasks import Environment
 
-__all__ = ["Ppo", "PpoSettings", "settings_for"]
+__all__ = ["Ppo", "PpoSettings"]
 
 ROLLOUT_SAMPLES = 4096
 """Fewest samples between two updates: with few worlds, rollouts are longer."""
@@ -72,15 +70,11 @@ class PpoSettings:
     """Whether the value sees what randomisation has drawn, which the policy does not."""
 
 
-def settings_for(task: Task, learner: str = "Ppo", **given: Any) -> PpoSettings:
-    """The settings of a training, with rollouts long enough; `given` as `task_settings.applied` takes it."""
-    settings = applied(PpoSettings(), **given)
-    rows = settings.worlds * len(task.agents)
-    return replace(settings, rollout=max(settings.rollout, math.ceil(ROLLOUT_SAMPLES / rows)))
-
-
 class Ppo(ActingLearner):
     """PPO on a batched environment. Arrays are (time, rows, ...), with a row for each agent of each world."""
+
+    Settings = PpoSettings
+    rollout_samples = ROLLOUT_SAMPLES
 
     def __init__(
         self,

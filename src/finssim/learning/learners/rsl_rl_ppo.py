@@ -6,20 +6,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+import warp as wp
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import nn
 
-from finssim.learning.learners.acting import ActingLearner
-from finssim.learning.learners.networks import privileged_rows, stack
-from finssim.learning.learners.on_policy import OnPolicySettings, fitted
+from finssim.learning.learners.base import ROLLOUT_SAMPLES, ActingLearner, OnPolicySettings
+from finssim.learning.recurrent import stack
 from finssim.learning.served import age_episodes
 from finssim.learning.tensors import Tensors
-from finssim.tasks import Environment, Task
+from finssim.tasks import Environment
 
-__all__ = ["RslRlPpo", "RslRlSettings", "settings_for"]
+__all__ = ["RslRlPpo", "RslRlSettings"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,14 +34,11 @@ class RslRlSettings(OnPolicySettings):
     """Whether the critic sees the drawn parameters of vehicle and water, where the environment tells them."""
 
 
-def settings_for(task: Task, learner: str = "RslRlPpo", **given: Any) -> RslRlSettings:
-    """The settings of a training; `given` as `on_policy.fitted` takes it."""
-    return fitted(RslRlSettings(), task, **given)
-
-
 class RslRlPpo(ActingLearner):
     """PPO; several agents of a world are rows of their own and share the networks."""
 
+    Settings = RslRlSettings
+    rollout_samples = ROLLOUT_SAMPLES
     settings: RslRlSettings
 
     def __init__(
@@ -152,3 +149,17 @@ def _begin(mlp: Any, last_gain: float) -> None:
     model = stack(linear[0].in_features, sizes[:-1], sizes[-1], last_gain)
     for ours, theirs in zip((x for x in model if isinstance(x, nn.Linear)), linear, strict=True):
         theirs.load_state_dict(ours.state_dict())
+
+
+def privileged_rows(environment: Environment, name: str = "privileged") -> torch.Tensor | None:
+    """What only a critic may see, one row per agent: a view of the environment's own memory; None if there is nothing.
+
+    Args:
+        environment: The worlds.
+        name: `privileged`, or `final_privileged` of the episode before, where one ended in this step.
+    """
+    array = getattr(environment.arrays, name, None)
+    if array is None or not array.size:
+        return None
+    tensor: torch.Tensor = wp.to_torch(array)
+    return tensor.view(environment.worlds * environment.agents, -1)

@@ -9,12 +9,11 @@ from sb3_contrib import RecurrentPPO
 from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from torch import nn
 
-from finssim.learning.learners.on_policy import OnPolicySettings, fitted
-from finssim.learning.learners.sb3_ppo import Sb3Ppo
+from finssim.learning.learners.base import OnPolicySettings
+from finssim.learning.learners.sb3 import Sb3Ppo
 from finssim.learning.recurrent import RecurrentNetwork
-from finssim.tasks import Task
 
-__all__ = ["RecurrentSettings", "Sb3RecurrentPpo", "settings_for"]
+__all__ = ["RecurrentSettings", "Sb3RecurrentPpo"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,14 +26,10 @@ class RecurrentSettings(OnPolicySettings):
     """Units of the hidden layers behind the LSTM, ELU."""
 
 
-def settings_for(task: Task, learner: str = "Sb3RecurrentPpo", **given: Any) -> RecurrentSettings:
-    """The settings of a training; `given` as `on_policy.fitted` takes it."""
-    return fitted(RecurrentSettings(), task, **given)
-
-
 class Sb3RecurrentPpo(Sb3Ppo):
     """PPO that remembers; several agents of a world are rows of their own, share the network, and remember each."""
 
+    Settings = RecurrentSettings
     settings: RecurrentSettings
     algorithm = RecurrentPPO
     policy = "MlpLstmPolicy"

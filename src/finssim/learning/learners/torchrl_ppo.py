@@ -18,24 +18,18 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
-from finssim.learning.learners.acting import ActingLearner
-from finssim.learning.learners.networks import stack
-from finssim.learning.learners.on_policy import OnPolicySettings, fitted
+from finssim.learning.learners.base import ROLLOUT_SAMPLES, ActingLearner, OnPolicySettings
+from finssim.learning.recurrent import stack
 from finssim.learning.served import age_episodes
 from finssim.learning.tensors import Tensors
-from finssim.tasks import Environment, Task
+from finssim.tasks import Environment
 
-__all__ = ["TorchRlIppo", "TorchRlMappo", "TorchRlPpo", "settings_for"]
+__all__ = ["TorchRlIppo", "TorchRlMappo", "TorchRlPpo"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class TorchRlSettings(OnPolicySettings):
     """As PPO's."""
-
-
-def settings_for(task: Task, learner: str = "TorchRlPpo", **given: Any) -> TorchRlSettings:
-    """The settings of a training; `given` as `on_policy.fitted` takes it."""
-    return fitted(TorchRlSettings(), task, **given)
 
 
 class Head(nn.Module):
@@ -81,6 +75,8 @@ class TeamValue(nn.Module):
 class TorchRlPpo(ActingLearner):
     """PPO of one agent. Tensors are (worlds, agents, size), the time in front where there is one."""
 
+    Settings = TorchRlSettings
+    rollout_samples = ROLLOUT_SAMPLES
     settings: TorchRlSettings
     value = OwnValue
     """What the critic sees."""

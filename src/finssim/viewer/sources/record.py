@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from finssim.files import plain_name
 from finssim.localization.pool import Pool, load_pool
-from finssim.pool.truth import Truth, read_truth
+from finssim.pool.virtual_pool import Truth, read_truth
 from finssim.robot.messages import TagCorners
 from finssim.robot.pictures import picture_of
 from finssim.robot.record_messages import STATES

@@ -1,0 +1,204 @@
+"""What learners share: their settings, by task where they are not the defaults, and how they act in an environment."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+from finssim.learning.episodes import EpisodeTally
+from finssim.learning.layers import Arrays
+from finssim.learning.resume import random_state, set_random_state
+from finssim.tasks import Environment, Task
+
+__all__ = [
+    "ActingLearner",
+    "ON_POLICY",
+    "OnPolicySettings",
+    "RANDOMIZED",
+    "ROLLOUT_SAMPLES",
+    "SETTINGS",
+    "own_settings",
+]
+
+
+# What a learner's settings are for a task, where they are not the defaults: the one place for them.
+
+
+ON_POLICY = ("sb3-ppo", "sb3-recurrent-ppo", "rsl-rl", "torchrl-ppo", "torchrl-ippo", "torchrl-mappo")
+"""The learners that `on-policy` means below: those of outside libraries with `OnPolicySettings`."""
+
+Table = dict[str, dict[str, dict[str, Any]]]
+"""Task -> `on-policy` or a learner's name, which outranks it -> changes of the defaults. `*` is every task, which the
+task's own lines outrank."""
+
+CHASE: dict[str, dict[str, Any]] = {
+    # A capture or delivery lies far ahead: ten seconds of foresight. It is worth so much more than a step that what the
+    # value is wrong by must not use up the gradient that policy and value share; RSL-RL's do not share one.
+    "on-policy": {"discount": 0.99, "value_weight": 0.05, "learning_rate": 2.0e-3, "steps": 1_000_000},
+    "rsl-rl": {"value_weight": 1.0},
+    "ppo": {"discount": 0.99, "steps": 600_000},
+}
+
+SETTINGS: Table = {
+    # Smaller networks than the default are as good here, and are learnt in three quarters of the time.
+    "t1": {"ppo": {"hidden": (48, 48)}},
+    "t2": {
+        # A reference is close all the time: one second of foresight is enough, and learns faster than five.
+        "ppo": {"discount": 0.9, "steps": 500_000},
+        "on-policy": {"discount": 0.9},
+        "sb3-sac": {"discount": 0.9},
+    },
+    # So is a target that moves, once it has been reached.
+    "t3": {"on-policy": {"discount": 0.95}, "ppo": {"steps": 600_000}},
+    "docking": {"ppo": {"steps": 900_000}},
+    "pursuit": CHASE,
+    # With 1.5 million, half of the seeds have only begun to capture.
+    "team-pursuit": {
+        "on-policy": {**CHASE["on-policy"], "steps": 3_600_000},
+        "rsl-rl": CHASE["rsl-rl"],
+        # The first captures are found by luck: a little reward for noise keeps the search going until they are.
+        "ppo": {"discount": 0.99, "learning_rate": 2.0e-3, "entropy_weight": 0.003, "steps": 1_500_000},
+    },
+    "formation": {
+        "on-policy": {**CHASE["on-policy"], "learning_rate": 2.5e-3, "steps": 1_800_000},
+        "rsl-rl": CHASE["rsl-rl"],
+        "ppo": {"discount": 0.99, "learning_rate": 2.0e-3, "steps": 1_500_000},
+    },
+}
+"""Of every training."""
+
+RANDOMIZED: Table = {
+    # What must be learnt is more.
+    "*": {
+        "ppo": {"steps": 1_000_000},
+        "on-policy": {"steps": 3_000_000},
+        "sb3-sac": {"steps": 800_000, "memory": 800_000},
+    },
+    # What it saw and did in the last steps tells how this vehicle answers: thrust, lag, and how late the state comes.
+    "t1": {"ppo": {"steps": 2_000_000, "history": 2, "last_action": True}},
+    "t2": {
+        "ppo": {"steps": 2_000_000, "history": 2, "last_action": True},
+        "on-policy": {"steps": 2_000_000},
+    },
+    "t3": {"ppo": {"steps": 1_500_000}},
+    "docking": {"ppo": {"steps": 2_000_000}},
+    "pursuit": {"ppo": {"steps": 1_500_000}, "on-policy": {"steps": 2_500_000}},
+    "team-pursuit": {"ppo": {"steps": 3_000_000}, "on-policy": {"steps": 6_000_000}},
+    "formation": {"ppo": {"steps": 3_000_000}, "on-policy": {"steps": 4_000_000}},
+}
+"""On top of those, where every episode has another vehicle (`--randomize`)."""
+
+
+def own_settings(task: str, learner: str, randomized: bool) -> dict[str, Any]:
+    """Changes of a learner's defaults for a task; none for a task that no table names."""
+    found: dict[str, Any] = {}
+    for name in ("*", task):
+        for table in (SETTINGS, RANDOMIZED) if randomized else (SETTINGS,):
+            rows = table.get(name, {})
+            found |= rows.get("on-policy", {}) if learner in ON_POLICY else {}
+            found |= rows.get(learner, {})
+    return found
+
+
+# Settings that all PPO learners share, whichever library they are of.
+
+
+ROLLOUT_SAMPLES = 8192
+"""Fewest samples between two updates: with few worlds, rollouts are longer."""
+
+
+ROLLOUT_SAMPLES = 8192
+"""Fewest samples between two updates of the learners of outside libraries."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnPolicySettings:
+    """Settings of PPO; the defaults, T1's, hold setpoints to a centimetre after some twenty seconds."""
+
+    worlds: int = 256
+    steps: int = 1_300_000
+    """Control steps of all worlds together."""
+    rollout: int = 32
+    """Control steps of each world between two updates."""
+    batch: int = 2048
+    """Samples in a gradient step. At equal arithmetic, many small steps learn faster here than few large ones."""
+    epochs: int = 5
+    """Passes over a rollout."""
+    learning_rate: float = 1.5e-3
+    """At the start; falls linearly to zero, which is what brings the last centimetres."""
+    discount: float = 0.98
+    """Per control step: 5 s of foresight at 10 Hz, a few time constants of the vehicle."""
+    gae_lambda: float = 0.95
+    clip: float = 0.2
+    value_weight: float = 0.5
+    """Of the value's squared error beside the policy's objective, where both share a gradient norm."""
+    largest_gradient: float = 0.5
+    """Longer gradients are shortened to this norm: an odd batch must not undo the work of many."""
+    entropy_weight: float = 0.0
+    """No reward for noise: it would keep the vehicle from settling."""
+    log_std: float = -1.0
+    """Logarithm of the action noise at the start: more hides the goal's last centimetres."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Units of the hidden layers, ELU, of the policy and of the value each."""
+
+
+# What all learners share that act in an environment: its tally, their steps, and a state that holds everything.
+
+
+class ActingLearner:
+    """Base of the learners; `learned` and `load_learned` are its own part of the state."""
+
+    Settings: ClassVar[Any]
+    """Class of its settings."""
+    rollout_samples: ClassVar[int] = 0
+    """Fewest samples between two updates: with few worlds, rollouts are longer. 0: as the settings say."""
+
+    @classmethod
+    def settings_for(cls, task: Task, own: Mapping[str, Any], worlds: int | None, steps: int | None) -> Any:
+        """The settings of a training: defaults with the task's `own` changes; then worlds and steps, unless None."""
+        given = {name: value for name, value in (("worlds", worlds), ("steps", steps)) if value is not None}
+        settings = replace(cls.Settings(), **{**own, **given})
+        if not cls.rollout_samples:
+            return settings
+        least = math.ceil(cls.rollout_samples / (settings.worlds * len(task.agents)))
+        return replace(settings, rollout=max(settings.rollout, least))
+
+    def __init__(self, environment: Environment, settings: Any, arrays: Arrays | None = None) -> None:
+        """Take the environment, whose first episodes are going to be aged, and the library of the learner's arrays."""
+        self.environment, self.settings = environment, settings
+        self.tally = EpisodeTally(environment, arrays=arrays)
+        self.steps = 0
+
+    @property
+    def left(self) -> float:
+        """Part of the training that is still to come, in [0, 1]."""
+        return max(0.0, 1.0 - self.steps / self.settings.steps)
+
+    def learned(self) -> dict[str, Any]:
+        """Parameters, optimisers and what else is the learner's own."""
+        raise NotImplementedError
+
+    def load_learned(self, state: dict[str, Any]) -> None:
+        """Take what `learned` gave."""
+        raise NotImplementedError
+
+    def state(self) -> dict[str, Any]:
+        """Everything that decides what comes next, as copies."""
+        return {
+            "steps": self.steps,
+            "environment": self.environment.state(),
+            "tally": self.tally.state(),
+            "random": random_state(),
+            "learner": deepcopy(self.learned()),
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Go on from a state of a learner that was made alike."""
+        self.steps = int(state["steps"])
+        self.environment.load_state(state["environment"])
+        self.tally.load(state["tally"])
+        self.load_learned(state["learner"])
+        set_random_state(state["random"])

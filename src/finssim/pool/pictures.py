@@ -1,0 +1,374 @@
+"""The camera's end of the picture wire: over UDP to one robot, or into shared memory."""
+
+from __future__ import annotations
+
+import fcntl
+import multiprocessing
+import os
+import queue
+import signal
+import socket
+import struct
+import tempfile
+import threading
+import time
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from finssim.localization.pool import Pool
+from finssim.pool.camera import CameraSettings, PoolCamera
+from finssim.pool.plant_spec import Basin
+from finssim.pool.positioning import Exposure, PoseAt
+from finssim.quiet import start_warp
+from finssim.robot.link.frames import LinkError
+from finssim.robot.messages import Picture
+from finssim.robot.pictures import (
+    LONGEST_FRAGMENT,
+    MEMORY_HEAD,
+    MEMORY_MAGIC,
+    MEMORY_SLOT,
+    MEMORY_VERSION,
+    encode_picture,
+    fragments,
+    memory_path,
+)
+from finssim.vehicles import Vehicle
+
+__all__ = [
+    "CameraPlan",
+    "PictureProcess",
+    "PictureSink",
+    "PictureWire",
+    "SharedMemorySender",
+    "UdpSender",
+    "bound_socket",
+]
+
+
+# The camera's end of the picture wire: over UDP to one robot, or into shared memory.
+
+
+SLOTS = 8
+SLOT_BYTES = 2 * 2**20
+"""A raw picture of 1920 x 1080 fits."""
+
+
+class PictureSink(Protocol):
+    """Takes pictures for a robot."""
+
+    def send(self, picture: Picture, now: float) -> None:
+        """Hand a picture on; `now` and `picture.time` are on this machine's `time.monotonic` [s]."""
+
+    def close(self) -> None:
+        """Let go of the wire."""
+
+
+def bound_socket(kind: int, address: tuple[str, int]) -> socket.socket:
+    """A socket of a kind (`socket.SOCK_...`) with an address, host and port; port 0 takes a free one.
+
+    Raises:
+        LinkError: The address cannot be bound.
+    """
+    out = socket.socket(socket.AF_INET, kind)
+    out.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(kind == socket.SOCK_STREAM))
+    try:
+        out.bind(address)
+    except OSError as problem:
+        out.close()
+        raise LinkError(
+            f"cannot bind {address[0]}:{address[1]} ({problem.strerror or problem}): "
+            "end the program that has it, or give another port"
+        ) from None
+    return out
+
+
+class UdpSender:
+    """Datagrams to one robot: JPEG of quality 90, or the tags alone in one of them."""
+
+    def __init__(
+        self, bind: tuple[str, int], peer: tuple[str, int], *, fragment: int = LONGEST_FRAGMENT
+    ) -> None:
+        """
+        Args:
+            bind: Address and port of this end; port 0 takes a free one (see `address`).
+            peer: Of the robot.
+            fragment: Bytes of a picture in a datagram; 1400 for a network, more only on this machine.
+
+        Raises:
+            LinkError: The address cannot be bound.
+        """
+        self.sent = self.lost = 0
+        self._peer, self._fragment = peer, fragment
+        self._socket = bound_socket(socket.SOCK_DGRAM, bind)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4 * 2**20)
+        self.address: tuple[str, int] = self._socket.getsockname()
+
+    def send(self, picture: Picture, now: float) -> None:
+        """Send a picture; one that cannot leave is counted and forgotten."""
+        data = encode_picture(picture, late=max(now - picture.time, 0.0), compress=True)
+        try:
+            for datagram in fragments(data, self.sent + self.lost, self._fragment):
+                self._socket.sendto(datagram, self._peer)
+            self.sent += 1
+        except OSError:
+            self.lost += 1
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+class SharedMemorySender:
+    """A ring in memory under a name: made anew at every start, taken away at the end.
+
+    Its file is locked for as long as its writer lives: no other camera can take the name meanwhile.
+    """
+
+    def __init__(self, name: str, *, slots: int = SLOTS, slot_bytes: int = SLOT_BYTES) -> None:
+        """
+        Args:
+            name: Letters, digits, - and _.
+            slots: Pictures that it holds.
+            slot_bytes: Longest picture [bytes].
+
+        Raises:
+            LinkError: It is not a plain name, another camera has it, or the memory cannot be had.
+        """
+        self.path = memory_path(name)
+        self.sent = self.lost = 0
+        self._slots, self._size = slots, slot_bytes
+        if _taken(self.path):
+            raise LinkError(f"shm:{name} belongs to a camera that is running: end it, or give another name")
+        try:
+            self._file = _ring(
+                self.path,
+                MEMORY_HEAD.pack(MEMORY_MAGIC, MEMORY_VERSION, slots, slot_bytes, 0),
+                slots * slot_bytes,
+            )
+        except OSError as problem:
+            raise LinkError(f"shared memory {self.path}: {problem.strerror}: free some or use udp") from None
+
+    def send(self, picture: Picture, now: float) -> None:
+        """Write a picture into the next slot; one that is too long, or finds no memory, is counted and forgotten."""
+        data = encode_picture(picture, late=max(now - picture.time, 0.0))
+        if len(data) > self._size - MEMORY_SLOT.size:
+            self.lost += 1
+            return
+        number = self.sent + 1
+        at = MEMORY_HEAD.size + (number - 1) % self._slots * self._size
+        try:
+            os.pwrite(self._file, bytes(MEMORY_SLOT.size), at)
+            os.pwrite(self._file, data, at + MEMORY_SLOT.size)
+            os.pwrite(self._file, MEMORY_SLOT.pack(number, len(data), zlib.crc32(data)), at)
+            os.pwrite(self._file, struct.pack("<Q", number), MEMORY_HEAD.size - 8)
+            self.sent = number
+        except OSError:
+            self.lost += 1
+
+    def close(self) -> None:
+        """Take the memory away, unless another camera has taken the name since."""
+        try:
+            if os.stat(self.path).st_ino == os.fstat(self._file).st_ino:
+                os.unlink(self.path)
+        except OSError:
+            pass
+        os.close(self._file)
+
+
+def _taken(path: Path) -> bool:
+    """Whether a camera that lives has the file. A lock ends with its process, however that ends."""
+    try:
+        file = os.open(path, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(file)
+    return False
+
+
+def _ring(path: Path, head: bytes, size: int) -> int:
+    """A new file under the name, locked and empty but for its head; returns its descriptor."""
+    file, temporary = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.truncate(file, len(head) + size)
+        os.pwrite(file, head, 0)
+        os.replace(temporary, path)
+    except OSError:
+        os.close(file)
+        os.unlink(temporary)
+        raise
+    return file
+
+
+# Drawing pictures in a process of its own, so that telemetry never waits for one.
+
+
+UNDRAWN = 4
+"""Exposures that wait to be drawn; more are dropped, as a camera does whose computer is too slow."""
+STARTING = 120.0
+"""Time for the process to start and to compile the renderer, the first time on a machine [s]."""
+ORPHANED = 1.0
+"""Between looks whether the parent is still there [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraPlan:
+    """All that `PoolCamera` is made of, so that another process can make it."""
+
+    vehicle: Vehicle
+    site: Pool
+    settings: CameraSettings
+    basin: Basin
+    mode: Literal["pictures", "corners"]
+    seed: int
+
+    def camera(self) -> PoolCamera:
+        """Make it."""
+        return PoolCamera(
+            self.vehicle, self.site, mode=self.mode, settings=self.settings, basin=self.basin, seed=self.seed
+        )
+
+
+@dataclass(frozen=True)
+class PictureWire:
+    """Where pictures go."""
+
+    bind: tuple[str, int]
+    peer: tuple[str, int]
+    memory: str = ""
+    """Name of shared memory; empty: over UDP."""
+
+    def open(self) -> PictureSink:
+        """Begin to send.
+
+        Raises:
+            LinkError: The address or the memory cannot be had.
+        """
+        return SharedMemorySender(self.memory) if self.memory else UdpSender(self.bind, self.peer)
+
+
+class PictureProcess:
+    """The camera of a `VirtualPool` in real time: exposes here, draws and sends elsewhere; `advance` gives nothing."""
+
+    def __init__(self, plan: CameraPlan, wire: PictureWire) -> None:
+        """Start the process and wait until it can draw.
+
+        Raises:
+            LinkError: The wire cannot be opened, or the process did not start.
+        """
+        self.dropped = 0
+        self.start = 0.0
+        """When the pool's clock was 0, on `time.monotonic` [s]."""
+        self._shutter = plan.settings.shutter(plan.seed)
+        context = multiprocessing.get_context("spawn")
+        self._undrawn: Any = context.Queue(UNDRAWN)
+        ready, theirs = context.Pipe(duplex=False)
+        self._process = context.Process(
+            target=_draw,
+            args=(plan, wire, self._undrawn, theirs, os.getpid()),
+            name="pool camera",
+            daemon=True,
+        )
+        with _deaf():
+            self._process.start()
+        theirs.close()
+        self._await(ready)
+
+    def advance(self, t0: float, t1: float, pose_at: PoseAt) -> Sequence[Picture]:
+        """Expose; pictures go their own way."""
+        for exposure in self._shutter.advance(t0, t1, pose_at):
+            try:
+                self._undrawn.put_nowait((exposure, self.start + exposure.arrival))
+            except queue.Full:
+                self.dropped += 1
+        return ()
+
+    @property
+    def complaint(self) -> str:
+        """Why pictures are missing, and what helps."""
+        if self._process.exitcode is not None:
+            return f"the process that draws ended (status {self._process.exitcode}): start the pool again"
+        return f"{self.dropped} pictures could not be drawn in time: --camera corners needs no drawing"
+
+    def close(self) -> None:
+        """End the process and let go of the wire."""
+        if self._process.is_alive():
+            try:
+                self._undrawn.put(None, timeout=1.0)
+            except queue.Full:
+                self._process.terminate()
+        self._process.join(timeout=5.0)
+        if self._process.is_alive():
+            self._process.kill()
+        self._undrawn.cancel_join_thread()
+
+    def _await(self, ready: Any) -> None:
+        try:
+            problem = ready.recv() if ready.poll(STARTING) else "it did not start in time"
+        except EOFError:
+            problem = "it ended while starting"
+        if problem:
+            self.close()
+            raise LinkError(problem)
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """A process started meanwhile ignores Ctrl-C, which goes to all of a terminal, from its first moment on."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _draw(plan: CameraPlan, wire: PictureWire, undrawn: Any, ready: Any, parent: int) -> None:
+    """The process: draw each exposure, wait until it is to arrive, send it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all; the parent says when to end
+    start_warp()
+    try:
+        sink, camera = wire.open(), plan.camera()
+        camera.develop(_first(plan))  # draws the background, and compiles the renderer where it is not
+    except ValueError as problem:
+        ready.send(str(problem))
+        return
+    ready.send("")
+    try:
+        while True:
+            try:
+                item = undrawn.get(timeout=ORPHANED)
+            except queue.Empty:
+                if os.getppid() != parent:
+                    return
+                continue
+            if item is None:
+                return
+            _send(camera, sink, *item)
+    finally:
+        sink.close()
+
+
+def _first(plan: CameraPlan) -> Exposure:
+    """A vehicle in the middle of the pool."""
+    pose = np.array([0.0, 0.0, -0.5 * plan.basin.depth]), np.array([0.0, 0.0, 0.0, 1.0])
+    return Exposure(0, 0.0, 0.0, pose, pose)
+
+
+def _send(camera: PoolCamera, sink: PictureSink, exposure: Exposure, arrival: float) -> None:
+    picture = replace(camera.develop(exposure), time=arrival)
+    time.sleep(max(arrival - time.monotonic(), 0.0))
+    sink.send(picture, time.monotonic())
