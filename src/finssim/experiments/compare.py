@@ -13,7 +13,6 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
 from finssim.control.policy import Policy, PolicyDescription
 from finssim.experiments.campaign import Say, keep_result, kept_result, write_json
@@ -26,12 +25,12 @@ from finssim.experiments.statistics import (
     probability_of_improvement,
     with_bootstrap,
 )
-from finssim.experiments.tables import Shown, markdown_of, print_shown
+from finssim.experiments.tables import Table
 from finssim.provenance import provenance
 from finssim.tasks import TASKS
 from finssim.vehicles import load_vehicle
 
-__all__ = ["MEASURES", "CompareError", "compare", "print_comparison"]
+__all__ = ["MEASURES", "CompareError", "compare", "tables_of"]
 
 CURVES_FILE = "curves.csv"
 SEED_AT_END = re.compile(r"[-_]?(?:seed|s)?[-_]?\d+$")
@@ -235,7 +234,7 @@ VERDICTS = {
 }
 
 
-def table_of(result: Mapping[str, Any]) -> Shown:
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
     """A row for each group, and what the intervals support of each pair and leave open."""
     rows = [
         [
@@ -252,18 +251,15 @@ def table_of(result: Mapping[str, Any]) -> Shown:
         low, high = pair["ci95"]
         chance = f"chance that {pair['a']} is better: {pair['probability']:.2f} [{low:.2f}, {high:.2f}]"
         sentences.append(f"{VERDICTS[pair['verdict']].format(**pair)} ({chance})")
-    return Shown(
+    table = Table(
         title=f"{result['task']}, plant {result['plant']}",
         heads=["", "seeds", "steps", "time [s]", *result["measures"]],
         rows=rows,
         note=NOTE,
         sentences=sentences,
+        intervals=True,
     )
-
-
-def print_comparison(result: Mapping[str, Any], console: Console) -> None:
-    """Print it."""
-    print_shown(table_of(result), console, intervals=True)
+    return [table]
 
 
 def _cell(figure: Mapping[str, Any]) -> str:
@@ -452,7 +448,7 @@ def compare(
         "provenance": provenance(),
     }
     draw_comparison(groups, result, out / "compare.png")
-    write_json(out / RESULT_FILE, result, markdown_of(table_of(result)))
+    write_json(out / RESULT_FILE, result, tables_of(result))
     return result
 
 

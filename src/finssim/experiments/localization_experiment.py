@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType
@@ -14,16 +13,15 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
 from finssim.calibration.vision.pool_command import pool_record
 from finssim.calibration.vision.pool_fit import PoolFit, calibrate_pool
 from finssim.calibration.vision.pool_model import Settings
 from finssim.calibration.vision.survey import Observations, observe, read_survey
-from finssim.experiments.campaign import Say, choice, write_json
+from finssim.experiments.campaign import Say, check_choices, write_json
 from finssim.experiments.figures import COLORS, clean, legend_below, new_figure, save_figure
 from finssim.experiments.statistics import bootstrap
-from finssim.experiments.tables import console_table, markdown_table
+from finssim.experiments.tables import Table
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.geometry.optics import Camera, Interface, Lens, Projection, Status, project
 from finssim.geometry.rotations import matrix_to_quat, quat_from_euler, quat_to_matrix
@@ -34,9 +32,10 @@ from finssim.localization.pool import Pool, write_pool
 from finssim.localization.poses.methods import METHODS, Constraints
 from finssim.provenance import provenance
 from finssim.sensors.overhead_camera import Basin, OverheadCamera, Pose, Ripples, Scene, TagInScene
+from finssim.text_table import write_csv
 from finssim.vehicles import Mount, Tags
 
-__all__ = ["RESULT_FILE", "draw_campaign", "localization_experiment", "print_table", "tables_of"]
+__all__ = ["RESULT_FILE", "draw_campaign", "localization_experiment", "tables_of"]
 
 Array = NDArray[np.float64]
 
@@ -245,7 +244,7 @@ def pictures(campaign: Campaign, renderer: str = "own") -> Iterator[Picture]:
     Raises:
         ValueError: There is no such renderer.
     """
-    choice(RENDERERS, renderer, "renderer", ValueError)
+    check_choices([renderer], RENDERERS, "renderer", ValueError)
     look = _geometry(campaign) if renderer == "geometry" else _rendered(campaign, renderer)
     number = 0
     for k, visit in enumerate(campaign.visits):
@@ -386,19 +385,16 @@ def survey_rows(campaign: Campaign, chosen: Sequence[Picture]) -> list[Row]:
     """The survey as a table: where the tag was said to lie in each picture."""
     rows: list[Row] = []
     for picture in chosen:
-        place = dict(zip("xyz", campaign.visits[picture.visit].nominal.tolist(), strict=True))
-        tag = {"yaw_deg": 0.0, "tag": TAG_ID, "edge": TAG.edge}
+        x, y, z = campaign.visits[picture.visit].nominal.tolist()
         # All pictures of a visit share its survey error.
-        rows.append({"image": picture.name, **place, **tag, "group": f"place {picture.visit}"})
+        about = {"yaw_deg": 0.0, "tag": TAG_ID, "edge": TAG.edge, "group": f"place {picture.visit}"}
+        rows.append({"image": picture.name, "x": x, "y": y, "z": z, **about})
     return rows
 
 
 def write_survey(rows: Sequence[Row], path: Path) -> None:
     """Write the table as `finssim calibrate pool --surveyed` reads it."""
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(path, list(rows[0]), [list(row.values()) for row in rows])
 
 
 def _observed(frames: list[Frame], rows: list[Row]) -> Observations:
@@ -457,7 +453,7 @@ WORDS = {
     "pinhole": "pinhole PnP",
     "pinhole, refractive pose": "pinhole PnP, as paper",
 }
-HEADS = ["", "RMSE [cm]", "95 % of it", "P95 [cm]", "95 % of it", "located"]
+HEADS = ("", "RMSE [cm]", "95 % of it", "P95 [cm]", "95 % of it", "located")
 CALIBRATION = {
     "seed": ("seed", ""),
     "camera_height_mm": ("camera height [mm]", ".2f"),
@@ -662,57 +658,50 @@ def _draw_sensitivity(swept: Mapping[str, Any], path: Path) -> None:
     save_figure(figure, path)
 
 
-def tables_of(result: Mapping[str, Any]) -> dict[str, tuple[list[str], list[list[str]]]]:
-    """Words about conditions -> heads and rows of the table; the last is the paper's."""
-    tables = {
-        f"ours, {name} conditions: {WORDS[name]}": [
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
+    """The tables, ours by conditions, then the paper's; and what the calibrations got wrong."""
+    title, origin = "Horizontal localization through water", result["provenance"]
+    tables = [Table(title=title, headline=_headline(result), note=_gain(result))]
+    for name, methods in result["results"].items():
+        rows = [
             [
                 WORDS[method],
-                *(_text(m["rmse_cm"], m["rmse_ci95_cm"])),
-                *(_text(m["p95_cm"], m["p95_ci95_cm"])),
+                *_texts(m["rmse_cm"], m["rmse_ci95_cm"]),
+                *_texts(m["p95_cm"], m["p95_ci95_cm"]),
                 f"{m['located']}/{m['pictures']}",
             ]
             for method, m in methods.items()
         ]
-        for name, methods in result["results"].items()
-    }
-    tables["the paper: its camera over its pool"] = [
+        tables.append(Table(title=f"ours, {name} conditions: {WORDS[name]}", heads=HEADS, rows=rows))
+    rows = [
         [f"paper, {WORDS[m]}", f"{p['rmse_cm']:.2f}", "", f"{p['p95_cm']:.2f}", "", ""]
         for m, p in result["paper"].items()
     ]
-    return {words: (HEADS, rows) for words, rows in tables.items()}
+    pictures = {"error_map.png": "Error map"}
+    if result["sensitivity"]:  # an interruption may come before it
+        pictures["sensitivity.png"] = "Sensitivity"
+    paper = "the paper: its camera over its pool"
+    rows_wrong = [
+        [format(c[key], form) for key, (_, form) in CALIBRATION.items()] for c in result["calibration"]
+    ]
+    return [
+        *tables,
+        Table(title=paper, heads=HEADS, rows=rows, note=NOTE, pictures=pictures),
+        Table(
+            title="what the calibrations got wrong",
+            heads=[heading for heading, _ in CALIBRATION.values()],
+            rows=rows_wrong,
+            left=(),
+            note=f"FinsSim {origin['finssim']}, revision {origin['revision']}, seeds {result['seeds']}.",
+        ),
+    ]
 
 
-def _text(value: float | None, interval: Sequence[float | None]) -> tuple[str, str]:
+def _texts(value: float | None, interval: Sequence[float | None]) -> tuple[str, str]:
     """A figure, and its interval."""
     low, high = interval
     bounds = "" if low is None or high is None else f"[{low:.2f}, {high:.2f}]"
     return "none" if value is None else f"{value:.2f}", bounds
-
-
-def print_table(result: Mapping[str, Any], console: Console) -> None:
-    """Print the tables, ours by conditions, then the paper's."""
-    console.print(_headline(result), highlight=False)
-    for words, (heads, rows) in tables_of(result).items():
-        console.print(console_table(heads, rows, title=words, title_style="bold"))
-    console.print(_gain(result), highlight=False)
-    console.print(NOTE, highlight=False)
-
-
-def markdown(result: Mapping[str, Any]) -> str:
-    """`localization.md`."""
-    parts = ["# Horizontal localization through water", _headline(result), _gain(result)]
-    for words, table in tables_of(result).items():
-        parts += [f"## {words[0].upper()}{words[1:]}", markdown_table(*table)]
-    parts += [NOTE, "![Error map](error_map.png)"]
-    if result["sensitivity"]:  # an interruption may come before it
-        parts.append("![Sensitivity](sensitivity.png)")
-    heads = [heading for heading, _ in CALIBRATION.values()]
-    rows = [[format(c[key], form) for key, (_, form) in CALIBRATION.items()] for c in result["calibration"]]
-    origin = result["provenance"]
-    parts += ["## What the calibrations got wrong", markdown_table(heads, rows, left=())]
-    parts.append(f"FinsSim {origin['finssim']}, revision {origin['revision']}, seeds {result['seeds']}.")
-    return "\n\n".join(parts) + "\n"
 
 
 def _headline(result: Mapping[str, Any]) -> str:
@@ -750,18 +739,6 @@ class SeedResult:
     """By method."""
 
 
-@dataclass
-class _Drawn:
-    """What is done so far."""
-
-    done: Mapping[str, list[SeedResult]] = field(default_factory=lambda: {name: [] for name in CONDITIONS})
-    """By conditions."""
-    higher: list[dict[str, Scores]] = field(default_factory=list)
-    """The tag lifted, by seed and method."""
-    swept: dict[str, Any] = field(default_factory=dict)
-    interrupted: bool = False
-
-
 def localization_experiment(
     *,
     out: Path,
@@ -794,34 +771,53 @@ def localization_experiment(
     """
     if seeds < 1:
         raise ValueError(f"seeds is {seeds}, expected at least 1")
-    choice(RENDERERS, renderer, "renderer", ValueError)
+    check_choices([renderer], RENDERERS, "renderer", ValueError)
     refuse_unwritable(atomic_directory(out, replaces=RESULT_FILE))
-    drawn = _draw_all(seeds, seed, renderer, size, say)
-    runs = drawn.done["published"]
-    first = runs[0]
-    scores = {name: [one.scores for one in each] for name, each in drawn.done.items()}
+    drawn: dict[str, list[SeedResult]] = {name: [] for name in CONDITIONS}
+    higher: list[Mapping[str, Scores]] = []
+    swept: dict[str, Any] = {}
+    runs, interrupted = drawn["published"], False
+    try:
+        for k in range(seeds):
+            for j, name in enumerate(CONDITIONS):
+                say((k + j / len(CONDITIONS)) / seeds, f"seed {seed + k}, {name} conditions")
+                drawn[name].append(_one(name, seed + k, renderer, size))
+            say((k + 0.8) / seeds, f"seed {seed + k}, another depth")
+            campaign = lifted(runs[k].campaign, LIFT)  # the same calibration, the tag at another depth
+            higher.append(_scored(campaign, list(pictures(campaign, renderer)), runs[k].found))
+            if not swept:
+                say((k + 0.9) / seeds, "sensitivity")
+                swept.update(_swept(runs[0], renderer))
+    except KeyboardInterrupt:
+        if not runs:
+            raise
+        interrupted = True
+        for each in drawn.values():
+            del each[max(len(higher), 1) :]
+    scores = {**{name: [one.scores for one in each] for name, each in drawn.items()}, "lifted": higher}
+    visits = runs[0].campaign.visits
     result = {
         "experiment": "localization",
         "renderer": renderer,
         "seeds": [one.campaign.seed for one in runs],
         "seeds_asked_for": seeds,
-        "interrupted": drawn.interrupted,
-        "places": len(first.campaign.visits),
-        "pictures_per_seed": sum(visit.images for visit in first.campaign.visits),
+        "interrupted": interrupted,
+        "places": len(visits),
+        "pictures_per_seed": sum(visit.images for visit in visits),
         "conditions": {name: vars(CONDITIONS[name]) for name in CONDITIONS},
         "results": {
             name: {method: pooled([one[method] for one in each]) for method in METHODS_SHOWN}
-            for name, each in (scores | {"lifted": drawn.higher}).items()
+            for name, each in scores.items()
             if each
         },
         "lift_m": LIFT,
         "pixel_std_px": [one.found.pixel_std for one in runs],
         "calibration": [_errors(one) for one in runs],
-        "sensitivity": drawn.swept,
+        "sensitivity": swept,
         "paper": {m: {"rmse_cm": r, "p95_cm": p} for m, (r, p) in PAPER_TABLE_2.items()},
         "provenance": provenance(),
     }
-    _write(result, out, first)
+    _write(result, out, runs[0])
     return result
 
 
@@ -837,31 +833,7 @@ def _write(result: Mapping[str, Any], out: Path, first: SeedResult) -> None:
         write_pool(found.pinhole, folder / "pool_pinhole.yaml")
         write_detections(found.frames, folder / "detections.csv")
         write_survey(found.survey, folder / "survey.csv")
-        write_json(folder / RESULT_FILE, result, markdown(result))
-
-
-def _draw_all(seeds: int, seed: int, renderer: str, size: Mapping[str, Any], say: Say) -> _Drawn:
-    """All seeds, or after Ctrl-C those that are finished, of the first what there is."""
-    drawn = _Drawn()
-    published = drawn.done["published"]
-    try:
-        for k in range(seeds):
-            for j, name in enumerate(CONDITIONS):
-                say((k + j / len(CONDITIONS)) / seeds, f"seed {seed + k}, {name} conditions")
-                drawn.done[name].append(_one(name, seed + k, renderer, size))
-            say((k + 0.8) / seeds, f"seed {seed + k}, another depth")
-            campaign = lifted(published[k].campaign, LIFT)  # the same calibration, the tag at another depth
-            drawn.higher.append(_scored(campaign, list(pictures(campaign, renderer)), published[k].found))
-            if not drawn.swept:
-                say((k + 0.9) / seeds, "sensitivity")
-                drawn.swept.update(_swept(published[0], renderer))
-    except KeyboardInterrupt:
-        if not published:
-            raise
-        drawn.interrupted = True
-        for runs in drawn.done.values():
-            del runs[max(len(drawn.higher), 1) :]
-    return drawn
+        write_json(folder / RESULT_FILE, result, tables_of(result))
 
 
 def _one(name: str, seed: int, renderer: str, size: Mapping[str, Any]) -> SeedResult:
@@ -889,39 +861,31 @@ def _swept(one: SeedResult, renderer: str) -> dict[str, Any]:
     held_out = np.flatnonzero(~one.campaign.calibrates)
     some = held_out[:: max(1, len(held_out) // RIPPLE_VISITS)]
     visits = tuple(replace(one.campaign.visits[k], images=RIPPLE_IMAGES) for k in some)
+    still = replace(one.campaign, visits=visits, calibrates=np.zeros(len(visits), bool))
     swept["ripples"] = []
     for slope in RIPPLES:
-        campaign = replace(
-            one.campaign,
-            conditions=replace(one.campaign.conditions, ripples=slope),
-            visits=visits,
-            calibrates=np.zeros(len(visits), bool),
-        )
-        scores = locate(
-            campaign,
-            list(pictures(campaign, renderer)),
-            one.found.refractive,
-            "refractive",
-            pixel_std=one.found.pixel_std,
-        )
+        campaign = replace(still, conditions=replace(still.conditions, ripples=slope))
+        seen, std = list(pictures(campaign, renderer)), one.found.pixel_std
+        scores = locate(campaign, seen, one.found.refractive, "refractive", pixel_std=std)
         swept["ripples"].append([slope, rmse_cm(scores)])
     return swept
 
 
 def _errors(one: SeedResult) -> dict[str, Any]:
     """What the calibration of one seed got wrong, the truth being known here."""
-    true, found = one.campaign.truth, one.found.refractive
+    true, fit = one.campaign.truth, one.found.refractive
     x, y = true.camera.position[:2]
-    above = [
-        float(pool.camera.position[2] - pool.interface.height(*pool.camera.position[:2]))
-        for pool in (true, found)
+    heights = [float(pool.camera.position[2]) for pool in (true, fit)]
+    over = [
+        h - float(pool.interface.height(*pool.camera.position[:2]))
+        for h, pool in zip(heights, (true, fit), strict=True)
     ]
-    lean = float(np.clip(true.interface.normal @ found.interface.normal, -1.0, 1.0))
+    lean = float(np.clip(true.interface.normal @ fit.interface.normal, -1.0, 1.0))
     return {
         "seed": one.campaign.seed,
-        "camera_height_mm": 1000.0 * float(found.camera.position[2] - true.camera.position[2]),
-        "water_height_mm": 1000.0 * float(found.interface.height(x, y) - true.interface.height(x, y)),
-        "camera_over_water_mm": 1000.0 * (above[1] - above[0]),
+        "camera_height_mm": 1000.0 * (heights[1] - heights[0]),
+        "water_height_mm": 1000.0 * float(fit.interface.height(x, y) - true.interface.height(x, y)),
+        "camera_over_water_mm": 1000.0 * float(over[1] - over[0]),
         "tilt_deg": float(np.degrees(np.arccos(lean))),
-        "index": float(found.interface.index_far - true.interface.index_far),
+        "index": float(fit.interface.index_far - true.interface.index_far),
     }

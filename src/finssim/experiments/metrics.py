@@ -145,9 +145,10 @@ PAPER_T2 = MappingProxyType(
 """Table of T2: controller -> trajectory -> horizontal RMSE, vertical RMSE and 95th percentile of the distance [m]."""
 
 
-def paper_t2_row(name: str, trajectory: str) -> dict[str, Any]:
-    """One controller on one trajectory, with the keys of our own results."""
-    return dict(zip(T2_KEYS, PAPER_T2[name][trajectory], strict=True))
+def paper_t2_row(name: str, trajectory: str) -> dict[str, Any] | None:
+    """One controller on one trajectory, with the keys of our own results; None where the paper has none."""
+    values = PAPER_T2[name].get(trajectory)
+    return values and dict(zip(T2_KEYS, values, strict=True))
 
 
 Array = NDArray[np.float64]
@@ -233,17 +234,15 @@ def summarize(trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     Returns:
         `trials` and `valid` (trials that have late errors), `success` (count), `e_p_m`, `e_y_m`, `e_psi_deg`, `t_s_s`,
-        `J_p_m`, `J_psi_deg` (None where no trial has one) and `per_trial`, the trials themselves.
+        `J_p_m`, `J_psi_deg` (None where no trial has one).
     """
     row: dict[str, Any] = {
         "trials": len(trials),
         "valid": sum(trial["e_p_m"] is not None for trial in trials),
         "success": sum(bool(trial["success"]) for trial in trials),
     }
-    for key in MEANS:
-        row[key] = _over(np.mean, trials, key)
-    row["t_s_s"] = _over(np.median, trials, "t_s_s")
-    return row | {"per_trial": [dict(trial) for trial in trials]}
+    means = {key: _over(np.mean, trials, key) for key in MEANS}
+    return row | means | {"t_s_s": _over(np.median, trials, "t_s_s")}
 
 
 def pose_error(position: Array, yaw: Array, goal: Array) -> tuple[Array, Array]:
@@ -479,7 +478,4 @@ def summarize_tracking(trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "valid": sum(trial["p95_m"] is not None for trial in trials),
         "complete": sum(bool(trial["complete"]) for trial in trials),
     }
-    for key in MEASURES:
-        values = [trial[key] for trial in trials if trial[key] is not None]
-        row[key] = float(np.mean(values)) if values else None
-    return row
+    return row | {key: _over(np.mean, trials, key) for key in MEASURES}

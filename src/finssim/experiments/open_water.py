@@ -10,11 +10,10 @@ from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
-from rich.console import Console
 
 from finssim.control.trajectories import Trajectory
-from finssim.experiments.campaign import Say, choice, write_json
-from finssim.experiments.tables import console_table
+from finssim.experiments.campaign import Say, check_choices, write_json
+from finssim.experiments.tables import Table
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.pool import PlantSpec, VirtualPool, draw_plant, read_truth
 from finssim.pool.sites import positioning_of, site_of
@@ -27,7 +26,7 @@ from finssim.robot.runtime import Runtime
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import vehicle_at
 
-__all__ = ["open_water", "print_open_water"]
+__all__ = ["open_water", "tables_of"]
 
 Array = npt.NDArray[np.float64]
 
@@ -55,7 +54,7 @@ def way_of(shape: str, duration: float, speed: float) -> Trajectory:
     Raises:
         ValueError: There is no such shape.
     """
-    choice(WAYS, shape, "way", ValueError)
+    check_choices([shape], WAYS, "way", ValueError)
     corners = [[0.0, 0.0], [speed * duration, 0.0]]
     if shape == "square":
         around = [[SIDE, 0.0], [SIDE, SIDE], [0.0, SIDE], [0.0, 0.0]]
@@ -214,12 +213,12 @@ def open_water(
         "trials": trials,
         "provenance": provenance(),
     }
-    write_json(Path(out) / "open_water.json", result)
+    write_json(Path(out) / "open_water.json", result, tables_of(result))
     return result
 
 
-def print_open_water(result: Mapping[str, Any], console: Console) -> None:
-    """Print a row for each way."""
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
+    """A row for each way."""
     title = f"{result['vehicle']['name']}, {result['shape']}, positioning {result['positioning']}"
     heads = ("seed", "way [m]", "drift [m]", "drift [%]", "std [m]", "NEES", "inside", "off way [m]", "")
     rows = [
@@ -229,4 +228,4 @@ def print_open_water(result: Mapping[str, Any], console: Console) -> None:
         ]
         for t in result["trials"]
     ]  # fmt: skip
-    console.print(console_table(heads, rows, left=(), title=title))
+    return [Table(title=title, heads=heads, rows=rows, left=())]

@@ -21,10 +21,10 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
-from finssim.experiments.campaign import Say, choice, write_json
+from finssim.experiments.campaign import Say, check_choices, write_json
 from finssim.experiments.pool_trial import stand_in_pool
+from finssim.experiments.tables import Table
 from finssim.pool import TruthError, VirtualPool, read_truth
 from finssim.provenance import provenance
 from finssim.robot.goals import station_of
@@ -40,9 +40,8 @@ __all__ = [
     "await_flush",
     "await_thrust",
     "pair",
-    "print_soak",
-    "print_timing",
     "soak",
+    "tables_of",
     "timing",
 ]
 
@@ -363,12 +362,11 @@ class _Samples:
         self._say(row[0], f"{row[0] / 3600.0:.2f} h, {row[2]:.1f} MiB, {row[4]}")
 
 
-def print_soak(result: Mapping[str, Any], console: Console) -> None:
-    """Print what came out."""
+def _soak_lines(result: Mapping[str, Any]) -> list[str]:
     slope = result["slope_mib_per_h"]
     grown = "" if slope is None else f", {slope:+.2f} MiB per hour of vehicle time"
     rms = result["error_rms_m"]
-    lines = [
+    return [
         f"{result['vehicle_h']:.2f} h of vehicle time in {result['wall_s'] / 60.0:.1f} min, "
         f"{result['times_real_time']:.1f} times real time",
         f"memory: {result['verdict']}{grown}; {result['first_mib']:.1f} MiB at the start, "
@@ -377,8 +375,6 @@ def print_soak(result: Mapping[str, Any], console: Console) -> None:
         f"faults: {'; '.join(result['faults']) or 'none'}; "
         f"decisions missed: {result['missed_decisions']} of {result['decisions']}",
     ]
-    for line in lines:
-        console.print(line, highlight=False, soft_wrap=True)
 
 
 # `finssim experiment timing`: does the robot keep its times on this machine, and how fast does lock-step go?
@@ -429,7 +425,7 @@ def timing(
     Raises:
         ReliabilityError: An unknown camera, or a process that did not start or end.
     """
-    choice(CAMERAS, camera, "camera", ReliabilityError)
+    check_choices([camera], CAMERAS, "camera", ReliabilityError)
     lockstep = {}
     for k, mode in enumerate(CAMERAS):
         say(0.1 * k, f"lock-step, {mode}")
@@ -506,12 +502,11 @@ def _wait(robot: Process, seconds: float, say: Say) -> None:
         time.sleep(0.5)
 
 
-def print_timing(result: Mapping[str, Any], console: Console) -> None:
-    """Print what came out."""
+def _timing_lines(result: Mapping[str, Any]) -> list[str]:
     told, reached = result["realtime"]["robot"], result["reached"]
     latency = told["latency_s"]
     ms = ", ".join(f"{name} {1e3 * value:.0f} ms" for name, value in latency.items() if value is not None)
-    lines = [
+    return [
         f"real time, {result['camera']}, {result['minutes']:g} min, {result['processors']} processors, "
         f"load {result['load']:.1f} before: ended {told['state']}{': ' + told['reason'] if told['reason'] else ''}",
         f"decisions missed: {told['missed']} of {told['decisions'] + told['missed']}; "
@@ -520,5 +515,9 @@ def print_timing(result: Mapping[str, Any], console: Console) -> None:
         *(f"lock-step, {mode}: {speed:.1f} times real time" for mode, speed in result["lockstep"].items()),
         "; ".join(f"{what}: {'reached' if good else 'not reached'}" for what, good in reached.items()),
     ]
-    for line in lines:
-        console.print(line, highlight=False, soft_wrap=True)
+
+
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
+    """What came out of either, in sentences."""
+    lines = _soak_lines if result["experiment"] == "soak" else _timing_lines
+    return [Table(title=str(result["experiment"]), sentences=lines(result))]
