@@ -98,13 +98,19 @@ def test_every_plant_can_be_flown_in(name, controller, monkeypatch):
     assert all(trial["e_p_m"] is None for trial in result["per_trial"])  # the window was never reached
 
 
+def positions(plant, **options):
+    """Of all trials of the tuned PID, (T, n, 3)."""
+    played = evaluate_controller("pid", plant, **options).trials
+    return np.stack([trial.motion.position for trial in played], axis=1)
+
+
 @pytest.mark.slow
 def test_plants_make_a_difference(monkeypatch):
     """A current pushes, noise shakes, lag delays: each path differs from the nominal one."""
     monkeypatch.setattr(trials_module, "DURATION", 5.0)
-    nominal = evaluate_controller("pid", NOMINAL, trials=2).trials.position
+    nominal = positions(NOMINAL, trials=2)
     for name in set(available_plants()) - {"nominal"}:
-        other = evaluate_controller("pid", load_plant(name), trials=2).trials.position
+        other = positions(load_plant(name), trials=2)
         assert np.abs(other - nominal).max() > 1e-3, name
 
 
@@ -112,12 +118,9 @@ def test_seeds_decide_what_is_drawn(monkeypatch):
     """Equal seeds are equal trials, others are not, and a trial does not depend on how many there are."""
     monkeypatch.setattr(trials_module, "DURATION", 3.0)
     plant = load_plant("randomised")
-
-    def positions(trials, seed):
-        played = evaluate_controller("pid", plant, trials=trials, seed=seed).trials
-        return np.stack([trial.motion.position for trial in played], axis=1)
-
-    one, again, other, many = (positions(*options) for options in ((4, 1), (4, 1), (4, 2), (70, 1)))
+    one, again, other, many = (
+        positions(plant, trials=trials, seed=seed) for trials, seed in ((4, 1), (4, 1), (4, 2), (70, 1))
+    )
     np.testing.assert_array_equal(one, again)
     np.testing.assert_array_equal(one, many[:, :4])
     assert np.abs(one - other).max() > 1e-4
@@ -152,8 +155,9 @@ def test_a_directory_holds_result_figure_and_trajectories(tmp_path, capsys):
     assert (tmp_path / "e" / "error_envelope.png").read_bytes().startswith(b"\x89PNG")
     table = read_run(tmp_path / "e" / "trajectories")
     path = table[table.world == 4].sort_values("t")
-    np.testing.assert_allclose(path[["x", "y", "z"]], evaluation.trials.position[:, 4], atol=1e-6)
-    np.testing.assert_allclose(path.t, evaluation.trials.t, atol=1e-6)
+    motion = evaluation.trials[4].motion
+    np.testing.assert_allclose(path[["x", "y", "z"]], motion.position, atol=1e-6)
+    np.testing.assert_allclose(path.t, motion.t, atol=1e-6)
 
 
 @pytest.mark.slow

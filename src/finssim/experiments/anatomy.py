@@ -17,7 +17,7 @@ from finssim.experiments.figures import COLORS, clean, new_figure, save_figure
 from finssim.experiments.plants import Plant, load_plant
 from finssim.experiments.statistics import with_interval
 from finssim.experiments.tables import Table, figure_text
-from finssim.experiments.transfer import T1_ROWS, controllers_of
+from finssim.experiments.transfer import T1, controllers_of
 from finssim.provenance import provenance
 from finssim.vehicles import load_vehicle
 
@@ -144,7 +144,7 @@ def anatomy(
     check_choices(names, ROWS, "row", ValueError)
     folder, run_seeds = Path(out), range(seed, seed + seeds)
     controllers = controllers_of(
-        {name: T1_ROWS[name] for name in names}, run_seeds, folder, vehicle, steps,
+        {name: T1.rows[name] for name in names}, run_seeds, folder, vehicle, steps,
         lambda part, what: say(TRAINING_SHARE * part, what),
     )  # fmt: skip
     plants = {
@@ -170,7 +170,7 @@ def anatomy(
     body = load_vehicle(vehicle)
     result = {
         "experiment": "anatomy", "vehicle": {"name": body.name, "sha256": body.sha256}, "trials": trials,
-        "seeds": list(run_seeds), "rows": {name: T1_ROWS[name].title for name in names},
+        "seeds": list(run_seeds), "rows": {name: T1.rows[name].title for name in names},
         "causes": {
             name: {
                 "title": CAUSES[name].title, "unit": CAUSES[name].unit, "amounts": list(CAUSES[name].amounts),

@@ -54,6 +54,7 @@ def run_experiment(
     name: str,
     work: Callable[..., dict[str, Any]],
     tables: Callable[[Mapping[str, Any]], Sequence[Table]],
+    /,
     *,
     as_json: bool = False,
     bar: bool = True,

@@ -641,7 +641,7 @@ class _Demonstration:
             role: programmes(tuple(levels), standing, levels=levels, coast=COAST)
             for role, levels in (("fit", scope.levels), ("held-out", scope.held_out))
         }
-        plans["fit"] += shuttles(scope.shuttles, standing)
+        plans["fit"] += shuttles(scope.shuttles, standing) if scope.shuttles else []
         plans = {role: [trimmed(programme, standing) for programme in plan] for role, plan in plans.items()}
         if self.robot is not None:
             robot = self.robot

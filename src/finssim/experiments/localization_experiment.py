@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import MappingProxyType
 from typing import Annotated, Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from finssim.calibration.vision.pool_model import Settings
 from finssim.calibration.vision.survey import Observations, observe, read_survey
 from finssim.experiments.campaign import Say, check_choices, write_json
 from finssim.experiments.figures import COLORS, clean, legend_below, new_figure, save_figure
+from finssim.experiments.metrics import PAPER
 from finssim.experiments.statistics import bootstrap
 from finssim.experiments.tables import Table
 from finssim.files import atomic_directory, refuse_unwritable
@@ -73,13 +73,11 @@ class Conditions:
     """Rms slope of the surface [-]."""
 
 
-CONDITIONS: Mapping[str, Conditions] = MappingProxyType(
-    {
-        "published": Conditions(),
-        "flat": Conditions(ripples=0.0),
-        "quiet": Conditions(**dict.fromkeys(Conditions.__dataclass_fields__, 0.0)),
-    }
-)
+CONDITIONS: Mapping[str, Conditions] = {
+    "published": Conditions(),
+    "flat": Conditions(ripples=0.0),
+    "quiet": Conditions(**dict.fromkeys(Conditions.__dataclass_fields__, 0.0)),
+}
 """`published`: every error; `flat`: every error but ripples; `quiet`: noise of the pictures alone."""
 
 
@@ -408,19 +406,14 @@ def _observed(frames: list[Frame], rows: list[Row]) -> Observations:
 
 RESULT_FILE = "localization.json"
 
-PAPER_TABLE_2 = MappingProxyType({"pinhole": (5.74, 11.41), "refractive": (0.73, 1.45)})
+PAPER_TABLE_2: Mapping[str, Sequence[float]] = PAPER["localization"]
 """Method -> RMSE and 95th percentile in the paper [cm]: its camera over its pool, calibrated on the same places."""
 
-METHODS_SHOWN = MappingProxyType(
-    {
-        "refractive": ("refractive", "refractive"),
-        "refractive-weighted": ("refractive-weighted", "refractive"),
-        "refractive-6dof": ("refractive-6dof", "refractive"),
-        "pinhole-depth": ("pinhole-depth", "pinhole"),
-        "pinhole": ("pinhole", "pinhole"),
-        "pinhole, refractive pose": ("pinhole", "refractive"),
-    }
-)
+METHODS_SHOWN = {
+    **{name: (name, "refractive") for name in ("refractive", "refractive-weighted", "refractive-6dof")},
+    **{name: (name, "pinhole") for name in ("pinhole-depth", "pinhole")},
+    "pinhole, refractive pose": ("pinhole", "refractive"),
+}
 """Row of the table -> method and the calibration it uses. The last is as the paper has it, with the camera pose of the
 refractive calibration."""
 

@@ -21,6 +21,7 @@ from finssim.experiments import campaign
 from finssim.experiments.evaluate import Evaluation, summary_of
 from finssim.experiments.metrics import T1_SETPOINTS, T1_START, in_room
 from finssim.experiments.on_robot import (
+    GETTING_READY,
     Attendant,
     OnRobot,
     Outcome,
@@ -28,7 +29,7 @@ from finssim.experiments.on_robot import (
     RobotTrial,
     Session,
     check_starts,
-    play_trial,
+    fault_of,
     session,
 )
 from finssim.experiments.recorded import RecordedError, read_record
@@ -209,15 +210,16 @@ def play_in_pool(
         pool: As of `stand_in_pool`.
     """
     world, site = stand_in_pool(standing, start, **pool)
+    perception = Perception(vehicle, site, **estimator)
+    runtime = Runtime(
+        vehicle, site, trial.pilot, trial.guide, arm=True, perception=perception, recorder=recorder
+    )
+    longest = GETTING_READY + trial.duration
     with closing(world):
-        return play_trial(
-            trial,
-            lambda runtime, **how: run_lockstep(runtime, world, **how),
-            vehicle,
-            site,
-            perception=Perception(vehicle, site, **estimator),
-            recorder=recorder,
-        )
+        run_lockstep(
+            runtime, world, longest, show=trial.watch, until=lambda r: r.bridge.state == "fault" or trial.over(r)
+        )  # fmt: skip
+    return Outcome(trial=trial, runtime=runtime, fault=fault_of(trial, runtime))
 
 
 def job_trial(job: Job, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotTrial, Station]:

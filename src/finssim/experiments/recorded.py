@@ -136,9 +136,10 @@ def read_record(
     drive = read_drive(path, vehicle)
     pilot = _pilot(path)
     steered = drive.stretch >= 0
-    if not (steered & (drive.since >= 0.0)).any():
+    t = drive.motion.t
+    if not (steered & (t >= 0.0)).any():
         raise RecordedError(f"{path}: the robot was never armed with its state known: nothing was done in it")
-    if task not in PUBLISHED and not drive.action.shape[1]:
+    if task not in PUBLISHED and not np.size(drive.motion.action):
         raise RecordedError(
             f"{path}: does not tell what the pilot did, in [-1, 1], which '{task}' scores: record a run of this version"
         )
@@ -148,14 +149,7 @@ def read_record(
         the_guide = GoalHistory.of(drive, steered) if fitted.moving else _station(drive, steered, task)
     longest = {"t1": duration, "t2": math.inf}.get(task, fitted.time_limit)
     full = min(the_guide.duration, longest)
-    estimate = Motion(
-        t=drive.since,
-        position=drive.position,
-        quaternion=drive.quaternion,
-        nu=drive.nu,
-        thrust=drive.force,
-        action=drive.action,
-    ).between(steered & (drive.since >= 0.0) & (drive.since <= full + 1e-6))
+    estimate = drive.motion.between(steered & (t >= 0.0) & (t <= full + 1e-6))
     stopped = float(estimate.t[-1]) < full - EARLY
     until = float(estimate.t[-1]) if stopped else full
     motion, offset = (estimate, None) if truth is None else _truth(truth, drive, until)
@@ -202,8 +196,8 @@ class GoalHistory:
         Raises:
             RecordedError: There was no goal.
         """
-        goals, rows = _goals(drive, steered), steered & (drive.since >= 0.0)
-        return cls(drive.since[rows], np.column_stack([goals[:, :3], np.unwrap(goals[:, 3])]))
+        goals, rows = _goals(drive, steered), steered & (drive.motion.t >= 0.0)
+        return cls(drive.motion.t[rows], np.column_stack([goals[:, :3], np.unwrap(goals[:, 3])]))
 
     def at(self, t: ArrayLike) -> Reference:
         """The goal between the decisions."""
@@ -219,7 +213,7 @@ def _goals(drive: Drive, steered: NDArray[np.bool_]) -> Array:
     """Where the vehicle should have been, by decision."""
     if not drive.has_goal:
         raise RecordedError(f"{drive.path}: was driven by hand to no goal: a record of finssim run has one")
-    return drive.goal[steered & (drive.since >= 0.0)]
+    return drive.goal[steered & (drive.motion.t >= 0.0)]
 
 
 def _station(drive: Drive, steered: NDArray[np.bool_], task: str) -> Guide:
@@ -246,11 +240,11 @@ def _truth(path: Path, drive: Drive, until: float) -> tuple[Motion, float]:
     """The true motion from the guide's start to a time after it [s], and what was added to its times."""
     motion = _table(path)
     try:
-        robot = PoseSeries(drive.time, drive.position, drive.quaternion)
+        robot = PoseSeries(drive.time, drive.motion.position, drive.motion.quaternion)
         offset = offset_between(robot, motion.t, motion.position)
     except ViewError as error:
         raise RecordedError(f"{path}: {error}") from None
-    t = motion.t + offset - (drive.time[0] - drive.since[0])
+    t = motion.t + offset - (drive.time[0] - drive.motion.t[0])
     return replace(motion, t=t).between((t >= 0.0) & (t <= until + 1e-6)), offset
 
 

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any
 
 import numpy as np
@@ -27,6 +26,7 @@ from finssim.calibration.trials.trial import Trial
 from finssim.engine import Simulator, TetherLine
 from finssim.experiments.campaign import Say, write_json
 from finssim.experiments.figures import save_figure
+from finssim.experiments.metrics import PAPER
 from finssim.experiments.plants import PlantError
 from finssim.experiments.statistics import RESAMPLES, SEED, bootstrap
 from finssim.experiments.tables import Table
@@ -224,13 +224,7 @@ def _range(ci95: Sequence[float]) -> str:
 AXES: tuple[Axis, ...] = ("surge", "sway", "heave", "yaw")
 MODELS = ("calibrated", "mesh", "simplified")
 
-PAPER_TABLE_3 = MappingProxyType(
-    {
-        "calibrated": (0.315, (0.255, 0.338)),
-        "mesh": (1.104, (0.923, 1.282)),
-        "simplified": (1.374, (1.201, 1.447)),
-    }
-)
+PAPER_TABLE_3: Mapping[str, Any] = PAPER["replay"]
 """Model -> NRMSE and 95 % interval in the paper: Unity against its real vehicle in its pool."""
 
 REPEATS = 8

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import yaml
 from rich.console import Console
 
 from finssim.calibration.output.calibrated_ranges import write_ranges
@@ -33,7 +33,7 @@ __all__ = [
     "MEASURES",
     "SPECS",
     "T1",
-    "T1_ROWS",
+    "ROWS",
     "T2",
     "controllers_of",
     "t1",
@@ -79,19 +79,19 @@ class Training:
     """Whether the policy has integrals of its errors and sees what it saw and did before; those of the paper do not."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Row:
-    """One row of a table: who steers and what is taken from it."""
+    """One row of a table: who steers and what is taken from it; see `rows.yaml`."""
 
     title: str
-    training: Training | None = None
+    training: Training | None
     """None for a PID."""
+    controller: str = ""
+    """Name of the PID."""
     paper: str | None = None
     """Row of the paper's table; None where it has none."""
     module: str = ""
     """What the row takes away or puts in place of the reference, as a sentence begins."""
-    controller: str = ""
-    """Name of the PID."""
     changes: dict[str, Any] = field(default_factory=dict)
     """Fields of its jobs."""
 
@@ -459,93 +459,24 @@ def _listed(items: list[str]) -> str:
     return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
 
 
-DR = "hold_for_position"
-"""The published ranges of station keeping."""
-INTEGRAL = "An integral of the errors"
-POOL = "Randomisation made for a pool, with an integral of the errors,"
-
-CALIBRATED = Training("calibrated")
-CALIBRATED_DR = Training("calibrated-dr", "t2", randomize=DR)
-
-T1_ROWS: dict[str, Row] = {
-    "calibrated": Row("Calibrated Fossen", CALIBRATED, "calibrated"),
-    "calibrated-dr": Row(
-        "+ DR", Training("calibrated-dr", randomize=DR), "calibrated + DR", "Domain randomisation"
-    ),
-    "noise": Row(
-        "+ localization noise",
-        CALIBRATED,
-        "calibrated, localisation noise",
-        "Localization noise of 5 cm and 10°",
-        changes={"position_noise": 0.05, "yaw_noise": math.radians(10.0)},
-    ),
-    "no-fusion": Row(
-        "without EKF", CALIBRATED, "without EKF", "Leaving out the fusion", changes={"fusion": False}
-    ),
-    "no-lag": Row(
-        "without thruster dynamics",
-        Training("calibrated-no-lag", randomize="no_thruster_dynamics"),
-        "without thruster dynamics",
-        "Training without thruster dynamics",
-    ),
-    "mesh": Row("Physics-Mesh", Training("mesh", hydrodynamics="mesh"), "mesh", "Training in the mesh model"),
-    "mesh-dr": Row(
-        "Physics-Mesh + DR",
-        Training("mesh-dr", hydrodynamics="mesh", randomize=DR),
-        "mesh + DR",
-        "Training in the mesh model with DR",
-    ),
-    "simplified": Row(
-        "Simplified Fossen",
-        Training("simplified", hydrodynamics="simplified"),
-        "simplified",
-        "Training in the simplified model",
-    ),
-    "simplified-dr": Row(
-        "Simplified Fossen + DR",
-        Training("simplified-dr", hydrodynamics="simplified", randomize=DR),
-        "simplified + DR",
-        "Training in the simplified model with DR",
-    ),
-    "pid-paper": Row("PID, published gains", None, "PID", "The published PID", "pid-paper"),
-    "pid": Row("PID, tuned from the model", None, None, "The tuned PID", "pid"),
-    "calibrated-intervals": Row(
-        "Calibrated + ranges of its intervals",
-        Training("calibrated-intervals", randomize=INTERVALS, remembers=True),
-        module="Randomisation within the calibration's intervals, with an integral of the errors,",
-    ),
-    "calibrated-integral": Row(
-        "Calibrated, integrating", Training("calibrated-integral", remembers=True), module=INTEGRAL
-    ),
-    "calibrated-pool": Row(
-        "Pool ranges, integrating",
-        Training("calibrated-pool", randomize="pool", remembers=True),
-        module=POOL,
-    ),
+ROWS: Mapping[str, Mapping[str, Row]] = {
+    task: {
+        name: Row(
+            **{k: v for k, v in row.items() if k != "training"},
+            training=Training(**{"name": name, "task": task, **row["training"]})
+            if "training" in row
+            else None,
+        )
+        for name, row in rows.items()
+    }
+    for task, rows in yaml.safe_load(
+        Path(__file__).with_name("rows.yaml").read_text(encoding="utf-8")
+    ).items()
 }
-"""The paper's ten rows of station keeping in the order of its table, and ours beyond them."""
+"""Task -> the rows of its table, in their order."""
 T1_DRAWN = ("calibrated", "mesh", "simplified", "pid-paper", "pid", "calibrated-pool")
 """The paper's four curves, and ours."""
 
-T2_ROWS: dict[str, Row] = {
-    "calibrated-dr": Row("Calibrated + DR", CALIBRATED_DR, "calibrated + DR"),
-    "calibrated": Row(
-        "Calibrated", Training("calibrated", "t2"), "calibrated", "Training without randomisation"
-    ),
-    "pid": Row("PID, tuned from the model", None, None, "The tuned PID", "pid"),
-    "pid-paper": Row("PID, published gains", None, "PID", "The published PID", "pid-paper"),
-    "calibrated-dr-integral": Row(
-        "Calibrated + DR, integrating",
-        Training("calibrated-dr-integral", "t2", randomize=DR, remembers=True),
-        module=INTEGRAL,
-    ),
-    "calibrated-pool": Row(
-        "Pool ranges, integrating",
-        Training("calibrated-pool", "t2", randomize="pool", remembers=True),
-        module=POOL,
-    ),
-}
-"""The paper's three rows of tracking, and ours beyond them."""
 T2_DRAWN = 4
 """Rows that are drawn, at most: more cannot be told apart."""
 
@@ -564,7 +495,7 @@ def _draw_t1(by_row: Results, folder: Path) -> Path:
     """Position and yaw error against time of the rows of `T1_DRAWN` that were played, or of all."""
     drawn = {name: by_row[name] for name in T1_DRAWN if name in by_row} or by_row
     envelopes = {
-        T1_ROWS[name].title: error_envelope([played_trial(r, folder / "trials") for r in results])
+        ROWS["t1"][name].title: error_envelope([played_trial(r, folder / "trials") for r in results])
         for name, results in drawn.items()
     }
     hardware = any(r["job"]["severity"] == HARDWARE for results in by_row.values() for r in results)
@@ -581,7 +512,7 @@ def _draw_t2(by_row: Results, folder: Path) -> Path | None:
             flown.setdefault(result["job"]["target"], []).append(result)
         middle = [of_target[len(of_target) // 2] for of_target in flown.values()]
         if middle:
-            runs[T2_ROWS[name].title] = [played_trial(result, folder / "trials") for result in middle]
+            runs[ROWS["t2"][name].title] = [played_trial(result, folder / "trials") for result in middle]
     if not runs:
         return None
     return save_figure(draw_tracking(dict(list(runs.items())[:T2_DRAWN])), folder / "t2_paths.png")
@@ -595,7 +526,7 @@ def _paper_t1(row: str, target: str) -> Mapping[str, Any]:
 T1 = Spec(
     name="t1",
     title="Station keeping",
-    rows=T1_ROWS,
+    rows=ROWS["t1"],
     targets=tuple(T1_SETPOINTS),
     known_targets=tuple(T1_SETPOINTS),
     kind="setpoints",
@@ -617,7 +548,7 @@ T1 = Spec(
 T2 = Spec(
     name="t2",
     title="Trajectory tracking",
-    rows=T2_ROWS,
+    rows=ROWS["t2"],
     targets=T2_TRAJECTORIES,
     known_targets=tuple(TRAJECTORIES),
     kind="trajectories",
