@@ -9,7 +9,7 @@ simulator = Simulator(vehicle, control_step=0.1)
 simulator.place(position=(0.0, 0.0, -2.0))
 
 # A wrench in body axes about the vehicle's wrench reference: surge, sway, heave [N], roll, pitch, yaw [N m].
-thrust, _ = Allocator.from_vehicle(vehicle).allocate([10.0, 0.0, 0.0, 0.0, 0.0, 0.5])
+thrust = Allocator.from_vehicle(vehicle).allocate([10.0, 0.0, 0.0, 0.0, 0.0, 0.5])
 simulator.set_thrust(thrust)
 for _ in range(100):
     simulator.step()

@@ -16,7 +16,7 @@ scene = Scene([vehicle, vehicle], pool=Pool(length=4.0, width=2.0, depth=1.0), o
 scene.place(position=[[[-0.3, 0.0, -0.85], [-1.4, 0.5, -0.4]]])
 
 # Surge [N] and a little heave to stay at the crate's height, for the first vehicle; the second one waits.
-thrust, _ = Allocator.from_vehicle(vehicle).allocate([16.0, 0.0, -0.3, 0.0, 0.0, 0.0])
+thrust = Allocator.from_vehicle(vehicle).allocate([16.0, 0.0, -0.3, 0.0, 0.0, 0.0])
 scene.set_thrust([[thrust, np.zeros_like(thrust)]])
 pushes = []
 for _ in range(60):

@@ -9,7 +9,7 @@ from torch import Tensor
 
 import finssim
 from finssim.tasks import ObservationPart
-from finssim.tasks.baselines import baseline
+from finssim.tasks.agents import baseline
 from finssim.tasks.station_keeping import OBSERVATION, Reward
 from finssim.tasks.torch_rotations import (
     about_axis,

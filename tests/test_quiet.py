@@ -16,7 +16,7 @@ start_warp()
 import numpy as np
 from finssim.control.allocation import Allocator
 from finssim.vehicles import load_vehicle
-thrusts, _ = Allocator.from_vehicle(load_vehicle("finsrov")).allocate(np.ones(6))
+thrusts = Allocator.from_vehicle(load_vehicle("finsrov")).allocate(np.ones(6))
 print(json.dumps(thrusts.tolist()))
 """
 

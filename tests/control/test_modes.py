@@ -5,9 +5,20 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+import warp as wp
 
 from finssim.control import ControlError
-from finssim.control.modes import MODES, Thruster8, Wrench4, Wrench6, action_mode, mode_from_dict
+from finssim.control.modes import (
+    MODES,
+    ModeData,
+    ModeKind,
+    action_mode,
+    mode_data,
+    mode_from_dict,
+    thrusts_of,
+)
+from finssim.physics.types import vec8
+from finssim.vehicles import catalogue, load_vehicle
 
 
 @dataclass(frozen=True)
@@ -40,10 +51,10 @@ def test_zero_action_is_zero_thrust(craft, name):
 
 def test_thruster_actions_reach_each_limit(craft):
     lower, upper = craft.force_limits
-    mode = Thruster8.from_vehicle(craft)
-    np.testing.assert_array_equal(mode.to_thrusters(np.ones(mode.size)), upper)
-    np.testing.assert_array_equal(mode.to_thrusters(-np.ones(mode.size)), lower)
-    np.testing.assert_allclose(mode.to_thrusters(np.full(mode.size, -0.5)), 0.5 * lower)
+    mode = action_mode("thruster8", craft)
+    np.testing.assert_array_equal(mode.to_thrusters(np.ones(mode.size)), np.float32(upper))
+    np.testing.assert_array_equal(mode.to_thrusters(-np.ones(mode.size)), np.float32(lower))
+    np.testing.assert_allclose(mode.to_thrusters(np.full(mode.size, -0.5)), 0.5 * lower, rtol=1e-6)
 
 
 def test_actions_beyond_one_saturate(craft):
@@ -56,18 +67,55 @@ def test_actions_beyond_one_saturate(craft):
 
 def test_wrench_actions_produce_their_part_of_each_axis_limit(finsrov):
     craft = Craft(finsrov.B, (finsrov.lower, finsrov.upper), finsrov.wrench_limits)
-    mode = Wrench6.from_vehicle(craft, scale=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6))
+    mode = action_mode("wrench6", craft, scale=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6))
     for axis in range(6):
         wrench = finsrov.B @ mode.to_thrusters(np.eye(6)[axis]) / finsrov.wrench_limits
         np.testing.assert_allclose(wrench, np.eye(6)[axis] * mode.scale[axis], atol=3e-4)  # lambda
 
 
 def test_wrench4_asks_for_no_roll_or_pitch(craft):
-    mode = Wrench4.from_vehicle(craft)
+    mode = action_mode("wrench4", craft)
     assert mode.labels == ("surge", "sway", "heave", "yaw")
     np.testing.assert_array_equal(
-        mode.to_wrench([0.1, 0.2, 0.3, 0.4]), np.array([0.1, 0.2, 0.3, 0, 0, 0.4]) * craft.wrench_limits
+        np.array([0.1, 0.2, 0.3, 0.4]) @ mode.columns,
+        np.array([0.1, 0.2, 0.3, 0, 0, 0.4]) * craft.wrench_limits,
     )
+
+
+@wp.kernel(enable_backward=False)
+def thrusts_of_worlds(action: wp.array2d(dtype=vec8), data: ModeData, force: wp.array2d(dtype=vec8)):
+    w, v = wp.tid()
+    force[w, v] = thrusts_of(action[w, v], v, data)
+
+
+@pytest.mark.parametrize("name", MODES)
+def test_a_batch_of_vehicles_and_the_robot_give_the_same_bits(name):
+    """Every vehicle of the catalogue that has the same number of thrusters, each with a scale of its own."""
+    vehicles = [one for one in map(load_vehicle, catalogue()) if len(one.thruster_names) == 8]
+    assert len(vehicles) > 3
+    scales = [1.0 / (1 + v) for v in range(len(vehicles))]
+    action = np.random.default_rng(2).uniform(-1.2, 1.2, (300, len(vehicles), 8)).astype(np.float32)
+    force = wp.zeros(action.shape[:2], dtype=vec8, device="cpu")
+    inputs = [wp.array(action, dtype=vec8, device="cpu"), mode_data(name, vehicles, scales), force]
+    wp.launch(thrusts_of_worlds, dim=action.shape[:2], inputs=inputs, device="cpu")
+    for v, vehicle in enumerate(vehicles):
+        mode = action_mode(name, vehicle, scales[v])
+        np.testing.assert_array_equal(mode.to_thrusters(action[:, v, : mode.size]), force.numpy()[:, v])
+        np.testing.assert_array_equal(mode.to_thrusters(action[7, v, : mode.size]), force.numpy()[7, v])
+
+
+def test_another_mode_is_one_entry(craft, monkeypatch):
+    """Two components that each drive half of the thrusters, the second of them backwards; more than all is all."""
+    n = len(craft.thruster_names)
+    half = np.stack([np.arange(n) < n // 2, -1.0 * (np.arange(n) >= n // 2)])
+    monkeypatch.setitem(
+        MODES, "sides", ModeKind(False, lambda vehicle: ("left", "right"), lambda vehicle: 2.0 * half)
+    )
+    mode = action_mode("sides", craft)
+    lower, upper = craft.force_limits
+    expected = np.where(half[0] > 0.0, 0.5 * upper, lower)
+    np.testing.assert_allclose(mode.to_thrusters([0.25, 1.0]), expected, rtol=1e-6)
+    assert mode_from_dict(mode.describe(), craft) == mode
 
 
 def test_batches_equal_single_actions(craft):

@@ -52,7 +52,7 @@ def run(pid, plant, goal, seconds, noise=None):
     for _ in range(round(seconds / pid.period)):
         measured = plant.measured if noise is None else noise(plant.measured)
         tau, memory = pid.command(memory, measured, goal)
-        plant.advance(pid.allocator.allocate(tau)[0], pid.period)
+        plant.advance(pid.allocator.allocate(tau), pid.period)
         true = plant.measured
         heading = wrap_angle(quat_yaw(true.quaternion) - quat_yaw(goal.quaternion))
         tilt = np.max(np.abs(quat_to_euler(true.quaternion)[:2]), axis=0)

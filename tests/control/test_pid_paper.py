@@ -83,6 +83,6 @@ def test_reaches_setpoints_in_still_water_but_needs_half_a_minute(pid, pool):
     distance = []
     for _ in range(60 * 60):
         tau, memory = pid.command(memory, plant.measured, goal)
-        plant.advance(allocator.allocate(tau)[0], pid.period)
+        plant.advance(allocator.allocate(tau), pid.period)
         distance.append(np.abs(plant.measured.position - goal.position).max())
     assert distance[-1] < 0.10 < 0.3 < distance[10 * 60]

@@ -7,6 +7,7 @@ import pytest
 
 from finssim import boundary
 from finssim.cli import app
+from finssim.control.allocation import Allocator
 from finssim.control.modes import action_mode
 from finssim.experiments.driven import (
     DriveError,
@@ -32,7 +33,7 @@ WRENCH6 = action_mode("wrench6", FINSROV)
 
 def surge(newtons):
     """Thrusts of a pure surge."""
-    return WRENCH6.allocator.allocate([newtons, 0.0, 0.0, 0.0, 0.0, 0.0])[0]
+    return Allocator.from_vehicle(FINSROV).allocate([newtons, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
 def written(path, seconds=2.0, *, meta=None, period=1, vehicle=FINSROV, events=(), **at):

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from finssim.control.modes import MODES
 from finssim.experiments.evaluate import evaluate
 from finssim.experiments.plants import load_plant
 from finssim.experiments.trials import EpisodeError, run_episodes, summarize_episodes
 from finssim.tasks import TASKS, Environment, task_named
-from finssim.tasks.actions import action_size
-from finssim.tasks.agents import agent_for
-from finssim.tasks.baselines import BASELINES
+from finssim.tasks.agents import BASELINES, agent_for
 from finssim.vehicles import load_vehicle
 
 FINSROV, NOMINAL = load_vehicle("finsrov"), load_plant("nominal")
@@ -30,7 +29,9 @@ class Still:
         pass
 
     def act(self, memory, readings, goal):
-        return np.zeros((len(readings.observation), action_size(self.action, 8)), np.float32), None
+        return np.zeros(
+            (len(readings.observation), len(MODES[self.action].labels(FINSROV))), np.float32
+        ), None
 
     def describe(self):
         return {"name": "still", "kind": "still"}

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from finssim.control.modes import MODES
 from finssim.control.trajectories import load_trajectory
 from finssim.engine import read_run
 from finssim.engine.ranges_file import load_ranges
@@ -12,7 +13,6 @@ from finssim.experiments import trials as trials_module
 from finssim.experiments.plants import Plant, PlantError, available_plants, load_plant
 from finssim.experiments.trials import run_episodes, run_trials
 from finssim.tasks import Environment, EnvironmentSetupError, MeasurementNoise, Sensing, task_named
-from finssim.tasks.actions import action_size
 from finssim.tasks.agents import agent_for
 from finssim.vehicles import VehicleError, load_vehicle
 
@@ -186,7 +186,7 @@ class Restless:
         return np.random.default_rng(3)
 
     def act(self, rng, readings, goal):
-        shape = (len(readings.observation), action_size(self.action, 8))
+        shape = (len(readings.observation), len(MODES[self.action].labels(FINSROV)))
         return rng.uniform(-1.0, 1.0, shape).astype(np.float32), rng
 
 
@@ -212,9 +212,6 @@ def test_stronger_thrusters_deliver_what_is_asked_of_the_vehicle_that_the_contro
     assert np.abs(known[1]).max() > 0.5  # the thrusters work
     for ours, theirs in zip(known, strong, strict=True):
         np.testing.assert_array_equal(ours, theirs)
-
-
-MODES = ["thruster8", "wrench6", "wrench4"]
 
 
 def commanded_and_delivered(mode, plant):

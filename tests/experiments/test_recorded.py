@@ -27,7 +27,7 @@ from finssim.robot.pilots import make_pilot
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.tasks import task_named
-from finssim.tasks.baselines import BASELINES
+from finssim.tasks.agents import BASELINES
 from finssim.vehicles import load_vehicle
 from reference.policies import linear, written
 

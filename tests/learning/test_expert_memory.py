@@ -6,7 +6,7 @@ import pytest
 from finssim.learning.expert_memory import memory_from, memory_numbers
 from finssim.learning.resume import read_state, write_state
 from finssim.tasks import TASKS, make
-from finssim.tasks.baselines import BASELINES, baseline
+from finssim.tasks.agents import BASELINES, baseline
 
 
 @pytest.mark.slow

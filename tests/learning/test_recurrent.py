@@ -20,8 +20,7 @@ from finssim.learning.recurrent import RecurrentNetwork
 from finssim.robot.pilots import make_pilot
 from finssim.robot.robot import Reading
 from finssim.tasks import StationKeeping
-from finssim.tasks.agents import NOWHERE, Known, WorldReadings, agent_for, expert_for
-from finssim.tasks.baselines import restarted
+from finssim.tasks.agents import NOWHERE, Known, WorldReadings, agent_for, expert_for, restarted
 from finssim.tasks.observer import Observer
 from reference.guess import Guess
 from reference.policies import FINSROV, written

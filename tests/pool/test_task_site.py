@@ -15,7 +15,7 @@ from finssim.experiments.stack import BATCH, site_of
 from finssim.pool.medium import Medium
 from finssim.robot.pilots import AgentPilot
 from finssim.tasks import TASKS, task_named
-from finssim.tasks.baselines import BASELINES
+from finssim.tasks.agents import BASELINES
 from finssim.tasks.communication import Communication
 from finssim.vehicles import load_vehicle
 from reference.policies import linear, written

@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 import warp as wp
 
 from finssim.engine.state import State
+from finssim.tasks import ObservationPart, Task
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.task import ObservationPart, Task
 from finssim.tasks.terms import End, RewardTerm, Terms, place_at_rest, uniform3
 
 

@@ -9,8 +9,9 @@ import yaml
 from onnx import TensorProto, helper, numpy_helper
 
 from finssim.control import ControlError
+from finssim.control.allocation import Allocator
 from finssim.control.guidance import Station, goal_at
-from finssim.control.modes import Wrench4, Wrench6
+from finssim.control.modes import action_mode
 from finssim.control.pid import controller
 from finssim.control.policy import PolicyError
 from finssim.experiments.pool_trial import NoisyInput
@@ -58,7 +59,7 @@ def policy(tmp_path):
             "format": 1,
             "task": "t1",
             "observation": StationKeeping().schema.model_dump(mode="json"),
-            "action": Wrench4.from_vehicle(VEHICLE, 0.5).describe(),
+            "action": action_mode("wrench4", VEHICLE, 0.5).describe(),
             "control_period": 0.1,
             "vehicle": {"name": VEHICLE.name, "sha256": VEHICLE.sha256},
             "hydrodynamics": "calibrated",
@@ -79,7 +80,7 @@ def test_a_policy_pilot_gives_the_thrusts_of_its_network(policy):
     """Observation, network, action mode and allocation in a row."""
     pilot = make_pilot(policy(), VEHICLE)
     action = np.clip(GAIN @ Observer("t1", VEHICLE).observe(READING, STATION, 0.0), -1.0, 1.0)
-    expected = Wrench4.from_vehicle(VEHICLE, 0.5).to_thrusters(action)
+    expected = action_mode("wrench4", VEHICLE, 0.5).to_thrusters(action)
     np.testing.assert_allclose(pilot.act(READING, STATION, 0.0), expected, atol=1e-4)
     assert pilot.period == 0.1 and pilot.describe()["task"] == "t1"
 
@@ -91,11 +92,11 @@ def test_a_policy_pilot_gives_the_thrusts_of_its_network(policy):
         ({"task": "t9"}, "unknown task 't9'"),
         ({"task": "t2"}, "observation schema does not fit"),
         (
-            {"action": {**Wrench4.from_vehicle(VEHICLE).describe(), "limits": [1.0] * 6}},
+            {"action": {**action_mode("wrench4", VEHICLE).describe(), "limits": [1.0] * 6}},
             "wrench4: limits was",
         ),
         (
-            {"action": {**Wrench4.from_vehicle(VEHICLE).describe(), "mode": "jet"}},
+            {"action": {**action_mode("wrench4", VEHICLE).describe(), "mode": "jet"}},
             "unknown action mode 'jet'",
         ),
     ],
@@ -129,7 +130,7 @@ def test_a_pid_pilot_allocates_the_controllers_wrench(name):
     memory, limits, first = same.reset(), VEHICLE.wrench_limits, None
     for _ in range(2):
         tau, memory = same.command(memory, READING, goal_at(STATION, 0.0))
-        expected = Wrench6.from_vehicle(VEHICLE).allocator.allocate(np.clip(tau, -limits, limits))[0]
+        expected = Allocator.from_vehicle(VEHICLE).allocate(np.clip(tau, -limits, limits))
         given = pilot.act(READING, STATION, 0.0)
         first = given if first is None else first
         np.testing.assert_allclose(given, expected, atol=1e-6)

@@ -201,7 +201,7 @@ def test_pictures_come_to_the_port_after_the_robots_own():
         port = free.getsockname()[1]
     source = open_camera(Wiring(bind=f"127.0.0.1:{port - 1}"), VEHICLE, overhead())
     try:
-        assert f"127.0.0.1:{port} from 127.0.0.1:58767" in source.describe()
+        assert f"127.0.0.1:{port} to 127.0.0.1:58767" in source.describe()
     finally:
         source.close()
 

@@ -59,8 +59,16 @@ def vehicle() -> Vehicle:
 
 def ideal(batch: Any) -> Any:
     """The same sensors without any error; rate, latency and mounts stay."""
-    exact = {"r", "q_bs", "gravity", "specific_weight", "range", "gyro_range", "accel_range", "tilt_cosine"}
-    exact |= {"altitude_min", "altitude_max"}
+    exact = {
+        "position",
+        "orientation",
+        "gravity",
+        "specific_weight",
+        "velocity_range",
+        "gyro_range",
+        "accel_range",
+    }
+    exact |= {"tilt_cosine", "max_tilt", "floor_depth", "altitude_min", "altitude_max"}
     names = batch.parameters.numpy().dtype.names
     batch.set(**{name: 0.0 for name in names if name not in exact})
     return batch

@@ -47,7 +47,7 @@ def test_noise_and_turn_on_bias_have_the_spread_of_the_file(vehicle: Any, rest: 
     """Over many worlds the error of the first reading is normal with variance noise² + turn-on²."""
     worlds, noise, turn_on = 5000, 0.004, 0.03
     suite = SensorSuite(vehicle, worlds=worlds, control_step=0.1, seed=5)
-    ideal(suite.depth).set(noise=noise, turn_on=turn_on)
+    ideal(suite.depth).set(noise_std=noise, bias_initial=turn_on)
     suite.reset(rest(worlds).put(position=[0.0, 0.0, -1.0]))
     error = suite.depth.depth.numpy().ravel() - (1.0 - vehicle.sensors.depth.position[2])
     assert stats.kstest(error, stats.norm(0.0, np.hypot(noise, turn_on)).cdf).pvalue > 1e-4

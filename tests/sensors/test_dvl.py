@@ -54,7 +54,7 @@ def test_going_ahead_it_reads_the_speed_along_the_nose(vehicle: Any, rest: Any, 
 def test_the_suite_tracks_the_water_when_it_is_told_its_velocity(vehicle: Any, rest: Any, ideal: Any) -> None:
     """Given the water's velocity, a vehicle at rest in a current sees the water come towards it."""
     suite = SensorSuite(vehicle, worlds=1, control_step=0.2)
-    ideal(suite.dvl).set(q_bs=[0, 0, 0, 1])
+    ideal(suite.dvl).set(orientation=[0, 0, 0, 1])
     current = wp.array([[[0.2, 0.0, 0.0]]], dtype=wp.vec3)
     suite.reset(rest(1), water_velocity=current)
     np.testing.assert_allclose(suite.dvl.velocity.numpy()[0, 0], [-0.2, 0.0, 0.0], atol=1e-7)
@@ -64,7 +64,7 @@ def test_error_is_scale_plus_bias_plus_noise(vehicle: Any, rest: Any, ideal: Any
     """Over many worlds the variance along a speed u is (scale u)² + turn-on² + noise²; across it there is no scale."""
     worlds, u = 5000, 1.5
     suite = SensorSuite(vehicle, worlds=worlds, control_step=0.2, seed=3)
-    ideal(suite.dvl).set(q_bs=[0, 0, 0, 1], scale=0.01, turn_on=0.006, noise=0.008)
+    ideal(suite.dvl).set(orientation=[0, 0, 0, 1], scale_error=0.01, bias_initial=0.006, noise_std=0.008)
     suite.reset(rest(worlds).put(velocity=[u, 0, 0, 0, 0, 0]))
     error = suite.dvl.velocity.numpy()[:, 0] - [u, 0.0, 0.0]
     for axis, std in enumerate([np.sqrt((0.01 * u) ** 2 + 0.01**2), 0.01, 0.01]):
@@ -74,7 +74,7 @@ def test_error_is_scale_plus_bias_plus_noise(vehicle: Any, rest: Any, ideal: Any
 def test_without_an_echo_the_last_reading_stays(vehicle: Any, rest: Any, ideal: Any) -> None:
     """Too high above the floor, too low or leaning too far, the reading is old; back within reach it is fresh."""
     suite = SensorSuite(vehicle, worlds=1, control_step=0.2, floor_depth=50.0)
-    ideal(suite.dvl).set(r=[0, 0, 0], tilt_cosine=np.cos(0.5), altitude_min=0.5, altitude_max=30.0)
+    ideal(suite.dvl).set(position=[0, 0, 0], tilt_cosine=np.cos(0.5), altitude_min=0.5, altitude_max=30.0)
     state = rest(1).put(position=[0.0, 0.0, -40.0])
     suite.reset(state)
     level = [0.0, 0.0, 0.0, 1.0]

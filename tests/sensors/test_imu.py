@@ -115,7 +115,7 @@ def test_allan_deviation_at_one_second_is_the_noise_density_of_the_file(name: st
     imu = load_vehicle(name).sensors.imu
     T, m = 1.0 / imu.rate, round(imu.rate)
     suite = SensorSuite(load_vehicle(name), worlds=64, control_step=T, seed=11)
-    suite.imu.set(gyro_quantum=0.0, accel_quantum=0.0, dropout=0.0)
+    suite.imu.set(gyro_quantisation=0.0, accel_quantisation=0.0, dropout=0.0)
     log = record(suite, rest(64), 20 * m)
     for what, N, K in (
         ("gyro", imu.gyro_noise_density, imu.gyro_bias_walk),
@@ -128,7 +128,7 @@ def test_allan_deviation_falls_as_white_noise_and_rises_as_the_bias_walk(rest: A
     """Slope -1/2 with N/√τ at short times, +1/2 with K √(τ/3) at long ones, and the sum of both between."""
     N, K, T = 2e-3, 4e-3, 0.01  # the two cross at √3 N/K = 0.87 s
     suite = SensorSuite(vehicle, worlds=64, control_step=T, seed=12)
-    suite.imu.set(gyro_noise=N / np.sqrt(T), gyro_walk=K, gyro_turn_on=1.0, gyro_quantum=0.0)
+    suite.imu.set(gyro_noise=N / np.sqrt(T), gyro_bias_walk=K, gyro_bias_initial=1.0, gyro_quantisation=0.0)
     gyro = record(suite, rest(64), 8000)["gyro"]
     deviation = {}
     for m in (1, 3, 10, 30, 100, 300, 800, 1600):
@@ -148,7 +148,7 @@ def test_quantisation_error_is_uniform_within_half_a_count(rest: Any, vehicle: A
     """For an input spread over many counts the error is uniform in ±q/2: its variance is q²/12."""
     q, worlds = 0.02, 20_000
     suite = SensorSuite(vehicle, worlds=worlds, control_step=0.1)
-    ideal(suite.imu).set(gyro_quantum=q)
+    ideal(suite.imu).set(gyro_quantisation=q)
     rates = np.random.default_rng(1).uniform(-2.0, 2.0, (worlds, 1, 6)).astype(np.float32)
     suite.reset(rest(worlds).put(velocity=rates))
     exact = Rotation.from_quat(vehicle.sensors.imu.orientation).inv().apply(rates[:, 0, 3:])
@@ -162,7 +162,7 @@ def test_quantisation_error_is_uniform_within_half_a_count(rest: Any, vehicle: A
 def test_readings_stop_at_the_range(rest: Any, vehicle: Any, ideal: Any) -> None:
     """Beyond its range a converter shows the end of its range, and inside it the value."""
     suite = SensorSuite(vehicle, worlds=3, control_step=0.1)
-    ideal(suite.imu).set(q_bs=[0, 0, 0, 1], gyro_range=1.5, accel_range=5.0)
+    ideal(suite.imu).set(orientation=[0, 0, 0, 1], gyro_range=1.5, accel_range=5.0)
     state = rest(3)
     state.velocity.numpy()[:, 0, 3] = [1.0, 4.0, -4.0]
     suite.reset(state)

@@ -1,8 +1,7 @@
-"""A sensor that the package does not know: one file with its schema and its kernel, and one line."""
+"""A sensor that the package does not know: one file with its schema and what it measures, and one line."""
 # mypy: disable-error-code="valid-type,misc,index,no-any-return,no-untyped-def,untyped-decorator"
 
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import warp as wp
@@ -10,22 +9,10 @@ import warp as wp
 from finssim.physics.types import vec6
 from finssim.sensors import SensorError, SensorSuite, add_sensor
 from finssim.sensors.batch import SensorBatch
-from finssim.sensors.sampling import (
-    WHITE,
-    Sampling,
-    arrival,
-    begin_update,
-    normal,
-    restart,
-    sample_due,
-    sample_key,
-    slot_of,
-)
+from finssim.sensors.sampling import WHITE, Truth, normal, parameters_of, sampling_kernel
 from finssim.vehicles import VehicleError, load_vehicle
 from finssim.vehicles.equipment import Sensor
 from finssim.vehicles.part import NonNegative
-
-PINGER = 77
 
 
 class Pinger(Sensor):
@@ -35,9 +22,7 @@ class Pinger(Sensor):
     """[m]"""
 
 
-@wp.struct
-class PingerParameters:
-    noise: float
+PingerParameters = parameters_of(Pinger)
 
 
 @wp.struct
@@ -46,37 +31,18 @@ class PingerArrays:
     ring: wp.array3d(dtype=float)
 
 
-@wp.kernel(enable_backward=False)
-def sample_pinger(
-    position: wp.array2d(dtype=wp.vec3),
-    steps: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
-    parameters: wp.array2d(dtype=PingerParameters),
-    pinger: PingerArrays,
-    sampling: Sampling,
-    mask: wp.array(dtype=int),
-    restarting: bool,
-    seed: int,
-    world_offset: int,
-):
-    i, v = wp.tid()
-    w = world_offset + i
-    if mask[w] == 0:
-        return
-    step = steps[w]
-    if restarting:
-        restart(sampling, w, v, step)
-    if not begin_update(sampling, w, v, step):
-        return
-    if restarting or sample_due(sampling, w, v, step):
-        key = sample_key(seed, PINGER, w, v, episode[w], step)
-        slot = slot_of(sampling, step)
-        pinger.ring[w, v, slot] = wp.length(position[w, v]) + parameters[w, v].noise * normal(key, WHITE)
-        sampling.sent[w, v, slot] = True
-        sampling.last[w, v] = step
-    slot = arrival(sampling, w, v, step, restarting)
-    if slot >= 0:
-        pinger.range[w, v] = pinger.ring[w, v, slot]
+@wp.func
+def measure_range(
+    truth: Truth, p: PingerParameters, key: wp.uint32, root: float, restarting: bool, pinger: PingerArrays, w: int,
+    v: int, slot: int,
+) -> bool:  # fmt: skip
+    pinger.ring[w, v, slot] = wp.length(truth.position) + p.noise_std * normal(key, WHITE)
+    return True
+
+
+@wp.func
+def display_range(p: PingerParameters, pinger: PingerArrays, w: int, v: int, slot: int):
+    pinger.range[w, v] = pinger.ring[w, v, slot]
 
 
 class PingerBatch(SensorBatch):
@@ -84,16 +50,10 @@ class PingerBatch(SensorBatch):
 
     kind = "pinger"
     schema = Pinger
-    kernel = sample_pinger
     parameter_struct = PingerParameters
     array_struct = PingerArrays
+    kernel = sampling_kernel(77, PingerParameters, PingerArrays, measure_range, display_range)
     readings = ("range",)
-
-    def state_arrays(self, state: Any, water_velocity: Any) -> list[Any]:
-        return [state.position]
-
-    def use(self, vehicle: int, entry: Any, *, gravity: float, density: float) -> None:
-        self.set(vehicle, noise=entry.noise_std)
 
 
 FILE = """

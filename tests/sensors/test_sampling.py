@@ -30,7 +30,7 @@ def gauge(
     """A suite with an exact gauge of the given rate, latency and dropout at the body origin."""
     changes = {f"sensors.depth.{name}": value for name, value in timing.items()}
     suite = SensorSuite(vehicle.replace(changes), worlds=worlds, control_step=control_step)
-    ideal(suite.depth).set(r=[0.0, 0.0, 0.0], dropout=timing.get("dropout", 0.0))
+    ideal(suite.depth).set(position=[0.0, 0.0, 0.0], dropout=timing.get("dropout", 0.0))
     return suite
 
 
@@ -161,7 +161,7 @@ def test_the_bias_walks_by_time_and_not_by_samples(vehicle: Any, ideal: Any, res
     K, worlds, steps = 0.03, 4000, 50
     for rate in (2.0, 10.0, 40.0):
         suite = gauge(vehicle, ideal, worlds, rate=rate, latency=0.0)
-        suite.depth.set(walk=K)
+        suite.depth.set(bias_walk=K)
         run(suite, rest(worlds), steps)
         z = suite.depth.bias.numpy() / (K * np.sqrt(steps * 0.1))
         assert 1e-4 < stats.chi2.cdf((z**2).sum(), worlds) < 1 - 1e-4

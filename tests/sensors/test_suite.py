@@ -121,7 +121,7 @@ def test_a_vehicle_without_the_sensor_reads_nothing(vehicle: Any, rest: Any) -> 
 def test_worlds_may_have_sensors_that_differ(vehicle: Any, rest: Any) -> None:
     """`set` broadcasts over worlds and vehicles: here the port of world 1 hangs half a metre lower."""
     suite = SensorSuite(vehicle, worlds=2, control_step=0.1)
-    suite.depth.set(r=[[[0, 0, 0]], [[0, 0, -0.5]]], noise=0.0, turn_on=0.0, quantum=0.0)
+    suite.depth.set(position=[[[0, 0, 0]], [[0, 0, -0.5]]], noise_std=0.0, bias_initial=0.0, quantisation=0.0)
     suite.reset(rest(2).put(position=[0.0, 0.0, -1.0]))
     np.testing.assert_allclose(suite.depth.depth.numpy().ravel(), [1.0, 1.5])
 
@@ -143,7 +143,7 @@ def test_a_bad_number_is_refused(options: dict[str, Any], message: str, vehicle:
 def test_an_unknown_parameter_is_refused(vehicle: Any) -> None:
     """The message lists the ones there are."""
     suite = SensorSuite(vehicle, worlds=1, control_step=0.1)
-    with pytest.raises(SensorError, match="no depth parameter 'nois'; available: dropout, r, "):
+    with pytest.raises(SensorError, match="no depth parameter 'nois'; available: position, orientation, "):
         suite.depth.set(nois=1.0)
 
 

@@ -9,7 +9,7 @@ from finssim.control.guidance import Goal
 from finssim.control.pid import Pid, PidMemory
 from finssim.geometry.rotations import quat_from_euler, quat_multiply, quat_rotate
 from finssim.tasks import TASKS, make
-from finssim.tasks.baselines import (
+from finssim.tasks.agents import (
     BASELINES,
     BaselineError,
     acceleration_ahead,

@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from finssim.tasks import Environment, EnvironmentSetupError
-from finssim.tasks.baselines import baseline
+from finssim.tasks.agents import baseline
 from finssim.tasks.communication import Communication
 from finssim.tasks.formation import Formation, sorted_edges, triangle_distance
 from finssim.tasks.pursuit import DriveNumbers

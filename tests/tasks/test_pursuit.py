@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from finssim.tasks import Environment, EnvironmentSetupError
-from finssim.tasks.baselines import baseline
+from finssim.tasks.agents import baseline
 from finssim.tasks.pursuit import PREY_MODES, DriveNumbers, Prey, Pursuit
 from finssim.vehicles import load_vehicle
 

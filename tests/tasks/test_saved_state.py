@@ -86,7 +86,7 @@ def test_instruments_and_filters_go_on():
     assert any(done.any() for done in first[3::5]), "no episode ended: the test proves less than it says"
     assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
     after, again = whole.state(), other.state()
-    assert {"readings.dvl.ring", "readings.gauge_samples.sent", "estimates.past_position"} <= after.keys()
+    assert {"readings.dvl.ring", "readings.gauge_samples.sent", "estimates.position"} <= after.keys()
     assert all(np.array_equal(after[k], again[k], equal_nan=True) for k in after)
 
 

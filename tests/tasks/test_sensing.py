@@ -93,7 +93,7 @@ def test_a_late_fix_moves_the_path_since_its_own_time():
     at_once, late = (made(fixes(position_std=0.02, delay=delay), worlds=40) for delay in (0.0, 0.3))
     known = run(at_once, 60)["position"]
     run(late, 60)
-    ring = late.sensing.estimates.past_position.numpy()[:, 0]
+    ring = late.sensing.estimates.position.numpy()[:, 0]
     assert ring.shape[1] == 4
     np.testing.assert_allclose(ring[:, 57 % 4, :2], known[56, :, :2], atol=2e-4)
 
@@ -114,7 +114,7 @@ def test_what_is_known_is_as_good_as_the_filter_says():
         env.sensing.add(pipeline, env.seed)
         pipeline.run()
     off = (env.arrays.position.numpy()[:, 0] - x)[:, :2]
-    speed = (env.sensing.estimates.velocity.numpy()[:, 0] - v)[:, :2]
+    speed = (env.sensing.estimates.velocity.numpy()[:, 0, 0] - v)[:, :2]
     assert off.std() == pytest.approx(math.sqrt(told[0]), rel=0.1)
     assert speed.std() == pytest.approx(math.sqrt(told[2]), rel=0.1)
     assert (off * speed).mean() == pytest.approx(told[1], rel=0.25)
@@ -136,7 +136,7 @@ def test_fixes_come_at_their_rate_and_are_lost_as_often_as_their_chance():
 def test_a_fix_is_as_old_as_it_takes_to_come():
     env = made(fixes(delay=0.24), worlds=20, vehicle=carrying())
     seen = run(env, 15)
-    ring = env.sensing.estimates.past_position.numpy()[:, 0]  # of 0.2 s ago: the nearest control step
+    ring = env.sensing.estimates.position.numpy()[:, 0]  # of 0.2 s ago: the nearest control step
     assert ring.shape[1] == 3
     np.testing.assert_allclose(ring[:, 13 % 3], seen["position_true"][12], atol=6.0 * EXACT)
     assert np.abs(seen["position"][14] - seen["position_true"][14]).max() > 10.0 * EXACT
@@ -151,7 +151,7 @@ def test_noise_and_offset_of_a_fix_are_those_that_were_given(rate):
     offsets, e = [], env.sensing.estimates
     R = 0.05**2 / (rate / 10.0)
     for _ in range(6):
-        before = env.arrays.position.numpy()[:, 0] + 0.1 * e.velocity.numpy()[:, 0]
+        before = env.arrays.position.numpy()[:, 0] + 0.1 * e.velocity.numpy()[:, 0, 0]
         env.step(np.zeros((300, 6)))
         gain = e.plane.numpy()[0, 0, 0] / R  # K = P / R after the fix
         fix = before + (env.arrays.position.numpy()[:, 0] - before) / gain
@@ -172,7 +172,7 @@ def test_ranges_draw_the_noise_of_fixes_by_world():
     seen = run(env, 12)
     drawn = env.drawing.draws.numpy(["sensors.delay", "sensors.position_bias"])[:, 0]
     steps = np.rint(drawn[:, 0].astype(float) / 0.1).astype(int)
-    ring = env.sensing.estimates.past_position.numpy()[:, 0]
+    ring = env.sensing.estimates.position.numpy()[:, 0]
     was = [
         ring[w, (12 - steps[w]) % ring.shape[1]] - seen["position_true"][11 - steps[w], w] for w in range(200)
     ]

@@ -9,7 +9,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from finssim.tasks import Environment, EnvironmentSetupError
-from finssim.tasks.baselines import baseline
+from finssim.tasks.agents import baseline
 from finssim.tasks.communication import Communication
 from finssim.tasks.pursuit import DriveNumbers, Prey
 from finssim.tasks.team_pursuit import LEVELS, TeamPursuit, net_distance

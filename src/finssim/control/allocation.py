@@ -32,14 +32,12 @@ __all__ = [
     "REGULARISATION",
     "AllocationData",
     "Allocator",
+    "RowLaunch",
     "Tables",
     "allocate",
-    "allocate_kernel",
     "allocation_data",
-    "allocation_residual",
     "axis_weights",
     "regularisation_weight",
-    "residual_kernel",
     "tables",
 ]
 
@@ -69,9 +67,6 @@ class Tables(NamedTuple):
 
     clamped: npt.NDArray[np.float32]
     """Columns of the map d -> (f_F - f0_F, mu) for each set of thrusters at a limit, (256, 8, 8)."""
-
-    hessian: npt.NDArray[np.float32]
-    """Columns of H / h, h the mean of its diagonal, (8, 8)."""
 
     lower: npt.NDArray[np.float32]
     """Least thrust [N], (8,)."""
@@ -112,8 +107,6 @@ def tables(
     h = np.trace(H) / n
     gain = np.zeros((6, MAX_THRUSTERS))
     gain[:, :n] = np.linalg.solve(H, WB.T * W).T
-    hessian = np.zeros((MAX_THRUSTERS, MAX_THRUSTERS))
-    hessian[:n, :n] = H / h
 
     clamped = np.zeros((1 << MAX_THRUSTERS, MAX_THRUSTERS, MAX_THRUSTERS))
     for mask in range(1, 1 << n):
@@ -125,7 +118,6 @@ def tables(
     return Tables(
         gain.astype(np.float32),
         clamped.astype(np.float32),
-        hessian.astype(np.float32),
         _toward_zero(low),
         _toward_zero(high),
     )
@@ -163,9 +155,6 @@ class AllocationData:
 
     clamped: wp.array3d(dtype=vec8)
     """Columns of the map d -> (f_F - f0_F, mu) for every set C (bit i: thruster i at a limit), (vehicles, 256, 8)."""
-
-    hessian: wp.array2d(dtype=vec8)
-    """Columns of H / h, h the mean of its diagonal, (vehicles, 8)."""
 
     lower: wp.array(dtype=vec8)
     """Least thrust [N], (vehicles,)."""
@@ -292,51 +281,17 @@ def allocate(tau: vec6, vehicle: int, data: AllocationData) -> vec8:
     return f0
 
 
-@wp.func
-def allocation_residual(f: vec8, tau: vec6, vehicle: int, data: AllocationData) -> float:
-    """Distance of `f` from optimality, max_i |f - clip(f - H (f - f0) / h)| [N]: zero only there.
+@wp.kernel(enable_backward=False)
+def allocate_row(tau: wp.array(dtype=vec6), data: AllocationData, f: wp.array(dtype=vec8)):
+    """`allocate` for the first vehicle type.
 
     Args:
-        f: Thrusts in the canonical order [N].
-        tau: Wanted wrench about the point that B was computed for, body frame [N, N m].
-        vehicle: Vehicle type, first index into `data`.
+        tau: Wanted wrenches, body frame [N, N m], (N,).
         data: From `allocation_data`.
+        f: Thrusts out, canonical order [N], (N,).
     """
-    error = f - unconstrained(tau, vehicle, data)
-    gradient = vec8()
-    for j in range(MAX_THRUSTERS):
-        gradient += data.hessian[vehicle, j] * error[j]
-    step = f - clip(f - gradient, data.lower[vehicle], data.upper[vehicle])
-    return wp.max(wp.max(step), -wp.min(step))
-
-
-@wp.kernel(enable_backward=False)
-def allocate_kernel(
-    tau: wp.array(dtype=vec6), vehicle: wp.array(dtype=int), data: AllocationData, f: wp.array(dtype=vec8)
-):
-    """`allocate` for every world.
-
-    Args:
-        tau: Wanted wrenches as of `allocate`, body frame [N, N m], (worlds,).
-        vehicle: Vehicle types, (worlds,).
-        data: From `allocation_data`.
-        f: Thrusts out [N], (worlds,).
-    """
-    world = wp.tid()
-    f[world] = allocate(tau[world], vehicle[world], data)
-
-
-@wp.kernel(enable_backward=False)
-def residual_kernel(
-    f: wp.array(dtype=vec8),
-    tau: wp.array(dtype=vec6),
-    vehicle: wp.array(dtype=int),
-    data: AllocationData,
-    residual: wp.array(dtype=float),
-):
-    """`allocation_residual` for every world [N], (worlds,)."""
-    world = wp.tid()
-    residual[world] = allocation_residual(f[world], tau[world], vehicle[world], data)
+    i = wp.tid()
+    f[i] = allocate(tau[i], 0, data)
 
 
 def allocation_data(
@@ -401,7 +356,7 @@ class Allocator:
         self.lower: Array = np.array(lower, float)
         self.upper: Array = np.array(upper, float)
         self.weights: Array = np.array(weights, float)
-        self._launch = _Launch(1, self.data)
+        self._launch = RowLaunch(allocate_row, vec6, self.data)
 
     @classmethod
     def from_vehicle(cls, vehicle: Any, regularisation: float = REGULARISATION) -> Allocator:
@@ -414,15 +369,11 @@ class Allocator:
         """Number of thrusters n."""
         return int(self.B.shape[1])
 
-    def allocate(self, tau: npt.ArrayLike) -> tuple[Array, Array]:
-        """Thrusts for wanted wrenches.
+    def allocate(self, tau: npt.ArrayLike) -> Array:
+        """Thrusts [N], (..., n), never outside the limits, for wanted wrenches.
 
         Args:
             tau: Wrenches about the point of B, body frame [N, N m], (..., 6).
-
-        Returns:
-            Thrusts [N], (..., n), never outside the limits; and how far each is from the optimum [N], (...), which is
-            rounding (about 1e-6 of the thrusts an unlimited vehicle would need).
 
         Raises:
             ControlError: The last axis is not 6 long, or a number is not finite.
@@ -432,44 +383,41 @@ class Allocator:
             raise ControlError(f"wrench has shape {wanted.shape}, expected (..., 6)")
         if not np.isfinite(wanted).all():
             raise ControlError("wrench is not finite: find where the NaN or infinity came from")
-        worlds = wanted.size // 6
-        if worlds == 0:
-            return np.zeros((*wanted.shape[:-1], self.thrusters)), np.zeros(wanted.shape[:-1])
-        if worlds != self._launch.worlds:
-            self._launch = _Launch(worlds, self.data)
-        f, residual = self._launch.run(wanted.reshape(worlds, 6))
-        return f[:, : self.thrusters].reshape(*wanted.shape[:-1], -1), residual.reshape(wanted.shape[:-1])
+        return self._launch(wanted)[..., : self.thrusters]
 
     def achieved(self, f: npt.ArrayLike) -> Array:
         """Wrench B f that thrusts produce, about the point of B, body frame [N, N m], (..., n) -> (..., 6)."""
         return np.asarray(f, float) @ self.B.T
 
 
-class _Launch:
-    """Recorded launches for one batch size: a call writes the wrenches, launches, and reads the thrusts."""
+class RowLaunch:
+    """A kernel (rows, data, thrusts) over rows of numbers, on the CPU: one for each vehicle or time.
 
-    def __init__(self, worlds: int, data: Any) -> None:
-        tau = wp.zeros(worlds, dtype=vec6, device="cpu")
-        f = wp.zeros(worlds, dtype=vec8, device="cpu")
-        vehicle = wp.zeros(worlds, dtype=wp.int32, device="cpu")
-        residual = wp.zeros(worlds, dtype=wp.float32, device="cpu")
-        self.worlds = worlds
-        self._commands = [
-            wp.launch(allocate_kernel, worlds, [tau, vehicle, data, f], device="cpu", record_cmd=True),
-            wp.launch(
-                residual_kernel, worlds, [f, tau, vehicle, data, residual], device="cpu", record_cmd=True
-            ),
-        ]
-        self._arrays = (tau, f, residual, vehicle)
-        views: list[npt.NDArray[np.float32]] = [np.asarray(array) for array in self._arrays[:3]]
-        self._tau, self._f, self._residual = views
+    A call writes the rows, launches, and reads the thrusts. The launch of the latest number of rows is recorded.
+    """
 
-    def run(self, tau: Array) -> tuple[Array, Array]:
-        """Thrusts (worlds, 8) and residuals (worlds,) for wrenches (worlds, 6)."""
-        self._tau[:] = tau
-        for command in self._commands:
-            command.launch()
-        return self._f.astype(float), self._residual.astype(float)
+    def __init__(self, kernel: Any, dtype: Any, data: Any) -> None:
+        """Args:
+        kernel: Takes an array of vectors, `data` and an array of vec8.
+        dtype: Warp type of the vectors.
+        data: Warp struct on the CPU.
+        """
+        self._kernel, self._dtype, self._data = kernel, dtype, data
+        self._count = -1
+
+    def __call__(self, rows: npt.ArrayLike) -> Array:
+        """Thrusts [N], (..., 8), for rows (..., m); what a vector holds beyond m is zero."""
+        rows = np.asarray(rows, float)
+        flat = rows.reshape(-1, rows.shape[-1])
+        if len(flat) != self._count:
+            self._count = len(flat)
+            self._arrays = [wp.zeros(self._count, dtype=kind, device="cpu") for kind in (self._dtype, vec8)]
+            inputs = [self._arrays[0], self._data, self._arrays[1]]
+            self._command = wp.launch(self._kernel, self._count, inputs, device="cpu", record_cmd=True)
+            self._given, self._thrusts = (array.numpy() for array in self._arrays)
+        self._given[:, : flat.shape[1]] = flat
+        self._command.launch()
+        return self._thrusts.astype(float).reshape(*rows.shape[:-1], MAX_THRUSTERS)
 
 
 def axis_weights(wrench_limits: npt.ArrayLike) -> Array:

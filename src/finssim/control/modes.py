@@ -1,178 +1,263 @@
-"""Action modes: what a policy's numbers in [-1, 1] mean; limits and scale are part of the definition."""
+"""Action modes: what a policy's numbers in [-1, 1] mean; limits and scale are part of the definition.
+
+A mode mixes the components of an action to parts of the vehicle's wrench limits, which are allocated to the thrusters,
+or to parts of the thrusters' own limits. The batch does so for all worlds and the robot for one, with the same function
+(`thrusts_of`) and the same numbers (`mode_data`).
+"""
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,valid-type,misc,untyped-decorator"
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import warp as wp
 
 from finssim.control import ControlError
-from finssim.control.allocation import Allocator
+from finssim.control.allocation import AllocationData, RowLaunch, allocate, allocation_data, axis_weights
+from finssim.physics.types import MAX_THRUSTERS, vec6, vec8
 
-__all__ = ["MODES", "Thruster8", "Wrench4", "Wrench6", "action_mode", "mode_from_dict"]
+__all__ = [
+    "AXES",
+    "MODES",
+    "ActionMode",
+    "ModeData",
+    "ModeKind",
+    "action_mode",
+    "mode_data",
+    "mode_from_dict",
+    "thrusts_of",
+]
 
 Array = npt.NDArray[np.float64]
 
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 
 
+class ModeKind(NamedTuple):
+    """One action mode, for any vehicle."""
+
+    wrench: bool
+    """Whether the components are mixed to a wrench, which is allocated to the thrusters, or to the thrusters."""
+    labels: Callable[[Any], tuple[str, ...]]
+    """Names of the components of an action for a vehicle, m of them."""
+    mix: Callable[[Any], Array]
+    """What each component asks for at 1: parts of the wrench limits (m, 6), or of the limits of n thrusters (m, n)."""
+
+
+def _axes(*axes: int) -> ModeKind:
+    """A mode whose components drive axes of the wrench; the others are asked to be zero."""
+    labels = tuple(AXES[axis] for axis in axes)
+    return ModeKind(True, lambda vehicle: labels, lambda vehicle: np.eye(6)[list(axes)])
+
+
+MODES: dict[str, ModeKind] = {
+    "thruster8": ModeKind(
+        False,
+        lambda vehicle: tuple(vehicle.thruster_names),
+        lambda vehicle: np.eye(len(vehicle.thruster_names)),
+    ),
+    "wrench6": _axes(0, 1, 2, 3, 4, 5),
+    "wrench4": _axes(0, 1, 2, 5),
+}
+"""Action modes by name; another is one entry."""
+
+
+@wp.struct
+class ModeData:
+    """What `thrusts_of` needs to know of each vehicle; built by `mode_data`, first index the vehicle."""
+
+    columns: wp.array2d(dtype=vec8)
+    """What each component asks for at 1: a wrench [N, N m] and two zeros, or parts of the thrusters' limits,
+    (vehicles, m)."""
+    lower: wp.array(dtype=vec8)
+    """Least thrust [N], (vehicles,)."""
+    upper: wp.array(dtype=vec8)
+    """Greatest thrust [N], (vehicles,)."""
+    wrench: wp.bool
+    """Whether the columns are wrenches."""
+    allocation: AllocationData
+    """Of wrenches to the thrusters; empty where the columns are no wrenches."""
+
+
+@wp.func
+def thrusts_of(action: vec8, vehicle: int, data: ModeData) -> vec8:
+    """Thrusts that an action asks for, canonical order [N].
+
+    Args:
+        action: Its components; those beyond +-1 saturate.
+        vehicle: First index into `data`.
+        data: From `mode_data`.
+    """
+    x = vec8()
+    for k in range(data.columns.shape[1]):
+        x += wp.clamp(action[k], -1.0, 1.0) * data.columns[vehicle, k]
+    if data.wrench:
+        return allocate(vec6(x[0], x[1], x[2], x[3], x[4], x[5]), vehicle, data.allocation)
+    f = vec8()
+    for k in range(MAX_THRUSTERS):
+        part = wp.clamp(x[k], -1.0, 1.0)
+        f[k] = wp.where(part >= 0.0, part * data.upper[vehicle][k], -part * data.lower[vehicle][k])
+    return f
+
+
+@wp.kernel(enable_backward=False)
+def thrusts_row(action: wp.array(dtype=vec8), data: ModeData, force: wp.array(dtype=vec8)):
+    """`thrusts_of` for the first vehicle.
+
+    Args:
+        action: Actions, (N,).
+        data: From `mode_data`.
+        force: Thrusts out, along the thrusters' axes, canonical order [N], (N,).
+    """
+    i = wp.tid()
+    force[i] = thrusts_of(action[i], 0, data)
+
+
+def mode_data(name: str, vehicles: Sequence[Any], scales: Sequence[Any], device: Any = "cpu") -> ModeData:
+    """The numbers of a mode for `thrusts_of`.
+
+    Args:
+        name: Of the mode.
+        vehicles: Alike in their number of thrusters where components drive thrusters.
+        scales: By vehicle: part of each limit that is asked for at 1, one number or one for each.
+        device: Warp device.
+    """
+    kind, data = MODES[name], ModeData()
+    limits = [vehicle.force_limits for vehicle in vehicles]
+    columns = [_columns(kind, *one) for one in zip(vehicles, scales, strict=True)]
+    data.columns = wp.array(_padded(columns), dtype=vec8, device=device)
+    data.lower = wp.array(_padded([lower for lower, _ in limits]), dtype=vec8, device=device)
+    data.upper = wp.array(_padded([upper for _, upper in limits]), dtype=vec8, device=device)
+    data.wrench = wp.bool(kind.wrench)
+    if kind.wrench:
+        data.allocation = allocation_data(
+            [vehicle.control_matrix for vehicle in vehicles],
+            [lower for lower, _ in limits],
+            [upper for _, upper in limits],
+            [axis_weights(vehicle.wrench_limits) for vehicle in vehicles],
+            device=device,
+        )
+    return data
+
+
+def _columns(kind: ModeKind, vehicle: Any, scale: Any) -> Array:
+    """What each component asks for at 1: a wrench [N, N m], (m, 6), or parts of the thrusters' limits, (m, n)."""
+    full = np.asarray(scale, float) * (np.asarray(vehicle.wrench_limits, float) if kind.wrench else 1.0)
+    return np.asarray(kind.mix(vehicle) * full)
+
+
+def _padded(rows: Sequence[npt.ArrayLike]) -> npt.NDArray[np.float32]:
+    """Rows with zeros for thrusters that are not there, (..., 8)."""
+    arrays = [np.asarray(row, np.float32) for row in rows]
+    return np.stack([np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, MAX_THRUSTERS - a.shape[-1])]) for a in arrays])
+
+
 @dataclass(frozen=True, kw_only=True)
-class Thruster8:
-    """Each component is a part of its thruster's limit: a >= 0 of the forward one, a < 0 of the reverse one."""
+class ActionMode:
+    """A mode for one vehicle.
 
-    name: ClassVar[str] = "thruster8"
+    Note:
+        Runs on the CPU and reuses its launch buffers, so one instance belongs to one thread.
+    """
 
+    name: str
     labels: tuple[str, ...]
-    """Thruster names in canonical order, (n,)."""
-    lower: tuple[float, ...]
-    """Least thrust [N], (n,), all <= 0."""
-    upper: tuple[float, ...]
-    """Greatest thrust [N], (n,), all >= 0."""
-    scale: tuple[float, ...]
-    """Part of the limit that action 1 stands for, (n,)."""
-
-    def __post_init__(self) -> None:
-        if not len(self.labels) == len(self.lower) == len(self.upper) == len(self.scale) > 0:
-            raise ControlError("thruster8 needs one name, lower limit, upper limit and scale per thruster")
-        if not (np.less_equal(self.lower, 0.0).all() and np.greater_equal(self.upper, 0.0).all()):
-            raise ControlError("thruster8 needs thrust limits with lower <= 0 <= upper")
-        _check_scale(self.name, self.scale)
-
-    @classmethod
-    def from_vehicle(cls, vehicle: Any, scale: float | Sequence[float] = 1.0) -> Thruster8:
-        """The mode of a vehicle's thrusters and limits."""
-        names = tuple(vehicle.thruster_names)
-        lower, upper = (tuple(map(float, limits)) for limits in vehicle.force_limits)
-        return cls(labels=names, lower=lower, upper=upper, scale=_spread(cls.name, scale, len(names)))
+    """Names of the components."""
+    definition: dict[str, tuple[float, ...]]
+    """Limits and scale, as `describe` has them: `scale`, with the `limits` of the wrench at action 1 and scale 1 about
+    `reference` [N, N m, m], or with `lower` and `upper` of the thrusters [N]."""
+    columns: Array = field(repr=False, compare=False)
+    """What each component asks for at 1: a wrench about `reference` [N, N m], (m, 6), or parts of the thrusters'
+    limits, (m, n)."""
+    thrusters: int
+    """Of the vehicle, n."""
+    launch: RowLaunch = field(repr=False, compare=False)
+    """Actions to thrusts, by `thrusts_of`."""
 
     @property
     def size(self) -> int:
-        """Components of an action."""
+        """Components of an action, m."""
         return len(self.labels)
 
+    @property
+    def scale(self) -> tuple[float, ...]:
+        """Part of the limits that action 1 stands for."""
+        return self.definition["scale"]
+
+    @property
+    def wrench(self) -> bool:
+        """Whether the components ask for a wrench."""
+        return MODES[self.name].wrench
+
+    @property
+    def ends(self) -> tuple[Array, Array]:
+        """What each component alone asks for at -1 and at 1, (m,): of its axis [N, N m] or of its thruster [N]."""
+        if self.wrench:
+            return -self.columns.sum(axis=1), self.columns.sum(axis=1)
+        return self.columns @ self.definition["lower"], self.columns @ self.definition["upper"]
+
     def to_thrusters(self, action: npt.ArrayLike) -> Array:
-        """Thrusts in canonical order [N], (..., n), for actions (..., n); components beyond +-1 saturate.
+        """Thrusts in canonical order [N], (..., n), for actions (..., m); components beyond +-1 saturate.
 
         Raises:
             ControlError: The action has another length, or holds NaN.
         """
-        a = _checked(self.name, self.size, action) * np.array(self.scale)
-        return np.asarray(np.where(a >= 0.0, a * np.array(self.upper), -a * np.array(self.lower)))
+        a = np.asarray(action, float)
+        if a.shape[-1:] != (self.size,):
+            raise ControlError(f"{self.name} action has shape {a.shape}, expected (..., {self.size})")
+        if np.isnan(a).any():
+            raise ControlError(f"{self.name} action holds NaN: the policy or its observation is broken")
+        return self.launch(a)[..., : self.thrusters]
 
     def describe(self) -> dict[str, Any]:
         """Everything that defines the mode, as plain data."""
-        return {
-            "mode": self.name,
-            "size": self.size,
-            "labels": list(self.labels),
-            "lower": list(self.lower),
-            "upper": list(self.upper),
-            "scale": list(self.scale),
-        }
+        numbers = {name: list(values) for name, values in self.definition.items()}
+        return {"mode": self.name, "size": self.size, "labels": list(self.labels), **numbers}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Wrench6:
-    """Each component is a part of one axis' wrench limit; the wrench is allocated to the thrusters."""
-
-    name: ClassVar[str] = "wrench6"
-    axes: ClassVar[tuple[int, ...]] = (0, 1, 2, 3, 4, 5)
-    """Axis of the wrench that each component drives; the others are asked to be zero."""
-
-    limits: tuple[float, ...]
-    """Wrench at action 1 and scale 1, about `reference`, body frame [N, N m], (6,)."""
-    scale: tuple[float, ...]
-    """Part of the limit that action 1 stands for, (6,)."""
-    reference: tuple[float, ...]
-    """Body point about which the wrench is meant [m], (3,)."""
-    allocator: Allocator = field(repr=False, compare=False)
-    """Of the vehicle, about `reference`."""
-
-    def __post_init__(self) -> None:
-        if len(self.limits) != 6 or not np.greater_equal(self.limits, 0.0).all():
-            raise ControlError(f"{self.name} needs 6 wrench limits, none negative")
-        _check_scale(self.name, self.scale)
-
-    @classmethod
-    def from_vehicle(cls, vehicle: Any, scale: float | Sequence[float] = 1.0) -> Wrench6:
-        """The mode of a vehicle's wrench limits, with its allocator."""
-        return cls(
-            limits=tuple(map(float, vehicle.wrench_limits)),
-            scale=_spread(cls.name, scale, 6),
-            reference=tuple(map(float, vehicle.wrench_reference)),
-            allocator=Allocator.from_vehicle(vehicle),
-        )
-
-    @property
-    def size(self) -> int:
-        """Components of an action."""
-        return len(self.axes)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Axis names."""
-        return tuple(AXES[axis] for axis in self.axes)
-
-    def to_wrench(self, action: npt.ArrayLike) -> Array:
-        """Wanted wrench about `reference`, body frame [N, N m], (..., 6), for actions (..., size).
-
-        Raises:
-            ControlError: The action has another length, or holds NaN.
-        """
-        a = _checked(self.name, self.size, action)
-        tau = np.zeros((*a.shape[:-1], 6))
-        tau[..., list(self.axes)] = a
-        return np.asarray(tau * np.array(self.scale) * np.array(self.limits))
-
-    def to_thrusters(self, action: npt.ArrayLike) -> Array:
-        """Thrusts in canonical order [N], (..., n), for actions (..., size); components beyond +-1 saturate.
-
-        Raises:
-            ControlError: The action has another length, or holds NaN.
-        """
-        return self.allocator.allocate(self.to_wrench(action))[0]
-
-    def describe(self) -> dict[str, Any]:
-        """Everything that defines the mode, as plain data."""
-        return {
-            "mode": self.name,
-            "size": self.size,
-            "labels": list(self.labels),
-            "limits": list(self.limits),
-            "scale": list(self.scale),
-            "reference": list(self.reference),
-        }
-
-
-@dataclass(frozen=True, kw_only=True)
-class Wrench4(Wrench6):
-    """Surge, sway, heave and yaw as in `Wrench6`; the roll and pitch moments are asked to be zero."""
-
-    name: ClassVar[str] = "wrench4"
-    axes: ClassVar[tuple[int, ...]] = (0, 1, 2, 5)
-
-
-MODES: dict[str, type[Thruster8] | type[Wrench6]] = {
-    mode.name: mode for mode in (Thruster8, Wrench6, Wrench4)
-}
-"""Action modes by name."""
-
-
-def action_mode(name: str, vehicle: Any, scale: float | Sequence[float] = 1.0) -> Thruster8 | Wrench6:
+def action_mode(name: str, vehicle: Any, scale: float | Sequence[float] = 1.0) -> ActionMode:
     """The mode of that name for a vehicle.
+
+    Args:
+        name: Key of `MODES`.
+        vehicle: Its limits, thrusters and control matrix are read.
+        scale: Part of each limit that action 1 stands for [-], one number or one for each axis or thruster.
 
     Raises:
         ControlError: No such mode, or a scale it cannot have.
     """
     if name not in MODES:
         raise ControlError(f"unknown action mode '{name}'; available: {', '.join(MODES)}")
-    return MODES[name].from_vehicle(vehicle, scale)
+    kind = MODES[name]
+    size = np.shape(kind.mix(vehicle))[1]
+    try:
+        parts = np.broadcast_to(np.asarray(scale, float), (size,))
+    except ValueError:
+        raise ControlError(
+            f"{name} scale has shape {np.shape(scale)}, expected one number or {size}"
+        ) from None
+    if not ((parts >= 0.0) & (parts <= 1.0)).all():
+        raise ControlError(f"{name} scale is {tuple(parts.tolist())}, expected numbers in 0 to 1")
+    if kind.wrench:
+        numbers = {"limits": vehicle.wrench_limits, "scale": parts, "reference": vehicle.wrench_reference}
+    else:
+        lower, upper = vehicle.force_limits
+        numbers = {"lower": lower, "upper": upper, "scale": parts}
+    return ActionMode(
+        name=name,
+        labels=kind.labels(vehicle),
+        definition={key: tuple(map(float, values)) for key, values in numbers.items()},
+        columns=_columns(kind, vehicle, parts),
+        thrusters=len(vehicle.thruster_names),
+        launch=RowLaunch(thrusts_row, vec8, mode_data(name, [vehicle], [parts])),
+    )
 
 
-def mode_from_dict(description: Mapping[str, Any], vehicle: Any) -> Thruster8 | Wrench6:
+def mode_from_dict(description: Mapping[str, Any], vehicle: Any) -> ActionMode:
     """The mode that `describe()` recorded, for the vehicle it is to drive now.
 
     Raises:
@@ -198,26 +283,3 @@ def _same(recorded: Any, here: Any) -> bool:
             and bool(np.allclose(recorded, here, rtol=1e-6, atol=1e-12))
         )
     return bool(recorded == here)
-
-
-def _checked(name: str, size: int, action: npt.ArrayLike) -> Array:
-    a = np.asarray(action, float)
-    if a.shape[-1:] != (size,):
-        raise ControlError(f"{name} action has shape {a.shape}, expected (..., {size})")
-    if np.isnan(a).any():
-        raise ControlError(f"{name} action holds NaN: the policy or its observation is broken")
-    return np.asarray(np.clip(a, -1.0, 1.0))
-
-
-def _spread(name: str, scale: float | Sequence[float], size: int) -> tuple[float, ...]:
-    try:
-        return tuple(np.broadcast_to(np.asarray(scale, float), (size,)).tolist())
-    except ValueError:
-        raise ControlError(
-            f"{name} scale has shape {np.shape(scale)}, expected one number or {size}"
-        ) from None
-
-
-def _check_scale(name: str, scale: Sequence[float]) -> None:
-    if not (np.greater_equal(scale, 0.0).all() and np.less_equal(scale, 1.0).all()):
-        raise ControlError(f"{name} scale is {tuple(scale)}, expected numbers in 0 to 1")

@@ -304,7 +304,7 @@ class Pid:
         )
         tau = np.clip(wanted, -self.wrench_limits, self.wrench_limits)
 
-        thrusts, _ = self.allocator.allocate(tau)
+        thrusts = self.allocator.allocate(tau)
         undelivered = self.allocator.achieved(thrusts) - wanted
         braking = self.gains.kd - self.model.inertia * self.gains.rate + damping
         left_over = (self.gains.kp + self.model.stiffness) * clipped - braking * slip + undelivered

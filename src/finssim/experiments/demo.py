@@ -221,7 +221,7 @@ def step_responses(
         return speeds
 
     def respond(axis: int, level: float) -> tuple[float, float]:
-        force, _ = allocator.allocate(np.where(np.arange(6) == axis, level, 0.0))
+        force = allocator.allocate(np.where(np.arange(6) == axis, level, 0.0))
         ride(axis, np.zeros(len(thrusters)), REST)
         plant.nu[:] = 0.0
         speeds = ride(axis, np.array([t.speed(f) for t, f in zip(thrusters, force, strict=True)]), PUSH)

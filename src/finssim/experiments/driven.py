@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.control.guidance import Guide, Station, Track
-from finssim.control.modes import AXES, Thruster8, Wrench6, action_mode
+from finssim.control.modes import AXES, ActionMode, action_mode
 from finssim.control.trajectories import PUBLISHED_NAMES, TRAJECTORIES, load_trajectory
 from finssim.experiments.campaign import Say
 from finssim.experiments.tables import Table
@@ -196,7 +196,7 @@ FEW = 0.05
 """Part of the decisions that may be off by more: those at the limits of the thrusters."""
 
 
-def actions_of(force: ArrayLike, mode: Thruster8 | Wrench6, vehicle: Vehicle) -> NDArray[np.float32]:
+def actions_of(force: ArrayLike, mode: ActionMode, vehicle: Vehicle) -> NDArray[np.float32]:
     """Actions that ask for what was commanded, in [-1, 1], (N, size).
 
     Args:
@@ -208,21 +208,18 @@ def actions_of(force: ArrayLike, mode: Thruster8 | Wrench6, vehicle: Vehicle) ->
         DriveError: More than a few of the commands are none that the mode can ask for.
     """
     f = np.asarray(force, float)
-    if isinstance(mode, Thruster8):
-        full = np.where(f >= 0.0, np.asarray(mode.upper), -np.asarray(mode.lower)) * np.asarray(mode.scale)
-        wanted = f
+    if mode.wrench:
+        parts = f @ vehicle.control_matrix.T
     else:
-        full = (np.asarray(mode.limits) * np.asarray(mode.scale))[list(mode.axes)]
-        wanted = (f @ vehicle.control_matrix.T)[:, list(mode.axes)]
-    action = np.divide(
-        wanted, full, out=np.zeros_like(wanted), where=np.broadcast_to(full, wanted.shape) > 0.0
-    )
-    action = np.clip(action, -1.0, 1.0)
+        lower, upper = vehicle.force_limits
+        full = np.where(f >= 0.0, upper, -lower)
+        parts = np.divide(f, full, out=np.zeros_like(f), where=full > 0.0)
+    action = np.clip(parts @ np.linalg.pinv(mode.columns), -1.0, 1.0)
     _check_actions(action, f, mode, vehicle)
     return action.astype(np.float32)
 
 
-def _check_actions(action: Array, force: Array, mode: Thruster8 | Wrench6, vehicle: Vehicle) -> None:
+def _check_actions(action: Array, force: Array, mode: ActionMode, vehicle: Vehicle) -> None:
     """Compare the wrench that the actions would give with the one that was commanded."""
     limits = np.asarray(vehicle.wrench_limits, float)
     off = np.abs((mode.to_thrusters(action) - force) @ vehicle.control_matrix.T)
@@ -247,7 +244,7 @@ SAME_GOAL = 1.0e-3
 
 
 def episodes_of(
-    drive: Drive, observer: Observer, mode: Thruster8 | Wrench6, vehicle: Vehicle, *,
+    drive: Drive, observer: Observer, mode: ActionMode, vehicle: Vehicle, *,
     goal: Station | str | None = None,
 ) -> list[Episode]:  # fmt: skip
     """Demonstrations of a drive; none where it has no stretch of two decisions.

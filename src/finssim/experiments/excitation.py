@@ -22,8 +22,8 @@ from finssim.calibration.importers.dispatch import print_folders, read_trials
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import load_trial, load_trials, write_trial
 from finssim.control import ControlError
+from finssim.control.allocation import Allocator
 from finssim.control.guidance import Goal, Guide, Measured, Station, goal_at
-from finssim.control.modes import Wrench6
 from finssim.control.pid import controller
 from finssim.experiments.campaign import Job, Say, Show, progress_bar, run_jobs
 from finssim.experiments.on_robot import (
@@ -97,7 +97,7 @@ class ProgrammePilot:
                 f"expected a wrench and a phase for every row, on axes of {', '.join(AXES)}"
             )
         self.period, self._programme, self._room = period, programme, room
-        self._mode = Wrench6.from_vehicle(vehicle)
+        self._allocator = Allocator.from_vehicle(vehicle)
         self._limits = np.asarray(vehicle.wrench_limits, float)
         held = HELD_IN_TURNS if "yaw" in axes else HELD
         self._driven = [AXES.index(axis) for axis in axes]
@@ -130,14 +130,14 @@ class ProgrammePilot:
         self.finished = self.finished or row >= len(phases)
         if self.finished:
             self.phase = ""
-            return np.zeros(self._mode.allocator.thrusters)
+            return np.zeros(self._allocator.thrusters)
         self.phase = str(phases[row])
         tau = self._programme.tau_desired[row].copy()
         if self._hold is not None:
             goal = self._beside(goal_at(guide, t), reading)
             corrected, self._memory = self._hold.command(self._memory, reading, goal)
             tau[self._held] = corrected[self._held]
-        return self._mode.allocator.allocate(np.clip(tau, -self._limits, self._limits))[0]
+        return self._allocator.allocate(np.clip(tau, -self._limits, self._limits))
 
     def watch(self, runtime: Runtime) -> None:
         """After every step: the record gets the phases, and the highest speed is kept."""

@@ -298,7 +298,7 @@ def step_responses(
         tau = np.zeros(6)
         tau[i] = direction * PART * vehicle.wrench_limits[i]
         simulator.place(position=(0.0, 0.0, -depth))
-        simulator.set_thrust(allocator.allocate(tau)[0])
+        simulator.set_thrust(allocator.allocate(tau))
         speed = np.zeros((samples, count + 1))
         for k in range(1, count + 1):
             step.run()

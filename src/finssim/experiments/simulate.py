@@ -113,7 +113,7 @@ def simulate(
         raise CommandError(f"{out} ends in '{out.suffix}', expected .csv")
     tau, chosen = parse_wrench(command), load_vehicle(vehicle)
     allocator, names = Allocator.from_vehicle(chosen), chosen.thruster_names
-    thrust, _ = allocator.allocate(tau)
+    thrust = allocator.allocate(tau)
     simulator = Simulator(chosen, hydrodynamics=hydrodynamics, control_step=CONTROL_STEP, device=device)
     with atomic_write(out) as table, atomic_write(f"{out}.json") as origin:
         rows = _run(simulator, thrust, depth, steps=round(duration / CONTROL_STEP))

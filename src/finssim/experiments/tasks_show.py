@@ -10,10 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, is_dataclass
 from typing import Any
 
-from finssim.control.modes import Thruster8, action_mode
+from finssim.control.modes import AXES, action_mode
 from finssim.experiments.tables import Table
 from finssim.tasks import TASKS
-from finssim.tasks.baselines import BASELINES
+from finssim.tasks import terms as library
+from finssim.tasks.agents import BASELINES
 from finssim.tasks.given import crew
 from finssim.tasks.make import task_named
 from finssim.tasks.sensing import Sensing, seen_with
@@ -107,27 +108,20 @@ def describe_task(
 
 
 def _text(task: Task, term: Any) -> str:
-    """The docstring of a term, or of what is shared under its name."""
+    """The docstring of a term, or of what is shared under its name; an expression itself."""
     if isinstance(term, str):
-        term = {**task.terms().shared, **task.terms().seen}[term]
+        terms = task.terms()
+        named = {**terms.shared, **terms.seen}.get(term, getattr(library, term, None))
+        return term.replace("wp.", "") if named is None else _text(task, named)
     return " ".join((inspect.getdoc(term.func) or "").split()) if term is not None else ""
 
 
 def _action(mode: str, vehicle: Vehicle) -> dict[str, Any]:
     """What 1 and -1 of every component stand for."""
     chosen = action_mode(mode, vehicle)
-    if isinstance(chosen, Thruster8):
-        ends = [
-            (low * k, high * k) for low, high, k in zip(chosen.lower, chosen.upper, chosen.scale, strict=True)
-        ]
-        units = ["N"] * len(ends)
-    else:
-        most = [chosen.limits[axis] * chosen.scale[axis] for axis in chosen.axes]
-        ends = [(-x, x) for x in most]
-        units = ["N" if axis < 3 else "N m" for axis in chosen.axes]
     components = [
-        {"name": label, "low": low, "high": high, "unit": unit}
-        for label, (low, high), unit in zip(chosen.labels, ends, units, strict=True)
+        {"name": label, "low": low, "high": high, "unit": "N m" if label in AXES[3:] else "N"}
+        for label, low, high in zip(chosen.labels, *(x.tolist() for x in chosen.ends), strict=True)
     ]
     return {"mode": mode, "size": len(components), "components": components}
 

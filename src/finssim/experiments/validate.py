@@ -92,7 +92,7 @@ def simulate_responses(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> l
     tau = np.zeros((len(cases), 6))
     tau[np.arange(len(cases)), axis] = [case["command"] for case in cases]
     allocator = Allocator.from_vehicle(vehicle)
-    thrust, _ = allocator.allocate(tau)
+    thrust = allocator.allocate(tau)
     speed = steady_speeds(vehicle, hydrodynamics, thrust)
     given = allocator.achieved(thrust)
     return [

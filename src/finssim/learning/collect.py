@@ -15,8 +15,7 @@ from finssim.files import atomic_directory, refuse_unwritable
 from finssim.learning.demonstrations import DATASET_FILE, DatasetError, Episode, save
 from finssim.provenance import provenance
 from finssim.tasks import Environment, make
-from finssim.tasks.agents import NOWHERE, Agent, Known, expert_for
-from finssim.tasks.baselines import restarted
+from finssim.tasks.agents import NOWHERE, Agent, Known, expert_for, restarted
 
 __all__ = ["collect", "record_episodes"]
 

@@ -18,7 +18,7 @@ import yaml
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from finssim.control.modes import action_mode
+from finssim.control.modes import MODES, action_mode
 from finssim.control.policy import DESCRIPTION_FILE, NETWORK_FILE, Policy, PolicyDescription, VehicleIdentity
 from finssim.files import atomic_directory
 from finssim.learning.network import (
@@ -276,7 +276,7 @@ def description_of(environment: Environment, **training: Any) -> PolicyDescripti
         training: More of how it was trained, as plain data.
     """
     task, vehicle, ranges = environment.task, environment.nominal[0], environment.randomization
-    wrench = environment.action_mode.startswith("wrench")
+    wrench = MODES[environment.action_mode].wrench
     scale = environment.wrench_scale.tolist() if wrench else 1.0
     return PolicyDescription(
         task=task.name,

@@ -579,7 +579,7 @@ class Workspace:
         if not out.any():
             return force
         push[out] = 0.0
-        allocated, _ = self._allocator.allocate(np.concatenate([R.T @ push, tau[3:]]))
+        allocated = self._allocator.allocate(np.concatenate([R.T @ push, tau[3:]]))
         still = (R @ self._allocator.achieved(allocated)[:3]) * outward
         return allocated if bool((still <= ROUNDING).all()) else np.zeros_like(force)
 

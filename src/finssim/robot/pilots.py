@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.control import ControlError
+from finssim.control.allocation import Allocator
 from finssim.control.guidance import Goal, Guide, Known, Measured, goal_at
-from finssim.control.modes import Wrench6, action_mode, mode_from_dict
+from finssim.control.modes import action_mode, mode_from_dict
 from finssim.control.pid import CONTROLLERS
 from finssim.control.policy import PolicyError, read_description
 from finssim.vehicles import Vehicle
@@ -136,12 +137,12 @@ class WrenchPilot:
             period: Time between two decisions [s].
         """
         self.name, self.period = name, period
-        self._wrench, self._mode = wrench, Wrench6.from_vehicle(vehicle)
+        self._wrench, self._allocator = wrench, Allocator.from_vehicle(vehicle)
         self._limits = np.asarray(vehicle.wrench_limits, float)
 
     def describe(self) -> dict[str, Any]:
         """Name and rate."""
-        return {"name": self.name, "kind": "teleop", "action": self._mode.name, "period_s": self.period}
+        return {"name": self.name, "kind": "teleop", "action": "wrench6", "period_s": self.period}
 
     def reset(self) -> None:
         """A person remembers."""
@@ -149,7 +150,7 @@ class WrenchPilot:
     def act(self, reading: Measured, guide: Guide, t: float) -> Array:
         """Wanted thrusts in canonical order [N], (n,)."""
         tau = np.asarray(self._wrench(), float)
-        return self._mode.allocator.allocate(np.clip(tau, -self._limits, self._limits))[0]
+        return self._allocator.allocate(np.clip(tau, -self._limits, self._limits))
 
 
 class ModeSwitch:
@@ -233,8 +234,7 @@ def make_pilot(
     Raises:
         PolicyError, ControlError: It does not fit the vehicle or the task, in one sentence.
     """
-    from finssim.tasks.agents import TASKS_OF_PIDS, BaselineAgent, PidAgent, PolicyAgent
-    from finssim.tasks.baselines import BASELINES
+    from finssim.tasks.agents import BASELINES, TASKS_OF_PIDS, BaselineAgent, PidAgent, PolicyAgent
     from finssim.tasks.observer import Observer
 
     who = str(name_or_directory)

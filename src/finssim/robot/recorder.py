@@ -6,22 +6,20 @@ import json
 import logging
 import math
 import os
-import struct
 import threading
 import time
-import zlib
-from collections import Counter, defaultdict, deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from finssim.files import OutputError, atomic_write, refuse_unwritable
-from finssim.mcap_repair import END, MAGIC
+from finssim.mcap_repair import END
 from finssim.provenance import provenance
 from finssim.robot.messages import CommandEcho, NavigationAid, Picture, Telemetry
 from finssim.robot.pictures import jpeg
@@ -29,207 +27,29 @@ from finssim.robot.record_messages import METADATA, TOPICS, Messages, definition
 from finssim.robot.robot import Reading
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["McapWriter", "RawFile", "RecordSink", "Recorder", "recording"]
+__all__ = ["RecordSink", "Recorder", "recording"]
 
 
-# MCAP files whose chunks close when their writer says so, so that little is lost when the process dies.
+class _Whole:
+    """A file opened without a buffer, as a stream that takes every write whole or raises."""
 
+    def __init__(self, file: Any) -> None:
+        self._file, self.written = file, 0
 
-MESSAGE = struct.Struct("<BQHIQQ")
-"""Kind 5, length of what follows, channel, sequence, log time and publish time [ns]."""
-
-COMPRESSION = "lz4"
-
-
-class RawFile(Protocol):
-    """What is written to: a file opened without a buffer."""
-
-    def write(self, data: memoryview, /) -> int | None:
-        """Take some of the bytes; returns how many."""
-
-
-class McapWriter:
-    """One file: metadata and attachments at once, messages in chunks that `close_chunk` ends (MCAP specification 0).
-
-    The writer of the `mcap` package closes a chunk by its size alone; here time has to. Its records are used for
-    everything that is rare.
-    """
-
-    def __init__(self, file: RawFile, *, profile: str = "ros2", library: str = "finssim") -> None:
-        from mcap.records import Header
-
-        self._file = file
-        self._at = 0
-        self._schemas: dict[str, Any] = {}
-        self._channels: dict[int, Any] = {}
-        self._counts: Counter[int] = Counter()
-        self._spans: list[tuple[int, int]] = []
-        self._indexes: dict[str, list[Any]] = {"chunk": [], "attachment": [], "metadata": []}
-        self._open_chunk()
-        self._put(MAGIC + _bytes(Header(profile=profile, library=library)))
-
-    @property
-    def pending(self) -> int:
-        """Bytes in the open chunk."""
-        return len(self._chunk)
-
-    @property
-    def written(self) -> int:
-        """Bytes of the whole records in the file."""
-        return self._at
-
-    @property
-    def messages(self) -> int:
-        """Messages in the file and in the open chunk."""
-        return sum(self._counts.values())
-
-    def metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Write a table of words."""
-        from mcap.records import Metadata, MetadataIndex
-
-        at = self._at
-        self._put(_bytes(Metadata(name=name, metadata=dict(values))))
-        self._indexes["metadata"].append(MetadataIndex(offset=at, length=self._at - at, name=name))
-
-    def attachment(self, name: str, media_type: str, data: bytes, time: int = 0) -> None:
-        """Write a file into the file; `time` in ns."""
-        from mcap.records import Attachment, AttachmentIndex
-
-        at, told = self._at, {"log_time": time, "create_time": time, "name": name, "media_type": media_type}
-        self._put(_bytes(Attachment(data=data, **told)))
-        self._indexes["attachment"].append(
-            AttachmentIndex(offset=at, length=self._at - at, data_size=len(data), **told)
-        )
-
-    def channel(self, topic: str, kind: str, definition: str, qos: str) -> int:
-        """Announce a topic of ROS 2 messages in CDR; returns its number.
-
-        Args:
-            topic: Name of the topic.
-            kind: Type, such as `sensor_msgs/msg/Imu`.
-            definition: Text of the type and of all that it uses, as in a rosbag.
-            qos: Offered profiles as rosbag2 keeps them (`offered_qos`).
-        """
-        from mcap.records import Channel, Schema
-
-        if kind not in self._schemas:
-            number = len(self._schemas) + 1
-            self._schemas[kind] = Schema(id=number, name=kind, encoding="ros2msg", data=definition.encode())
-            self._chunk += _bytes(self._schemas[kind])
-        number = len(self._channels) + 1
-        self._channels[number] = Channel(
-            id=number,
-            schema_id=self._schemas[kind].id,
-            topic=topic,
-            message_encoding="cdr",
-            metadata={"offered_qos_profiles": qos},
-        )
-        self._chunk += _bytes(self._channels[number])
-        return number
-
-    def message(self, channel: int, time: int, data: bytes) -> None:
-        """Add a message to the open chunk; `time` in ns."""
-        self._places[channel].append((time, len(self._chunk)))
-        self._chunk += MESSAGE.pack(
-            5, 22 + len(data), channel, self._counts[channel] & 0xFFFFFFFF, time, time
-        )
-        self._chunk += data
-        self._counts[channel] += 1
-
-    def close_chunk(self) -> None:
-        """Write the open chunk and its index; nothing if it is empty."""
-        import lz4.frame
-        from mcap.records import Chunk, ChunkIndex, MessageIndex
-
-        if not self._chunk:
-            return
-        times = [time for places in self._places.values() for time, _ in places]
-        first, last = (min(times), max(times)) if times else (0, 0)
-        packed = lz4.frame.compress(bytes(self._chunk))
-        told = {"message_start_time": first, "message_end_time": last, "compression": COMPRESSION}
-        told["uncompressed_size"] = len(self._chunk)
-        chunk = _bytes(Chunk(data=packed, uncompressed_crc=zlib.crc32(self._chunk), **told))
-        at, offsets, indexes = self._at, {}, b""
-        for channel, places in self._places.items():
-            offsets[channel] = at + len(chunk) + len(indexes)
-            indexes += _bytes(MessageIndex(channel_id=channel, records=places))
-        self._put(chunk + indexes)
-        self._indexes["chunk"].append(
-            ChunkIndex(
-                chunk_start_offset=at,
-                chunk_length=len(chunk),
-                message_index_offsets=offsets,
-                message_index_length=len(indexes),
-                compressed_size=len(packed),
-                **told,
-            )
-        )
-        self._spans += [(first, last)] if times else []
-        self._open_chunk()
-
-    def finish(self) -> None:
-        """Close the last chunk and write the summary by which readers find their way."""
-        from mcap.records import DataEnd, Footer, SummaryOffset
-
-        self.close_chunk()
-        self._put(_bytes(DataEnd(data_section_crc=0)))
-        start, summary, offsets = self._at, b"", b""
-        for kind, records in self._summary().items():
-            group = b"".join(map(_bytes, records))
-            place = SummaryOffset(
-                group_opcode=kind, group_start=start + len(summary), group_length=len(group)
-            )
-            offsets += _bytes(place) if group else b""
-            summary += group
-        listed = start + len(summary)
-        summary += offsets
-        crc = zlib.crc32(struct.pack("<BQQQ", 2, 20, start, listed), zlib.crc32(summary))
-        footer = Footer(summary_start=start, summary_offset_start=listed, summary_crc=crc)
-        self._put(summary + _bytes(footer) + MAGIC)
-
-    def _summary(self) -> dict[Any, list[Any]]:
-        """Records of the summary by their kind."""
-        from mcap.opcode import Opcode
-        from mcap.records import Statistics
-
-        statistics = Statistics(
-            message_count=self.messages,
-            schema_count=len(self._schemas),
-            channel_count=len(self._channels),
-            attachment_count=len(self._indexes["attachment"]),
-            metadata_count=len(self._indexes["metadata"]),
-            chunk_count=len(self._indexes["chunk"]),
-            message_start_time=min((first for first, _ in self._spans), default=0),
-            message_end_time=max((last for _, last in self._spans), default=0),
-            channel_message_counts=dict(self._counts),
-        )
-        return {
-            Opcode.SCHEMA: list(self._schemas.values()),
-            Opcode.CHANNEL: list(self._channels.values()),
-            Opcode.STATISTICS: [statistics],
-            Opcode.CHUNK_INDEX: self._indexes["chunk"],
-            Opcode.ATTACHMENT_INDEX: self._indexes["attachment"],
-            Opcode.METADATA_INDEX: self._indexes["metadata"],
-        }
-
-    def _open_chunk(self) -> None:
-        self._chunk = bytearray()
-        self._places: dict[int, list[tuple[int, int]]] = defaultdict(list)
-
-    def _put(self, data: bytes) -> None:
+    def write(self, data: bytes) -> None:
         """Write all of it; counted only when the system has taken it whole."""
         view = memoryview(data)
         while view:
             view = view[self._file.write(view) or 0 :]
-        self._at += len(data)
+        self.written += len(data)
 
+    def tell(self) -> int:
+        """Bytes of the whole records in the file."""
+        return self.written
 
-def _bytes(record: Any) -> bytes:
-    from mcap.data_stream import RecordBuilder
-
-    builder = RecordBuilder()
-    record.write(builder)
-    return bytes(builder.end())
+    def flush(self) -> None:
+        """Return when what was written is on disk."""
+        os.fsync(self._file.fileno())
 
 
 # The thread that puts a record on disk: the control loop never waits for it, and a full disk never stops it.
@@ -260,14 +80,15 @@ class RecordSink:
     def __init__(
         self,
         path: Path,
-        announce: Callable[[McapWriter, str], int],
+        announce: Callable[[Any, str], int],
         *,
         chunk_seconds: float = 0.5,
         longest_queue: int = 64 << 20,
     ) -> None:
         """Args:
             path: File to make; an existing one is refused.
-            announce: Makes the channel of a key when its first message is written, and returns its number.
+            announce: Registers the channel of a key with an `mcap.writer.Writer` when its first message is written, and
+                returns its number.
             chunk_seconds: [s]
             longest_queue: Bytes that may wait for the disk; more are dropped.
 
@@ -278,6 +99,8 @@ class RecordSink:
             raise OutputError(
                 f"cannot write {path}: it exists, and records are never replaced: give a new name"
             )
+        from mcap.writer import CompressionType, Writer
+
         refuse_unwritable(atomic_write(path))
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
@@ -286,10 +109,13 @@ class RecordSink:
         self.dropped = 0
         """Messages that were not recorded."""
         self._file = open(path, "xb", buffering=0)
-        self.writer = McapWriter(self._file)
+        self._stream: Any = _Whole(self._file)
+        self.writer = Writer(self._stream, chunk_size=LARGEST_CHUNK, compression=CompressionType.LZ4)
         """For metadata and attachments, before `start`."""
+        self.writer.start(profile="ros2", library="finssim")
         self._announce = announce
         self._channels: dict[str, int] = {}
+        self._counts: Counter[str] = Counter()
         self._chunk_seconds, self._longest_queue = chunk_seconds, longest_queue
         self._queue: deque[tuple[str, int, Payload, int]] = deque()
         self._put_bytes = self._taken_bytes = 0  # each written by one thread only
@@ -300,7 +126,7 @@ class RecordSink:
 
     def start(self) -> None:
         """Begin to write."""
-        os.fsync(self._file.fileno())
+        self._stream.flush()
         self._thread.start()
 
     def put(self, key: str, time: int, payload: Payload, size: int) -> None:
@@ -333,13 +159,13 @@ class RecordSink:
             idle = 0
             while not self._closing.wait(self._chunk_seconds / POLLS):
                 self._drain()
-                idle = idle + 1 if self.writer.pending else 0
+                idle = idle + 1 if self._opened is not None else 0
                 if idle >= POLLS:
                     self._close_chunk()
                     idle = 0
             self._drain()
             self.writer.finish()
-            os.fsync(self._file.fileno())
+            self._stream.flush()
         except Exception as error:  # whatever it is, it must be told, and must not stop the vehicle's control
             self._stop(error)
         finally:
@@ -356,14 +182,15 @@ class RecordSink:
             if key not in self._channels:
                 self._channels[key] = self._announce(self.writer, key)
             self._opened = time if self._opened is None else self._opened
-            self.writer.message(self._channels[key], time, data)
-            if time - self._opened >= self._chunk_seconds * 1e9 or self.writer.pending >= LARGEST_CHUNK:
+            sequence = self._counts[key] & 0xFFFFFFFF
+            self.writer.add_message(self._channels[key], time, data, time, sequence)
+            self._counts[key] += 1
+            if time - self._opened >= self._chunk_seconds * 1e9:
                 self._close_chunk()
 
     def _close_chunk(self) -> None:
-        self.writer.close_chunk()
+        self.writer.flush()
         self._opened = None
-        os.fsync(self._file.fileno())
 
     def _stop(self, error: Exception) -> None:
         """Give up: the file ends after its last whole record, if the system lets it."""
@@ -376,7 +203,7 @@ class RecordSink:
         self._queue.clear()
         LOG.warning(self.problem)
         try:
-            self._file.truncate(self.writer.written)
+            self._file.truncate(self._stream.written)
             self._file.seek(0, os.SEEK_END)
             self._file.write(END)
         except OSError:
@@ -422,9 +249,9 @@ class Recorder:
         texts = {name: Path(file).read_bytes() for name, file in (files or {}).items()}
         texts |= _vehicle_file(vehicle)
         self._name, self._messages = vehicle.name, Messages(vehicle)
-        for (
-            topic
-        ) in TOPICS.values():  # compiles what packs a type: the first message of each must not wait for it
+        self._schemas: dict[str, int] = {}
+        # Compiles what packs a type: the first message of each must not wait for it.
+        for topic in TOPICS.values():
             self._messages.types.get_msgdef(topic.type)
         self._pictures, self._epoch = pictures, round(epoch * 1e9)
         self._sink = RecordSink(Path(path), self._announce, chunk_seconds=chunk_seconds)
@@ -435,9 +262,9 @@ class Recorder:
             "provenance": json.dumps(provenance()),
         }
         given = {k: v if isinstance(v, str) else json.dumps(v, default=str) for k, v in (meta or {}).items()}
-        self._sink.writer.metadata(METADATA, {**given, **about})
+        self._sink.writer.add_metadata(METADATA, {**given, **about})
         for name, text in texts.items():
-            self._sink.writer.attachment(name, "text/plain", text)
+            self._sink.writer.add_attachment(0, 0, name, "text/plain", text)
         self._sink.start()
 
     @property
@@ -566,11 +393,12 @@ class Recorder:
     ) -> None:
         self.close()
 
-    def _announce(self, writer: McapWriter, key: str) -> int:
-        topic = TOPICS[key]
-        return writer.channel(
-            self._topic_name(key), topic.type, definition(topic.type), offered_qos(topic.quality)
-        )
+    def _announce(self, writer: Any, key: str) -> int:
+        kind = TOPICS[key].type
+        if kind not in self._schemas:
+            self._schemas[kind] = writer.register_schema(kind, "ros2msg", definition(kind).encode())
+        quality = {"offered_qos_profiles": offered_qos(TOPICS[key].quality)}
+        return int(writer.register_channel(self._topic_name(key), "cdr", self._schemas[kind], quality))
 
     def _topic_name(self, key: str) -> str:
         return TOPICS[key].under(self._name)

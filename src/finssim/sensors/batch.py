@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import warp as wp
 from numpy.typing import NDArray
@@ -13,6 +13,17 @@ from finssim.sensors.sampling import SensedState, new_sampling
 
 class SensorError(ValueError):
     """A sensor was asked for something it cannot do; the message says what to do instead."""
+
+
+class Surroundings(NamedTuple):
+    """What a sensor's parameters may depend on beside the vehicle's file."""
+
+    gravity: float
+    """[m/s²]"""
+    density: float
+    """Of the water [kg/m³]."""
+    floor_depth: float
+    """Depth of the flat floor [m]; infinite if not known."""
 
 
 class SensorBatch:
@@ -27,8 +38,11 @@ class SensorBatch:
     schema: ClassVar[Any] = None
     """What a vehicle file says of it, a `vehicles.equipment.Sensor`; for `add_sensor`."""
     kernel: ClassVar[Any]
+    """From `sampling.sampling_kernel`."""
     parameter_struct: ClassVar[Any]
+    """From `sampling.parameters_of`."""
     array_struct: ClassVar[Any]
+    """Warp struct of readings, by (world, vehicle), and of rings, which have one more index."""
     readings: ClassVar[tuple[str, ...]]
     """Names of the arrays that `numpy` returns beside `stamp` and `fresh`."""
 
@@ -72,10 +86,6 @@ class SensorBatch:
             setattr(self, name, array)
         return arrays
 
-    def state_arrays(self, state: SensedState, water_velocity: Any) -> list[Any]:
-        """The kernel's first arguments: what this sensor measures."""
-        raise NotImplementedError
-
     def inputs(self, state: SensedState, water_velocity: Any, mask: Any, restarting: bool) -> list[Any]:
         """All arguments of the kernel but its last, `world_offset`.
 
@@ -85,22 +95,25 @@ class SensorBatch:
             mask: Worlds to look at, int (W,).
             restarting: Whether these worlds have just been reset.
         """
-        measured = self.state_arrays(state, water_velocity)
+        truth = [state.position, state.quaternion, state.velocity, state.acceleration, water_velocity]
         memory = [self.parameters, self.arrays, self.sampling]
-        return [*measured, state.steps, state.episode, *memory, mask, restarting, self.seed]
+        return [*truth, state.steps, state.episode, *memory, mask, restarting, self.seed]
 
-    def use(self, vehicle: int, entry: Any, *, gravity: float, density: float) -> None:
+    def use(self, vehicle: int, entry: Any, site: Surroundings) -> None:
         """Take one vehicle's parameters from its file.
 
         Args:
             vehicle: Index.
             entry: `vehicle.sensors.KIND`.
-            gravity: [m/s²]
-            density: Of the water [kg/m³].
+            site: What else they depend on.
         """
-        raise NotImplementedError(
-            f"sensor '{self.kind}' does not say what it takes of a vehicle: define use()"
-        )
+        names = self.parameter_struct.vars
+        values = {name: getattr(entry, name) for name in names if hasattr(entry, name)}
+        self.set(vehicle, **{**values, **self.derived(entry, site)})
+
+    def derived(self, entry: Any, site: Surroundings) -> dict[str, float]:
+        """Parameters that the file does not give as they are, or that replace what it gives; none by default."""
+        return {}
 
     def numpy(self) -> dict[str, NDArray[Any]]:
         """Copies of the readings with `stamp` and `fresh`, each (W, V, ...)."""

@@ -6,34 +6,10 @@ from typing import Any
 import warp as wp
 
 from finssim.sensors.batch import SensorBatch
-from finssim.sensors.sampling import (
-    TURN_ON,
-    WHITE,
-    Sampling,
-    SensedState,
-    arrival,
-    begin_update,
-    digitised,
-    lost,
-    normal,
-    restart,
-    sample_due,
-    sample_key,
-    slot_of,
-)
+from finssim.sensors.sampling import TURN_ON, WHITE, Truth, digitised, normal, parameters_of, sampling_kernel
+from finssim.vehicles.equipment import Compass
 
-COMPASS = 4
-"""Number of this kind of sensor in the random key."""
-
-
-@wp.struct
-class CompassParameters:
-    """Errors of one compass. Standard deviations are per sample."""
-
-    dropout: float  # probability that a sample never arrives
-    noise: float  # [rad]
-    turn_on: float  # [rad]
-    quantum: float  # [rad]
+CompassParameters = parameters_of(Compass)
 
 
 @wp.struct
@@ -56,87 +32,35 @@ def heading_of(q_wb: wp.quat) -> float:
     return wp.atan2(ahead[1], ahead[0])
 
 
-@wp.kernel(enable_backward=False)
-def sample_compass(
-    quaternion: wp.array2d(dtype=wp.quat),
-    steps: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
-    parameters: wp.array2d(dtype=CompassParameters),
-    compass: CompassArrays,
-    sampling: Sampling,
-    mask: wp.array(dtype=int),
-    restarting: bool,
-    seed: int,
-    world_offset: int,
-):
-    """One update of every compass.
-
-    Args:
-        quaternion: Attitude, body to world, xyzw, (W, V).
-        steps: Control steps since the world's reset, (W,).
-        episode: Resets of the world so far, (W,).
-        parameters: Errors of each compass, (W, V).
-        compass: Readings and memory.
-        sampling: When each samples.
-        mask: Worlds to look at, (W,).
-        restarting: Whether these worlds have just been reset.
-        seed: Of all random numbers.
-        world_offset: World of the first thread.
-    """
-    i, v = wp.tid()
-    w = world_offset + i
-    if mask[w] == 0:
-        return
-    p = parameters[w, v]
-    step = steps[w]
-    key = sample_key(seed, COMPASS, w, v, episode[w], step)
+@wp.func
+def measure_heading(
+    truth: Truth, p: CompassParameters, key: wp.uint32, root: float, restarting: bool, compass: CompassArrays, w: int,
+    v: int, slot: int,
+) -> bool:  # fmt: skip
+    """One sample of a compass; arguments as `sampling_kernel` has them."""
     if restarting:
-        restart(sampling, w, v, step)
-        compass.bias[w, v] = p.turn_on * normal(key, TURN_ON)
-    if not begin_update(sampling, w, v, step):
-        return
-    if restarting or sample_due(sampling, w, v, step):
-        heading = heading_of(quaternion[w, v]) + compass.bias[w, v] + p.noise * normal(key, WHITE)
-        slot = slot_of(sampling, step)
-        compass.ring[w, v, slot] = digitised(heading, p.quantum, wp.inf)
-        sampling.sent[w, v, slot] = restarting or not lost(key, p.dropout)
-        sampling.last[w, v] = step
-    slot = arrival(sampling, w, v, step, restarting)
-    if slot >= 0:
-        compass.heading[w, v] = compass.ring[w, v, slot]
+        compass.bias[w, v] = p.bias_initial * normal(key, TURN_ON)
+    heading = heading_of(truth.quaternion) + compass.bias[w, v] + p.noise_std * normal(key, WHITE)
+    compass.ring[w, v, slot] = digitised(heading, p.quantisation, wp.inf)
+    return True
+
+
+@wp.func
+def display_heading(p: CompassParameters, compass: CompassArrays, w: int, v: int, slot: int):
+    """The heading of a sample that arrived."""
+    compass.heading[w, v] = compass.ring[w, v, slot]
 
 
 class CompassBatch(SensorBatch):
     """The compasses of all vehicles of all worlds."""
 
     kind = "compass"
-    kernel = sample_compass
     parameter_struct = CompassParameters
     array_struct = CompassArrays
+    kernel = sampling_kernel(4, CompassParameters, CompassArrays, measure_heading, display_heading)
     readings = ("heading",)
 
     heading: "wp.array[Any]"
     """Of the body's x axis from world x, left positive [rad]; float (W, V)."""
     bias: "wp.array[Any]"
     """Truth: the offset in it [rad]; float (W, V)."""
-
-    def state_arrays(self, state: SensedState, water_velocity: Any) -> list[Any]:
-        """Attitude."""
-        return [state.quaternion]
-
-    def use(self, vehicle: int, entry: Any, *, gravity: float, density: float) -> None:
-        """Take one vehicle's parameters from its file.
-
-        Args:
-            vehicle: Index.
-            entry: `vehicle.sensors.compass`.
-            gravity: Not used [m/s²].
-            density: Not used [kg/m³].
-        """
-        self.set(
-            vehicle,
-            dropout=entry.dropout,
-            noise=entry.noise_std,
-            turn_on=entry.bias_initial,
-            quantum=entry.quantisation,
-        )

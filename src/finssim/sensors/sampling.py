@@ -7,6 +7,9 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
+from finssim.physics.types import vec6
+from finssim.vehicles.equipment import Sensor
+
 # Imperfections shared by all sensors: random streams, white noise, wandering bias, quantisation and saturation.
 
 
@@ -218,3 +221,97 @@ def new_sampling(
     sampling.stamp = wp.full(shape, -1.0, dtype=float, device=device)
     sampling.fresh = wp.zeros(shape, dtype=wp.bool, device=device)
     return sampling
+
+
+# A kind of sensor is what it measures and what it shows of a sample that arrives; all else is the same for every kind.
+
+
+@wp.struct
+class Truth:
+    """What is true of one vehicle at the end of a control step."""
+
+    position: wp.vec3  # body origin, world frame [m]
+    quaternion: wp.quat  # attitude, body to world, xyzw
+    velocity: vec6  # nu at the body origin, body frame [m/s, rad/s]
+    acceleration: vec6  # nu_dot, rate of the components of nu, body frame [m/s², rad/s²]
+    water: wp.vec3  # velocity of the water, world frame [m/s]
+    water_known: wp.bool  # whether that was given
+
+
+def parameters_of(schema: type[Sensor], **derived: Any) -> Any:
+    """Warp struct of what the kernel of a kind of sensor reads of one of them.
+
+    It has the numbers that a vehicle file gives, under their names there, but rate and latency, which size the memory.
+
+    Args:
+        schema: What a vehicle file says of the sensor.
+        derived: Further fields, which `SensorBatch.derived` fills, and their Warp types.
+    """
+    types = {"position": wp.vec3, "orientation": wp.quat}
+    types |= {name: float for name, field in schema.model_fields.items() if field.annotation is float}
+    fields = {name: kind for name, kind in types.items() if name not in ("rate", "latency")} | derived
+    space = {"__annotations__": fields, "__module__": schema.__module__, "__doc__": schema.__doc__}
+    return wp.struct(type(f"{schema.__name__}Parameters", (), space))
+
+
+def sampling_kernel(number: int, parameters: Any, arrays: Any, measure: Any, display: Any) -> Any:
+    """The kernel that brings all sensors of one kind up to date after a control step, or at a reset.
+
+    Args:
+        number: Of the kind, in the key of its random numbers; no other kind may have it.
+        parameters: Warp struct of one sensor, from `parameters_of`.
+        arrays: Warp struct of readings and memory.
+        measure: Warp function (truth, parameters, key, root of the time since the last sample [√s], whether worlds were
+            just reset, arrays, world, vehicle, slot) -> whether there is a sample; it puts the sample into the slot of
+            its rings, and at a reset draws what stays for an episode.
+        display: Warp function (parameters, arrays, world, vehicle, slot) that copies a sample that arrives from the
+            slot to the readings.
+    """
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def sample(
+        position: wp.array2d(dtype=wp.vec3),
+        quaternion: wp.array2d(dtype=wp.quat),
+        velocity: wp.array2d(dtype=vec6),
+        acceleration: wp.array2d(dtype=vec6),
+        water_velocity: wp.array2d(dtype=wp.vec3),
+        steps: wp.array(dtype=int),
+        episode: wp.array(dtype=int),
+        errors: wp.array2d(dtype=parameters),
+        sensor: arrays,
+        sampling: Sampling,
+        mask: wp.array(dtype=int),
+        restarting: bool,
+        seed: int,
+        world_offset: int,
+    ):
+        i, v = wp.tid()
+        w = world_offset + i
+        if mask[w] == 0:
+            return
+        p = errors[w, v]
+        step = steps[w]
+        if restarting:
+            restart(sampling, w, v, step)
+        if not begin_update(sampling, w, v, step):
+            return
+        if restarting or sample_due(sampling, w, v, step):
+            key = sample_key(seed, number, w, v, episode[w], step)
+            truth = Truth()
+            truth.position = position[w, v]
+            truth.quaternion = quaternion[w, v]
+            truth.velocity = velocity[w, v]
+            truth.acceleration = acceleration[w, v]
+            if water_velocity.shape[0] > 0:
+                truth.water = water_velocity[w, v]
+                truth.water_known = True
+            slot = slot_of(sampling, step)
+            root = root_of_wait(sampling, w, v, step)
+            measured = measure(truth, p, key, root, restarting, sensor, w, v, slot)
+            sampling.sent[w, v, slot] = measured and (restarting or not lost(key, p.dropout))
+            sampling.last[w, v] = step
+        arrived = arrival(sampling, w, v, step, restarting)
+        if arrived >= 0:
+            display(p, sensor, w, v, arrived)
+
+    return sample

@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from finssim.sensors.batch import SensorBatch, SensorError
+from finssim.sensors.batch import SensorBatch, SensorError, Surroundings
 from finssim.sensors.compass import CompassBatch
 from finssim.sensors.depth import DepthBatch
 from finssim.sensors.dvl import DvlBatch
@@ -107,15 +107,16 @@ class SensorSuite:
         """The kinds of sensor that at least one vehicle has, one's own among them."""
         for name in ("imu", "depth", "dvl", "compass"):
             setattr(self, name, self.by_kind.get(name))
-        if self.dvl is not None and floor_depth is not None:
-            self.dvl.floor_depth = floor_depth
         for v, vehicle in enumerate(vehicles):
-            g = vehicle.water.gravity if gravity is None else gravity
-            rho = vehicle.water.density if density is None else density
+            site = Surroundings(
+                gravity=vehicle.water.gravity if gravity is None else gravity,
+                density=vehicle.water.density if density is None else density,
+                floor_depth=math.inf if floor_depth is None else floor_depth,
+            )
             for name, made in self.by_kind.items():
                 entry = getattr(vehicle.sensors, name, None)
                 if entry is not None:
-                    made.use(v, entry, gravity=g, density=rho)
+                    made.use(v, entry, site)
 
     @property
     def batches(self) -> tuple[SensorBatch, ...]:

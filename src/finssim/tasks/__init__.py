@@ -8,7 +8,8 @@ from finssim.tasks.moving_target import MovingTarget
 from finssim.tasks.reference import follow
 from finssim.tasks.sensing import Sensing
 from finssim.tasks.station_keeping import StationKeeping
-from finssim.tasks.task import ObservationPart, Task
+from finssim.tasks.task import Task
+from finssim.tasks.terms import ObservationPart
 from finssim.tasks.trajectory_tracking import TrajectoryTracking
 
 __all__ = [

@@ -2,42 +2,525 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.control.guidance import Controller, Goal, Known
+from finssim.control.guidance import Goal, Known, Measured, Track
 from finssim.control.modes import mode_from_dict
-from finssim.control.pid import CONTROLLERS, controller_for
+from finssim.control.pid import CONTROLLERS, Pid, PidMemory, controller_for
 from finssim.control.policy import DESCRIPTION_FILE, Policy
 from finssim.engine import Recorder
-from finssim.tasks.baselines import BASELINES, baseline
+from finssim.geometry.rotations import (
+    cross,
+    matrix_to_quat,
+    quat_conjugate,
+    quat_from_euler,
+    quat_from_yaw,
+    quat_rotate,
+)
+from finssim.tasks.docking import DISTANCE_SCALE as DOCK_SCALE
+from finssim.tasks.docking import Docking
 from finssim.tasks.environment import Environment
+from finssim.tasks.fitting import coefficients_of
+from finssim.tasks.formation import NEAR, Formation
 from finssim.tasks.given import Step
+from finssim.tasks.moving_target import DISTANCE_SCALE as TARGET_DISTANCE_SCALE
+from finssim.tasks.moving_target import TARGET_SCALE
+from finssim.tasks.pursuit import DISTANCE_SCALE as CHASE_SCALE
+from finssim.tasks.pursuit import PI, DriveNumbers
+from finssim.tasks.station_keeping import DISTANCE_SCALE as STATION_SCALE
 from finssim.tasks.task import Task
-from finssim.vehicles import Vehicle
+from finssim.tasks.trajectory_tracking import DISTANCE_SCALE as TRACKING_SCALE
+from finssim.tasks.trajectory_tracking import LOOK_AHEAD
+from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = [
-    "NOWHERE",
-    "Agent",
-    "AgentError",
-    "BaselineAgent",
-    "Known",
-    "PidAgent",
-    "PolicyAgent",
-    "Readings",
-    "WorldReadings",
-    "agent_for",
-    "expert_for",
-    "rollout",
-]
-
+    "BASELINES", "NOWHERE", "Agent", "AgentError", "Baseline", "BaselineAgent", "BaselineError", "ConsensusFormation",
+    "FormationPursuit", "Known", "LeadPursuit", "PidAgent", "PolicyAgent", "Readings", "StationPid", "TargetPid",
+    "TrackingPid", "WorldReadings", "agent_for", "baseline", "expert_for", "restarted", "rollout",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
+
+
+# Classical controllers by task: each sees what a policy sees and acts as a policy does.
+
+
+PERIOD = 0.1
+"""Control step of every task [s]."""
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+"""No rotation, xyzw."""
+
+
+class Baseline(Protocol):
+    """A controller that keeps no state of its own: its memory goes in with every call and comes back."""
+
+    @property
+    def period(self) -> float:
+        """Time between two actions [s]."""
+
+    def reset(self, n: int) -> Any:
+        """Memory at the start of n episodes: arrays with n rows, in tuples or dataclasses; or None."""
+
+    def act(self, memory: Any, observation: NDArray[Any]) -> tuple[NDArray[np.float32], Any]:
+        """Actions (n, size) for observations (n, numbers), in the task's own action mode, and the memory after."""
+
+
+@dataclass(frozen=True)
+class WrenchPid:
+    """Base of the baselines with the full-wrench PID of `control.pid`, whose state is read from the observation."""
+
+    pid: Pid
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD) -> Any:
+        """Gains by pole placement for a vehicle and the time between two actions [s]; a batch shows it the present."""
+        return cls(Pid.from_vehicle(vehicle, coefficients_of(vehicle), period, least_lag=0.0))
+
+    @property
+    def period(self) -> float:
+        """Time between two actions [s]."""
+        return self.pid.period
+
+    def reset(self, n: int) -> Any:
+        """Empty integrals."""
+        return self.pid.reset(n)
+
+    def command(self, memory: PidMemory, seen: Measured, goal: Goal) -> tuple[NDArray[np.float32], PidMemory]:
+        """Actions (n, 6), as parts of each axis' limit within ±1, and the memory after."""
+        tau, memory = self.pid.command(memory, seen, goal)
+        return part_of_limits(tau, np.asarray(self.pid.wrench_limits)), memory
+
+
+def part_of_limits(tau: Array, limits: Array) -> NDArray[np.float32]:
+    """A wrench as a part of each axis' limit, 0 where there is none, (..., 6).
+
+    Args:
+        tau: Wrench, body frame [N, N m], (..., 6).
+        limits: Largest of each axis [N, N m], (6,).
+    """
+    return np.divide(tau, limits, out=np.zeros_like(tau), where=limits > 0.0).astype(np.float32)
+
+
+class StationPid(WrenchPid):
+    """PID of T1. The goal is level, so its own axes have z up: the vehicle's pose in them is all that matters."""
+
+    def act(
+        self, memory: PidMemory, observation: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], PidMemory]:
+        """Actions for observations of T1."""
+        seen = seen_from_goal(observation)
+        here = Goal(np.zeros_like(seen.position), np.broadcast_to(LEVEL, seen.quaternion.shape))
+        return self.command(memory, seen, here)
+
+
+def seen_from_goal(observation: NDArray[np.float32]) -> Track:
+    """The vehicle in the axes of its goal, from the first 15 numbers of T1's observation."""
+    o = np.asarray(observation, float)
+    q = turned_from(o)
+    return Track(-quat_rotate(q, STATION_SCALE * o[..., :3]), q, o[..., 9:15])
+
+
+def turned_from(o: Array) -> Array:
+    """Body to goal axes, xyzw, (n, 4), from the two columns of the goal's rotation in observations (n, numbers)."""
+    x, y = o[..., 3:6], o[..., 6:9]
+    # The columns of R_b' R*: the goal's axes in the body. Together with their cross product they are the rotation.
+    return quat_conjugate(matrix_to_quat(np.stack([x, y, cross(x, y)], axis=-1)))
+
+
+class TrackingMemory(NamedTuple):
+    """What `TrackingPid` remembers."""
+
+    heading: Array
+    """Heading since the start, counted from the yaw rate [rad], (n,)."""
+    pid: PidMemory
+
+
+class TrackingPid(WrenchPid):
+    """PID of T2. The observation has no heading, and none is asked for: the vehicle keeps the one it starts with.
+
+    The axes are level, with the vehicle at the origin and x where it pointed at the start, as its yaw rate tells.
+    """
+
+    def reset(self, n: int) -> TrackingMemory:
+        """Heading zero, empty integrals."""
+        return TrackingMemory(np.zeros(n), self.pid.reset(n))
+
+    def act(
+        self, memory: TrackingMemory, observation: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], TrackingMemory]:
+        """Actions for observations of T2."""
+        o = np.asarray(observation, float)
+        up, nu = o[..., 21:24], o[..., 15:21]
+        q = attitude_from(up, memory.heading)
+        offsets = [TRACKING_SCALE * o[..., 3 * i : 3 * i + 3] for i in range(3)]
+        goal = Goal(
+            quat_rotate(q, offsets[0]),
+            quat_from_yaw(np.zeros(len(o))),
+            quat_rotate(q, o[..., 12:15]),
+            quat_rotate(q, acceleration_ahead(offsets, o[..., 12:15])),
+        )
+        action, pid = self.command(memory.pid, Track(np.zeros_like(up), q, nu), goal)
+        return action, TrackingMemory(memory.heading + self.period * heading_rate(up, nu), pid)
+
+
+class TargetPid(TrackingPid):
+    """PID of T3 with the target's velocity fed forward. The observation has no attitude: it is taken to be level.
+
+    The heading is the one at the start, as the yaw rate tells; roll and pitch are left to the water and their rates.
+    """
+
+    def act(
+        self, memory: TrackingMemory, observation: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], TrackingMemory]:
+        """Actions for observations of T3."""
+        o = np.asarray(observation, float)
+        q, nu = quat_from_yaw(memory.heading), o[..., 6:12]
+        goal = Goal(
+            quat_rotate(q, TARGET_DISTANCE_SCALE * o[..., :3]),
+            quat_from_yaw(np.zeros(len(o))),
+            quat_rotate(q, TARGET_SCALE * o[..., 3:6]),
+        )
+        action, pid = self.command(memory.pid, Track(np.zeros((len(o), 3)), q, nu), goal)
+        return action, TrackingMemory(memory.heading + self.period * nu[..., 5], pid)
+
+
+def attitude_from(up: Array, heading: Array) -> Array:
+    """Body to level axes, xyzw, (n, 4), from the world's up in the body, (n, 3), and a heading [rad], (n,)."""
+    roll = np.arctan2(up[..., 1], up[..., 2])
+    pitch = np.arctan2(-up[..., 0], np.hypot(up[..., 1], up[..., 2]))
+    return quat_from_euler(roll, pitch, heading)
+
+
+def heading_rate(up: Array, nu: Array) -> Array:
+    """(q sin φ + r cos φ) / cos θ, with up = [-sin θ, cos θ sin φ, cos θ cos φ].
+
+    Args:
+        up: World's up in the body frame [-], (n, 3).
+        nu: Twist, body frame [m/s, rad/s], (n, 6).
+
+    Returns:
+        [rad/s], (n,).
+    """
+    level = np.maximum(up[..., 1] ** 2 + up[..., 2] ** 2, 1e-6)
+    return np.asarray((nu[..., 4] * up[..., 1] + nu[..., 5] * up[..., 2]) / level)
+
+
+def acceleration_ahead(offsets: list[Array], velocity: Array) -> Array:
+    """Acceleration of a reference from where it is now, one and two `LOOK_AHEAD` later, and its velocity.
+
+    p(k) - p(0) = v k + a k²/2 + j k³/6; of k and 2k together the jerk j falls out.
+
+    Args:
+        offsets: Way to the reference at the three times, in one frame [m], (n, 3) each.
+        velocity: Of the reference, same frame [m/s], (n, 3).
+
+    Returns:
+        Same frame [m/s²], (n, 3).
+    """
+    near, far = offsets[1] - offsets[0], offsets[2] - offsets[0]
+    return np.asarray((8.0 * near - far - 6.0 * LOOK_AHEAD * velocity) / (2.0 * LOOK_AHEAD**2))
+
+
+# Lead pursuit: a baseline of 1-v-1 pursuit that steers to where the prey will be.
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveBaseline:
+    """Base of the baselines that steer by a vehicle's thrust and drag; it remembers nothing, and acts by wrench4."""
+
+    drive: DriveNumbers
+    period: float = PERIOD
+    turn_first: float = math.inf
+    """A heading error above this is turned away before anything else [rad]."""
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle) -> Any:
+        """With the numbers of a vehicle."""
+        return cls(drive=DriveNumbers.of(vehicle))
+
+    def reset(self, n: int) -> None:
+        """It remembers nothing."""
+        return None
+
+    def act(self, memory: None, observation: NDArray[np.float32]) -> tuple[NDArray[np.float32], None]:
+        """Actions for observations, (n, numbers)."""
+        o = np.asarray(observation, dtype=float)
+        wanted, turn = self.wanted(o)
+        velocity = np.column_stack([o[:, 0:3], o[:, 5]])
+        action = self.drive.action(velocity, np.column_stack([wanted, self.drive.turned(turn)]))
+        action[np.abs(turn) > self.turn_first, :2] = 0.0
+        return action, None
+
+    def wanted(self, o: Array) -> tuple[Array, Array]:
+        """Velocity of the body, body frame [m/s], (n, 3), and the heading error to turn away [rad], (n,)."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeadPursuit(DriveBaseline):
+    """Point at where the prey will be, turn first while that is far to the side, then come up and keep its speed.
+
+    The point aimed at lies `lead` seconds ahead of the prey. Closing in, the speed wanted is the prey's plus
+    `approach` times the way that is left to `stand_off`, so that the relative speed vanishes there.
+    """
+
+    lead: float = 0.30
+    """[s]"""
+    turn_first: float = math.radians(15.0)
+    approach: float = 0.5
+    """[1/s]"""
+    stand_off: float = 0.5
+    """Distance that is gone to [m]."""
+
+    def wanted(self, o: Array) -> tuple[Array, Array]:
+        """See `DriveBaseline`."""
+        own, gap, relative = o[:, 0:3], CHASE_SCALE * o[:, 6:9], o[:, 9:12]
+        aim = gap + self.lead * relative
+        distance = np.maximum(np.linalg.norm(gap, axis=1, keepdims=True), 1e-6)
+        wanted = own + relative + self.approach * (distance - self.stand_off) * aim / distance
+        top = np.array([self.drive.top, *self.drive.terminal[1:3]])
+        return np.clip(wanted, -top, top), np.arctan2(aim[:, 1], aim[:, 0])
+
+
+# The classical controller of formation keeping: a consensus on the shape, and a state machine for where to go.
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConsensusFormation(DriveBaseline):
+    """Each agent pulls its edges to equal sides and its height to the others', and adds what the state asks for.
+
+    gather, while an edge is off by more than `loose`: the shape alone. approach: the net's middle goes to the target.
+    carry, while the net has the target: on to the goal, with the target kept in the middle. Which state it is follows
+    from the observation alone, so that all three agree without a word, as far as they see the same.
+    """
+
+    side: float
+    """Of the net [m]."""
+    reach: float
+    """Distance from the net within which it has the target [m]."""
+    shape: float = 0.6
+    """Speed per error of an edge or of the height [1/s]."""
+    go: float = 0.4
+    """Speed per distance [1/s]."""
+    cruise: float = 0.5
+    """Largest speed of the net's middle, as a part of the vehicle's slowest steady speed."""
+    loose: float = 0.15
+    """[sides]"""
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle) -> ConsensusFormation:
+        """With the numbers of a vehicle, for the net that three of them carry by the task's default settings."""
+        task = Formation().fitted([vehicle])
+        return cls(drive=DriveNumbers.of(vehicle), side=task.side, reach=task.reach)
+
+    def wanted(self, o: Array) -> tuple[Array, Array]:
+        """See `DriveBaseline`; of observations (n, 34)."""
+        mates = CHASE_SCALE * np.stack([o[:, 14:17], o[:, 20:23]], axis=1)
+        return self.shaping(mates) + self.going(o, mates.sum(axis=1) / 3.0), PI * o[:, 13]
+
+    def shaping(self, mates: Array) -> Array:
+        """Velocity towards equal sides and equal heights, from the team-mates' places, (n, 2, 3)."""
+        length = np.maximum(np.linalg.norm(mates, axis=2, keepdims=True), 1e-6)
+        pull = np.sum((length - self.side) * mates / length, axis=1)
+        pull[:, 2] = mates[:, :, 2].sum(axis=1)
+        return np.asarray(self.shape * pull)
+
+    def going(self, o: Array, middle: Array) -> Array:
+        """Velocity of the net's middle, from the observation and from where the middle is."""
+        target, goal = NEAR * o[:, 6:9], NEAR * o[:, 26:29]
+        has = (NEAR * o[:, 32] <= self.reach) & (o[:, 33] >= 0.0)
+        way = np.where(has[:, None], goal - target + 0.5 * (target - middle), target - middle)
+        speed = self.go * np.linalg.norm(way, axis=1, keepdims=True)
+        top = self.cruise * min(self.drive.top, *self.drive.terminal[1:3])
+        going = self.go * way * np.minimum(1.0, top / np.maximum(speed, 1e-6))
+        loose = np.abs(o[:, 29:32]).max(axis=1) > self.loose
+        return np.asarray(np.where(loose[:, None], 0.0, going))
+
+
+# The formation baseline of 3-v-1 pursuit: netters abreast of the prey, herder behind it.
+
+
+def level_unit(x: Array) -> Array:
+    """Level directions of vectors (n, 3); zero where there is none."""
+    level = x * np.array([1.0, 1.0, 0.0])
+    length = np.linalg.norm(level, axis=1, keepdims=True)
+    return level / np.maximum(length, 1e-6)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FormationPursuit(DriveBaseline):
+    """Each agent goes to its place relative to the prey, from its own observation and with the prey's velocity added.
+
+    The way ahead leads from the herder through the prey. Netters stand `forward` ahead of the prey and half of
+    `spacing` to either side of the way, so that the net lies across it; the herder stays `behind`. Published with 6, 2
+    and 3 m for vehicles twelve times as fast; here 0.4 times that.
+    """
+
+    spacing: float = 2.4
+    forward: float = 0.8
+    behind: float = 1.2
+    gain: float = 0.6
+    """Speed per distance to one's place [1/s]."""
+
+    def places(self, observation: Array) -> Array:
+        """Where each agent should be, from itself, body frame [m], (n, 3); one row per agent."""
+        prey = CHASE_SCALE * observation[:, 6:9]
+        mates = CHASE_SCALE * np.stack([observation[:, 16:19], observation[:, 24:27]], axis=1)
+        herds = observation[:, [14, 22]]
+        herder = herds.max(axis=1) < 0.5
+        ahead = level_unit(prey - np.einsum("nm,nmk->nk", herds, mates))
+        across = np.column_stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(ahead))])
+        other = np.einsum("nm,nmk->nk", 1.0 - herds, mates)
+        # Of two netters the one farther to the left of the way takes the left place.
+        side = np.where(np.sum(other * across, axis=1) < 0.0, 1.0, -1.0)[:, None]
+        netter = prey + self.forward * ahead + 0.5 * self.spacing * side * across
+        drives = level_unit(0.5 * mates.sum(axis=1) - prey)
+        return np.asarray(np.where(herder[:, None], prey - self.behind * drives, netter))
+
+    def wanted(self, o: Array) -> tuple[Array, Array]:
+        """See `DriveBaseline`; of observations (n, 30)."""
+        wanted = o[:, 0:3] + o[:, 9:12] + self.gain * self.places(o)
+        # Faster than the vehicle goes is the same direction as fast as it goes.
+        level = np.maximum(np.linalg.norm(wanted[:, :2], axis=1, keepdims=True) / self.drive.top, 1.0)
+        wanted[:, :2] /= level
+        wanted[:, 2] = np.clip(wanted[:, 2], -self.drive.terminal[2], self.drive.terminal[2])
+        moving = np.linalg.norm(wanted[:, :2], axis=1) > 0.05
+        return wanted, np.where(moving, np.arctan2(wanted[:, 1], wanted[:, 0]), 0.0)
+
+
+# The classical way into a dock: come before its mouth, turn to it, and go in as far as the nose is on the axis.
+
+
+@dataclass(frozen=True)
+class DockingPid(WrenchPid):
+    """A PID whose goal runs ahead of the nose, along the dock's axis, while nose and heading are right.
+
+    In dock axes. Beside the axis, or turned away, the goal is the waiting place before the mouth; there is no switch
+    between the two: the goal moves with how right it is.
+    """
+
+    nose: float
+    """Of the vehicle, from its origin [m]."""
+    berth: float
+    """Where the nose is to rest, along the axis [m]."""
+    wait: float
+    """Where the nose waits until it is right, along the axis [m]."""
+    gap: float
+    """How far beside the axis the nose may be in the tube [m]; towards the mouth it grows by `slope`."""
+    slope: float
+    lead: float
+    """How far the goal runs ahead of the nose [m]: it sets the speed."""
+    turn: float = np.radians(15.0)
+    """How far the vehicle may be turned away [rad]."""
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD) -> DockingPid:
+        """For a vehicle and its dock, and the time between two actions [s]."""
+        task = Docking().fitted([vehicle])
+        dock, hull = task.dock(), task.hull
+        return cls(
+            WrenchPid.for_vehicle(vehicle, period).pid,
+            nose=0.5 * hull.length,
+            berth=task.berth * dock.tube_length,
+            wait=-dock.cone_length - 0.5 * hull.length,
+            gap=dock.throat_radius - hull.girth,
+            slope=0.5 * np.tan(task.cone),
+            lead=0.25 * hull.length,
+        )
+
+    def act(
+        self, memory: PidMemory, observation: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], PidMemory]:
+        """Actions for observations of docking."""
+        o = np.asarray(observation, float)
+        q = turned_from(o)
+        nose = DOCK_SCALE * o[..., 15:18]
+        arm = np.array([self.nose, 0.0, 0.0])
+        place = np.zeros_like(nose)
+        place[..., 0] = self._ahead(nose, quat_rotate(q, [1.0, 0.0, 0.0]))
+        level = np.broadcast_to(LEVEL, q.shape)
+        seen = Track(nose - quat_rotate(q, arm), q, o[..., 9:15])
+        return self.command(memory, seen, Goal(place - arm, level))
+
+    def _ahead(self, nose: Array, forward: Array) -> Array:
+        """Where on the axis the nose is to go next [m], (n,), from where it is and points, dock axes, (n, 3)."""
+        aside = np.hypot(nose[..., 1], nose[..., 2])
+        allowed = self.gap + self.slope * np.maximum(-nose[..., 0], 0.0)
+        turned = np.arccos(np.clip(forward[..., 0], -1.0, 1.0))
+        right = np.clip(2.0 - np.maximum(aside / allowed, turned / self.turn), 0.0, 1.0)
+        onward = np.minimum(nose[..., 0] + self.lead, self.berth)
+        return np.asarray(self.wait + right * (np.maximum(onward, self.wait) - self.wait))
+
+
+class BaselineError(ValueError):
+    """A baseline that does not exist."""
+
+
+BASELINES: dict[str, dict[str, Callable[..., Baseline]]] = {
+    "t1": {"pid": StationPid.for_vehicle},
+    "t2": {"pid": TrackingPid.for_vehicle},
+    "t3": {"pid": TargetPid.for_vehicle},
+    "docking": {"align-insert": DockingPid.for_vehicle},
+    "pursuit": {"lead": LeadPursuit.for_vehicle},
+    "team-pursuit": {"formation": FormationPursuit.for_vehicle},
+    "formation": {"consensus": ConsensusFormation.for_vehicle},
+}
+"""Task -> name -> maker of the baseline for a vehicle; its `period` is the task's control step."""
+
+
+def baseline(task: str, name: str, vehicle: Vehicle | str = "finsrov") -> Baseline:
+    """A task's baseline by name.
+
+    Raises:
+        BaselineError: The task has none of that name.
+        ControlError: The vehicle's file does not give what it needs.
+    """
+    have = BASELINES.get(task, {})
+    if name not in have:
+        raise BaselineError(
+            f"unknown baseline '{name}' of task '{task}'; available: {', '.join(have) or 'none'}"
+        )
+    return have[name](vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle))
+
+
+def restarted(memory: Any, fresh: Any, mask: NDArray[Any]) -> Any:
+    """A baseline's memory after some episodes started over.
+
+    Args:
+        memory: What `act` gave.
+        fresh: What `reset` gives for as many episodes.
+        mask: Which episodes started over, bool, (n,).
+
+    Returns:
+        The rows of `fresh` where mask is true, those of `memory` elsewhere.
+    """
+    if memory is None:
+        return None
+    if isinstance(memory, np.ndarray):
+        return np.where(mask.reshape(-1, *[1] * (memory.ndim - 1)), fresh, memory)
+    if is_dataclass(memory) and not isinstance(memory, type):
+        names = [field.name for field in fields(memory)]
+        return replace(
+            memory, **{name: restarted(getattr(memory, name), getattr(fresh, name), mask) for name in names}
+        )
+    if isinstance(memory, tuple):
+        rows = [restarted(old, new, mask) for old, new in zip(memory, fresh, strict=True)]
+        return type(memory)(*rows) if hasattr(memory, "_fields") else tuple(rows)
+    raise TypeError(
+        f"memory of a baseline is a {type(memory).__name__}, expected arrays in tuples or dataclasses"
+    )
+
+
+# Agents.
+
 
 TASKS_OF_PIDS = ("t1", "t2")
 """Tasks that the robot's own PIDs do."""
@@ -146,7 +629,7 @@ class PolicyAgent:
         mode = mode_from_dict(policy.description.action, vehicle)
         self.period = policy.description.control_period
         self.action = mode.name
-        self.wrench_scale = mode.scale if mode.name.startswith("wrench") else 1.0
+        self.wrench_scale = mode.scale if mode.wrench else 1.0
         self.policy = policy
         self.name = Path(directory).resolve().name
 
@@ -177,53 +660,43 @@ class PolicyAgent:
 class PidAgent:
     """A PID by name: its wrench, as a part of each axis' limit, goes through the same allocation as a policy's."""
 
-    action = "wrench6"
-    wrench_scale = 1.0
+    kind, action, wrench_scale = "pid", "wrench6", 1.0
 
     def __init__(self, name: str, vehicle: Vehicle, task: str = "t1") -> None:
         """Make the controller of that name for a vehicle and a task."""
         self.name = name
-        self.controller: Controller = controller_for(task, name, vehicle)
+        self.controller: Any = controller_for(task, name, vehicle)
         self.period = self.controller.period
         self._limits = np.asarray(vehicle.wrench_limits, dtype=float)
 
     def reset(self, n: int) -> Any:
-        """Empty integrals."""
+        """Memory before the first of n episodes' actions: empty integrals."""
         return self.controller.reset(n)
 
     def act(self, memory: Any, readings: Readings, goal: Goal) -> tuple[NDArray[np.float32], Any]:
         """Wrench of each world, as a part of the limits; more than a limit is limited axis by axis."""
         tau, memory = self.controller.command(memory, readings, goal)
-        part = np.divide(tau, self._limits, out=np.zeros_like(tau), where=self._limits > 0.0)
-        return part.astype(np.float32), memory
+        return part_of_limits(tau, self._limits), memory
 
     def describe(self) -> dict[str, Any]:
         """Name and rate."""
-        return {"name": self.name, "kind": "pid", "action": self.action, "period_s": self.period}
+        return {"name": self.name, "kind": self.kind, "action": self.action, "period_s": self.period}
 
 
-class BaselineAgent:
+class BaselineAgent(PidAgent):
     """A baseline of a task, which sees the observation alone."""
 
-    wrench_scale = 1.0
+    kind = "baseline"
 
     def __init__(self, name: str, vehicle: Vehicle, task: Task) -> None:
         """Make the task's baseline of that name for a vehicle."""
         self.name, self.action = name, task.action
-        self.baseline = baseline(task.name, name, vehicle)
-        self.period = self.baseline.period
-
-    def reset(self, n: int) -> Any:
-        """Memory before the first of n episodes' actions."""
-        return self.baseline.reset(n)
+        self.controller = baseline(task.name, name, vehicle)
+        self.period = self.controller.period
 
     def act(self, memory: Any, readings: Readings, goal: Goal) -> tuple[NDArray[np.float32], Any]:
         """Actions, a row for each agent of each world."""
-        return self.baseline.act(memory, readings.observation)
-
-    def describe(self) -> dict[str, Any]:
-        """Name and rate."""
-        return {"name": self.name, "kind": "baseline", "action": self.action, "period_s": self.period}
+        return self.controller.act(memory, readings.observation)
 
 
 def agent_for(

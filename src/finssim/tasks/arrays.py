@@ -1,5 +1,8 @@
 """The arrays through which task, action and learner meet: all indexed by world."""
 
+from typing import Any
+
+import numpy as np
 import warp as wp
 
 from finssim.physics.funnel import Funnel
@@ -121,49 +124,19 @@ class TaskArrays:
     final_privileged: wp.array2d(dtype=float)  # the same of the episode that ended last
 
 
-def task_arrays(
-    worlds: int,
-    agents: int,
-    others: int,
-    observation: int,
-    action: int,
-    device: wp.Device,
-    totals: int = 0,
-    earned: int = 0,
-) -> TaskArrays:
-    """Zero arrays of the right size; the measured ones are left for the environment to fill or alias.
+def allocated(kind: Any, worlds: int, device: wp.Device, **columns: int | tuple[int, ...]) -> Any:
+    """A struct of arrays by world, all zero.
 
     Args:
+        kind: The struct.
         worlds: How many.
-        agents: Vehicles that learn.
-        others: Vehicles that the task commands.
-        observation: Numbers in the observation of an agent.
-        action: Numbers in the action of a vehicle.
         device: Where.
-        totals: Numbers that the task counts in an episode.
-        earned: Rewards and ends of the task.
+        columns: Sizes of the dimensions after the worlds, by the name of an array. Arrays with such dimensions that are
+            not named are left for who fills or aliases them.
     """
-    out = TaskArrays()
-    out.action_size = action
-    for name, columns in {
-        "action": agents * action,
-        "previous_action": agents * action,
-        "scripted": others * action,
-        "observation": agents * observation,
-        "final_observation": agents * observation,
-        "agent_reward": agents,
-        "totals": totals,
-        "final_totals": totals,
-        "earned": earned,
-        "final_earned": earned,
-    }.items():
-        setattr(out, name, wp.zeros((worlds, columns), dtype=wp.float32, device=device))
-    for name in ("time", "reward", "episode_return", "final_return", "held", "final_held"):
-        setattr(out, name, wp.zeros(worlds, dtype=wp.float32, device=device))
-    if agents == 1:
-        out.reward = out.agent_reward.reshape(worlds)
-    for name in ("terminated", "truncated", "done", "final_length"):
-        setattr(out, name, wp.zeros(worlds, dtype=wp.int32, device=device))
-    out.goal_position = wp.zeros(worlds, dtype=wp.vec3, device=device)
-    out.goal_quaternion = wp.full(worlds, value=wp.quat(0.0, 0.0, 0.0, 1.0), dtype=wp.quat, device=device)
+    out = kind()
+    for name, variable in kind.vars.items():
+        if isinstance(variable.type, wp.array) and (name in columns or variable.type.ndim == 1):
+            shape = np.append(worlds, columns.get(name, ())).astype(int)
+            setattr(out, name, wp.zeros(tuple(shape.tolist()), dtype=variable.type.dtype, device=device))
     return out

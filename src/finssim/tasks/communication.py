@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from finssim.engine.state import State
-from finssim.tasks.arrays import MessageTable, TaskArrays
+from finssim.tasks.arrays import MessageTable, TaskArrays, allocated
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.terms import measured_velocity
 
@@ -83,22 +83,18 @@ def message_table(
     Raises:
         EnvironmentSetupError: More messages would be under way at once than there is room for.
     """
-    table = MessageTable()
     if communication is None:
-        return table
-    c = communication
-    table.on, table.control_step = 1, control_step
-    table.period = max(1, round(c.period / control_step))
-    table.slots = most_under_way(c, table.period * control_step, reach)
+        return MessageTable()
+    c, period = communication, max(1, round(communication.period / control_step))
+    slots = most_under_way(c, period * control_step, reach)
+    sent, heard = agents * slots, agents**2
+    table: MessageTable = allocated(
+        MessageTable, worlds, device, sent_position=sent, sent_velocity=sent, sent_step=sent, arrival=(sent, agents),
+        position=heard, velocity=heard, step=heard,
+    )  # fmt: skip
+    table.on, table.control_step, table.period, table.slots = 1, control_step, period, slots
     table.processing, table.loss, table.speed_of_sound = c.processing, c.loss, c.speed_of_sound
-    table.key = wp.zeros(worlds, dtype=wp.int32, device=device)
-    for name in ("position", "velocity"):
-        setattr(table, name, wp.zeros((worlds, agents**2), dtype=wp.vec3, device=device))
-        sent = wp.zeros((worlds, agents * table.slots), dtype=wp.vec3, device=device)
-        setattr(table, f"sent_{name}", sent)
-    table.sent_step = wp.zeros((worlds, agents * table.slots), dtype=wp.int32, device=device)
-    table.step = wp.zeros((worlds, agents**2), dtype=wp.int32, device=device)
-    table.arrival = wp.full((worlds, agents * table.slots, agents), value=-1, dtype=wp.int32, device=device)
+    table.arrival.fill_(-1)
     return table
 
 

@@ -16,22 +16,15 @@ from finssim.physics.types import vec6
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.fitting import coefficients_of
 from finssim.tasks.measurement import MeasurementNoise
-from finssim.tasks.task import ObservationPart, Task
+from finssim.tasks.task import Task
 from finssim.tasks.terms import (
     End,
+    ObservationPart,
     RewardTerm,
     Terms,
     Total,
-    action_change,
-    action_effort,
-    attitude_error,
-    goal_columns,
-    length,
-    linear_velocity,
-    straight,
+    own_velocity,
     tilted,
-    turn_rates,
-    turning,
     uniform3,
 )
 from finssim.vehicles import Vehicle
@@ -39,21 +32,13 @@ from finssim.vehicles.capability import terminal_speeds
 
 DISTANCE_SCALE = 3.0
 """Distances are divided by this in the observation [m]."""
-VELOCITY_CLIP = 2.0
-"""Velocities are clipped here in the observation [m/s, rad/s]."""
 
 
 @wp.func
 def in_dock(arrays: TaskArrays, p: Any, w: int, x: wp.vec3, q: wp.quat) -> wp.vec3:
-    """The nose of a vehicle with its origin at x and attitude q, in the axes of the world's dock [m]."""
+    """The nose of a vehicle with its origin at x and attitude q, in dock axes, from the throat [m]."""
     nose = x + wp.quat_rotate(q, wp.vec3(0.5 * p.hull.length, 0.0, 0.0))
     return wp.quat_rotate_inv(arrays.goal_quaternion[w], nose - arrays.goal_position[w])
-
-
-@wp.func
-def seen_nose(arrays: TaskArrays, p: Any, w: int) -> wp.vec3:
-    """The nose as measured, in dock axes, from the throat [m]."""
-    return in_dock(arrays, p, w, arrays.position[w, 0], arrays.quaternion[w, 0])
 
 
 @wp.func
@@ -65,11 +50,12 @@ def berth_offset(arrays: TaskArrays, p: Any, w: int, nose: wp.vec3) -> wp.vec3:
 
 OBSERVATION = (
     ObservationPart("nose to its berth, body frame", 3, "m", scale=DISTANCE_SCALE, term="offset"),
-    ObservationPart("dock rotation relative to the body, first two columns", 6, "1", term=goal_columns),
-    ObservationPart("linear velocity, body frame", 3, "m/s", clip=VELOCITY_CLIP, term=linear_velocity),
-    ObservationPart("angular velocity, body frame", 3, "rad/s", clip=VELOCITY_CLIP, term=turn_rates),
+    ObservationPart("dock rotation relative to the body, first two columns", 6, "1", term="goal_columns"),
+    *own_velocity(clip=2.0),
     ObservationPart("nose from the throat, dock axes", 3, "m", scale=DISTANCE_SCALE, term="nose"),
-    ObservationPart("distance of the nose to its berth", 1, "m", scale=DISTANCE_SCALE, clip=1.0, term=length),
+    ObservationPart(
+        "distance of the nose to its berth", 1, "m", scale=DISTANCE_SCALE, clip=1.0, term="wp.length(offset)"
+    ),
 )
 
 BRISK = 0.9
@@ -138,24 +124,6 @@ class DockingReward:
 
 
 @wp.func
-def nose(state: State, arrays: TaskArrays, p: Any, w: int) -> wp.vec3:
-    """The nose in dock axes [m]."""
-    return in_dock(arrays, p, w, state.position[w, 0], state.quaternion[w, 0])
-
-
-@wp.func
-def berth_error(p: Any, x: wp.vec3) -> float:
-    """e: from the nose to its berth, in vehicle lengths."""
-    return wp.length(wp.vec3(p.berth * p.funnel.tube_length - x[0], x[1], x[2])) / p.hull.length
-
-
-@wp.func
-def berthed(p: Any, e: float) -> float:
-    """exp(-e / position_scale)."""
-    return wp.exp(-e / p.reward.position_scale)
-
-
-@wp.func
 def off_corridor(p: Any, x: wp.vec3) -> float:
     """off: how far the nose is outside the cone that leads to the berth, in vehicle lengths."""
     room = p.gap + wp.tan(p.cone) * wp.max(-x[0], 0.0)
@@ -163,15 +131,15 @@ def off_corridor(p: Any, x: wp.vec3) -> float:
 
 
 @wp.func
-def push(arrays: TaskArrays, p: Any, w: int) -> float:
-    """min(contact force / limit, 1)."""
-    return wp.min(arrays.funnel.force[w, 0] / p.force_limit, 1.0)
+def nose(state: State, arrays: TaskArrays, p: Any, w: int) -> wp.vec3:
+    """The nose in dock axes [m]."""
+    return in_dock(arrays, p, w, state.position[w, 0], state.quaternion[w, 0])
 
 
 @wp.func
-def is_crashed(arrays: TaskArrays, p: Any, w: int) -> bool:
-    """A contact force above `force_limit`."""
-    return arrays.funnel.force[w, 0] > p.force_limit
+def seen_nose(arrays: TaskArrays, p: Any, w: int) -> wp.vec3:
+    """The nose in dock axes, as measured [m]."""
+    return in_dock(arrays, p, w, arrays.position[w, 0], arrays.quaternion[w, 0])
 
 
 @wp.func
@@ -183,25 +151,12 @@ def is_lost(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
 
 
 @wp.func
-def is_docked(state: State, arrays: TaskArrays, p: Any, w: int, x: wp.vec3) -> bool:
-    """The nose far enough in the tube, slow and not crashed."""
+def is_docked(state: State, p: Any, w: int, x: wp.vec3) -> bool:
+    """The nose far enough in the tube, and slow."""
     nu = state.velocity[w, 0]
     still = wp.length(wp.vec3(nu[0], nu[1], nu[2])) <= p.slow * p.hull.speed
-    aside = wp.length(wp.vec2(x[1], x[2]))
     deep = x[0] >= p.inside * p.funnel.tube_length
-    return deep and aside <= 2.0 * p.gap and still and not is_crashed(arrays, p, w)
-
-
-@wp.func
-def contact_impulse(arrays: TaskArrays, w: int, was: float) -> float:
-    """Of all contacts so far [N s]."""
-    return was + arrays.funnel.impulse[w, 0]
-
-
-@wp.func
-def peak_force(arrays: TaskArrays, w: int, was: float) -> float:
-    """Greatest contact force so far [N]."""
-    return wp.max(was, arrays.funnel.force[w, 0])
+    return deep and wp.length(wp.vec2(x[1], x[2])) <= 2.0 * p.gap and still
 
 
 @wp.func
@@ -351,20 +306,29 @@ class Docking(Task):
         r = self.reward
         return Terms(
             start=start,
-            shared={"x": nose, "e": berth_error, "theta": attitude_error},
+            shared={
+                "x": nose,
+                "e": "wp.length(wp.vec3(p.berth * p.funnel.tube_length - x[0], x[1], x[2])) / p.hull.length",
+                "theta": "attitude_error",
+                "force": "arrays.funnel.force[w, 0]",
+                "docked": is_docked,
+            },
             seen={"nose": seen_nose, "offset": berth_offset},
             rewards=(
-                RewardTerm("position", berthed, r.position),
+                RewardTerm("position", "wp.exp(-e / p.reward.position_scale)", r.position),
                 RewardTerm("distance", "e", -r.distance),
                 RewardTerm("corridor", off_corridor, -r.corridor),
-                RewardTerm("heading", straight, r.heading),
+                RewardTerm("heading", "wp.exp(-theta / p.reward.heading_scale)", r.heading),
                 RewardTerm("turn", "theta", -r.turn),
-                RewardTerm("contact", push, -r.contact),
-                RewardTerm("action", action_effort, -r.action),
-                RewardTerm("change", action_change, -r.change),
-                RewardTerm("rate", turning, -r.rate),
+                RewardTerm("contact", "wp.min(force / p.force_limit, 1.0)", -r.contact),
+                RewardTerm("action", "action_effort", -r.action),
+                RewardTerm("change", "action_change", -r.change),
+                RewardTerm("rate", "turning", -r.rate),
             ),
-            ends=(End("crash", is_crashed, -r.loss), End("lost", is_lost, -r.loss)),
-            inside=is_docked,
-            totals=(Total("contact_impulse", contact_impulse), Total("peak_force", peak_force)),
+            ends=(End("crash", "force > p.force_limit", -r.loss), End("lost", is_lost, -r.loss)),
+            inside="docked and not force > p.force_limit",
+            totals=(
+                Total("contact_impulse", "was + arrays.funnel.impulse[w, 0]"),
+                Total("peak_force", "wp.max(was, force)"),
+            ),
         )

@@ -1,9 +1,8 @@
 """What randomisation does in one environment: the draws, how their ranges grow, what agents and logs are told."""
 
-import csv
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -210,8 +209,8 @@ def _counts(success: Success, draws: Draws, names: int) -> Counts:
 
 # What was drawn for every episode, and how the episode went: kept while a run goes on, written as CSV or NPZ.
 
-COUNTS = ("world", "episode", "length")
-OUTCOMES = ("episode_return", "held")
+OUTCOME = ("world", "episode", "length", "episode_return", "held")
+"""First columns of a table of episodes."""
 
 
 class LogError(ValueError):
@@ -285,9 +284,8 @@ class DrawLog:
     def episodes(self) -> DrawnEpisodes:
         """All that ended so far."""
         names, vehicles = tuple(self._draws.names), self._draws.simulator.vehicles
-        rows = np.concatenate([np.zeros((0, 5)), *self._rows])
+        rows = np.concatenate([np.zeros((0, len(OUTCOME))), *self._rows])
         empty = np.zeros((0, len(vehicles), len(names)), np.float32)
-        world, episode, length = (rows[:, i].astype(np.int64) for i in range(3))
         about = {
             "ranges": self._draws.randomization.ranges.model_dump(mode="json"),
             "vehicles": [{"name": v.name, "sha256": v.sha256} for v in vehicles],
@@ -296,7 +294,8 @@ class DrawLog:
         }
         units = tuple(ENTRIES[INDEX[name]].unit for name in names)
         values = np.concatenate([empty, *self._values])
-        return DrawnEpisodes(names, units, values, world, episode, length, rows[:, 3], rows[:, 4], about)
+        counts = (rows[:, i].astype(np.int64) for i in range(3))
+        return DrawnEpisodes(names, units, values, *counts, rows[:, 3], rows[:, 4], about)
 
     def save(self, path: str | Path) -> Path:
         """Write the episodes so far.
@@ -308,29 +307,22 @@ class DrawLog:
             LogError: Another suffix.
             OutputError: The place cannot be written.
         """
-        target, episodes = Path(path), self.episodes()
+        target, e = Path(path), self.episodes()
         if target.suffix not in (".npz", ".csv"):
             raise LogError(f"{path} ends in '{target.suffix}', expected .npz or .csv")
-        with atomic_write(target) as temporary:
-            (_write_npz if target.suffix == ".npz" else _write_csv)(temporary, episodes)
+        with atomic_write(target) as temporary, temporary.open("wb") as file:
+            if target.suffix == ".npz":
+                np.savez_compressed(file, **{**asdict(e), "about": json.dumps(dict(e.about))})
+            else:
+                episodes, vehicles, _ = e.values.shape
+                outcome = np.column_stack([getattr(e, name) for name in OUTCOME])
+                vehicle = np.tile(np.arange(vehicles), episodes)
+                drawn = e.values.reshape(episodes * vehicles, -1)
+                rows = np.column_stack([np.repeat(outcome, vehicles, axis=0), vehicle, drawn])
+                head = ",".join([*OUTCOME, "vehicle", *e.names])
+                form = ["%d"] * 3 + ["%.7g"] * 2 + ["%d"] + ["%.7g"] * len(e.names)
+                np.savetxt(file, rows, fmt=form, delimiter=",", header=head, comments="")
         return target
-
-
-def _write_npz(path: Path, e: DrawnEpisodes) -> None:
-    columns = {name: getattr(e, name) for name in (*COUNTS, *OUTCOMES, "values")}
-    words = {name: np.array(getattr(e, name), dtype=str) for name in ("names", "units")}
-    with path.open("wb") as file:
-        np.savez_compressed(file, **columns, **words, about=np.array(json.dumps(dict(e.about))))
-
-
-def _write_csv(path: Path, e: DrawnEpisodes) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow([*COUNTS, *OUTCOMES, "vehicle", *e.names])
-        for i, drawn in enumerate(e.values):
-            outcome = [*(getattr(e, n)[i] for n in COUNTS), *(f"{getattr(e, n)[i]:.7g}" for n in OUTCOMES)]
-            for vehicle, row in enumerate(drawn):
-                writer.writerow([*outcome, vehicle, *(f"{x:.7g}" for x in row)])
 
 
 def read_draws(path: str | Path) -> DrawnEpisodes:
@@ -344,13 +336,13 @@ def read_draws(path: str | Path) -> DrawnEpisodes:
     """
     try:
         with np.load(path, allow_pickle=False) as file:
-            data = {name: file[name] for name in file.files}
-        words = {name: tuple(map(str, data[name])) for name in ("names", "units")}
-        numbers = {name: data[name] for name in (*COUNTS, *OUTCOMES, "values")}
-        return DrawnEpisodes(**words, **numbers, about=json_value(str(data["about"]), LogError, str(path)))
+            data: dict[str, Any] = dict(file)
+        names = {name: tuple(map(str, data[name])) for name in ("names", "units")}
+        about = json_value(str(data["about"]), LogError, str(path))
+        return DrawnEpisodes(**{**data, **names, "about": about})
     except FileNotFoundError:
         raise LogError(f"{path}: no such file") from None
-    except (KeyError, OSError, ValueError) as error:
+    except (KeyError, OSError, TypeError, ValueError) as error:
         raise LogError(
             f"{path}: not a log of draws ({error}): give a .npz file that DrawLog.save wrote"
         ) from None

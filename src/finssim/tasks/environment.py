@@ -11,10 +11,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from finssim.control.modes import MODES
 from finssim.engine import Pool, Simulator, TetherLine, Water
 from finssim.engine.randomize import Randomization
-from finssim.tasks.actions import ACTION_MODES, action_size, add_action
-from finssim.tasks.arrays import task_arrays
+from finssim.tasks.actions import add_action
 from finssim.tasks.drawing import Drawing
 from finssim.tasks.given import (
     GREATEST_SEED,
@@ -101,9 +101,9 @@ class Environment:
         """
         self.action_mode, self.seed = action or task.action, checked_seed(seed)
         self.crash_directory, self.auto_reset = crash_directory, auto_reset
-        if self.action_mode not in ACTION_MODES:
+        if self.action_mode not in MODES:
             raise EnvironmentSetupError(
-                f"unknown action mode '{self.action_mode}'; available: {', '.join(ACTION_MODES)}"
+                f"unknown action mode '{self.action_mode}'; available: {', '.join(MODES)}"
             )
         vehicles = crew(vehicle, task, self.action_mode)
         self.nominal = vehicles if nominal is None else crew(nominal, task, self.action_mode)
@@ -117,17 +117,13 @@ class Environment:
             dock=task.dock(), device=device, threads=threads, seed=self.seed, **extra,
         )  # fmt: skip
         self.worlds, self.agents, self.device = worlds, len(task.agents), self.simulator.device
-        self.action_size = action_size(self.action_mode, len(vehicles[0].thrusters))
+        self.action_size = len(MODES[self.action_mode].labels(vehicles[0]))
         """Numbers in the action of an agent."""
-        self.arrays = task_arrays(
-            worlds, self.agents, len(task.others), task.observation_size, self.action_size, self.device,
-            len(task.totals), len(task.earnings),
-        )  # fmt: skip
+        self.arrays = task.arrays(worlds, self.action_size, self.device)
         if self.simulator.dock is not None:
             # The dock is the goal: the same memory.
             self.arrays.funnel = funnel = self.simulator.funnel
             self.arrays.goal_position, self.arrays.goal_quaternion = funnel.position, funnel.quaternion
-        task.allocate(self.arrays, worlds, self.device)
         self.wrench_scale = np.broadcast_to(np.asarray(wrench_scale, dtype=float), (6,))
         self.noise = noise or MeasurementNoise()
         self.randomization = randomization
@@ -258,7 +254,15 @@ class Environment:
             Observations, (worlds, size).
         """
         self.reset()
-        place(self, position, quaternion, goal_position, goal_quaternion)
+        state, arrays = self.simulator.state, self.arrays
+        for array, value in ((state.position, position), (state.quaternion, quaternion)):
+            rows = array.numpy().copy()
+            rows[:, 0] = value
+            array.assign(rows)
+        state.velocity.zero_()
+        for goal, value in ((arrays.goal_position, goal_position), (arrays.goal_quaternion, goal_quaternion)):
+            row = np.asarray(value, dtype=np.float32)
+            goal.assign(np.ascontiguousarray(np.broadcast_to(row, goal.numpy().shape)))
         again = self.simulator.pipeline()
         self._add_measure(again, self._mask)
         self.task.add_observe(again, self._batch, self._mask)
@@ -322,130 +326,63 @@ class Environment:
             a.truncated.numpy() != 0, self._by_agent(a.final_observation.numpy()),
         )  # fmt: skip
 
+    # All that decides what comes next, as NumPy arrays: a run that goes on from them is the same run.
+
     def state(self) -> dict[str, NDArray[Any]]:
-        """Everything that decides what comes next, as copies; see `load_state`."""
-        return save_state(self)
+        """Copies of the vehicles' states, delay lines, water, the task's arrays and all counters; see `load_state`.
+
+        Returns:
+            Arrays by name, such as `state.position` or `plant.mass`; the counters under `counters.`.
+        """
+        saved = {name: np.array(array.numpy()) for name, array in self._members()}
+        saved["counters.seed"], saved["counters.steps"] = np.array(self.seed), np.array(self._steps)
+        if self.drawing.schedule is not None:
+            saved["counters.schedule"] = np.array(self.drawing.schedule._steps)
+        if self.levels is not None:
+            saved.update(self.levels.state())
+        reported = np.array(sorted(self.simulator._reported), dtype=np.int64)
+        return {**saved, "counters.reported": reported.reshape(-1, 2)}
 
     def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Go on from where `state()` of an environment made with the same arguments was taken, bit for bit.
 
         Raises:
-            EnvironmentSetupError: It was made with other arguments.
+            EnvironmentSetupError: It was made with other arguments: a name or shape does not fit.
         """
-        load_state(self, state)
+        refused, remedy = "saved state does not fit: ", "make the environment with the same arguments"
+        if (self.levels is None) == ("counters.level" in state):
+            reason = "has levels and the saved state has none" if self.levels else "has no levels"
+            raise EnvironmentSetupError(f"{refused}the environment {reason}: make it with the same arguments")
+        if int(state["counters.seed"]) != self.seed:
+            self.reset(seed=int(state["counters.seed"]))
+        if self.levels is not None:
+            self.levels.load(state)
+        arrays = dict(self._members())
+        for name in sorted(arrays.keys() ^ {name for name in state if not name.startswith("counters.")}):
+            reason = "is not in the saved state" if name in arrays else "is in the saved state alone"
+            raise EnvironmentSetupError(f"{refused}'{name}' {reason}: {remedy}")
+        for name, array in arrays.items():
+            shape = array.numpy().shape
+            if state[name].shape != shape:
+                raise EnvironmentSetupError(
+                    f"{refused}'{name}' has shape {state[name].shape}, expected {shape}: {remedy}"
+                )
+        for name, array in arrays.items():
+            array.assign(np.ascontiguousarray(state[name]))
+        self.simulator.compare_worlds()
+        self._steps = int(state["counters.steps"])
+        if self.drawing.schedule is not None:
+            self.drawing.schedule._steps = int(state["counters.schedule"])
+        self.simulator._reported = {(int(w), int(e)) for w, e in state["counters.reported"]}
 
-
-# Episodes that start at given poses towards given goals, in place of drawn ones.
-
-
-def place(
-    environment: "Environment",
-    position: ArrayLike,
-    quaternion: ArrayLike,
-    goal_position: ArrayLike,
-    goal_quaternion: ArrayLike,
-) -> None:
-    """Put vehicle 0 of every world somewhere at rest, with a goal; an episode must just have begun there.
-
-    Args:
-        environment: The worlds.
-        position: World frame [m], broadcastable to (worlds, 3).
-        quaternion: Body to world, xyzw, broadcastable to (worlds, 4).
-        goal_position: World frame [m], broadcastable to (worlds, 3).
-        goal_quaternion: Body to world, broadcastable to (worlds, 4).
-    """
-    state, arrays, worlds = environment.simulator.state, environment.arrays, environment.worlds
-    for array, value, width in ((state.position, position, 3), (state.quaternion, quaternion, 4)):
-        everyone = array.numpy().copy()
-        everyone[:, 0] = np.broadcast_to(np.asarray(value, dtype=np.float32), (worlds, width))
-        array.assign(everyone)
-    state.velocity.zero_()
-    for array, value, width in (
-        (arrays.goal_position, goal_position, 3),
-        (arrays.goal_quaternion, goal_quaternion, 4),
-    ):
-        array.assign(np.array(np.broadcast_to(np.asarray(value, dtype=np.float32), (worlds, width))))
-
-
-# All that decides what an environment does next, as NumPy arrays: a run that goes on from them is the same run.
-
-
-def save_state(environment: "Environment") -> dict[str, NDArray[Any]]:
-    """Copies of the vehicles' states, delay lines, water, the task's arrays and all counters.
-
-    Returns:
-        Arrays by name, such as `state.position` or `plant.mass`; the counters under `counters.`.
-    """
-    simulator = environment.simulator
-    saved = {name: np.array(array.numpy()) for name, array in _arrays(environment)}
-    saved["counters.seed"] = np.array(environment.seed)
-    saved["counters.steps"] = np.array(environment._steps)
-    reported = sorted(simulator._reported)
-    if environment.drawing.schedule is not None:
-        saved["counters.schedule"] = np.array(environment.drawing.schedule._steps)
-    if environment.levels is not None:
-        saved.update(environment.levels.state())
-    saved["counters.reported"] = np.array(reported, dtype=np.int64).reshape(-1, 2)
-    return saved
-
-
-def load_state(environment: "Environment", saved: Mapping[str, NDArray[Any]]) -> None:
-    """Bring an environment that was made alike to where `save_state` left another; arrays keep their memory.
-
-    Raises:
-        EnvironmentSetupError: The environment was made with other arguments: a name or shape does not fit.
-    """
-    if (environment.levels is None) == ("counters.level" in saved):
-        where = "has levels and the saved state has none" if environment.levels else "has no levels"
-        raise EnvironmentSetupError(
-            f"saved state does not fit: the environment {where}: make it with the same arguments"
-        )
-    _set_seed(environment, int(saved["counters.seed"]))
-    if environment.levels is not None:
-        environment.levels.load(saved)
-    arrays = dict(_arrays(environment))
-    wanted = {name for name in saved if not name.startswith("counters.")}
-    if arrays.keys() != wanted:
-        name = min(arrays.keys() ^ wanted)
-        where = "is not in the saved state" if name in arrays else "is in the saved state alone"
-        raise EnvironmentSetupError(
-            f"saved state does not fit: '{name}' {where}: make the environment with the same arguments"
-        )
-    for name, array in arrays.items():
-        shape = array.numpy().shape
-        if saved[name].shape != shape:
-            raise EnvironmentSetupError(
-                f"saved state does not fit: '{name}' has shape {saved[name].shape}, expected {shape}: "
-                "make the environment with the same arguments"
-            )
-    for name, array in arrays.items():
-        array.assign(np.ascontiguousarray(saved[name]))
-    environment.simulator.compare_worlds()
-    environment._steps = int(saved["counters.steps"])
-    if environment.drawing.schedule is not None:
-        environment.drawing.schedule._steps = int(saved["counters.schedule"])
-    environment.simulator._reported = {(int(w), int(e)) for w, e in saved["counters.reported"]}
-
-
-def _set_seed(environment: "Environment", seed: int) -> None:
-    if seed != environment.seed:
-        environment.reset(seed=seed)
-
-
-def _arrays(environment: "Environment") -> Iterator[tuple[str, wp.array]]:
-    """Every array that a step or a reset reads from an earlier one, by name."""
-    simulator = environment.simulator
-    for name, packed in (("plant", simulator.plant), ("command", simulator.command)):
-        yield from ((f"{name}.{field}", array) for field, array in packed.fields.items())
-    yield from ((f"drawing.{name}", array) for name, array in environment.drawing.arrays())
-    for name, struct in (
-        ("state", simulator.state),
-        ("water", simulator.water),
-        ("task", environment.arrays),
-    ):
-        yield from _members(name, struct)
-    if environment.sensing is not None:
-        for name, struct in environment.sensing.arrays():
+    def _members(self) -> Iterator[tuple[str, wp.array]]:
+        """Every array that a step or a reset reads from an earlier one, by name."""
+        simulator = self.simulator
+        for name, packed in (("plant", simulator.plant), ("command", simulator.command)):
+            yield from ((f"{name}.{field}", array) for field, array in packed.fields.items())
+        yield from ((f"drawing.{name}", array) for name, array in self.drawing.arrays())
+        structs = {"state": simulator.state, "water": simulator.water, "task": self.arrays}
+        for name, struct in {**structs, **(self.sensing.structs() if self.sensing else {})}.items():
             yield from _members(name, struct)
 
 

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finssim.control.pid import axis_model
 from finssim.engine import Pool
+from finssim.tasks.measurement import MeasurementNoise
+from finssim.tasks.task import Task
 from finssim.vehicles import HydrodynamicSet, Vehicle
 from finssim.vehicles.capability import terminal_speeds
 from finssim.vehicles.defaults import POOL, room
 
-__all__ = ["Fit", "authority", "coefficients_of", "driven_axes", "fit"]
+__all__ = ["Fit", "FittedTask", "PoolTask", "authority", "coefficients_of", "driven_axes", "fit"]
 
 Array = NDArray[np.float64]
 
@@ -83,3 +88,42 @@ def fit(vehicle: Vehicle) -> Fit:
     speeds = terminal_speeds(vehicle, coefficients_of(vehicle))[list(driven_axes(vehicle))]
     slowest = float(speeds.min()) if len(speeds) else 0.0
     return Fit(size, min(size, slowest / SLOWEST_SPEED), max(1.0, float(vehicle.body.mass) / MASS))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FittedTask(Task):
+    """Base of the tasks in the paper's pool: as large and as fast as suits the vehicle."""
+
+    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave")
+
+    fit: Fit = Fit()
+    """Factors of the vehicle; the environment sets them."""
+    tilt: float = math.radians(20.0)
+    """Largest roll and pitch at the start."""
+    ceiling: float = 0.3
+    """Rising above this height ends the episode."""
+    training_noise: MeasurementNoise = MeasurementNoise(
+        position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02
+    )
+    """About what an estimate is off by: with exact states, gains are learnt that chatter on measured ones."""
+
+    def fitted(self, vehicles: Sequence[Vehicle]) -> FittedTask:
+        """As large and fast as suits the vehicle."""
+        return replace(self, fit=fit(vehicles[0]))
+
+    def arena(self) -> Pool:
+        """See `Fit.pool`."""
+        return self.fit.pool()
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoolTask(FittedTask):
+    """Base of those that start anywhere in the pool."""
+
+    spawn_low: tuple[float, float, float] = (-1.4, -0.6, -0.80)
+    """The vehicle starts in this box, with any heading."""
+    spawn_high: tuple[float, float, float] = (1.4, 0.6, -0.20)
+    bounds: tuple[float, float] = (2.5, 1.5)
+    """Leaving |x|, |y| beyond these ends the episode."""
+    depth: float = 1.5
+    """So does sinking below this depth."""

@@ -7,29 +7,29 @@ from typing import Any, ClassVar
 import warp as wp
 
 from finssim.engine.state import State
-from finssim.tasks.arrays import NetTable, TaskArrays
-from finssim.tasks.communication import (
-    Communication,
-    exchange_messages,
-    key_messages,
-    mate_position,
-    message_table,
-    open_messages,
-)
+from finssim.tasks.arrays import NetTable, TaskArrays, allocated
+from finssim.tasks.communication import exchange_messages, key_messages, mate_position, open_messages
 from finssim.tasks.given import EnvironmentSetupError
-from finssim.tasks.pursuit import OWN, PI, OpenWater, gap_to, mate, motion_of, slowest
-from finssim.tasks.task import ObservationPart
-from finssim.tasks.team_pursuit import any_outside, bumps
+from finssim.tasks.pursuit import (
+    PI,
+    VELOCITY_CLIP,
+    Team,
+    any_outside,
+    bumps,
+    gap_to,
+    mate,
+    motion_of,
+    slowest,
+)
 from finssim.tasks.terms import (
     End,
+    ObservationPart,
     RewardTerm,
     Terms,
     Total,
-    action_change,
-    action_effort,
     level_direction,
     measured_velocity,
-    one,
+    own_velocity,
     place_at_rest,
     uniform3,
     world_velocity,
@@ -96,106 +96,79 @@ def sorted_edges(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def next_corner(a: int, k: int) -> int:
-    """Number of the k-th corner after agent a, around the triangle."""
-    return (a + k) % AGENTS
+def spanned(x: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec4:
+    """A net's distance from a point [m], and the lengths of its edges, the shortest first [m]."""
+    edges = sorted_edges(a, b, c)
+    return wp.vec4(triangle_distance(x, a, b, c), edges[0], edges[1], edges[2])
 
 
 @wp.func
 def corner_gap(arrays: TaskArrays, w: int, a: int, k: int) -> wp.vec3:
     """From the agent to its k-th next corner, body frame [m]."""
-    return gap_to(arrays, w, a, next_corner(a, k))
+    return gap_to(arrays, w, a, (a + k) % AGENTS)
 
 
 @wp.func
 def corner_motion(arrays: TaskArrays, w: int, a: int, k: int) -> wp.vec3:
     """Velocity of the k-th next corner less one's own, body frame [m/s]."""
-    return motion_of(arrays, w, a, next_corner(a, k))
-
-
-@wp.func
-def in_body(arrays: TaskArrays, w: int, a: int, x: wp.vec3) -> wp.vec3:
-    """A way in the world as one in the measured body frame of agent a."""
-    return wp.quat_rotate_inv(arrays.quaternion[w, a], x)
-
-
-@wp.func
-def target_gap(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
-    """From the agent to the target, body frame [m]."""
-    return in_body(arrays, w, a, arrays.net.target[w] - arrays.position[w, a])
+    return motion_of(arrays, w, a, (a + k) % AGENTS)
 
 
 @wp.func
 def target_slip(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
     """The target's velocity less the agent's own, body frame [m/s]."""
-    return in_body(arrays, w, a, arrays.net.motion[w] - measured_velocity(arrays, w, a))
-
-
-@wp.func
-def goal_gap(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
-    """From the agent to the goal, body frame [m]."""
-    return in_body(arrays, w, a, arrays.goal_position[w] - arrays.position[w, a])
-
-
-@wp.func
-def seen_depth(arrays: TaskArrays, w: int, a: int) -> float:
-    """Depth of the agent [m]."""
-    return -arrays.position[w, a][2]
+    slip = arrays.net.motion[w] - measured_velocity(arrays, w, a)
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], slip)
 
 
 @wp.func
 def next_place(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
     """Where the agent takes the next corner to be, world frame [m]."""
-    return mate_position(arrays, w, a, next_corner(a, 1))
+    return mate_position(arrays, w, a, (a + 1) % AGENTS)
 
 
 @wp.func
 def last_place(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
     """Where the agent takes the corner after that to be, world frame [m]."""
-    return mate_position(arrays, w, a, next_corner(a, 2))
+    return mate_position(arrays, w, a, (a + 2) % AGENTS)
 
 
 @wp.func
 def outward(arrays: TaskArrays, w: int, a: int, left: wp.vec3, right: wp.vec3) -> float:
     """Bearing of the way out from the net's middle, seen from the agent [rad]."""
-    away = in_body(arrays, w, a, 2.0 * arrays.position[w, a] - left - right)
+    away = wp.quat_rotate_inv(arrays.quaternion[w, a], 2.0 * arrays.position[w, a] - left - right)
     return wp.atan2(away[1], away[0])
 
 
 @wp.func
-def seen_edges(arrays: TaskArrays, w: int, a: int, left: wp.vec3, right: wp.vec3) -> wp.vec3:
-    """Lengths of the net's edges as far as the agent has heard, the shortest first [m]."""
-    return sorted_edges(arrays.position[w, a], left, right)
+def seen_net(arrays: TaskArrays, w: int, a: int, left: wp.vec3, right: wp.vec3) -> wp.vec4:
+    """`spanned` of the target, as far as the agent has heard."""
+    return spanned(arrays.net.target[w], arrays.position[w, a], left, right)
 
 
 @wp.func
-def edge_errors(p: Any, edges: wp.vec3) -> wp.vec3:
+def edge_errors(p: Any, net: wp.vec4) -> wp.vec3:
     """Lengths of the edges less the side, in sides, the shortest first."""
     side = wp.vec3(p.side, p.side, p.side)
-    return (edges - side) / p.side
-
-
-@wp.func
-def seen_surface(arrays: TaskArrays, w: int, a: int, left: wp.vec3, right: wp.vec3) -> float:
-    """From the target to the net's surface, as far as the agent has heard [m]."""
-    return triangle_distance(arrays.net.target[w], arrays.position[w, a], left, right)
-
-
-@wp.func
-def left_to_stretch(p: Any, edges: wp.vec3) -> float:
-    """What the longest edge may still stretch, in sides."""
-    return p.stretch - edges[2] / p.side
+    return (wp.vec3(net[1], net[2], net[3]) - side) / p.side
 
 
 OBSERVATION = (
-    *OWN,
-    ObservationPart("target from here, body frame", 3, "m", NEAR, REACH, target_gap),
+    *own_velocity(clip=VELOCITY_CLIP),
+    ObservationPart(
+        "target from here, body frame",
+        3,
+        "m",
+        NEAR,
+        REACH,
+        "wp.quat_rotate_inv(arrays.quaternion[w, a], arrays.net.target[w] - arrays.position[w, a])",
+    ),
     ObservationPart("target's velocity less one's own, body frame", 3, "m/s", clip=REACH, term=target_slip),
-    ObservationPart("depth", 1, "m", DEPTH_SCALE, REACH, seen_depth),
+    ObservationPart("depth", 1, "m", DEPTH_SCALE, REACH, "-arrays.position[w, a][2]"),
     ObservationPart("bearing of the way out from the net's middle", 1, "rad", PI, 1.0, outward),
     *mate(1, corner_gap, corner_motion),
     *mate(2, corner_gap, corner_motion),
-    ObservationPart("goal from here, body frame", 3, "m", NEAR, REACH, goal_gap),
+    ObservationPart("goal from here, body frame", 3, "m", NEAR, REACH, "goal_offset"),
     ObservationPart(
         "lengths of the edges less the side, in sides, the shortest first",
         3,
@@ -203,9 +176,13 @@ OBSERVATION = (
         clip=REACH,
         term=edge_errors,
     ),
-    ObservationPart("distance from the target to the net", 1, "m", NEAR, REACH, seen_surface),
+    ObservationPart("distance from the target to the net", 1, "m", NEAR, REACH, "net[0]"),
     ObservationPart(
-        "what the longest edge may still stretch, in sides", 1, "1", clip=REACH, term=left_to_stretch
+        "what the longest edge may still stretch, in sides",
+        1,
+        "1",
+        clip=REACH,
+        term="p.stretch - net[3] / p.side",
     ),
 )
 """34 numbers of each agent. Team-mates follow in the order of the triangle: each sees its next one first."""
@@ -238,13 +215,9 @@ class FormationReward:
 
 
 @wp.func
-def carried_net(state: State, w: int, x: wp.vec3) -> wp.vec4:
-    """The net's distance from a point [m], and the lengths of its edges, the shortest first [m]."""
-    a = state.position[w, 0]
-    b = state.position[w, 1]
-    c = state.position[w, 2]
-    edges = sorted_edges(a, b, c)
-    return wp.vec4(triangle_distance(x, a, b, c), edges[0], edges[1], edges[2])
+def true_net(state: State, arrays: TaskArrays, w: int) -> wp.vec4:
+    """`spanned` of the target."""
+    return spanned(arrays.net.target[w], state.position[w, 0], state.position[w, 1], state.position[w, 2])
 
 
 @wp.func
@@ -258,42 +231,12 @@ def move_target(state: State, arrays: TaskArrays, p: Any, w: int):
     """Messages; then the target goes along with the net and into its middle while it is held, else it drifts."""
     exchange_messages(state, arrays, w)
     v = arrays.net.drift[w]
-    if holds(p, carried_net(state, w, arrays.net.target[w])):
+    if holds(p, true_net(state, arrays, w)):
         middle = (state.position[w, 0] + state.position[w, 1] + state.position[w, 2]) / 3.0
         v = (world_velocity(state, w, 0) + world_velocity(state, w, 1) + world_velocity(state, w, 2)) / 3.0
         v += SETTLE * (middle - arrays.net.target[w])
     arrays.net.motion[w] = v
     arrays.net.target[w] = arrays.net.target[w] + p.control_step * v
-
-
-@wp.func
-def net_now(state: State, arrays: TaskArrays, w: int) -> wp.vec4:
-    """`carried_net` of the target."""
-    return carried_net(state, w, arrays.net.target[w])
-
-
-@wp.func
-def net_gap(net: wp.vec4) -> float:
-    """From the target to the net's surface [m]."""
-    return net[0]
-
-
-@wp.func
-def goal_distance(arrays: TaskArrays, w: int) -> float:
-    """From the target to the goal [m]."""
-    return wp.length(arrays.goal_position[w] - arrays.net.target[w])
-
-
-@wp.func
-def net_gained(net: wp.vec4, to_net: float) -> float:
-    """Way of the net to the target in this step [m]."""
-    return to_net - net[0]
-
-
-@wp.func
-def goal_gained(arrays: TaskArrays, w: int, to_goal: float) -> float:
-    """Way of the target to the goal in this step [m]."""
-    return to_goal - goal_distance(arrays, w)
 
 
 @wp.func
@@ -306,40 +249,13 @@ def misshape(p: Any, net: wp.vec4) -> float:
 
 
 @wp.func
-def held_time(p: Any, net: wp.vec4, was: float) -> float:
-    """Time that the target was held [s]."""
-    return was + wp.where(holds(p, net), p.control_step, 0.0)
-
-
-@wp.func
 def shape_error(state: State, p: Any, w: int, net: wp.vec4, was: float) -> float:
     """Mean of the error of an edge, in sides."""
     return was + (misshape(p, net) - was) / float(state.steps[w])
 
 
-@wp.func
-def stretched_time(p: Any, net: wp.vec4, stretched: float) -> float:
-    """Time that the net has been too long [s]."""
-    far = net[3] > p.stretch * p.side
-    return wp.where(far, stretched + p.control_step, 0.0)
-
-
-@wp.func
-def is_there(arrays: TaskArrays, p: Any, w: int, net: wp.vec4) -> bool:
-    """The target held, near the goal."""
-    return holds(p, net) and goal_distance(arrays, w) <= p.goal_radius
-
-
-@wp.func
-def is_delivered(p: Any, held: float) -> bool:
-    """Held near the goal for `hold` seconds."""
-    return held > 0.0 and held >= p.hold - 0.1 * p.control_step
-
-
-@wp.func
-def is_torn(p: Any, net: wp.vec4, stretched: float) -> bool:
-    """Stretched for more than `grace` seconds."""
-    return stretched_time(p, net, stretched) > p.grace + 0.1 * p.control_step
+STRETCHED = "wp.where(net[3] > p.stretch * p.side, stretched + p.control_step, 0.0)"
+"""Time that the net has been too long [s]."""
 
 
 @wp.func
@@ -371,7 +287,7 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Formation(OpenWater):
+class Formation(Team):
     """Carry a virtual net. It is a triangle between the three vehicles, without weight or drag, and it can tear.
 
     The target is held while the net's surface is within `reach` of it, no edge is longer than `stretch` sides and none
@@ -382,10 +298,8 @@ class Formation(OpenWater):
     agents: ClassVar[tuple[str, ...]] = ("corner_1", "corner_2", "corner_3")
     succeeds: ClassVar[str] = "delivered"
     title: ClassVar[str] = "catch what drifts in a net and carry it, three together"
-    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
     name: str = "formation"
     observation: tuple[ObservationPart, ...] = field(default=OBSERVATION, repr=False)
-    time_limit: float = 60.0
     spawn_radius: float = 1.0
     bounds: float = 8.0
     side: float = 1.2
@@ -404,19 +318,13 @@ class Formation(OpenWater):
     """[s]"""
     drift: float = 0.05
     """Speed of a target that nobody holds, as a part of the speed that the slowest vehicle can hold."""
-    collision: float = 0.6
-    """Vehicles nearer to each other than this bump [m]; nothing stops them."""
     jitter: float = 0.05
     """Largest shift of a vehicle from its corner at the start, per axis [m]."""
     nearest: float = 1.0
     """The target starts this far from the net's middle, and the goal from the target ..."""
     farthest: float = 2.0
     """... to this far [m]."""
-    communication: Communication | None = None
-    """How vehicles know of each other; None: everybody sees everybody."""
     reward: FormationReward = field(default_factory=FormationReward)
-    speed: float = 0.0
-    """Of the drift [m/s]: follows from the vehicles."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.slack < 1.0 < self.stretch or self.side <= 0.0:
@@ -432,13 +340,8 @@ class Formation(OpenWater):
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """Room for the target and for messages, if there are any."""
-        net = NetTable()
-        for name in ("target", "drift", "motion"):
-            setattr(net, name, wp.zeros(worlds, dtype=wp.vec3, device=device))
-        arrays.net = net
-        arrays.messages = message_table(
-            self.communication, worlds, len(self.agents), self.control_step, 2.0 * self.bounds, device
-        )
+        super().allocate(arrays, worlds, device)
+        arrays.net = allocated(NetTable, worlds, device)
 
     def success_rule(self) -> str:
         """See `Task`."""
@@ -451,28 +354,32 @@ class Formation(OpenWater):
             start=start,
             begin=open_messages,
             advance=move_target,
-            shared={"net": net_now},
-            seen={"left": next_place, "right": last_place, "edges": seen_edges},
+            shared={
+                "net": true_net,
+                "away": "wp.length(arrays.goal_position[w] - arrays.net.target[w])",
+                "holding": holds,
+            },
+            seen={"left": next_place, "right": last_place, "net": seen_net},
             rewards=(
-                RewardTerm("net", net_gained, r.net),
-                RewardTerm("goal", goal_gained, r.goal),
+                RewardTerm("net", "to_net - net[0]", r.net),
+                RewardTerm("goal", "to_goal - away", r.goal),
                 RewardTerm("shape", misshape, -r.shape),
-                RewardTerm("step", one, -r.step),
+                RewardTerm("step", "1.0", -r.step),
                 RewardTerm("bump", bumps, -r.bump),
-                RewardTerm("action", action_effort, -r.action),
-                RewardTerm("change", action_change, -r.change),
+                RewardTerm("action", "action_effort", -r.action),
+                RewardTerm("change", "action_change", -r.change),
             ),
             ends=(
-                End("delivered", is_delivered, r.success),
-                End("torn", is_torn, -r.loss),
+                End("delivered", "held > 0.0 and held >= p.hold - 0.1 * p.control_step", r.success),
+                End("torn", f"{STRETCHED} > p.grace + 0.1 * p.control_step", -r.loss),
                 End("left", any_outside, -r.loss),
             ),
-            inside=is_there,
+            inside="holding and away <= p.goal_radius",
             totals=(
-                Total("held_time", held_time),
+                Total("held_time", "was + wp.where(holding, p.control_step, 0.0)"),
                 Total("shape_error", shape_error),
-                Total("to_net", net_gap, first=net_gap),
-                Total("to_goal", goal_distance, first=goal_distance),
-                Total("stretched", stretched_time),
+                Total("to_net", "net[0]", first="net[0]"),
+                Total("to_goal", "away", first="away"),
+                Total("stretched", STRETCHED),
             ),
         )

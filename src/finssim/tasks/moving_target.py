@@ -1,44 +1,30 @@
 """T3, moving target: stay with something that changes its course every few seconds."""
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.engine import Pool
 from finssim.engine.state import State
-from finssim.tasks.arrays import TargetMotion, TaskArrays
-from finssim.tasks.fitting import Fit, fit
-from finssim.tasks.measurement import MeasurementNoise
-from finssim.tasks.task import ObservationPart, Task
+from finssim.tasks.arrays import TargetMotion, TaskArrays, allocated
+from finssim.tasks.fitting import PoolTask
 from finssim.tasks.terms import (
     End,
+    ObservationPart,
     RewardTerm,
     Terms,
     Total,
-    action_change,
-    action_effort,
-    angular_velocity,
-    goal_offset,
-    length,
-    linear_velocity,
-    out_of_pool,
-    tilted,
-    turn_rates,
+    own_velocity,
+    start_upright,
     uniform3,
 )
-from finssim.vehicles import Vehicle
 
 DISTANCE_SCALE = 3.0
 """Distances are divided by this in the observation [m]."""
 TARGET_SCALE = 0.2
 """The target's velocity is divided by this in the observation [m/s]."""
-VELOCITY_CLIP = 2.0
-"""Velocities of the vehicle are clipped here in the observation [m/s, rad/s]."""
 
 
 @wp.func
@@ -52,9 +38,10 @@ OBSERVATION = (
         "target offset, body frame", 3, "m", scale=DISTANCE_SCALE, term="offset", errors=(0, 1, 2)
     ),
     ObservationPart("target velocity, body frame", 3, "m/s", scale=TARGET_SCALE, term=target_drift),
-    ObservationPart("linear velocity, body frame", 3, "m/s", clip=VELOCITY_CLIP, term=linear_velocity),
-    ObservationPart("angular velocity, body frame", 3, "rad/s", clip=VELOCITY_CLIP, term=turn_rates),
-    ObservationPart("distance to the target", 1, "m", scale=DISTANCE_SCALE, clip=1.0, term=length),
+    *own_velocity(clip=2.0),
+    ObservationPart(
+        "distance to the target", 1, "m", scale=DISTANCE_SCALE, clip=1.0, term="wp.length(offset)"
+    ),
 )
 
 
@@ -120,43 +107,11 @@ def move_target(arrays: TaskArrays, p: Any, w: int):
 
 
 @wp.func
-def target_error(state: State, arrays: TaskArrays, w: int) -> float:
-    """e: from the vehicle to the target [m]."""
-    return wp.length(arrays.goal_position[w] - state.position[w, 0])
-
-
-@wp.func
 def slip(state: State, arrays: TaskArrays, w: int) -> float:
     """u: speed relative to the target [m/s]."""
     nu = state.velocity[w, 0]
     drift = wp.quat_rotate_inv(state.quaternion[w, 0], arrays.target.velocity[w])
     return wp.length(wp.vec3(nu[0], nu[1], nu[2]) - drift)
-
-
-@wp.func
-def near(p: Any, e: float) -> float:
-    """near = exp(-e / near_scale)."""
-    return wp.exp(-e / (p.fit.size * p.reward.near_scale))
-
-
-@wp.func
-def match(p: Any, close: float, u: float) -> float:
-    """near · exp(-u / match_scale)."""
-    return close * wp.exp(-u / (p.fit.pace * p.reward.match_scale))
-
-
-@wp.func
-def spin(state: State, w: int) -> float:
-    """min(|ω|, 2) [rad/s]."""
-    return wp.min(wp.length(angular_velocity(state, w)), 2.0)
-
-
-@wp.func
-def with_target(state: State, p: Any, w: int, e: float, u: float) -> bool:
-    """Near enough, as fast as the target, and not turning."""
-    close = e <= p.fit.size * p.tolerance
-    matched = u <= p.fit.pace * p.slip_tolerance
-    return close and matched and wp.length(angular_velocity(state, w)) <= p.rate_tolerance
 
 
 @wp.func
@@ -177,19 +132,11 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
     new_course(arrays, p, w, 0.0)
     state.position[w, 0] = uniform3(wp.rand_init(key, 4 * w + 2), size * p.spawn_low, size * p.spawn_high)
     rng = wp.rand_init(key, 4 * w + 3)
-    roll = wp.randf(rng, -p.tilt, p.tilt)
-    pitch = wp.randf(rng, -p.tilt, p.tilt)
-    state.quaternion[w, 0] = tilted(roll, pitch, wp.randf(rng, -3.14159265, 3.14159265))
-    most = p.fit.pace * p.speed
-    nu = state.velocity[w, 0]
-    for k in range(3):
-        nu[k] = wp.randf(rng, -most, most)
-        nu[k + 3] = 0.0
-    state.velocity[w, 0] = nu
+    start_upright(state, w, rng, p.tilt, p.fit.pace * p.speed)
 
 
 @dataclass(frozen=True, kw_only=True)
-class MovingTarget(Task):
+class MovingTarget(PoolTask):
     """T3. Lengths in metres, world frame with z up and 0 on the water, as for FinsROV.
 
     A longer vehicle has everything `fit.size` times as large, and `fit.pace` times as fast. The target's speed, courses
@@ -199,12 +146,9 @@ class MovingTarget(Task):
     succeeds: ClassVar[str] = "once"
     moving: ClassVar[bool] = True
     title: ClassVar[str] = "stay with a target that changes its course"
-    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave")
     name: str = "t3"
     observation: tuple[ObservationPart, ...] = OBSERVATION
     time_limit: float = 30.0
-    fit: Fit = Fit()
-    """Factors of the vehicle; the environment sets them."""
     low: tuple[float, float, float] = (-1.25, -0.50, -0.675)
     """The target starts in this box, and turns back where it leaves it; with 0.08 m/s² it needs 0.06 m for that."""
     high: tuple[float, float, float] = (1.25, 0.50, -0.325)
@@ -216,19 +160,8 @@ class MovingTarget(Task):
     """Part of the drawn speed that is left upwards and downwards."""
     retarget: tuple[float, float] = (1.5, 4.0)
     """Another velocity is drawn after a time from this range [s]."""
-    spawn_low: tuple[float, float, float] = (-1.4, -0.6, -0.80)
-    """The vehicle starts in this box, with any heading."""
-    spawn_high: tuple[float, float, float] = (1.4, 0.6, -0.20)
-    tilt: float = math.radians(20.0)
-    """Largest roll and pitch at the start [rad]."""
     speed: float = 0.1
     """Largest starting speed per axis [m/s]."""
-    bounds: tuple[float, float] = (2.5, 1.5)
-    """Leaving |x|, |y| beyond these ends the episode."""
-    ceiling: float = 0.3
-    """So does rising above this height."""
-    depth: float = 1.5
-    """So does sinking below this depth."""
     tolerance: float = 0.25
     """Success: within this distance, ..."""
     slip_tolerance: float = 0.12
@@ -240,26 +173,10 @@ class MovingTarget(Task):
     settle: float = 10.0
     """The error of an episode is counted from here [s]."""
     reward: TargetReward = field(default_factory=TargetReward)
-    training_noise: MeasurementNoise = MeasurementNoise(
-        position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02
-    )
-
-    def fitted(self, vehicles: Sequence[Vehicle]) -> "MovingTarget":
-        """As large and fast as suits the vehicle."""
-        return replace(self, fit=fit(vehicles[0]))
-
-    def arena(self) -> Pool:
-        """See `Fit.pool`."""
-        return self.fit.pool()
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """Room for every target's motion."""
-        motion = TargetMotion()
-        motion.velocity = wp.zeros(worlds, dtype=wp.vec3, device=device)
-        motion.wanted = wp.zeros(worlds, dtype=wp.vec3, device=device)
-        motion.until = wp.zeros(worlds, dtype=wp.float32, device=device)
-        motion.rng = wp.zeros(worlds, dtype=wp.uint32, device=device)
-        arrays.target = motion
+        arrays.target = allocated(TargetMotion, worlds, device)
 
     def success_rule(self) -> str:
         """See `Task`."""
@@ -284,17 +201,23 @@ class MovingTarget(Task):
         return Terms(
             start=start,
             advance=move_target,
-            shared={"e": target_error, "u": slip, "close": near},
-            seen={"offset": goal_offset},
+            shared={
+                "e": "position_error",
+                "u": slip,
+                "close": "wp.exp(-e / (p.fit.size * p.reward.near_scale))",
+                "turn": "wp.length(angular_velocity)",
+            },
+            seen={"offset": "goal_offset"},
             rewards=(
                 RewardTerm("near", "close", r.near),
-                RewardTerm("match", match, r.match),
+                RewardTerm("match", "close * wp.exp(-u / (p.fit.pace * p.reward.match_scale))", r.match),
                 RewardTerm("distance", "e", -r.distance / self.fit.size),
-                RewardTerm("spin", spin, -r.spin),
-                RewardTerm("action", action_effort, -r.action),
-                RewardTerm("change", action_change, -r.change),
+                RewardTerm("spin", "wp.min(turn, 2.0)", -r.spin),
+                RewardTerm("action", "action_effort", -r.action),
+                RewardTerm("change", "action_change", -r.change),
             ),
-            ends=(End("left", out_of_pool, -r.loss),),
-            inside=with_target,
+            ends=(End("left", "out_of_pool", -r.loss),),
+            # Near enough, as fast as the target, and not turning.
+            inside="e <= p.fit.size * p.tolerance and u <= p.fit.pace * p.slip_tolerance and turn <= p.rate_tolerance",
             totals=(Total("squared_error", squared_error),),
         )

@@ -13,13 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from finssim.control import ControlError
 from finssim.control.guidance import Guide, Measured, Reference, Track
+from finssim.control.modes import MODES
 from finssim.control.policy import ObservationSchema
 from finssim.engine.launch import Pipeline
 from finssim.engine.state import State
 from finssim.geometry.rotations import quat_from_yaw, quat_inverse_rotate, quat_rotate
 from finssim.physics.types import vec6
-from finssim.tasks.actions import action_size
-from finssim.tasks.arrays import TaskArrays, task_arrays
+from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError, crew
 from finssim.tasks.make import task_named
 from finssim.tasks.reference import fill_table
@@ -90,8 +90,8 @@ class Observer:
             raise ControlError(f"task '{task.name}' has no '{agent}'; its agents: {', '.join(task.agents)}")
         self.schema: ObservationSchema = task.schema
         self._place = task.vehicles.index(self.agent)
-        thrusters = len(crew(vehicle, task, action or task.action)[0].thrusters)
-        self._action_size = action_size(action or task.action, thrusters)
+        mode = action or task.action
+        self._action_size = len(MODES[mode].labels(crew(vehicle, task, mode)[0]))
         self._guide: Guide | None = None
         self._build(task)
 
@@ -226,11 +226,7 @@ def one_world(task: Task, action_size: int) -> tuple[State, TaskArrays]:
         action_size: Numbers in the action of a vehicle.
     """
     device, vehicles = wp.get_device("cpu"), len(task.vehicles)
-    arrays = task_arrays(
-        1, len(task.agents), len(task.others), task.observation_size, action_size, device, len(task.totals),
-        len(task.earnings),
-    )  # fmt: skip
-    task.allocate(arrays, 1, device)
+    arrays = task.arrays(1, action_size, device)
     dock = task.dock()
     if dock is not None:
         arrays.funnel = funnel = dock.struct(1, vehicles, device)

@@ -11,22 +11,24 @@ from numpy.typing import NDArray
 from finssim.engine.state import State
 from finssim.physics.types import vec6
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.communication import mate_position, mate_velocity
+from finssim.tasks.communication import (
+    Communication,
+    mate_position,
+    mate_velocity,
+    message_table,
+)
 from finssim.tasks.given import EnvironmentSetupError
-from finssim.tasks.task import ObservationPart, Task
+from finssim.tasks.task import Task
 from finssim.tasks.terms import (
     End,
+    ObservationPart,
     RewardTerm,
     Terms,
     Total,
-    action_change,
-    action_effort,
     level_direction,
-    linear_velocity,
     measured_velocity,
-    one,
+    own_velocity,
     place_at_rest,
-    turn_rates,
     world_velocity,
 )
 from finssim.vehicles import HydrodynamicSet, Vehicle
@@ -210,18 +212,6 @@ def prey_motion(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
 
 
 @wp.func
-def prey_distance(gap: wp.vec3) -> float:
-    """From the agent to the vehicle after the agents [m]."""
-    return wp.length(gap)
-
-
-@wp.func
-def prey_bearing(gap: wp.vec3) -> float:
-    """Positive to the left [rad]."""
-    return wp.atan2(gap[1], gap[0])
-
-
-@wp.func
 def gap_to(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
     """From agent a to agent b, as far as a has heard, body frame of a [m]."""
     return wp.quat_rotate_inv(arrays.quaternion[w, a], mate_position(arrays, w, a, b) - arrays.position[w, a])
@@ -234,20 +224,16 @@ def motion_of(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
     return wp.quat_rotate_inv(arrays.quaternion[w, a], relative)
 
 
-OWN = (
-    ObservationPart("linear velocity, body frame", 3, "m/s", clip=VELOCITY_CLIP, term=linear_velocity),
-    ObservationPart("angular velocity, body frame", 3, "rad/s", clip=VELOCITY_CLIP, term=turn_rates),
-)
-"""6 numbers of oneself."""
-
 CHASE = (
-    *OWN,
+    *own_velocity(clip=VELOCITY_CLIP),
     ObservationPart("prey from here, body frame", 3, "m", DISTANCE_SCALE, REACH, term="gap"),
     ObservationPart(
         "prey's velocity less one's own, body frame", 3, "m/s", clip=VELOCITY_CLIP, term=prey_motion
     ),
-    ObservationPart("distance to the prey", 1, "m", DISTANCE_SCALE, REACH, term=prey_distance),
-    ObservationPart("bearing of the prey, positive to the left", 1, "rad", PI, 1.0, term=prey_bearing),
+    ObservationPart("distance to the prey", 1, "m", DISTANCE_SCALE, REACH, term="wp.length(gap)"),
+    ObservationPart(
+        "bearing of the prey, positive to the left", 1, "rad", PI, 1.0, term="wp.atan2(gap[1], gap[0])"
+    ),
 )
 """14 numbers of one pursuer, for a task that shares `prey_gap` as `gap`."""
 
@@ -310,15 +296,6 @@ class Prey:
         return PREY_MODES.index(self.mode)
 
 
-def prey_speed(part: float, pursuers: Sequence[Vehicle], prey: Vehicle) -> float:
-    """Speed of a prey: `part` of what the slowest pursuer can hold, within what the prey itself can do [m/s]."""
-    if not 0.0 <= part <= 1.0:
-        raise EnvironmentSetupError(
-            f"prey_speed is {part}, expected 0 to 1: a part of the slowest pursuer's speed"
-        )
-    return min(part * slowest(pursuers), RESERVE * DriveNumbers.of(prey).top)
-
-
 @wp.func
 def most_climb(p: Any) -> float:
     """Up or down [m/s]."""
@@ -335,8 +312,9 @@ def wander(p: Any, key: int, w: int, draw: int) -> wp.vec3:
 
 
 @wp.func
-def flight(state: State, p: Any, pursuers: int, w: int, reach: float) -> wp.vec3:
+def flight(state: State, arrays: TaskArrays, w: int, reach: float) -> wp.vec3:
     """Away from all pursuers within reach, each weighted by 1/d²; zero where there is none."""
+    pursuers = arrays.agent_reward.shape[1]
     x = state.position[w, pursuers]
     away = wp.vec3()
     for a in range(pursuers):
@@ -348,8 +326,9 @@ def flight(state: State, p: Any, pursuers: int, w: int, reach: float) -> wp.vec3
 
 
 @wp.func
-def nearest_pursuer(state: State, pursuers: int, w: int) -> float:
+def nearest_pursuer(state: State, arrays: TaskArrays, w: int) -> float:
     """Distance from the prey to the nearest pursuer [m]."""
+    pursuers = arrays.agent_reward.shape[1]
     x = state.position[w, pursuers]
     d = wp.length(x - state.position[w, 0])
     for a in range(1, pursuers):
@@ -376,7 +355,7 @@ def kept_inside(p: Any, x: wp.vec3, v: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def prey_velocity(state: State, p: Any, pursuers: int, key: int, w: int) -> wp.vec3:
+def prey_velocity(state: State, arrays: TaskArrays, p: Any, key: int, w: int) -> wp.vec3:
     """Velocity that the prey wants, world frame; its level part is no faster than `speed` [m/s]."""
     pi = 3.14159265
     rng = wp.rand_init(key, 4 * w + 3)
@@ -387,16 +366,16 @@ def prey_velocity(state: State, p: Any, pursuers: int, key: int, w: int) -> wp.v
     if mode == 1:
         v = p.speed * level_direction(heading)
     if mode == 3:
-        v = flight(state, p, pursuers, w, nearest_pursuer(state, pursuers, w) * 1.0001 + 1.0e-3)
+        v = flight(state, arrays, w, nearest_pursuer(state, arrays, w) * 1.0001 + 1.0e-3)
     if mode == 2:
-        away = flight(state, p, pursuers, w, p.prey.alarm)
+        away = flight(state, arrays, w, p.prey.alarm)
         if wp.length(away) > 0.0:
             turn = wp.where(wp.randf(wp.rand_init(key + draw, 4 * w + 1)) < 0.5, -0.6, 0.6)
             v = wp.quat_rotate(wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), turn), away)
-    if mode >= 2 and (mode == 3 or nearest_pursuer(state, pursuers, w) < p.prey.alarm):
+    if mode >= 2 and (mode == 3 or nearest_pursuer(state, arrays, w) < p.prey.alarm):
         pace = wp.sqrt(v[0] * v[0] + v[1] * v[1])
         v = v * (p.speed / wp.max(pace, 1.0e-6))
-    return kept_inside(p, state.position[w, pursuers], v)
+    return kept_inside(p, state.position[w, arrays.agent_reward.shape[1]], v)
 
 
 @wp.func
@@ -404,12 +383,120 @@ def command_prey(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
     """Write the action of the prey, which is the vehicle after the pursuers; it sees the truth."""
     pursuers = arrays.agent_reward.shape[1]
     q = state.quaternion[w, pursuers]
-    wanted = towards(q, prey_velocity(state, p, pursuers, key + 7, w))
+    wanted = towards(q, prey_velocity(state, arrays, p, key + 7, w))
     write_scripted(arrays, w, drive(p.prey_drive, q, state.velocity[w, pursuers], wanted))
 
 
-DISTANCE_SLOPE = 8.0
-"""The distance costs its full weight here and beyond [m]."""
+# What the tasks in open water have in common: where episodes start and end, the prey, and the team.
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenWater(Task):
+    """Base of the tasks in open water: where episodes start and end. Lengths in metres, world frame with z up."""
+
+    action: ClassVar[str] = "wrench4"
+    pool: ClassVar[None] = None
+    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
+
+    time_limit: float = 60.0
+    spawn_radius: float = 2.5
+    """Agents start this near to the origin."""
+    low: float = -4.0
+    """Everybody starts between this height ..."""
+    high: float = -2.0
+    """... and this one."""
+    bounds: float = 12.0
+    """Going farther from the origin than this ends the episode."""
+    ceiling: float = 0.3
+    """So does rising above this height."""
+    depth: float = 8.0
+    """And sinking below this depth."""
+    nearest: float = 2.0
+    """What is to be caught starts this far from the agents ..."""
+    farthest: float = 5.0
+    """... to this far."""
+    speed: float = 0.0
+    """Of what is to be caught [m/s]: follows from the vehicles."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chase(OpenWater):
+    """Base of the tasks with a prey, which is the vehicle after the agents."""
+
+    others: ClassVar[tuple[str, ...]] = ("prey",)
+    succeeds: ClassVar[str] = "captured"
+    moving: ClassVar[bool] = True
+
+    prey: Prey = field(default_factory=Prey)
+    """What the prey does; it sees all agents."""
+    prey_drive: DriveNumbers | None = field(default=None, repr=False)
+    """What the prey's thrusters do: follows from its vehicle."""
+
+    def chased(self, part: float, vehicles: Sequence[Vehicle], **changes: Any) -> Any:
+        """The task with the prey's thrust from its vehicle, and its speed.
+
+        Args:
+            part: Of what the slowest agent can hold.
+            vehicles: Agents, then the prey.
+            changes: Of other settings.
+        """
+        if not 0.0 <= part <= 1.0:
+            raise EnvironmentSetupError(
+                f"prey_speed is {part}, expected 0 to 1: a part of the slowest pursuer's speed"
+            )
+        drive = DriveNumbers.of(vehicles[-1])
+        speed = min(part * slowest(vehicles[:-1]), RESERVE * drive.top)
+        return replace(self, speed=speed, prey_drive=drive, **changes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Team(OpenWater):
+    """Base of the tasks of several agents."""
+
+    collision: float = 0.6
+    """Agents nearer to each other than this bump [m]; nothing stops them."""
+    communication: Communication | None = None
+    """How agents know of each other; None: everybody sees everybody."""
+
+    def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
+        """Room for the messages, if there are any."""
+        arrays.messages = message_table(
+            self.communication, worlds, len(self.agents), self.control_step, 2.0 * self.bounds, device
+        )
+
+
+@wp.func
+def any_outside(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
+    """An agent is out of bounds."""
+    out = bool(False)
+    for a in range(arrays.agent_reward.shape[1]):
+        x = state.position[w, a]
+        if x[0] * x[0] + x[1] * x[1] > p.bounds * p.bounds or x[2] > p.ceiling or x[2] < -p.depth:
+            out = True
+    return out
+
+
+@wp.func
+def bumps(state: State, arrays: TaskArrays, p: Any, w: int, a: int) -> float:
+    """Agents nearer than `collision`."""
+    count = float(0.0)
+    for b in range(arrays.agent_reward.shape[1]):
+        if b != a and wp.length(state.position[w, b] - state.position[w, a]) < p.collision:
+            count += 1.0
+    return count
+
+
+@wp.func
+def prey_start(p: Any, rng: wp.uint32, x: wp.vec3) -> wp.vec3:
+    """A place for the prey: at a distance from x that is drawn, in any direction, at about the same height."""
+    angle = wp.randf(rng, -3.14159265, 3.14159265)
+    away = wp.randf(rng, p.nearest, p.farthest)
+    height = wp.clamp(x[2] + wp.randf(rng, -0.5, 0.5), p.low, p.high)
+    level = x + away * level_direction(angle)
+    return wp.vec3(level[0], level[1], height)
+
+
+# The task of one pursuer.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -442,56 +529,6 @@ class PursuitReward:
     loss: float = 20.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class OpenWater(Task):
-    """Base of the tasks in open water: where episodes start and end. Lengths in metres, world frame with z up."""
-
-    action: ClassVar[str] = "wrench4"
-    pool: ClassVar[None] = None
-
-    spawn_radius: float = 2.5
-    """Agents start this near to the origin."""
-    low: float = -4.0
-    """Everybody starts between this height ..."""
-    high: float = -2.0
-    """... and this one."""
-    bounds: float = 12.0
-    """Going farther from the origin than this ends the episode."""
-    ceiling: float = 0.3
-    """So does rising above this height."""
-    depth: float = 8.0
-    """And sinking below this depth."""
-
-
-@wp.func
-def outside(state: State, p: Any, w: int, v: int) -> bool:
-    """Whether a vehicle is out of bounds."""
-    x = state.position[w, v]
-    return x[0] * x[0] + x[1] * x[1] > p.bounds * p.bounds or x[2] > p.ceiling or x[2] < -p.depth
-
-
-@wp.func
-def prey_start(p: Any, rng: wp.uint32, x: wp.vec3) -> wp.vec3:
-    """A place for the prey: at a distance from x that is drawn, in any direction, at about the same height."""
-    angle = wp.randf(rng, -3.14159265, 3.14159265)
-    away = wp.randf(rng, p.nearest, p.farthest)
-    height = wp.clamp(x[2] + wp.randf(rng, -0.5, 0.5), p.low, p.high)
-    level = x + away * level_direction(angle)
-    return wp.vec3(level[0], level[1], height)
-
-
-@wp.func
-def gap(state: State, w: int) -> wp.vec3:
-    """From the pursuer to the prey, world frame [m]."""
-    return state.position[w, 1] - state.position[w, 0]
-
-
-@wp.func
-def distance(way: wp.vec3) -> float:
-    """d, from the pursuer to the prey [m]."""
-    return wp.max(wp.length(way), 1.0e-6)
-
-
 @wp.func
 def relative_motion(state: State, w: int) -> wp.vec3:
     """The prey's velocity less the pursuer's, world frame [m/s]."""
@@ -499,59 +536,10 @@ def relative_motion(state: State, w: int) -> wp.vec3:
 
 
 @wp.func
-def gained(p: Any, way: wp.vec3, d: float, motion: wp.vec3) -> float:
-    """Closing speed times the control step [m]."""
-    return -wp.dot(way, motion) / d * p.control_step
-
-
-@wp.func
-def far(d: float) -> float:
-    """min(d / 8 m, 1)."""
-    return wp.min(d / DISTANCE_SLOPE, 1.0)
-
-
-@wp.func
 def facing(state: State, w: int, way: wp.vec3, d: float) -> float:
     """Cosine of the angle from the bow to the prey."""
     ahead = wp.quat_rotate(state.quaternion[w, 0], wp.vec3(1.0, 0.0, 0.0))
     return wp.dot(ahead, way) / d
-
-
-@wp.func
-def close_by(p: Any, d: float) -> float:
-    """1 within `near_radius`."""
-    return wp.where(d < p.reward.near_radius, 1.0, 0.0)
-
-
-@wp.func
-def yawing(state: State, w: int) -> float:
-    """r², the yaw rate squared [rad²/s²]."""
-    r = state.velocity[w, 0][5]
-    return r * r
-
-
-@wp.func
-def with_prey(p: Any, d: float, motion: wp.vec3) -> bool:
-    """Within `radius`, at no more than `relative_speed`."""
-    return d <= p.radius and wp.length(motion) <= p.relative_speed
-
-
-@wp.func
-def is_captured(p: Any, held: float) -> bool:
-    """With the prey for `hold` seconds."""
-    return held > 0.0 and held >= p.hold - 0.1 * p.control_step
-
-
-@wp.func
-def is_outside(state: State, p: Any, w: int) -> bool:
-    """The pursuer is out of bounds."""
-    return outside(state, p, w, 0)
-
-
-@wp.func
-def closest(d: float, was: float) -> float:
-    """Smallest distance so far [m]."""
-    return wp.min(was, d)
 
 
 @wp.func
@@ -567,41 +555,25 @@ def start(state: State, p: Any, key: int, w: int):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pursuit(OpenWater):
+class Pursuit(Chase):
     """1-v-1 pursuit. Captured: within `radius` at a relative speed of at most `relative_speed`, for `hold` seconds."""
 
     agents: ClassVar[tuple[str, ...]] = ("pursuer",)
-    others: ClassVar[tuple[str, ...]] = ("prey",)
-    succeeds: ClassVar[str] = "captured"
-    moving: ClassVar[bool] = True
     title: ClassVar[str] = "catch a prey, one against one"
-    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
     name: str = "pursuit"
     observation: tuple[ObservationPart, ...] = field(default=CHASE, repr=False)
-    time_limit: float = 60.0
-    prey: Prey = field(default_factory=Prey)
-    """What the prey does."""
     prey_speed: float = 0.6
-    """Its speed, as a part of what the pursuer can hold (published: 2 m/s, four times that speed)."""
-    nearest: float = 2.0
-    """The prey starts this far from the pursuer ..."""
-    farthest: float = 5.0
-    """... to this far."""
+    """Speed of the prey, as a part of what the pursuer can hold (published: 2 m/s, four times that speed)."""
     radius: float = 0.8
     relative_speed: float = 0.35
     """[m/s]"""
     hold: float = 0.5
     """[s]"""
     reward: PursuitReward = field(default_factory=PursuitReward)
-    speed: float = 0.0
-    """Speed of the prey [m/s]: follows from the vehicles."""
-    prey_drive: DriveNumbers | None = field(default=None, repr=False)
-    """What the prey's thrusters do: follows from its vehicle."""
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Pursuit":
         """The prey's speed and thrust from the vehicles: pursuer, prey."""
-        speed = prey_speed(self.prey_speed, vehicles[:1], vehicles[1])
-        return replace(self, speed=speed, prey_drive=DriveNumbers.of(vehicles[1]))
+        return self.chased(self.prey_speed, vehicles)
 
     def success_rule(self) -> str:
         """See `Task`."""
@@ -613,19 +585,27 @@ class Pursuit(OpenWater):
         return Terms(
             start=start,
             command=command_prey,
-            shared={"way": gap, "d": distance, "motion": relative_motion},
+            shared={
+                "way": "state.position[w, 1] - state.position[w, 0]",
+                "d": "wp.max(wp.length(way), 1.0e-6)",
+                "motion": relative_motion,
+                "spin": "state.velocity[w, 0][5]",
+            },
             seen={"gap": prey_gap},
             rewards=(
-                RewardTerm("progress", gained, r.progress),
-                RewardTerm("distance", far, -r.distance),
+                RewardTerm("progress", "-wp.dot(way, motion) / d * p.control_step", r.progress),
+                RewardTerm("distance", "wp.min(d / 8.0, 1.0)", -r.distance),
                 RewardTerm("heading", facing, r.heading),
-                RewardTerm("near", close_by, r.near),
-                RewardTerm("spin", yawing, -r.spin),
-                RewardTerm("action", action_effort, -r.action),
-                RewardTerm("change", action_change, -r.change),
-                RewardTerm("step", one, -r.step),
+                RewardTerm("near", "wp.where(d < p.reward.near_radius, 1.0, 0.0)", r.near),
+                RewardTerm("spin", "spin * spin", -r.spin),
+                RewardTerm("action", "action_effort", -r.action),
+                RewardTerm("change", "action_change", -r.change),
+                RewardTerm("step", "1.0", -r.step),
             ),
-            ends=(End("captured", is_captured, r.capture), End("left", is_outside, -r.loss)),
-            inside=with_prey,
-            totals=(Total("closest", closest, first="d"),),
+            ends=(
+                End("captured", "held > 0.0 and held >= p.hold - 0.1 * p.control_step", r.capture),
+                End("left", any_outside, -r.loss),
+            ),
+            inside="d <= p.radius and wp.length(motion) <= p.relative_speed",
+            totals=(Total("closest", "wp.min(was, d)", first="d"),),
         )

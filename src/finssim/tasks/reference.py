@@ -7,7 +7,7 @@ import warp as wp
 
 from finssim.control.guidance import Guide, Reference
 from finssim.geometry.rotations import quat_from_yaw
-from finssim.tasks.arrays import ReferenceTable
+from finssim.tasks.arrays import ReferenceTable, allocated
 from finssim.tasks.environment import Environment, EnvironmentSetupError
 
 ENDLESS = 1.0e9
@@ -16,13 +16,9 @@ ENDLESS = 1.0e9
 
 def reference_table(worlds: int, knots: int, spacing: float, device: wp.Device) -> ReferenceTable:
     """An empty table of `knots` knots, `spacing` apart [s]."""
-    table = ReferenceTable()
-    table.position = wp.zeros((worlds, knots), dtype=wp.vec3, device=device)
-    table.velocity = wp.zeros((worlds, knots), dtype=wp.vec3, device=device)
+    table: ReferenceTable = allocated(ReferenceTable, worlds, device, position=knots, velocity=knots)
     table.spacing = spacing
-    table.duration = wp.ones(worlds, dtype=wp.float32, device=device)
-    table.offset = wp.zeros(worlds, dtype=wp.float32, device=device)
-    table.given = wp.zeros(worlds, dtype=wp.int32, device=device)
+    table.duration.fill_(1.0)
     return table
 
 

@@ -11,7 +11,7 @@ A measurement that comes late is compared with the estimate of its own time and 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,7 @@ from finssim.sensors.sampling import (
     sample_key,
     samples_until,
 )
-from finssim.tasks.arrays import TaskArrays
+from finssim.tasks.arrays import TaskArrays, allocated
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.measurement import LONGEST_DELAY, MeasurementNoise
 from finssim.vehicles import Vehicle
@@ -151,18 +151,17 @@ class Aboard:
 
 @wp.struct
 class Estimates:
-    """Memory of the filters, by (world, vehicle); position and attitude stand in the task's arrays."""
+    """Memory of the filters, by (world, vehicle); position, velocity and attitude of the last control steps, a ring."""
 
     aboard: wp.array(dtype=Aboard)  # by vehicle
-    velocity: wp.array2d(dtype=wp.vec3)  # world frame [m/s]
+    position: wp.array3d(dtype=wp.vec3)  # world frame [m]
+    velocity: wp.array3d(dtype=wp.vec3)  # world frame [m/s]
+    quaternion: wp.array3d(dtype=wp.quat)  # body to world
     bias: wp.array2d(dtype=wp.vec3)  # of the gyro, body frame [rad/s]
     rate: wp.array2d(dtype=wp.vec3)  # of turn, a step ago, body frame [rad/s]
     plane: wp.array2d(dtype=wp.vec3)  # doubts, as in `Aboard`
     height: wp.array2d(dtype=wp.vec3)
     yaw: wp.array2d(dtype=wp.vec3)
-    past_position: wp.array3d(dtype=wp.vec3)  # of earlier control steps, a ring
-    past_velocity: wp.array3d(dtype=wp.vec3)
-    past_quaternion: wp.array3d(dtype=wp.quat)
 
 
 @wp.struct
@@ -253,29 +252,9 @@ def doubted(P: wp.vec3, a: float, b: float) -> wp.vec2:
 
 
 @wp.func
-def lateness(delay: int, step: int, past: wp.array3d(dtype=wp.vec3)) -> int:
-    """Control steps that a measurement is old, no more than are kept and than the episode has."""
-    return wp.min(wp.min(delay, past.shape[2] - 1), step)
-
-
-@wp.func
-def move_past(
-    e: Estimates, w: int, v: int, step: int, late: int, dt: float, dx: wp.vec3, dv: wp.vec3, turn: wp.vec2
-):
-    """Move the path since `late` steps ago by what was learned of there: offsets, and rates that go on growing."""
-    for j in range(step - late, step):
-        k = j % e.past_position.shape[2]
-        t = float(j - step + late) * dt
-        e.past_position[w, v, k] = e.past_position[w, v, k] + dx + t * dv
-        e.past_velocity[w, v, k] = e.past_velocity[w, v, k] + dv
-        e.past_quaternion[w, v, k] = about_z(turn[0] + t * turn[1]) * e.past_quaternion[w, v, k]
-
-
-@wp.func
 def begin(
-    state: State, arrays: TaskArrays, m: Measurement, r: Readings, e: Estimates, has_fixes: bool, seed: int, w: int,
-    v: int,
-):  # fmt: skip
+    state: State, m: Measurement, r: Readings, e: Estimates, has_fixes: bool, seed: int, w: int, v: int
+):
     """Start where the filter would be had it run before: off by its settled doubt and by what lasts."""
     key = sample_key(seed, FIX, w, v, state.episode[w], 0)
     known = e.aboard[v]
@@ -295,26 +274,29 @@ def begin(
         lasting[2] = -r.gauge.bias[w, v]
     imu = r.imu_errors[w, v]
     up = wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
-    felt = wp.normalize(imu.gravity * up + wp.quat_rotate(imu.q_bs, r.imu.accel_bias[w, v]))
-    arrays.position[w, v] = x + wp.vec3(px[0], py[0], pz[0]) + lasting
-    arrays.quaternion[w, v] = wp.normalize(about_z(turn[0]) * q * turned_by(wp.cross(felt, up)))
+    felt = wp.normalize(imu.gravity * up + wp.quat_rotate(imu.orientation, r.imu.accel_bias[w, v]))
     nu = state.velocity[w, v]
-    e.velocity[w, v] = wp.quat_rotate(q, wp.vec3(nu[0], nu[1], nu[2])) + wp.vec3(px[1], py[1], pz[1])
-    e.bias[w, v] = wp.quat_rotate(imu.q_bs, r.imu.gyro_bias[w, v]) - turn[1] * up
-    e.rate[w, v] = wp.quat_rotate(imu.q_bs, r.imu.gyro[w, v]) - e.bias[w, v]
+    k = state.steps[w] % e.position.shape[2]
+    e.position[w, v, k] = x + wp.vec3(px[0], py[0], pz[0]) + lasting
+    e.quaternion[w, v, k] = wp.normalize(about_z(turn[0]) * q * turned_by(wp.cross(felt, up)))
+    e.velocity[w, v, k] = wp.quat_rotate(q, wp.vec3(nu[0], nu[1], nu[2])) + wp.vec3(px[1], py[1], pz[1])
+    e.bias[w, v] = wp.quat_rotate(imu.orientation, r.imu.gyro_bias[w, v]) - turn[1] * up
+    e.rate[w, v] = wp.quat_rotate(imu.orientation, r.imu.gyro[w, v]) - e.bias[w, v]
     e.plane[w, v] = known.plane
     e.height[w, v] = known.height
     e.yaw[w, v] = known.yaw
 
 
 @wp.func
-def go_on(r: Readings, arrays: TaskArrays, e: Estimates, dt: float, w: int, v: int):
+def go_on(r: Readings, e: Estimates, step: int, dt: float, w: int, v: int):
     """The state a control step later: the gyro turns it, the accelerometer says where up is, velocity goes on."""
+    before = (step - 1) % e.position.shape[2]
+    now = step % e.position.shape[2]
     imu = r.imu_errors[w, v]
-    rate = wp.quat_rotate(imu.q_bs, r.imu.gyro[w, v]) - e.bias[w, v]
-    q = arrays.quaternion[w, v] * turned_by(0.5 * dt * (rate + e.rate[w, v]))
+    rate = wp.quat_rotate(imu.orientation, r.imu.gyro[w, v]) - e.bias[w, v]
+    q = e.quaternion[w, v, before] * turned_by(0.5 * dt * (rate + e.rate[w, v]))
     if r.imu_samples.fresh[w, v]:
-        force = wp.quat_rotate(imu.q_bs, r.imu.accel[w, v])
+        force = wp.quat_rotate(imu.orientation, r.imu.accel[w, v])
         size = wp.max(wp.length(force), 1.0e-6)
         off = (size - imu.gravity) / TILT_TOLERANCE
         up = wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
@@ -322,9 +304,10 @@ def go_on(r: Readings, arrays: TaskArrays, e: Estimates, dt: float, w: int, v: i
         q = q * turned_by(TILT_P * dt * error)
         e.bias[w, v] = e.bias[w, v] - TILT_I * dt * error
         rate += TILT_I * dt * error
-    arrays.quaternion[w, v] = wp.normalize(q)
+    e.quaternion[w, v, now] = wp.normalize(q)
     e.rate[w, v] = rate
-    arrays.position[w, v] = arrays.position[w, v] + dt * e.velocity[w, v]
+    e.position[w, v, now] = e.position[w, v, before] + dt * e.velocity[w, v, before]
+    e.velocity[w, v, now] = e.velocity[w, v, before]
     noise = wp.max(imu.gyro_noise * imu.gyro_noise * dt, GYRO_FLOOR * GYRO_FLOOR) * dt
     e.yaw[w, v] = grown(e.yaw[w, v], GYRO_WALK * GYRO_WALK, dt) + wp.vec3(noise, 0.0, 0.0)
     e.plane[w, v] = grown(e.plane[w, v], ACCELERATION[0], dt)
@@ -332,150 +315,129 @@ def go_on(r: Readings, arrays: TaskArrays, e: Estimates, dt: float, w: int, v: i
 
 
 @wp.func
+def measured_at(e: Estimates, latency: int, step: int) -> int:
+    """Control step of a measurement that is so many steps old, within what is kept and what the episode has."""
+    return step - wp.min(wp.min(latency, e.position.shape[2] - 1), step)
+
+
+@wp.func
+def shift(
+    e: Estimates, w: int, v: int, at: int, step: int, dt: float, dx: wp.vec3, dv: wp.vec3, turn: wp.vec2
+):
+    """Take in what was learned of control step `at`: offsets, which go on growing until now, and the gyro's bias."""
+    up = wp.quat_rotate_inv(e.quaternion[w, v, step % e.position.shape[2]], wp.vec3(0.0, 0.0, 1.0))
+    e.bias[w, v] = e.bias[w, v] - turn[1] * up
+    e.rate[w, v] = e.rate[w, v] + turn[1] * up
+    for j in range(at, step + 1):
+        k = j % e.position.shape[2]
+        t = float(j - at) * dt
+        e.position[w, v, k] = e.position[w, v, k] + dx + t * dv
+        e.velocity[w, v, k] = e.velocity[w, v, k] + dv
+        e.quaternion[w, v, k] = about_z(turn[0] + t * turn[1]) * e.quaternion[w, v, k]
+
+
+@wp.func
 def take_fix(
-    state: State, arrays: TaskArrays, m: Measurement, e: Estimates, rate: wp.float64, dt: float, seed: int, w: int,
-    v: int,
-):  # fmt: skip
+    state: State, m: Measurement, e: Estimates, rate: wp.float64, dt: float, seed: int, w: int, v: int
+):
     """What was fixed as long ago as fixes take, if any of it has come: of several in a control step the mean."""
     step = state.steps[w]
-    late = lateness(int(wp.rint(m.delay / dt)), step, e.past_position)
-    taken = step - late
-    if taken < 1:
+    at = measured_at(e, int(wp.rint(m.delay / dt)), step)
+    if at < 1:
         return
-    key = sample_key(seed, FIX, w, v, state.episode[w], taken)
+    key = sample_key(seed, FIX, w, v, state.episode[w], at)
     came = float(0.0)
-    for i in range(samples_until(rate, taken) - samples_until(rate, taken - 1)):
+    for i in range(samples_until(rate, at) - samples_until(rate, at - 1)):
         if wp.randf(wp.rand_init(int(key), DROPOUT + i)) >= m.dropout:
             came += 1.0
     if came == 0.0:
         return
     x = state.position[w, v]
     q = state.quaternion[w, v]
-    seen = arrays.position[w, v]
-    heading = arrays.quaternion[w, v]
-    if late > 0:
-        true = state.history[(taken - 1) % wp.static(HISTORY), w, v]
+    if at < step:
+        true = state.history[(at - 1) % wp.static(HISTORY), w, v]
         x = wp.vec3(true[0], true[1], true[2])
         q = wp.quat(true[3], true[4], true[5], true[6])
-        k = taken % e.past_position.shape[2]
-        seen = e.past_position[w, v, k]
-        heading = e.past_quaternion[w, v, k]
+    k = at % e.position.shape[2]
     begun = sample_key(seed, FIX, w, v, state.episode[w], 0)
     fewer = 1.0 / wp.sqrt(came)
-    off = x + m.position_bias * normal3(begun, TURN_ON) + fewer * m.position_std * normal3(key, WHITE) - seen
+    lasting = m.position_bias * normal3(begun, TURN_ON)
+    off = x + lasting + fewer * m.position_std * normal3(key, WHITE) - e.position[w, v, k]
     angle = m.yaw_bias * normal(begun, TURN_ON_2) + fewer * m.yaw_std * normal(key, WHITE_2)
-    turn_off = turn_about_z(about_z(angle) * q, heading)
+    turn_off = turn_about_z(about_z(angle) * q, e.quaternion[w, v, k])
     R = counted(fewer * m.position_std, 0.0)
-    K = value_gain(e.plane[w, v], R)
-    gain, push = wp.vec3(K[0], K[0], 0.0), wp.vec3(K[1], K[1], 0.0)
+    A = value_gain(e.plane[w, v], R)
+    B = wp.vec2(0.0, 0.0)
     e.plane[w, v] = value_known(e.plane[w, v], R)
     if not e.aboard[v].gauge:
-        K = value_gain(e.height[w, v], R)
-        gain, push = wp.vec3(gain[0], gain[0], K[0]), wp.vec3(push[0], push[0], K[1])
+        B = value_gain(e.height[w, v], R)
         e.height[w, v] = value_known(e.height[w, v], R)
     R_yaw = counted(fewer * m.yaw_std, 0.0)
     turn = value_gain(e.yaw[w, v], R_yaw) * turn_off
     e.yaw[w, v] = value_known(e.yaw[w, v], R_yaw)
-    shift(arrays, e, w, v, step, late, dt, wp.cw_mul(gain, off), wp.cw_mul(push, off), turn)
+    dx = wp.cw_mul(wp.vec3(A[0], A[0], B[0]), off)
+    shift(e, w, v, at, step, dt, dx, wp.cw_mul(wp.vec3(A[1], A[1], B[1]), off), turn)
 
 
 @wp.func
-def shift(
-    arrays: TaskArrays, e: Estimates, w: int, v: int, step: int, late: int, dt: float, dx: wp.vec3, dv: wp.vec3,
-    turn: wp.vec2,
-):  # fmt: skip
-    """Take in what was learned of `late` steps ago: of the path since, of now, and of the gyro's bias."""
-    move_past(e, w, v, step, late, dt, dx, dv, turn)
-    t = float(late) * dt
-    arrays.position[w, v] = arrays.position[w, v] + dx + t * dv
-    e.velocity[w, v] = e.velocity[w, v] + dv
-    q = arrays.quaternion[w, v]
-    change = turn[1] * wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
-    e.bias[w, v] = e.bias[w, v] - change
-    e.rate[w, v] = e.rate[w, v] + change
-    arrays.quaternion[w, v] = about_z(turn[0] + t * turn[1]) * q
-
-
-@wp.func
-def take_depth(r: Readings, arrays: TaskArrays, e: Estimates, step: int, dt: float, w: int, v: int):
+def take_depth(r: Readings, e: Estimates, step: int, dt: float, w: int, v: int):
     """A depth that has come: of the gauge's port, -z - (R r)_z."""
-    late = lateness(r.gauge_samples.timing[v].latency, step, e.past_position)
-    z = arrays.position[w, v][2]
-    q = arrays.quaternion[w, v]
-    if late > 0:
-        k = (step - late) % e.past_position.shape[2]
-        z = e.past_position[w, v, k][2]
-        q = e.past_quaternion[w, v, k]
+    at = measured_at(e, r.gauge_samples.timing[v].latency, step)
+    k = at % e.position.shape[2]
     gauge = r.gauge_errors[w, v]
-    off = -r.gauge.depth[w, v] - wp.quat_rotate(q, gauge.r)[2] - z
-    R = counted(gauge.noise, gauge.quantum)
+    port = wp.quat_rotate(e.quaternion[w, v, k], gauge.position)
+    off = -r.gauge.depth[w, v] - port[2] - e.position[w, v, k][2]
+    R = counted(gauge.noise_std, gauge.quantisation)
     K = value_gain(e.height[w, v], R) * off
     e.height[w, v] = value_known(e.height[w, v], R)
-    shift(
-        arrays, e, w, v, step, late, dt, wp.vec3(0.0, 0.0, K[0]), wp.vec3(0.0, 0.0, K[1]), wp.vec2(0.0, 0.0)
-    )
+    dx = wp.vec3(0.0, 0.0, K[0])
+    shift(e, w, v, at, step, dt, dx, wp.vec3(0.0, 0.0, K[1]), wp.vec2(0.0, 0.0))
 
 
 @wp.func
-def take_velocity(r: Readings, arrays: TaskArrays, e: Estimates, step: int, dt: float, w: int, v: int):
+def take_velocity(r: Readings, e: Estimates, step: int, dt: float, w: int, v: int):
     """A velocity of the DVL that has come: of the body's origin, v = R_bs z - ω × r, in world axes."""
-    late = lateness(r.dvl_samples.timing[v].latency, step, e.past_position)
-    speed = e.velocity[w, v]
-    q = arrays.quaternion[w, v]
-    if late > 0:
-        k = (step - late) % e.past_position.shape[2]
-        speed = e.past_velocity[w, v, k]
-        q = e.past_quaternion[w, v, k]
+    at = measured_at(e, r.dvl_samples.timing[v].latency, step)
+    k = at % e.position.shape[2]
     dvl = r.dvl_errors[w, v]
-    own = wp.quat_rotate(dvl.q_bs, r.dvl.velocity[w, v]) - wp.cross(e.rate[w, v], dvl.r)
-    off = wp.quat_rotate(q, own) - speed
-    R = counted(dvl.noise, dvl.quantum) + dvl.turn_on * dvl.turn_on
+    own = wp.quat_rotate(dvl.orientation, r.dvl.velocity[w, v]) - wp.cross(e.rate[w, v], dvl.position)
+    off = wp.quat_rotate(e.quaternion[w, v, k], own) - e.velocity[w, v, k]
+    R = counted(dvl.noise_std, dvl.quantisation) + dvl.bias_initial * dvl.bias_initial
     A = rate_gain(e.plane[w, v], R)
     B = rate_gain(e.height[w, v], R)
     e.plane[w, v] = rate_known(e.plane[w, v], R)
     e.height[w, v] = rate_known(e.height[w, v], R)
     dx = wp.cw_mul(wp.vec3(A[0], A[0], B[0]), off)
-    shift(arrays, e, w, v, step, late, dt, dx, wp.cw_mul(wp.vec3(A[1], A[1], B[1]), off), wp.vec2(0.0, 0.0))
+    shift(e, w, v, at, step, dt, dx, wp.cw_mul(wp.vec3(A[1], A[1], B[1]), off), wp.vec2(0.0, 0.0))
 
 
 @wp.kernel(enable_backward=False)
 def estimate(
-    state: State,
-    arrays: TaskArrays,
-    seen: wp.array2d(dtype=Measurement),
-    r: Readings,
-    e: Estimates,
-    rate: wp.float64,
-    dt: float,
-    seed: int,
-    mask: wp.array(dtype=int),
-    starting: bool,
-    world_offset: int,
-):
+    state: State, arrays: TaskArrays, seen: wp.array2d(dtype=Measurement), r: Readings, e: Estimates, rate: wp.float64,
+    dt: float, seed: int, mask: wp.array(dtype=int), starting: bool, world_offset: int,
+):  # fmt: skip
     """What is known of every vehicle: after a control step of all, or where an episode starts and mask is not 0."""
     i, v = wp.tid()
     w = world_offset + i
     if mask[w] == 0 or state.frozen[w] != 0:
         return
     step = state.steps[w]
+    has_fixes = rate > wp.float64(0.0)
     if starting:
-        begin(state, arrays, seen[w, v], r, e, rate > wp.float64(0.0), seed, w, v)
+        begin(state, seen[w, v], r, e, has_fixes, seed, w, v)
     else:
-        go_on(r, arrays, e, dt, w, v)
-        if rate > wp.float64(0.0):
-            take_fix(state, arrays, seen[w, v], e, rate, dt, seed, w, v)
+        go_on(r, e, step, dt, w, v)
+        if has_fixes:
+            take_fix(state, seen[w, v], e, rate, dt, seed, w, v)
         if r.gauge_errors.shape[0] > 0 and r.gauge_samples.fresh[w, v]:
-            take_depth(r, arrays, e, step, dt, w, v)
+            take_depth(r, e, step, dt, w, v)
         if r.dvl_errors.shape[0] > 0 and r.dvl_samples.fresh[w, v]:
-            take_velocity(r, arrays, e, step, dt, w, v)
-    x = arrays.position[w, v]
-    q = arrays.quaternion[w, v]
-    speed = e.velocity[w, v]
-    arrays.velocity[w, v] = join(wp.quat_rotate_inv(q, speed), e.rate[w, v])
-    k = step % e.past_position.shape[2]
-    e.past_position[w, v, k] = x
-    e.past_velocity[w, v, k] = speed
-    e.past_quaternion[w, v, k] = q
+            take_velocity(r, e, step, dt, w, v)
+    k = step % e.position.shape[2]
+    q = e.quaternion[w, v, k]
+    arrays.position[w, v] = e.position[w, v, k]
+    arrays.quaternion[w, v] = q
+    arrays.velocity[w, v] = join(wp.quat_rotate_inv(q, e.velocity[w, v, k]), e.rate[w, v])
 
 
 class SensingBatch:
@@ -517,32 +479,23 @@ class SensingBatch:
             floor_depth=floor_depth,
         )  # fmt: skip
         self._rate = sensing.rate * dt
-        self.readings = self._readings()
-        delay = LONGEST_DELAY if drawn else sensing.fixes.delay
-        slow = [
-            b.sampling.timing.numpy()["latency"].max()
-            for b in (self.suite.depth, self.suite.dvl)
-            if b is not None
-        ]
-        late = min(max(round(delay / dt), *slow, 0) if slow else round(delay / dt), HISTORY - 1)
-        shape, device = (simulator.worlds, len(simulator.vehicles)), simulator.device
-        self.estimates = e = Estimates()
-        for name in ("velocity", "bias", "rate", "plane", "height", "yaw"):
-            setattr(e, name, wp.zeros(shape, dtype=wp.vec3, device=device))
-        for name, dtype in (("position", wp.vec3), ("velocity", wp.vec3), ("quaternion", wp.quat)):
-            setattr(e, f"past_{name}", wp.zeros((*shape, late + 1), dtype=dtype, device=device))
-        e.aboard = wp.array(
-            [_aboard(one, sensing, dt) for one in simulator.vehicles], dtype=Aboard, device=device
-        )
-
-    def _readings(self) -> Any:
-        r = Readings()
+        self.readings, slow = Readings(), [0]
         for name, batch in (("imu", self.suite.imu), ("gauge", self.suite.depth), ("dvl", self.suite.dvl)):
             if batch is not None:
-                setattr(r, name, batch.arrays)
-                setattr(r, f"{name}_errors", batch.parameters)
-                setattr(r, f"{name}_samples", batch.sampling)
-        return r
+                setattr(self.readings, name, batch.arrays)
+                setattr(self.readings, f"{name}_errors", batch.parameters)
+                setattr(self.readings, f"{name}_samples", batch.sampling)
+                if name != "imu":
+                    slow.append(int(batch.sampling.timing.numpy()["latency"].max()))
+        delay = LONGEST_DELAY if drawn else sensing.fixes.delay
+        late = min(max(round(delay / dt), *slow), HISTORY - 1)
+        vehicles, past = len(simulator.vehicles), (len(simulator.vehicles), late + 1)
+        self.estimates = allocated(
+            Estimates, simulator.worlds, simulator.device, position=past, velocity=past, quaternion=past,
+            bias=vehicles, rate=vehicles, plane=vehicles, height=vehicles, yaw=vehicles,
+        )  # fmt: skip
+        aboard = [_aboard(one, sensing, dt) for one in simulator.vehicles]
+        self.estimates.aboard = wp.array(aboard, dtype=Aboard, device=simulator.device)
 
     def add(self, pipeline: Pipeline, seed: int, mask: wp.array | None = None) -> None:
         """Append what comes after a control step; or where an episode starts, in the worlds where mask is not 0."""
@@ -563,10 +516,9 @@ class SensingBatch:
             vehicles=count,
         )  # fmt: skip
 
-    def arrays(self) -> Iterator[tuple[str, Any]]:
-        """Structs of all that decides what is seen next, by name; parameters that `suite` was given are not in it."""
-        yield "estimates", self.estimates
-        yield "readings", self.readings
+    def structs(self) -> dict[str, Any]:
+        """All that decides what is seen next, by name; parameters that `suite` was given are not in it."""
+        return {"estimates": self.estimates, "readings": self.readings}
 
 
 def _aboard(vehicle: Vehicle, sensing: Sensing, dt: float) -> Any:

@@ -1,51 +1,27 @@
 """T1, station keeping: reach a pose in the pool and hold it within 0.10 m per axis and 10° (paper, section IV)."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import warp as wp
 
-from finssim.engine import Pool
 from finssim.engine.state import State
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.fitting import Fit, fit
+from finssim.tasks.fitting import PoolTask
 from finssim.tasks.measurement import MeasurementNoise
-from finssim.tasks.task import ObservationPart, Task
-from finssim.tasks.terms import (
-    End,
-    RewardTerm,
-    Terms,
-    action_change,
-    action_effort,
-    attitude_error,
-    goal_columns,
-    goal_offset,
-    length,
-    linear_velocity,
-    out_of_pool,
-    straight,
-    tilted,
-    turn_rates,
-    turning,
-    uniform3,
-)
-from finssim.vehicles import Vehicle
+from finssim.tasks.terms import End, ObservationPart, RewardTerm, Terms, own_velocity, tilted, uniform3
 
 DISTANCE_SCALE = 3.0
 """Distances are divided by this in the observation [m]."""
-VELOCITY_CLIP = 2.0
-"""Velocities are clipped here in the observation [m/s, rad/s]."""
 
 OBSERVATION = (
     ObservationPart("goal offset, body frame", 3, "m", scale=DISTANCE_SCALE, term="offset", errors=(0, 1, 2)),
     ObservationPart(
-        "goal rotation relative to the body, first two columns", 6, "1", term=goal_columns, errors=(1,)
+        "goal rotation relative to the body, first two columns", 6, "1", term="goal_columns", errors=(1,)
     ),
-    ObservationPart("linear velocity, body frame", 3, "m/s", clip=VELOCITY_CLIP, term=linear_velocity),
-    ObservationPart("angular velocity, body frame", 3, "rad/s", clip=VELOCITY_CLIP, term=turn_rates),
-    ObservationPart("distance to the goal", 1, "m", scale=DISTANCE_SCALE, clip=1.0, term=length),
+    *own_velocity(clip=2.0),
+    ObservationPart("distance to the goal", 1, "m", scale=DISTANCE_SCALE, clip=1.0, term="wp.length(offset)"),
 )
 
 
@@ -73,18 +49,6 @@ class Reward:
     change: float = 0.05
     rate: float = 0.01
     loss: float = 10.0
-
-
-@wp.func
-def position_error(state: State, arrays: TaskArrays, w: int) -> float:
-    """e = |p* - p| [m]."""
-    return wp.length(arrays.goal_position[w] - state.position[w, 0])
-
-
-@wp.func
-def near(p: Any, e: float) -> float:
-    """exp(-e / position_scale)."""
-    return wp.exp(-e / (p.fit.size * p.reward.position_scale))
 
 
 @wp.func
@@ -130,7 +94,7 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 
 
 @dataclass(frozen=True, kw_only=True)
-class StationKeeping(Task):
+class StationKeeping(PoolTask):
     """T1. Lengths in metres, angles in radians, world frame with z up and 0 on the water.
 
     A longer vehicle has goals, starts and pool `fit.size` times as large; the tolerance stays.
@@ -141,25 +105,13 @@ class StationKeeping(Task):
     needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
     name: str = "t1"
     observation: tuple[ObservationPart, ...] = OBSERVATION
-    fit: Fit = Fit()
-    """Of lengths to the vehicle; the environment sets it."""
     goal_low: tuple[float, float, float] = (-1.2, -0.5, -0.82)
     """Goals are uniform in this box; yaw is uniform over the circle, roll and pitch are level."""
     goal_high: tuple[float, float, float] = (1.2, 0.5, -0.28)
-    spawn_low: tuple[float, float, float] = (-1.4, -0.6, -0.80)
-    spawn_high: tuple[float, float, float] = (1.4, 0.6, -0.20)
-    tilt: float = math.radians(20.0)
-    """Largest roll and pitch at the start."""
     speed: float = 0.30
     """Largest starting speed per axis [m/s]."""
     rate: float = 0.35
     """Largest starting turn rate per axis [rad/s]."""
-    bounds: tuple[float, float] = (2.5, 1.5)
-    """Leaving |x|, |y| beyond these ends the episode."""
-    ceiling: float = 0.3
-    """So does rising above this height."""
-    depth: float = 1.5
-    """So does sinking below this depth."""
     tolerance: float = 0.10
     """Success: every axis within this ..."""
     yaw_tolerance: float = math.radians(10.0)
@@ -172,14 +124,6 @@ class StationKeeping(Task):
     )
     """About what an estimate is off by, and how late it comes: with exact states, gains are learnt that chatter."""
 
-    def fitted(self, vehicles: Sequence[Vehicle]) -> "StationKeeping":
-        """As large as suits the vehicle."""
-        return replace(self, fit=fit(vehicles[0]))
-
-    def arena(self) -> Pool:
-        """See `Fit.pool`."""
-        return self.fit.pool()
-
     def success_rule(self) -> str:
         """See `Task`."""
         turn = math.degrees(self.yaw_tolerance)
@@ -190,17 +134,17 @@ class StationKeeping(Task):
         r = self.reward
         return Terms(
             start=start,
-            shared={"e": position_error, "theta": attitude_error},
-            seen={"offset": goal_offset},
+            shared={"e": "position_error", "theta": "attitude_error"},
+            seen={"offset": "goal_offset"},
             rewards=(
-                RewardTerm("position", near, r.position),
+                RewardTerm("position", "wp.exp(-e / (p.fit.size * p.reward.position_scale))", r.position),
                 RewardTerm("distance", "e", -r.distance / self.fit.size),
-                RewardTerm("heading", straight, r.heading),
+                RewardTerm("heading", "wp.exp(-theta / p.reward.heading_scale)", r.heading),
                 RewardTerm("turn", "theta", -r.turn),
-                RewardTerm("action", action_effort, -r.action),
-                RewardTerm("change", action_change, -r.change),
-                RewardTerm("rate", turning, -r.rate),
+                RewardTerm("action", "action_effort", -r.action),
+                RewardTerm("change", "action_change", -r.change),
+                RewardTerm("rate", "turning", -r.rate),
             ),
-            ends=(End("left", out_of_pool, -r.loss),),
+            ends=(End("left", "out_of_pool", -r.loss),),
             inside=within_tolerance,
         )

@@ -1,10 +1,11 @@
 """What a task is: what is seen, done and paid for, as terms, and how long an episode takes."""
 
+import ast
 import hashlib
 import inspect
 import itertools
 import linecache
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from functools import cache
 from types import UnionType
@@ -18,30 +19,14 @@ from finssim.control.policy import ObservationEntry, ObservationSchema
 from finssim.engine import Dock, Pool
 from finssim.engine.launch import Pipeline
 from finssim.engine.state import State
-from finssim.tasks.arrays import TaskArrays
+from finssim.tasks import terms as library
+from finssim.tasks.arrays import TaskArrays, allocated
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.measurement import MeasurementNoise
-from finssim.tasks.terms import Terms, close_episode, open_episode, remember_actions, report_frozen
+from finssim.tasks.terms import ObservationPart, Terms
 from finssim.vehicles import Vehicle
 
 __all__ = ["Kernels", "kernels_of", "settings_of"]
-
-
-@dataclass(frozen=True)
-class ObservationPart:
-    """A named run of numbers in the observation: value / scale, then limited to ±clip."""
-
-    name: str
-    size: int
-    unit: str
-    scale: float = 1.0
-    clip: float | None = None
-    term: Any = field(default=None, repr=False)
-    """What gives the value, from what is measured: a float, or a vector of `size`. None in a task in plain torch."""
-    index: int = 0
-    """The term's argument `k`: of which team-mate, how far ahead, ..."""
-    errors: tuple[int, ...] = ()
-    """Which of its numbers are 0 where the task wants the vehicle: what an integral may collect."""
 
 
 class Batch(NamedTuple):
@@ -161,6 +146,28 @@ class Task:
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """Give `arrays` what only this task uses; nothing unless the task says so."""
 
+    def arrays(self, worlds: int, action_size: int, device: wp.Device) -> TaskArrays:
+        """Zero arrays of the right size; the measured ones are left for the environment to fill or alias.
+
+        Args:
+            worlds: How many.
+            action_size: Numbers in the action of a vehicle.
+            device: Where.
+        """
+        agents, totals, earned = len(self.agents), len(self.totals), len(self.earnings)
+        observation, action = agents * self.observation_size, agents * action_size
+        out: TaskArrays = allocated(
+            TaskArrays, worlds, device, action=action, previous_action=action, observation=observation,
+            final_observation=observation, scripted=len(self.others) * action_size, agent_reward=agents, totals=totals,
+            final_totals=totals, earned=earned, final_earned=earned,
+        )  # fmt: skip
+        out.action_size = action_size
+        if agents == 1:
+            out.reward = out.agent_reward.reshape(worlds)
+        out.goal_quaternion.fill_(wp.quat(0.0, 0.0, 0.0, 1.0))
+        self.allocate(out, worlds, device)
+        return out
+
     def success_rule(self) -> str:
         """What counts as a success, with its numbers, in a few words."""
         hold = getattr(self, "hold", None)
@@ -222,7 +229,8 @@ class Task:
 # The kernels of a task, written from its terms; and the struct of its settings that they take.
 #
 # Each stage of an episode is one kernel for all tasks but for the terms that it calls: what every task does at the
-# start, in each step and at the end of an episode stands here once. A term is called by the names of its arguments:
+# start, in each step and at the end of an episode stands here once. A term is called by the names of its arguments, or
+# written out, if it is an expression, with these names in it:
 #
 #     state   the truth                           a     number of the agent; a reward without it is the team's
 #     arrays  what is measured, wanted, counted   k     the index given with the term
@@ -230,7 +238,8 @@ class Task:
 #     w       number of the world                 seed  of all draws
 #
 # and after a step any of the task's totals by its name, as it was before, `was` for the total's own, and `held`: the
-# time within the tolerance of success without a break [s]; and whatever the task shares between its terms, by name.
+# time within the tolerance of success without a break [s]; and whatever the task shares between its terms, by name. A
+# function of `finssim.tasks.terms` stands in an expression for what it gives.
 
 
 APART = ("name", "observation", "training_noise", "communication")
@@ -240,22 +249,29 @@ VECTORS = {
     (int, 2): wp.vec2i, (int, 3): wp.vec3i, (int, 4): wp.vec4i,
 }  # fmt: skip
 """What a tuple of so many numbers is in a kernel."""
+STAGES = {
+    "evaluate": "state: State, arrays: TaskArrays, p: P, weights: W, world_offset: int",
+    "spawn": "state: State, arrays: TaskArrays, p: P, seed: int, mask: wp.array(dtype=int), world_offset: int",
+    "observe": "arrays: TaskArrays, p: P, mask: wp.array(dtype=int), world_offset: int",
+    "command": "state: State, arrays: TaskArrays, p: P, seed: int, world_offset: int",
+}
+"""The kernels and what they take."""
+KEY = "seed + 15485863 * state.episode[w]"
 
 
-@dataclass(frozen=True)
-class Kernels:
-    """The stages of a task's episodes, each over worlds."""
+class Kernels(NamedTuple):
+    """The stages of a task's episodes, each over worlds; see `STAGES`."""
 
-    evaluate: wp.Kernel
-    """(state, arrays, p, weights, world_offset), after each step."""
-    spawn: wp.Kernel
-    """(state, arrays, p, seed, mask, world_offset), where an episode starts."""
-    observe: wp.Kernel
-    """(arrays, p, mask, world_offset), its first observation."""
-    command: wp.Kernel | None
-    """(state, arrays, p, seed, world_offset), before each step, of a task with vehicles of its own."""
     weights: Any
     """Type of the vector of reward weights: of the terms, then of the ends."""
+    evaluate: wp.Kernel
+    """After each step."""
+    spawn: wp.Kernel
+    """Where an episode starts."""
+    observe: wp.Kernel
+    """Its first observation."""
+    command: wp.Kernel | None = None
+    """Before each step, of a task with vehicles of its own."""
 
 
 _made: dict[tuple[Any, ...], Kernels] = {}
@@ -282,102 +298,94 @@ class _Writer:
         self.task, self.terms = task, task.terms()
         self.functions: dict[str, Any] = {}
         """Name in the source -> function."""
-        self._totals = {name: i for i, name in enumerate(task.totals)}
-        self._agents = len(task.agents)
+        self._totals = {name: f"arrays.totals[w, {i}]" for i, name in enumerate(task.totals)}
+        self._agents = f"for a in range({len(task.agents)}):"
 
     def text(self) -> str:
         """All of it."""
-        return "\n\n".join([self._look(), self._evaluate(), self._spawn(), self._observe(), self._command()])
+        stages = {name: getattr(self, f"_{name}")() for name in STAGES}
+        sources = [_function(f"{name}({STAGES[name]})", lines) for name, lines in stages.items() if lines]
+        return "\n".join([_function("look(arrays: TaskArrays, p: P, w: int)", self._look()), *sources])
 
-    def _call(self, function: Any, what: str, **known: str) -> str:
-        """A call of a term, with what it takes by name."""
-        if isinstance(function, str):
-            if function not in known:
-                raise EnvironmentSetupError(
-                    f"task '{self.task.name}': {what} is '{function}', which it does not share"
-                )
-            return known[function]
-        known = {"arrays": "arrays", "p": "p", "w": "w", "a": "a" if self._agents > 1 else "0"} | known
-        taken = []
-        for name in inspect.signature(function.func).parameters:
+    def _value(self, term: Any, role: str, **known: str) -> str:
+        """A term in the source: a call with what it takes by name, or the expression."""
+        known = {name: name for name in ("arrays", "p", "w", "a")} | known
+
+        def value(name: str, whose: str) -> str:
             if name not in known:
                 raise EnvironmentSetupError(
-                    f"task '{self.task.name}': {what} ({function.key}) takes '{name}', expected of: "
-                    f"{', '.join(known)}"
+                    f"task '{self.task.name}': {role}{whose} takes '{name}', expected of: {', '.join(known)}"
                 )
-            taken.append(known[name])
-        own = next(
-            (n for n, f in self.functions.items() if f is function), f"t{len(self.functions)}_{function.key}"
-        )
-        self.functions[own] = function
-        return f"{own}({', '.join(taken)})"
+            return known[name]
 
-    def _stepped(self) -> dict[str, str]:
-        """What a term after a step may take besides."""
-        return {"state": "state", **{name: f"arrays.totals[w, {i}]" for name, i in self._totals.items()}}
+        def call(function: Any) -> str:
+            names = inspect.signature(function.func).parameters
+            taken = ", ".join(value(name, f" ({function.key})") for name in names)
+            label = next(
+                (n for n, f in self.functions.items() if f is function),
+                f"t{len(self.functions)}_{function.key}",
+            )
+            self.functions[label] = function
+            return f"{label}({taken})"
 
-    def _shared(
-        self, functions: Mapping[str, Any], known: dict[str, str]
-    ) -> tuple[list[str], dict[str, str]]:
+        if not isinstance(term, str):
+            return call(term)
+        tree = ast.parse(term, mode="eval")
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Name) and node.id not in ("wp", "float", "int"):
+                function = None if node.id in known else getattr(library, node.id, None)
+                node.id = value(node.id, "") if function is None else call(function)
+        return f"({ast.unparse(tree)})"
+
+    def _shared(self, terms: Mapping[str, Any], known: dict[str, str]) -> tuple[list[str], dict[str, str]]:
         """Lines that compute what terms share, and what is known with it."""
         lines, known = [], dict(known)
-        for name, function in functions.items():
-            lines.append(f"s_{name} = {self._call(function, f'shared {name!r}', **known)}")
+        for name, term in terms.items():
+            lines.append(f"s_{name} = {self._value(term, f'shared {name!r}', **known)}")
             known[name] = f"s_{name}"
         return lines, known
 
-    def _look(self) -> str:
+    def _look(self) -> list[str]:
+        """The observation of every agent."""
         writes, first, size = [], 0, self.task.observation_size
         values, seen = self._shared(self.terms.seen, {})
         for i, part in enumerate(self.task.observation if self.terms.shown else ()):
-            at = f"a * {size} + {first}" if self._agents > 1 else str(first)
-            value = self._call(part.term, f"observation '{part.name}'", **seen, k=str(part.index))
+            value = self._value(part.term, f"observation '{part.name}'", **seen, k=str(part.index))
             number = f"x{i}" if part.size == 1 else f"x{i}[i]"
             if part.scale != 1.0:
                 number = f"{number} / {float(part.scale)!r}"
             if part.clip is not None:
                 number = f"wp.clamp({number}, {-float(part.clip)!r}, {float(part.clip)!r})"
             values.append(f"x{i} = {value}")
-            if part.size == 1:
-                writes.append(f"arrays.observation[w, {at}] = {number}")
-            else:
-                writes += [f"for i in range({part.size}):", f"    arrays.observation[w, {at} + i] = {number}"]
+            loop = f"for i in range({part.size}):"
+            writes += [loop, f"    arrays.observation[w, a * {size} + {first} + i] = {number}"]
             first += part.size
-        return _function("look(arrays: TaskArrays, p: P, w: int)", self._each([*values, *writes]) or ["pass"])
+        return [self._agents, *_indented([*values, *writes] or ["pass"])]
 
-    def _each(self, lines: Sequence[str]) -> list[str]:
-        """Lines for every agent."""
-        if self._agents == 1 or not lines:
-            return list(lines)
-        return [f"for a in range({self._agents}):", *(f"    {line}" for line in lines)]
-
-    def _evaluate(self) -> str:
+    def _evaluate(self) -> list[str]:
         """All terms are computed before anything is written, so that the compiler does what they share only once."""
-        terms = self.terms
-        inside = "False"
-        lines = [
+        terms, known = self.terms, {"state": "state", **self._totals}
+        advance = [] if terms.advance is None else [self._value(terms.advance, "advance", **known)]
+        shared, known = self._shared(terms.shared, known)
+        inside = "False" if terms.inside is None else self._value(terms.inside, "inside", **known)
+        known["held"] = "held"
+        ends = [
+            f"e{i} = {self._value(end.term, f'end {end.name!r}', **known)} and not ended\nended = ended or e{i}"
+            for i, end in enumerate(terms.ends)
+        ]
+        counts, counted = self._counts(known)
+        return [
             "w = world_offset + wp.tid()",
             "if state.frozen[w] != 0:",
             "    report_frozen(state, arrays, w)",
             "    return",
             "t = float(state.steps[w]) * p.control_step",
             "arrays.time[w] = t",
-        ]
-        if terms.advance is not None:
-            lines.append(self._call(terms.advance, "advance", **self._stepped()))
-        shared, known = self._shared(terms.shared, self._stepped())
-        lines += shared
-        if terms.inside is not None:
-            inside = self._call(terms.inside, "inside", **known)
-        known["held"] = "held"
-        lines += [f"held = wp.where({inside}, arrays.held[w] + p.control_step, 0.0)", "ended = bool(False)"]
-        for i, end in enumerate(terms.ends):
-            lines += [
-                f"e{i} = {self._call(end.term, f'end {end.name!r}', **known)} and not ended",
-                f"ended = ended or e{i}",
-            ]
-        counts, counted = self._counts(known)
-        lines += [
+            *advance,
+            *shared,
+            f"held = wp.where({inside}, arrays.held[w] + p.control_step, 0.0)",
+            "ended = bool(False)",
+            *"\n".join(ends).splitlines(),
             "late = t >= p.time_limit - 0.5 * p.control_step",
             *counts,
             *self._rewards(known),
@@ -392,107 +400,82 @@ class _Writer:
             "if ended or late:",
             "    close_episode(state, arrays, w)",
         ]
-        return _function(
-            "evaluate(state: State, arrays: TaskArrays, p: P, weights: W, world_offset: int)", lines
-        )
 
     def _rewards(self, known: Mapping[str, str]) -> list[str]:
         """Every term once, for all agents or for each; what they add up to, and each by itself over the episode."""
-        shared, own, names, each = [], [], [], []
-        for i, term in enumerate(self.terms.rewards):
-            names.append(f"r{i}")
-            line = f"r{i} = weights[{i}] * {self._call(term.term, f'reward {term.name!r}', **known)}"
-            takes = () if isinstance(term.term, str) else inspect.signature(term.term.func).parameters
-            each.append(self._agents > 1 and "a" in takes)
-            (own if each[i] else shared).append(line)
-        for i, _ in enumerate(self.terms.ends):
-            names.append(f"r{len(names)}")
-            each.append(False)
-            shared.append(f"{names[-1]} = weights[{len(names) - 1}] * wp.where(e{i}, 1.0, 0.0)")
-        whole = " + ".join(names) or "0.0"
-        kept = [
-            f"arrays.earned[w, {i}] = arrays.earned[w, {i}] + "
-            + (f"m{i} / {float(self._agents)!r}" if of else name)
-            for i, (name, of) in enumerate(zip(names, each, strict=True))
+        values = [self._value(term.term, f"reward {term.name!r}", **known) for term in self.terms.rewards] + [
+            f"wp.where(e{i}, 1.0, 0.0)" for i, _ in enumerate(self.terms.ends)
         ]
-        if self._agents == 1:
-            return [*shared, f"reward = {whole}", *kept, "arrays.reward[w] = reward"]
-        sums = [i for i, of in enumerate(each) if of]
-        zeros = [f"m{i} = float(0.0)" for i in sums]
+        numbers, count = range(len(values)), float(len(self.task.agents))
+        each = [
+            i for i in numbers if any(getattr(n, "id", "") == "a" for n in ast.walk(ast.parse(values[i])))
+        ]
+        lines = [f"r{i} = weights[{i}] * {values[i]}" for i in numbers]
+        means = [f"m{i} / {count!r}" if i in each else f"r{i}" for i in numbers]
         loop = [
-            *own,
-            f"total = {whole}",
-            *(f"m{i} += r{i}" for i in sums),
+            *(lines[i] for i in each),
+            f"total = {' + '.join(f'r{i}' for i in numbers) or '0.0'}",
+            *(f"m{i} += r{i}" for i in each),
             "arrays.agent_reward[w, a] = total",
-            f"reward += total / {float(self._agents)!r}",
+            f"reward += total / {count!r}",
         ]
-        begin = [*shared, *zeros, "reward = float(0.0)"]
-        return [*begin, *self._each(loop), *kept, "arrays.reward[w] = reward"]
+        return [
+            *(lines[i] for i in numbers if i not in each),
+            *(f"m{i} = float(0.0)" for i in each),
+            "reward = float(0.0)",
+            self._agents,
+            *_indented(loop),
+            *(f"arrays.earned[w, {i}] = arrays.earned[w, {i}] + {mean}" for i, mean in enumerate(means)),
+            "arrays.reward[w] = reward",
+        ]
 
     def _counts(self, known: Mapping[str, str]) -> tuple[list[str], list[str]]:
         """The totals, each from what all were before; then how they are written."""
         values, writes, totals = [], [], self._totals
         if self.task.succeeds == "once":
-            success, time = totals["success"], totals["success_time"]
             writes += [
-                f"if held >= p.hold - 0.5 * p.control_step and arrays.totals[w, {success}] == 0.0:",
-                f"    arrays.totals[w, {success}] = 1.0",
-                f"    arrays.totals[w, {time}] = t",
+                f"if held >= p.hold - 0.5 * p.control_step and {totals['success']} == 0.0:",
+                f"    {totals['success']} = 1.0",
+                f"    {totals['success_time']} = t",
             ]
         for i, total in enumerate(self.terms.totals):
-            place = totals[total.name]
-            own = {"was": f"arrays.totals[w, {place}]", "k": str(total.index)}
-            values.append(f"n{i} = {self._call(total.term, f'total {total.name!r}', **known, **own)}")
-            writes.append(f"arrays.totals[w, {place}] = n{i}")
-        for i, end in enumerate(self.terms.ends):
-            if end.name in totals:
-                writes.append(f"arrays.totals[w, {totals[end.name]}] = wp.where(e{i}, 1.0, 0.0)")
+            local = {"was": totals[total.name], "k": str(total.index)}
+            values.append(f"n{i} = {self._value(total.term, f'total {total.name!r}', **known, **local)}")
+            writes.append(f"{totals[total.name]} = n{i}")
+        ends = enumerate(self.terms.ends)
+        writes += [f"{totals[end.name]} = wp.where(e{i}, 1.0, 0.0)" for i, end in ends if end.name in totals]
         return values, writes
 
-    def _spawn(self) -> str:
+    def _spawn(self) -> list[str]:
         known = {"state": "state", "seed": "seed", "key": "key"}
-        lines = [
-            "w = world_offset + wp.tid()",
-            "if mask[w] == 0:",
-            "    return",
-            "key = seed + 15485863 * state.episode[w]",
-            "open_episode(arrays, w)",
-            self._call(self.terms.start, "start", **known),
-        ]
-        if not all(isinstance(total.first, int | float) for total in self.terms.totals):
+        start = self._value(self.terms.start, "start", **known)
+        firsts = {one.name: one.first for one in self.terms.totals if one.first != 0.0}
+        shared: list[str] = []
+        if not all(isinstance(first, int | float) for first in firsts.values()):
             shared, known = self._shared(self.terms.shared, known)
-            lines += shared
-        for total in self.terms.totals:
-            first = total.first
-            if first != 0.0:
-                value = repr(float(first)) if isinstance(first, int | float) else self._call(
-                    first, f"first of total {total.name!r}", **known
-                )  # fmt: skip
-                lines.append(f"arrays.totals[w, {self._totals[total.name]}] = {value}")
-        head = (
-            "state: State, arrays: TaskArrays, p: P, seed: int, mask: wp.array(dtype=int), world_offset: int"
-        )
-        return _function(f"spawn({head})", lines)
+        for name, first in firsts.items():
+            term = repr(float(first)) if isinstance(first, int | float) else first
+            shared.append(f"{self._totals[name]} = {self._value(term, f'first of total {name!r}', **known)}")
+        head = ["w = world_offset + wp.tid()", "if mask[w] == 0:", "    return"]
+        return [*head, f"key = {KEY}", "open_episode(arrays, w)", start, *shared]
 
-    def _observe(self) -> str:
-        begin = [] if self.terms.begin is None else [f"    {self._call(self.terms.begin, 'begin')}"]
-        lines = ["w = world_offset + wp.tid()", "if mask[w] != 0:", *begin, "    look(arrays, p, w)"]
-        return _function(
-            "observe(arrays: TaskArrays, p: P, mask: wp.array(dtype=int), world_offset: int)", lines
-        )
+    def _observe(self) -> list[str]:
+        begin = [] if self.terms.begin is None else [self._value(self.terms.begin, "begin")]
+        return ["w = world_offset + wp.tid()", "if mask[w] != 0:", *_indented([*begin, "look(arrays, p, w)"])]
 
-    def _command(self) -> str:
+    def _command(self) -> list[str]:
         if self.terms.command is None:
-            return ""
-        known = {"state": "state", "seed": "seed", "key": "(seed + 15485863 * state.episode[w])"}
-        lines = ["w = world_offset + wp.tid()", self._call(self.terms.command, "command", **known)]
-        return _function(
-            "command(state: State, arrays: TaskArrays, p: P, seed: int, world_offset: int)", lines
-        )
+            return []
+        known = {"state": "state", "seed": "seed", "key": f"({KEY})"}
+        return ["w = world_offset + wp.tid()", self._value(self.terms.command, "command", **known)]
+
+
+def _indented(lines: Iterable[str]) -> list[str]:
+    return [f"    {line}" for line in lines]
 
 
 def _function(head: str, lines: Sequence[str]) -> str:
-    return "\n".join([f"def {head}:", *(f"    {line}" for line in lines)]) + "\n"
+    return "\n".join([f"def {head}:", *_indented(lines)]) + "\n"
 
 
 _numbers = itertools.count()
@@ -507,24 +490,21 @@ def _compiled(task: Task, text: str, functions: Mapping[str, Any]) -> Kernels:
         kernels.evaluate.module.name == name for kernels in _made.values()
     ):  # other functions of the same names
         name = f"{name}_{next(_numbers)}"
-    place = f"<kernels of {name}>"
-    linecache.cache[place] = (len(text), None, text.splitlines(keepends=True), place)  # Warp reads the source
+    path = f"<kernels of {name}>"
+    linecache.cache[path] = (len(text), None, text.splitlines(keepends=True), path)  # Warp reads the source
     terms = task.terms()
     W = wp.types.vector(length=max(len(terms.rewards) + len(terms.ends), 1), dtype=float)
     space: dict[str, Any] = {
-        "__name__": name, "wp": wp, "State": State, "TaskArrays": TaskArrays, "P": _struct(kind), "W": W,
-        "open_episode": open_episode, "close_episode": close_episode, "report_frozen": report_frozen,
-        "remember_actions": remember_actions, **functions,
+        **vars(library), "__name__": name, "wp": wp, "State": State, "TaskArrays": TaskArrays, "P": _struct(kind),
+        "W": W, **functions,
     }  # fmt: skip
-    exec(compile(text, place, "exec"), space)
+    exec(compile(text, path, "exec"), space)
     module = wp.get_module(name)
     space["look"] = wp.func(space["look"], module=module)
-    made: list[wp.Kernel] = [
-        wp.kernel(space[stage], enable_backward=False, module=module)
-        for stage in ("evaluate", "spawn", "observe", "command")
-        if stage in space
+    made = [
+        wp.kernel(space[stage], enable_backward=False, module=module) for stage in STAGES if stage in space
     ]
-    return Kernels(made[0], made[1], made[2], made[3] if len(made) > 3 else None, W)
+    return Kernels(W, *made)
 
 
 def settings_of(task: Task) -> Any:
@@ -539,51 +519,36 @@ def settings_of(task: Task) -> Any:
     return _filled(task, task.settings_class(), f"task '{task.name}'")
 
 
-def _filled(one: Any, of: type, whose: str) -> Any:
-    kind = _struct(of)
-    out = kind()
-    for name, hint in _numbers_of(of).items():
+def _filled(one: Any, kind: type, owner: str) -> Any:
+    struct = _struct(kind)
+    out = struct()
+    for name, variable in struct.vars.items():
         value = getattr(one, name)
-        if is_dataclass(hint):
-            if value is None:
-                raise EnvironmentSetupError(f"{whose} is not fitted to vehicles: call fitted([...]) first")
-            value = _filled(value, type(value), whose)
-        elif isinstance(value, tuple):
-            value = kind.vars[name].type(*value)
-        setattr(out, name, value)
+        if value is None:
+            raise EnvironmentSetupError(f"{owner} is not fitted to vehicles: call fitted([...]) first")
+        if is_dataclass(value):
+            value = _filled(value, type(value), owner)
+        setattr(out, name, variable.type(*value) if isinstance(value, tuple) else value)
     return out
 
 
 @cache
 def _struct(kind: type) -> Any:
-    """Warp's struct of a dataclass."""
-    types = {name: _warp_type(hint) for name, hint in _numbers_of(kind).items()}
+    """Warp's struct of what kernels can take of a dataclass; None if that is nothing."""
+    own = _hints(kind)
+    hints = {one.name: own.get(one.name) for one in fields(kind) if one.name not in APART}
+    for name, value in inspect.getmembers(kind, lambda one: isinstance(one, property)):
+        if not hasattr(Task, name) and value.fget is not None:
+            hints[name] = _hints(value.fget).get("return")
+    types = {name: taken for name, hint in hints.items() if (taken := _kernel_type(hint)) is not None}
+    if not types:
+        return None
     made = type(kind.__name__, (), {"__annotations__": types, "__module__": kind.__module__})
     # Classes of one name that functions make are not one class.
     made.__qualname__ = f"{kind.__qualname__}Settings" + (
         str(next(_numbers)) if "<" in kind.__qualname__ else ""
     )
     return wp.struct(made)
-
-
-def _warp_type(hint: Any) -> Any:
-    if is_dataclass(hint):
-        return _struct(hint)  # type: ignore[arg-type]
-    parts = get_args(hint)
-    return VECTORS[parts[0], len(parts)] if parts else hint
-
-
-@cache
-def _numbers_of(kind: type) -> dict[str, Any]:
-    """Names and types of what kernels can take of a dataclass."""
-
-    hints = _hints(kind)
-    found = {one.name: hints.get(one.name) for one in fields(kind) if one.name not in APART}
-    for name, value in inspect.getmembers(kind, lambda one: isinstance(one, property)):
-        if not hasattr(Task, name) and value.fget is not None:
-            found[name] = _return_type(value.fget)
-    taken = {name: _number(hint) for name, hint in found.items()}
-    return {name: hint for name, hint in taken.items() if hint is not None}
 
 
 def _hints(one: Any) -> dict[str, Any]:
@@ -594,18 +559,14 @@ def _hints(one: Any) -> dict[str, Any]:
         return {}
 
 
-def _return_type(function: Callable[..., Any]) -> Any:
-    return _hints(function).get("return")
-
-
-def _number(hint: Any) -> Any:
-    """The type, of a dataclass also where it may be None; None where kernels cannot take it."""
+def _kernel_type(hint: Any) -> Any:
+    """The type in a kernel, of a dataclass also where it may be None; None where kernels cannot take it."""
+    parts = get_args(hint)
     if get_origin(hint) in (Union, UnionType):
-        rest = [one for one in get_args(hint) if one is not type(None)]
-        return rest[0] if len(rest) == 1 and is_dataclass(rest[0]) and _numbers_of(rest[0]) else None
-    if hint in (float, int, bool):
-        return hint
+        rest = [one for one in parts if one is not type(None)]
+        return _struct(rest[0]) if len(rest) == 1 and is_dataclass(rest[0]) else None
     if get_origin(hint) is tuple:
-        parts = get_args(hint)
-        return hint if len(set(parts)) == 1 and (parts[0], len(parts)) in VECTORS else None
-    return hint if isinstance(hint, type) and is_dataclass(hint) and _numbers_of(hint) else None
+        return VECTORS.get((parts[0], len(parts))) if len(set(parts)) == 1 else None
+    if isinstance(hint, type) and is_dataclass(hint):
+        return _struct(hint)
+    return hint if hint in (float, int, bool) else None

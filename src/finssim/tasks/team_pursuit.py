@@ -8,39 +8,30 @@ import warp as wp
 
 from finssim.engine.state import State
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.communication import (
-    Communication,
-    exchange_messages,
-    key_messages,
-    message_table,
-    open_messages,
-)
+from finssim.tasks.communication import exchange_messages, key_messages, open_messages
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.pursuit import (
     CHASE,
-    DriveNumbers,
-    OpenWater,
+    Chase,
     Prey,
+    Team,
+    any_outside,
+    bumps,
     command_prey,
     gap_to,
     mate,
     motion_of,
     nearest_pursuer,
-    outside,
     prey_gap,
-    prey_speed,
     prey_start,
 )
-from finssim.tasks.task import ObservationPart
 from finssim.tasks.terms import (
     End,
+    ObservationPart,
     RewardTerm,
     Terms,
     Total,
-    action_change,
-    action_effort,
     level_direction,
-    one,
     place_at_rest,
 )
 from finssim.vehicles import Vehicle
@@ -56,7 +47,7 @@ is within `proximity` of it. either: net or proximity.
 """
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Level:
     """One step of the published curriculum. Speeds were 0.25, 0.30 and 0.40 m/s, where a pursuer reaches 0.5 m/s."""
 
@@ -82,36 +73,10 @@ class Level:
 
 
 LEVELS = (
-    Level(
-        capture="proximity", proximity=1.5, net_reach=1.0, hold=0.10, prey_speed=0.5, stake=25.0, from_step=0
-    ),
-    Level(
-        capture="net",
-        proximity=1.0,
-        net_reach=1.0,
-        hold=0.10,
-        prey_speed=0.6,
-        stake=25.0,
-        from_step=1_500_000,
-    ),
-    Level(
-        capture="net",
-        proximity=1.0,
-        net_reach=0.8,
-        hold=0.25,
-        prey_speed=0.8,
-        stake=30.0,
-        from_step=4_000_000,
-    ),
-    Level(
-        capture="touch",
-        proximity=1.0,
-        net_reach=0.8,
-        hold=0.25,
-        prey_speed=0.8,
-        stake=30.0,
-        from_step=7_000_000,
-    ),
+    Level("proximity", 1.5, net_reach=1.0, hold=0.10, prey_speed=0.5, stake=25.0, from_step=0),
+    Level("net", 1.0, net_reach=1.0, hold=0.10, prey_speed=0.6, stake=25.0, from_step=1_500_000),
+    Level("net", 1.0, net_reach=0.8, hold=0.25, prey_speed=0.8, stake=30.0, from_step=4_000_000),
+    Level("touch", 1.0, net_reach=0.8, hold=0.25, prey_speed=0.8, stake=30.0, from_step=7_000_000),
 )
 """The published curriculum in three levels, all of which the formation baseline masters, and the task: one more."""
 
@@ -214,12 +179,6 @@ def net_gap(state: State, p: Any, w: int) -> float:
 
 
 @wp.func
-def agent_gap(state: State, w: int) -> float:
-    """Distance from the prey to the nearest agent [m]."""
-    return nearest_pursuer(state, AGENTS, w)
-
-
-@wp.func
 def missing(p: Any, net: float, near: float) -> float:
     """How much nearer the prey must come to be captured, by the mode's rule [m]; 0: it is near enough."""
     by_net = net - p.rules.net_reach
@@ -235,24 +194,12 @@ def missing(p: Any, net: float, near: float) -> float:
 
 
 @wp.func
-def capture_gap(p: Any, net: float, near: float) -> float:
-    """What is missing for a capture now [m]."""
-    return missing(p, net, near)
-
-
-@wp.func
 def gained(p: Any, gap_now: float, to_net: float, to_agent: float) -> float:
     """Way gained towards a capture in this step [m].
 
     What was missing by the rules of now: a level that rises under a running episode is no way gained or lost.
     """
     return missing(p, to_net, to_agent) - gap_now
-
-
-@wp.func
-def far(gap_now: float) -> float:
-    """min(what is missing / 8 m, 1)."""
-    return wp.min(gap_now / 8.0, 1.0)
 
 
 @wp.func
@@ -279,22 +226,6 @@ def misfit(state: State, p: Any, w: int, a: int) -> float:
 
 
 @wp.func
-def bumps(state: State, arrays: TaskArrays, p: Any, w: int, a: int) -> float:
-    """Agents nearer than `collision`."""
-    count = float(0.0)
-    for b in range(arrays.agent_reward.shape[1]):
-        if b != a and wp.length(state.position[w, b] - state.position[w, a]) < p.collision:
-            count += 1.0
-    return count
-
-
-@wp.func
-def in_net(p: Any, net: float) -> bool:
-    """The prey within the net's reach."""
-    return net <= p.rules.net_reach
-
-
-@wp.func
 def is_captured(p: Any, net: float, near: float, held: float) -> bool:
     """By the mode's rule; the net of modes net and either must have it for `hold`, without a break."""
     netted = held > 0.0 and held >= p.rules.hold - 0.1 * p.control_step
@@ -304,28 +235,6 @@ def is_captured(p: Any, net: float, near: float, held: float) -> bool:
     if p.rules.mode >= 2 and near <= p.rules.proximity:
         caught = True
     return caught
-
-
-@wp.func
-def any_outside(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
-    """An agent is out of bounds."""
-    out = bool(False)
-    for a in range(arrays.agent_reward.shape[1]):
-        if outside(state, p, w, a):
-            out = True
-    return out
-
-
-@wp.func
-def closest(near: float, was: float) -> float:
-    """Smallest distance from the prey to an agent so far [m]."""
-    return wp.min(was, near)
-
-
-@wp.func
-def closest_to_net(net: float, was: float) -> float:
-    """Smallest distance from the prey to the net so far [m]."""
-    return wp.min(was, net)
 
 
 @wp.func
@@ -347,20 +256,15 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TeamPursuit(OpenWater):
+class TeamPursuit(Team, Chase):
     """3-v-1 pursuit. What counts as a capture, the prey's speed and the stake are the level's, unless given here."""
 
     agents: ClassVar[tuple[str, ...]] = ("herder", "left_netter", "right_netter")
-    others: ClassVar[tuple[str, ...]] = ("prey",)
-    succeeds: ClassVar[str] = "captured"
     levels: ClassVar[int] = len(LEVELS)
-    moving: ClassVar[bool] = True
     title: ClassVar[str] = "drive a prey into a net, three against one"
-    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
     name: str = "team-pursuit"
     observation: tuple[ObservationPart, ...] = field(default=OBSERVATION, repr=False)
     spawn_radius: float = 1.5
-    time_limit: float = 60.0
     level: int = 3
     """Which of `LEVELS`."""
     capture: str | None = None
@@ -376,23 +280,11 @@ class TeamPursuit(OpenWater):
     """A net stretched farther than this does not catch [m]."""
     net_height: float = 1.0
     """[m]"""
-    collision: float = 0.6
-    """Agents nearer to each other than this bump [m]; nothing stops them."""
     prey: Prey = field(default_factory=lambda: Prey(mode="hybrid"))
-    """What the prey does; it sees all three."""
     nearest: float = 3.5
-    """The prey starts this far from the middle of the team ..."""
-    farthest: float = 5.0
-    """... to this far."""
-    communication: Communication | None = None
-    """How agents know of each other; None: everybody sees everybody."""
     reward: TeamReward = field(default_factory=TeamReward)
-    speed: float = 0.0
-    """Speed of the prey [m/s]: follows from the vehicles."""
     prey_radius: float = 0.0
     """Of its hull, level [m]: follows from its vehicle."""
-    prey_drive: DriveNumbers | None = field(default=None, repr=False)
-    """What its thrusters do: follows from its vehicle."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.level < len(LEVELS):
@@ -412,16 +304,8 @@ class TeamPursuit(OpenWater):
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "TeamPursuit":
         """The prey's speed, size and thrust from the vehicles: herder, netters, prey."""
-        prey = vehicles[-1]
-        speed = prey_speed(self.rules.prey_speed, vehicles[:-1], prey)
-        radius = 0.25 * (prey.body.size[0] + prey.body.size[1])
-        return replace(self, speed=speed, prey_radius=float(radius), prey_drive=DriveNumbers.of(prey))
-
-    def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
-        """Room for the messages, if there are any."""
-        arrays.messages = message_table(
-            self.communication, worlds, len(self.agents), self.control_step, 2.0 * self.bounds, device
-        )
+        size = vehicles[-1].body.size
+        return self.chased(self.rules.prey_speed, vehicles, prey_radius=float(0.25 * (size[0] + size[1])))
 
     def success_rule(self) -> str:
         """See `Task`."""
@@ -444,23 +328,23 @@ class TeamPursuit(OpenWater):
             advance=exchange_messages,
             command=command_prey,
             seen={"gap": prey_gap},
-            shared={"net": net_gap, "near": agent_gap, "gap_now": capture_gap},
+            shared={"net": net_gap, "near": nearest_pursuer, "gap_now": missing},
             rewards=(
                 RewardTerm("progress", gained, r.progress),
-                RewardTerm("distance", far, -r.distance),
-                RewardTerm("step", one, -r.step),
+                RewardTerm("distance", "wp.min(gap_now / 8.0, 1.0)", -r.distance),
+                RewardTerm("step", "1.0", -r.step),
                 RewardTerm("drive", driving, r.drive),
                 RewardTerm("stray", straying, -r.stray),
                 RewardTerm("spread", misfit, -r.spread),
                 RewardTerm("bump", bumps, -r.bump),
-                RewardTerm("action", action_effort, -r.action),
-                RewardTerm("change", action_change, -r.change),
+                RewardTerm("action", "action_effort", -r.action),
+                RewardTerm("change", "action_change", -r.change),
             ),
             ends=(End("captured", is_captured, stake), End("left", any_outside, -stake)),
-            inside=in_net,
+            inside="net <= p.rules.net_reach",
             totals=(
-                Total("closest", closest, first="near"),
-                Total("closest_to_net", closest_to_net, first="net"),
+                Total("closest", "wp.min(was, near)", first="near"),
+                Total("closest_to_net", "wp.min(was, net)", first="net"),
                 Total("gap", "gap_now", first="gap_now"),
                 Total("to_net", "net", first="net"),
                 Total("to_agent", "near", first="near"),

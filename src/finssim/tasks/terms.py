@@ -1,7 +1,9 @@
-"""Terms: small functions of which a task is made, each with a name; and those that tasks share.
+"""Terms: the small functions and expressions of which a task is made, each with a name; and those that tasks share.
 
-A term is a `wp.func` whose arguments are told by their names; see `finssim.tasks.task`. What a policy sees comes
-from `arrays`, which holds what is measured; what it is paid for and how an episode ends comes from `state`, the truth.
+A term is a `wp.func`, which takes its arguments by their names, or an expression of the same names as text, such as
+`"wp.exp(-e / p.scale)"`; in an expression the functions of this module stand for themselves, without arguments. See
+`finssim.tasks.task` for the names. What a policy sees comes from `arrays`, which holds what is measured; what it is
+paid for and how an episode ends comes from `state`, the truth.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,12 +18,29 @@ from finssim.tasks.arrays import TaskArrays
 
 
 @dataclass(frozen=True)
+class ObservationPart:
+    """A named run of numbers in the observation: value / scale, then limited to ±clip."""
+
+    name: str
+    size: int
+    unit: str
+    scale: float = 1.0
+    clip: float | None = None
+    term: Any = field(default=None, repr=False)
+    """What gives the value, from what is measured: a float, or a vector of `size`. None in a task in plain torch."""
+    index: int = 0
+    """The term's argument `k`: of which team-mate, how far ahead, ..."""
+    errors: tuple[int, ...] = ()
+    """Which of its numbers are 0 where the task wants the vehicle: what an integral may collect."""
+
+
+@dataclass(frozen=True)
 class RewardTerm:
     """A part of the reward of every step: weight times what the term gives."""
 
     name: str
     term: Any
-    """-> float; with an argument `a`, of that agent, otherwise of all together. Or the name of what is shared."""
+    """-> float; of one that takes `a`, of that agent, otherwise of all together."""
     weight: float
 
 
@@ -42,9 +61,9 @@ class Total:
 
     name: str
     term: Any
-    """-> float: the total after a step; its argument `was` is the total before. Or the name of what is shared."""
+    """-> float: the total after a step; `was` is the total before."""
     first: Any = 0.0
-    """Where an episode starts: a number, a function of the start, or the name of what is shared."""
+    """Where an episode starts: a number, or a term of the start."""
     index: int = 0
     """The term's argument `k`."""
 
@@ -65,9 +84,9 @@ class Terms:
     begin: Any = None
     """What is done before the first observation, when the start has been measured."""
     shared: Mapping[str, Any] = field(default_factory=dict)
-    """Of which several terms are made: name -> function of the truth, once a step; terms take it by an argument."""
+    """Of which several terms are made: name -> term of the truth, once a step; the terms take it by that name."""
     seen: Mapping[str, Any] = field(default_factory=dict)
-    """The same for observation terms: name -> function of what is measured, once for each agent."""
+    """The same for observation terms: name -> term of what is measured, once for each agent."""
     shown: bool = True
     """Whether the observation is written by the terms of its parts; False: the task writes it by itself."""
     command: Any = None
@@ -139,6 +158,18 @@ def tilted(roll: float, pitch: float, yaw: float) -> wp.quat:
 
 
 @wp.func
+def start_upright(state: State, w: int, rng: wp.uint32, tilt: float, speed: float):
+    """Any heading, a roll and a pitch up to a tilt [rad], and a velocity up to a speed per axis [m/s], drawn."""
+    roll = wp.randf(rng, -tilt, tilt)
+    pitch = wp.randf(rng, -tilt, tilt)
+    state.quaternion[w, 0] = tilted(roll, pitch, wp.randf(rng, -3.14159265, 3.14159265))
+    nu = vec6()
+    for k in range(3):
+        nu[k] = wp.randf(rng, -speed, speed)
+    state.velocity[w, 0] = nu
+
+
+@wp.func
 def level_direction(angle: float) -> wp.vec3:
     """Unit vector at an angle [rad] from the world's x axis, counter-clockwise from above, world frame."""
     return wp.vec3(wp.cos(angle), wp.sin(angle), 0.0)
@@ -175,16 +206,16 @@ def angular_velocity(state: State, w: int) -> wp.vec3:
 
 
 @wp.func
+def position_error(state: State, arrays: TaskArrays, w: int) -> float:
+    """From vehicle 0 to its goal [m]."""
+    return wp.length(arrays.goal_position[w] - state.position[w, 0])
+
+
+@wp.func
 def attitude_error(state: State, arrays: TaskArrays, w: int) -> float:
     """Angle of the rotation from vehicle 0's attitude to its goal's [rad], in [0, π]."""
     d = wp.quat_inverse(state.quaternion[w, 0]) * arrays.goal_quaternion[w]
     return 2.0 * wp.atan2(wp.length(wp.vec3(d[0], d[1], d[2])), wp.abs(d[3]))
-
-
-@wp.func
-def straight(p: Any, theta: float) -> float:
-    """exp(-θ / heading_scale), θ the attitude error."""
-    return wp.exp(-theta / p.reward.heading_scale)
 
 
 @wp.func
@@ -216,12 +247,6 @@ def turning(state: State, w: int) -> float:
 
 
 @wp.func
-def one(w: int) -> float:
-    """1, in every step."""
-    return 1.0
-
-
-@wp.func
 def out_of_pool(state: State, p: Any, w: int) -> bool:
     """Beyond `bounds`, above `ceiling` or below `depth`, in proportion to the vehicle."""
     x = state.position[w, 0] / p.fit.size
@@ -250,19 +275,21 @@ def measured_velocity(arrays: TaskArrays, w: int, v: int) -> wp.vec3:
 
 
 @wp.func
-def goal_offset(arrays: TaskArrays, w: int) -> wp.vec3:
-    """From vehicle 0 to the goal, body frame [m]."""
-    return wp.quat_rotate_inv(arrays.quaternion[w, 0], arrays.goal_position[w] - arrays.position[w, 0])
+def goal_offset(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """From an agent to the goal, body frame [m]."""
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], arrays.goal_position[w] - arrays.position[w, a])
 
 
 @wp.func
-def length(offset: wp.vec3) -> float:
-    """Of the offset that is shared under this name [m]."""
-    return wp.length(offset)
-
-
-@wp.func
-def goal_columns(arrays: TaskArrays, w: int) -> vec6:
-    """First two columns of the goal's rotation relative to vehicle 0's body."""
-    R = wp.quat_to_matrix(wp.quat_inverse(arrays.quaternion[w, 0]) * arrays.goal_quaternion[w])
+def goal_columns(arrays: TaskArrays, w: int, a: int) -> vec6:
+    """First two columns of the goal's rotation relative to an agent's body."""
+    R = wp.quat_to_matrix(wp.quat_inverse(arrays.quaternion[w, a]) * arrays.goal_quaternion[w])
     return vec6(R[0, 0], R[1, 0], R[2, 0], R[0, 1], R[1, 1], R[2, 1])
+
+
+def own_velocity(clip: float) -> tuple[ObservationPart, ...]:
+    """6 numbers of the agent itself, limited to ±clip [m/s, rad/s]."""
+    return (
+        ObservationPart("linear velocity, body frame", 3, "m/s", clip=clip, term=linear_velocity),
+        ObservationPart("angular velocity, body frame", 3, "rad/s", clip=clip, term=turn_rates),
+    )

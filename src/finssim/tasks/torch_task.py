@@ -12,8 +12,7 @@ from torch import Tensor
 
 from finssim.engine.launch import Pipeline
 from finssim.engine.state import State
-from finssim.physics.types import vec6
-from finssim.tasks.arrays import Answers, TaskArrays
+from finssim.tasks.arrays import Answers, TaskArrays, allocated
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.task import Batch, Task
 from finssim.tasks.terms import End, RewardTerm, Terms, Total
@@ -22,30 +21,6 @@ __all__ = ["Start", "TorchTask", "Worlds"]
 
 
 # The terms of every task in plain torch, which go on with what its functions answered; and its draws.
-
-
-@wp.func
-def answered_reward(arrays: TaskArrays, w: int, a: int) -> float:
-    """What `reward` gave."""
-    return arrays.answers.reward[w, a]
-
-
-@wp.func
-def answered_failure(arrays: TaskArrays, w: int) -> bool:
-    """What `terminated` gave."""
-    return arrays.answers.terminated[w] != 0
-
-
-@wp.func
-def answered_inside(arrays: TaskArrays, w: int) -> bool:
-    """What `inside` gave."""
-    return arrays.answers.inside[w] != 0
-
-
-@wp.func
-def answered_total(arrays: TaskArrays, w: int, was: float, k: int) -> float:
-    """The total, and what `counted` gave."""
-    return was + arrays.answers.counted[w, k]
 
 
 @wp.func
@@ -76,43 +51,6 @@ def draw(
     rng = wp.rand_init(wp.randi(own) + 104729 * steps[w], place)
     for i in range(out.shape[1]):
         out[w, i] = wp.where(normal != 0, wp.randn(rng), wp.randf(rng))
-
-
-def answers(
-    worlds: int,
-    vehicles: int,
-    agents: int,
-    totals: int,
-    memory: int,
-    device: wp.Device,
-) -> Answers:
-    """Room for the answers of a task's functions; nothing is answered yet.
-
-    Args:
-        worlds: How many.
-        vehicles: In each.
-        agents: Of these.
-        totals: Numbers that the task counts.
-        memory: Numbers that it keeps within an episode.
-        device: Where.
-    """
-    out = Answers()
-    shapes: dict[str, tuple[Sequence[int], type]] = {
-        "reward": ((worlds, agents), wp.float32),
-        "terminated": ((worlds,), wp.int32),
-        "inside": ((worlds,), wp.int32),
-        "counted": ((worlds, totals), wp.float32),
-        "position": ((worlds, vehicles), wp.vec3),
-        "quaternion": ((worlds, vehicles), wp.quat),
-        "velocity": ((worlds, vehicles), vec6),
-        "goal_position": ((worlds,), wp.vec3),
-        "goal_quaternion": ((worlds,), wp.quat),
-        "begun": ((worlds, memory), wp.float32),
-        "memory": ((worlds, memory), wp.float32),
-    }
-    for name, (shape, dtype) in shapes.items():
-        setattr(out, name, wp.zeros(shape, dtype=dtype, device=device))
-    return out
 
 
 # All worlds of an environment as torch tensors in the same memory, as a task in plain torch sees them.
@@ -332,10 +270,12 @@ class TorchTask(Task):
         return Terms(
             start=answered_start,
             shown=False,
-            rewards=(RewardTerm("reward", answered_reward, 1.0),),
-            ends=(End("terminated", answered_failure),),
-            inside=answered_inside,
-            totals=tuple(Total(name, answered_total, index=i) for i, name in enumerate(self.totals)),
+            rewards=(RewardTerm("reward", "arrays.answers.reward[w, a]", 1.0),),
+            ends=(End("terminated", "arrays.answers.terminated[w] != 0"),),
+            inside="arrays.answers.inside[w] != 0",
+            totals=tuple(
+                Total(name, f"was + arrays.answers.counted[w, {i}]") for i, name in enumerate(self.totals)
+            ),
         )
 
     def settings_class(self) -> type:
@@ -344,8 +284,10 @@ class TorchTask(Task):
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """Room for what the functions answer."""
-        arrays.answers = answers(
-            worlds, len(self.vehicles), len(self.agents), len(self.totals), sum(self.memory.values()), device
+        vehicles, memory = len(self.vehicles), sum(self.memory.values())
+        arrays.answers = allocated(
+            Answers, worlds, device, reward=len(self.agents), counted=len(self.totals), position=vehicles,
+            quaternion=vehicles, velocity=vehicles, begun=memory, memory=memory,
         )  # fmt: skip
 
     def add_command(self, pipeline: Pipeline, batch: Batch) -> None:
@@ -423,22 +365,14 @@ class TorchTask(Task):
 
     def _begin(self, w: Worlds, arrays: TaskArrays) -> None:
         given, start = arrays.answers, self.reset(w)
-        upright = w.full((0.0, 0.0, 0.0, 1.0))
-        each = upright if len(self.vehicles) == 1 else upright[:, None].expand(-1, len(self.vehicles), -1)
-        self._answer("reset: position", start.position, given.position)
-        self._answer(
-            "reset: quaternion", each if start.quaternion is None else start.quaternion, given.quaternion
-        )
-        for name, value, out in (
-            ("velocity", start.velocity, given.velocity),
-            ("goal_position", start.goal_position, given.goal_position),
-        ):
-            if value is None:
-                out.zero_()
-            else:
+        for name in ("position", "quaternion", "velocity", "goal_position", "goal_quaternion"):
+            value, out = getattr(start, name), getattr(given, name)
+            if value is not None:
                 self._answer(f"reset: {name}", value, out)
-        goal = upright if start.goal_quaternion is None else start.goal_quaternion
-        self._answer("reset: goal_quaternion", goal, given.goal_quaternion)
+            elif name.endswith("quaternion"):
+                out.fill_(wp.quat(0.0, 0.0, 0.0, 1.0))
+            else:
+                out.zero_()
         unknown = start.memory.keys() - self.memory.keys()
         if unknown:
             raise EnvironmentSetupError(

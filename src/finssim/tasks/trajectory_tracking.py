@@ -1,17 +1,14 @@
 """T2, trajectory tracking: follow a moving reference, whatever the heading (paper, section IV)."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import warp as wp
 
-from finssim.engine import Pool
 from finssim.engine.state import State
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.fitting import Fit, fit
-from finssim.tasks.measurement import MeasurementNoise
+from finssim.tasks.fitting import FittedTask
 from finssim.tasks.reference import (
     SHAPE_NAMES,
     fill_reference,
@@ -21,19 +18,15 @@ from finssim.tasks.reference import (
     reference_table,
     reference_velocity,
 )
-from finssim.tasks.task import ObservationPart, Task
 from finssim.tasks.terms import (
     End,
+    ObservationPart,
     RewardTerm,
     Terms,
-    action_change,
-    action_effort,
-    linear_velocity,
-    tilted,
-    turn_rates,
+    own_velocity,
+    start_upright,
     uniform3,
 )
-from finssim.vehicles import Vehicle
 
 LEVELS = (
     ("line", "circle"),
@@ -45,8 +38,6 @@ LEVELS = (
 
 DISTANCE_SCALE = 3.0
 """Distances are divided by this in the observation [m]."""
-VELOCITY_CLIP = 2.0
-"""Velocities are clipped here in the observation [m/s, rad/s]."""
 LOOK_AHEAD = 0.1
 """The reference is seen now and one, two and three times this later [s]."""
 
@@ -70,12 +61,6 @@ def reference_drift(arrays: TaskArrays, w: int) -> wp.vec3:
 
 
 @wp.func
-def world_up(arrays: TaskArrays, w: int) -> wp.vec3:
-    """The world's z axis, body frame."""
-    return wp.quat_rotate_inv(arrays.quaternion[w, 0], wp.vec3(0.0, 0.0, 1.0))
-
-
-@wp.func
 def tangent(drift: wp.vec3) -> wp.vec2:
     """Sine and cosine of the heading of the reference's velocity, seen from the body."""
     pace = wp.sqrt(drift[0] * drift[0] + drift[1] * drift[1])
@@ -96,17 +81,20 @@ OBSERVATION = (
             3,
             "m",
             DISTANCE_SCALE,
-            None,
-            reference_offset,
-            i,
+            term=reference_offset,
+            index=i,
             errors=(0, 1, 2) if i == 0 else (),
         )
         for i in range(4)
     ),
     ObservationPart("reference velocity, body frame", 3, "m/s", term="drift"),
-    ObservationPart("linear velocity, body frame", 3, "m/s", clip=VELOCITY_CLIP, term=linear_velocity),
-    ObservationPart("angular velocity, body frame", 3, "rad/s", clip=VELOCITY_CLIP, term=turn_rates),
-    ObservationPart("world up, body frame", 3, "1", term=world_up),
+    *own_velocity(clip=2.0),
+    ObservationPart(
+        "world up, body frame",
+        3,
+        "1",
+        term="wp.quat_rotate_inv(arrays.quaternion[w, a], wp.vec3(0.0, 0.0, 1.0))",
+    ),
     ObservationPart("tangent heading in the body, sine and cosine", 2, "1", term=tangent),
     ObservationPart("progress, sine and cosine of one and two turns", 4, "1", term=progress),
 )
@@ -150,18 +138,6 @@ def lead_reference(arrays: TaskArrays, w: int):
 
 
 @wp.func
-def tracking_error(state: State, arrays: TaskArrays, w: int) -> float:
-    """e: from the vehicle to the reference [m]."""
-    return wp.length(arrays.goal_position[w] - state.position[w, 0])
-
-
-@wp.func
-def track(p: Any, e: float) -> float:
-    """pose = exp(-e / track_scale)."""
-    return wp.exp(-e / (p.fit.size * p.reward.track_scale))
-
-
-@wp.func
 def posture(state: State, p: Any, w: int, pose: float) -> float:
     """pose · (0.5 / (1 + (tilt / tilt_scale)²) + 0.5 / (1 + (r / spin_scale)⁴))."""
     tilt = wp.acos(wp.clamp(wp.quat_rotate(state.quaternion[w, 0], wp.vec3(0.0, 0.0, 1.0))[2], -1.0, 1.0))
@@ -172,23 +148,11 @@ def posture(state: State, p: Any, w: int, pose: float) -> float:
 
 
 @wp.func
-def spin(state: State, w: int) -> float:
-    """|r|, the yaw rate [rad/s]."""
-    return wp.abs(state.velocity[w, 0][5])
-
-
-@wp.func
 def is_lost(state: State, p: Any, w: int, e: float) -> bool:
     """Farther than `lost` from the reference, above `ceiling`, or beyond `range`."""
     x = state.position[w, 0]
     size = p.fit.size
     return e > size * p.lost or x[2] > size * p.ceiling or wp.length(x) > size * p.range
-
-
-@wp.func
-def within_tolerance(p: Any, e: float) -> bool:
-    """Within `tolerance` of the reference."""
-    return e <= p.tolerance
 
 
 @wp.func
@@ -219,21 +183,13 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
     start = reference_position(arrays.reference, w, 0.0)
     away = wp.vec3(wp.randf(rng, -1.0, 1.0), wp.randf(rng, -1.0, 1.0), wp.randf(rng, -1.0, 1.0))
     state.position[w, 0] = start + wp.cw_mul(away, p.fit.size * p.jitter)
-    roll = wp.randf(rng, -p.tilt, p.tilt)
-    pitch = wp.randf(rng, -p.tilt, p.tilt)
-    state.quaternion[w, 0] = tilted(roll, pitch, wp.randf(rng, -3.14159265, 3.14159265))
-    nu = state.velocity[w, 0]
-    for i in range(3):
-        nu[i] = wp.randf(rng, -p.speed, p.speed)
-    for i in range(3):
-        nu[i + 3] = 0.0
-    state.velocity[w, 0] = nu
+    start_upright(state, w, rng, p.tilt, p.speed)
     arrays.goal_position[w] = start
     arrays.goal_quaternion[w] = wp.quat_identity()
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrajectoryTracking(Task):
+class TrajectoryTracking(FittedTask):
     """T2. Lengths in metres, angles in radians, world frame with z up and 0 on the water.
 
     The published generator, except that shapes are as large as the pool (published: half axes up to 2.5 and 1.25 m,
@@ -245,12 +201,9 @@ class TrajectoryTracking(Task):
     succeeds: ClassVar[str] = "held"
     moving: ClassVar[bool] = True
     title: ClassVar[str] = "follow a moving reference, whatever the heading"
-    needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave")
     name: str = "t2"
     observation: tuple[ObservationPart, ...] = OBSERVATION
     time_limit: float = 30.0
-    fit: Fit = Fit()
-    """Of lengths to the vehicle; the environment sets it."""
     level: int = 3
     """Which of `LEVELS` the shapes are drawn from: 0 to 2 as published, 3 all of them."""
     scale_low: tuple[float, float, float] = (0.3, 0.2, 0.04)
@@ -267,14 +220,10 @@ class TrajectoryTracking(Task):
     """Height of the middle of a shape."""
     jitter: tuple[float, float, float] = (0.15, 0.15, 0.15)
     """Largest shift of a shape, and of the start from its first point."""
-    tilt: float = math.radians(20.0)
-    """Largest roll and pitch at the start; the heading is any."""
     speed: float = 0.1
     """Largest starting speed per axis [m/s]."""
     lost: float = 4.0
     """A greater distance to the reference ends the episode."""
-    ceiling: float = 0.3
-    """So does rising above this height."""
     range: float = 12.0
     """So does going this far from the world's origin."""
     tolerance: float = 0.05
@@ -284,22 +233,10 @@ class TrajectoryTracking(Task):
     knot_spacing: float = 0.25
     """Time between two knots of the reference's table [s]."""
     reward: TrackingReward = field(default_factory=TrackingReward)
-    training_noise: MeasurementNoise = MeasurementNoise(
-        position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02
-    )
-    """About what an estimate is off by: with exact states, gains are learnt that chatter on measured ones."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.level < len(LEVELS):
             raise ValueError(f"level is {self.level}, expected 0 to {len(LEVELS) - 1}")
-
-    def fitted(self, vehicles: Sequence[Vehicle]) -> "TrajectoryTracking":
-        """As large as suits the vehicle."""
-        return replace(self, fit=fit(vehicles[0]))
-
-    def arena(self) -> Pool:
-        """See `Fit.pool`."""
-        return self.fit.pool()
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """Room for every world's reference, from the start to what is seen at the end."""
@@ -327,16 +264,16 @@ class TrajectoryTracking(Task):
         return Terms(
             start=start,
             advance=lead_reference,
-            shared={"e": tracking_error, "pose": track},
+            shared={"e": "position_error", "pose": "wp.exp(-e / (p.fit.size * p.reward.track_scale))"},
             seen={"drift": reference_drift},
             rewards=(
                 RewardTerm("track", "pose", r.track),
                 RewardTerm("posture", posture, r.posture),
                 RewardTerm("distance", "e", -r.distance / self.fit.size),
-                RewardTerm("spin", spin, -r.spin),
-                RewardTerm("action", action_effort, -r.action),
-                RewardTerm("change", action_change, -r.change),
+                RewardTerm("spin", "wp.abs(state.velocity[w, 0][5])", -r.spin),
+                RewardTerm("action", "action_effort", -r.action),
+                RewardTerm("change", "action_change", -r.change),
             ),
             ends=(End("lost", is_lost, -r.loss),),
-            inside=within_tolerance,
+            inside="e <= p.tolerance",
         )

@@ -72,7 +72,7 @@ def test_every_vehicle_gets_levels_within_its_limits(name, kind):
     allocator = Allocator.from_vehicle(vehicle)
     rows = [AXES.index(axis) for axis in vehicle.controlled_axes]
     for p in plan:
-        thrust, _ = allocator.allocate(p.tau_desired)
+        thrust = allocator.allocate(p.tau_desired)
         missing = np.abs(allocator.achieved(thrust) - p.tau_desired)[:, rows]
         assert (missing.max(axis=0) <= 5e-3 * vehicle.wrench_limits[rows]).all(), p.name
 

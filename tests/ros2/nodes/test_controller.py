@@ -17,8 +17,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
+from finssim.control.allocation import Allocator
 from finssim.control.guidance import Station, goal_at
-from finssim.control.modes import Wrench6
 from finssim.control.pid import controller
 from finssim.robot.robot import Reading
 from finssim.ros2.nodes.controller import Controller
@@ -129,7 +129,7 @@ def pid_force(goal):
     at = Reading(0.0, PLACE, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(6), True)
     tau, _ = pid.command(pid.reset(), at, goal_at(goal, 0.0))
     limits = np.asarray(vehicle.wrench_limits, float)
-    return Wrench6.from_vehicle(vehicle).allocator.allocate(np.clip(tau, -limits, limits))[0]
+    return Allocator.from_vehicle(vehicle).allocate(np.clip(tau, -limits, limits))
 
 
 def test_it_is_silent_until_the_bridge_is_armed(wire):
@@ -302,7 +302,7 @@ def test_a_person_takes_over_by_mode_and_wrench(wire):
     stage.send("mode", data="teleop")
     tau = np.array([3.0, 0.0, 0.0, 0.0, 0.0, 0.2])
     push = lambda: stage.send("wrench", stage.make.wrench(time.time_ns(), tau))  # noqa: E731
-    wanted = Wrench6.from_vehicle(stage.node.vehicle).allocator.allocate(tau)[0]
+    wanted = Allocator.from_vehicle(stage.node.vehicle).allocate(tau)
     assert stage.until(lambda: stage.heard["command"] and np.allclose(stage.asked(), wanted), push)
     bad = lambda: stage.send("wrench", stage.make.wrench(0, [math.nan] * 6))  # noqa: E731
     assert stage.until(lambda: not np.any(stage.asked()), bad)

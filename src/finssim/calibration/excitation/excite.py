@@ -131,7 +131,7 @@ def write_programme(programme: Programme, vehicle: Vehicle, folder: Path) -> Non
     Raises:
         OutputError: The system refused to write.
     """
-    thrust, _ = Allocator.from_vehicle(vehicle).allocate(programme.tau_desired)
+    thrust = Allocator.from_vehicle(vehicle).allocate(programme.tau_desired)
     with atomic_write(folder / "programme.csv") as path, path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(["t", *TAU, *(f"force_{name}" for name in vehicle.thruster_names), "phase"])

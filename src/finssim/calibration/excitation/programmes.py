@@ -156,7 +156,7 @@ def _feasible(tau: Array, vehicle: Vehicle) -> float:
     weights = np.where(vehicle.wrench_limits > 0.0, 1.0 / np.maximum(vehicle.wrench_limits, 1e-9), 0.0)
 
     def given(factor: float) -> bool:
-        thrust, _ = allocator.allocate(factor * tau)
+        thrust = allocator.allocate(factor * tau)
         missing = np.abs(allocator.achieved(thrust) - factor * tau) * weights
         return bool(missing.max() < 2e-3)
 

@@ -169,7 +169,7 @@ def _commands(programmes: Sequence[Programme], vehicle: Vehicle) -> NDArray[np.f
     for w, programme in enumerate(programmes):
         tau[: len(programme.phase), w] = programme.tau_desired
     distinct, index = np.unique(tau.reshape(-1, 6), axis=0, return_inverse=True)
-    thrust, _ = allocator.allocate(distinct)
+    thrust = allocator.allocate(distinct)
     # The allocator leaves dust of its rounding where nothing is wanted.
     thrust[~distinct.any(axis=1)] = 0.0
     return np.asarray(thrust[index.ravel()].reshape(length, len(programmes), -1), dtype=np.float32)

@@ -18,8 +18,7 @@ from finssim.learning.learners.task_settings import applied
 from finssim.learning.served import age_episodes
 from finssim.learning.tensors import Tensors
 from finssim.tasks import Environment, Task
-from finssim.tasks.agents import NOWHERE, Known, expert_for
-from finssim.tasks.baselines import restarted
+from finssim.tasks.agents import NOWHERE, Known, expert_for, restarted
 
 __all__ = ["Bc", "Dagger", "demonstrations_for", "settings_for"]
 

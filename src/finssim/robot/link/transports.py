@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import select
 import socket
 import time
 from collections import Counter, deque
@@ -32,7 +33,7 @@ Address = tuple[str, int]
 
 _LOG = logging.getLogger("finssim.robot.link")
 _DATAGRAM = 2048
-"""Bytes taken of a datagram; a longer one is cut, and its CRC no longer fits."""
+"""Bytes of the longest datagram of a motor controller."""
 _DATAGRAMS_AT_ONCE = 1024
 """Datagrams taken by one call, so that a flood cannot hold the loop up."""
 _NAMED = 64
@@ -46,10 +47,12 @@ class UdpTransport:
         `refused` counts by sender, `send_errors` the frames that could not leave (nobody listens, network down).
     """
 
-    def __init__(self, bind: Address, peer: Address) -> None:
+    def __init__(self, bind: Address, peer: Address, *, longest: int = _DATAGRAM, buffer: int = 0) -> None:
         """Args:
             bind: Address and port of this end; port 0 takes a free one (see `address`).
-            peer: Host and port of the motor controller; the name is looked up once.
+            peer: Host and port of the other end; the name is looked up once.
+            longest: Bytes taken of a datagram; a longer one is cut, and its checksum no longer fits.
+            buffer: Asked of the system for what has not been read yet [bytes]; its own choice if 0.
 
         Raises:
             LinkError: An address cannot be found, bound, or reached from `bind`.
@@ -67,10 +70,12 @@ class UdpTransport:
             )
         self.refused: Counter[Address | None] = Counter()
         self.send_errors = 0
-        self._send_problem = ""
+        self._send_problem, self._longest = "", longest
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
+            if buffer:
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer)
             self._socket.bind(here)
         except OSError as problem:
             self._socket.close()
@@ -90,12 +95,18 @@ class UdpTransport:
                 self._send_problem = str(problem)
                 _LOG.warning("nothing leaves for %s: %s", _name(self.peer), problem)
 
-    def receive(self) -> list[bytes]:
-        """Datagrams of the peer, oldest first; at most 1024 are looked at in one call."""
+    def receive(self, wait: float = 0.0) -> list[bytes]:
+        """Datagrams of the peer, oldest first; at most 1024 are looked at in one call.
+
+        Args:
+            wait: Longest time to wait for one [s].
+        """
         found: list[bytes] = []
+        if wait:
+            select.select([self._socket], [], [], wait)
         for _ in range(_DATAGRAMS_AT_ONCE):
             try:
-                data, sender = self._socket.recvfrom(_DATAGRAM)
+                data, sender = self._socket.recvfrom(self._longest)
             except BlockingIOError:
                 break
             except ConnectionError:  # how some systems tell that an earlier datagram found nobody
