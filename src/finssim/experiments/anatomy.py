@@ -10,9 +10,8 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from finssim.experiments import campaign
 from finssim.experiments.campaign import Say, check_choices, run_jobs, write_json
-from finssim.experiments.evaluate import evaluate_controller
+from finssim.experiments.evaluate import Job, play
 from finssim.experiments.figures import COLORS, clean, new_figure, save_figure
 from finssim.experiments.plants import Plant, load_plant
 from finssim.experiments.statistics import with_interval
@@ -89,24 +88,6 @@ FOREIGN = "foreign"
 """The plant in which all of it is wrong at once, another in each trial."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Job(campaign.Job):
-    """Trials of one controller in one plant: the target is the cause, the plant the number of its amount."""
-
-    controller: str
-    vehicle: str
-    trials: int
-    water: Plant
-
-
-def play(job: Job, _: Path) -> dict[str, Any]:
-    """Success, error [m] and settling time [s] of each trial; None where there is none."""
-    done = evaluate_controller(
-        job.controller, job.water, vehicle=job.vehicle, trials=job.trials, seed=job.seed
-    ).result
-    return {key: [trial[key] for trial in done["per_trial"]] for key in ("success", "e_p_m", "t_s_s")}
-
-
 def anatomy(
     *,
     out: Path,
@@ -155,8 +136,8 @@ def anatomy(
     plants[FOREIGN, 0] = load_plant(FOREIGN)
     jobs = [
         Job(
-            row=row, target=name, plant=k, seed=s, water=water, vehicle=vehicle, controller=controllers[row, s],
-            trials=trials * (10 if name == FOREIGN else 1),
+            row=row, target=name, plant=k, seed=s, noise=s, controller=controllers[row, s], vehicle=vehicle,
+            water=water, trials=trials * (10 if name == FOREIGN else 1),
         )
         for (name, k), water in plants.items() for row in names for s in run_seeds
     ]  # fmt: skip
@@ -192,7 +173,9 @@ def _figures(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Success, median error and mean settling time over all trials, with intervals from redrawing trials."""
     out: dict[str, Any] = {}
     for key, statistic in (("success", np.mean), ("e_p_m", np.median), ("t_s_s", np.mean)):
-        values = [float(x) for result in results for x in result[key] if x is not None]
+        values = [
+            float(x) for result in results for trial in result["per_trial"] if (x := trial[key]) is not None
+        ]
         interval = with_interval({i: [x] for i, x in enumerate(values)}, statistic)
         out[key] = interval and interval.as_json()
     return out

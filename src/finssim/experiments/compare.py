@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.control.policy import Policy, PolicyDescription
-from finssim.experiments import campaign
 from finssim.experiments.campaign import Say, run_jobs, write_json
-from finssim.experiments.evaluate import evaluate_controller
+from finssim.experiments.evaluate import Job, play
 from finssim.experiments.figures import COLORS, clean, new_figure, save_figure
-from finssim.experiments.plants import Plant, load_plant
+from finssim.experiments.plants import load_plant
 from finssim.experiments.statistics import (
     better,
     interquartile_mean,
@@ -177,25 +176,6 @@ def measures_of(task: str, trials: Sequence[Mapping[str, Any]], asked: Sequence[
             raise CompareError(f"no measure '{name}' of task '{task}'; available: {', '.join(have)}")
     preferred = MEASURES.get(task, ("success", "return"))
     return tuple(asked) or tuple(name for name in preferred if name in have) or tuple(have[:1])
-
-
-@dataclass(frozen=True, kw_only=True)
-class Job(campaign.Job):
-    """The evaluation of a run: the row is its group, the target the task, the seed that of the training."""
-
-    controller: str
-    vehicle: str
-    water: Plant
-    trials: int | None
-    noise: int
-    """Seed of the trials."""
-
-
-def play(job: Job, _: Path) -> dict[str, Any]:
-    """Its trials."""
-    options: dict[str, Any] = {"vehicle": job.vehicle, "trials": job.trials, "seed": job.noise}
-    result = evaluate_controller(job.controller, job.water, task=job.target, **options).result
-    return {"per_trial": result["per_trial"]}
 
 
 def scores_of(runs: Sequence[Sequence[Mapping[str, Any]]], measure: str) -> NDArray[np.float64]:
@@ -428,8 +408,8 @@ def compare(
     water = load_plant(plant)
     jobs = [
         Job(
-            row=group.name, target=run.description.task, seed=run.seed, controller=str(run.place), vehicle=vehicle,
-            water=water, trials=trials, noise=seed,
+            row=group.name, target=run.description.task, task=run.description.task, seed=run.seed, noise=seed,
+            controller=str(run.place), vehicle=vehicle, water=water, trials=trials,
         )
         for group in groups for run in group.runs
     ]  # fmt: skip

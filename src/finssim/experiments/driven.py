@@ -215,14 +215,9 @@ def actions_of(force: ArrayLike, mode: ActionMode, vehicle: Vehicle) -> NDArray[
         full = np.where(f >= 0.0, upper, -lower)
         parts = np.divide(f, full, out=np.zeros_like(f), where=full > 0.0)
     action = np.clip(parts @ np.linalg.pinv(mode.columns), -1.0, 1.0)
-    _check_actions(action, f, mode, vehicle)
-    return action.astype(np.float32)
-
-
-def _check_actions(action: Array, force: Array, mode: ActionMode, vehicle: Vehicle) -> None:
-    """Compare the wrench that the actions would give with the one that was commanded."""
+    # Compare the wrench that the actions would give with the one that was commanded.
     limits = np.asarray(vehicle.wrench_limits, float)
-    off = np.abs((mode.to_thrusters(action) - force) @ vehicle.control_matrix.T)
+    off = np.abs((mode.to_thrusters(action) - f) @ vehicle.control_matrix.T)
     off = np.divide(off, limits, out=np.zeros_like(off), where=limits > 0.0)
     wrong = float(np.mean(off.max(axis=1) > NEAR_WRENCH))
     if wrong > FEW:
@@ -231,6 +226,7 @@ def _check_actions(action: Array, force: Array, mode: ActionMode, vehicle: Vehic
             f"{mode.name} cannot ask for what was commanded in {100.0 * wrong:.0f} % of the decisions ({AXES[worst]} "
             f"is off by up to {off[:, worst].max():.2f} of its limit): give another --action"
         )
+    return action.astype(np.float32)
 
 
 Indices = NDArray[np.int64]

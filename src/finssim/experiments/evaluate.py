@@ -12,6 +12,7 @@ from typing import Annotated, Any, NamedTuple
 
 from rich.console import Console
 
+from finssim.experiments import campaign
 from finssim.experiments.campaign import progress_bar, write_json
 from finssim.experiments.figures import (
     draw_envelopes,
@@ -461,3 +462,23 @@ def evaluate_controller(
         "provenance": provenance(),
     }
     return Evaluation(result, played)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job(campaign.Job):
+    """Trials of one controller in one plant, as a campaign plays them."""
+
+    controller: str
+    vehicle: str
+    water: Plant
+    trials: int | None
+    noise: int
+    """Seed of the trials."""
+    task: str = "t1"
+
+
+def play(job: Job, _: Path) -> dict[str, Any]:
+    """The measures of every trial."""
+    options: dict[str, Any] = {"vehicle": job.vehicle, "trials": job.trials, "seed": job.noise}
+    result = evaluate_controller(job.controller, job.water, task=job.task, **options).result
+    return {"per_trial": result["per_trial"]}

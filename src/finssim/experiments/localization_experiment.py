@@ -23,7 +23,7 @@ from finssim.experiments.metrics import PAPER
 from finssim.experiments.statistics import bootstrap
 from finssim.experiments.tables import Table
 from finssim.files import atomic_directory, refuse_unwritable
-from finssim.geometry.optics import Camera, Interface, Lens, Projection, Status, project
+from finssim.geometry.optics import Camera, Interface, Lens, Status, project
 from finssim.geometry.rotations import matrix_to_quat, quat_from_euler, quat_to_matrix
 from finssim.localization.camera_file import write_camera
 from finssim.localization.detection.detections import Detection, Frame, write_detections
@@ -243,7 +243,7 @@ def pictures(campaign: Campaign, renderer: str = "own") -> Iterator[Picture]:
         ValueError: There is no such renderer.
     """
     check_choices([renderer], RENDERERS, "renderer", ValueError)
-    look = _geometry(campaign) if renderer == "geometry" else _rendered(campaign, renderer)
+    look = _rendered(campaign, renderer)
     number = 0
     for k, visit in enumerate(campaign.visits):
         for _ in range(visit.images):
@@ -276,50 +276,29 @@ def tag_of(visit: Visit) -> TagInScene:
     )
 
 
-def region_of(campaign: Campaign, visit: Visit) -> tuple[int, int, int, int]:
-    """Left, top, right and bottom of the pixels around the tag."""
-    seen = _seen(campaign, visit).pixels
-    lens = campaign.truth.camera.lens
-    low, high = np.floor(seen.min(0)) - SURROUND, np.ceil(seen.max(0)) + SURROUND + 1
-    left, top = np.maximum(low, 0).astype(int).tolist()
-    right, bottom = np.minimum(high, [lens.width, lens.height]).astype(int).tolist()
-    return left, top, right, bottom
-
-
-def _seen(campaign: Campaign, visit: Visit) -> Projection:
-    points = visit.position + corners(TAG.edge) @ visit.R_pb.T
-    return project(campaign.truth.camera, campaign.truth.interface, points)
-
-
-def _geometry(campaign: Campaign) -> Callable[..., Detection | None]:
-    """Exact projection with white noise: no picture, no ripples."""
-
-    def look(visit: Visit, time: float, seed: int) -> Detection | None:
-        seen = _seen(campaign, visit)
-        if (seen.status != Status.OK).any():
-            return None
-        noise = np.random.default_rng(seed).normal(0.0, CORNER_NOISE, (4, 2))
-        return Detection(TAG_ID, seen.pixels + noise, family=TAG.family)
-
-    return look
-
-
 def _rendered(campaign: Campaign, renderer: str) -> Callable[..., Detection | None]:
-    """A picture, and what the default detector finds in it."""
+    """A picture, and what the default detector finds in it; of `geometry` exact projection with white noise."""
     from finssim.localization.detection.detector import detector
 
-    scene, find = scene_of(campaign), detector(TAG.family)
-    if renderer == "own":
-        camera = OverheadCamera(scene)
-    else:
-        from finssim.experiments.mitsuba_renderer import render_with_mitsuba
+    scene, find, lens = scene_of(campaign), detector(TAG.family), campaign.truth.camera.lens
+    camera = OverheadCamera(scene) if renderer == "own" else None
 
     def look(visit: Visit, time: float, seed: int) -> Detection | None:
-        tags, region = (tag_of(visit),), region_of(campaign, visit)
-        moment: Any = {"time": time, "seed": seed, "region": region}
-        if renderer == "own":
+        points = visit.position + corners(TAG.edge) @ visit.R_pb.T
+        exact = project(campaign.truth.camera, campaign.truth.interface, points)
+        if renderer == "geometry":
+            noise = np.random.default_rng(seed).normal(0.0, CORNER_NOISE, (4, 2))
+            visible = not (exact.status != Status.OK).any()
+            return Detection(TAG_ID, exact.pixels + noise, family=TAG.family) if visible else None
+        low = np.maximum(np.floor(exact.pixels.min(0)) - SURROUND, 0)
+        high = np.minimum(np.ceil(exact.pixels.max(0)) + SURROUND + 1, [lens.width, lens.height])
+        region = (*low.astype(int).tolist(), *high.astype(int).tolist())
+        tags, moment = (tag_of(visit),), {"time": time, "seed": seed, "region": region}
+        if camera is not None:
             picture = camera.render(tags=tags, **moment)
         else:
+            from finssim.experiments.mitsuba_renderer import render_with_mitsuba
+
             picture = render_with_mitsuba(replace(scene, tags=tags), rays=MITSUBA_RAYS, **moment)
         return next((d for d in find.detect(picture, region) if d.tag == TAG_ID), None)
 
@@ -504,43 +483,38 @@ def locate(
         pixel_std: Standard deviation of a corner, as the calibration found it [px].
         depth_offset: Added to the depth reading [m].
     """
-    found: dict[int, list[tuple[float, float]]] = {}
-    reasons = Counter[str]()
-    pictures = 0
-    for picture in seen:
-        if campaign.calibrates[picture.visit]:
+    places: dict[int, list[tuple[float, float]]] = {}
+    reasons, water = Counter[str](), pool.interface  # depth is measured along its normal, which is up
+    held_out = [picture for picture in seen if not campaign.calibrates[picture.visit]]
+    for picture in held_out:
+        if picture.detection is None:
+            reasons["tag not detected"] += 1
             continue
-        pictures += 1
         visit = campaign.visits[picture.visit]
-        place, reason = _place(picture, visit, pool, method, pixel_std, depth_offset)
-        if place is None:
-            reasons[reason.partition(":")[0]] += 1
+        prior = Constraints(
+            z_b=-water.offset - visit.depth_read - depth_offset,
+            z_std=Z_STD,
+            roll=visit.roll_read,
+            pitch=visit.pitch_read,
+            tilt_std=TILT_STD,
+            up=tuple(water.normal.tolist()),
+        )
+        measured = METHODS[method]((picture.detection,), pool, TAGS_B, prior, pixel_std)
+        if measured.ok:
+            places.setdefault(picture.visit, []).append((measured.x, measured.y))
         else:
-            found.setdefault(picture.visit, []).append(place)
-    index = np.array(sorted(found), np.intp)
-    means = np.array([np.mean(found[k], axis=0) for k in index]).reshape(-1, 2)
-    surveyed = np.array([campaign.visits[k].nominal[:2] for k in index]).reshape(-1, 2)
-    true = np.array([campaign.visits[k].position[:2] for k in index]).reshape(-1, 2)
-    located = sum(map(len, found.values()))
-    return Scores(index, means - surveyed, means - true, pictures, located, reasons)
-
-
-def _place(
-    picture: Picture, visit: Visit, pool: Pool, method: str, pixel_std: float, depth_offset: float
-) -> tuple[tuple[float, float] | None, str]:
-    if picture.detection is None:
-        return None, "tag not detected"
-    water = pool.interface  # depth is measured along its normal, which is up
-    given = Constraints(
-        z_b=-water.offset - visit.depth_read - depth_offset,
-        z_std=Z_STD,
-        roll=visit.roll_read,
-        pitch=visit.pitch_read,
-        tilt_std=TILT_STD,
-        up=tuple(water.normal.tolist()),
+            reasons[measured.reason.partition(":")[0]] += 1
+    index = np.array(sorted(places), np.intp)
+    means, surveyed, true = (
+        np.array(rows).reshape(-1, 2)
+        for rows in (
+            [np.mean(places[k], axis=0) for k in index],
+            [campaign.visits[k].nominal[:2] for k in index],
+            [campaign.visits[k].position[:2] for k in index],
+        )
     )
-    measured = METHODS[method]((picture.detection,), pool, TAGS_B, given, pixel_std)
-    return ((measured.x, measured.y), "") if measured.ok else (None, measured.reason)
+    located = sum(map(len, places.values()))
+    return Scores(index, means - surveyed, means - true, len(held_out), located, reasons)
 
 
 def pooled(scores: Sequence[Scores]) -> dict[str, Any]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -71,24 +72,6 @@ def way_of(shape: str, duration: float, speed: float) -> Trajectory:
     return Trajectory(name=shape, duration=float(starts[-1]), motion=motion)
 
 
-class _Watch:
-    """Keeps what the estimator says of itself."""
-
-    def __init__(self, perception: Perception) -> None:
-        self.rows: list[tuple[float, ...]] = []
-        self._perception = perception
-
-    def __call__(self, runtime: Runtime) -> None:
-        reading = runtime.reading
-        if reading is None:
-            return
-        if math.isnan(runtime.t) or (self.rows and reading.time < self.rows[-1][0] + PERIOD - 1e-6):
-            return
-        found = self._perception.estimator.estimate(reading.time)
-        P = found.P[:2, :2].ravel().tolist()
-        self.rows.append((reading.time, *found.x[:2].tolist(), found.yaw, *P))
-
-
 def swim(
     vehicle: Vehicle,
     spec: PlantSpec,
@@ -120,7 +103,17 @@ def swim(
     equipped = vehicle_at("open-water", vehicle)
     start = np.random.default_rng([seed, 0x57A]).normal(0.0, LET_IN_STD, 2).tolist()
     perception = Perception(equipped, None, mode="error-state", let_in=start)
-    watch = _Watch(perception)
+    rows: list[tuple[float, ...]] = []
+
+    def watch(runtime: Runtime) -> None:
+        """Keep what the estimator says of itself."""
+        reading = runtime.reading
+        if reading is None or math.isnan(runtime.t) or (rows and reading.time < rows[-1][0] + PERIOD - 1e-6):
+            return
+        estimate = perception.estimator.estimate(reading.time)
+        P = estimate.P[:2, :2].ravel().tolist()
+        rows.append((reading.time, *estimate.x[:2].tolist(), estimate.yaw, *P))
+
     pilot = make_pilot(controller, equipped, task="t2")
     runtime = Runtime(equipped, None, pilot, way, arm=True, perception=perception)
     with tempfile.TemporaryDirectory() as folder:
@@ -132,20 +125,13 @@ def swim(
             seed=seed,
             truth=Path(folder) / "truth",
         )
-        try:
-            run_lockstep(
-                runtime,
-                world,
-                GETTING_READY + way.duration,
-                show=watch,
-                until=lambda r: r.t >= way.duration or r.bridge.state == "fault",
-            )
-        finally:
-            world.close()
+        over: Callable[[Runtime], bool] = lambda r: r.t >= way.duration or r.bridge.state == "fault"  # noqa: E731
+        with closing(world):
+            run_lockstep(runtime, world, GETTING_READY + way.duration, show=watch, until=over)
         truth = read_truth(Path(folder) / "truth")
-    if not watch.rows:
+    if not rows:
         raise ValueError(f"open water: never armed: {runtime.refusal or 'no state'}")
-    a = np.array(watch.rows)
+    a = np.array(rows)
     true = np.stack([np.interp(a[:, 0], truth.time, column) for column in truth.position.T], axis=1)
     yaw = np.interp(a[:, 0], truth.time, np.unwrap(quat_yaw(truth.quaternion)))
     error, P = a[:, 1:3] - true[:, :2], a[:, 4:8].reshape(-1, 2, 2)
