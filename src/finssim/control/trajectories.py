@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 
 from finssim.control import ControlError
 from finssim.control.guidance import Reference
@@ -32,7 +33,6 @@ __all__ = [
     "ellipse",
     "gerono",
     "helix",
-    "hermite",
     "load_trajectory",
     "polyline",
     "read_trajectory",
@@ -156,12 +156,12 @@ def ellipse(a: float, b: float, duration: float, depth: float = DEPTH) -> Motion
     ends = slowness(theta)
     pieces = (ends[:-1] + 4.0 * middle + ends[1:]) * np.diff(theta) / 6.0  # Simpson's rule
     table = np.concatenate([[0.0], np.cumsum(pieces)])
-    knots, slopes = table / table[-1], table[-1] / ends
+    turned = CubicHermiteSpline(table / table[-1], theta, table[-1] / ends)
+    turning = turned.derivative()
 
     def motion(t: Array) -> tuple[Array, Array]:
         s, s_dot = _smooth_step(t / duration)
-        angle, slope = hermite(s, knots, theta, slopes)
-        rate = slope * s_dot / duration
+        angle, rate = turned(s), turning(s) * s_dot / duration
         c, n = np.cos(angle), np.sin(angle)
         position = np.stack([a * c, b * n, np.full_like(c, depth)], axis=-1)
         return position, np.stack([-a * rate * n, b * rate * c, 0.0 * c], axis=-1)
@@ -177,26 +177,6 @@ SHAPES: dict[str, Callable[..., Motion]] = {
     "ellipse": ellipse,
 }
 """Shapes by the name that trajectory files use."""
-
-
-def hermite(x: Array, knots: Array, values: Array, slopes: Array) -> tuple[Array, Array]:
-    """Cubic Hermite interpolation and its exact derivative.
-
-    Args:
-        x: Where, within the knots, (...).
-        knots: Increasing, (n,).
-        values: At the knots, (n,) or (n, m).
-        slopes: Derivatives there, like `values`.
-
-    Returns:
-        Value and derivative, (...) or (..., m).
-    """
-    i = np.clip(np.searchsorted(knots, x, side="right") - 1, 0, len(knots) - 2)
-    h, shape = knots[i + 1] - knots[i], (*np.shape(x), *(1,) * (values.ndim - 1))
-    u, h = np.reshape((x - knots[i]) / h, shape), np.reshape(h, shape)
-    way, a, b = values[i + 1] - values[i], slopes[i] * h, slopes[i + 1] * h
-    value = values[i] + u * (a + u * (3.0 * way - 2.0 * a - b + u * (a + b - 2.0 * way)))
-    return value, (a + u * (6.0 * way - 4.0 * a - 2.0 * b + 3.0 * u * (a + b - 2.0 * way))) / h
 
 
 def _smooth_step(u: Array) -> tuple[Array, Array]:
@@ -439,7 +419,8 @@ def read_trajectory(path: Path) -> Trajectory:
 def through_points(name: str, points: npt.ArrayLike, **options: Any) -> Trajectory:
     """A trajectory through points in time: smooth, and never beyond two neighbours on any axis.
 
-    Piecewise cubic with the slopes of Fritsch and Carlson (1980): a rest between two equal points stays a rest.
+    Piecewise cubic with the slopes of Fritsch and Carlson (1980), at rest at both ends: a rest between two equal points
+    stays a rest.
 
     Args:
         name: Of the trajectory.
@@ -452,15 +433,16 @@ def through_points(name: str, points: npt.ArrayLike, **options: Any) -> Trajecto
     table = _checked_points(points)
     t = table[:, 0]
     table[:, 4:] = np.unwrap(table[:, 4:], axis=0)
-    slopes = _monotone_slopes(t, table[:, 1:])
-    place, drift = table[:, 1:4], slopes[:, :3]
+    slopes = PchipInterpolator(t, table[:, 1:]).derivative()(t)
+    slopes[[0, -1]] = 0.0
+    place = CubicHermiteSpline(t, table[:, 1:4], slopes[:, :3])
+    drift = place.derivative()
 
     def motion(time: Array) -> tuple[Array, Array]:
-        return hermite(time, t, place, drift)
+        return place(time), drift(time)
 
     if table.shape[1] == 5:
-        yaw, rate = table[:, 4], slopes[:, 3]
-        options["turning"] = lambda time: hermite(time, t, yaw, rate)[0]
+        options["turning"] = CubicHermiteSpline(t, table[:, 4], slopes[:, 3])
     return Trajectory(name=name, duration=float(t[-1]), motion=motion, **options)
 
 
@@ -527,16 +509,3 @@ def _checked_points(points: Any) -> Array:
         row = int(late[0]) + 2
         raise ControlError(f"point {row} is at {table[row - 1, 0]:g} s, not after the one before it")
     return table
-
-
-def _monotone_slopes(t: Array, values: Array) -> Array:
-    """Slopes at the points, (n, m): zero at every turn, else a harmonic mean of the neighbours; at rest at the ends."""
-    h = np.diff(t)[:, None]
-    slope = np.diff(values, axis=0) / h
-    slopes = np.zeros_like(values)
-    before, after = slope[:-1], slope[1:]
-    same = before * after > 0.0
-    w1, w2 = 2.0 * h[1:] + h[:-1], h[1:] + 2.0 * h[:-1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        slopes[1:-1] = np.where(same, (w1 + w2) / (w1 / before + w2 / after), 0.0)
-    return slopes

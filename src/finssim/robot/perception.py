@@ -13,7 +13,10 @@ import numpy.typing as npt
 from finssim.geometry.rotations import (
     matrix_to_quat,
     quat_conjugate,
+    quat_from_euler,
+    quat_inverse_rotate,
     quat_multiply,
+    quat_rotate,
     quat_to_matrix,
     wrap_angle,
 )
@@ -98,7 +101,7 @@ class Aboard:
         R = quat_to_matrix(imu.orientation if imu else (0.0, 0.0, 0.0, 1.0))
         log = vehicle.sensors.dvl
         self._R_bl = quat_to_matrix(log.orientation if log else (0.0, 0.0, 0.0, 1.0))
-        self._R_bs = tuple(tuple(row) for row in R.tolist())
+        self._R_bs = R
         self._imu_latency = imu.latency if imu else 0.0
         self._depth_latency = depth.latency if depth else 0.0
         self._depth_period = 1.0 / depth.rate if depth else 0.05
@@ -168,35 +171,27 @@ class Aboard:
 
     def to_body(self, vector_s: Three) -> Three:
         """A vector of the IMU's frame in body axes."""
-        x, y, z = vector_s
-        a, b, c = self._R_bs
-        return (
-            a[0] * x + a[1] * y + a[2] * z,
-            b[0] * x + b[1] * y + b[2] * z,
-            c[0] * x + c[1] * y + c[2] * z,
-        )
+        x, y, z = (self._R_bs @ vector_s).tolist()
+        return x, y, z
 
     def tilt(self, telemetry: Telemetry) -> tuple[float, float] | None:
         """Roll and pitch of the body [rad], from what the attitude filter takes for upwards; None: it has none."""
-        up = self._up(telemetry)
-        return up and (math.atan2(up[1], up[2]), math.atan2(-up[0], math.hypot(up[1], up[2])))
+        if not _is_unit(telemetry.quaternion):
+            return None
+        x, y, z = self._R_bs @ quat_inverse_rotate(telemetry.quaternion, (0.0, 0.0, 1.0))
+        return math.atan2(y, z), math.atan2(-x, math.hypot(y, z))
 
     def yaw(self, telemetry: Telemetry) -> float:
         """Heading of the body's x axis by the attitude filter alone [rad], which drifts; NaN where it has none."""
-        if self._up(telemetry) is None:
+        if not _is_unit(telemetry.quaternion):
             return math.nan
-        x, y, z, w = telemetry.quaternion
-        # Columns of R_ls weighted with the body's x axis in the sensor's frame, which is the first row of R_bs.
-        a, b, c = self._R_bs[0]
-        east = a * (1.0 - 2.0 * (y * y + z * z)) + b * 2.0 * (x * y - z * w) + c * 2.0 * (x * z + y * w)
-        north = a * 2.0 * (x * y + z * w) + b * (1.0 - 2.0 * (x * x + z * z)) + c * 2.0 * (y * z - x * w)
-        return math.atan2(north, east)
+        x, y, _ = quat_rotate(telemetry.quaternion, self._R_bs[0])
+        return math.atan2(y, x)
 
-    def _up(self, telemetry: Telemetry) -> Three | None:
-        x, y, z, w = telemetry.quaternion
-        if not abs(x * x + y * y + z * z + w * w - 1.0) < 0.1:
-            return None
-        return self.to_body((2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)))
+
+def _is_unit(q: tuple[float, float, float, float]) -> bool:
+    """Whether a quaternion is about one of unit length."""
+    return abs(math.hypot(*q) ** 2 - 1.0) < 0.1
 
 
 def _within(values: Three, bound: float) -> bool:
@@ -497,12 +492,10 @@ class Perception:
         """Angular velocity, body frame [rad/s], less what is known of the gyro's bias: its part about the vertical."""
         if not math.isfinite(estimate.yaw_rate):
             return np.full(3, math.nan)
-        p, q, r = self._omega
-        level, y = math.cos(estimate.pitch), math.sin(estimate.roll)
-        z = math.cos(estimate.roll)
-        # Upwards is (-sin θ, y cos θ, z cos θ) in the body.
-        bias = (q * y + r * z) / level - estimate.yaw_rate
-        return np.array([p + bias * math.sin(estimate.pitch), q - bias * y * level, r - bias * z * level])
+        omega, roll, cos = np.array(self._omega), estimate.roll, math.cos(estimate.pitch)
+        up = np.array([-math.sin(estimate.pitch), math.sin(roll) * cos, math.cos(roll) * cos])
+        bias = (omega[1] * up[1] + omega[2] * up[2]) / cos**2 - estimate.yaw_rate
+        return omega - bias * up
 
     def _height(self, telemetry: Telemetry) -> float:
         """Height of the body origin in the pool frame from depth and tilt alone [m]."""
@@ -533,7 +526,7 @@ class _WorldFrame:
         T = np.eye(4) if pool is None else pool.T_wp
         self._R_wp, self._t = T[:3, :3].copy(), T[:3, 3].copy()
         self._R_wg = self._R_wp @ axes_of_up(up)
-        self._q_wg = tuple(matrix_to_quat(self._R_wg).tolist())
+        self._q_wg = matrix_to_quat(self._R_wg)
         self._plain = bool(np.allclose(self._R_wp, np.eye(3), atol=1e-12))
         # Heading of the pool frame's level axes, in which the estimator counts yaw.
         self._yaw = math.atan2(self._R_wg[1, 0], self._R_wg[0, 0])
@@ -544,33 +537,16 @@ class _WorldFrame:
             return replace(sample, yaw=math.remainder(sample.yaw - self._yaw, math.tau))
         if not isinstance(sample, VisionSample):
             return sample
-        (x, y), (cos, sin) = (
-            np.array(sample.position) - self._t[:2],
-            (math.cos(self._yaw), math.sin(self._yaw)),
-        )
+        x, y = np.array(sample.position) - self._t[:2]
+        cos, sin = math.cos(self._yaw), math.sin(self._yaw)
         yaw = None if sample.yaw is None else math.remainder(sample.yaw - self._yaw, math.tau)
         return replace(sample, position=(cos * x + sin * y, cos * y - sin * x), yaw=yaw)
 
     def state(self, estimate: Estimate) -> tuple[Array, Array, Array]:
         """Position [m], attitude xyzw, velocity in body axes [m/s]."""
         position = self._R_wp @ estimate.x[:3] + self._t
-        r, p, y = 0.5 * estimate.roll, 0.5 * estimate.pitch, 0.5 * estimate.yaw
-        cr, sr, cp, sp, cy, sy = math.cos(r), math.sin(r), math.cos(p), math.sin(p), math.cos(y), math.sin(y)
-        level = (
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-            cr * cp * cy + sr * sp * sy,
-        )
-        x, y, z, w = _product(self._q_wg, level)
-        R = np.array(
-            [
-                [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
-                [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
-                [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
-            ]
-        )
-        return position, np.array([x, y, z, w]), (self._R_wp @ estimate.x[3:]) @ R
+        q = quat_multiply(self._q_wg, quat_from_euler(estimate.roll, estimate.pitch, estimate.yaw))
+        return position, q, quat_inverse_rotate(q, self._R_wp @ estimate.x[3:])
 
     def std(self, estimate: Estimate) -> Array:
         """Standard deviations of position, velocity (world axes) and yaw, (7,)."""
@@ -585,18 +561,6 @@ class _WorldFrame:
 def _older(time: float, last: float) -> bool:
     """Whether something comes again or late; much too late means that the clock was set back."""
     return last - JUMP < time <= last
-
-
-def _product(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, float, float]:
-    """Quaternions xyzw multiplied."""
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return (
-        aw * bx + bw * ax + ay * bz - az * by,
-        aw * by + bw * ay + az * bx - ax * bz,
-        aw * bz + bw * az + ax * by - ay * bx,
-        aw * bw - ax * bx - ay * by - az * bz,
-    )
 
 
 def _why(health: Health, camera: bool) -> str:

@@ -74,63 +74,38 @@ def refuse_foreign(path: Path) -> None:
 
 def write_whole(source: Path, target: Path, notes: list[str]) -> None:
     """Copy every record of a file, as far as it can be read, into one with an index."""
+    from mcap import records
     from mcap.stream_reader import StreamReader
     from mcap.writer import CompressionType, Writer
 
+    schemas, channels, started = {0: 0}, dict[int, int](), False  # numbered anew
     with source.open("rb") as given, target.open("wb") as made:
         writer = Writer(made, compression=CompressionType.LZ4)
-        copier = _Copier(writer)
         try:
-            for record in StreamReader(given, validate_crcs=True).records:
-                copier.copy(record)
+            for one in StreamReader(given, validate_crcs=True).records:
+                match one:
+                    case records.Header():
+                        writer.start(one.profile, one.library)
+                        started = True
+                    case records.Schema() if one.id not in schemas:
+                        schemas[one.id] = writer.register_schema(one.name, one.encoding, one.data)
+                    case records.Channel() if one.id not in channels:
+                        kind, schema = one.message_encoding, schemas[one.schema_id]
+                        channels[one.id] = writer.register_channel(one.topic, kind, schema, one.metadata)
+                    case records.Message() if one.channel_id in channels:
+                        channel = channels[one.channel_id]
+                        writer.add_message(channel, one.log_time, one.data, one.publish_time, one.sequence)
+                    case records.Metadata():
+                        writer.add_metadata(one.name, one.metadata)
+                    case records.Attachment():
+                        writer.add_attachment(
+                            one.create_time, one.log_time, one.name, one.media_type, one.data
+                        )
         except Exception as error:  # damage shows in whatever layer meets it
             notes.append(f"{source.name} is damaged and was read up to there: {str(error).splitlines()[0]}")
-        copier.finish()
-
-
-class _Copier:
-    """Puts records of one file into a writer, which numbers schemas and channels anew."""
-
-    def __init__(self, writer: Any) -> None:
-        self.writer = writer
-        self.schemas: dict[int, int] = {0: 0}
-        self.channels: dict[int, int] = {}
-        self.started = False
-
-    def copy(self, record: Any) -> None:
-        from mcap import records
-
-        if isinstance(record, records.Header):
-            self._start(record.profile, record.library)
-        elif isinstance(record, records.Schema) and record.id not in self.schemas:
-            self.schemas[record.id] = self.writer.register_schema(record.name, record.encoding, record.data)
-        elif isinstance(record, records.Channel) and record.id not in self.channels:
-            self.channels[record.id] = self.writer.register_channel(
-                record.topic, record.message_encoding, self.schemas[record.schema_id], record.metadata
-            )
-        elif isinstance(record, records.Message) and record.channel_id in self.channels:
-            self.writer.add_message(
-                self.channels[record.channel_id],
-                record.log_time,
-                record.data,
-                record.publish_time,
-                record.sequence,
-            )
-        elif isinstance(record, records.Metadata):
-            self.writer.add_metadata(record.name, record.metadata)
-        elif isinstance(record, records.Attachment):
-            self.writer.add_attachment(
-                record.create_time, record.log_time, record.name, record.media_type, record.data
-            )
-
-    def finish(self) -> None:
-        self._start("", "")
-        self.writer.finish()
-
-    def _start(self, profile: str, library: str) -> None:
-        if not self.started:
-            self.writer.start(profile=profile, library=library)
-            self.started = True
+        if not started:
+            writer.start()
+        writer.finish()
 
 
 class Entry(NamedTuple):

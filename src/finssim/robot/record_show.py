@@ -6,9 +6,8 @@ import json
 import math
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,10 +18,10 @@ from finssim.robot.record_reader import Entry, Record, open_record
 from finssim.yaml_file import json_value
 
 __all__ = [
-    "TopicInfo",
     "as_line",
     "describe_record",
     "events_of",
+    "figures_of",
     "info",
     "json_line",
     "plain",
@@ -41,61 +40,47 @@ SHORTEST_GAP = 0.1
 """[s]"""
 
 
-@dataclass
-class TopicInfo:
-    """One topic in figures."""
+def figures_of(kind: str, times: Sequence[float], size: int) -> dict[str, Any]:
+    """One topic in figures.
 
-    kind: str
-    times: list[float]
-    """[s]"""
-    bytes: int = 0
-
-    @property
-    def rate(self) -> float:
-        """Messages a second; 0 of fewer than two."""
-        span = self.times[-1] - self.times[0] if self.times else 0.0
-        return (len(self.times) - 1) / span if span > 0.0 else 0.0
-
-    @property
-    def gaps(self) -> list[tuple[float, float]]:
-        """Beginning and length of the pauses that are far longer than the usual one [s]."""
-        steps = [(a, b - a) for a, b in pairwise(self.times)]
-        if len(steps) < GAP:
-            return []
-        usual = sorted(step for _, step in steps)[len(steps) // 2]
-        return [(at, step) for at, step in steps if step > max(GAP * usual, SHORTEST_GAP)]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        longest = max((step for _, step in self.gaps), default=0.0)
-        return {
-            "type": self.kind,
-            "messages": len(self.times),
-            "rate_hz": round(self.rate, 3),
-            "bytes": self.bytes,
-            "gaps": len(self.gaps),
-            "longest_gap_s": round(longest, 3),
-        }
+    Args:
+        kind: Its type.
+        times: Of its messages [s], (n,).
+        size: Of all of them [bytes].
+    """
+    steps = np.diff(times)
+    usual = np.sort(steps)[len(steps) // 2] if len(steps) >= GAP else math.inf
+    gaps = steps[steps > max(GAP * usual, SHORTEST_GAP)]
+    span = times[-1] - times[0] if times else 0.0
+    return {
+        "type": kind,
+        "messages": len(times),
+        "rate_hz": round((len(times) - 1) / span, 3) if span > 0.0 else 0.0,
+        "bytes": size,
+        "gaps": len(gaps),
+        "longest_gap_s": round(float(gaps.max(initial=0.0)), 3),
+    }
 
 
 def describe_record(record: Record) -> dict[str, Any]:
     """Duration, vehicle, topics, events and damage, as plain values."""
-    topics = {topic: TopicInfo(kind, []) for topic, kind in sorted(record.topics.items())}
+    times: dict[str, list[float]] = {topic: [] for topic in sorted(record.topics)}
+    sizes = Counter[str]()
     for at, topic, size in record.sizes():
-        topics[topic].times.append(at)
-        topics[topic].bytes += size
-    times = [at for info in topics.values() for at in (info.times[:1] + info.times[-1:])]
-    start, end = min(times, default=0.0), max(times, default=0.0)
+        times[topic].append(at)
+        sizes[topic] += size
+    ends = [at for of_topic in times.values() for at in (of_topic[:1] + of_topic[-1:])]
+    start, end = min(ends, default=0.0), max(ends, default=0.0)
     return {
         "file": str(record.path),
         "cut": record.cut,
         "notes": list(record.notes),
         "start_s": start,
         "duration_s": end - start,
-        "messages": sum(len(info.times) for info in topics.values()),
+        "messages": sum(map(len, times.values())),
         "metadata": record.metadata,
         "files": sorted(record.files),
-        "topics": {topic: info.as_dict() for topic, info in topics.items()},
+        "topics": {topic: figures_of(record.topics[topic], x, sizes[topic]) for topic, x in times.items()},
         "events": events_of(record),
     }
 

@@ -10,8 +10,8 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -38,7 +38,7 @@ from finssim.robot.wiring import POOL_ADDRESS, Drive, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
 
-__all__ = ["APART", "FAULT", "POOL_ADDRESS", "UNHEARD", "Summary", "Wiring", "run", "run_team"]
+__all__ = ["APART", "FAULT", "POOL_ADDRESS", "UNHEARD", "Wiring", "run", "run_team"]
 
 
 # What a person wants to know of a run: how near the goal it was, what stopped it, and whether it was in time.
@@ -48,49 +48,75 @@ LAST = 20.0
 """Errors are those of this much of the end [s]."""
 EVERY = 0.1
 """Between two errors [s]."""
+UPDATE = 1.0
+"""Between two updates of the line on the terminal [s]."""
+AFTERWARDS = 2.0
+"""A trajectory's end is held for so long before the run ends [s]."""
+MUTE = 3.0
+"""A vehicle that has said nothing for so long is told of [s]."""
 
 
-class Summary:
-    """Looks at a runtime after every step, and tells at the end.
+class _Monitor:
+    """Looks at a runtime after every step; knows when the run is over, and tells at the end.
 
     Note:
         Errors are those of the estimate, which is all that a robot knows.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, runtime: Runtime, duration: float | None, robot: str, console: Console) -> None:
+        self.state = runtime.bridge.state
+        """Of the bridge, before the run is ended."""
+        follows = duration is None and math.isfinite(runtime.guide.duration)
+        self._end = runtime.guide.duration + AFTERWARDS if follows else math.inf
+        self._robot, self._console = robot, console
         self._errors: deque[tuple[float, float]] = deque(maxlen=round(LAST / EVERY))
-        self._next = -math.inf
+        self._next = self._spoken = -math.inf
+        self._mute_at = math.nan
+        self.status: Any = None
+        """The line on the terminal, if there is one."""
 
     def look(self, runtime: Runtime) -> None:
-        """Take down the distance to the goal [m] and the heading error [rad], where they are known."""
+        """Take down state and errors, and say how it goes."""
+        self.state = runtime.bridge.state
         reading = runtime.reading
-        if reading is None or reading.time < self._next or math.isnan(runtime.started) or not reading.ready:
+        if reading is None:
             return
-        self._next = reading.time + EVERY - 1e-6
-        goal = runtime.guide.at(runtime.t)
-        turn = float(wrap_angle(quat_yaw(reading.quaternion) - goal.yaw))
-        self._errors.append((float(np.linalg.norm(reading.position - goal.position)), turn))
+        now = reading.time
+        if not math.isnan(runtime.started) and reading.ready and now >= self._next:
+            self._next = now + EVERY - 1e-6
+            goal = runtime.guide.at(runtime.t)
+            turn = float(wrap_angle(quat_yaw(reading.quaternion) - goal.yaw))
+            self._errors.append((float(np.linalg.norm(reading.position - goal.position)), turn))
+        self._mute_at = now + MUTE if math.isnan(self._mute_at) else self._mute_at
+        if now >= self._mute_at and not runtime.counters.telemetry:
+            self._mute_at = math.inf
+            self._console.print(
+                f"no telemetry from {self._robot} yet: is it on, and does it know this end's address?",
+                markup=False,
+            )
+        if self.status is not None and now - self._spoken >= UPDATE:
+            self._spoken = now
+            reason = runtime.bridge.reason or reading.reason or runtime.refusal
+            self.status.update(f"{self.state}{f' ({reason})' if reason else ''}: {self._newest}")
+
+    def over(self, runtime: Runtime) -> bool:
+        """Whether the run is over."""
+        return self.state == "fault" or runtime.t > self._end
 
     @property
-    def newest(self) -> str:
+    def _newest(self) -> str:
         """The latest error in words."""
         if not self._errors:
             return "position not known"
         distance, turn = self._errors[-1]
         return f"{100.0 * distance:.1f} cm and {math.degrees(turn):+.1f} deg off"
 
-    def tell(self, runtime: Runtime, duration: float, state: str) -> dict[str, Any]:
-        """All of it as plain data.
-
-        Args:
-            runtime: After the run.
-            duration: Of the run [s].
-            state: Of the bridge before the run was ended.
-        """
+    def report(self, runtime: Runtime, duration: float) -> dict[str, Any]:
+        """All of it as plain data, after a run of a duration [s]."""
         rms = np.sqrt(np.mean(np.square(self._errors), axis=0)) if self._errors else (None, None)
         faults = [event.text for event in runtime.counters.events if event.kind == "fault"]
         return {
-            "state": state,
+            "state": self.state,
             "reason": runtime.bridge.reason or runtime.refusal or _waiting(runtime),
             "duration_s": duration,
             "goal": runtime.guide.name,
@@ -110,7 +136,7 @@ def _waiting(runtime: Runtime) -> str:
 
 
 def show(told: dict[str, Any], console: Console) -> None:
-    """Print what `Summary.tell` told as a table."""
+    """Print what `_Monitor.report` told as a table."""
     table = Table(show_header=False, box=None)
     latency = told["latency_s"]
     position, yaw = told["position_rms_m"], told["yaw_rms_deg"]
@@ -241,10 +267,6 @@ UNHEARD = 4
 """Exit status of a run in which the vehicle said nothing."""
 _GO = Station((0.0, 0.0, 0.0), 0.0, name="team")
 """The guide of a vehicle that goes by the others alone."""
-AFTERWARDS = 2.0
-"""A trajectory's end is held for so long before the run ends [s]."""
-MUTE = 3.0
-"""A vehicle that has said nothing for so long is told of [s]."""
 
 
 def run(
@@ -329,9 +351,17 @@ def run(
                 "--team has every agent in its place: leave --agent, --trajectory, --lockstep, --number and --let-in "
                 "out"
             )
-        return _run_team(
-            team, site=site, pool_file=pool_file, goal=goal, mode=mode, duration=duration, arm=arm,
-            task=task, vehicle=vehicle, robot=robot, bind=bind, messages=messages, record=record, as_json=as_json,
+        options = {
+            "--site": site or "open-water",
+            "--pool-file": pool_file or "none",
+            "--goal": goal,
+            "--mode": mode or "constant-velocity",
+            "--duration": duration,
+        }
+        words = [word for name, x in options.items() if x is not None for word in (name, str(x))]
+        return run_team(
+            team, [*words, *(["--arm"] if arm else [])], task=task, vehicle=vehicle, robot=robot, bind=bind,
+            messages=messages, record=record, as_json=as_json,
         )  # fmt: skip
     assert policy is not None
     wiring = Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep, team=messages)
@@ -378,51 +408,25 @@ def run(
             recorder=recorder,
             team=team,
         )
-        watch, summary = _Watch(runtime, duration, wiring.robot, console), Summary()
-        with _progress(console) as say:
+        monitor = _Monitor(runtime, duration, wiring.robot, console)
 
-            def look(runtime: Runtime) -> None:
-                if heard is not None:
-                    heard.started = runtime.started
-                watch.look(runtime)
-                summary.look(runtime)
-                say(runtime, summary)
+        def look(runtime: Runtime) -> None:
+            if heard is not None:
+                heard.started = runtime.started
+            monitor.look(runtime)
 
+        line = console.status("waiting for the vehicle", refresh_per_second=2.0)
+        with line if console.is_terminal else nullcontext() as monitor.status:
             longest = math.inf if duration is None else duration
-            took = drive(runtime, duration=longest, show=look, until=watch.over)
-    told = summary.tell(runtime, took, watch.state)
+            took = drive(runtime, duration=longest, show=look, until=monitor.over)
+    told = monitor.report(runtime, took)
     if as_json:
         print(json.dumps(told))
     else:
         show(told, Console())
-    if watch.state == "fault":
+    if monitor.state == "fault":
         return FAULT
     return UNHEARD if runtime.counters.steps and not runtime.counters.telemetry else 0
-
-
-def _run_team(
-    team: str,
-    *,
-    site: str | None,
-    pool_file: str | None,
-    goal: str | None,
-    mode: str | None,
-    duration: float | None,
-    arm: bool,
-    **rest: Any,
-) -> int:
-    """Run every agent of a task, each with these options, in a process of its own."""
-
-    options = {
-        "--site": site or "open-water",
-        "--pool-file": pool_file or "none",
-        "--goal": goal,
-        "--mode": mode or "constant-velocity",
-        "--duration": duration,
-    }
-    words = [word for name, x in options.items() if x is not None for word in (name, str(x))]
-    words += ["--arm"] if arm else []
-    return run_team(team, words, **rest)
 
 
 def _is_address(text: str) -> bool:
@@ -485,52 +489,3 @@ def _opened(
                 recorder.path.unlink()
             raise
         yield drive, recorder
-
-
-class _Watch:
-    """Remembers the state of the bridge, and when the run is over; tells of a vehicle that says nothing."""
-
-    def __init__(self, runtime: Runtime, duration: float | None, robot: str, console: Console) -> None:
-        self.state = runtime.bridge.state
-        follows = duration is None and math.isfinite(runtime.guide.duration)
-        self._end = runtime.guide.duration + AFTERWARDS if follows else math.inf
-        self._robot, self._console = robot, console
-        self._waits_since = math.nan
-        self._told = False
-
-    def look(self, runtime: Runtime) -> None:
-        self.state = runtime.bridge.state
-        if self._told or runtime.counters.telemetry or runtime.reading is None:
-            return
-        now = runtime.reading.time
-        self._waits_since = now if math.isnan(self._waits_since) else self._waits_since
-        if now - self._waits_since >= MUTE:
-            self._told = True
-            self._console.print(
-                f"no telemetry from {self._robot} yet: is it on, and does it know this end's address?",
-                markup=False,
-            )
-
-    def over(self, runtime: Runtime) -> bool:
-        return self.state == "fault" or runtime.t > self._end
-
-
-@contextmanager
-def _progress(console: Console) -> Iterator[Callable[[Runtime, Summary], None]]:
-    """Says once a second how it goes, where somebody watches."""
-    if not console.is_terminal:
-        yield lambda runtime, summary: None
-        return
-    spoken = -math.inf
-    with console.status("waiting for the vehicle", refresh_per_second=2.0) as status:
-
-        def say(runtime: Runtime, summary: Summary) -> None:
-            nonlocal spoken
-            reading = runtime.reading
-            if reading is not None and reading.time - spoken >= 1.0:
-                spoken = reading.time
-                state = runtime.bridge.state
-                why = runtime.bridge.reason or reading.reason or runtime.refusal
-                status.update(f"{state}{f' ({why})' if why else ''}: {summary.newest}")
-
-        yield say

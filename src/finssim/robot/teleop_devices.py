@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import select
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, TextIO
 
 from finssim.robot.teleop import Hands, TeleopError
 
-__all__ = ["GAMEPAD_HELP", "KEYBOARD_HELP", "XBOX", "Gamepad", "Keyboard", "Keys", "Layout"]
+__all__ = ["GAMEPAD_HELP", "KEYBOARD_HELP", "XBOX", "Gamepad", "Keyboard", "Keys", "Layout", "Pad"]
 
 
 # A terminal's keyboard as teleoperation device, also over ssh; the terminal is put back as it was.
@@ -38,7 +39,7 @@ AXES = {
 }
 """Key -> axis and deflection; the arrows drive and turn."""
 
-BUTTONS = {"\r": "arm", "\n": "arm", "x": "stop", "k": "acknowledge", "m": "mode"}
+KEY_BUTTONS = {"\r": "arm", "\n": "arm", "x": "stop", "k": "acknowledge", "m": "mode"}
 GEAR_KEYS = {"1": "precision", "2": "cruise", "3": "boost"}
 
 
@@ -65,8 +66,8 @@ class Keys:
         if key in AXES:
             axis, deflection = AXES[key]
             self._pressed[axis] = (now, deflection)
-        elif key in BUTTONS:
-            self._pressed[BUTTONS[key]] = (now, 1.0)
+        elif key in KEY_BUTTONS:
+            self._pressed[KEY_BUTTONS[key]] = (now, 1.0)
         elif key in GEAR_KEYS:
             self._gear = GEAR_KEYS[key]
         elif key == " ":
@@ -193,15 +194,17 @@ class Layout:
     @property
     def axes(self) -> int:
         """How many axes a pad has to have."""
-        return 1 + max(self.left_x, self.left_y, self.right_x, self.left_trigger, self.right_trigger)
+        return 1 + max(getattr(self, name) for name in STICKS)
 
     @property
     def buttons(self) -> int:
         """How many buttons a pad has to have."""
-        return 1 + max(
-            self.dead_man, self.precision, self.boost, self.arm, self.stop, self.acknowledge, self.mode
-        )
+        return 1 + max(getattr(self, name) for name in BUTTONS)
 
+
+STICKS = ("left_x", "left_y", "right_x", "left_trigger", "right_trigger")
+BUTTONS = ("dead_man", "precision", "boost", "arm", "stop", "acknowledge", "mode")
+"""Fields of a layout."""
 
 XBOX = Layout(
     left_x=0,
@@ -218,6 +221,30 @@ XBOX = Layout(
     arm=7,
 )
 """Pads of the Xbox family under Linux."""
+
+
+class Pad:
+    """Axes and buttons of a pad as `Hands`."""
+
+    def __init__(self, layout: Layout = XBOX) -> None:
+        self.layout, self._moved = layout, set[int]()
+
+    def hands(self, axes: Sequence[float], buttons: Sequence[Any]) -> Hands:
+        """What the pad shows, as SDL has it: right and backwards are positive, a trigger goes from -1 to 1."""
+        at = self.layout
+        return Hands(
+            surge=-axes[at.left_y],
+            sway=-axes[at.left_x],
+            heave=self._pulled(axes, at.right_trigger) - self._pulled(axes, at.left_trigger),
+            yaw=-axes[at.right_x],
+            **{name: bool(buttons[getattr(at, name)]) for name in BUTTONS},
+        )
+
+    def _pulled(self, axes: Sequence[float], axis: int) -> float:
+        """How far a trigger is pulled, [0, 1]; 0, which is half way, is shown until it is moved for the first time."""
+        if axes[axis] != 0.0:
+            self._moved.add(axis)
+        return (axes[axis] + 1.0) / 2.0 if axis in self._moved else 0.0
 
 
 class Gamepad:
@@ -239,7 +266,6 @@ class Gamepad:
 
         self.layout = layout
         self._pygame = pygame
-        self._moved: set[int] = set()
         pygame.display.init()
         pygame.joystick.init()
         self._pad: Any = None
@@ -285,31 +311,8 @@ class Gamepad:
     def _find(self) -> None:
         if self._pygame.joystick.get_count():
             self._pad = self._pygame.joystick.Joystick(0)
-            self._moved.clear()
+            self._shown = Pad(self.layout)
 
     def _hands(self) -> Hands:
-        pad, at = self._pad, self.layout
-
-        def held(button: int) -> bool:
-            return bool(pad.get_button(button))
-
-        return Hands(
-            surge=-pad.get_axis(at.left_y),
-            sway=-pad.get_axis(at.left_x),
-            heave=self._trigger(at.right_trigger) - self._trigger(at.left_trigger),
-            yaw=-pad.get_axis(at.right_x),
-            dead_man=held(at.dead_man),
-            precision=held(at.precision),
-            boost=held(at.boost),
-            arm=held(at.arm),
-            stop=held(at.stop),
-            acknowledge=held(at.acknowledge),
-            mode=held(at.mode),
-        )
-
-    def _trigger(self, axis: int) -> float:
-        """How far a trigger is pulled, [0, 1]; SDL shows 0, which is half way, until it is moved for the first time."""
-        value = float(self._pad.get_axis(axis))
-        if value != 0.0:
-            self._moved.add(axis)
-        return (value + 1.0) / 2.0 if axis in self._moved else 0.0
+        axes = [float(self._pad.get_axis(i)) for i in range(self.layout.axes)]
+        return self._shown.hands(axes, [self._pad.get_button(i) for i in range(self.layout.buttons)])

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from typing import Any
 
 from finssim.robot.teleop import Device, Hands, Operator, TeleopError
-from finssim.robot.teleop_devices import XBOX
+from finssim.robot.teleop_devices import XBOX, Pad
 from finssim.ros2.nodes.remote import RemoteBridge
 from finssim.ros2.nodes.robot_node import RobotNode
 from finssim.ros2.nodes.ros_messages import ros_type
@@ -75,7 +75,7 @@ class JoyDevice:
 
     def __init__(self) -> None:
         self._newest: Any = None
-        self._moved: set[int] = set()
+        self._pad = Pad()
 
     def take(self, message: Any) -> None:
         """The newest message."""
@@ -86,21 +86,4 @@ class JoyDevice:
         message, self._newest = self._newest, None
         if message is None or len(message.axes) < XBOX.axes or len(message.buttons) < XBOX.buttons:
             return None
-        axes, held = message.axes, [bool(b) for b in message.buttons]
-        return Hands(
-            surge=float(axes[XBOX.left_y]),
-            sway=float(axes[XBOX.left_x]),
-            heave=self._trigger(axes, XBOX.right_trigger) - self._trigger(axes, XBOX.left_trigger),
-            yaw=float(axes[XBOX.right_x]),
-            **{
-                name: held[getattr(XBOX, name)]
-                for name in ("dead_man", "precision", "boost", "arm", "stop", "acknowledge", "mode")
-            },
-        )
-
-    def _trigger(self, axes: Any, axis: int) -> float:
-        """How far a trigger is pulled, [0, 1]: 1 at rest to -1, but 0 until it is moved for the first time."""
-        value = float(axes[axis])
-        if value != 0.0:
-            self._moved.add(axis)
-        return (1.0 - value) / 2.0 if axis in self._moved else 0.0
+        return self._pad.hands([-float(x) for x in message.axes], message.buttons)
