@@ -17,8 +17,8 @@ once:
 What comes before `*` is typed by its place, the rest as `--name`; a bool is a flag, a `Sequence` may be given several
 times. `Annotated` adds bounds as `(low, high)`, another `"--name"`, or `","` where one option holds several words. What
 is no text, number, flag or path, or is annotated "python", is no option and keeps its default, but for the types of
-`MAKERS`. `**options`, "As of `module.function`.", are those of that function. What is returned is the exit status, or a
-result, whose `ok` makes it 0 or 3.
+`MAKERS`. `**options`, "As of `module.function`, without rows, robot.", are those of that function but for some. What
+is returned is the exit status, or a result, whose `ok` makes it 0 or 3.
 """
 
 from __future__ import annotations
@@ -59,12 +59,10 @@ JSON = "Print one JSON object instead of tables."
 
 @dataclass(frozen=True)
 class Experiment:
-    """A command whose work takes `out` and `say` and returns a result, which `show` prints."""
+    """A command whose work returns a result, of which the module's `tables_of` makes tables."""
 
     work: str
     """module:function"""
-    show: str
-    """Function of that module."""
 
 
 Work = str | Experiment
@@ -139,12 +137,16 @@ class Definition:
         for maker in self.made.values():
             yield from maker.options
 
-    def call(self, given: Mapping[str, Any], *words: str, **fixed: Any) -> Any:
-        """Call it with what was typed."""
+    def values(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Parameter -> what it is called with, of what was typed."""
         values = {option.name: option.value(given[option.name]) for option in self.options}
-        values |= {name: maker.call(given) for name, maker in self.made.items()}
+        return values | {name: maker.call(given) for name, maker in self.made.items()}
+
+    def call(self, given: Mapping[str, Any], *words: str) -> Any:
+        """Call it with what was typed."""
+        values = self.values(given)
         positional = [values.pop(option.name) for option in self.options if option.positional]
-        return loaded(self.place)(*positional, *words, **values | fixed)
+        return loaded(self.place)(*positional, *words, **values)
 
 
 def loaded(place: str) -> Callable[..., Any]:
@@ -181,12 +183,13 @@ def read(place: str) -> Definition:
             words = words or (JSON if argument == "as_json" else "")
             options.append(Option(argument, kind, many, positional, value, notes, metavar, words))
     rest = node.args.kwarg.arg if isinstance(node, ast.FunctionDef) and node.args.kwarg else ""
-    reference = re.match(r"As of ([\w.]+)\.(\w+)", helps.get(rest, (None, ""))[1])
+    reference = re.match(r"As of ([\w.]+)\.(\w+)(?:, without ([\w, ]+))?", helps.get(rest, (None, ""))[1])
     if isinstance(node, ast.FunctionDef) and reference is not None:
         further = read(f"finssim.{reference[1]}:{reference[2]}")
         names = {argument.arg for argument in node.args.args + node.args.kwonlyargs}
+        names |= set((reference[3] or "").split(", "))
         options += [option for option in further.options if option.name not in names]
-        made |= further.made
+        made |= {name: maker for name, maker in further.made.items() if name not in names}
     shown = re.split(r"\n(?:Args|Returns|Raises|Note):\n", about)[0].replace("`", "")
     extra = isinstance(node, ast.FunctionDef) and node.args.vararg is not None
     return Definition(place, shown, tuple(options), made, extra)
@@ -307,7 +310,7 @@ def _handler(words: str, what: Work, *, group: bool = False) -> Callable[..., An
         if group and context.invoked_subcommand is not None:
             return None
         if experiment is not None:
-            return _experiment(words, definition, experiment.show, given)
+            return _experiment(words, definition, given)
         return _status(definition.call(given, *(context.args if definition.extra else ())))
 
     context = inspect.Parameter("context", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)
@@ -319,19 +322,13 @@ def _handler(words: str, what: Work, *, group: bool = False) -> Callable[..., An
     return handle
 
 
-def _experiment(words: str, definition: Definition, show: str, given: Mapping[str, Any]) -> int:
+def _experiment(words: str, definition: Definition, given: Mapping[str, Any]) -> int:
     from finssim.experiments.campaign import run_experiment
 
-    module = definition.place.partition(":")[0]
-
-    def work(**said: Any) -> Any:
-        return definition.call(given, **said)
-
-    result = run_experiment(
-        words, work, loaded(f"{module}:{show}"), out=given["out"], as_json=given["as_json"],
-        bar=given.get("robot") is None,
-    )  # fmt: skip
-    return _status(result)
+    place = definition.place
+    work, tables = loaded(place), loaded(f"{place.partition(':')[0]}:tables_of")
+    options = {"bar": given.get("robot") is None, "as_json": given["as_json"]}
+    return _status(run_experiment(words, work, tables, **options, **definition.values(given)))
 
 
 def _status(result: Any) -> int:

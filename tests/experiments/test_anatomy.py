@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from finssim.experiments import anatomy as module
+from finssim.experiments import evaluate
 from finssim.experiments.anatomy import CAUSES, anatomy, tables_of, tolerated
 from finssim.experiments.plants import Plant
 from finssim.tasks.agents import agent_for
@@ -49,7 +50,7 @@ def test_a_table_and_a_figure_that_a_later_call_does_not_play_again(tmp_path, mo
     what, everything = tables_of(result)
     assert what.rows == [["too much ballast, of its weight [%]", "16+", "0"]]
     assert [row[0] for row in everything.rows] == ["PID, tuned from the model", "PID, published gains"]
-    monkeypatch.setattr(module, "evaluate_controller", None)
+    monkeypatch.setattr(evaluate, "evaluate_controller", None)
     again = anatomy(out=tmp_path, **options)
     assert again["causes"] == result["causes"]
 

@@ -17,7 +17,7 @@ from finssim.experiments.compare import (
     groups_of,
     measures_of,
     scores_of,
-    table_of,
+    tables_of,
 )
 from finssim.experiments.tables import markdown_of
 from finssim.learning.export import export_policy
@@ -125,9 +125,9 @@ def test_a_difference_in_every_seed_is_told_and_two_seeds_tell_nothing(tmp_path)
     assert result["groups"]["a"]["measures"]["e_p_m"]["value"] == pytest.approx(0.0115)
     assert (
         "a is better than b in e_p_m (chance that a is better: 1.00 [1.00, 1.00])"
-        in table_of(result).sentences
+        in tables_of(result)[0].sentences
     )
-    assert "| a | 4 | 1,000 | 5 | 1 [1, 1] | 0.0115 [0.0115, 0.0115] |" in markdown_of(table_of(result))
+    assert "| a | 4 | 1,000 | 5 | 1 [1, 1] | 0.0115 [0.0115, 0.0115] |" in markdown_of(tables_of(result))
     few = groups_of([word for word in words if word.endswith(("1", "2"))])
     assert all(p["verdict"] == "open" for p in comparison(few, found)["pairs"])
 

@@ -15,7 +15,7 @@ from finssim.experiments import demo as demo_module
 from finssim.experiments.demo import FULL, Scope, demo
 from finssim.experiments.identify import identify
 from finssim.experiments.metrics import T1_SETPOINTS
-from finssim.experiments.pool_trial import read_series
+from finssim.experiments.trials import Motion
 from finssim.files import OutputError
 from finssim.learning.training_loop import Loop
 from finssim.pool import load_plant_spec
@@ -71,6 +71,9 @@ def test_policy_results_and_report_are_there(folder):
         "pid.json",
         "pid-paper.json",
         "camera.png",
+        "envelopes.png",
+        "paths.png",
+        "training.png",
         "report.html",
     }
 
@@ -112,7 +115,7 @@ def test_controllers_met_the_plant_that_the_trials_came_from_through_the_whole_s
         assert result["camera"] == camera and trial["fault"] == ""
         assert trial["localization"]["position_m"] < 0.05
     for file in (folder / "deployed").glob("*.npz"):
-        assert abs(read_series(file.with_suffix(""))["position"][0]).max() < 0.6
+        assert abs(Motion.read(file.with_suffix("")).position[0]).max() < 0.6
 
 
 def test_the_full_demonstration_tries_all_setpoints_and_axes():

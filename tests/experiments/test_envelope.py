@@ -7,8 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from finssim.control.guidance import Station
 from finssim.experiments.figures import draw_envelopes, error_envelope, save_figure
+from finssim.experiments.trials import Motion, Trial
 from finssim.files import OutputError
+from finssim.geometry.rotations import quat_from_yaw
 
 GOAL = np.array([1.0, 0.3, -0.5, math.pi])
 T = np.arange(601) / 10.0
@@ -17,7 +20,9 @@ T = np.arange(601) / 10.0
 def at_distance(distance, turn=0.0, t=T):
     """A trial that stays `distance` below the goal, turned by `turn`."""
     position = np.tile(GOAL[:3], (len(t), 1)) - np.outer(np.broadcast_to(distance, t.shape), [0.0, 0.0, 1.0])
-    return t, position, np.full(len(t), GOAL[3] - 2 * math.pi) + turn, GOAL
+    quaternion = quat_from_yaw(np.full(len(t), GOAL[3] - 2 * math.pi) + turn)
+    guide = Station(tuple(GOAL[:3]), GOAL[3])
+    return Trial(name="P", guide=guide, motion=Motion(t=t, position=position, quaternion=quaternion))
 
 
 def test_five_constant_errors_have_their_own_quartiles():

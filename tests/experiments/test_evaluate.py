@@ -76,13 +76,15 @@ def test_trials_are_those_of_the_protocol():
     """60 s from the published start, level and at rest, the eight setpoints in turn, at the controller's rate."""
     player = PidAgent("pid", FINSROV)
     done = run_trials(player, StationKeeping(), FINSROV, NOMINAL, trials=10)
-    assert done.setpoints == (*T1_SETPOINTS, "P01", "P02")
-    np.testing.assert_allclose(done.position[0], np.broadcast_to(T1_START[:3], (10, 3)), atol=1e-6)
-    np.testing.assert_allclose(done.yaw[0], 0.0, atol=1e-6)
-    np.testing.assert_allclose(done.goals[3], T1_SETPOINTS["P04"])
-    assert done.t[-1] == pytest.approx(60.0) and done.t[1] == player.period
+    assert [trial.name for trial in done] == [*T1_SETPOINTS, "P01", "P02"]
+    motions = [trial.motion for trial in done]
+    for motion in motions:
+        np.testing.assert_allclose(motion.position[0], T1_START[:3], atol=1e-6)
+        np.testing.assert_allclose(motion.yaw[0], 0.0, atol=1e-6)
+        assert motion.t[-1] == pytest.approx(60.0) and motion.t[1] == player.period
+    np.testing.assert_allclose(done[3].goal, T1_SETPOINTS["P04"])
     # Equal goals in an undisturbed plant are equal trials.
-    np.testing.assert_array_equal(done.position[:, 0], done.position[:, 8])
+    np.testing.assert_array_equal(motions[0].position, motions[8].position)
 
 
 @pytest.mark.slow
@@ -96,13 +98,19 @@ def test_every_plant_can_be_flown_in(name, controller, monkeypatch):
     assert all(trial["e_p_m"] is None for trial in result["per_trial"])  # the window was never reached
 
 
+def positions(plant, **options):
+    """Of all trials of the tuned PID, (T, n, 3)."""
+    played = evaluate_controller("pid", plant, **options).trials
+    return np.stack([trial.motion.position for trial in played], axis=1)
+
+
 @pytest.mark.slow
 def test_plants_make_a_difference(monkeypatch):
     """A current pushes, noise shakes, lag delays: each path differs from the nominal one."""
     monkeypatch.setattr(trials_module, "DURATION", 5.0)
-    nominal = evaluate_controller("pid", NOMINAL, trials=2).trials.position
+    nominal = positions(NOMINAL, trials=2)
     for name in set(available_plants()) - {"nominal"}:
-        other = evaluate_controller("pid", load_plant(name), trials=2).trials.position
+        other = positions(load_plant(name), trials=2)
         assert np.abs(other - nominal).max() > 1e-3, name
 
 
@@ -110,10 +118,9 @@ def test_seeds_decide_what_is_drawn(monkeypatch):
     """Equal seeds are equal trials, others are not, and a trial does not depend on how many there are."""
     monkeypatch.setattr(trials_module, "DURATION", 3.0)
     plant = load_plant("randomised")
-    one, again, other = (
-        evaluate_controller("pid", plant, trials=4, seed=s).trials.position for s in (1, 1, 2)
+    one, again, other, many = (
+        positions(plant, trials=trials, seed=seed) for trials, seed in ((4, 1), (4, 1), (4, 2), (70, 1))
     )
-    many = evaluate_controller("pid", plant, trials=70, seed=1).trials.position
     np.testing.assert_array_equal(one, again)
     np.testing.assert_array_equal(one, many[:, :4])
     assert np.abs(one - other).max() > 1e-4
@@ -148,8 +155,9 @@ def test_a_directory_holds_result_figure_and_trajectories(tmp_path, capsys):
     assert (tmp_path / "e" / "error_envelope.png").read_bytes().startswith(b"\x89PNG")
     table = read_run(tmp_path / "e" / "trajectories")
     path = table[table.world == 4].sort_values("t")
-    np.testing.assert_allclose(path[["x", "y", "z"]], evaluation.trials.position[:, 4], atol=1e-6)
-    np.testing.assert_allclose(path.t, evaluation.trials.t, atol=1e-6)
+    motion = evaluation.trials[4].motion
+    np.testing.assert_allclose(path[["x", "y", "z"]], motion.position, atol=1e-6)
+    np.testing.assert_allclose(path.t, motion.t, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -187,9 +195,10 @@ def test_a_world_that_breaks_fails_its_trial_alone(tmp_path, monkeypatch):
     done = run_trials(
         PidAgent("pid", FINSROV), StationKeeping(), FINSROV, NOMINAL, trials=8, crash_directory=tmp_path
     )
-    assert np.isfinite(done.position[:100]).all()
-    assert np.isnan(done.position[100:, 2]).all() and np.isfinite(np.delete(done.position, 2, axis=1)).all()
-    measures = done.measures()
+    position = np.stack([trial.motion.position for trial in done], axis=1)
+    assert np.isfinite(position[:100]).all()
+    assert np.isnan(position[100:, 2]).all() and np.isfinite(np.delete(position, 2, axis=1)).all()
+    measures = [trial.measures("t1", FINSROV.force_limits) for trial in done]
     assert [m["success"] for m in measures] == [i != 2 for i in range(8)] and measures[2]["e_p_m"] is None
     assert len(list(tmp_path.iterdir())) == 1
 
@@ -249,4 +258,4 @@ def test_somebodys_files_are_not_replaced(policy):
 def test_the_papers_rows_are_the_published_table():
     """Table of T1: eight trials each, the best at 7 of 8."""
     assert {row[4] for row in PAPER_T1.values()} == {8} and max(row[3] for row in PAPER_T1.values()) == 7
-    assert PAPER_T1["calibrated + DR"][:3] == (0.092, 0.043, 5.42)
+    assert PAPER_T1["calibrated + DR"][:3] == [0.092, 0.043, 5.42]

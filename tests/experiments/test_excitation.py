@@ -30,6 +30,7 @@ def step(level, axis="surge"):
 def run_of(programme, **settings):
     return PoolRun(
         row="fit",
+        target=programme.name,
         programme=programme,
         vehicle="finsrov",
         pool_vehicle="finsrov",
@@ -42,9 +43,9 @@ def run_of(programme, **settings):
 def surge(tmp_path_factory):
     """One step of 12 N in a pool without secrets: its trial."""
     folder = tmp_path_factory.mktemp("surge")
-    result = play_programme(run_of(step(12.0)), folder / "surge")
-    assert result["fault"] == ""
-    return load_trials([folder / "surge"])[0]
+    run = run_of(step(12.0))
+    assert play_programme(run, folder)["fault"] == ""
+    return load_trials([folder / run.target])[0]
 
 
 def test_a_record_becomes_a_trial_with_phases_axis_and_role(surge):
@@ -106,9 +107,10 @@ def test_a_programme_that_the_bridge_stops_is_refused(tmp_path):
 
 def test_steps_on_rails_reach_the_closed_form():
     """Nominal surge of 12 N: linear damping alone, v = 12 / 39.07."""
-    found = step_responses(FINSROV, draw_plant(FINSROV, 1, "nominal"), {"surge": [12.0]})["surge", 12.0]
-    assert found.speed == pytest.approx(12.0 / 39.073593, rel=0.02)
-    assert 27.14 / 39.07 < found.time_constant < 27.14 / 39.07 + 0.4  # motors and their delay come on top
+    responses = step_responses(FINSROV, draw_plant(FINSROV, 1, "nominal"), {"surge": [12.0]})
+    speed, time_constant = responses["surge", 12.0]
+    assert speed == pytest.approx(12.0 / 39.073593, rel=0.02)
+    assert 27.14 / 39.07 < time_constant < 27.14 / 39.07 + 0.4  # motors and their delay come on top
 
 
 def test_excite_in_a_pool_by_command(tmp_path):

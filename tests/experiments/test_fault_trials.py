@@ -2,7 +2,7 @@
 
 import pytest
 
-from finssim.experiments.faults import SCENARIOS, FaultJob, play
+from finssim.experiments.faults import SCENARIOS, fault_job, play
 
 
 @pytest.fixture
@@ -10,7 +10,7 @@ def tried(tmp_path):
     """Plays a scenario."""
 
     def trial(scenario, variant="", motion="moving"):
-        result = play(FaultJob(scenario=scenario, variant=variant, motion=motion), tmp_path / "trial")
+        result = play(fault_job(scenario, variant, motion), tmp_path / "trial")
         assert not result["raised"] and result["thrust_n"] > 0.5  # something was there to be stopped
         assert not list(tmp_path.glob("*.mcap"))
         return result

@@ -2,20 +2,20 @@
 
 import pytest
 
-from finssim.experiments.faults import FaultJob, play_kill
+from finssim.experiments.faults import fault_job, play_kill
 
 
 @pytest.mark.slow
-def test_a_killed_robot_leaves_motors_that_stop_and_a_record_that_opens():
+def test_a_killed_robot_leaves_motors_that_stop_and_a_record_that_opens(tmp_path):
     """By the controller's own timeout of 0.5 s; no more than a second is missing."""
-    result = play_kill(FaultJob(scenario="kill-robot", motion="station"))
+    result = play_kill(fault_job("kill-robot"), tmp_path)
     assert result["ok"], result
     assert 0.3 < result["thrust_gone_s"] < 1.5 and result["record_lost_s"] <= 1.0 and result["thrust_n"] > 0.5
 
 
 @pytest.mark.slow
-def test_a_robot_whose_pool_is_killed_stops_commanding_and_says_why():
+def test_a_robot_whose_pool_is_killed_stops_commanding_and_says_why(tmp_path):
     """Its process ends by itself, with a fault that names the silence."""
-    result = play_kill(FaultJob(scenario="kill-pool", motion="station"))
+    result = play_kill(fault_job("kill-pool"), tmp_path)
     assert result["ok"], result
     assert result["state"] == "fault" and "telemetry" in result["reason"] and result["frames_off_s"] <= 0.5

@@ -6,7 +6,7 @@ import pytest
 
 from finssim import boundary
 from finssim.cli import app
-from finssim.experiments.faults import faults_table, row_ok
+from finssim.experiments.faults import row_ok, tables_of
 
 GOOD = {
     "ok": True, "thrust_gone_s": 0.4, "frames_off_s": 0.1, "margin_m": 0.2, "state": "fault", "reason": "silence",
@@ -20,7 +20,7 @@ def trial(row, **changes):
 
 def told(*trials):
     result = {"severity": "realistic", "seeds": [1], "vehicle": {"name": "finsrov", "sha256": "0" * 64}}
-    shown = faults_table({**result, "trials": list(trials)})
+    (shown,) = tables_of({**result, "trials": list(trials)})
     return shown.rows, shown
 
 

@@ -73,7 +73,7 @@ def test_the_result_has_its_documented_parts(done):
             assert figures["located"] + sum(figures["reasons"].values()) == figures["pictures"]
             low, high = figures["rmse_ci95_cm"]
             assert low <= figures["rmse_cm"] <= high
-    assert {m: tuple(p.values()) for m, p in result["paper"].items()} == PAPER_TABLE_2
+    assert {m: list(p.values()) for m, p in result["paper"].items()} == PAPER_TABLE_2
     assert set(result["sensitivity"]) == {"depth_cm", "tilt_deg", "index", "ripples"}
     assert result["provenance"]["finssim"]
 

@@ -9,9 +9,9 @@ from finssim.experiments.localization_experiment import (
     CONDITIONS,
     METHODS_SHOWN,
     PAPER_TABLE_2,
-    markdown,
-    print_table,
+    tables_of,
 )
+from finssim.experiments.tables import markdown_of, print_tables
 
 
 def figures(rmse, located=10):
@@ -67,13 +67,13 @@ def result():
 def printed(result, width=100):
     """What is printed in a terminal of a width."""
     text = io.StringIO()
-    print_table(result, Console(file=text, width=width))
+    print_tables(tables_of(result), Console(file=text, width=width))
     return text.getvalue()
 
 
 def test_every_figure_of_every_method_is_shown(result):
     """Under its conditions, with its interval and how many pictures were located; and on the page as well."""
-    text, page = printed(result), markdown(result)
+    text, page = printed(result), markdown_of(tables_of(result))
     for k in range(len(METHODS_SHOWN)):
         for cell in (f"{1 + k:.2f}", f"[{0.875 + k:.2f}, {1.125 + k:.2f}]", f"{2 + 2 * k:.2f}"):
             assert text.count(cell) >= 4 and page.count(cell) >= 4
@@ -84,7 +84,7 @@ def test_every_figure_of_every_method_is_shown(result):
 
 def test_the_paper_stands_beside_ours_as_another_experiment(result):
     """Its figures, and that the two are not the same."""
-    for text in (printed(result), markdown(result)):
+    for text in (printed(result), markdown_of(tables_of(result))):
         words = " ".join(text.split())
         for rmse, p95 in PAPER_TABLE_2.values():
             assert f"{rmse:.2f}" in words and f"{p95:.2f}" in words
@@ -110,22 +110,22 @@ def test_the_table_fits_a_terminal(result):
 def test_where_nothing_was_located_the_table_says_so(result):
     """In place of a figure; and no gain is claimed over it."""
     result["results"]["published"] = {**result["results"]["published"], "pinhole": NOTHING}
-    for text in (printed(result), markdown(result)):
+    for text in (printed(result), markdown_of(tables_of(result))):
         assert "none" in text and "0/12" in text
         assert "calibrated on the same half" not in " ".join(text.split())
 
 
 def test_an_interruption_is_said_and_nothing_missing_is_linked(result):
     """Seeds that were asked for, and no picture that was not drawn."""
-    assert "](sensitivity.png)" in markdown(result)
+    assert "](sensitivity.png)" in markdown_of(tables_of(result))
     result |= {"interrupted": True, "seeds_asked_for": 5, "sensitivity": {}}
-    page = markdown(result)
+    page = markdown_of(tables_of(result))
     assert "(interrupted, 5 asked for)" in page and "sensitivity.png" not in page
     assert "(interrupted, 5 asked for)" in " ".join(printed(result).split())
 
 
 def test_errors_of_the_calibrations_are_on_the_page(result):
     """One row a seed, with units, and where it all comes from."""
-    page = markdown(result)
+    page = markdown_of(tables_of(result))
     assert "| 1 | 1.23 | -5.68 | 6.91 | 0.046 | +0.0012 |" in page
     assert "camera height [mm]" in page and "FinsSim 0.1, revision abc, seeds [1, 2]" in page

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from finssim.control.guidance import Station
-from finssim.experiments.on_robot import Placing, RobotTrial, Stages, start_bounds
+from finssim.experiments.on_robot import RobotTrial, Stages, start_bounds
 from finssim.geometry.rotations import quat_from_yaw
 from finssim.robot.pilots import WrenchPilot
 from finssim.robot.robot import Reading
@@ -20,7 +20,7 @@ def begins(exact, off, turn_deg, speed, rate_deg, site="pool"):
     """When a vehicle that circles its start, so far off and so fast, may begin [s]; None within 20 s."""
     pilot = WrenchPilot(lambda: np.zeros(6), FINSROV, name="idle")
     trial = RobotTrial(name="x", pilot=pilot, guide=START, duration=1.0, over=lambda runtime: False)
-    stages = Stages(trial, FINSROV, None, Placing(start=START, bounds=start_bounds(site, exact)))
+    stages = Stages(trial, FINSROV, START, start_bounds(site, exact))
     for now in np.arange(0.0, 20.0, 0.1):
         reading = Reading(
             time=now,

@@ -11,7 +11,7 @@ from finssim.engine import read_run
 from finssim.engine.ranges_file import load_ranges
 from finssim.experiments import trials as trials_module
 from finssim.experiments.plants import Plant, PlantError, available_plants, load_plant
-from finssim.experiments.trials import run_episodes, run_tracking, run_trials
+from finssim.experiments.trials import run_episodes, run_trials
 from finssim.tasks import Environment, EnvironmentSetupError, MeasurementNoise, Sensing, task_named
 from finssim.tasks.agents import agent_for
 from finssim.vehicles import VehicleError, load_vehicle
@@ -163,9 +163,7 @@ def t1_trials(controller):
 def t2_trials(plant, folder):
     task = task_named("t2")
     guides = [load_trajectory("lemniscate")]
-    run_tracking(
-        agent_for("pid", FINSROV, task), task, FINSROV, plant, guides=guides, trials=1, record=folder
-    )
+    run_trials(agent_for("pid", FINSROV, task), task, FINSROV, plant, guides=guides, trials=1, record=folder)
 
 
 def episodes(name, action=None):

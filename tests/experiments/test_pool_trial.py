@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from finssim.experiments.metrics import T1_SETPOINTS, T1_START, in_room
-from finssim.experiments.pool_trial import Job, play, read_series
+from finssim.experiments.pool_trial import Job, play
+from finssim.experiments.trials import Motion
 from finssim.vehicles import load_vehicle
 
 SHORT = Job(row="pid", controller="pid", target="P03", camera="corners", duration=6.0)
@@ -21,7 +22,7 @@ def played(tmp_path_factory):
         job = dataclasses.replace(SHORT, **changes)
         if job not in known:
             path = folder / str(len(known))
-            known[job] = play(job, path), read_series(path)
+            known[job] = play(job, path), Motion.read(path)
         return known[job]
 
     return of
@@ -31,8 +32,8 @@ def test_a_trial_starts_at_the_published_pose_and_goes_to_its_setpoint(played):
     """And its estimate is the truth but for centimetres."""
     result, series = played()
     assert result["fault"] == "" and result["missed_decisions"] == 0
-    np.testing.assert_allclose(series["position"][0], T1_START[:3], atol=0.06)
-    before, after = (np.linalg.norm(series["position"][k] - T1_SETPOINTS["P03"][:3]) for k in (0, -1))
+    np.testing.assert_allclose(series.position[0], T1_START[:3], atol=0.06)
+    before, after = (np.linalg.norm(series.position[k] - T1_SETPOINTS["P03"][:3]) for k in (0, -1))
     assert after < 0.2 * before
     assert result["localization"]["horizontal_m"] < 0.03 and result["localization"]["heading_deg"] < 2.0
 
@@ -42,7 +43,7 @@ def test_equal_jobs_give_equal_results(played, tmp_path):
     again = play(SHORT, tmp_path / "again")
     told = ("localization", "success", "t_s_s", "valid")
     assert {key: again[key] for key in told} == {key: played()[0][key] for key in told}
-    assert np.array_equal(read_series(tmp_path / "again")["position"], played()[1]["position"])
+    assert np.array_equal(Motion.read(tmp_path / "again").position, played()[1].position)
 
 
 @pytest.mark.slow
@@ -61,7 +62,7 @@ def test_equal_jobs_give_equal_results(played, tmp_path):
 )
 def test_every_field_of_a_job_changes_the_motion(played, change):
     """None of them is only written down."""
-    assert not np.array_equal(played(**change)[1]["position"], played()[1]["position"])
+    assert not np.array_equal(played(**change)[1].position, played()[1].position)
 
 
 def test_noise_on_the_input_does_not_reach_the_estimate(played):
@@ -75,8 +76,8 @@ def test_pictures_and_corners_tell_nearly_the_same(played):
     """The quick camera stands for the slow one: the same plant, within a few centimetres of each other."""
     pictures = played(camera="pictures", duration=3.0)
     corners = played(duration=3.0)
-    n = min(len(pictures[1]["t"]), len(corners[1]["t"]))
-    apart = np.linalg.norm(pictures[1]["position"][:n] - corners[1]["position"][:n], axis=1)
+    n = min(len(pictures[1].t), len(corners[1].t))
+    apart = np.linalg.norm(pictures[1].position[:n] - corners[1].position[:n], axis=1)
     assert 0.0 < apart.max() < 0.08
     assert pictures[0]["localization"]["horizontal_m"] < 0.03
 
@@ -85,8 +86,8 @@ def test_pictures_and_corners_tell_nearly_the_same(played):
 def test_a_trajectory_is_followed_from_its_own_start(played):
     """T2 begins where the way begins."""
     _, series = played(target="lemniscate", duration=60.0)
-    assert np.linalg.norm(series["position"][0][:2] - [0.0, 0.0]) < 0.06
-    assert series["t"][-1] == pytest.approx(30.0, abs=0.11)
+    assert np.linalg.norm(series.position[0][:2] - [0.0, 0.0]) < 0.06
+    assert series.t[-1] == pytest.approx(30.0, abs=0.11)
 
 
 @pytest.mark.slow
@@ -97,5 +98,5 @@ def test_other_vehicles_hold_a_setpoint_of_their_own_pool(played, name):
     result, series = played(vehicle=name, pool_vehicle=name, target="P01", duration=20.0)
     goal = in_room(T1_SETPOINTS["P01"], vehicle)[:3]
     assert result["fault"] == "" and result["localization"]["position_m"] < 0.05
-    assert np.linalg.norm(series["position"][-1] - goal) < 0.05
+    assert np.linalg.norm(series.position[-1] - goal) < 0.05
     np.testing.assert_allclose(result["goal"][:3], goal)

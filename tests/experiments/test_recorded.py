@@ -78,7 +78,7 @@ def test_the_truth_gives_the_measures_of_the_true_motion(held):
     """Those that the truth has when its clock is known; the found offset is within a step of the search."""
     record, truth, started = held
     trial = read_record(record, "t1", FINSROV, truth=truth)
-    measures, found = trial.measures("t1", FINSROV), read_truth(truth)
+    measures, found = trial.scores("t1", FINSROV), read_truth(truth)
     exact = measure_trial(
         found.time - started, found.position, quat_yaw(found.quaternion), T1_SETPOINTS["P03"]
     )
@@ -92,8 +92,8 @@ def test_the_truth_gives_the_measures_of_the_true_motion(held):
 def test_the_estimate_is_off_by_what_localization_is(held):
     """Both are measured alike; they differ by no more than the error of the estimate."""
     record, truth, _ = held
-    known = read_record(record, "t1", FINSROV).measures("t1", FINSROV)
-    true = read_record(record, "t1", FINSROV, truth=truth).measures("t1", FINSROV)
+    known = read_record(record, "t1", FINSROV).scores("t1", FINSROV)
+    true = read_record(record, "t1", FINSROV, truth=truth).scores("t1", FINSROV)
     assert known["success"] and known["localization"] is None and known["fault"] == ""
     assert abs(known["e_p_m"] - true["e_p_m"]) < true["localization"]["position_m"] + 1e-3
 
@@ -104,7 +104,7 @@ def test_a_table_on_another_clock_is_laid_over_the_record(held, tmp_path):
     known = read_record(record, "t1", FINSROV, truth=truth)
     trial = read_record(record, "t1", FINSROV, truth=captured(tmp_path / "m.csv", truth, -180.0))
     assert trial.offset == pytest.approx(known.offset + 180.0, abs=0.021)
-    first, second = (x.measures("t1", FINSROV) for x in (known, trial))
+    first, second = (x.scores("t1", FINSROV) for x in (known, trial))
     assert second["e_p_m"] == pytest.approx(first["e_p_m"], rel=0.02)
 
 
@@ -175,7 +175,7 @@ def test_a_record_is_scored_as_the_episode_was(task, tmp_path, capsys):
     assert scored["length"] == live["length"] and abs(scored["held"] - live["held"]) < 0.35
     assert scored["return"] == pytest.approx(live["return"], rel=0.02)
     assert 0.0005 < scored["localization"]["position_m"] < 0.05
-    known = read_record(record, task, FINSROV).measures(task, FINSROV)
+    known = read_record(record, task, FINSROV).scores(task, FINSROV)
     assert known["success"] == 1.0 and known["return"] == pytest.approx(live["return"], rel=0.05)
 
 
@@ -197,7 +197,7 @@ def test_a_memory_that_was_drawn_is_not_in_a_record(held, tmp_path):
     (tmp_path / "go.py").write_text(text.replace("Start(position=", f"Start({start}"))
     task = f"{tmp_path / 'go.py'}:Go"
     with pytest.raises(ControlError, match="begins with a memory that its reset draws"):
-        read_record(held[0], task, FINSROV).measures(task, FINSROV)
+        read_record(held[0], task, FINSROV).scores(task, FINSROV)
     assert Referee(task, [FINSROV], seed=1).metrics()["success"] == 0.0  # where it is played, it is scored
 
 

@@ -14,12 +14,11 @@ from finssim.experiments import replay_experiment as module
 from finssim.experiments.replay_experiment import (
     MODELS,
     PAPER_TABLE_3,
-    markdown,
     pooled,
-    print_table,
     replay_experiment,
     tables_of,
 )
+from finssim.experiments.tables import markdown_of, print_tables
 from finssim.vehicles import load_vehicle
 
 pytestmark = pytest.mark.slow
@@ -64,15 +63,15 @@ def test_the_folder_holds_the_result_a_table_a_figure_and_the_vehicle(small):
 
 
 def test_the_papers_numbers_stand_apart_from_ours(small):
-    *ours, theirs = tables_of(small[0]).values()
-    assert [row[1] for row in theirs[1]] == [f"{value:.3f}" for value, _ in PAPER_TABLE_3.values()]
-    assert all(row[0].startswith("paper,") for row in theirs[1])
-    assert all(row[0].startswith("ours,") for _, rows in ours for row in rows)
+    _, *ours, theirs = tables_of(small[0])
+    assert [row[1] for row in theirs.rows] == [f"{value:.3f}" for value, _ in PAPER_TABLE_3.values()]
+    assert all(row[0].startswith("paper,") for row in theirs.rows)
+    assert all(row[0].startswith("ours,") for table in ours for row in table.rows)
 
 
 def test_the_table_fits_a_terminal(small):
     console = Console(width=80, record=True, file=io.StringIO())
-    print_table(small[0], console)
+    print_tables(tables_of(small[0]), console)
     text = console.export_text()
     assert "…" not in text and "0.315" in text and "ours, Calibrated Fossen" in text
 
@@ -126,7 +125,7 @@ def test_an_interruption_keeps_the_finished_seeds(small, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "experiment_seed", interrupted)
     result = replay_experiment(seeds=3, seed=7, out=tmp_path / "out", repeats=2, axes=("yaw",))
     assert result["interrupted"] and result["seeds"] == [7] and result["seeds_asked_for"] == 3
-    assert "interrupted" in markdown(result)
+    assert "interrupted" in markdown_of(tables_of(result))
     with pytest.raises(KeyboardInterrupt):
         replay_experiment(seeds=1, seed=8, out=tmp_path / "none", repeats=2)
     assert not (tmp_path / "none").exists()

@@ -8,11 +8,11 @@ from rich.console import Console
 from finssim.experiments.evaluate import (
     T1_COLUMNS,
     T2_COLUMNS,
-    print_comparison,
-    print_results,
-    print_tracking,
+    comparison_table,
+    tables_of,
 )
 from finssim.experiments.metrics import MEASURES
+from finssim.experiments.tables import print_tables
 
 T1_FIGURES = {
     "e_p_m": 0.0188,
@@ -33,9 +33,9 @@ T2_FIGURES = dict.fromkeys(MEASURES) | {
 }
 
 
-def result(figures, **trial):
+def result(figures, task="t1", **trial):
     whose = {
-        "task": "t1",
+        "task": task,
         "controller": {
             "kind": "policy",
             "name": "policy",
@@ -51,16 +51,16 @@ def result(figures, **trial):
     return {**whose, **counts, **figures, "per_trial": [one]}
 
 
-def printed(show, *args):
+def printed(tables):
     out = io.StringIO()
-    show(*args, Console(file=out, width=80))
+    print_tables(tables, Console(file=out, width=80))
     return out.getvalue()
 
 
-@pytest.mark.parametrize("show", [print_results, print_comparison])
-def test_station_keeping_shows_every_unit_and_digit(show):
+@pytest.mark.parametrize("tables", [tables_of, lambda results: [comparison_table(results, "controller")]])
+def test_station_keeping_shows_every_unit_and_digit(tables):
     """Rich would take `[m]` for a style and leave it out."""
-    text = printed(show, [result(T1_FIGURES, setpoint="P01")])
+    text = printed(tables([result(T1_FIGURES, setpoint="P01")]))
     units = [heading.split(" [")[1] for heading, _ in T1_COLUMNS.values() if " [" in heading]
     assert [text.count(f"[{unit}") >= units.count(unit) for unit in units] == [True] * len(units)
     assert "…" not in text and all(
@@ -70,7 +70,7 @@ def test_station_keeping_shows_every_unit_and_digit(show):
 
 def test_tracking_shows_every_unit_and_digit():
     """The same of T2."""
-    text = printed(print_tracking, [result(T2_FIGURES, trajectory="lemniscate")])
+    text = printed(tables_of([result(T2_FIGURES, "t2", trajectory="lemniscate")]))
     assert all(word in text for heading, _ in T2_COLUMNS.values() for word in heading.split())
     assert "…" not in text and all(
         figure in text for figure in ("0.0681", "0.1293", "0.4052", "100%", "12.3")

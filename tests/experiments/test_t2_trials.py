@@ -14,14 +14,16 @@ from finssim.control.policy import PolicyDescription, VehicleIdentity
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.experiments.evaluate import (
     EvaluationError,
-    by_trajectory,
-    draw_tracking,
+    by_target,
     evaluate,
     evaluate_controller,
+    tables_of,
 )
+from finssim.experiments.figures import draw_tracking
 from finssim.experiments.metrics import MEASURES, PAPER_T2, paper_t2_row
 from finssim.experiments.plants import load_plant
-from finssim.experiments.trials import T2_TRAJECTORIES, run_tracking
+from finssim.experiments.tables import print_tables
+from finssim.experiments.trials import T2_TRAJECTORIES, run_trials
 from finssim.learning.export import export_policy
 from finssim.learning.network import Linear, Network
 from finssim.tasks import TrajectoryTracking
@@ -46,7 +48,7 @@ def nominal(tmp_path_factory):
 def test_the_pid_follows_the_published_trajectories_within_a_centimetre(nominal):
     """In the nominal plant; the eight begins with a jump in velocity from rest, which costs most."""
     _, evaluation = nominal
-    for name, row in by_trajectory(evaluation.result["per_trial"]).items():
+    for name, row in by_target(evaluation.result).items():
         assert row["horizontal_rmse_m"] < 0.01 and row["vertical_rmse_m"] < 0.001, name
         assert row["complete"] == row["trials"] == 1
     assert (
@@ -66,15 +68,18 @@ def test_a_directory_holds_result_figure_and_states(nominal):
 
 
 def test_the_table_has_a_row_per_trajectory_and_the_papers(nominal, capsys):
-    from finssim.experiments.evaluate import print_tracking
-
     result = nominal[1].result
-    print_tracking([result], Console(width=80))
+    print_tables(tables_of([result]), Console(width=80))
     out = capsys.readouterr().out
     assert all(f"{name} " in out and f"paper, {name}" in out for name in T2_TRAJECTORIES)
     assert "0.182" in out and "…" not in out
-    print_tracking([result, result], Console(width=80))
+    print_tables(tables_of([result, result]), Console(width=80))
     assert "nominal, ellipse" in capsys.readouterr().out
+
+
+def horizontal(trials):
+    """Of the first of them [m]."""
+    return trials[0].measures("t2", FINSROV.force_limits)["horizontal_rmse_m"]
 
 
 def test_a_current_and_the_number_of_trials_are_heard():
@@ -82,19 +87,19 @@ def test_a_current_and_the_number_of_trials_are_heard():
     guides = [TRAJECTORIES["straight"]]
     player = agent_for("pid", FINSROV, TASK)
     still, current = (
-        run_tracking(player, TASK, FINSROV, load_plant(plant), trials=2, guides=guides)
+        run_trials(player, TASK, FINSROV, load_plant(plant), trials=2, guides=guides)
         for plant in ("nominal", "current")
     )
-    assert np.abs(still.position[:, 0] - still.position[:, 1]).max() == 0.0
-    assert np.abs(current.position[:, 0] - current.position[:, 1]).max() > 1e-3
-    assert current.measures()[0]["horizontal_rmse_m"] > 2.0 * still.measures()[0]["horizontal_rmse_m"]
+    apart = [np.abs(a.motion.position - b.motion.position).max() for a, b in (still, current)]
+    assert apart[0] == 0.0 and apart[1] > 1e-3
+    assert horizontal(current) > 2.0 * horizontal(still)
 
 
 def test_a_feed_forward_of_acceleration_halves_the_error():
     """The straight line within 1 mm; without the goal's acceleration it was 2.6 mm."""
     player = agent_for("pid", FINSROV, TASK)
-    trials = run_tracking(player, TASK, FINSROV, NOMINAL, guides=[TRAJECTORIES["straight"]], trials=1)
-    assert trials.measures()[0]["horizontal_rmse_m"] < 1e-3
+    trials = run_trials(player, TASK, FINSROV, NOMINAL, guides=[TRAJECTORIES["straight"]], trials=1)
+    assert horizontal(trials) < 1e-3
 
 
 def test_the_published_baseline_has_a_profile_for_trajectories():
@@ -102,14 +107,13 @@ def test_the_published_baseline_has_a_profile_for_trajectories():
     assert controller_for("t2", "pid-paper", FINSROV).profile == TRAJECTORY_PROFILE
     assert controller_for("t1", "pid-paper", FINSROV).profile == PAPER_PROFILE
     player = agent_for("pid-paper", FINSROV, TASK)
-    trials = run_tracking(player, TASK, FINSROV, NOMINAL, guides=[TRAJECTORIES["straight"]], trials=1)
+    trials = run_trials(player, TASK, FINSROV, NOMINAL, guides=[TRAJECTORIES["straight"]], trials=1)
     published = paper_t2_row("PID", "straight")["horizontal_rmse_m"]
-    assert trials.measures()[0]["horizontal_rmse_m"] == pytest.approx(published, rel=0.2)
+    assert horizontal(trials) == pytest.approx(published, rel=0.2)
 
 
 def test_the_figure_has_a_row_for_each_trajectory(nominal):
-    trials = nominal[1].trials
-    runs = [(guide, trials.t, trials.position[:, i]) for i, guide in enumerate(trials.guides)]
+    runs = nominal[1].trials
     figure = draw_tracking({"a": runs, "b": runs}, "title")
     assert len(figure.axes) == 2 * len(T2_TRAJECTORIES)
     assert [axes.get_title(loc="left") for axes in figure.axes[::2]] == list(T2_TRAJECTORIES)
@@ -128,7 +132,7 @@ def test_equal_seeds_are_equal_trials():
     plant = load_plant("randomised")
     player = agent_for("pid", FINSROV, TASK)
     one, again, other = (
-        run_tracking(player, TASK, FINSROV, plant, trials=1, guides=guides, seed=seed).position
+        run_trials(player, TASK, FINSROV, plant, trials=1, guides=guides, seed=seed)[0].motion.position
         for seed in (1, 1, 2)
     )
     np.testing.assert_array_equal(one, again)

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from finssim.experiments.ablation import ablation_tables
+from finssim.experiments.ablation import tables_of
 from finssim.experiments.tables import html_of, markdown_of
 from finssim.experiments.transfer import T1, T2, row_figures, scores, trained, transfer_experiment
 
@@ -40,11 +40,13 @@ def test_a_second_call_plays_nothing_again(small):
 
 
 def test_the_table_stands_beside_the_papers(small):
-    """Theirs is marked, in every form."""
-    _, result = small
-    shown = T1.shown({**result, "rows": {"pid-paper": result["rows"]["pid"]}})
-    assert [row[0] for row in shown.rows][1:] == ["  paper: PID"]
-    assert "paper: PID" in markdown_of(shown) and 'class="theirs"' in html_of(shown)
+    """Theirs is marked, in every form, and the figure is on the page."""
+    out, result = small
+    table = T1.table({**result, "rows": {"pid-paper": result["rows"]["pid"]}})
+    assert [row[0] for row in table.rows][1:] == ["  paper: PID"]
+    assert "paper: PID" in markdown_of([table])
+    html = "".join(html_of([table], out))
+    assert 'class="theirs"' in html and "data:image/png" in html
 
 
 @pytest.mark.parametrize(
@@ -118,7 +120,7 @@ def test_the_ablation_says_which_way_each_module_moves(small):
     _, result = small
     d = {"value": 0.03, "ci95": [0.02, 0.04], "count": 9}
     differences = {"no-fusion": {"success_rate": None, "e_p_m": d, "e_psi_deg": d}}
-    (shown,) = ablation_tables({"t1": {**result, "differences": differences, "sentences": []}})
+    (shown,) = tables_of({"t1": {**result, "differences": differences, "sentences": []}})
     assert shown.rows[0] == [T1.rows["no-fusion"].title, "–", "+3.0 [+2.0, +4.0]", "+0.0 [+0.0, +0.0]"]
     assert shown.rows[1] == ["  paper", "+0", "-0.8", "+6.9"]
     assert T2.rows["pid"].paper is None

@@ -7,6 +7,8 @@ import json
 import numpy as np
 import pytest
 
+from finssim import boundary
+from finssim.cli import app
 from finssim.experiments.validate import Response, ValidationError, simulate_responses, validate
 from finssim.vehicles import load_vehicle
 
@@ -52,7 +54,7 @@ def test_applied_is_what_the_thrusters_give(responses: dict[str, Response]) -> N
 
 def test_the_command_prints_one_object(capsys: pytest.CaptureFixture[str]) -> None:
     """--json is one JSON object with every response and the vehicle's hash."""
-    validate("finsrov", as_json=True)
+    assert boundary.run(app, ["validate", "finsrov", "--json"]) == 0
     out = json.loads(capsys.readouterr().out)
     assert out["vehicle"]["sha256"] == FINSROV.sha256
     assert len(out["responses"]) == 6 and all(np.isfinite(r["simulated"]) for r in out["responses"])

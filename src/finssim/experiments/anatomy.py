@@ -9,21 +9,18 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from rich.console import Console
 
-from finssim.experiments import campaign
-from finssim.experiments.campaign import Say, choice, run_jobs, write_json
-from finssim.experiments.evaluate import evaluate_controller
+from finssim.experiments.campaign import Say, check_choices, run_jobs, write_json
+from finssim.experiments.evaluate import Job, play
 from finssim.experiments.figures import COLORS, clean, new_figure, save_figure
 from finssim.experiments.plants import Plant, load_plant
-from finssim.experiments.pool_trial import files_of
-from finssim.experiments.statistics import Interval, bootstrap
-from finssim.experiments.tables import Shown, figure_text, markdown_of, print_shown
-from finssim.experiments.transfer import T1_ROWS, policies_of
+from finssim.experiments.statistics import with_interval
+from finssim.experiments.tables import Table, figure_text
+from finssim.experiments.transfer import T1, controllers_of
 from finssim.provenance import provenance
 from finssim.vehicles import load_vehicle
 
-__all__ = ["CAUSES", "anatomy", "print_anatomy"]
+__all__ = ["CAUSES", "anatomy", "tables_of"]
 
 TRAINING_SHARE = 0.3
 """Of the progress bar."""
@@ -91,37 +88,6 @@ FOREIGN = "foreign"
 """The plant in which all of it is wrong at once, another in each trial."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Job(campaign.Job):
-    """Trials of one controller in one plant."""
-
-    row: str
-    target: str
-    """Name of the cause."""
-    plant: int
-    """Number of its amount."""
-    seed: int
-    controller: str
-    vehicle: str
-    trials: int
-    water: Plant
-
-    def described(self) -> dict[str, Any]:
-        """Everything that decides the result."""
-        return {
-            "controller": files_of(self.controller), "vehicle": load_vehicle(self.vehicle).sha256,
-            "plant": self.water.model_dump(mode="json"), "trials": self.trials, "seed": self.seed,
-        }  # fmt: skip
-
-
-def play(job: Job, _: Path) -> dict[str, Any]:
-    """Success, error [m] and settling time [s] of each trial; None where there is none."""
-    done = evaluate_controller(
-        job.controller, job.water, vehicle=job.vehicle, trials=job.trials, seed=job.seed
-    ).result
-    return {key: [trial[key] for trial in done["per_trial"]] for key in ("success", "e_p_m", "t_s_s")}
-
-
 def anatomy(
     *,
     out: Path,
@@ -155,12 +121,11 @@ def anatomy(
         `causes`: cause -> row -> figures at every amount; `foreign`: row -> figures; the jobs are in the directory.
     """
     chosen, names = list(causes or CAUSES), list(rows or ROWS)
-    for known, kind, given in ((CAUSES, "cause", chosen), (ROWS, "row", names)):
-        for name in given:
-            choice(known, name, kind, ValueError)
+    check_choices(chosen, CAUSES, "cause", ValueError)
+    check_choices(names, ROWS, "row", ValueError)
     folder, run_seeds = Path(out), range(seed, seed + seeds)
-    policies = policies_of(
-        {name: T1_ROWS[name] for name in names}, run_seeds, folder, vehicle, steps,
+    controllers = controllers_of(
+        {name: T1.rows[name] for name in names}, run_seeds, folder, vehicle, steps,
         lambda part, what: say(TRAINING_SHARE * part, what),
     )  # fmt: skip
     plants = {
@@ -171,26 +136,22 @@ def anatomy(
     plants[FOREIGN, 0] = load_plant(FOREIGN)
     jobs = [
         Job(
-            row=row, target=name, plant=k, seed=s, water=water, vehicle=vehicle,
-            controller=str(policies[training.name, s]) if training else T1_ROWS[row].controller,
-            trials=trials * (10 if name == FOREIGN else 1),
+            row=row, target=name, plant=k, seed=s, noise=s, controller=controllers[row, s], vehicle=vehicle,
+            water=water, trials=trials * (10 if name == FOREIGN else 1),
         )
-        for (name, k), water in plants.items()
-        for row in names
-        for training in [T1_ROWS[row].training]
-        for s in run_seeds
+        for (name, k), water in plants.items() for row in names for s in run_seeds
     ]  # fmt: skip
     results = run_jobs(
         jobs, folder / "trials", play, processes=processes,
         say=lambda part, what: say(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, what),
     )  # fmt: skip
-    played: dict[tuple[str, str, int], dict[int, dict[str, Any]]] = {}
+    played: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for job, one in zip(jobs, results, strict=True):
-        played.setdefault((job.row, job.target, job.plant), {})[job.seed] = one
+        played.setdefault((job.row, job.target, job.plant), []).append(one)
     body = load_vehicle(vehicle)
     result = {
         "experiment": "anatomy", "vehicle": {"name": body.name, "sha256": body.sha256}, "trials": trials,
-        "seeds": list(run_seeds), "rows": {name: T1_ROWS[name].title for name in names},
+        "seeds": list(run_seeds), "rows": {name: T1.rows[name].title for name in names},
         "causes": {
             name: {
                 "title": CAUSES[name].title, "unit": CAUSES[name].unit, "amounts": list(CAUSES[name].amounts),
@@ -203,21 +164,20 @@ def anatomy(
         FOREIGN: {row: _figures(played[row, FOREIGN, 0]) for row in names},
         "provenance": provenance(),
     }  # fmt: skip
-    write_json(folder / RESULT_FILE, result, "\n".join(map(markdown_of, tables_of(result))))
+    write_json(folder / RESULT_FILE, result, tables_of(result))
     draw(result, folder / "anatomy.png")
     return result
 
 
-def _figures(by_seed: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
+def _figures(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Success, median error and mean settling time over all trials, with intervals from redrawing trials."""
     out: dict[str, Any] = {}
     for key, statistic in (("success", np.mean), ("e_p_m", np.median), ("t_s_s", np.mean)):
-        x = np.array([value for one in by_seed.values() for value in one[key] if value is not None], float)
-        if len(x) == 0:
-            out[key] = None
-            continue
-        low, high = bootstrap(lambda random, x=x, f=statistic: f(x[random.integers(len(x), size=len(x))]))
-        out[key] = Interval(float(statistic(x)), float(low), float(high), len(x)).as_json()
+        values = [
+            float(x) for result in results for trial in result["per_trial"] if (x := trial[key]) is not None
+        ]
+        interval = with_interval({i: [x] for i, x in enumerate(values)}, statistic)
+        out[key] = interval and interval.as_json()
     return out
 
 
@@ -231,7 +191,7 @@ def tolerated(cause: Mapping[str, Any], row: str) -> float | None:
     return most
 
 
-def tables_of(result: Mapping[str, Any]) -> list[Shown]:
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
     """What each row tolerates of each cause; and the plant in which all is wrong."""
     rows, vehicle = result["rows"], result["vehicle"]
     about = f"{vehicle['name']} {vehicle['sha256'][:12]}, seeds: {len(result['seeds'])}, setpoints in turn"
@@ -247,25 +207,19 @@ def tables_of(result: Mapping[str, Any]) -> list[Shown]:
         for row, title in rows.items()
     ]  # fmt: skip
     return [
-        Shown(
+        Table(
             title="What is tolerated (T1)", headline=f"T1 with one thing wrong, {about}",
             heads=["wrong", *rows], rows=lines,
             note=f"the largest amount at which {100.0 * HELD:.0f} % of the trials hold, there and at all smaller ones; "
             "+: the largest that was tried. The rest of the plant is as the file has it, the state exact.",
         ),
-        Shown(
+        Table(
             title="Everything wrong at once", headline=f"T1 in the plant '{FOREIGN}', another in each trial, {about}",
             heads=["", *heads], rows=foreign,
             note="in brackets 95 % from a bootstrap of the trials of these trainings; times to settle are of those "
             "that hold.",
         ),
     ]  # fmt: skip
-
-
-def print_anatomy(result: Mapping[str, Any], console: Console) -> None:
-    """Print its tables."""
-    for shown in tables_of(result):
-        print_shown(shown, console)
 
 
 def draw(result: Mapping[str, Any], path: Path) -> None:

@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 import warp as wp
-from rich.console import Console
-from rich.progress import Progress
 
 from finssim.engine import Simulator
 from finssim.engine.launch import default_threads
-from finssim.experiments.tables import console_table
+from finssim.experiments.campaign import Say
+from finssim.experiments.tables import Table
 from finssim.provenance import provenance
 from finssim.tasks import Environment, StationKeeping
 
-__all__ = ["bench", "measure"]
+__all__ = ["bench", "tables_of"]
 
 SECONDS = 1.0
 """Time each figure is measured for; the best of its rounds counts, since other load only ever slows one down."""
@@ -147,84 +146,61 @@ def machine() -> dict[str, Any]:
     return {"processor": model, "threads": default_threads(), "load_1min": load, **provenance()}
 
 
-def measure(device: str = "cpu", progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """All figures.
-
-    Args:
-        device: Warp device of the batched figures.
-        progress: Told what is measured next.
-
-    Returns:
-        The object that `finssim bench --json` prints.
-    """
-    physics: dict[str, float] = {}
-    env: dict[str, float] = {}
-    for model in MODELS:
-        for worlds in WORLDS:
-            progress(f"physics, {model}, {worlds} worlds")
-            physics[f"{model}/{worlds}"] = physics_rate(model, worlds, device=device)
-    progress("physics on one core")
-    physics[f"calibrated/{WORLDS[-1]}/1 thread"] = physics_rate("calibrated", WORLDS[-1], threads=1)
-    for action in ACTIONS:
-        for worlds in WORLDS:
-            progress(f"T1, {action}, {worlds} worlds")
-            env[f"{action}/{worlds}"] = environment_rate(action, worlds, device=device)
-    progress("hull triangles")
-    faces = faces_rate()
-    progress("MuJoCo, one free body")
-    reference = mujoco_rate()
-    progress(f"memory of {MEMORY_WORLDS} worlds")
-    return {
-        "physics_steps_per_s": physics,
-        "env_steps_per_s": env,
-        "faces_per_s": faces,
-        "single_step_us": 1e6 / physics["calibrated/1"],
-        "mujoco_steps_per_s": reference,
-        "physics_substeps_over_mujoco_steps": (
-            None if reference is None else PHYSICS_SUBSTEPS * physics[f"calibrated/{WORLDS[-1]}"] / reference
-        ),
-        f"memory_mb/{MEMORY_WORLDS}": memory_mb(MEMORY_WORLDS),
-        "device": device,
-        "machine": machine(),
-    }
-
-
-def bench(
-    *,
-    device: str = "cpu",
-    as_json: bool = False,
-) -> None:
+def bench(*, device: str = "cpu", say: Say = lambda part, what: None) -> dict[str, Any]:
     """Measure this machine's speed: physics steps/s, environment steps/s, mesh faces/s.
 
     Example: finssim bench --json > bench.json
 
     Args:
         device (DEVICE): Where to compute: cpu or cuda.
-        as_json: Print one JSON object instead of tables.
+        say: Told the share that is done and what is measured next.
     """
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True) as bar:
-        task = bar.add_task("", total=len(MODELS) * len(WORLDS) + len(ACTIONS) * len(WORLDS) + 4)
-        figures = measure(device, lambda what: bar.update(task, description=what, advance=1))
-    if as_json:
-        print(json.dumps(figures, indent=2))
-        return
-    rates = {
-        **{f"physics, {name}": rate for name, rate in figures["physics_steps_per_s"].items()},
-        **{f"T1, {name}": rate for name, rate in figures["env_steps_per_s"].items()},
-        "hull triangles, one core": figures["faces_per_s"],
-        "MuJoCo, one free body": figures["mujoco_steps_per_s"],
+    plan: dict[tuple[str, str], Callable[[], float | None]] = {
+        ("physics", f"{model}/{worlds}"): partial(physics_rate, model, worlds, device=device)
+        for model in MODELS
+        for worlds in WORLDS
     }
-    rows = [[name, f"{rate:,.0f}"] for name, rate in rates.items() if rate]
-    out = Console()
-    out.print(console_table(["", "per second"], rows, title="steps per second"))
-    ratio = figures["physics_substeps_over_mujoco_steps"]
-    if ratio:
-        out.print(f"batched physics substeps over MuJoCo steps: {ratio:.0f}", highlight=False)
-    memory = figures[f"memory_mb/{MEMORY_WORLDS}"]
-    out.print(
-        f"one step from Python {figures['single_step_us']:.1f} us; {MEMORY_WORLDS} worlds {memory:.0f} MB",
-        highlight=False,
+    one_core = f"calibrated/{WORLDS[-1]}/1 thread"
+    plan["physics", one_core] = partial(physics_rate, "calibrated", WORLDS[-1], threads=1)
+    for action in ACTIONS:
+        for worlds in WORLDS:
+            plan["T1", f"{action}/{worlds}"] = partial(environment_rate, action, worlds, device=device)
+    plan["faces", ""], plan["MuJoCo", ""] = faces_rate, mujoco_rate
+    plan["memory", ""] = partial(memory_mb, MEMORY_WORLDS)
+    figures: dict[tuple[str, str], Any] = {}
+    for (kind, name), figure in plan.items():
+        say(len(figures) / len(plan), f"{kind} {name}".strip())
+        figures[kind, name] = figure()
+    physics, reference = figures["physics", f"calibrated/{WORLDS[-1]}"], figures["MuJoCo", ""]
+    return {
+        "physics_steps_per_s": {name: rate for (kind, name), rate in figures.items() if kind == "physics"},
+        "env_steps_per_s": {name: rate for (kind, name), rate in figures.items() if kind == "T1"},
+        "faces_per_s": figures["faces", ""],
+        "single_step_us": 1e6 / figures["physics", "calibrated/1"],
+        "mujoco_steps_per_s": reference,
+        "physics_substeps_over_mujoco_steps": reference and PHYSICS_SUBSTEPS * physics / reference,
+        f"memory_mb/{MEMORY_WORLDS}": figures["memory", ""],
+        "device": device,
+        "machine": machine(),
+    }
+
+
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
+    """Rates of this machine."""
+    rates = {
+        **{f"physics, {name}": rate for name, rate in result["physics_steps_per_s"].items()},
+        **{f"T1, {name}": rate for name, rate in result["env_steps_per_s"].items()},
+        "hull triangles, one core": result["faces_per_s"],
+        "MuJoCo, one free body": result["mujoco_steps_per_s"],
+    }
+    ratio, on = result["physics_substeps_over_mujoco_steps"], result["machine"]
+    table = Table(
+        title="steps per second",
+        heads=["", "per second"],
+        rows=[[name, f"{rate:,.0f}"] for name, rate in rates.items() if rate],
+        note=f"one step from Python {result['single_step_us']:.1f} us; {MEMORY_WORLDS} worlds "
+        f"{result[f'memory_mb/{MEMORY_WORLDS}']:.0f} MB"
+        + (f"; batched physics substeps over MuJoCo steps: {ratio:.0f}" if ratio else "")
+        + f"; on {on['processor']}, {on['threads']} threads, load {on['load_1min']}",
     )
-    on = figures["machine"]
-    out.print(f"on {on['processor']}, {on['threads']} threads, load {on['load_1min']}", highlight=False)
+    return [table]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
+import inspect
 import json
 import multiprocessing
 import os
@@ -13,6 +15,7 @@ import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,18 +23,21 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
+from finssim.control.controllers import CONTROLLERS
+from finssim.control.policy import DESCRIPTION_FILE, NETWORK_FILE
+from finssim.experiments.tables import Table, markdown_of, print_tables
 from finssim.files import atomic_write
 from finssim.quiet import start_warp
+from finssim.vehicles import load_vehicle
 from finssim.yaml_file import json_value, read_json
 
 __all__ = [
     "Job",
     "Say",
     "Show",
-    "choice",
+    "check_choices",
     "progress_bar",
     "run_experiment",
-    "run_in_turn",
     "run_jobs",
     "spread",
     "write_json",
@@ -47,23 +53,21 @@ WATCH = 1.0
 def run_experiment(
     name: str,
     work: Callable[..., dict[str, Any]],
-    show: Callable[[Mapping[str, Any], Console], None],
+    tables: Callable[[Mapping[str, Any]], Sequence[Table]],
+    /,
     *,
-    out: Path,
     as_json: bool = False,
-    console: Console | None = None,
     bar: bool = True,
     **options: Any,
 ) -> dict[str, Any]:
-    """Run an experiment with a progress bar on standard error and print what came out.
+    """Run an experiment with a progress bar on standard error and print its tables.
 
     Args:
         name: What the bar is called.
-        work: The experiment, which writes its directory itself; called with `out`, `say` and the options.
-        show: Prints its table.
-        out: The directory.
-        as_json: Print one JSON object in place of the table.
-        console: Where the table goes; standard output if None.
+        work: The experiment, which writes its directory `out`, if it has one, itself; called with `say`, if it takes
+            that, and the options.
+        tables: Those of its result.
+        as_json: Print one JSON object in place of the tables.
         bar: Show it; False where the work has a line of its own on the screen.
         options: Of the work.
 
@@ -71,14 +75,18 @@ def run_experiment(
         What `work` returned.
     """
     start_warp()
-    with progress_bar(name, shown=bar) as say:
-        result = work(out=out, say=say, **options)
+    if {"say", "options"} & set(inspect.signature(work).parameters):
+        with progress_bar(name, shown=bar) as say:
+            result = work(say=say, **options)
+    else:
+        result = work(**options)
     if as_json:
         print(json.dumps(result, allow_nan=False))
         return result
-    console = console or Console()
-    show(result, console)
-    console.print(f"written: {out}", highlight=False, soft_wrap=True)
+    console = Console()
+    print_tables(tables(result), console)
+    if options.get("out") is not None:
+        console.print(f"written: {options['out']}", highlight=False, soft_wrap=True)
     return result
 
 
@@ -91,23 +99,26 @@ def progress_bar(name: str, *, shown: bool = True) -> Iterator[Say]:
         yield lambda part, what=name: progress.update(task, completed=part, description=what)
 
 
-def choice(known: Mapping[str, Any] | Sequence[str], name: str, kind: str, error: type[Exception]) -> None:
-    """Refuse a name that is not known, in a sentence with those that are."""
-    if name not in known:
-        raise error(f"unknown {kind} '{name}'; available: {', '.join(known)}")
+def check_choices(
+    names: Sequence[str], available: Mapping[str, Any] | Sequence[str], kind: str, error: type[Exception]
+) -> None:
+    """Refuse a name that does not exist, in a sentence with those that do."""
+    for name in names:
+        if name not in available:
+            raise error(f"unknown {kind} '{name}'; available: {', '.join(available)}")
 
 
 class ResultError(ValueError):
     """A result that was kept cannot be gone on with; the message is one sentence."""
 
 
-def write_json(path: Path, result: Mapping[str, Any], page: str | None = None) -> None:
+def write_json(path: Path, result: Mapping[str, Any], tables: Sequence[Table] = ()) -> None:
     """Write a result, and beside it, ending in .md, the page that a person reads."""
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    if page is not None:
+    if tables:
         with atomic_write(path.with_suffix(".md")) as temporary:
-            temporary.write_text(page, encoding="utf-8")
+            temporary.write_text(markdown_of(tables), encoding="utf-8")
 
 
 def keep_result(path: Path, result: Mapping[str, Any]) -> None:
@@ -136,6 +147,7 @@ def _digest(result: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(read, sort_keys=True).encode()).hexdigest()
 
 
+@dataclass(frozen=True, kw_only=True)
 class Job:
     """One trial as plain data: equal jobs give equal results, and a result is kept under its key."""
 
@@ -143,12 +155,16 @@ class Job:
     """Of the table."""
     target: str
     """What is to be done."""
-    plant: int
-    seed: int
+    plant: int = 1
+    """Seed of the pool, or number of the plant."""
+    seed: int = 1
+    """Of the noise."""
 
     def described(self) -> dict[str, Any]:
         """Everything that decides the result, with the contents of files in place of their names."""
-        raise NotImplementedError
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        del values["row"]
+        return {name: _content(name, value) for name, value in values.items()}
 
     def key(self) -> str:
         """File name of its result: readable first, then a digest of everything that decides it."""
@@ -157,10 +173,23 @@ class Job:
         return f"{name}_plant{self.plant}_seed{self.seed}_{digest}"
 
 
-Play = Callable[[Any, Path], dict[str, Any]]
-"""Plays a job, leaves its series in files that begin with the given path, and returns its result as plain data."""
+def _content(name: str, value: Any) -> Any:
+    """A field of a job as plain data: SHA-256 of a vehicle, of a policy's files, of a programme."""
+    if name in ("vehicle", "pool_vehicle"):
+        return load_vehicle(value).sha256
+    if name == "controller" and value not in CONTROLLERS:
+        files = {file: (Path(value) / file).read_bytes() for file in (DESCRIPTION_FILE, NETWORK_FILE)}
+        return {file: hashlib.sha256(data).hexdigest() for file, data in files.items()}
+    if hasattr(value, "model_dump"):
+        return value.model_dump(mode="json")
+    return value.sha256 if hasattr(value, "sha256") else value
+
+
+Play = Callable[[Any, Path], dict[str, Any] | None]
+"""Plays a job, leaves its series in files that begin with the given path, and returns its result as plain data; None:
+there is none yet, and the next call tries again."""
 Show = Callable[[Any, Mapping[str, Any]], None]
-"""Given a job that has been played, and its result."""
+"""Called with a job that has been played, and its result."""
 
 
 def run_jobs(
@@ -177,53 +206,24 @@ def run_jobs(
     Args:
         jobs: Trials; equal ones are played once.
         folder: Takes KEY.json of each, made if missing.
-        play: A function of a module, as it is called in other processes.
-        processes: As many as there are processors if None.
+        play: A function of a module, as it is called in other processes; any function with `processes=1`.
+        processes: As many as there are processors if None; 1: in this process, one after the other.
         say: Told the share that is done and what is left.
-        show: Given each trial that is played now and its result, as soon as there is one.
+        show: Called with each trial that is played now and its result, as soon as there is one.
 
     Returns:
-        The results in the order of the jobs, each with its `job` and `key`.
+        The results in the order of the jobs, each with its `job` and `key`; jobs without a result are left out.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    keys = [job.key() for job in jobs]
-    files = {key: folder / f"{key}.json" for key in keys}
-    missing = {key: job for key, job in zip(keys, jobs, strict=True) if not files[key].is_file()}
-    with closing(
-        spread(partial(_play_one, folder=folder, play=play), list(missing.items()), processes)
-    ) as played:
-        for left, ((_, job), future) in zip(reversed(range(len(missing))), played, strict=True):
-            show(job, future.result())
+    files = {job.key(): folder / f"{job.key()}.json" for job in jobs}
+    missing = {job.key(): job for job in jobs if not files[job.key()].is_file()}
+    work = partial(_play_one, folder=folder, play=play)
+    with closing(spread(work, list(missing.items()), processes)) as played:
+        for left, ((_, job), outcome) in zip(reversed(range(len(missing))), played, strict=True):
+            if (result := outcome.result()) is not None:
+                show(job, result)
             say(1.0 - left / len(files), f"{left} trials left")
-    return [kept_result(files[key]) for key in keys]
-
-
-def run_in_turn(
-    jobs: Sequence[Job],
-    folder: Path,
-    play: Callable[[Any, Path], dict[str, Any] | None],
-    *,
-    show: Show = lambda job, result: None,
-) -> list[dict[str, Any]]:
-    """The same in this process, one after the other, for what there is only one of.
-
-    Args:
-        jobs: Trials; equal ones are played once, and those without a result are left out.
-        folder: Takes KEY.json of each, made if missing.
-        play: Its result; None: there is none yet, and the next call tries again.
-        show: Given each trial that is played now and its result.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    results = []
-    for key, job in {job.key(): job for job in jobs}.items():
-        file = folder / f"{key}.json"
-        if not file.is_file():
-            result = play(job, folder / key)
-            if result is None:
-                continue
-            show(job, _write(key, job, folder, result))
-        results.append(kept_result(file))
-    return results
+    return [kept_result(files[job.key()]) for job in jobs if files[job.key()].is_file()]
 
 
 def spread(
@@ -286,13 +286,12 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-def _play_one(keyed: tuple[str, Job], folder: Path, play: Play) -> dict[str, Any]:
+def _play_one(keyed: tuple[str, Job], folder: Path, play: Play) -> dict[str, Any] | None:
+    """Play a job and write KEY.json of its result, with its job."""
     key, job = keyed
-    return _write(key, job, folder, play(job, folder / key))
-
-
-def _write(key: str, job: Job, folder: Path, played: Mapping[str, Any]) -> dict[str, Any]:
-    """Write KEY.json of a result, with its job."""
+    played = play(job, folder / key)
+    if played is None:
+        return None
     result = {"key": key, "job": {**job.described(), "row": job.row, "target": job.target}, **played}
     keep_result(folder / f"{key}.json", result)
     return result

@@ -7,31 +7,30 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from functools import partial
+from itertools import combinations, product
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
 from finssim.control.policy import Policy, PolicyDescription
-from finssim.experiments.campaign import Say, keep_result, kept_result, write_json
-from finssim.experiments.evaluate import evaluate_controller
+from finssim.experiments.campaign import Say, run_jobs, write_json
+from finssim.experiments.evaluate import Job, play
 from finssim.experiments.figures import COLORS, clean, new_figure, save_figure
-from finssim.experiments.plants import Plant, load_plant
+from finssim.experiments.plants import load_plant
 from finssim.experiments.statistics import (
     better,
     interquartile_mean,
     probability_of_improvement,
     with_bootstrap,
 )
-from finssim.experiments.tables import Shown, markdown_of, print_shown
+from finssim.experiments.tables import Table
 from finssim.provenance import provenance
 from finssim.tasks import TASKS
-from finssim.vehicles import load_vehicle
 
-__all__ = ["MEASURES", "CompareError", "compare", "print_comparison"]
+__all__ = ["MEASURES", "CompareError", "compare", "tables_of"]
 
 CURVES_FILE = "curves.csv"
 SEED_AT_END = re.compile(r"[-_]?(?:seed|s)?[-_]?\d+$")
@@ -179,37 +178,6 @@ def measures_of(task: str, trials: Sequence[Mapping[str, Any]], asked: Sequence[
     return tuple(asked) or tuple(name for name in preferred if name in have) or tuple(have[:1])
 
 
-def evaluated(
-    groups: Sequence[Group], folder: Path, plant: Plant, say: Say, **options: Any
-) -> dict[tuple[str, int], list[dict[str, Any]]]:
-    """The trials of every run by (group, seed); what is in the folder already is not evaluated again."""
-    trials: dict[tuple[str, int], list[dict[str, Any]]] = {}
-    count = sum(len(group.runs) for group in groups)
-    for group in groups:
-        for run in group.runs:
-            say(len(trials) / count, f"evaluating {group.name}, seed {run.seed}")
-            trials[group.name, run.seed] = _trials(run, folder, plant, **options)
-    return trials
-
-
-def _trials(run: Run, folder: Path, plant: Plant, *, vehicle: str, **options: Any) -> list[dict[str, Any]]:
-    about = {
-        "files": run.description.files,
-        "vehicle": load_vehicle(vehicle).sha256,
-        "plant": plant.model_dump(mode="json"),
-        **options,
-    }
-    path = folder / f"{run.place.resolve().name}-{run.description.files['policy.onnx'][:10]}.json"
-    if path.is_file():
-        kept = kept_result(path)
-        if kept["about"] == about:
-            return list(kept["result"]["per_trial"])
-    task = run.description.task
-    result = evaluate_controller(run.place, plant, task=task, vehicle=vehicle, **options).result
-    keep_result(path, {"about": about, "result": result})
-    return list(result["per_trial"])
-
-
 def scores_of(runs: Sequence[Sequence[Mapping[str, Any]]], measure: str) -> NDArray[np.float64]:
     """Scores (runs, strata): the mean over a run's trials of a stratum; a trial without a value is infinitely bad."""
     worst = math.inf if less_is_better(measure) else -math.inf
@@ -228,6 +196,7 @@ NOTE = (
     "interquartile mean over seeds and targets; in brackets 95 % of a bootstrap over the seeds, stratified by target. "
     "With fewer than five seeds an interval is too narrow; with fewer than three nobody is called better."
 )
+VERDICT_OF = {True: "better", False: "worse", None: "open"}
 VERDICTS = {
     "better": "{a} is better than {b} in {measure}",
     "worse": "{b} is better than {a} in {measure}",
@@ -235,7 +204,7 @@ VERDICTS = {
 }
 
 
-def table_of(result: Mapping[str, Any]) -> Shown:
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
     """A row for each group, and what the intervals support of each pair and leave open."""
     rows = [
         [
@@ -252,18 +221,15 @@ def table_of(result: Mapping[str, Any]) -> Shown:
         low, high = pair["ci95"]
         chance = f"chance that {pair['a']} is better: {pair['probability']:.2f} [{low:.2f}, {high:.2f}]"
         sentences.append(f"{VERDICTS[pair['verdict']].format(**pair)} ({chance})")
-    return Shown(
+    table = Table(
         title=f"{result['task']}, plant {result['plant']}",
         heads=["", "seeds", "steps", "time [s]", *result["measures"]],
         rows=rows,
         note=NOTE,
         sentences=sentences,
+        intervals=True,
     )
-
-
-def print_comparison(result: Mapping[str, Any], console: Console) -> None:
-    """Print it."""
-    print_shown(table_of(result), console, intervals=True)
+    return [table]
 
 
 def _cell(figure: Mapping[str, Any]) -> str:
@@ -295,7 +261,7 @@ POINTS = 60
 CURVE_RESAMPLES = 200
 
 
-def draw_comparison(groups: Sequence[Group], result: Mapping[str, Any], path: Path) -> None:
+def draw_comparison(groups: Sequence[Group], result: Mapping[str, Any], path: Path) -> Path:
     """Write the figure."""
     runs = [run for group in groups for run in group.runs]
     curves = [name for name in CURVES if all(_drawable(run, name) for run in runs)][:2]
@@ -305,18 +271,16 @@ def draw_comparison(groups: Sequence[Group], result: Mapping[str, Any], path: Pa
     figure = new_figure(2.4 + 2.6 * columns, height + 3.4)
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(height, 3.4))[:, 0]
     above.suptitle("interquartile means, with 95 % intervals over the seeds", fontsize=9)
-    for k, axes in enumerate(_row(above, len(measures))):
+    for k, axes in enumerate(above.subplots(1, len(measures), squeeze=False)[0]):
         _intervals(axes, groups, result, measures[k], labels=k == 0)
-    panels = _row(below, len(curves) + pairs)
+    if not curves and not pairs:
+        return save_figure(figure, path)
+    panels = below.subplots(1, len(curves) + pairs, squeeze=False)[0]
     for k, name in enumerate(curves):
         _draw_curves(panels[k], groups, name, legend=k == 0)
     if pairs:
         _matrix(panels[-1], groups, result, measures[0])
-    save_figure(figure, path)
-
-
-def _row(figure: Any, n: int) -> list[Any]:
-    return list(figure.subplots(1, n, squeeze=False)[0]) if n else []
+    return save_figure(figure, path)
 
 
 def _intervals(
@@ -441,9 +405,16 @@ def compare(
         CompareError, EvaluationError, PolicyError, PlantError, VehicleError, OutputError: As they say.
     """
     groups = groups_of(runs)
-    scored = evaluated(
-        groups, out / "evaluations", load_plant(plant), say, vehicle=vehicle, trials=trials, seed=seed
-    )
+    water = load_plant(plant)
+    jobs = [
+        Job(
+            row=group.name, target=run.description.task, task=run.description.task, seed=run.seed, noise=seed,
+            controller=str(run.place), vehicle=vehicle, water=water, trials=trials,
+        )
+        for group in groups for run in group.runs
+    ]  # fmt: skip
+    results = run_jobs(jobs, out / "evaluations", play, say=say)
+    scored = {(job.row, job.seed): r["per_trial"] for job, r in zip(jobs, results, strict=True)}
     result = {
         **comparison(groups, scored, measures),
         "vehicle": vehicle,
@@ -452,7 +423,7 @@ def compare(
         "provenance": provenance(),
     }
     draw_comparison(groups, result, out / "compare.png")
-    write_json(out / RESULT_FILE, result, markdown_of(table_of(result)))
+    write_json(out / RESULT_FILE, result, tables_of(result))
     return result
 
 
@@ -492,24 +463,17 @@ def comparison(
                 for name in names
             },
         }
-    pairs = [_pair(a.name, b.name, name, scores) for a, b in combinations(groups, 2) for name in names]
+    pairs = []
+    for (a, b), name in product(combinations([group.name for group in groups], 2), names):
+        both = scores[a, name], scores[b, name]
+        improvement = partial(probability_of_improvement, less_is_better=less_is_better(name))
+        chance = with_bootstrap(both, improvement)
+        verdict = VERDICT_OF[better(chance) if min(map(len, both)) >= FEWEST else None]
+        about = {"a": a, "b": b, "measure": name, "verdict": verdict}
+        pairs.append({**about, "probability": chance.value, "ci95": [chance.low, chance.high]})
     return {
         "task": task,
         "measures": {name: less_is_better(name) for name in names},
         "groups": rows,
         "pairs": pairs,
     }
-
-
-def _pair(a: str, b: str, measure: str, scores: Mapping[tuple[str, str], Any]) -> dict[str, Any]:
-    less = less_is_better(measure)
-    found = with_bootstrap(
-        [scores[a, measure], scores[b, measure]],
-        lambda x, y: probability_of_improvement(x, y, less),
-    )
-    enough = min(len(scores[name, measure]) for name in (a, b)) >= FEWEST
-    verdict = {True: "better", False: "worse", None: "open"}[better(found) if enough else None]
-    return {
-        "a": a, "b": b, "measure": measure, "probability": found.value, "ci95": [found.low, found.high],
-        "verdict": verdict,
-    }  # fmt: skip

@@ -31,7 +31,7 @@ from finssim.control.pid import AxisModel, axis_model
 from finssim.control.policy import DESCRIPTION_FILE, Policy
 from finssim.engine import Pool
 from finssim.experiments.campaign import Say, run_jobs, write_json
-from finssim.experiments.evaluate import CAPTION, T1_COLUMNS, Evaluation, by_setpoint, cells, print_comparison
+from finssim.experiments.evaluate import CAPTION, Evaluation, by_target, cells, comparison_table
 from finssim.experiments.excitation import pool_trials, trials_on_robot
 from finssim.experiments.figures import (
     COLORS,
@@ -40,34 +40,20 @@ from finssim.experiments.figures import (
     error_envelope,
     legend_below,
     new_figure,
-    png,
+    save_figure,
 )
-from finssim.experiments.identify import (
-    HELD_OUT,
-    TRIALS,
-    Identification,
-    commands,
-    identify,
-    vehicle_files,
-)
+from finssim.experiments.identify import HELD_OUT, TRIALS, Identification, commands, identify, vehicle_files
 from finssim.experiments.metrics import T1_SETPOINTS, paper_row
 from finssim.experiments.on_robot import Attendant, OnRobot, kept_folder
-from finssim.experiments.pool_trial import (
-    HARDWARE,
-    Job,
-    play,
-    pool_evaluation,
-    pool_jobs,
-    read_series,
-    run_on_robot,
-)
-from finssim.experiments.tables import html_row
+from finssim.experiments.pool_trial import HARDWARE, Job, play, pool_evaluation, run_on_robot
+from finssim.experiments.tables import Table, html_of, print_tables
 from finssim.experiments.transfer import finished
-from finssim.experiments.trials import Trials
+from finssim.experiments.trials import Motion
+from finssim.experiments.trials import Trial as PlayedTrial
 from finssim.files import atomic_directory
 from finssim.learning.train import train
 from finssim.localization.detection.detector import detector
-from finssim.page import html_page, html_picture, html_table
+from finssim.page import html_page
 from finssim.pool import PlantSpec, draw_plant
 from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.plant import Plant
@@ -78,7 +64,7 @@ from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.capability import level_speed, terminal_speed
 from finssim.vehicles.defaults import room
 
-__all__ = ["camera_view", "demo", "report_html"]
+__all__ = ["camera_view", "demo"]
 
 SHARE = 0.9
 """Largest level, part of the wrench limit: the rest is for the controller that holds the other axes."""
@@ -199,21 +185,12 @@ Array = NDArray[np.float64]
 PUSH, REST = 6.0, 1.0
 """Lengths of a step and of the pause before the next one [s]."""
 OPEN = Basin(length=60.0, width=60.0, depth=60.0)
-
-
-@dataclass(frozen=True)
-class StepResponse:
-    """Of one axis to one level, the mean of both directions."""
-
-    speed: float
-    """Terminal [m/s, rad/s]."""
-    time_constant: float
-    """Until 63 % of it, motors included [s]."""
+DEEP = (0.0, 0.0, -30.0)
 
 
 def step_responses(
     vehicle: Vehicle, spec: PlantSpec, levels: Mapping[str, Sequence[float]]
-) -> dict[tuple[str, float], StepResponse]:
+) -> dict[tuple[str, float], tuple[float, float]]:
     """Steps of a plant on rails: it can move along one axis alone, in water at rest, far from everything.
 
     Args:
@@ -222,18 +199,39 @@ def step_responses(
         levels: Axis -> wrenches [N, N m].
 
     Returns:
-        (axis, level) -> response.
+        (axis, level) -> terminal speed [m/s, rad/s] and time to 63 % of it, motors included [s]: means of both
+        directions.
     """
     start_warp()
     still = {"basin": OPEN, "circulation": Circulation(), "tether": None, "buoyancy": BuoyancyDrift()}
-    plant = Plant(vehicle, spec.model_copy(update=still), position=(0.0, 0.0, -30.0))
-    found = {}
+    plant = Plant(vehicle, spec.model_copy(update=still), position=DEEP)
+    allocator, thrusters = Allocator.from_vehicle(vehicle), list(vehicle.thrusters.values())
+
+    def ride(axis: int, target: Array, duration: float) -> Array:
+        """Speed along the rail at every physics step."""
+        speeds = np.empty(round(duration / plant.step))
+        plant.target[:] = target
+        for k in range(len(speeds)):
+            plant.advance()
+            speeds[k] = abs(plant.nu[axis])
+            plant.nu[:] = np.where(np.arange(6) == axis, plant.nu, 0.0)
+            plant.position[:], plant.quaternion[:] = DEEP, (0.0, 0.0, 0.0, 1.0)
+        return speeds
+
+    def respond(axis: int, level: float) -> tuple[float, float]:
+        force = allocator.allocate(np.where(np.arange(6) == axis, level, 0.0))
+        ride(axis, np.zeros(len(thrusters)), REST)
+        plant.nu[:] = 0.0
+        speeds = ride(axis, np.array([t.speed(f) for t, f in zip(thrusters, force, strict=True)]), PUSH)
+        terminal = float(speeds[-round(0.5 / plant.step) :].mean())
+        return terminal, float(np.argmax(speeds >= 0.632 * terminal) * plant.step)
+
+    responses = {}
     for axis, values in levels.items():
         for level in values:
-            both = [_step(plant, vehicle, AXES.index(axis), sign * level) for sign in (1.0, -1.0)]
-            speed, time = np.mean(both, axis=0)
-            found[axis, level] = StepResponse(float(speed), float(time))
-    return found
+            both = [respond(AXES.index(axis), sign * level) for sign in (1.0, -1.0)]  # type: ignore[arg-type]
+            responses[axis, level] = tuple(np.mean(both, axis=0).tolist())
+    return responses
 
 
 def compare_steps(
@@ -252,43 +250,8 @@ def compare_steps(
     """
     model = step_responses(identified, draw_plant(identified, 0, "nominal"), levels)
     real = step_responses(standing, spec, levels)
-    return [
-        {
-            "axis": axis,
-            "level": level,
-            "model_speed": model[axis, level].speed,
-            "plant_speed": response.speed,
-            "model_time_constant": model[axis, level].time_constant,
-            "plant_time_constant": response.time_constant,
-        }
-        for (axis, level), response in real.items()
-    ]
-
-
-def _step(plant: Plant, vehicle: Vehicle, axis: int, level: float) -> tuple[float, float]:
-    """Terminal speed and time constant."""
-    tau = np.zeros(6)
-    tau[axis] = level
-    force = Allocator.from_vehicle(vehicle).allocate(tau)
-    speeds = [t.speed(f) for t, f in zip(vehicle.thrusters.values(), force, strict=True)]
-    _ride(plant, axis, np.zeros(len(speeds)), REST)
-    plant.nu[:] = 0.0
-    nu = np.abs(_ride(plant, axis, np.array(speeds), PUSH))
-    speed = float(nu[-round(0.5 / plant.step) :].mean())
-    return speed, float(np.argmax(nu >= 0.632 * speed) * plant.step)
-
-
-def _ride(plant: Plant, axis: int, target: Array, duration: float) -> Array:
-    """Speed along the rail at every physics step."""
-    out = np.empty(round(duration / plant.step))
-    plant.target[:] = target
-    for k in range(len(out)):
-        plant.advance()
-        out[k] = plant.nu[axis]
-        plant.nu[:] = np.where(np.arange(6) == axis, plant.nu, 0.0)
-        plant.position[:] = (0.0, 0.0, -30.0)
-        plant.quaternion[:] = (0.0, 0.0, 0.0, 1.0)
-    return out
+    names = ("axis", "level", "model_speed", "model_time_constant", "plant_speed", "plant_time_constant")
+    return [dict(zip(names, (*step, *model[step], *real[step]), strict=True)) for step in real]
 
 
 ZOOM = 110
@@ -298,7 +261,7 @@ ARROW = 0.18
 """Length of an arrow that shows a heading [m]."""
 
 HEADS = ("parameter", "estimate", "95 % interval", "catalogue", "unit", "state")
-STEPS = ("axis", "push", "identified", "in the plant", "ratio", "time constant", "in the plant")
+STEP_HEADS = ("axis", "push", "identified", "in the plant", "ratio", "time constant", "in the plant")
 UNSURE = (
     "unsure: told together with another number and not alone, as a part of the drag. file kept: the trials do not "
     "determine the number, and the vehicle keeps its guess."
@@ -326,48 +289,43 @@ POOL = (
 ROBOT = "hardware, too. Errors are those of the robot's own estimate, whose error is not in them."
 
 
-def camera_view(job: Job, series: Path, at: float, seed: int) -> bytes:
-    """What the camera of a pool saw at one moment, drawn anew from the pose that the vehicle truly had.
+def camera_view(job: Job, series: Path, at: float, seed: int, path: Path) -> None:
+    """Draw what the camera of a pool saw at one moment, anew from the pose that the vehicle truly had.
+
+    On the left is the whole picture, on the right the vehicle in it with the outlines of the tags that were detected.
 
     Args:
         job: The trial.
         series: As `run_jobs` left it, without its suffix.
         at: Time since its start [s].
         seed: Of ripples and noise.
-
-    Returns:
-        PNG: the whole picture, and the vehicle in it with the outlines of the tags that were found.
+        path: Picture to write.
     """
     standing = load_vehicle(job.pool_vehicle)
     site, _, settings = camera_of(standing, job.plant, job.severity)  # type: ignore[arg-type]
     camera = PoolCamera(standing, site, mode="pictures", settings=settings, seed=seed)
-    motion = read_series(series)
-    k = int(np.argmin(np.abs(motion["t"] - at)))
-    pose = motion["position"][k], motion["quaternion"][k]
-    picture = camera.develop(Exposure(0, at, at + settings.latency, pose, pose))
-    assert picture.image is not None and standing.tags is not None
-    found = [d for d in detector(standing.tags.family).detect(picture.image) if d.tag in standing.tags.mounts]
-    return _drawn(picture.image, found)
-
-
-def _drawn(image: Any, detections: Sequence[Any]) -> bytes:
+    motion = Motion.read(series)
+    k = int(np.argmin(np.abs(motion.t - at)))
+    pose = motion.position[k], motion.quaternion[k]
+    image = camera.develop(Exposure(0, at, at + settings.latency, pose, pose)).image
+    assert image is not None and standing.tags is not None
+    tags = [d for d in detector(standing.tags.family).detect(image) if d.tag in standing.tags.mounts]
     figure = new_figure(9.0, 3.4, layout="compressed")
     whole, close = figure.subplots(1, 2, width_ratios=(16, 9))
-    corners = [np.asarray(d.corners, float) for d in detections]
     for axes in (whole, close):
         axes.imshow(image, cmap="gray", vmin=0, vmax=255)
         axes.set_axis_off()
-        for tag in corners:
-            axes.plot(*np.vstack([tag, tag[:1]]).T, color=ORANGE, linewidth=1.4)
+        for tag in tags:
+            axes.plot(*np.vstack([tag.corners, tag.corners[:1]]).T, color=ORANGE, linewidth=1.4)
     whole.set_title("the overhead camera's picture", fontsize=9)
-    close.set_title(f"tags found: {', '.join(str(d.tag) for d in detections) or 'none'}", fontsize=9)
-    if corners:
-        x, y = np.concatenate(corners).mean(axis=0)
+    close.set_title(f"tags found: {', '.join(str(d.tag) for d in tags) or 'none'}", fontsize=9)
+    if tags:
+        x, y = np.concatenate([tag.corners for tag in tags]).mean(axis=0)
         close.set(xlim=(x - ZOOM, x + ZOOM), ylim=(y + ZOOM, y - ZOOM))
-    return png(figure)
+    save_figure(figure, path)
 
 
-def _training_curve(curves: Sequence[Mapping[str, Any]]) -> bytes:
+def _training_curve(curves: Sequence[Mapping[str, Any]]) -> Any:
     """Mean return and share of episodes held, against control steps and wall time, of rows of `curves.csv`."""
     figure = new_figure(7.2, 3.0)
     axes = figure.subplots()
@@ -386,195 +344,133 @@ def _training_curve(curves: Sequence[Mapping[str, Any]]) -> bytes:
     if rows:
         last = rows[-1]
         axes.set_title(f"{last['steps'] / 1e6:.1f} million steps in {last['seconds']:.0f} s", fontsize=10)
-    return png(figure)
+    return figure
 
 
-def _paths(trials: Trials) -> bytes:
+def _paths(trials: Sequence[PlayedTrial]) -> Any:
     """The paths of all trials from above and from the side, in the pool; start and goals with their headings."""
     pool = Pool()
     figure = new_figure(7.2, 6.0, layout="compressed")
     panels = figure.subplots(2, 1, sharex=True, height_ratios=(pool.width, pool.depth))
     spans = ((1, -pool.width / 2, pool.width), (2, -pool.depth, pool.depth))
+    goals = np.array([trial.goal for trial in trials])
     for axes, (vertical, low, height) in zip(panels, spans, strict=True):
         axes.fill_between([-pool.length / 2, pool.length / 2], low, low + height, color="#eaf3f8")
-        axes.plot(trials.position[..., 0], trials.position[..., vertical], color=BLUE, linewidth=1.2)
-        goals = trials.goals[:, [0, vertical]].T
-        axes.plot(*goals, "o", mfc="none", mec=ORANGE, ms=9, label="goal")
-        axes.plot(*trials.position[0, 0, [0, vertical]], "s", color="0.2", ms=5, label="start")
+        for trial in trials:
+            axes.plot(*trial.motion.position[:, [0, vertical]].T, color=BLUE, linewidth=1.2)
+        axes.plot(*goals[:, [0, vertical]].T, "o", mfc="none", mec=ORANGE, ms=9, label="goal")
+        axes.plot(*trials[0].motion.position[0, [0, vertical]], "s", color="0.2", ms=5, label="start")
         axes.set(aspect="equal", ylim=(low - 0.05, low + height + 0.05))
         axes.spines[["top", "right"]].set_visible(False)
     above, side = panels
-    for x, y, _, yaw in trials.goals:
+    for x, y, _, yaw in goals:
         tip = (x + ARROW * np.cos(yaw), y + ARROW * np.sin(yaw))
         above.annotate("", tip, (x, y), arrowprops={"arrowstyle": "->", "color": ORANGE})
     above.set_ylabel("y, left [m]")
     side.set(ylabel="z, up [m]", xlabel="x, forward [m]")
     legend_below(figure, above, 2)
-    return png(figure)
+    return figure
 
 
-def _identification(found: Identification) -> list[str]:
-    """What the trials told, and how the result replays others."""
-    score = found.replay.aggregate(found.replay.models[0]).value
+def _identification(result: Identification) -> list[Table]:
+    """What the trials made identifiable, and how the result replays others."""
+    score = result.replay.aggregate(result.replay.models[0]).value
     source, same = (
-        ("the virtual pool", "in the same pool") if found.steps else ("a robot", "on the same robot")
+        ("the virtual pool", "in the same pool") if result.steps else ("a robot", "on the same robot")
     )
     lead = (
-        f"Identified in {found.seconds:.0f} s from {len(found.fit.trials)} trials of {source}, beginning with "
+        f"Identified in {result.seconds:.0f} s from {len(result.fit.trials)} trials of {source}, beginning with "
         "guessed hydrodynamics: the robot's own software played each programme, and its record became a trial. "
-        f"{len(found.replay.pairs)} other trials, at levels that the fit has not seen, are replayed with an NRMSE of "
+        f"{len(result.replay.pairs)} other trials, at levels that the fit has not seen, are replayed with an NRMSE of "
         f"{'unknown' if score is None else f'{score:.3f}'}. What follows was trained and tuned in the identified "
         f"vehicle, and tried {same}."
     )
+    estimates = {name: e for name, e in result.fit.estimates.items() if e.path is not None}
     rows = [
-        html_row(
-            [
-                name,
-                number_text(e.estimate),
-                interval_text(e),
-                number_text(number_in(found.truth, e.path)),
-                e.unit,
-                state_text(e, found.fit, found.vehicle),
-            ],
-            "" if e.identifiable else "doubt",
+        [
+            name, number_text(e.estimate), interval_text(e), number_text(number_in(result.truth, str(e.path))), e.unit,
+            state_text(e, result.fit, result.vehicle),
+        ]
+        for name, e in estimates.items() if str(e.path).startswith("hydrodynamics.")
+    ]  # fmt: skip
+    tables = [
+        Table(
+            title="Identification",
+            headline=lead,
+            heads=HEADS,
+            rows=rows,
+            note=UNSURE + (POOL_VEHICLE if result.steps else ""),
+            sentences=sentences(result.findings),
+            pictures={"replay.png": "Held-out trials: measured and replayed by the identified vehicle"},
         )
-        for name, e in found.fit.estimates.items()
-        if e.path is not None and e.path.startswith("hydrodynamics.")
     ]
-    return [
-        "<h2>Identification</h2>",
-        f"<p>{escape(lead)}</p>",
-        html_table(HEADS, rows),
-        _note(UNSURE + (POOL_VEHICLE if found.steps else "")),
-        *_terminal_speeds(found),
-        *map(_note, sentences(found.findings)),
-        html_picture(found.picture, "Held-out trials: measured and replayed by the identified vehicle"),
-    ]
-
-
-def _terminal_speeds(found: Identification) -> list[str]:
-    """How fast the identified vehicle gets, beside the plant."""
-    rows = []
-    for step in found.steps:
-        unit, push = ("m/s", "N") if step["axis"] in ("surge", "sway", "heave") else ("rad/s", "N m")
+    speeds = []
+    for step in result.steps:
+        unit, push = ("m/s", "N") if step["axis"] in AXES[:3] else ("rad/s", "N m")
         model, plant = float(step["model_speed"]), float(step["plant_speed"])
-        rows.append(
-            html_row(
-                [
-                    str(step["axis"]),
-                    f"{step['level']:g} {push}",
-                    f"{model:.3f} {unit}",
-                    f"{plant:.3f} {unit}",
-                    f"{model / plant:.2f}" if plant else "–",
-                    f"{step['model_time_constant']:.2f} s",
-                    f"{step['plant_time_constant']:.2f} s",
-                ]
-            )
-        )
-    return ["<h3>Terminal speeds</h3>", html_table(STEPS, rows), _note(RAILS)] if rows else []
+        ratio = f"{model / plant:.2f}" if plant else "–"
+        times = (f"{step[f'{name}_time_constant']:.2f} s" for name in ("model", "plant"))
+        row = [str(step["axis"]), f"{step['level']:g} {push}", f"{model:.3f} {unit}", f"{plant:.3f} {unit}"]
+        speeds.append([*row, ratio, *times])
+    if speeds:
+        tables.append(Table(title="Terminal speeds", heads=STEP_HEADS, rows=speeds, note=RAILS))
+    return tables
 
 
-def report_html(
-    evaluations: Sequence[Evaluation],
-    curves: Sequence[Mapping[str, Any]],
-    training: Mapping[str, Any],
-    commands: Sequence[str],
-    found: Identification,
-    picture: bytes | None = None,
-) -> str:
-    """The report.
-
-    Args:
-        evaluations: The policy first, then what it is compared with, all on the same trials.
-        curves: Rows of the policy's `curves.csv`.
-        training: `seconds` (of the training), `seed`, `steps`.
-        commands: That repeat it by hand.
-        found: What the trials told.
-        picture: PNG of what the camera saw; none if None.
-    """
-    policy = evaluations[0]
-    result = policy.result
-    hardware = result["plant"]["name"] == "hardware"
-    compared = [e for e in evaluations if e.result["trials"] == result["trials"]]
-    envelopes = {e.label: error_envelope(e.trials.all_series()) for e in compared}
-    title = f"Station keeping of {result['vehicle']['name']}"
-    rows = [html_row([e.label, *cells(e.result)]) for e in evaluations]
-    for i, name in enumerate(("calibrated", "calibrated + DR", "PID")):
-        rows.append(html_row([f"paper: {name}", *cells(paper_row(name))], "theirs" if i else "theirs first"))
-    origin = {
-        "vehicle": result["vehicle"],
-        "hydrodynamics": result["hydrodynamics"],
-        "training seed": training["seed"],
-        "evaluation seed": result["seed"],
-        "policy": result["controller"].get("files", {}),
-        **result["provenance"],
-    }
-    sections = [
-        f"<h1>{escape(title)}</h1>",
-        f'<p class="lead">{_lead(compared, training, hardware)}</p>',
-        *_identification(found),
-        "<h2>Results</h2>",
-        _results("controller", rows),
-        _note(f"{CAPTION} {PAPER}{ROBOT if hardware else POOL}"),
-        "<h2>Error against time</h2>",
-        html_picture(
-            png(draw_envelopes(envelopes)), "Position and yaw error against time, median and middle half"
-        ),
-        "<h2>Paths of the policy</h2>",
-        html_picture(_paths(policy.trials), "Paths of the eight trials from above and from the side"),
-    ]
-    if picture is not None:
-        view = html_picture(picture, "A picture of the overhead camera with the tags found in it")
-        sections += ["<h2>What the camera sees</h2>", view, _note(VIEW)]
-    sections += [
-        "<h2>Training</h2>",
-        html_picture(_training_curve(curves), "Mean return and share of episodes held while training"),
-        "<h2>Every setpoint</h2>",
-    ]
-    for e in evaluations:
-        each = by_setpoint(e.result["per_trial"])
-        sections.append(_results(e.label, [html_row([name, *cells(row)]) for name, row in each.items()]))
-    sections += [
-        "<h2>How to repeat it</h2>",
-        f"<pre>{escape(chr(10).join(commands))}</pre>",
-        "<h2>Provenance</h2>",
-        f"<pre>{escape(json.dumps(origin, indent=2))}</pre>",
-    ]
-    return html_page(title, sections)
-
-
-def _lead(evaluations: Sequence[Evaluation], training: Mapping[str, Any], hardware: bool) -> str:
+def _lead(evaluations: Sequence[Evaluation], seconds: float) -> str:
     r = evaluations[0].result
     errors = ""
     if r["e_p_m"] is not None:
         errors = f", with {100.0 * r['e_p_m']:.1f} cm and {r['e_psi_deg']:.1f}° of error once settled"
-    place = "on hardware" if hardware else "in the virtual pool"
+    place = "on hardware" if r["plant"]["name"] == HARDWARE else "in the virtual pool"
     others = " and ".join(f"{e.label} {e.result['success']}" for e in evaluations[1:])
-    return escape(
-        f"A policy trained here in {training['seconds']:.0f} s, from nothing to a file that runs on the vehicle, holds "
+    return (
+        f"A policy trained here in {seconds:.0f} s, from nothing to a file that runs on the vehicle, holds "
         f"{r['success']} of {r['trials']} published setpoints {place}{errors}. On the same trials, "
         f"successes: {others}."
     )
 
 
-def _results(first: str, rows: Sequence[str]) -> str:
-    return html_table((first, *(heading for heading, _ in T1_COLUMNS.values())), rows)
-
-
-def _note(text: str) -> str:
-    return f'<p class="note">{escape(text)}</p>'
+def _results(evaluations: Sequence[Evaluation]) -> list[Table]:
+    """All controllers beside the paper's, the policy's paths, what the camera saw, the training, and every setpoint."""
+    results = comparison_table([e.result for e in evaluations], "controller")
+    heads = [head.replace("\n", " ") for head in results.heads]
+    rows = [[e.label, *cells(e.result)] for e in evaluations]
+    rows += [[f"paper: {name}", *cells(paper_row(name))] for name in ("calibrated", "calibrated + DR", "PID")]
+    policy = evaluations[0].result
+    source = ROBOT if policy["plant"]["name"] == HARDWARE else POOL
+    tables = [
+        Table(
+            title="Results", heads=heads, rows=rows, note=f"{CAPTION} {PAPER}{source}",
+            pictures={"envelopes.png": "Position and yaw error against time, median and middle half"},
+        ),
+        Table(
+            title="Paths of the policy",
+            pictures={"paths.png": "Paths of the trials from above and from the side"},
+        ),
+    ]  # fmt: skip
+    if any(e.result["camera"] == "pictures" for e in evaluations):
+        seen = {"camera.png": "A picture of the overhead camera with the tags found in it"}
+        tables.append(Table(title="What the camera sees", note=VIEW, pictures=seen))
+    learnt = {"training.png": "Mean return and share of episodes held while training"}
+    tables.append(Table(title="Training", pictures=learnt))
+    for e in evaluations:
+        each = [[name, *cells(row)] for name, row in by_target(e.result).items()]
+        tables.append(Table(title=f"Every setpoint: {e.label}", heads=[e.label, *heads[1:]], rows=each))
+    return tables
 
 
 PLANT_FILE = "pool.yaml"
 """The plant, for `finssim pool --plant`."""
 TRIALS_FOLDER = "deployed"
-"""A result and a series for every trial of a controller."""
+"""A result and a motion for every trial of a controller."""
 
 
 REPORT_FILE = "report.html"
 SEED = 1
 PLANT, SEVERITY, RANGES = 1, "realistic", "pool"
 CONTROLLERS = ("policy", "pid", "pid-paper")
+WITH_PICTURES = "policy-with-pictures"
 VIEW_AT = 12.0
 """Time of a trial from which the report shows a picture [s]."""
 COAST = 4.0
@@ -601,7 +497,7 @@ class Scope:
     def of(self, vehicle: Vehicle) -> Scope:
         """The same for a vehicle: levels that move it as FinsROV's move FinsROV, on the axes that it controls.
 
-        See `programmes.matched`.
+        See `matched`.
         """
         return replace(
             self,
@@ -668,235 +564,215 @@ def demo(
             `out` as it was.
     """
     console, standing = console or Console(stderr=True), load_vehicle(vehicle)
-    scope = (scope or FULL).of(standing)
     start_warp()
-    rescue = out.with_name(f"{out.name}-training") / "interrupted"
-    place = _Place(vehicle, robot, attendant, processes, console)
-    with atomic_directory(out, replaces=REPORT_FILE) if robot is None else kept_folder(out) as folder:
-        found = _identified(folder, out, seed, scope, place)
-        began = time.perf_counter()
-        policy = folder / "policy"
-        if robot is None or not finished(policy, found.vehicle):
-            train(
-                "t1",
-                out=policy,
-                vehicle=found.vehicle,
-                randomize=RANGES,
-                seed=seed,
-                steps=steps,
-                console=console,
-                shown=out / "policy",
-                interrupted=rescue,
-            )
-        training = {
-            "seconds": time.perf_counter() - began,
-            "seed": seed,
-            "steps": Policy.load(policy).description.training["steps"],
-        }
-        with _rescued(policy, rescue, console):
-            evaluations, picture = _deployed(folder, policy, seed, scope, place)
-            _write(folder, found, evaluations, training, _commands(out, place, training), picture)
-    print_comparison([e.result for e in evaluations if e.result["camera"] != "pictures"], Console())
+    place = atomic_directory(out, replaces=REPORT_FILE) if robot is None else kept_folder(out)
+    with place as folder:
+        demonstration = _Demonstration(
+            folder=folder, out=out, name=vehicle, standing=standing, seed=seed, scope=(scope or FULL).of(standing),
+            console=console, processes=processes, robot=robot, attendant=attendant,
+        )  # fmt: skip
+        evaluations = demonstration.run(steps)
+    simulated = [e.result for e in evaluations if e.result["camera"] != "pictures"]
+    print_tables([comparison_table(simulated, "controller")], Console())
     report = Path(out) / REPORT_FILE
     print(f"report: {report}")
-    if _has_display():
+    display = environ.get("DISPLAY") or environ.get("WAYLAND_DISPLAY") or sys.platform in ("darwin", "win32")
+    if sys.stdout.isatty() and display:
         webbrowser.open(report.resolve().as_uri())
     return report
 
 
-@dataclass(frozen=True)
-class _Place:
-    """With what and where it is done."""
+@dataclass(frozen=True, kw_only=True)
+class _Demonstration:
+    """What is done, with what and where."""
 
-    vehicle: str
-    """Name or file, as the catalogue has it."""
+    folder: Path
+    """In which it is done."""
+    out: Path
+    """Name of that folder afterwards."""
+    name: str
+    """Name or file of the vehicle, as the catalogue has it."""
+    standing: Vehicle
+    seed: int
+    scope: Scope
+    console: Console
+    processes: int | None
     robot: OnRobot | None
     attendant: Attendant | None
-    processes: int | None
-    console: Console
 
+    def run(self, steps: int | None) -> list[Evaluation]:
+        """Identify, train, deploy and report; returns an evaluation of each controller, the policy's first."""
+        result = self._identified()
+        began, policy = time.perf_counter(), self.folder / "policy"
+        rescue = self.out.with_name(f"{self.out.name}-training") / "interrupted"
+        if self.robot is None or not finished(policy, result.vehicle):
+            train(
+                "t1", out=policy, vehicle=result.vehicle, randomize=RANGES, seed=self.seed, steps=steps,
+                console=self.console, shown=self.out / "policy", interrupted=rescue,
+            )  # fmt: skip
+        seconds = time.perf_counter() - began
+        try:
+            evaluations = self._deployed(policy)
+            self._report(result, evaluations, seconds)
+        except KeyboardInterrupt:  # the folder goes, and the policy was trained
+            with atomic_directory(rescue, replaces=DESCRIPTION_FILE) as copy:
+                shutil.copytree(policy, copy, dirs_exist_ok=True)
+            self.tell(f"policy kept: {rescue}")
+            raise
+        return evaluations
 
-def _identified(folder: Path, out: Path, seed: int, scope: Scope, place: _Place) -> Identification:
-    """Trials, the vehicle they tell of, and in a pool how its speeds compare with the plant's."""
-    standing, console = load_vehicle(place.vehicle), place.console
-    plans = _plans(standing, scope)
-    if place.robot is not None:
-        robot = place.robot
-        console.print("recording trials on the robot", highlight=False)
+    def tell(self, text: str) -> None:
+        """Show a line of progress."""
+        self.console.print(text, highlight=False, markup=False, soft_wrap=True)
 
-        def record(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
-            return trials_on_robot(
-                plans, folder, load_vehicle(rough), robot, attendant=place.attendant, console=console
-            )
+    @contextmanager
+    def _working(self, text: str) -> Iterator[Say]:
+        """Show what is done, and how far it is."""
+        self.tell(text)
+        with self.console.status(text) as status:
+            yield lambda part, what: status.update(f"{text}: {what}")
 
-        return _told(identify(folder, place.vehicle, seed=seed, shown=out, record=record), console)
-    spec = draw_plant(standing, PLANT, SEVERITY)
-    spec.write(folder / PLANT_FILE)
-    console.print("recording trials in the virtual pool", highlight=False)
-    with console.status("recording trials in the virtual pool") as status:
+    def _identified(self) -> Identification:
+        """Trials, the vehicle that they make identifiable, and in a pool how its speeds compare with the plant's."""
+        standing, scope = self.standing, self.scope
+        plans = {
+            role: programmes(tuple(levels), standing, levels=levels, coast=COAST)
+            for role, levels in (("fit", scope.levels), ("held-out", scope.held_out))
+        }
+        plans["fit"] += shuttles(scope.shuttles, standing) if scope.shuttles else []
+        plans = {role: [trimmed(programme, standing) for programme in plan] for role, plan in plans.items()}
+        if self.robot is not None:
+            robot = self.robot
+            self.tell("recording trials on the robot")
 
-        def say(part: float, what: str) -> None:
-            fitting = f"fitting {standing.name} to the trials, replaying others"
-            status.update(f"recording trials in the virtual pool: {what}" if part < 1.0 else fitting)
+            def record(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
+                known = load_vehicle(rough)
+                return trials_on_robot(
+                    plans, folder, known, robot, attendant=self.attendant, console=self.console
+                )
 
-        def show(run: Any, result: Mapping[str, Any]) -> None:
-            unit = "m/s" if run.programme.axes[0] in AXES[:3] else "rad/s"
-            text = f"up to {result['fastest']:.2f} {unit} in {result['duration']:.0f} s"
-            text = f"left out: {result['fault']}" if result["fault"] else text
-            console.print(f"  {run.target}: {text}", highlight=False)
+            result = identify(self.folder, self.name, seed=self.seed, shown=self.out, record=record)
+        else:
+            spec = draw_plant(standing, PLANT, SEVERITY)
+            spec.write(self.folder / PLANT_FILE)
+            with self._working("recording trials in the virtual pool") as say:
 
-        def simulated(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
-            return pool_trials(
-                plans, folder, vehicle=str(rough), pool_vehicle=place.vehicle, plant=PLANT, severity=SEVERITY,
-                seed=seed, leave_out=True, processes=place.processes, say=say, show=show,
+                def show(run: Any, result: Mapping[str, Any]) -> None:
+                    unit = "m/s" if run.programme.axes[0] in AXES[:3] else "rad/s"
+                    text = f"up to {result['fastest']:.2f} {unit} in {result['duration']:.0f} s"
+                    text = f"left out: {result['fault']}" if result["fault"] else text
+                    self.tell(f"  {run.target}: {text}")
+
+                def simulated(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
+                    return pool_trials(
+                        plans, folder, vehicle=str(rough), pool_vehicle=self.name, plant=PLANT, severity=SEVERITY,
+                        seed=seed, leave_out=True, processes=self.processes, say=say, show=show,
+                    )  # fmt: skip
+
+                result = identify(self.folder, self.name, seed=self.seed, shown=self.out, record=simulated)
+                linear = {
+                    axis: levels for axis, levels in scope.levels.items() if axis not in ("roll", "pitch")
+                }
+                result = replace(result, steps=tuple(compare_steps(result.vehicle, standing, spec, linear)))
+        off = [abs(float(s["model_speed"]) / float(s["plant_speed"]) - 1.0) for s in result.steps]
+        speeds = f", terminal speeds within {100.0 * max(off):.0f} % of the pool's own vehicle" if off else ""
+        identifiable = sum(e.identifiable for e in result.fit.estimates.values())
+        self.tell(
+            f"identified from {len(result.fit.trials)} trials in {result.seconds:.0f} s: {identifiable} of "
+            f"{len(result.fit.estimates)} parameters told, NRMSE on {len(result.replay.pairs)} other trials "
+            f"{result.replay.aggregate('calibrated').value:.3f}{speeds}"
+        )
+        return result
+
+    def _deployed(self, policy: Path) -> list[Evaluation]:
+        """All controllers in the pool, the policy with pictures too, and one of those pictures; or all on the robot."""
+        vehicle = str(self.folder / vehicle_files(self.standing.name)[1])
+        pool_vehicle, plant, severity, camera = self.name, PLANT, SEVERITY, "corners"
+        if self.robot is not None:
+            pool_vehicle, plant, severity, camera = vehicle, 0, HARDWARE, HARDWARE
+
+        def job(row: str, target: str, camera: str) -> Job:
+            controller = str(policy) if row.startswith("policy") else row
+            return Job(
+                row=row, controller=controller, target=target, camera=camera, vehicle=vehicle, seed=self.seed,
+                pool_vehicle=pool_vehicle, plant=plant, severity=severity, duration=self.scope.duration,
             )  # fmt: skip
 
-        found = identify(folder, place.vehicle, seed=seed, shown=out, record=simulated)
-        linear = {axis: levels for axis, levels in scope.levels.items() if axis not in ("roll", "pitch")}
-        found = replace(found, steps=tuple(compare_steps(found.vehicle, standing, spec, linear)))
-    return _told(found, console)
+        # Pictures first: they take longest, and the other processor has time for the rest.
+        pictures = [] if self.robot else [job(WITH_PICTURES, t, "pictures") for t in self.scope.pictures]
+        jobs = pictures + [job(row, target, camera) for row in CONTROLLERS for target in self.scope.setpoints]
+        place = self.folder / TRIALS_FOLDER
+        if self.robot is not None:
+            results = run_on_robot(jobs, place, self.robot, attendant=self.attendant, console=self.console)
+        else:
+            with self._working("holding setpoints in the virtual pool") as say:
+                results = run_jobs(jobs, place, play, processes=self.processes, say=say, show=self._show)
+            if pictures:
+                series = place / pictures[0].key()
+                camera_view(pictures[0], series, VIEW_AT, self.seed, self.folder / "camera.png")
+        evaluations = []
+        for row in (*CONTROLLERS, WITH_PICTURES):
+            of_row = [result for result in results if result["job"]["row"] == row]
+            if of_row:
+                evaluations.append(pool_evaluation(next(j for j in jobs if j.row == row), of_row, place))
+        return evaluations
 
+    def _show(self, job: Job, result: Mapping[str, Any]) -> None:
+        held = "held" if result["success"] else result["fault"] or "not held"
+        if result["e_p_m"] is not None:
+            held += f", {result['e_p_m']:.3f} m and {result['e_psi_deg']:.1f}° off"
+        self.tell(f"  {job.row} at {job.target}: {held}")
 
-def _told(found: Identification, console: Console) -> Identification:
-    """Say what was identified."""
-    off = [abs(float(s["model_speed"]) / float(s["plant_speed"]) - 1.0) for s in found.steps]
-    speeds = f", terminal speeds within {100.0 * max(off):.0f} % of the pool's own vehicle" if off else ""
-    identifiable = sum(e.identifiable for e in found.fit.estimates.values())
-    console.print(
-        f"identified from {len(found.fit.trials)} trials in {found.seconds:.0f} s: {identifiable} of "
-        f"{len(found.fit.estimates)} parameters told, NRMSE on {len(found.replay.pairs)} other trials "
-        f"{found.replay.aggregate('calibrated').value:.3f}{speeds}",
-        highlight=False,
-    )
-    return found
-
-
-def _plans(standing: Vehicle, scope: Scope) -> dict[str, list[Programme]]:
-    """Programmes by role."""
-    plans = {
-        role: programmes(tuple(levels), standing, levels=levels, coast=COAST)
-        for role, levels in (("fit", scope.levels), ("held-out", scope.held_out))
-    }
-    plans["fit"] += shuttles(scope.shuttles, standing) if scope.shuttles else []
-    return {role: [trimmed(programme, standing) for programme in plan] for role, plan in plans.items()}
-
-
-def _deployed(
-    folder: Path, policy: Path, seed: int, scope: Scope, where: _Place
-) -> tuple[list[Evaluation], bytes | None]:
-    """All controllers in the pool, the policy with pictures too, and one of those pictures; or all on the robot."""
-    console = where.console
-    common: dict[str, Any] = {
-        "vehicle": str(folder / vehicle_files(load_vehicle(where.vehicle).name)[1]),
-        "pool_vehicle": where.vehicle,
-        "plant": PLANT,
-        "severity": SEVERITY,
-        "seed": seed,
-        "duration": scope.duration,
-    }
-    names = {name: str(policy) if name == "policy" else name for name in CONTROLLERS}
-    if where.robot is not None:
-        common |= {"pool_vehicle": common["vehicle"], "plant": 0, "severity": HARDWARE}
-        jobs = pool_jobs(names, scope.setpoints, camera=HARDWARE, **common)
-        results = run_on_robot(
-            jobs, folder / TRIALS_FOLDER, where.robot, attendant=where.attendant, console=console
-        )
-        played = {result["key"]: result for result in results}
-        jobs = [job for job in jobs if job.key() in played]
-        return _by_row(jobs, [played[job.key()] for job in jobs], folder / TRIALS_FOLDER), None
-    # Pictures first: they take longest, and the other processor has time for the rest.
-    jobs = pool_jobs({"policy-with-pictures": str(policy)}, scope.pictures, camera="pictures", **common)
-    seen = jobs[:1]
-    jobs += pool_jobs(names, scope.setpoints, camera="corners", **common)
-    place = folder / TRIALS_FOLDER
-    console.print("holding setpoints in the virtual pool", highlight=False)
-    with console.status("holding setpoints in the virtual pool") as status:
-        say: Say = lambda part, what: status.update(f"holding setpoints in the virtual pool: {what}")  # noqa: E731
-
-        def show(job: Job, result: Mapping[str, Any]) -> None:
-            held = "held" if result["success"] else result["fault"] or "not held"
-            if result["e_p_m"] is not None:
-                held += f", {result['e_p_m']:.3f} m and {result['e_psi_deg']:.1f}° off"
-            console.print(f"  {job.row} at {job.target}: {held}", highlight=False)
-
-        results = run_jobs(jobs, place, play, processes=where.processes, say=say, show=show)
-        evaluations = _by_row(jobs, results, place)
-        picture = camera_view(seen[0], place / seen[0].key(), VIEW_AT, seed) if seen else None
-    return evaluations, picture
-
-
-def _by_row(jobs: Sequence[Job], results: Sequence[dict[str, Any]], place: Path) -> list[Evaluation]:
-    """One evaluation for each row, the policy's first."""
-    rows = sorted({job.row for job in jobs}, key=lambda row: [*CONTROLLERS, row].index(row))
-    chosen = [[i for i, job in enumerate(jobs) if job.row == row] for row in rows]
-    return [pool_evaluation([jobs[i] for i in those], [results[i] for i in those], place) for those in chosen]
-
-
-def _write(
-    folder: Path,
-    found: Identification,
-    evaluations: Sequence[Evaluation],
-    training: Mapping[str, Any],
-    commands: Sequence[str],
-    picture: bytes | None,
-) -> None:
-    """Write NAME.json of every controller, `steps.json`, `camera.png` and `report.html`."""
-    for evaluation in evaluations:
-        write_json(folder / f"{evaluation.result['controller']['name']}.json", evaluation.result)
-    (folder / "steps.json").write_text(json.dumps(found.steps, indent=2) + "\n", encoding="utf-8")
-    if picture is not None:
-        (folder / "camera.png").write_bytes(picture)
-    with (folder / "policy" / "curves.csv").open(encoding="utf-8", newline="") as file:
-        curves = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
-    html = report_html(evaluations, curves, training, commands, found, picture)
-    (folder / REPORT_FILE).write_text(html, encoding="utf-8")
-
-
-def _commands(out: Path, place: _Place, training: Mapping[str, Any]) -> list[str]:
-    """Command lines that repeat the demonstration's steps by hand."""
-    name = load_vehicle(place.vehicle).name
-    rough, identified = (out / file for file in vehicle_files(name))
-    seed, steps = training["seed"], training["steps"]
-    goal = f"finssim run --policy policy --vehicle {identified} --goal 1,0.3,-0.5,90"
-    excite = f"finssim excite all --vehicle {rough}"
-    middle = [
-        *commands(out, name, seed),
-        f"finssim train t1 --vehicle {identified} --randomize {RANGES} --seed {seed} --steps {steps} --out policy",
-    ]
-    if place.robot is not None:
-        robot = f"{place.robot.options} --arm"
-        return [
-            f"{excite} {robot} --coast {COAST:g} --out more-trials",
-            *middle,
-            f"{goal} {robot} --record run.mcap",
-            f"finssim evaluate run.mcap --task t1 --vehicle {identified}",
+    def _report(self, result: Identification, evaluations: Sequence[Evaluation], seconds: float) -> None:
+        """Write NAME.json of every controller, `steps.json`, the pictures and `report.html`."""
+        folder, policy = self.folder, evaluations[0]
+        for evaluation in evaluations:
+            write_json(folder / f"{evaluation.result['controller']['name']}.json", evaluation.result)
+        (folder / "steps.json").write_text(json.dumps(result.steps, indent=2) + "\n", encoding="utf-8")
+        with (folder / "policy" / "curves.csv").open(encoding="utf-8", newline="") as file:
+            curves = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+        compared = [e for e in evaluations if e.result["trials"] == policy.result["trials"]]
+        envelopes = {e.label: error_envelope(e.trials) for e in compared}
+        save_figure(draw_envelopes(envelopes), folder / "envelopes.png")
+        save_figure(_paths(policy.trials), folder / "paths.png")
+        save_figure(_training_curve(curves), folder / "training.png")
+        title = f"Station keeping of {policy.result['vehicle']['name']}"
+        origin = {
+            "vehicle": policy.result["vehicle"],
+            "hydrodynamics": policy.result["hydrodynamics"],
+            "seed": self.seed,
+            "policy": policy.result["controller"].get("files", {}),
+            **policy.result["provenance"],
+        }
+        sections = [
+            f"<h1>{escape(title)}</h1>",
+            f'<p class="lead">{escape(_lead(compared, seconds))}</p>',
+            *html_of([*_identification(result), *_results(evaluations)], folder),
+            "<h2>How to repeat it</h2>",
+            f"<pre>{escape(chr(10).join(self._commands()))}</pre>",
+            "<h2>Provenance</h2>",
+            f"<pre>{escape(json.dumps(origin, indent=2))}</pre>",
         ]
-    return [
-        f"finssim trials import {out / TRIALS / 'fit' / 'records'}/*.mcap --split phase --out trials",
-        f"{excite} --pool {PLANT} --severity {SEVERITY} --pool-vehicle {place.vehicle} --coast {COAST:g} "
-        "--out more-trials",
-        *middle,
-        f"finssim pool --vehicle {place.vehicle} --plant {out / PLANT_FILE} --pool-file site.yaml --truth truth.fst",
-        f"{goal} --robot pool --pool-file site.yaml --arm",
-    ]
+        (folder / REPORT_FILE).write_text(html_page(title, sections), encoding="utf-8")
 
-
-@contextmanager
-def _rescued(policy: Path, rescue: Path, console: Console) -> Iterator[None]:
-    """Keep a trained policy when what follows its training is interrupted, and `folder` goes."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        with atomic_directory(rescue, replaces=DESCRIPTION_FILE) as copy:
-            shutil.copytree(policy, copy, dirs_exist_ok=True)
-        console.print(f"policy kept: {rescue}", highlight=False, soft_wrap=True)
-        raise
-
-
-def _has_display() -> bool:
-    """Whether a person sits in front of a screen where a browser could open."""
-    if not sys.stdout.isatty():
-        return False
-    return sys.platform in ("darwin", "win32") or bool(
-        environ.get("DISPLAY") or environ.get("WAYLAND_DISPLAY")
-    )
+    def _commands(self) -> list[str]:
+        """Command lines that repeat the demonstration's steps by hand."""
+        out, seed, name = self.out, self.seed, self.standing.name
+        rough, identified = (out / file for file in vehicle_files(name))
+        steps = Policy.load(self.folder / "policy").description.training["steps"]
+        options = f"--randomize {RANGES} --seed {seed} --steps {steps}"
+        learn = f"finssim train t1 --vehicle {identified} {options} --out policy"
+        drive = f"finssim run --policy policy --vehicle {identified} --goal 1,0.3,-0.5,90"
+        excite = f"finssim excite all --vehicle {rough} --coast {COAST:g} --out more-trials"
+        middle = [*commands(out, name, seed), learn]
+        if self.robot is not None:
+            robot = f"{self.robot.options} --arm"
+            evaluated = f"finssim evaluate run.mcap --task t1 --vehicle {identified}"
+            return [f"{excite} {robot}", *middle, f"{drive} {robot} --record run.mcap", evaluated]
+        return [
+            f"finssim trials import {out / TRIALS / 'fit' / 'records'}/*.mcap --split phase --out trials",
+            f"{excite} --pool {PLANT} --severity {SEVERITY} --pool-vehicle {self.name}",
+            *middle,
+            f"finssim pool --vehicle {self.name} --plant {out / PLANT_FILE} --pool-file site.yaml --truth truth.fst",
+            f"{drive} --robot pool --pool-file site.yaml --arm",
+        ]

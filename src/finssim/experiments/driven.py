@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,14 +11,13 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from rich.console import Console
 
 from finssim.control.guidance import Guide, Station, Track
 from finssim.control.modes import AXES, ActionMode, action_mode
 from finssim.control.trajectories import PUBLISHED_NAMES, TRAJECTORIES, load_trajectory
-from finssim.experiments.campaign import progress_bar
-from finssim.experiments.tables import console_table
-from finssim.geometry.rotations import quat_yaw
+from finssim.experiments.campaign import Say
+from finssim.experiments.tables import Table
+from finssim.experiments.trials import Motion
 from finssim.learning.demonstrations import Episode, about, found_in, save
 from finssim.learning.demonstrations import collect as collect_episodes
 from finssim.provenance import provenance
@@ -39,6 +37,7 @@ __all__ = [
     "datasets",
     "read_drive",
     "station_at",
+    "tables_of",
     "trajectory_of",
 ]
 
@@ -74,22 +73,13 @@ class Drive:
     """Of the decisions [s]."""
     time: Array
     """Robot's clock [s], (N,)."""
-    since: Array
-    """Time since the guide's start [s], (N,); NaN where the record does not tell it."""
+    motion: Motion
+    """As estimated, with the thrusts and the pilot's actions, which have size 0 where the record does not tell them, as
+    of a person; its times are NaN where the record does not tell the guide's start."""
     guide: str
     """Name of the station or trajectory; empty where the record does not tell it."""
-    position: Array
-    """Estimate of the body origin, world frame [m], (N, 3)."""
-    quaternion: Array
-    """Estimate of body to world, xyzw, (N, 4)."""
-    nu: Array
-    """Estimate of the velocity, body frame [m/s, rad/s], (N, 6)."""
     goal: Array
     """Where the vehicle should be: x, y, z [m], yaw [rad], world frame, (N, 4)."""
-    force: Array
-    """Thrusts that were asked for, canonical order [N], (N, n)."""
-    action: Array
-    """What the pilot did, in [-1, 1], (N, size); of size 0 where the record does not tell it, as of a person."""
     stretch: NDArray[np.int64]
     """Number of the stretch a decision belongs to, (N,): all through it the robot was armed, the estimate ready and
     the driver at the helm. Negative: in none."""
@@ -118,22 +108,39 @@ def read_drive(path: Path, vehicle: Vehicle) -> Drive:
         told = [(event["time"], event) for event in events_of(record)]
     steps = np.array(sorted(columns["thruster_state"]))
     numbers = dict(zip(steps.tolist(), _stretches(steps, columns, _helm(steps, told, teleop)), strict=True))
-    whole = [t for t in sorted(columns["thruster_cmd"]) if all(t in columns[name] for name in TOPICS)]
-    if not whole:
+    complete = [t for t in sorted(columns["thruster_cmd"]) if all(t in columns[name] for name in TOPICS)]
+    if not complete:
         raise DriveError(f"{path}: no decision at which there was an estimate: nothing to learn from")
-    rows = [{name: columns[name][t] for name in TOPICS} for t in whole]
-    stretch = np.array([numbers[t] for t in whole])
-    first = rows[int(np.argmax(stretch >= 0))]["policy_info"]
-    began, guide = _start(told)
+    rows, time = {name: [columns[name][t] for t in complete] for name in TOPICS}, np.array(complete)
+    stretch = np.array([numbers[t] for t in complete])
+    first = rows["policy_info"][int(np.argmax(stretch >= 0))]
+    began, guide = next(
+        ((t, str(event["text"])) for t, event in told if event["kind"] == "trial_start"), (math.nan, "")
+    )
+    poses, twists = ([getattr(m, k) for m in rows["odom"]] for k in ("pose", "twist"))
+    goals = [message.pose for message in rows["goal"]]
+    actions = [np.asarray(message.action, dtype=float) for message in rows["policy_info"]]
+    alike = len({len(action) for action in actions}) == 1
+    motion = Motion(
+        t=time - began,
+        position=np.array([_xyz(p.pose.position) for p in poses]),
+        quaternion=np.array([(*_xyz(p.pose.orientation), p.pose.orientation.w) for p in poses]),
+        nu=np.array([(*_xyz(t.twist.linear), *_xyz(t.twist.angular)) for t in twists]),
+        thrust=np.array([message.force for message in rows["thruster_cmd"]], dtype=float),
+        action=np.array(actions) if alike else np.zeros((len(complete), 0)),
+    )
     return Drive(
         path=path,
         driver="teleop" if teleop else str(first.pilot),
         period=float(first.period),
-        time=np.array(whole),
-        since=np.array(whole) - began,
+        time=time,
+        motion=motion,
         guide=guide,
+        # The goal is level: its quaternion turns about z alone.
+        goal=np.array(
+            [(*_xyz(g.position), 2.0 * math.atan2(g.orientation.z, g.orientation.w)) for g in goals]
+        ),
         stretch=stretch,
-        **_numbers(rows),
     )
 
 
@@ -179,31 +186,6 @@ def _stretches(
     return [int(n) for n in np.where(fit, np.cumsum(~fit), -1)]
 
 
-def _start(told: list[tuple[float, Any]]) -> tuple[float, str]:
-    """When the guide's time began, and the guide's name."""
-    return next(
-        ((t, str(event["text"])) for t, event in told if event["kind"] == "trial_start"), (math.nan, "")
-    )
-
-
-def _numbers(rows: list[dict[str, Any]]) -> dict[str, Array]:
-    poses = [row["odom"].pose.pose for row in rows]
-    twists = [row["odom"].twist.twist for row in rows]
-    goals = [row["goal"].pose for row in rows]
-    # The goal is level: its quaternion turns about z alone.
-    yaw = [2.0 * math.atan2(g.orientation.z, g.orientation.w) for g in goals]
-    actions = [np.asarray(row["policy_info"].action, dtype=float) for row in rows]
-    alike = len({len(action) for action in actions}) == 1
-    return {
-        "action": np.array(actions) if alike else np.zeros((len(rows), 0)),
-        "position": np.array([_xyz(p.position) for p in poses]),
-        "quaternion": np.array([(*_xyz(p.orientation), p.orientation.w) for p in poses]),
-        "nu": np.array([(*_xyz(t.linear), *_xyz(t.angular)) for t in twists]),
-        "goal": np.array([(*_xyz(g.position), a) for g, a in zip(goals, yaw, strict=True)]),
-        "force": np.array([row["thruster_cmd"].force for row in rows], dtype=float),
-    }
-
-
 def _xyz(v: Any) -> tuple[float, float, float]:
     return float(v.x), float(v.y), float(v.z)
 
@@ -233,14 +215,9 @@ def actions_of(force: ArrayLike, mode: ActionMode, vehicle: Vehicle) -> NDArray[
         full = np.where(f >= 0.0, upper, -lower)
         parts = np.divide(f, full, out=np.zeros_like(f), where=full > 0.0)
     action = np.clip(parts @ np.linalg.pinv(mode.columns), -1.0, 1.0)
-    _check_actions(action, f, mode, vehicle)
-    return action.astype(np.float32)
-
-
-def _check_actions(action: Array, force: Array, mode: ActionMode, vehicle: Vehicle) -> None:
-    """Compare the wrench that the actions would give with the one that was commanded."""
+    # Compare the wrench that the actions would give with the one that was commanded.
     limits = np.asarray(vehicle.wrench_limits, float)
-    off = np.abs((mode.to_thrusters(action) - force) @ vehicle.control_matrix.T)
+    off = np.abs((mode.to_thrusters(action) - f) @ vehicle.control_matrix.T)
     off = np.divide(off, limits, out=np.zeros_like(off), where=limits > 0.0)
     wrong = float(np.mean(off.max(axis=1) > NEAR_WRENCH))
     if wrong > FEW:
@@ -249,6 +226,7 @@ def _check_actions(action: Array, force: Array, mode: ActionMode, vehicle: Vehic
             f"{mode.name} cannot ask for what was commanded in {100.0 * wrong:.0f} % of the decisions ({AXES[worst]} "
             f"is off by up to {off[:, worst].max():.2f} of its limit): give another --action"
         )
+    return action.astype(np.float32)
 
 
 Indices = NDArray[np.int64]
@@ -290,16 +268,18 @@ def episodes_of(
     stretches = indices_of(drive, period, split_goals=not task.moving and goal is None)
     if not stretches:
         return []
+    motion = drive.motion
     try:
-        actions = actions_of(drive.force[np.concatenate(stretches)], mode, vehicle)
+        assert motion.thrust is not None and motion.nu is not None
+        actions = actions_of(motion.thrust[np.concatenate(stretches)], mode, vehicle)
     except DriveError as error:
         raise DriveError(f"{drive.path}: {error}") from None
     found, first = [], 0
     for rows in stretches:
         guide = guide_of(rows)
         observer.restart()
-        seen = [Track(drive.position[i], drive.quaternion[i], drive.nu[i]) for i in rows]
-        times = np.nan_to_num(drive.since[rows])
+        seen = [Track(motion.position[i], motion.quaternion[i], motion.nu[i]) for i in rows]
+        times = np.nan_to_num(motion.t[rows])
         observation = [observer.observe(s, guide, float(t)) for s, t in zip(seen, times, strict=True)]
         found.append(
             Episode(
@@ -356,7 +336,8 @@ def _guides(
     if isinstance(goal, Station):
         return lambda rows: goal
     if goal == END:
-        return lambda rows: _ended(drive, rows)
+        where = drive.motion.between
+        return lambda rows: station_at((*where(rows).position[-1], float(where(rows).yaw[-1])))
     if not drive.has_goal:
         raise DriveError(
             f"{drive.path}: was driven by hand to no goal: give --goal x,y,z,yaw_deg, where to, or --goal {END}: where "
@@ -371,20 +352,6 @@ def station_at(goal: Sequence[float] | Array) -> Station:
     return Station((x, y, z), yaw)
 
 
-def _ended(drive: Drive, rows: Indices) -> Station:
-    return station_at((*drive.position[rows[-1]], float(quat_yaw(drive.quaternion[rows[-1]]))))
-
-
-def _recorded_name(drive: Drive) -> str:
-    """Name of the trajectory that the record says was followed: one of ours, since what a record names is no path."""
-    if drive.guide not in (*TRAJECTORIES, *PUBLISHED_NAMES):
-        raise DriveError(
-            f"{drive.path}: followed '{drive.guide}', which is none of {', '.join(TRAJECTORIES)}: give --goal, the "
-            "name or the file of what was followed"
-        )
-    return drive.guide
-
-
 def trajectory_of(drive: Drive, vehicle: Vehicle, name: str | None = None) -> Guide:
     """The trajectory that was followed, checked against the recorded goals.
 
@@ -396,11 +363,19 @@ def trajectory_of(drive: Drive, vehicle: Vehicle, name: str | None = None) -> Gu
     Raises:
         DriveError: The record does not tell, or its goals are not on the trajectory.
     """
-    name = name or _recorded_name(drive)
-    if np.isnan(drive.since).any():
+    name = name or drive.guide
+    if name == drive.guide and name not in (
+        *TRAJECTORIES,
+        *PUBLISHED_NAMES,
+    ):  # what a record names is no path
+        raise DriveError(
+            f"{drive.path}: followed '{drive.guide}', which is none of {', '.join(TRAJECTORIES)}: give --goal, the "
+            "name or the file of what was followed"
+        )
+    if np.isnan(drive.motion.t).any():
         raise DriveError(f"{drive.path}: does not say when its trajectory began: not a record of finssim run")
     guide = load_trajectory(name, vehicle=vehicle)
-    off = float(np.linalg.norm(guide.at(drive.since).position - drive.goal[:, :3], axis=1).max())
+    off = float(np.linalg.norm(guide.at(drive.motion.t).position - drive.goal[:, :3], axis=1).max())
     if off > SAME_GOAL:
         raise DriveError(
             f"{drive.path}: its goals are up to {off:.3g} m off the trajectory '{name}': give --goal, the name or the "
@@ -423,8 +398,8 @@ def collect(
     disturb: float = 0.0,
     goal: str | None = None,
     seed: int = 42,
-    as_json: bool = False,
-) -> None:
+    say: Say = lambda part, what: None,
+) -> dict[str, Any]:
     """Keep episodes of a task as a Minari data set: let an expert do it, or take what was done with a vehicle.
 
     Example: finssim collect pid --task t1 --episodes 200 --out demonstrations/hold
@@ -445,7 +420,7 @@ def collect(
         goal (GOAL): Of records: where to, in place of what they say: x,y,z,yaw_deg [m, deg], or end: where each stretch
             ended; of t2 the trajectory.
         seed: Seed of every random number; equal seeds give equal results.
-        as_json: Print one JSON object instead of tables.
+        say: Told the share that is done.
     """
     records = [Path(word) for word in experts if word.endswith(".mcap")]
     if records and (len(records) < len(experts) or episodes or randomize or disturb):
@@ -454,53 +429,44 @@ def collect(
             "--disturb"
         )
     if records:
-        told = collect_records(records, task, out=out, vehicle=vehicle, action=action, goal=goal)
-    elif len(experts) > 1 or episodes is None or goal is not None:
+        return collect_records(records, task, out=out, vehicle=vehicle, action=action, goal=goal)
+    if len(experts) > 1 or episodes is None or goal is not None:
         raise DriveError("give one expert and --episodes, and no --goal, which is of records")
-    else:
-        with progress_bar("collecting") as show:
-            told = collect_episodes(
-                experts[0], task, episodes=episodes, out=out, vehicle=vehicle, hydrodynamics=hydrodynamics,
-                action=action, randomize=randomize, observe=observe, disturb=disturb, seed=seed, show=show,
-            )  # fmt: skip
-    if as_json:
-        print(json.dumps(told, allow_nan=False))
-        return
-    measures = ", ".join(
-        f"{name} {value:.4g}" for name, value in told.get("metrics", {}).items() if value is not None
-    )
-    print(f"{told['episodes']} episodes, {told['steps']:,} steps{'; means: ' * bool(measures)}{measures}")
-    for source in told.get("records", ()):
-        print(
-            f"{source['file']}: {source['driver']}, {source['episodes']} episodes, {source['steps']:,} steps"
-        )
-    print(f"written: {out}")
+    return collect_episodes(
+        experts[0], task, episodes=episodes, out=out, vehicle=vehicle, hydrodynamics=hydrodynamics,
+        action=action, randomize=randomize, observe=observe, disturb=disturb, seed=seed, show=say,
+    )  # fmt: skip
 
 
-def datasets(
-    places: Sequence[Path],
-    *,
-    as_json: bool = False,
-) -> None:
+def datasets(places: Sequence[Path]) -> dict[str, Any]:
     """List demonstrations: task, vehicle, expert, episodes, steps.
 
     Example: finssim datasets demonstrations
 
     Args:
         places (PATH...): Data sets, or folders that hold some.
-        as_json: Print one JSON object instead of tables.
     """
-    rows = {str(path): about(path) for place in places for path in found_in(place)}
-    if as_json:
-        print(json.dumps(rows))
-        return
-    cells = [
+    return {str(path): about(path) for place in places for path in found_in(place)}
+
+
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
+    """What was collected; or a row for each data set."""
+    if "task" in result:
+        means = {name: x for name, x in result.get("metrics", {}).items() if x is not None}
+        text = f"{result['episodes']} episodes, {result['steps']:,} steps{'; means: ' * bool(means)}"
+        sources = [
+            f"{one['file']}: {one['driver']}, {one['episodes']} episodes, {one['steps']:,} steps"
+            for one in result.get("records", ())
+        ]
+        title = text + ", ".join(f"{name} {x:.4g}" for name, x in means.items())
+        return [Table(title=title, sentences=sources)]
+    rows = [
         [name, row["task"], row["vehicle"]["name"], row["expert"], row["observe"], str(row["episodes"]),
          f"{row['steps']:,}"]
-        for name, row in rows.items()
+        for name, row in result.items()
     ]  # fmt: skip
     heads = ("data set", "task", "vehicle", "expert", "observes", "episodes", "steps")
-    Console().print(console_table(heads, cells, left=range(5)))
+    return [Table(title="", heads=heads, rows=rows, left=range(5))]
 
 
 def collect_records(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
@@ -9,20 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
-from finssim.control.guidance import Guide
-from finssim.control.trajectories import load_trajectory
+from finssim.experiments import campaign
 from finssim.experiments.campaign import progress_bar, write_json
 from finssim.experiments.figures import (
-    COLORS,
-    clean,
     draw_envelopes,
+    draw_episodes,
+    draw_tracking,
     error_envelope,
-    legend_below,
-    new_figure,
     save_figure,
 )
 from finssim.experiments.metrics import (
@@ -34,12 +30,13 @@ from finssim.experiments.metrics import (
     summarize_tracking,
 )
 from finssim.experiments.plants import Plant, load_plant
-from finssim.experiments.tables import console_table, figure_text
+from finssim.experiments.tables import Table, figure_text, print_tables
 from finssim.experiments.trials import (
     EPISODES,
     T2_TRAJECTORIES,
+    Trial,
+    guide_of,
     run_episodes,
-    run_tracking,
     run_trials,
     summarize_episodes,
 )
@@ -55,16 +52,13 @@ __all__ = [
     "T1_COLUMNS",
     "Evaluation",
     "EvaluationError",
-    "TrackingRun",
-    "by_setpoint",
+    "by_target",
     "cells",
-    "draw_tracking",
+    "comparison_table",
     "evaluate",
     "evaluate_controller",
-    "print_comparison",
+    "tables_of",
 ]
-
-Array = NDArray[np.float64]
 
 EVALUATION_FILE = "evaluation.json"
 TRAJECTORIES = "trajectories"
@@ -109,168 +103,118 @@ def cells(row: Mapping[str, Any], columns: Mapping[str, tuple[str, str]] = T1_CO
     ]
 
 
-def by_trajectory(trials: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """A row for each trajectory, in the order in which they were followed first."""
-    names = dict.fromkeys(str(trial["trajectory"]) for trial in trials)
-    return {name: summarize_tracking([x for x in trials if x["trajectory"] == name]) for name in names}
-
-
-def by_setpoint(trials: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """A row for each setpoint."""
-    names = sorted({trial["setpoint"] for trial in trials})
-    return {name: summarize([trial for trial in trials if trial["setpoint"] == name]) for name in names}
-
-
 def paper_name(result: Mapping[str, Any]) -> str:
     """The row of the paper's table that is nearest to what was evaluated."""
     controller = result["controller"]
     if controller["kind"] == "pid":
         return "PID"
+    randomized = " + DR" if controller.get("randomization") else ""
+    if result["task"] == "t2":
+        return f"calibrated{randomized}"
     if result["plant"]["name"] == "noise" and controller["hydrodynamics"] == "calibrated":
         return "calibrated, localisation noise"
-    return f"{controller['hydrodynamics']}{' + DR' if controller.get('randomization') else ''}"
+    return f"{controller['hydrodynamics']}{randomized}"
 
 
-def paper_kind(result: Mapping[str, Any]) -> str:
-    """The rows of the paper's table of tracking that are nearest to what was evaluated."""
-    controller = result["controller"]
-    if controller["kind"] == "pid":
-        return "PID"
-    return "calibrated + DR" if controller.get("randomization") else "calibrated"
+class Form(NamedTuple):
+    """How the trials of a task that is measured as in the paper are summed up and shown."""
+
+    kind: str
+    """What a trial goes to: the key of its name in a row."""
+    targets: Sequence[str]
+    columns: Mapping[str, tuple[str, str]]
+    caption: str
+    summarize: Callable[[Sequence[Mapping[str, Any]]], dict[str, Any]]
+    paper: Callable[[str], dict[str, dict[str, Any]]]
+    """Name of the paper's row -> its rows by their names in our table."""
+    figure: str
+    """Name of its file."""
+    draw: Callable[[Mapping[str, Sequence[Trial]], str], Any]
 
 
-def _headline(results: Sequence[Mapping[str, Any]]) -> str:
-    """Who was evaluated, and of one plant where."""
+def _draw_envelopes(runs: Mapping[str, Sequence[Trial]], title: str) -> Any:
+    return draw_envelopes({label: error_envelope(trials) for label, trials in runs.items()}, title)
+
+
+FORMS: Mapping[str, Form] = {
+    "t1": Form(
+        "setpoint", tuple(T1_SETPOINTS), T1_COLUMNS, CAPTION, summarize, lambda name: {"": paper_row(name)},
+        "error_envelope.png", _draw_envelopes,
+    ),
+    "t2": Form(
+        "trajectory", T2_TRAJECTORIES, T2_COLUMNS, T2_CAPTION, summarize_tracking,
+        lambda name: {target: paper_t2_row(name, target) or {} for target in PAPER_T2[name]},
+        "trajectories.png", draw_tracking,
+    ),
+}  # fmt: skip
+"""Every other task is measured in episodes as in training, by itself."""
+
+
+def by_target(result: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """A row for each setpoint or trajectory of a result, in the order in which they were tried first."""
+    form, trials = FORMS[result["task"]], result["per_trial"]
+    names = dict.fromkeys(str(trial[form.kind]) for trial in trials)
+    return {name: form.summarize([x for x in trials if x[form.kind] == name]) for name in names}
+
+
+def tables_of(results: Sequence[Mapping[str, Any]]) -> list[Table]:
+    """The table of one evaluation, a row for each target; or of several plants, a row for each."""
     first = results[0]
-    who = f"{first['task']} · {first['controller']['name']} · {first['vehicle']['name']}"
-    plant = first["plant"]
-    where = f", {first['hydrodynamics']} · plant {plant['name']}: {plant.get('title', '')}"
-    return who + where if len(results) == 1 else who
-
-
-def _print(
-    console: Console, name: str, columns: Mapping[str, tuple[str, str]], rows: Sequence[Any], note: str
-) -> None:
-    heads = [heading.replace(" [", "\n[") for heading, _ in columns.values()]  # 80 columns are enough then
-    console.print(console_table([name, *heads], rows))
-    console.print(note, highlight=False)
-
-
-def print_results(results: Sequence[Mapping[str, Any]], console: Console) -> None:
-    """Print the table of one evaluation of T1, a row for each setpoint, or of several plants, a row for each."""
-    console.print(_headline(results), highlight=False)
+    title = f"{first['task']} · {first['controller']['name']} · {first['vehicle']['name']}"
+    if len(results) == 1:
+        plant = first["plant"]
+        title += f", {first['hydrodynamics']} · plant {plant['name']}: {plant.get('title', '')}"
+    if first["task"] not in FORMS:
+        return [_episodes_table(results, title)]
+    form = FORMS[first["task"]]
+    if len(results) > 1 and form.kind == "setpoint":
+        return [comparison_table(results, "plant", title)]
+    rows: list[list[str] | None] = []
+    for result in results:
+        place = f"{result['plant']['name']}, " if results[1:] else ""
+        rows += [[f"{place}{name}", *cells(row, form.columns)] for name, row in by_target(result).items()]
+        rows.append(None)
     if len(results) > 1:
-        print_comparison(results, console, by="plant")
-        return
-    result, paper = results[0], paper_name(results[0])
-    rows = [[name, *cells(row)] for name, row in by_setpoint(result["per_trial"]).items()]
-    rows = [*rows, None, ["all", *cells(result)], None, ["paper", *cells(paper_row(paper))]]
-    note = f"{CAPTION} paper: its vehicle in its pool, {paper}, for orientation."
-    _print(console, "setpoint", T1_COLUMNS, rows, note)
-
-
-def print_comparison(results: Sequence[Mapping[str, Any]], console: Console, by: str = "controller") -> None:
-    """Print a row for each evaluation, named by its controller or plant, and the paper's rows that answer to them."""
-    papers = dict.fromkeys(paper_name(result) for result in results)
-    rows = [[result[by]["name"], *cells(result)] for result in results]
-    rows = [*rows, None, *([f"paper, {name}", *cells(paper_row(name))] for name in papers)]
-    _print(console, by, T1_COLUMNS, rows, f"{CAPTION} paper: its real vehicle in its pool.")
-
-
-def print_tracking(results: Sequence[Mapping[str, Any]], console: Console) -> None:
-    """Print the table of one evaluation of T2, a row for each trajectory, or of several plants, for each in each."""
-    console.print(_headline(results), highlight=False)
-    parts = [by_trajectory(result["per_trial"]) for result in results]
-    if len(results) > 1:
-        plants = [result["plant"]["name"] for result in results]
-        rows: list[Any] = []
-        for plant, part in zip(plants, parts, strict=True):
-            rows += [[f"{plant}, {name}", *cells(row, T2_COLUMNS)] for name, row in part.items()] + [None]
-        _print(console, "plant, trajectory", T2_COLUMNS, rows, T2_CAPTION)
-        return
-    result, kind = results[0], paper_kind(results[0])
-    rows = [[name, *cells(row, T2_COLUMNS)] for name, row in parts[0].items()]
-    rows += [None, ["all", *cells(result, T2_COLUMNS)], None]
-    rows += [[f"paper, {name}", *cells(paper_t2_row(kind, name), T2_COLUMNS)] for name in PAPER_T2[kind]]
-    note = f"{T2_CAPTION} paper: its vehicle in its pool, {kind}, for orientation."
-    _print(console, "trajectory", T2_COLUMNS, rows, note)
-
-
-def print_episodes(results: Sequence[Mapping[str, Any]], console: Console) -> None:
-    """Print a row for each measure of an episode, and a column for each plant."""
-    first = results[0]
-    whole = f" · {first['valid']} of {first['trials']} episodes" if len(results) == 1 else ""
-    console.print(_headline(results) + whole, highlight=False)
-    rows = [
-        [name, *(figure_text(result["metrics"][name], ".4g") for result in results)]
-        for name in first["metrics"]
+        return [_table(form, title, f"plant, {form.kind}", rows, form.caption)]
+    paper = paper_name(first)
+    rows += [["all", *cells(first, form.columns)], None]
+    rows += [
+        [f"paper, {name}".removesuffix(", "), *cells(row, form.columns)]
+        for name, row in form.paper(paper).items()
     ]
-    heads = ["measure", *(result["plant"]["name"] for result in results)]
-    console.print(console_table(heads, rows, caption=EPISODES_CAPTION, caption_justify="left"))
-    for trial in (trial for result in results for trial in result["per_trial"] if trial.get("fault")):
-        console.print(f"{trial['record']}: {trial['fault']}", highlight=False, markup=False)
+    note = f"{form.caption} paper: its vehicle in its pool, {paper}, for orientation."
+    return [_table(form, title, form.kind, rows, note)]
 
 
-def draw_episodes(evaluations: Sequence[Any], folder: Path, title: str) -> None:
-    """`episodes.png`: for each measure, every episode as a point, a column for each plant, the mean as a bar."""
-    names = list(evaluations[0].result["metrics"])
-    columns = min(len(names), 4)
-    rows = -(-len(names) // columns)
-    figure = new_figure(2.6 * columns, 2.4 * rows, title)
-    rng = np.random.default_rng(0)
-    for k, name in enumerate(names):
-        axes = figure.add_subplot(rows, columns, k + 1)
-        for i, evaluation in enumerate(evaluations):
-            values = [trial[name] for trial in evaluation.result["per_trial"] if trial[name] is not None]
-            color = COLORS[i % len(COLORS)]
-            spread = i + rng.uniform(-0.3, 0.3, len(values))
-            axes.plot(spread, values, ".", color=color, alpha=0.5, markersize=4)
-            if values:
-                axes.hlines(np.mean(values), i - 0.4, i + 0.4, color=color, linewidth=2)
-        clean(axes)
-        axes.set_title(name, fontsize=9)
-        axes.set_xticks(range(len(evaluations)), [e.label for e in evaluations], fontsize=7, rotation=20)
-        axes.set_xlim(-0.6, len(evaluations) - 0.4)
-    save_figure(figure, folder / "episodes.png")
+def comparison_table(results: Sequence[Mapping[str, Any]], by: str, title: str = "") -> Table:
+    """A row for each evaluation of T1, named by its controller or plant, and the paper's rows that answer to them."""
+    papers = dict.fromkeys(paper_name(result) for result in results)
+    rows: list[list[str] | None] = [[result[by]["name"], *cells(result)] for result in results]
+    rows += [None, *([f"paper, {name}", *cells(paper_row(name))] for name in papers)]
+    return _table(FORMS["t1"], title, by, rows, f"{CAPTION} paper: its real vehicle in its pool.")
 
 
-TrackingRun = tuple[Guide, Array, Array]
-"""What was followed; times since the start [s], (T,); positions, world frame [m], (T, 3)."""
+def _table(form: Form, title: str, kind: str, rows: Sequence[list[str] | None], note: str) -> Table:
+    heads = [heading.replace(" [", "\n[") for heading, _ in form.columns.values()]  # for 80 columns
+    return Table(title=title, heads=[kind, *heads], rows=rows, note=note)
 
 
-def draw_tracking(runs: Mapping[str, Sequence[TrackingRun]], title: str = "") -> Any:
-    """The figure: a row for each trajectory, its way from above on the left, distances to the reference on the right.
-
-    Args:
-        runs: Legend label -> runs; each controller's runs of one trajectory are drawn in one colour.
-        title: Written above, or left out when empty.
-    """
-    guides = {guide.name: guide for each in runs.values() for guide, _, _ in each}
-    figure = new_figure(9.0, 2.4 * len(guides) + 0.8, title)
-    rows = figure.subplots(len(guides), 2, squeeze=False, width_ratios=(1.0, 1.2))
-    for (above, beside), guide in zip(rows, guides.values(), strict=True):
-        way = guide.at(np.linspace(0.0, guide.duration, 1001)).position
-        above.plot(way[:, 0], way[:, 1], color="0.2", linewidth=1.0, linestyle="--", label="reference")
-        for i, (label, each) in enumerate(runs.items()):
-            _draw(above, beside, [run for run in each if run[0].name == guide.name], label, COLORS[i % 6])
-        above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
-        above.set_title(guide.name, fontsize=10, loc="left")
-        beside.set(xlabel="time [s]", ylabel="distance [mm]", xlim=(0.0, guide.duration))
-        beside.set_ylim(bottom=0.0)
-        clean(above, beside)
-    legend_below(figure, rows[0][0], 4)
-    return figure
-
-
-def _draw(above: Any, beside: Any, runs: Sequence[TrackingRun], label: str, color: str) -> None:
-    """All runs of one controller on one trajectory; only the first has the label."""
-    for k, (guide, t, position) in enumerate(runs):
-        during = (t >= 0.0) & (t <= guide.duration + 1e-6)
-        t, position = t[during], position[during]
-        error = np.linalg.norm(position - guide.at(t).position, axis=-1)
-        style = {"color": color, "linewidth": 1.2, "alpha": 0.9 if len(runs) == 1 else 0.5}
-        above.plot(position[:, 0], position[:, 1], label=label if k == 0 else None, **style)
-        beside.plot(t, 1e3 * error, **style)
+def _episodes_table(results: Sequence[Mapping[str, Any]], title: str) -> Table:
+    """A row for each measure of an episode, and a column for each plant."""
+    first = results[0]
+    complete = "" if results[1:] else f" · {first['valid']} of {first['trials']} episodes"
+    trials = [trial for result in results for trial in result["per_trial"] if trial.get("fault")]
+    return Table(
+        title=title + complete,
+        heads=["measure", *(result["plant"]["name"] for result in results)],
+        rows=[
+            [name, *(figure_text(result["metrics"][name], ".4g") for result in results)]
+            for name in first["metrics"]
+        ],
+        note=EPISODES_CAPTION,
+        sentences=[f"{trial['record']}: {trial['fault']}" for trial in trials],
+        intervals=True,
+    )
 
 
 class EvaluationError(ValueError):
@@ -283,8 +227,8 @@ class Evaluation:
 
     result: dict[str, Any]
     """What `--json` prints: who, where, the measures over all trials, `per_trial`, provenance."""
-    trials: Any
-    """`Trials` of T1, `TrackingTrials` of T2."""
+    trials: Sequence[Trial] = ()
+    """Of T1 and T2, for figures."""
 
     @property
     def label(self) -> str:
@@ -292,6 +236,18 @@ class Evaluation:
         plant = self.result["plant"]["name"]
         name: str = self.result["controller"]["name"]
         return name if plant == "nominal" else f"{name}, {plant}"
+
+
+def summary_of(task: str, measures: Sequence[dict[str, Any]], trials: Sequence[Trial] = ()) -> dict[str, Any]:
+    """The measures over all trials, and `per_trial`; of T1 and T2 with the names of what they went to."""
+    form = FORMS.get(task)
+    if form is None:
+        return summarize_episodes(measures)
+    rows = [
+        {"trial": i, form.kind: trial.name, **row}
+        for i, (trial, row) in enumerate(zip(trials, measures, strict=True))
+    ]
+    return {**form.summarize(rows), "per_trial": rows}
 
 
 def evaluate(
@@ -347,7 +303,8 @@ def evaluate(
     Raises:
         EvaluationError, PolicyError, ControlError, PlantError, VehicleError, OutputError: As they say.
     """
-    form, names = _form(task), [controller] if isinstance(controller, str | Path) else controller
+    task_named(task)  # which refuses one that does not exist
+    names = [controller] if isinstance(controller, str | Path) else controller
     records = [Path(name) for name in names if str(name).endswith(".mcap")]
     if len(names) > 1 and len(records) < len(names):
         raise EvaluationError(
@@ -366,29 +323,29 @@ def evaluate(
         evaluations = [_recorded(records, task, vehicle, trajectories, truth)] if records else []
         for one in plants:
             place = folder and folder / TRAJECTORIES / (one.name if plants[1:] else "")
+            options = {"hydrodynamics": hydrodynamics, "trials": trials, "seed": seed, "record": place}
             evaluations.append(
                 evaluate_controller(
-                    names[0],
-                    one,
-                    task=task,
-                    vehicle=vehicle,
-                    trajectories=trajectories,
-                    record=place,
-                    hydrodynamics=hydrodynamics,
-                    trials=trials,
-                    seed=seed,
+                    names[0], one, task=task, vehicle=vehicle, trajectories=trajectories, **options
                 )
             )
         results = [evaluation.result for evaluation in evaluations]
         document = results[0] if len(results) == 1 else {"plants": results}
         if folder is not None:
             write_json(folder / EVALUATION_FILE, document)
-            form.draw(evaluations, folder, results[0]["plant"].get("title", "") if len(results) == 1 else "")
+            title = "" if results[1:] else results[0]["plant"].get("title", "")
+            if task in FORMS:
+                form = FORMS[task]
+                figure = form.draw({e.label: e.trials for e in evaluations}, title)
+                save_figure(figure, folder / form.figure)
+            else:
+                runs = {e.label: e.result["per_trial"] for e in evaluations}
+                save_figure(draw_episodes(runs, title), folder / "episodes.png")
     if as_json:
         print(json.dumps(document, allow_nan=False))
         return evaluations
     console = console or Console()
-    form.show(results, console)
+    print_tables(tables_of(results), console)
     if out is not None:
         console.print(f"written: {out}", highlight=False, soft_wrap=True)
     return evaluations
@@ -402,14 +359,37 @@ def _recorded(
     truth: Path | None,
 ) -> Evaluation:
     """The evaluation of records of one controller."""
-    from finssim.experiments.recorded import measured_records
+    from finssim.experiments.recorded import read_record
 
     if len(trajectories) > 1:
         raise EvaluationError("records follow one trajectory each: give at most one --trajectory")
     body = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
-    way = trajectories[0] if trajectories else None
-    described, measures, trials = measured_records(records, task, body, trajectory=way, truth=truth)
-    return Evaluation({**described, **_form(task).summarize(measures), "provenance": provenance()}, trials)
+    guide = guide_of(trajectories[0], body) if trajectories else None
+    trials = [read_record(path, task, body, guide=guide, truth=truth) for path in records]
+    pilots = [trial.pilot for trial in trials]
+    if any(pilot != pilots[0] for pilot in pilots):
+        names = ", ".join(dict.fromkeys(str(pilot.get("name")) for pilot in pilots))
+        raise EvaluationError(
+            f"the records are of several controllers ({names}): evaluate those of one at a time"
+        )
+    measures = [
+        {"trial": i, "record": trial.path.name, **trial.scores(task, body)} for i, trial in enumerate(trials)
+    ]
+    source = "its own estimate" if truth is None else truth.name
+    result = {
+        "controller": {"kind": "pid", "action": "wrench6", "hydrodynamics": "calibrated"} | pilots[0],
+        "task": task,
+        "vehicle": {"name": body.name, "sha256": body.sha256},
+        "hydrodynamics": "calibrated",
+        "plant": {"name": "record", "title": f"as recorded, by {source}"},
+        "records": [
+            {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()} for path in records
+        ],
+        "truth": truth and truth.name,
+        **summary_of(task, measures, trials),
+        "provenance": provenance(),
+    }
+    return Evaluation(result, trials)
 
 
 def _plants(names: Sequence[str | Path]) -> list[Plant]:
@@ -445,30 +425,31 @@ def evaluate_controller(
         seed: Of what the plant draws.
         record: New folder for every state, command and thrust; none if None.
     """
-    form = _form(task)
     if trajectories and task != "t2":
         raise EvaluationError(f"task '{task}' follows no trajectory: leave it out, or evaluate t2")
-    trials = (len(trajectories) or form.count) if trials is None else trials
+    the_task = task_named(task)
+    count = len(trajectories) or (len(FORMS[task].targets) if task in FORMS else EPISODES)
+    trials = count if trials is None else trials
     if trials < 1:
         raise EvaluationError(f"trials is {trials}, expected 1 or more")
     start_warp()
     body = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
-    the_task = task_named(task)
-    guides = {"guides": [load_trajectory(x, vehicle=body) for x in trajectories]} if trajectories else {}
     agent = agent_for(controller, body, the_task)
+    guides = [guide_of(x, body) for x in trajectories] or None
+    options: dict[str, Any] = {
+        "trials": trials,
+        "hydrodynamics": hydrodynamics,
+        "seed": seed,
+        "record": record,
+    }
+    played: list[Trial] = []
     with progress_bar(f"{trials} trials") as show:
-        done = form.run(
-            agent,
-            the_task,
-            body,
-            plant,
-            trials=trials,
-            hydrodynamics=hydrodynamics,
-            seed=seed,
-            record=record,
-            show=show,
-            **guides,
-        )
+        if task in FORMS:
+            played = run_trials(agent, the_task, body, plant, guides=guides, show=show, **options)
+            limits = plant.changed(body).force_limits
+            measures = [trial.measures(task, limits) for trial in played]
+        else:
+            measures = run_episodes(agent, the_task, body, plant, show=show, **options)
     result = {
         "controller": agent.describe(),
         "task": task,
@@ -477,53 +458,27 @@ def evaluate_controller(
         "plant": plant.model_dump(mode="json", exclude_defaults=True),
         **plant.told_of_sight(body),
         "seed": seed,
-        **form.summarize(done.measures()),
+        **summary_of(task, measures, played),
         "provenance": provenance(),
     }
-    return Evaluation(result, done)
+    return Evaluation(result, played)
 
 
-def _draw_envelopes(evaluations: Sequence[Evaluation], folder: Path, title: str) -> None:
-    envelopes = {e.label: error_envelope(e.trials.all_series()) for e in evaluations}
-    save_figure(draw_envelopes(envelopes, title), folder / "error_envelope.png")
+@dataclass(frozen=True, kw_only=True)
+class Job(campaign.Job):
+    """Trials of one controller in one plant, as a campaign plays them."""
+
+    controller: str
+    vehicle: str
+    water: Plant
+    trials: int | None
+    noise: int
+    """Seed of the trials."""
+    task: str = "t1"
 
 
-def _draw_paths(evaluations: Sequence[Evaluation], folder: Path, title: str) -> None:
-    runs = {
-        e.label: [(guide, e.trials.t, e.trials.position[:, i]) for i, guide in enumerate(e.trials.guides)]
-        for e in evaluations
-    }
-    save_figure(draw_tracking(runs, title), folder / "trajectories.png")
-
-
-class Form(NamedTuple):
-    """How the trials of one task are run, summed up and shown."""
-
-    count: int
-    """Trials, unless told otherwise."""
-    run: Callable[..., Any]
-    summarize: Callable[[Sequence[dict[str, Any]]], dict[str, Any]]
-    show: Callable[[Any, Console], None]
-    draw: Callable[[Sequence[Evaluation], Path, str], None]
-
-
-FORMS = {
-    "t1": Form(len(T1_SETPOINTS), run_trials, summarize, print_results, _draw_envelopes),
-    "t2": Form(
-        len(T2_TRAJECTORIES),
-        run_tracking,
-        lambda trials: {**summarize_tracking(trials), "per_trial": list(trials)},
-        print_tracking,
-        _draw_paths,
-    ),
-}
-"""Tasks that are measured as in the paper."""
-
-
-EPISODIC = Form(EPISODES, run_episodes, summarize_episodes, print_episodes, draw_episodes)
-"""Of every other task: episodes as in training, measured by the task."""
-
-
-def _form(task: str) -> Form:
-    task_named(task)  # which refuses one that there is not
-    return FORMS.get(task, EPISODIC)
+def play(job: Job, _: Path) -> dict[str, Any]:
+    """The measures of every trial."""
+    options: dict[str, Any] = {"vehicle": job.vehicle, "trials": job.trials, "seed": job.noise}
+    result = evaluate_controller(job.controller, job.water, task=job.task, **options).result
+    return {"per_trial": result["per_trial"]}

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import yaml
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from rich.console import Console
 
 from finssim.calibration.errors import CalibrationError
@@ -51,9 +50,6 @@ from finssim.vehicles.defaults import room
 __all__ = ["ProgrammePilot", "excite", "excite_on_robot", "pool_trials", "trials_on_robot"]
 
 
-# A pilot that plays an excitation programme: a wrench over time on some axes, the others held where they were.
-
-
 Array = NDArray[np.float64]
 
 HELD = ("surge", "sway", "heave", "yaw")
@@ -74,48 +70,38 @@ class ProgrammePilot:
 
     def __init__(
         self,
-        tau_desired: ArrayLike,
-        phase: Sequence[str] | NDArray[np.str_],
-        rate: float,
-        axes: Sequence[str],
+        programme: Programme,
         vehicle: Vehicle,
         *,
         room: float | None = None,
-        ascent_speed: float | None = None,
-        ascent_time: float = 2.0,
         hold: str | None = "pid",
         period: float = 0.05,
     ) -> None:
         """
         Args:
-            tau_desired: Wrench about `vehicle.wrench_reference`, body frame, held over each row [N, N m], (n, 6).
-            phase: A word for every row; rows of `excitation` may end early, see `room`.
-            rate: Of the rows [Hz].
-            axes: That the programme excites.
+            programme: What to command; rows of `excitation` may end early, see `room`, and a coast where the programme
+                says how fast the vehicle then rises.
             vehicle: Whose thrusters; its model gives the gains of the PID.
             room: Longest way from where the programme began, after which the excitation ends [m].
-            ascent_speed: A coast ends when the vehicle has risen faster than this [m/s] for `ascent_time` [s].
-            ascent_time: [s]
             hold: Name of the PID; None leaves the other axes alone.
             period: Time between two decisions [s].
 
         Raises:
             ControlError: Rows and phases differ in number, or an unknown axis or PID.
         """
-        self._tau, self._phase = np.asarray(tau_desired, float), np.asarray(phase)
+        axes, phases = programme.axes, len(programme.phase)
         unknown = [axis for axis in axes if axis not in AXES]
-        if self._tau.shape != (len(self._phase), 6) or not len(self._phase) or unknown:
+        if programme.tau_desired.shape != (phases, 6) or not phases or unknown:
             raise ControlError(
-                f"a programme of shape {self._tau.shape} with {len(self._phase)} phases on {', '.join(axes)}: "
+                f"a programme of shape {programme.tau_desired.shape} with {phases} phases on {', '.join(axes)}: "
                 f"expected a wrench and a phase for every row, on axes of {', '.join(AXES)}"
             )
-        self.period, self._rate, self._room = period, rate, room
-        self._ascent, self._ascent_time = ascent_speed, ascent_time
+        self.period, self._programme, self._room = period, programme, room
         self._allocator = Allocator.from_vehicle(vehicle)
         self._limits = np.asarray(vehicle.wrench_limits, float)
-        kept = HELD_IN_TURNS if "yaw" in axes else HELD
-        self._driven = [AXES.index(axis) for axis in axes]  # type: ignore[arg-type]
-        self._held = [AXES.index(a) for a in kept if hold is not None and a not in axes]
+        held = HELD_IN_TURNS if "yaw" in axes else HELD
+        self._driven = [AXES.index(axis) for axis in axes]
+        self._held = [AXES.index(a) for a in held if hold is not None and a not in axes]  # type: ignore[arg-type]
         self._hold = controller(hold, vehicle, period=period) if hold is not None else None
         self.reset()
 
@@ -125,30 +111,44 @@ class ProgrammePilot:
         self._skipped = 0
         self._origin: Array | None = None
         self._rising_since: float | None = None
+        self._recorded = ""
         self.phase = ""
         """The word of the row that was commanded last; empty before and after the programme."""
+        self.fastest = 0.0
+        """Highest speed along the programme's first axis so far, as the robot estimates it [m/s, rad/s]."""
         self.finished = False
         """Whether the programme is over."""
 
     def describe(self) -> dict[str, Any]:
         """Name, rate and length."""
-        length = len(self._phase) / self._rate
+        length = self._programme.duration
         return {"name": self.name, "kind": "programme", "period_s": self.period, "duration_s": length}
 
     def act(self, reading: Measured, guide: Guide, t: float) -> Array:
         """Wanted thrusts in canonical order [N], (n,); none after the end."""
-        row = self._row(reading, t)
-        self.finished = self.finished or row >= len(self._phase)
+        row, phases = self._row(reading, t), self._programme.phase
+        self.finished = self.finished or row >= len(phases)
         if self.finished:
             self.phase = ""
             return np.zeros(self._allocator.thrusters)
-        self.phase = str(self._phase[row])
-        tau = self._tau[row].copy()
+        self.phase = str(phases[row])
+        tau = self._programme.tau_desired[row].copy()
         if self._hold is not None:
             goal = self._beside(goal_at(guide, t), reading)
-            wanted, self._memory = self._hold.command(self._memory, reading, goal)
-            tau[self._held] = wanted[self._held]
+            corrected, self._memory = self._hold.command(self._memory, reading, goal)
+            tau[self._held] = corrected[self._held]
         return self._allocator.allocate(np.clip(tau, -self._limits, self._limits))
+
+    def watch(self, runtime: Runtime) -> None:
+        """After every step: the record gets the phases, and the highest speed is kept."""
+        reading = runtime.reading
+        if reading is None:
+            return
+        if self._recorded:
+            self.fastest = max(self.fastest, abs(float(reading.nu[self._driven[0]])))
+        if self.phase != self._recorded and runtime.recorder is not None:
+            self._recorded = self.phase
+            runtime.recorder.event(reading.time, "phase", self.phase)
 
     def _beside(self, goal: Goal, reading: Measured) -> Goal:
         """The goal moved along the excited axes to where the vehicle is.
@@ -163,31 +163,30 @@ class ProgrammePilot:
 
     def _row(self, reading: Measured, t: float) -> int:
         """Which row it is the turn of; excitations and coasts that have done their work are left early."""
-        if self._origin is None:
-            self._origin = np.array(reading.position, float)
-        row = int(t * self._rate + 1e-6) + self._skipped
-        if row >= len(self._phase):
+        phases, position = self._programme.phase, np.array(reading.position, float)
+        self._origin = position if self._origin is None else self._origin
+        row = int(t * self._programme.rate + 1e-6) + self._skipped
+        if row >= len(phases):
             return row
-        word = self._phase[row]
-        way = float(np.linalg.norm(np.asarray(reading.position) - self._origin))
-        done = word == "excitation" and self._room is not None and way > self._room
-        if done or (word == "coast" and self._risen(reading, t)):
-            later = np.flatnonzero(self._phase[row:] != word)
-            end = row + int(later[0]) if len(later) else len(self._phase)
-            self._skipped += end - row
-            row = end
+        way = float(np.linalg.norm(position - self._origin))
+        done = phases[row] == "excitation" and self._room is not None and way > self._room
+        if done or (phases[row] == "coast" and self._risen(reading, t)):
+            later = np.flatnonzero(phases[row:] != phases[row])
+            skipped = int(later[0]) if len(later) else len(phases) - row
+            self._skipped += skipped
+            row += skipped
         return row
 
     def _risen(self, reading: Measured, t: float) -> bool:
         """Whether the vehicle has risen steadily for long enough."""
-        if self._ascent is None:
+        if self._programme.ascent_speed is None:
             return False
         velocity = quat_rotate(reading.quaternion, np.asarray(reading.nu)[:3])
-        if float(velocity[2]) <= self._ascent:
+        if float(velocity[2]) <= self._programme.ascent_speed:
             self._rising_since = None
             return False
         self._rising_since = t if self._rising_since is None else self._rising_since
-        return t - self._rising_since >= self._ascent_time
+        return t - self._rising_since >= self._programme.ascent_time
 
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -241,35 +240,26 @@ def place_of(programme: Programme, vehicle: Vehicle, box: Box) -> Place:
     scale = room(vehicle.body.size)
     top, bottom = z1 - 0.5 * height - scale * SURFACE, z0 + 0.5 * height + scale * FLOOR
     x, y, z = 0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.5 * (top + bottom)
-    if len(programme.axes) != 1 or programme.axes[0] in ("roll", "pitch", "yaw"):
-        return Place((x, y, z), 0.0, 0.5 * (y1 - y0) - 0.5 * math.hypot(length, width))
     axis = programme.axes[0]
-    sign = _sign(programme)
+    if len(programme.axes) != 1 or axis in ("roll", "pitch", "yaw"):
+        return Place((x, y, z), 0.0, 0.5 * (y1 - y0) - 0.5 * math.hypot(length, width))
+    column = programme.tau_desired[:, AXES.index(axis)]
+    sign = float(column.max() > 0.0) - float(column.min() < 0.0)  # 0 where it goes both ways
+    # Heading along x for surge; across it for sway, so that its left is where x falls.
+    yaw = 0.5 * math.pi if axis == "sway" else 0.0
     if axis == "heave":
-        way = top - bottom
-        start = Place(
-            (x, y, z - 0.5 * sign * way), 0.0, way * (1.0 if sign else 0.5) - scale * STOPPING[axis]
-        )
+        half = 0.5 * (top - bottom)
+        z -= sign * half
     else:
         half = 0.5 * (x1 - x0) - 0.5 * (length if axis == "surge" else width) - scale * WALL
-        # Heading along x for surge; across it for sway, so that its left is where x falls.
-        ahead = 1.0 if axis == "surge" else -1.0
-        yaw = 0.0 if axis == "surge" else 0.5 * math.pi
-        start = Place(
-            (x - sign * ahead * half, y, z), yaw, half * (2.0 if sign else 1.0) - scale * STOPPING[axis]
-        )
-    if start.room is None or not start.room >= LEAST_ROOM:
+        x -= sign * half * (1.0 if axis == "surge" else -1.0)
+    way = half * (2.0 if sign else 1.0) - scale * STOPPING[axis]
+    if not way >= LEAST_ROOM:
         raise CalibrationError(
-            f"{programme.name}: the pool leaves {start.room or 0.0:.2f} m to go along {axis}, expected {LEAST_ROOM} m "
-            "or more: use a larger pool"
+            f"{programme.name}: the pool leaves {way:.2f} m to go along {axis}, expected {LEAST_ROOM} m or more: use a "
+            "larger pool"
         )
-    return start
-
-
-def _sign(programme: Programme) -> float:
-    """Direction in which a programme goes along its only axis; 0 where it goes both ways."""
-    column = programme.tau_desired[:, AXES.index(programme.axes[0])]
-    return float(column.max() > 0.0) - float(column.min() < 0.0)
+    return Place((x, y, z), yaw, way)
 
 
 ESTIMATOR = "error-state"
@@ -287,44 +277,15 @@ def programme_trial(
         place: Where it begins, and how far it may go.
         hold: PID that keeps the other axes; None leaves them alone.
     """
-    pilot = ProgrammePilot(
-        programme.tau_desired,
-        programme.phase,
-        programme.rate,
-        programme.axes,
-        vehicle,
-        room=place.room,
-        ascent_speed=programme.ascent_speed,
-        ascent_time=programme.ascent_time,
-        hold=hold,
-    )
+    pilot = ProgrammePilot(programme, vehicle, room=place.room, hold=hold)
     return RobotTrial(
         name=programme.name,
         pilot=pilot,
         guide=Station(place.position, place.yaw, name=programme.name),
         duration=programme.duration,
         over=lambda runtime: pilot.finished,
-        watch=_Phases(pilot, AXES.index(programme.axes[0])),
+        watch=pilot.watch,
     )
-
-
-class _Phases:
-    """Tells the record when the programme's phase changes, and remembers how fast the vehicle was."""
-
-    def __init__(self, pilot: ProgrammePilot, axis: int) -> None:
-        self._pilot, self._axis, self._said, self.fastest = pilot, axis, "", 0.0
-
-    def __call__(self, runtime: Runtime) -> None:
-        if self._said and runtime.reading is not None:
-            self.fastest = max(self.fastest, abs(float(runtime.reading.nu[self._axis])))
-        if self._pilot.phase != self._said and runtime.reading is not None and runtime.recorder is not None:
-            self._said = self._pilot.phase
-            runtime.recorder.event(runtime.reading.time, "phase", self._said)
-
-
-def fastest(trial: RobotTrial) -> float:
-    """Highest speed along the first axis of a programme that was played, as the robot knows it [m/s, rad/s]."""
-    return trial.watch.fastest if isinstance(trial.watch, _Phases) else 0.0
 
 
 def about_programme(programme: Programme, where: str) -> dict[str, Any]:
@@ -332,16 +293,19 @@ def about_programme(programme: Programme, where: str) -> dict[str, Any]:
     return {"trial": {"axis": list(programme.axes), "description": f"{where}: {programme.name}"}}
 
 
-def trial_of_record(record: Path, name: str, role: str) -> Trial:
-    """The trial of a record, from where its programme began.
+def write_trial_of(record: Path, folder: Path, role: str) -> Trial:
+    """Write the trial of a record, from where its programme began, into a folder of its name.
 
     Args:
         record: MCAP of one programme.
-        name: Of the trial.
+        folder: Of the trial.
         role: fit or held-out.
     """
     trial = read_trials([record], split="phase")[0]
-    return replace(trial, name=name, header=trial.header.model_copy(update={"role": role}))
+    header = trial.header.model_copy(update={"role": role})
+    trial = replace(trial, name=folder.name, header=header)
+    write_trial(trial, folder, format="parquet")
+    return trial
 
 
 RECORDS = "records"
@@ -351,59 +315,42 @@ PLAN_FILE = "programmes.yaml"
 
 @dataclass(frozen=True, kw_only=True)
 class PoolRun(Job):
-    """A programme, who plays it and where; equal ones give equal trials."""
+    """A programme, who plays it and where; the row is the role of its trial: fit or held-out."""
 
-    row: str
-    """fit or held-out."""
     programme: Programme
     vehicle: str
     """Name or file of the vehicle as the robot knows it."""
     pool_vehicle: str
     """Name or file of the vehicle around which the pool's own is drawn."""
-    plant: int = 1
-    """Seed of the pool."""
     severity: str = "realistic"
     """nominal, realistic or hard."""
-    seed: int = 1
-    """Of noise; programmes of different names never share it."""
     hold: str | None = "pid"
     """PID that keeps the other axes."""
 
     @property
-    def target(self) -> str:  # type: ignore[override]
-        """What is to be done."""
-        return self.programme.name
-
-    def described(self) -> dict[str, Any]:
-        """Everything that decides the trial, as plain data."""
-        vehicles = {name: load_vehicle(getattr(self, name)).sha256 for name in ("vehicle", "pool_vehicle")}
-        programme = {"name": self.target, "sha256": _digest([self.programme])}
-        return {**asdict(self), **vehicles, "programme": programme}
-
-
-def _digest(plan: Sequence[Programme]) -> str:
-    """Of what programmes ask for, and when."""
-    parts = (p.tau_desired.tobytes() + "".join(p.phase).encode() for p in plan)
-    return hashlib.sha256(b"".join(parts)).hexdigest()
+    def water(self) -> Box:
+        """Of the pool."""
+        standing = load_vehicle(self.pool_vehicle)
+        return box_of(draw_plant(standing, self.plant, self.severity).basin)  # type: ignore[arg-type]
 
 
 def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
     """Play a programme in its pool.
 
     Args:
-        run: What, who and where.
-        path: PATH.mcap takes the record, PATH (a folder) the trial.
+        run: What, who and where; the target is the name of the programme.
+        path: Folder that takes TARGET, the trial, and TARGET.mcap, the record.
 
     Returns:
         `fault` (why the bridge ended it early, or empty), `duration` [s], `fastest` (the highest speed along the
         programme's first axis, as the robot estimates it [m/s, rad/s]) and the `notes` of the import.
     """
     start_warp()
-    path.mkdir(parents=True, exist_ok=True)
-    record = path.with_name(f"{path.name}.mcap")
+    record = path / f"{run.target}.mcap"
+    record.parent.mkdir(parents=True, exist_ok=True)
     record.unlink(missing_ok=True)
     vehicle, standing = load_vehicle(run.vehicle), load_vehicle(run.pool_vehicle)
-    place = place_of(run.programme, vehicle, _water_of(run))
+    place = place_of(run.programme, vehicle, run.water)
     trial = programme_trial(run.programme, vehicle, place, hold=run.hold)
     about = {**about_programme(run.programme, "virtual pool"), "seed": run.seed}
     with Recorder(record, vehicle, about, pictures="none") as recorder:
@@ -412,19 +359,14 @@ def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
             estimator={"mode": ESTIMATOR}, plant=run.plant, severity=run.severity,
             seed=noise_seed(run.seed, run.row, run.target),
         )  # fmt: skip
-    t = outcome.runtime.t
-    made = trial_of_record(record, run.target, run.row)
-    write_trial(made, path, format="parquet")
+    t, pilot = outcome.runtime.t, outcome.trial.pilot
+    assert isinstance(pilot, ProgrammePilot)
     return {
         "fault": outcome.fault,
         "duration": 0.0 if math.isnan(t) else t,
-        "fastest": fastest(trial),
-        "notes": list(map(str, made.findings)),
+        "fastest": pilot.fastest,
+        "notes": list(map(str, write_trial_of(record, path / run.target, run.row).findings)),
     }
-
-
-def _water_of(run: PoolRun) -> Box:
-    return box_of(draw_plant(load_vehicle(run.pool_vehicle), run.plant, run.severity).basin)  # type: ignore[arg-type]
 
 
 def pool_trials(
@@ -456,13 +398,13 @@ def pool_trials(
         PlantSpecError: A vehicle that cannot be put into a pool.
     """
     runs = [
-        PoolRun(row=role, programme=programme, **settings)
+        PoolRun(row=role, target=programme.name, programme=programme, **settings)
         for role, plan in plans.items()
         for programme in plan
     ]
-    body, box = load_vehicle(runs[0].vehicle), _water_of(runs[0])
+    body = load_vehicle(runs[0].vehicle)
     for run in runs:  # what cannot be is refused before anything is played
-        place_of(run.programme, body, box)
+        place_of(run.programme, body, runs[0].water)
     trials: dict[str, list[Trial]] = {role: [] for role in plans}
     with tempfile.TemporaryDirectory() as scratch:
         results = run_jobs(runs, Path(scratch), play_programme, processes=processes, say=say, show=show)
@@ -473,15 +415,16 @@ def pool_trials(
                 raise CalibrationError(
                     f"{run.target} in the virtual pool: {result['fault']}: give lower levels, or fewer axes at once"
                 )
-            made, role = Path(scratch) / run.key(), folder / run.row
+            made, role = Path(scratch) / result["key"], folder / run.row
             (role / RECORDS).mkdir(parents=True, exist_ok=True)
-            shutil.move(made, role / run.target)
-            shutil.move(made.with_name(f"{made.name}.mcap"), role / RECORDS / f"{run.target}.mcap")
+            shutil.move(made / run.target, role / run.target)
+            shutil.move(made / f"{run.target}.mcap", role / RECORDS)
             trials[run.row].append(load_trial(role / run.target))
-    for name, made_of in trials.items():
+    for role_name, made_of in trials.items():
         if not made_of:
             raise CalibrationError(
-                f"the bridge stopped every {name} trial in the virtual pool: {results[0]['fault']}: give lower levels"
+                f"the bridge stopped every {role_name} trial in the virtual pool: {results[0]['fault']}: give lower "
+                "levels"
             )
     return trials
 
@@ -571,7 +514,7 @@ def excite(
                 made.rename(folder / made.name)
             (folder / "fit").rmdir()
             about = {"vehicle": load_vehicle(pool_vehicle).name, "plant": pool, "severity": severity}
-            text = _about(body, played, seed, plan, {"pool": about})
+            text = _about(body, played, seed, kind, {"pool": about})
             (folder / PLAN_FILE).write_text(text, encoding="utf-8")
         folders = [Path(out) / programme.name for programme in played]
     else:
@@ -632,7 +575,7 @@ def excite_on_robot(
     start_warp()
     body = load_vehicle(vehicle)
     played = programmes(axes, body, seed=seed, **plan)
-    _take_folder(Path(out), _about(body, played, seed, plan, {"robot": True}))
+    _take_folder(Path(out), _about(body, played, seed, str(plan.get("kind", "published")), {"robot": True}))
     with session(robot, body, attendant=attendant, console=console) as opened:
         return robot_trials(played, Path(out), opened)
 
@@ -671,10 +614,11 @@ def robot_trials(
             )
             if outcome is None:
                 continue
+            assert isinstance(outcome.trial.pilot, ProgrammePilot)
             unit = "m/s" if programme.axes[0] in AXES[:3] else "rad/s"
-            opened.say(f"  up to {fastest(outcome.trial):.2f} {unit} in {outcome.runtime.t:.0f} s")
+            opened.say(f"  up to {outcome.trial.pilot.fastest:.2f} {unit} in {outcome.runtime.t:.0f} s")
         if not (folder / name).is_dir():
-            write_trial(trial_of_record(record, name, role), folder / name, format="parquet")
+            write_trial_of(record, folder / name, role)
         made.append(folder / name)
     return made
 
@@ -710,20 +654,16 @@ def trials_on_robot(
 
 
 def _about(
-    vehicle: Vehicle,
-    played: Sequence[Programme],
-    seed: int,
-    plan: Mapping[str, Any],
-    where: Mapping[str, Any],
+    vehicle: Vehicle, played: Sequence[Programme], seed: int, kind: str, where: Mapping[str, Any]
 ) -> str:
     """What the folder is of."""
     about = {
         "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
-        "kind": plan.get("kind", "published"),
+        "kind": kind,
         **where,
         "seed": seed,
         "programmes": [programme.name for programme in played],
-        "sha256": _digest(played),
+        "sha256": [programme.sha256 for programme in played],
     }
     return yaml.safe_dump(about, sort_keys=False)
 

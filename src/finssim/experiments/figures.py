@@ -1,4 +1,4 @@
-"""Figures of one style, and the one that several experiments draw: errors of controllers against time."""
+"""Figures of one style, and those that several experiments draw: errors against time, paths, episodes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from finssim.experiments.metrics import (
     EVALUATION_WINDOW,
@@ -19,12 +19,15 @@ from finssim.experiments.metrics import (
     pose_error,
     resample,
 )
+from finssim.experiments.trials import LABELS, Trial
 from finssim.files import atomic_write
 
 __all__ = [
     "COLORS",
     "clean",
     "draw_envelopes",
+    "draw_episodes",
+    "draw_tracking",
     "error_envelope",
     "legend_below",
     "new_figure",
@@ -101,11 +104,11 @@ class Envelope:
     trials: int
 
 
-def error_envelope(trials: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]]) -> Envelope:
+def error_envelope(trials: Sequence[Trial]) -> Envelope:
     """Pointwise quartiles of the errors of one controller's trials, on the 10 Hz evaluation grid.
 
     Args:
-        trials: For each trial, what `measure_trial` takes: t [s], position [m], yaw [rad], goal [m, rad], world frame.
+        trials: Of station keeping.
 
     Returns:
         The envelope, as long as the shortest grid; NaN where more than half of the trials have no value.
@@ -116,9 +119,9 @@ def error_envelope(trials: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike, Array
     if not trials:
         raise ValueError("an envelope needs at least one trial")
     grids, distances, turns = [], [], []
-    for t, position, yaw, goal in trials:
-        grid, position, yaw = resample(t, position, yaw)
-        error, yaw_error = pose_error(position, yaw, np.asarray(goal, dtype=np.float64))
+    for trial in trials:
+        grid, position, yaw = resample(trial.motion.t, trial.motion.position, trial.motion.yaw)
+        error, yaw_error = pose_error(position, yaw, trial.goal)
         grids.append(grid)
         distances.append(np.linalg.norm(error, axis=-1))
         turns.append(np.abs(yaw_error))
@@ -177,3 +180,63 @@ def _scale(axes: Any, bottom: float, limit: float, label: str) -> None:
     )
     note.set(ha="right", fontsize=8, color="0.2")
     note.set_bbox({"facecolor": "white", "alpha": 0.7, "linewidth": 0.0, "pad": 1.0})
+
+
+def draw_tracking(runs: Mapping[str, Sequence[Trial]], title: str = "") -> Any:
+    """The figure: a row for each trajectory, its way from above on the left, distances to the reference on the right.
+
+    Args:
+        runs: Legend label -> trials; each controller's trials of one trajectory are drawn in one colour.
+        title: Written above, or left out when empty.
+    """
+    guides = {trial.name: trial.guide for trials in runs.values() for trial in trials}
+    figure = new_figure(9.0, 2.4 * len(guides) + 0.8, title)
+    rows = figure.subplots(len(guides), 2, squeeze=False, width_ratios=(1.0, 1.2))
+    for (above, beside), (name, guide) in zip(rows, guides.items(), strict=True):
+        way = guide.at(np.linspace(0.0, guide.duration, 1001)).position
+        above.plot(way[:, 0], way[:, 1], color="0.2", linewidth=1.0, linestyle="--", label="reference")
+        for i, (label, trials) in enumerate(runs.items()):
+            motions = [trial.motion for trial in trials if trial.name == name]
+            for k, motion in enumerate(motions):
+                during = (motion.t >= 0.0) & (motion.t <= guide.duration + 1e-6)
+                t, position = motion.t[during], motion.position[during]
+                error = np.linalg.norm(position - guide.at(t).position, axis=-1)
+                style = {"color": COLORS[i % 6], "linewidth": 1.2, "alpha": 0.5 if motions[1:] else 0.9}
+                above.plot(position[:, 0], position[:, 1], label=None if k else label, **style)
+                beside.plot(t, 1e3 * error, **style)
+        above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+        above.set_title(name, fontsize=10, loc="left")
+        beside.set(xlabel="time [s]", ylabel="distance [mm]", xlim=(0.0, guide.duration))
+        beside.set_ylim(bottom=0.0)
+        clean(above, beside)
+    legend_below(figure, rows[0][0], 4)
+    return figure
+
+
+def draw_episodes(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str = "") -> Any:
+    """The figure: for each measure, every episode as a point, a column for each plant, the mean as a bar.
+
+    Args:
+        runs: Label of a column -> measures of its episodes.
+        title: Written above, or left out when empty.
+    """
+    names = [name for name in next(iter(runs.values()))[0] if name not in LABELS]
+    columns = min(len(names), 4)
+    rows = -(-len(names) // columns)
+    figure = new_figure(2.6 * columns, 2.4 * rows, title)
+    rng = np.random.default_rng(0)
+    for k, name in enumerate(names):
+        axes = figure.add_subplot(rows, columns, k + 1)
+        for i, episodes in enumerate(runs.values()):
+            values = [episode[name] for episode in episodes if episode[name] is not None]
+            color = COLORS[i % len(COLORS)]
+            axes.plot(
+                i + rng.uniform(-0.3, 0.3, len(values)), values, ".", color=color, alpha=0.5, markersize=4
+            )
+            if values:
+                axes.hlines(np.mean(values), i - 0.4, i + 0.4, color=color, linewidth=2)
+        clean(axes)
+        axes.set_title(name, fontsize=9)
+        axes.set_xticks(range(len(runs)), list(runs), fontsize=7, rotation=20)
+        axes.set_xlim(-0.6, len(runs) - 0.4)
+    return figure

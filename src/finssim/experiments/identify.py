@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import time
 from collections.abc import Callable
@@ -21,6 +20,7 @@ from finssim.calibration.replay.figure import draw_response_envelopes
 from finssim.calibration.replay.replay import Replay, replay
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import write_trial
+from finssim.experiments.figures import save_figure
 from finssim.quiet import start_warp
 from finssim.vehicles import Provenance, Vehicle, load_vehicle
 from finssim.vehicles.defaults import room
@@ -50,8 +50,6 @@ class Identification:
     """On the held-out trials, of the identified vehicle."""
     truth: Vehicle
     """The vehicle of the catalogue that made the trials, or around which the pool's own was drawn."""
-    picture: bytes
-    """PNG of the held-out trials, measured and replayed."""
     findings: tuple[Finding, ...]
     seconds: float
     steps: tuple[dict[str, float | str], ...] = ()
@@ -126,12 +124,14 @@ def identify(
         out=place / vehicle_file,
     )
     scored = replay(recorded["held-out"], vehicle, seed=seed)
+    text = json.dumps(scored.as_json(), indent=2, allow_nan=False) + "\n"
+    (folder / "replay.json").write_text(text, encoding="utf-8")
+    save_figure(draw_response_envelopes(scored.pairs), folder / "replay.png")
     return Identification(
         vehicle=vehicle,
         fit=fit,
         replay=scored,
         truth=truth,
-        picture=_write_replay(scored, folder),
         findings=findings,
         seconds=time.perf_counter() - began,
     )
@@ -171,13 +171,3 @@ def simulated_trials(truth: Vehicle) -> Record:
         return recorded
 
     return record
-
-
-def _write_replay(scored: Replay, folder: Path) -> bytes:
-    """Write `replay.json` and `replay.png`; returns the picture."""
-    text = json.dumps(scored.as_json(), indent=2, allow_nan=False) + "\n"
-    (folder / "replay.json").write_text(text, encoding="utf-8")
-    buffer = io.BytesIO()
-    draw_response_envelopes(scored.pairs).savefig(buffer, format="png", dpi=120)
-    (folder / "replay.png").write_bytes(buffer.getvalue())
-    return buffer.getvalue()

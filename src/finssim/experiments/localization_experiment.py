@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import MappingProxyType
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
 from finssim.calibration.vision.pool_command import pool_record
 from finssim.calibration.vision.pool_fit import PoolFit, calibrate_pool
 from finssim.calibration.vision.pool_model import Settings
 from finssim.calibration.vision.survey import Observations, observe, read_survey
-from finssim.experiments.campaign import Say, choice, write_json
+from finssim.experiments.campaign import Say, check_choices, write_json
 from finssim.experiments.figures import COLORS, clean, legend_below, new_figure, save_figure
+from finssim.experiments.metrics import PAPER
 from finssim.experiments.statistics import bootstrap
-from finssim.experiments.tables import console_table, markdown_table
+from finssim.experiments.tables import Table
 from finssim.files import atomic_directory, refuse_unwritable
-from finssim.geometry.optics import Camera, Interface, Lens, Projection, Status, project
+from finssim.geometry.optics import Camera, Interface, Lens, Status, project
 from finssim.geometry.rotations import matrix_to_quat, quat_from_euler, quat_to_matrix
 from finssim.localization.camera_file import write_camera
 from finssim.localization.detection.detections import Detection, Frame, write_detections
@@ -34,9 +32,10 @@ from finssim.localization.pool import Pool, write_pool
 from finssim.localization.poses.methods import METHODS, Constraints
 from finssim.provenance import provenance
 from finssim.sensors.overhead_camera import Basin, OverheadCamera, Pose, Ripples, Scene, TagInScene
+from finssim.text_table import write_csv
 from finssim.vehicles import Mount, Tags
 
-__all__ = ["RESULT_FILE", "draw_campaign", "localization_experiment", "print_table", "tables_of"]
+__all__ = ["RESULT_FILE", "draw_campaign", "localization_experiment", "tables_of"]
 
 Array = NDArray[np.float64]
 
@@ -74,13 +73,11 @@ class Conditions:
     """Rms slope of the surface [-]."""
 
 
-CONDITIONS: Mapping[str, Conditions] = MappingProxyType(
-    {
-        "published": Conditions(),
-        "flat": Conditions(ripples=0.0),
-        "quiet": Conditions(**dict.fromkeys(Conditions.__dataclass_fields__, 0.0)),
-    }
-)
+CONDITIONS: Mapping[str, Conditions] = {
+    "published": Conditions(),
+    "flat": Conditions(ripples=0.0),
+    "quiet": Conditions(**dict.fromkeys(Conditions.__dataclass_fields__, 0.0)),
+}
 """`published`: every error; `flat`: every error but ripples; `quiet`: noise of the pictures alone."""
 
 
@@ -245,8 +242,8 @@ def pictures(campaign: Campaign, renderer: str = "own") -> Iterator[Picture]:
     Raises:
         ValueError: There is no such renderer.
     """
-    choice(RENDERERS, renderer, "renderer", ValueError)
-    look = _geometry(campaign) if renderer == "geometry" else _rendered(campaign, renderer)
+    check_choices([renderer], RENDERERS, "renderer", ValueError)
+    look = _rendered(campaign, renderer)
     number = 0
     for k, visit in enumerate(campaign.visits):
         for _ in range(visit.images):
@@ -279,50 +276,29 @@ def tag_of(visit: Visit) -> TagInScene:
     )
 
 
-def region_of(campaign: Campaign, visit: Visit) -> tuple[int, int, int, int]:
-    """Left, top, right and bottom of the pixels around the tag."""
-    seen = _seen(campaign, visit).pixels
-    lens = campaign.truth.camera.lens
-    low, high = np.floor(seen.min(0)) - SURROUND, np.ceil(seen.max(0)) + SURROUND + 1
-    left, top = np.maximum(low, 0).astype(int).tolist()
-    right, bottom = np.minimum(high, [lens.width, lens.height]).astype(int).tolist()
-    return left, top, right, bottom
-
-
-def _seen(campaign: Campaign, visit: Visit) -> Projection:
-    points = visit.position + corners(TAG.edge) @ visit.R_pb.T
-    return project(campaign.truth.camera, campaign.truth.interface, points)
-
-
-def _geometry(campaign: Campaign) -> Callable[..., Detection | None]:
-    """Exact projection with white noise: no picture, no ripples."""
-
-    def look(visit: Visit, time: float, seed: int) -> Detection | None:
-        seen = _seen(campaign, visit)
-        if (seen.status != Status.OK).any():
-            return None
-        noise = np.random.default_rng(seed).normal(0.0, CORNER_NOISE, (4, 2))
-        return Detection(TAG_ID, seen.pixels + noise, family=TAG.family)
-
-    return look
-
-
 def _rendered(campaign: Campaign, renderer: str) -> Callable[..., Detection | None]:
-    """A picture, and what the default detector finds in it."""
+    """A picture, and what the default detector finds in it; of `geometry` exact projection with white noise."""
     from finssim.localization.detection.detector import detector
 
-    scene, find = scene_of(campaign), detector(TAG.family)
-    if renderer == "own":
-        camera = OverheadCamera(scene)
-    else:
-        from finssim.experiments.mitsuba_renderer import render_with_mitsuba
+    scene, find, lens = scene_of(campaign), detector(TAG.family), campaign.truth.camera.lens
+    camera = OverheadCamera(scene) if renderer == "own" else None
 
     def look(visit: Visit, time: float, seed: int) -> Detection | None:
-        tags, region = (tag_of(visit),), region_of(campaign, visit)
-        moment: Any = {"time": time, "seed": seed, "region": region}
-        if renderer == "own":
+        points = visit.position + corners(TAG.edge) @ visit.R_pb.T
+        exact = project(campaign.truth.camera, campaign.truth.interface, points)
+        if renderer == "geometry":
+            noise = np.random.default_rng(seed).normal(0.0, CORNER_NOISE, (4, 2))
+            visible = not (exact.status != Status.OK).any()
+            return Detection(TAG_ID, exact.pixels + noise, family=TAG.family) if visible else None
+        low = np.maximum(np.floor(exact.pixels.min(0)) - SURROUND, 0)
+        high = np.minimum(np.ceil(exact.pixels.max(0)) + SURROUND + 1, [lens.width, lens.height])
+        region = (*low.astype(int).tolist(), *high.astype(int).tolist())
+        tags, moment = (tag_of(visit),), {"time": time, "seed": seed, "region": region}
+        if camera is not None:
             picture = camera.render(tags=tags, **moment)
         else:
+            from finssim.experiments.mitsuba_renderer import render_with_mitsuba
+
             picture = render_with_mitsuba(replace(scene, tags=tags), rays=MITSUBA_RAYS, **moment)
         return next((d for d in find.detect(picture, region) if d.tag == TAG_ID), None)
 
@@ -386,19 +362,16 @@ def survey_rows(campaign: Campaign, chosen: Sequence[Picture]) -> list[Row]:
     """The survey as a table: where the tag was said to lie in each picture."""
     rows: list[Row] = []
     for picture in chosen:
-        place = dict(zip("xyz", campaign.visits[picture.visit].nominal.tolist(), strict=True))
-        tag = {"yaw_deg": 0.0, "tag": TAG_ID, "edge": TAG.edge}
+        x, y, z = campaign.visits[picture.visit].nominal.tolist()
         # All pictures of a visit share its survey error.
-        rows.append({"image": picture.name, **place, **tag, "group": f"place {picture.visit}"})
+        about = {"yaw_deg": 0.0, "tag": TAG_ID, "edge": TAG.edge, "group": f"place {picture.visit}"}
+        rows.append({"image": picture.name, "x": x, "y": y, "z": z, **about})
     return rows
 
 
 def write_survey(rows: Sequence[Row], path: Path) -> None:
     """Write the table as `finssim calibrate pool --surveyed` reads it."""
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(path, list(rows[0]), [list(row.values()) for row in rows])
 
 
 def _observed(frames: list[Frame], rows: list[Row]) -> Observations:
@@ -412,19 +385,14 @@ def _observed(frames: list[Frame], rows: list[Row]) -> Observations:
 
 RESULT_FILE = "localization.json"
 
-PAPER_TABLE_2 = MappingProxyType({"pinhole": (5.74, 11.41), "refractive": (0.73, 1.45)})
+PAPER_TABLE_2: Mapping[str, Sequence[float]] = PAPER["localization"]
 """Method -> RMSE and 95th percentile in the paper [cm]: its camera over its pool, calibrated on the same places."""
 
-METHODS_SHOWN = MappingProxyType(
-    {
-        "refractive": ("refractive", "refractive"),
-        "refractive-weighted": ("refractive-weighted", "refractive"),
-        "refractive-6dof": ("refractive-6dof", "refractive"),
-        "pinhole-depth": ("pinhole-depth", "pinhole"),
-        "pinhole": ("pinhole", "pinhole"),
-        "pinhole, refractive pose": ("pinhole", "refractive"),
-    }
-)
+METHODS_SHOWN = {
+    **{name: (name, "refractive") for name in ("refractive", "refractive-weighted", "refractive-6dof")},
+    **{name: (name, "pinhole") for name in ("pinhole-depth", "pinhole")},
+    "pinhole, refractive pose": ("pinhole", "refractive"),
+}
 """Row of the table -> method and the calibration it uses. The last is as the paper has it, with the camera pose of the
 refractive calibration."""
 
@@ -457,7 +425,7 @@ WORDS = {
     "pinhole": "pinhole PnP",
     "pinhole, refractive pose": "pinhole PnP, as paper",
 }
-HEADS = ["", "RMSE [cm]", "95 % of it", "P95 [cm]", "95 % of it", "located"]
+HEADS = ("", "RMSE [cm]", "95 % of it", "P95 [cm]", "95 % of it", "located")
 CALIBRATION = {
     "seed": ("seed", ""),
     "camera_height_mm": ("camera height [mm]", ".2f"),
@@ -515,43 +483,38 @@ def locate(
         pixel_std: Standard deviation of a corner, as the calibration found it [px].
         depth_offset: Added to the depth reading [m].
     """
-    found: dict[int, list[tuple[float, float]]] = {}
-    reasons = Counter[str]()
-    pictures = 0
-    for picture in seen:
-        if campaign.calibrates[picture.visit]:
+    places: dict[int, list[tuple[float, float]]] = {}
+    reasons, water = Counter[str](), pool.interface  # depth is measured along its normal, which is up
+    held_out = [picture for picture in seen if not campaign.calibrates[picture.visit]]
+    for picture in held_out:
+        if picture.detection is None:
+            reasons["tag not detected"] += 1
             continue
-        pictures += 1
         visit = campaign.visits[picture.visit]
-        place, reason = _place(picture, visit, pool, method, pixel_std, depth_offset)
-        if place is None:
-            reasons[reason.partition(":")[0]] += 1
+        prior = Constraints(
+            z_b=-water.offset - visit.depth_read - depth_offset,
+            z_std=Z_STD,
+            roll=visit.roll_read,
+            pitch=visit.pitch_read,
+            tilt_std=TILT_STD,
+            up=tuple(water.normal.tolist()),
+        )
+        measured = METHODS[method]((picture.detection,), pool, TAGS_B, prior, pixel_std)
+        if measured.ok:
+            places.setdefault(picture.visit, []).append((measured.x, measured.y))
         else:
-            found.setdefault(picture.visit, []).append(place)
-    index = np.array(sorted(found), np.intp)
-    means = np.array([np.mean(found[k], axis=0) for k in index]).reshape(-1, 2)
-    surveyed = np.array([campaign.visits[k].nominal[:2] for k in index]).reshape(-1, 2)
-    true = np.array([campaign.visits[k].position[:2] for k in index]).reshape(-1, 2)
-    located = sum(map(len, found.values()))
-    return Scores(index, means - surveyed, means - true, pictures, located, reasons)
-
-
-def _place(
-    picture: Picture, visit: Visit, pool: Pool, method: str, pixel_std: float, depth_offset: float
-) -> tuple[tuple[float, float] | None, str]:
-    if picture.detection is None:
-        return None, "tag not detected"
-    water = pool.interface  # depth is measured along its normal, which is up
-    given = Constraints(
-        z_b=-water.offset - visit.depth_read - depth_offset,
-        z_std=Z_STD,
-        roll=visit.roll_read,
-        pitch=visit.pitch_read,
-        tilt_std=TILT_STD,
-        up=tuple(water.normal.tolist()),
+            reasons[measured.reason.partition(":")[0]] += 1
+    index = np.array(sorted(places), np.intp)
+    means, surveyed, true = (
+        np.array(rows).reshape(-1, 2)
+        for rows in (
+            [np.mean(places[k], axis=0) for k in index],
+            [campaign.visits[k].nominal[:2] for k in index],
+            [campaign.visits[k].position[:2] for k in index],
+        )
     )
-    measured = METHODS[method]((picture.detection,), pool, TAGS_B, given, pixel_std)
-    return ((measured.x, measured.y), "") if measured.ok else (None, measured.reason)
+    located = sum(map(len, places.values()))
+    return Scores(index, means - surveyed, means - true, len(held_out), located, reasons)
 
 
 def pooled(scores: Sequence[Scores]) -> dict[str, Any]:
@@ -662,57 +625,50 @@ def _draw_sensitivity(swept: Mapping[str, Any], path: Path) -> None:
     save_figure(figure, path)
 
 
-def tables_of(result: Mapping[str, Any]) -> dict[str, tuple[list[str], list[list[str]]]]:
-    """Words about conditions -> heads and rows of the table; the last is the paper's."""
-    tables = {
-        f"ours, {name} conditions: {WORDS[name]}": [
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
+    """The tables, ours by conditions, then the paper's; and what the calibrations got wrong."""
+    title, origin = "Horizontal localization through water", result["provenance"]
+    tables = [Table(title=title, headline=_headline(result), note=_gain(result))]
+    for name, methods in result["results"].items():
+        rows = [
             [
                 WORDS[method],
-                *(_text(m["rmse_cm"], m["rmse_ci95_cm"])),
-                *(_text(m["p95_cm"], m["p95_ci95_cm"])),
+                *_texts(m["rmse_cm"], m["rmse_ci95_cm"]),
+                *_texts(m["p95_cm"], m["p95_ci95_cm"]),
                 f"{m['located']}/{m['pictures']}",
             ]
             for method, m in methods.items()
         ]
-        for name, methods in result["results"].items()
-    }
-    tables["the paper: its camera over its pool"] = [
+        tables.append(Table(title=f"ours, {name} conditions: {WORDS[name]}", heads=HEADS, rows=rows))
+    rows = [
         [f"paper, {WORDS[m]}", f"{p['rmse_cm']:.2f}", "", f"{p['p95_cm']:.2f}", "", ""]
         for m, p in result["paper"].items()
     ]
-    return {words: (HEADS, rows) for words, rows in tables.items()}
+    pictures = {"error_map.png": "Error map"}
+    if result["sensitivity"]:  # an interruption may come before it
+        pictures["sensitivity.png"] = "Sensitivity"
+    paper = "the paper: its camera over its pool"
+    rows_wrong = [
+        [format(c[key], form) for key, (_, form) in CALIBRATION.items()] for c in result["calibration"]
+    ]
+    return [
+        *tables,
+        Table(title=paper, heads=HEADS, rows=rows, note=NOTE, pictures=pictures),
+        Table(
+            title="what the calibrations got wrong",
+            heads=[heading for heading, _ in CALIBRATION.values()],
+            rows=rows_wrong,
+            left=(),
+            note=f"FinsSim {origin['finssim']}, revision {origin['revision']}, seeds {result['seeds']}.",
+        ),
+    ]
 
 
-def _text(value: float | None, interval: Sequence[float | None]) -> tuple[str, str]:
+def _texts(value: float | None, interval: Sequence[float | None]) -> tuple[str, str]:
     """A figure, and its interval."""
     low, high = interval
     bounds = "" if low is None or high is None else f"[{low:.2f}, {high:.2f}]"
     return "none" if value is None else f"{value:.2f}", bounds
-
-
-def print_table(result: Mapping[str, Any], console: Console) -> None:
-    """Print the tables, ours by conditions, then the paper's."""
-    console.print(_headline(result), highlight=False)
-    for words, (heads, rows) in tables_of(result).items():
-        console.print(console_table(heads, rows, title=words, title_style="bold"))
-    console.print(_gain(result), highlight=False)
-    console.print(NOTE, highlight=False)
-
-
-def markdown(result: Mapping[str, Any]) -> str:
-    """`localization.md`."""
-    parts = ["# Horizontal localization through water", _headline(result), _gain(result)]
-    for words, table in tables_of(result).items():
-        parts += [f"## {words[0].upper()}{words[1:]}", markdown_table(*table)]
-    parts += [NOTE, "![Error map](error_map.png)"]
-    if result["sensitivity"]:  # an interruption may come before it
-        parts.append("![Sensitivity](sensitivity.png)")
-    heads = [heading for heading, _ in CALIBRATION.values()]
-    rows = [[format(c[key], form) for key, (_, form) in CALIBRATION.items()] for c in result["calibration"]]
-    origin = result["provenance"]
-    parts += ["## What the calibrations got wrong", markdown_table(heads, rows, left=())]
-    parts.append(f"FinsSim {origin['finssim']}, revision {origin['revision']}, seeds {result['seeds']}.")
-    return "\n\n".join(parts) + "\n"
 
 
 def _headline(result: Mapping[str, Any]) -> str:
@@ -750,18 +706,6 @@ class SeedResult:
     """By method."""
 
 
-@dataclass
-class _Drawn:
-    """What is done so far."""
-
-    done: Mapping[str, list[SeedResult]] = field(default_factory=lambda: {name: [] for name in CONDITIONS})
-    """By conditions."""
-    higher: list[dict[str, Scores]] = field(default_factory=list)
-    """The tag lifted, by seed and method."""
-    swept: dict[str, Any] = field(default_factory=dict)
-    interrupted: bool = False
-
-
 def localization_experiment(
     *,
     out: Path,
@@ -794,34 +738,53 @@ def localization_experiment(
     """
     if seeds < 1:
         raise ValueError(f"seeds is {seeds}, expected at least 1")
-    choice(RENDERERS, renderer, "renderer", ValueError)
+    check_choices([renderer], RENDERERS, "renderer", ValueError)
     refuse_unwritable(atomic_directory(out, replaces=RESULT_FILE))
-    drawn = _draw_all(seeds, seed, renderer, size, say)
-    runs = drawn.done["published"]
-    first = runs[0]
-    scores = {name: [one.scores for one in each] for name, each in drawn.done.items()}
+    drawn: dict[str, list[SeedResult]] = {name: [] for name in CONDITIONS}
+    higher: list[Mapping[str, Scores]] = []
+    swept: dict[str, Any] = {}
+    runs, interrupted = drawn["published"], False
+    try:
+        for k in range(seeds):
+            for j, name in enumerate(CONDITIONS):
+                say((k + j / len(CONDITIONS)) / seeds, f"seed {seed + k}, {name} conditions")
+                drawn[name].append(_one(name, seed + k, renderer, size))
+            say((k + 0.8) / seeds, f"seed {seed + k}, another depth")
+            campaign = lifted(runs[k].campaign, LIFT)  # the same calibration, the tag at another depth
+            higher.append(_scored(campaign, list(pictures(campaign, renderer)), runs[k].found))
+            if not swept:
+                say((k + 0.9) / seeds, "sensitivity")
+                swept.update(_swept(runs[0], renderer))
+    except KeyboardInterrupt:
+        if not runs:
+            raise
+        interrupted = True
+        for each in drawn.values():
+            del each[max(len(higher), 1) :]
+    scores = {**{name: [one.scores for one in each] for name, each in drawn.items()}, "lifted": higher}
+    visits = runs[0].campaign.visits
     result = {
         "experiment": "localization",
         "renderer": renderer,
         "seeds": [one.campaign.seed for one in runs],
         "seeds_asked_for": seeds,
-        "interrupted": drawn.interrupted,
-        "places": len(first.campaign.visits),
-        "pictures_per_seed": sum(visit.images for visit in first.campaign.visits),
+        "interrupted": interrupted,
+        "places": len(visits),
+        "pictures_per_seed": sum(visit.images for visit in visits),
         "conditions": {name: vars(CONDITIONS[name]) for name in CONDITIONS},
         "results": {
             name: {method: pooled([one[method] for one in each]) for method in METHODS_SHOWN}
-            for name, each in (scores | {"lifted": drawn.higher}).items()
+            for name, each in scores.items()
             if each
         },
         "lift_m": LIFT,
         "pixel_std_px": [one.found.pixel_std for one in runs],
         "calibration": [_errors(one) for one in runs],
-        "sensitivity": drawn.swept,
+        "sensitivity": swept,
         "paper": {m: {"rmse_cm": r, "p95_cm": p} for m, (r, p) in PAPER_TABLE_2.items()},
         "provenance": provenance(),
     }
-    _write(result, out, first)
+    _write(result, out, runs[0])
     return result
 
 
@@ -837,31 +800,7 @@ def _write(result: Mapping[str, Any], out: Path, first: SeedResult) -> None:
         write_pool(found.pinhole, folder / "pool_pinhole.yaml")
         write_detections(found.frames, folder / "detections.csv")
         write_survey(found.survey, folder / "survey.csv")
-        write_json(folder / RESULT_FILE, result, markdown(result))
-
-
-def _draw_all(seeds: int, seed: int, renderer: str, size: Mapping[str, Any], say: Say) -> _Drawn:
-    """All seeds, or after Ctrl-C those that are finished, of the first what there is."""
-    drawn = _Drawn()
-    published = drawn.done["published"]
-    try:
-        for k in range(seeds):
-            for j, name in enumerate(CONDITIONS):
-                say((k + j / len(CONDITIONS)) / seeds, f"seed {seed + k}, {name} conditions")
-                drawn.done[name].append(_one(name, seed + k, renderer, size))
-            say((k + 0.8) / seeds, f"seed {seed + k}, another depth")
-            campaign = lifted(published[k].campaign, LIFT)  # the same calibration, the tag at another depth
-            drawn.higher.append(_scored(campaign, list(pictures(campaign, renderer)), published[k].found))
-            if not drawn.swept:
-                say((k + 0.9) / seeds, "sensitivity")
-                drawn.swept.update(_swept(published[0], renderer))
-    except KeyboardInterrupt:
-        if not published:
-            raise
-        drawn.interrupted = True
-        for runs in drawn.done.values():
-            del runs[max(len(drawn.higher), 1) :]
-    return drawn
+        write_json(folder / RESULT_FILE, result, tables_of(result))
 
 
 def _one(name: str, seed: int, renderer: str, size: Mapping[str, Any]) -> SeedResult:
@@ -889,39 +828,31 @@ def _swept(one: SeedResult, renderer: str) -> dict[str, Any]:
     held_out = np.flatnonzero(~one.campaign.calibrates)
     some = held_out[:: max(1, len(held_out) // RIPPLE_VISITS)]
     visits = tuple(replace(one.campaign.visits[k], images=RIPPLE_IMAGES) for k in some)
+    still = replace(one.campaign, visits=visits, calibrates=np.zeros(len(visits), bool))
     swept["ripples"] = []
     for slope in RIPPLES:
-        campaign = replace(
-            one.campaign,
-            conditions=replace(one.campaign.conditions, ripples=slope),
-            visits=visits,
-            calibrates=np.zeros(len(visits), bool),
-        )
-        scores = locate(
-            campaign,
-            list(pictures(campaign, renderer)),
-            one.found.refractive,
-            "refractive",
-            pixel_std=one.found.pixel_std,
-        )
+        campaign = replace(still, conditions=replace(still.conditions, ripples=slope))
+        seen, std = list(pictures(campaign, renderer)), one.found.pixel_std
+        scores = locate(campaign, seen, one.found.refractive, "refractive", pixel_std=std)
         swept["ripples"].append([slope, rmse_cm(scores)])
     return swept
 
 
 def _errors(one: SeedResult) -> dict[str, Any]:
     """What the calibration of one seed got wrong, the truth being known here."""
-    true, found = one.campaign.truth, one.found.refractive
+    true, fit = one.campaign.truth, one.found.refractive
     x, y = true.camera.position[:2]
-    above = [
-        float(pool.camera.position[2] - pool.interface.height(*pool.camera.position[:2]))
-        for pool in (true, found)
+    heights = [float(pool.camera.position[2]) for pool in (true, fit)]
+    over = [
+        h - float(pool.interface.height(*pool.camera.position[:2]))
+        for h, pool in zip(heights, (true, fit), strict=True)
     ]
-    lean = float(np.clip(true.interface.normal @ found.interface.normal, -1.0, 1.0))
+    lean = float(np.clip(true.interface.normal @ fit.interface.normal, -1.0, 1.0))
     return {
         "seed": one.campaign.seed,
-        "camera_height_mm": 1000.0 * float(found.camera.position[2] - true.camera.position[2]),
-        "water_height_mm": 1000.0 * float(found.interface.height(x, y) - true.interface.height(x, y)),
-        "camera_over_water_mm": 1000.0 * (above[1] - above[0]),
+        "camera_height_mm": 1000.0 * (heights[1] - heights[0]),
+        "water_height_mm": 1000.0 * float(fit.interface.height(x, y) - true.interface.height(x, y)),
+        "camera_over_water_mm": 1000.0 * float(over[1] - over[0]),
         "tilt_deg": float(np.degrees(np.arccos(lean))),
-        "index": float(found.interface.index_far - true.interface.index_far),
+        "index": float(fit.interface.index_far - true.interface.index_far),
     }

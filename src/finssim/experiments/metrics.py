@@ -13,10 +13,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.control.guidance import Guide
@@ -47,19 +49,10 @@ __all__ = [
 # What the paper has: its eight setpoints and the start of T1 in our frames, and its results on its real vehicle.
 
 
-T1_PUBLISHED = MappingProxyType(
-    {
-        "P01": (1.0, -0.5, 0.3, 0.0),
-        "P02": (1.0, -0.5, -0.3, -90.0),
-        "P03": (-1.0, -0.5, -0.3, 90.0),
-        "P04": (-1.0, -0.5, 0.3, 180.0),
-        "P05": (1.0, -0.8, 0.3, 0.0),
-        # Yaw as in the hardware trials; the published simulation list says -90.
-        "P06": (1.0, -0.8, -0.3, 0.0),
-        "P07": (-1.0, -0.8, -0.3, 90.0),
-        "P08": (-1.0, -0.8, 0.3, 180.0),
-    }
-)
+PAPER: Mapping[str, Any] = yaml.safe_load(Path(__file__).with_name("paper.yaml").read_text(encoding="utf-8"))
+"""Everything that the paper's tables say."""
+
+T1_PUBLISHED: Mapping[str, tuple[float, float, float, float]] = PAPER["setpoints"]
 """Name -> (x, y, z [m], yaw [deg]) as published: controller frame, x forward, y up from the surface, z left."""
 
 
@@ -96,20 +89,7 @@ def in_room(pose: NDArray[np.float64], vehicle: Vehicle) -> NDArray[np.float64]:
 
 KEYS = ("e_p_m", "e_y_m", "e_psi_deg", "success", "trials", "t_s_s", "J_p_m", "J_psi_deg")
 
-PAPER_T1 = MappingProxyType(
-    {
-        "calibrated": (0.077, 0.027, 6.54, 7, 8, 20.16, 0.032, 2.35),
-        "calibrated + DR": (0.092, 0.043, 5.42, 7, 8, 36.92, 0.034, 2.06),
-        "calibrated, localisation noise": (0.658, 0.079, 13.53, 2, 8, 41.16, 0.025, 3.98),
-        "without EKF": (0.069, 0.025, 13.48, 7, 8, 29.52, 0.035, 2.60),
-        "without thruster dynamics": (0.055, 0.030, 3.82, 6, 8, 24.41, 0.034, 2.12),
-        "mesh": (0.746, 0.108, 12.19, 0, 8, None, None, None),
-        "mesh + DR": (0.197, 0.103, 8.62, 0, 8, None, None, None),
-        "simplified": (0.598, 0.504, 23.37, 0, 8, None, None, None),
-        "simplified + DR": (0.609, 0.564, 5.48, 0, 8, None, None, None),
-        "PID": (0.176, 0.101, 44.08, 0, 8, None, None, None),
-    }
-)
+PAPER_T1: Mapping[str, Sequence[float | None]] = PAPER["station_keeping"]
 """Table of T1: the model trained in (DR: domain randomisation) -> the figures in the order of `KEYS`, on hardware."""
 
 
@@ -118,36 +98,16 @@ def paper_row(name: str) -> dict[str, Any]:
     return {"name": name, **dict(zip(KEYS, PAPER_T1[name], strict=True))}
 
 
-T2_KEYS = ("horizontal_rmse_m", "vertical_rmse_m", "p95_m")
-
-PAPER_T2 = MappingProxyType(
-    {
-        "calibrated + DR": {
-            "straight": (0.068, 0.129, 0.409),
-            "broken": (0.086, 0.084, 0.265),
-            "ellipse": (0.091, 0.080, 0.366),
-            "lemniscate": (0.051, 0.073, 0.134),
-        },
-        "calibrated": {
-            "straight": (0.135, 0.139, 0.406),
-            "broken": (0.136, 0.133, 0.310),
-            "ellipse": (0.166, 0.102, 0.338),
-            "lemniscate": (0.163, 0.103, 0.305),
-        },
-        "PID": {
-            "straight": (0.182, 0.146, 0.405),
-            "broken": (0.196, 0.152, 0.426),
-            "ellipse": (0.174, 0.134, 0.433),
-            "lemniscate": (0.207, 0.170, 0.514),
-        },
-    }
-)
-"""Table of T2: controller -> trajectory -> horizontal RMSE, vertical RMSE and 95th percentile of the distance [m]."""
+ERRORS = ("horizontal_rmse_m", "vertical_rmse_m", "p95_m")
+"""What the paper reports of tracking."""
+PAPER_T2: Mapping[str, Mapping[str, Sequence[float]]] = PAPER["tracking"]
+"""Table of T2: controller -> trajectory -> the figures in the order of `ERRORS`."""
 
 
-def paper_t2_row(name: str, trajectory: str) -> dict[str, Any]:
-    """One controller on one trajectory, with the keys of our own results."""
-    return dict(zip(T2_KEYS, PAPER_T2[name][trajectory], strict=True))
+def paper_t2_row(name: str, trajectory: str) -> dict[str, Any] | None:
+    """One controller on one trajectory, with the keys of our own results; None where the paper has none."""
+    values = PAPER_T2[name].get(trajectory)
+    return values and dict(zip(ERRORS, values, strict=True))
 
 
 Array = NDArray[np.float64]
@@ -233,17 +193,15 @@ def summarize(trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     Returns:
         `trials` and `valid` (trials that have late errors), `success` (count), `e_p_m`, `e_y_m`, `e_psi_deg`, `t_s_s`,
-        `J_p_m`, `J_psi_deg` (None where no trial has one) and `per_trial`, the trials themselves.
+        `J_p_m`, `J_psi_deg` (None where no trial has one).
     """
     row: dict[str, Any] = {
         "trials": len(trials),
         "valid": sum(trial["e_p_m"] is not None for trial in trials),
         "success": sum(bool(trial["success"]) for trial in trials),
     }
-    for key in MEANS:
-        row[key] = _over(np.mean, trials, key)
-    row["t_s_s"] = _over(np.median, trials, "t_s_s")
-    return row | {"per_trial": [dict(trial) for trial in trials]}
+    means = {key: _over(np.mean, trials, key) for key in MEANS}
+    return row | means | {"t_s_s": _over(np.median, trials, "t_s_s")}
 
 
 def pose_error(position: Array, yaw: Array, goal: Array) -> tuple[Array, Array]:
@@ -329,9 +287,6 @@ COMPLETE = 0.98
 
 SATURATED = 0.99
 """A thruster at this part of its limit is saturated."""
-
-ERRORS = ("horizontal_rmse_m", "vertical_rmse_m", "p95_m")
-"""What the paper reports."""
 
 MEASURES = (
     *ERRORS,
@@ -479,7 +434,4 @@ def summarize_tracking(trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "valid": sum(trial["p95_m"] is not None for trial in trials),
         "complete": sum(bool(trial["complete"]) for trial in trials),
     }
-    for key in MEASURES:
-        values = [trial[key] for trial in trials if trial[key] is not None]
-        row[key] = float(np.mean(values)) if values else None
-    return row
+    return row | {key: _over(np.mean, trials, key) for key in MEASURES}

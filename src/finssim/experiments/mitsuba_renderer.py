@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from finssim.geometry.rotations import quat_to_matrix
 from finssim.sensors.batch import SensorError
-from finssim.sensors.overhead_camera import Body, Pose, Rectangle, Scene, TagInScene
+from finssim.sensors.overhead_camera import Pose, Rectangle, Scene, TagInScene
 from finssim.sensors.overhead_camera.photometry import digitise, noise_key
 from finssim.sensors.overhead_camera.scene import SurfaceFrame, surface_frame
 from finssim.sensors.overhead_camera.surface import waves_of
@@ -93,7 +93,10 @@ def radiance_by_mitsuba(
     for i, tag in enumerate(scene.tags):
         parts |= _tag(mi, tag, f"tag{i}", _gain(scene, tag.pose))
     for i, body in enumerate(scene.bodies):
-        parts[f"body{i}"] = _body(mi, body, _gain(scene, body.pose))
+        pose, half = body.pose, 0.5 * np.asarray(body.size)
+        place = _matrix(mi, quat_to_matrix(pose.orientation), pose.position, half)
+        glow = _glowing(mi, body.colour, _gain(scene, pose))
+        parts[f"body{i}"] = {"type": "cube", "to_world": place, **glow}
     if scene.light.sky > 0.0:
         parts["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": scene.light.sky}}
     picture = np.array(mi.render(mi.load_dict(parts), seed=seed))
@@ -210,13 +213,6 @@ def _tag(mi: Any, tag: TagInScene, name: str, gain: float) -> dict[str, Any]:
     }
 
 
-def _body(mi: Any, body: Body, gain: float) -> dict[str, Any]:
-    to_world = _matrix(
-        mi, quat_to_matrix(body.pose.orientation), body.pose.position, 0.5 * np.asarray(body.size)
-    )
-    return {"type": "cube", "to_world": to_world, **_glowing(mi, body.colour, gain)}
-
-
 def _basin(mi: Any, scene: Scene) -> dict[str, Any]:
     """The inside of the box without its lid, the face on the camera's side."""
     lower, upper = np.asarray(scene.basin.lower, float), np.asarray(scene.basin.upper, float)
@@ -251,13 +247,9 @@ def _surface(mi: Any, scene: Scene, frame: SurfaceFrame, footprint: Array, time:
             faces[f"face{i}"] = {
                 "type": "rectangle",
                 "to_world": _matrix(mi, frame.R_sp.T, origin, [FAR, FAR, 1.0]),
-                "bsdf": _dielectric(indices[i], indices[i + 1]),
+                "bsdf": {"type": "dielectric", "ext_ior": indices[i], "int_ior": indices[i + 1]},
             }
     return faces
-
-
-def _dielectric(near: float, far: float) -> dict[str, Any]:
-    return {"type": "dielectric", "ext_ior": near, "int_ior": far}
 
 
 def _rippling(mi: Any, scene: Scene, frame: SurfaceFrame, footprint: Array, time: float) -> Any:
@@ -274,22 +266,13 @@ def _rippling(mi: Any, scene: Scene, frame: SurfaceFrame, footprint: Array, time
     right, up = corner + 1, corner + len(x)
     faces = np.concatenate([np.stack([corner, right, up + 1], -1), np.stack([corner, up + 1, up], -1)])
     vertices = np.column_stack([xy, z]) @ frame.R_sp + frame.origin_p
-    return _mesh(
-        mi,
-        vertices,
-        normals @ frame.R_sp,
-        faces,
-        _dielectric(scene.interface.index_near, scene.interface.index_far),
-    )
-
-
-def _mesh(mi: Any, vertices: Array, normals: Array, faces: Any, bsdf: dict[str, Any]) -> Any:
     properties = mi.Properties()
+    bsdf = {"type": "dielectric", "ext_ior": scene.interface.index_near, "int_ior": scene.interface.index_far}
     properties["bsdf"] = mi.load_dict(bsdf)
     mesh = mi.Mesh("surface", len(vertices), len(faces), has_vertex_normals=True, props=properties)
     values = mi.traverse(mesh)
     values["vertex_positions"] = vertices.ravel().astype(np.float32)
-    values["vertex_normals"] = normals.ravel().astype(np.float32)
+    values["vertex_normals"] = (normals @ frame.R_sp).ravel().astype(np.float32)
     values["faces"] = faces.ravel().astype(np.uint32)
     values.update()
     return mesh

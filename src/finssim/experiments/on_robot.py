@@ -94,123 +94,111 @@ class RobotTrial:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Placing:
-    """How a vehicle gets to where a trial begins."""
-
-    start: Station
-    by_hand: bool = False
-    """Somebody carries it there, and presses enter. False: the tuned PID steers it there."""
-    bounds: tuple[tuple[float, ...], ...] = (EXACTLY,)
-    """Any of which is near enough."""
-    attendant: Attendant | None = None
-    """Nobody is asked if None: the way to the start begins as soon as the state is known."""
-
-
-@dataclass(frozen=True)
 class Outcome:
     """How a trial went."""
 
     trial: RobotTrial
     runtime: Runtime
-    ended: Ended
     fault: str
     """Why it ended before its time, or never began; empty if it did neither."""
-    begun: bool
+    ended: Ended = "over"
+    begun: bool = True
     """Whether the trial itself was begun, not only the way to its start."""
 
 
-def play_trial(
-    trial: RobotTrial,
-    drive: Drive,
-    vehicle: Vehicle,
-    site: Pool | None,
-    *,
-    perception: Perception | None = None,
-    recorder: Recorder | None = None,
-    placing: Placing | None = None,
-) -> Outcome:
-    """Play a trial.
-
-    Args:
-        trial: What to do.
-        drive: Runs the robot's software on its wires, or in lock-step with a world.
-        vehicle: As the robot knows it.
-        site: Camera, water and frames, as calibrated; None: no camera looks.
-        perception: Otherwise than by default.
-        recorder: Takes down the trial itself, not the way to its start.
-        placing: How the vehicle gets to the start; None: it is there already, at rest, as in a pool that begins.
-    """
-    stages = Stages(trial, vehicle, recorder, placing)
-    if placing is None:
-        runtime = Runtime(
-            vehicle, site, trial.pilot, trial.guide, arm=True, perception=perception, recorder=recorder
-        )
-        longest = GETTING_READY + trial.duration
-    else:
-        idle = WrenchPilot(lambda: np.zeros(6), vehicle, name="idle")
-        runtime = Runtime(vehicle, site, idle, placing.start, arm=False, perception=perception)
-        longest = math.inf
-    drive(runtime, duration=longest, show=stages.look, until=stages.over)
-    ended: Ended = stages.ended or ("interrupted" if math.isinf(longest) else "over")
-    return Outcome(trial, runtime, ended, stages.fault(runtime), stages.begun)
+def fault_of(trial: RobotTrial, runtime: Runtime) -> str:
+    """Why a trial that was begun ended before its time; empty if it did not."""
+    if runtime.bridge.state == "fault":
+        return runtime.bridge.reason
+    if math.isnan(runtime.started):
+        return f"never armed: {runtime.refusal or 'no state'}"
+    return "" if trial.over(runtime) else "not finished"
 
 
 class Stages:
     """Waits for the vehicle and its attendant, sees it to the start, hands over to the trial, and ends it."""
 
     def __init__(
-        self, trial: RobotTrial, vehicle: Vehicle, recorder: Recorder | None, placing: Placing | None
+        self,
+        trial: RobotTrial,
+        vehicle: Vehicle,
+        start: Station,
+        bounds: Sequence[tuple[float, ...]],
+        *,
+        by_hand: bool = False,
+        attendant: Attendant | None = None,
+        recorder: Recorder | None = None,
     ) -> None:
-        self._trial, self._vehicle, self._recorder = trial, vehicle, recorder
-        self._placed = placing is None
-        self._placing = placing or Placing(start=Station((0.0, 0.0, 0.0), 0.0))
-        self._stage: Callable[[Runtime, float], bool] = self._play if self._placed else self._wait
+        """
+        Args:
+            trial: What to do.
+            vehicle: As the robot knows it.
+            start: Where the trial begins.
+            bounds: Of `start_bounds`, any of which is near enough.
+            by_hand: Somebody carries it there, and presses enter. False: the tuned PID steers it there.
+            attendant: Nobody is asked if None: the way to the start begins as soon as the state is known.
+            recorder: Takes down the trial itself, not the way to its start.
+        """
+        self._trial, self._vehicle, self._start, self._bounds = trial, vehicle, start, bounds
+        self._by_hand, self._attendant, self._recorder = by_hand, attendant, recorder
+        self._stage: Callable[[Runtime, Reading, float], bool] = self._wait
         self._since = math.nan
         """When the stage began [s]."""
         self._near_since: dict[tuple[float, ...], float] = {}
-        self.ended: Ended | None = None
-        self.begun = self._placed
+        self._ended: Ended = "interrupted"
         self._reason = ""
+        self._begun = False
 
-    def look(self, runtime: Runtime) -> None:
+    def play(self, drive: Drive, site: Pool | None, perception: Perception | None = None) -> Outcome:
+        """Play the trial.
+
+        Args:
+            drive: Runs the robot's software on its wires, or in lock-step with a world.
+            site: Camera, water and frames, as calibrated; None: no camera looks.
+            perception: Otherwise than by default.
+        """
+        idle = WrenchPilot(lambda: np.zeros(6), self._vehicle, name="idle")
+        runtime = Runtime(self._vehicle, site, idle, self._start, arm=False, perception=perception)
+        drive(runtime, duration=math.inf, show=self._look, until=self._over)
+        fault = self._reason or (fault_of(self._trial, runtime) if self._begun else runtime.bridge.reason)
+        fault = fault or ("" if self._ended == "over" else "not finished")
+        return Outcome(trial=self._trial, runtime=runtime, fault=fault, ended=self._ended, begun=self._begun)
+
+    def _look(self, runtime: Runtime) -> None:
         """After every step."""
-        if self.begun:
+        if self._begun:
             self._trial.watch(runtime)
 
-    def over(self, runtime: Runtime) -> bool:
+    def _over(self, runtime: Runtime) -> bool:
         """Whether to end; goes from stage to stage."""
         assert runtime.reading is not None  # a step has been made
         now = runtime.reading.time
         self._since = now if math.isnan(self._since) else self._since
         if runtime.bridge.state == "fault":
             return self._end("fault")
-        return self._stage(runtime, now)
-
-    def fault(self, runtime: Runtime) -> str:
-        """Why the trial ended before its time, or never began; empty if it did neither."""
-        if runtime.bridge.state == "fault":
-            return runtime.bridge.reason
-        if self._reason:
-            return self._reason
-        if self.begun and math.isnan(runtime.started):
-            return f"never armed: {runtime.refusal or 'no state'}"
-        return "" if self.ended == "over" else "not finished"
+        return self._stage(runtime, runtime.reading, now)
 
     def _end(self, how: Ended, reason: str = "") -> bool:
-        self.ended, self._reason = how, reason
+        self._ended, self._reason = how, reason
         return True
 
     def _keys(self) -> Sequence[str]:
-        return self._placing.attendant.keys() if self._placing.attendant else ()
+        return self._attendant.keys() if self._attendant else ()
+
+    def _stopped(self, runtime: Runtime, now: float) -> bool:
+        """Whether the operator stops the thrusters now."""
+        if not {"x", " "} & set(self._keys()):
+            return False
+        runtime.bridge.stop(now, "stopped by the operator")
+        return self._end("fault")
 
     def _line(self, text: str) -> None:
-        if self._placing.attendant is not None:
-            self._placing.attendant.line(text)
+        if self._attendant is not None:
+            self._attendant.line(text)
 
-    def _wait(self, runtime: Runtime, now: float) -> bool:
+    def _wait(self, runtime: Runtime, reading: Reading, now: float) -> bool:
         """Thrusters cannot turn: until the state is known and the attendant says go."""
-        assert runtime.reading is not None
-        keys, reading = self._keys(), runtime.reading
+        keys = self._keys()
         if now == self._since:
             return False  # what was pressed before anybody was asked means nothing
         if "s" in keys:
@@ -219,31 +207,23 @@ class Stages:
             return self._end("interrupted")
         if not reading.ready:
             self._line(f"waiting for the vehicle: {reading.reason}")
-            return False
-        there = self.there(reading, now)
-        if self._placing.by_hand and not there:
+        elif not self.there(reading, now) and self._by_hand:
             self._line(f"bring it to its start: {self._way(reading)}")
-            return False
-        if self._placing.attendant is not None and not {"\r", "\n"} & set(keys):
-            word = "play" if self._placing.by_hand else "let it go to its start and play"
-            self._line(f"enter: {word}; s: skip; q: end; {self._way(reading)}")
-            return False
-        if self._placing.by_hand:
+        elif self._attendant is not None and not {"\r", "\n"} & set(keys):
+            action = "play" if self._by_hand else "let it go to its start and play"
+            self._line(f"enter: {action}; s: skip; q: end; {self._way(reading)}")
+        elif self._by_hand:
             self._begin(runtime, now)
         else:
-            pilot = make_pilot("pid", self._vehicle)
-            runtime.hand_over(now, pilot, self._placing.start, arm=True)
+            runtime.hand_over(now, make_pilot("pid", self._vehicle), self._start, arm=True)
             self._stage, self._since = self._approach, now
             self._near_since.clear()
         return False
 
-    def _approach(self, runtime: Runtime, now: float) -> bool:
+    def _approach(self, runtime: Runtime, reading: Reading, now: float) -> bool:
         """The PID steers to the start."""
-        assert runtime.reading is not None
-        if {"x", " "} & set(self._keys()):
-            runtime.bridge.stop(now, "stopped by the operator")
-            return self._end("fault")
-        reading = runtime.reading
+        if self._stopped(runtime, now):
+            return True
         self._line(f"on the way to its start: {self._way(reading)}; x: stop")
         if self.there(reading, now):
             self._begin(runtime, now)
@@ -255,16 +235,13 @@ class Stages:
     def _begin(self, runtime: Runtime, now: float) -> None:
         """Hand over to the trial: disarmed, and armed again for its pilot."""
         runtime.hand_over(now, self._trial.pilot, self._trial.guide, arm=True, recorder=self._recorder)
-        self._stage, self._since, self.begun = self._play, now, True
+        self._stage, self._since, self._begun = self._play, now, True
 
-    def _play(self, runtime: Runtime, now: float) -> bool:
-        if {"x", " "} & set(self._keys()):
-            runtime.bridge.stop(now, "stopped by the operator")
-            return self._end("fault")
+    def _play(self, runtime: Runtime, reading: Reading, now: float) -> bool:
+        if self._stopped(runtime, now):
+            return True
         if self._trial.over(runtime):
             return self._end("over")
-        if self._placed:
-            return False  # the drive ends it
         t = 0.0 if math.isnan(runtime.t) else runtime.t
         self._line(f"{t:.0f} s of {self._trial.duration:.0f} s; x: stop")
         late = math.isnan(runtime.started) and now - self._since > GETTING_READY
@@ -273,12 +250,12 @@ class Stages:
     def there(self, reading: Reading, now: float) -> bool:
         """Whether the vehicle has been at its start, at rest, for long enough."""
         off = (
-            float(np.abs(reading.position - self._placing.start.position).max()),
+            float(np.abs(reading.position - self._start.position).max()),
             abs(self._turn(reading)),
             float(np.linalg.norm(reading.nu[:3])),
             float(np.linalg.norm(reading.nu[3:])),
         )
-        for bounds in self._placing.bounds:
+        for bounds in self._bounds:
             if not reading.ready or any(x > limit for x, limit in zip(off, bounds[:4], strict=True)):
                 self._near_since.pop(bounds, None)
             elif now - self._near_since.setdefault(bounds, now) >= bounds[4]:
@@ -286,11 +263,11 @@ class Stages:
         return False
 
     def _turn(self, reading: Reading) -> float:
-        return float(wrap_angle(self._placing.start.yaw - quat_yaw(reading.quaternion)))
+        return float(wrap_angle(self._start.yaw - quat_yaw(reading.quaternion)))
 
     def _way(self, reading: Reading) -> str:
-        """What is left of the way."""
-        x, y, z = self._placing.start.position - reading.position
+        """The remaining way."""
+        x, y, z = self._start.position - reading.position
         return f"({x:+.2f}, {y:+.2f}, {z:+.2f}) m and {math.degrees(self._turn(reading)):+.0f}° to go"
 
 
@@ -459,19 +436,29 @@ class Session:
             trial = make()
             x, y, z = start.position
             self.say(f"{trial.name}: from {x:.2f}, {y:.2f}, {z:.2f} m, {math.degrees(start.yaw):.0f}°")
-            placing = Placing(
-                start=start,
-                by_hand=self.robot.by_hand,
-                bounds=start_bounds(self.robot.site, exact),
-                attendant=self.attendant,
+            partial = record.with_name(f".{record.stem}.partial.mcap")
+            partial.parent.mkdir(parents=True, exist_ok=True)
+            partial.unlink(missing_ok=True)
+            wiring = self.robot.wiring
+            meta = {
+                "pilot": trial.pilot.describe(), "guide": trial.guide.name, "armed": True, "robot": wiring.robot,
+                "site": self.robot.site, **({"pool_sha256": self.site.sha256} if self.site else {}), **(about or {}),
+            }  # fmt: skip
+            kept = recording(
+                partial, self.vehicle, meta, pool_file=self.robot.pool_file, lockstep=wiring.lockstep, pictures="none"
+            )  # fmt: skip
+            with kept as recorder:
+                stages = Stages(
+                    trial, self.equipped, start, start_bounds(self.robot.site, exact), by_hand=self.robot.by_hand,
+                    attendant=self.attendant, recorder=recorder,
+                )  # fmt: skip
+                outcome = stages.play(self.drive, self.site, perception and perception())
+            if recorder is not None and recorder.problem and outcome.ended == "over":
+                raise RobotError(f"{record}: {recorder.problem}")
+            stopped = (
+                outcome.begun and outcome.ended == "fault" and outcome.fault != "stopped by the operator"
             )
-            outcome, partial = self._attempt(trial, placing, record, perception, about or {})
-            stopped_by_hand = outcome.fault == "stopped by the operator"
-            done = outcome.ended == "over" or (
-                counts and outcome.begun and outcome.ended == "fault" and not stopped_by_hand
-            )
-            if done:
-                record.parent.mkdir(parents=True, exist_ok=True)
+            if outcome.ended == "over" or (counts and stopped):
                 partial.replace(record)
                 return outcome
             self._put_away(partial, record, outcome)
@@ -485,45 +472,6 @@ class Session:
                     f"{trial.name}: {outcome.fault}: look at the vehicle, then give the command again: it goes on here"
                 )
             self.say(f"{trial.name}: {outcome.fault}: once more, or s to skip it")
-
-    def _attempt(
-        self,
-        trial: RobotTrial,
-        placing: Placing,
-        record: Path,
-        perception: Callable[[], Perception] | None,
-        about: Mapping[str, Any],
-    ) -> tuple[Outcome, Path]:
-        """One attempt and its record, which is not yet in its place."""
-        partial = record.with_name(f".{record.stem}.partial.mcap")
-        partial.parent.mkdir(parents=True, exist_ok=True)
-        partial.unlink(missing_ok=True)
-        meta = {
-            "pilot": trial.pilot.describe(),
-            "guide": trial.guide.name,
-            "armed": True,
-            "robot": self.robot.wiring.robot,
-            "site": self.robot.site,
-            **({"pool_sha256": self.site.sha256} if self.site else {}),
-            **about,
-        }
-        kept = recording(
-            partial, self.vehicle, meta, pool_file=self.robot.pool_file,
-            lockstep=self.robot.wiring.lockstep, pictures="none",
-        )  # fmt: skip
-        with kept as recorder:
-            outcome = play_trial(
-                trial,
-                self.drive,
-                self.equipped,
-                self.site,
-                perception=perception and perception(),
-                recorder=recorder,
-                placing=placing,
-            )
-        if recorder is not None and recorder.problem and outcome.ended == "over":
-            raise RobotError(f"{record}: {recorder.problem}")
-        return outcome, partial
 
     def _put_away(self, partial: Path, record: Path, outcome: Outcome) -> None:
         """Keep what there is of a trial that was begun; nothing was recorded of one that was not."""

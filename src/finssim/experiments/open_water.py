@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
-from rich.console import Console
 
 from finssim.control.trajectories import Trajectory
-from finssim.experiments.campaign import Say, choice, write_json
-from finssim.experiments.tables import console_table
+from finssim.experiments.campaign import Say, check_choices, write_json
+from finssim.experiments.tables import Table
 from finssim.geometry.rotations import quat_from_yaw, quat_yaw
 from finssim.pool import PlantSpec, VirtualPool, draw_plant, read_truth
 from finssim.pool.draw_plant import positioning_of, site_of
@@ -27,7 +27,7 @@ from finssim.robot.runtime import Runtime
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import vehicle_at
 
-__all__ = ["open_water", "print_open_water"]
+__all__ = ["open_water", "tables_of"]
 
 Array = npt.NDArray[np.float64]
 
@@ -55,7 +55,7 @@ def way_of(shape: str, duration: float, speed: float) -> Trajectory:
     Raises:
         ValueError: There is no such shape.
     """
-    choice(WAYS, shape, "way", ValueError)
+    check_choices([shape], WAYS, "way", ValueError)
     corners = [[0.0, 0.0], [speed * duration, 0.0]]
     if shape == "square":
         around = [[SIDE, 0.0], [SIDE, SIDE], [0.0, SIDE], [0.0, 0.0]]
@@ -70,24 +70,6 @@ def way_of(shape: str, duration: float, speed: float) -> Trajectory:
         return points[i] + ((t - starts[i]) / times[i])[..., None] * steps[i], steps[i] / times[i][..., None]
 
     return Trajectory(name=shape, duration=float(starts[-1]), motion=motion)
-
-
-class _Watch:
-    """Keeps what the estimator says of itself."""
-
-    def __init__(self, perception: Perception) -> None:
-        self.rows: list[tuple[float, ...]] = []
-        self._perception = perception
-
-    def __call__(self, runtime: Runtime) -> None:
-        reading = runtime.reading
-        if reading is None:
-            return
-        if math.isnan(runtime.t) or (self.rows and reading.time < self.rows[-1][0] + PERIOD - 1e-6):
-            return
-        found = self._perception.estimator.estimate(reading.time)
-        P = found.P[:2, :2].ravel().tolist()
-        self.rows.append((reading.time, *found.x[:2].tolist(), found.yaw, *P))
 
 
 def swim(
@@ -121,7 +103,17 @@ def swim(
     equipped = vehicle_at("open-water", vehicle)
     start = np.random.default_rng([seed, 0x57A]).normal(0.0, LET_IN_STD, 2).tolist()
     perception = Perception(equipped, None, mode="error-state", let_in=start)
-    watch = _Watch(perception)
+    rows: list[tuple[float, ...]] = []
+
+    def watch(runtime: Runtime) -> None:
+        """Keep what the estimator says of itself."""
+        reading = runtime.reading
+        if reading is None or math.isnan(runtime.t) or (rows and reading.time < rows[-1][0] + PERIOD - 1e-6):
+            return
+        estimate = perception.estimator.estimate(reading.time)
+        P = estimate.P[:2, :2].ravel().tolist()
+        rows.append((reading.time, *estimate.x[:2].tolist(), estimate.yaw, *P))
+
     pilot = make_pilot(controller, equipped, task="t2")
     runtime = Runtime(equipped, None, pilot, way, arm=True, perception=perception)
     with tempfile.TemporaryDirectory() as folder:
@@ -133,20 +125,13 @@ def swim(
             seed=seed,
             truth=Path(folder) / "truth",
         )
-        try:
-            run_lockstep(
-                runtime,
-                world,
-                GETTING_READY + way.duration,
-                show=watch,
-                until=lambda r: r.t >= way.duration or r.bridge.state == "fault",
-            )
-        finally:
-            world.close()
+        over: Callable[[Runtime], bool] = lambda r: r.t >= way.duration or r.bridge.state == "fault"  # noqa: E731
+        with closing(world):
+            run_lockstep(runtime, world, GETTING_READY + way.duration, show=watch, until=over)
         truth = read_truth(Path(folder) / "truth")
-    if not watch.rows:
+    if not rows:
         raise ValueError(f"open water: never armed: {runtime.refusal or 'no state'}")
-    a = np.array(watch.rows)
+    a = np.array(rows)
     true = np.stack([np.interp(a[:, 0], truth.time, column) for column in truth.position.T], axis=1)
     yaw = np.interp(a[:, 0], truth.time, np.unwrap(quat_yaw(truth.quaternion)))
     error, P = a[:, 1:3] - true[:, :2], a[:, 4:8].reshape(-1, 2, 2)
@@ -214,12 +199,12 @@ def open_water(
         "trials": trials,
         "provenance": provenance(),
     }
-    write_json(Path(out) / "open_water.json", result)
+    write_json(Path(out) / "open_water.json", result, tables_of(result))
     return result
 
 
-def print_open_water(result: Mapping[str, Any], console: Console) -> None:
-    """Print a row for each way."""
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
+    """A row for each way."""
     title = f"{result['vehicle']['name']}, {result['shape']}, positioning {result['positioning']}"
     heads = ("seed", "way [m]", "drift [m]", "drift [%]", "std [m]", "NEES", "inside", "off way [m]", "")
     rows = [
@@ -229,4 +214,4 @@ def print_open_water(result: Mapping[str, Any], console: Console) -> None:
         ]
         for t in result["trials"]
     ]  # fmt: skip
-    console.print(console_table(heads, rows, left=(), title=title))
+    return [Table(title=title, heads=heads, rows=rows, left=())]

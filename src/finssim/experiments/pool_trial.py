@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import tempfile
 import time
 import zlib
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from finssim.control.controllers import CONTROLLERS
 from finssim.control.guidance import Guide, Measured, Station, Track
-from finssim.control.policy import DESCRIPTION_FILE, NETWORK_FILE
-from finssim.control.trajectories import load_trajectory
 from finssim.experiments import campaign
-from finssim.experiments.evaluate import Evaluation
-from finssim.experiments.metrics import T1_SETPOINTS, T1_START, in_room, summarize
+from finssim.experiments.evaluate import Evaluation, summary_of
+from finssim.experiments.metrics import T1_SETPOINTS, T1_START, in_room
 from finssim.experiments.on_robot import (
+    GETTING_READY,
     Attendant,
     OnRobot,
     Outcome,
@@ -32,23 +29,14 @@ from finssim.experiments.on_robot import (
     RobotTrial,
     Session,
     check_starts,
-    play_trial,
+    fault_of,
     session,
 )
-from finssim.experiments.recorded import (
-    PERIOD,
-    Motion,
-    RecordedError,
-    localization_errors,
-    measure,
-    on_grid,
-    read_record,
-)
-from finssim.experiments.trials import DURATION, Trials
-from finssim.files import atomic_write
-from finssim.geometry.rotations import quat_from_yaw, quat_multiply, quat_yaw
+from finssim.experiments.recorded import RecordedError, read_record
+from finssim.experiments.trials import PERIOD, Motion, Trial, guide_of, localization_errors
+from finssim.geometry.rotations import quat_from_yaw, quat_multiply
 from finssim.localization.pool import Pool
-from finssim.pool import Truth, VirtualPool, draw_plant, read_truth
+from finssim.pool import VirtualPool, draw_plant, read_truth
 from finssim.pool.camera import PoolCamera, camera_of
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
@@ -70,9 +58,8 @@ __all__ = [
     "noise_seed",
     "play",
     "play_in_pool",
+    "played_trial",
     "pool_evaluation",
-    "pool_jobs",
-    "read_series",
     "run_on_robot",
     "stand_in_pool",
 ]
@@ -107,22 +94,8 @@ class NoisyInput:
             seed: Of the errors; `reset` starts them again.
         """
         self._pilot, self._stds, self._seed = pilot, (position_std, yaw_std), seed
+        self.name, self.period, self.needs_state = pilot.name, pilot.period, pilot.needs_state
         self._random = np.random.default_rng(seed)
-
-    @property
-    def name(self) -> str:
-        """That of the pilot."""
-        return self._pilot.name
-
-    @property
-    def period(self) -> float:
-        """Time between two decisions [s]."""
-        return self._pilot.period
-
-    @property
-    def needs_state(self) -> bool:
-        """As the pilot."""
-        return self._pilot.needs_state
 
     def describe(self) -> dict[str, Any]:
         """The pilot and the noise."""
@@ -149,24 +122,16 @@ HARDWARE = "hardware"
 
 @dataclass(frozen=True, kw_only=True)
 class Job(campaign.Job):
-    """A controller, what it knows, where it is put, and what it is to do."""
+    """A controller, what it knows, where it is put, and what it is to do: a setpoint of T1 or a trajectory of T2."""
 
-    row: str
-    """Of the table."""
     controller: str
     """Policy directory, or the name of a PID."""
-    target: str
-    """Setpoint of T1 (P01 ...), or trajectory of T2."""
     vehicle: str = "finsrov"
     """Name or file of the vehicle as controller and localization know it."""
     pool_vehicle: str = "finsrov"
     """Name or file of the vehicle around which the pool's own is drawn."""
-    plant: int = 1
-    """Seed of the pool: vehicle, camera and water."""
     severity: str = "realistic"
     """nominal, realistic or hard."""
-    seed: int = 1
-    """Of the noise of this trial; trials of different targets never share noise."""
     camera: str = "pictures"
     """pictures (drawn and searched for tags) or corners (of the tags, with noise)."""
     fusion: bool = True
@@ -182,25 +147,6 @@ class Job(campaign.Job):
     def task(self) -> str:
         """t1 or t2."""
         return "t1" if self.target in T1_SETPOINTS else "t2"
-
-    def described(self) -> dict[str, Any]:
-        """Everything that decides the result, with the contents of files in place of their names."""
-        fields = asdict(self)
-        fields.pop("row")
-        fields["controller"] = files_of(self.controller)
-        for name in ("vehicle", "pool_vehicle"):
-            fields[name] = load_vehicle(fields[name]).sha256
-        return fields
-
-
-def files_of(controller: str) -> Any:
-    """The SHA-256 of a policy's files by name; of a PID its name."""
-    if controller in CONTROLLERS:
-        return controller
-    return {
-        name: hashlib.sha256((Path(controller) / name).read_bytes()).hexdigest()
-        for name in (DESCRIPTION_FILE, NETWORK_FILE)
-    }
 
 
 def noise_seed(*words: Any) -> int:
@@ -263,15 +209,16 @@ def play_in_pool(
         pool: As of `stand_in_pool`.
     """
     world, site = stand_in_pool(standing, start, **pool)
+    perception = Perception(vehicle, site, **estimator)
+    runtime = Runtime(
+        vehicle, site, trial.pilot, trial.guide, arm=True, perception=perception, recorder=recorder
+    )
+    longest = GETTING_READY + trial.duration
     with closing(world):
-        return play_trial(
-            trial,
-            lambda runtime, **how: run_lockstep(runtime, world, **how),
-            vehicle,
-            site,
-            perception=Perception(vehicle, site, **estimator),
-            recorder=recorder,
-        )
+        run_lockstep(
+            runtime, world, longest, show=trial.watch, until=lambda r: r.bridge.state == "fault" or trial.over(r)
+        )  # fmt: skip
+    return Outcome(trial=trial, runtime=runtime, fault=fault_of(trial, runtime))
 
 
 def job_trial(job: Job, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotTrial, Station]:
@@ -286,14 +233,9 @@ def job_trial(job: Job, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotTrial,
         PolicyError, ControlError: The controller does not fit the vehicle or the task.
     """
     standing = load_vehicle(job.pool_vehicle)
-    guide: Guide
-    if job.task == "t1":
-        x, y, z, yaw = in_room(T1_SETPOINTS[job.target], standing).tolist()
-        guide, first = Station((x, y, z), yaw, name=job.target), in_room(T1_START, standing).tolist()
-    else:
-        guide = load_trajectory(job.target, vehicle=standing)
-        reference = guide.at(0.0)
-        first = [*reference.position.tolist(), float(reference.yaw)]
+    guide = guide_of(job.target, standing)
+    first = guide.at(0.0)
+    *place, yaw = in_room(T1_START, standing) if job.task == "t1" else (*first.position, float(first.yaw))
     duration = guide.duration if math.isfinite(guide.duration) else job.duration
     pilot: Pilot = make_pilot(job.controller, vehicle, task=job.task)
     if job.position_noise or job.yaw_noise:
@@ -306,20 +248,26 @@ def job_trial(job: Job, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotTrial,
         over=lambda runtime: runtime.t >= duration,
         watch=_Estimates(),
     )
-    return trial, Station((first[0], first[1], first[2]), first[3])
+    return trial, Station(tuple(map(float, place)), float(yaw))  # type: ignore[arg-type]
 
 
 class _Estimates:
     """What the robot believed, at the period of the series."""
 
     def __init__(self) -> None:
-        self.rows: list[tuple[float, ...]] = []
+        self._rows: list[tuple[float, Any, Any]] = []
 
     def __call__(self, runtime: Runtime) -> None:
         reading, t = runtime.reading, runtime.t
-        if reading is None or math.isnan(t) or (self.rows and t < self.rows[-1][0] + PERIOD - 1e-6):
+        if reading is None or math.isnan(t) or (self._rows and t < self._rows[-1][0] + PERIOD - 1e-6):
             return
-        self.rows.append((t, *reading.position, float(quat_yaw(reading.quaternion))))
+        self._rows.append((t, reading.position, reading.quaternion))
+
+    def motion(self) -> Motion:
+        """All of it."""
+        t, position, quaternion = zip(*self._rows, strict=True) if self._rows else ((), (), ())
+        columns = (np.reshape(x, (-1, n)) for x, n in ((position, 3), (quaternion, 4)))
+        return Motion(t=np.array(t), **dict(zip(("position", "quaternion"), columns, strict=True)))
 
 
 def play(job: Job, path: Path) -> dict[str, Any]:
@@ -327,7 +275,7 @@ def play(job: Job, path: Path) -> dict[str, Any]:
 
     Args:
         job: Who, where and what.
-        path: PATH.npz takes the series of truth and estimate.
+        path: PATH.npz takes the true motion.
 
     Returns:
         The measures of its task, `fault` (why the bridge stopped it, or empty), `localization` (errors of the estimate
@@ -344,52 +292,43 @@ def play(job: Job, path: Path) -> dict[str, Any]:
             trial, start, vehicle, standing, estimator={"fusion": job.fusion}, plant=job.plant,
             severity=job.severity, seed=seed, camera=job.camera, truth=file,
         )  # fmt: skip
-        true = read_truth(file)
+        truth = read_truth(file)
+    t = truth.time - outcome.runtime.started
+    rows = np.flatnonzero((t >= 0.0) & (t <= trial.duration + 1e-6))
+    rows = rows[:: max(1, round(PERIOD / np.median(np.diff(t))))]
+    states = {name: getattr(truth, name) for name in ("position", "quaternion", "nu", "thrust")}
+    motion = Motion(t=t, **states).between(rows)
     assert isinstance(trial.watch, _Estimates)
-    series = _series(true, outcome.runtime.started, trial.duration, np.array(trial.watch.rows))
-    write_series(path, series)
-    truth = Motion(**{name: series[name] for name in ("t", "position", "yaw", "quaternion", "thrust")})
-    estimate = Motion(t=series["estimate_t"], position=series["estimate"], yaw=series["estimate_yaw"])
+    localization = localization_errors(motion, trial.watch.motion())
+    return _result(job, path, motion, outcome, began) | {"localization": localization}
+
+
+def _result(job: Job, path: Path, motion: Motion, outcome: Outcome, began: float) -> dict[str, Any]:
+    """Write the motion of a trial to PATH.npz, and measure it."""
+    motion.write(path)
+    trial = Trial(name=job.target, guide=outcome.trial.guide, motion=motion)
+    limits = load_vehicle(job.vehicle).force_limits
     return {
-        **measure(job.task, trial.guide, truth, vehicle.force_limits, stopped=bool(outcome.fault)),
+        **trial.measures(job.task, limits, stopped=bool(outcome.fault)),
         "fault": outcome.fault,
-        "room": room(standing.body.size),
-        "localization": localization_errors(truth, estimate),
+        "room": room(load_vehicle(job.pool_vehicle).body.size),
+        "localization": None,
         "missed_decisions": outcome.runtime.counters.missed,
         "seconds": time.perf_counter() - began,
         "provenance": provenance(),
     }
 
 
-def _series(truth: Truth, started: float, duration: float, estimates: Array) -> dict[str, Array]:
-    """Truth from the start of the guide's time, and the estimates at their own times."""
-    t = truth.time - started
-    rows = np.flatnonzero((t >= 0.0) & (t <= duration + 1e-6))
-    rows = rows[:: max(1, round(PERIOD / np.median(np.diff(truth.time))))]
-    estimates = estimates.reshape(-1, 5)
-    return {
-        "t": t[rows],
-        **{name: getattr(truth, name)[rows] for name in ("position", "quaternion", "nu", "thrust")},
-        "yaw": np.asarray(quat_yaw(truth.quaternion[rows])),
-        "estimate_t": estimates[:, 0],
-        "estimate": estimates[:, 1:4],
-        "estimate_yaw": estimates[:, 4],
-    }
+def played_trial(result: Mapping[str, Any], folder: Path) -> Trial:
+    """The trial of a result, with its motion.
 
-
-def write_series(path: Path, series: dict[str, Array]) -> None:
-    """Write PATH.npz."""
-    with atomic_write(path.with_name(f"{path.name}.npz")) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **series)
-
-
-def read_series(path: Path) -> dict[str, Array]:
-    """Read PATH.npz, which a trial leaves for figures, at 10 Hz.
-
-    `t` [s], `position` [m], `yaw` [rad] of the truth, `estimate` and `estimate_yaw`, and more.
+    Args:
+        result: As `run_jobs` returns it.
+        folder: Where `run_jobs` left the motions.
     """
-    with np.load(path.with_name(f"{path.name}.npz")) as file:
-        return {name: file[name] for name in file.files}
+    target = result["job"]["target"]
+    guide = guide_of(target, size=result.get("room", 1.0))
+    return Trial(name=target, guide=guide, motion=Motion.read(folder / result["key"]))
 
 
 def run_on_robot(
@@ -443,14 +382,14 @@ def run_on_robot(
                 )
             return _play_on_robot(job, path, opened[0])
 
-        results = campaign.run_in_turn(jobs, folder, play, show=show)
+        results = campaign.run_jobs(jobs, folder, play, processes=1, show=show)
     if not results:
         raise RobotError("every trial was skipped: there is nothing to report")
     return results
 
 
 def _play_on_robot(job: Job, path: Path, opened: Session) -> dict[str, Any] | None:
-    """One job; PATH.mcap takes the record, PATH.npz the series of the estimate. None if it was skipped."""
+    """One job; PATH.mcap takes the record, PATH.npz the estimate of the motion. None if it was skipped."""
     began, vehicle, record = time.perf_counter(), opened.vehicle, path.with_name(f"{path.name}.mcap")
     trial, start = job_trial(job, vehicle, seed=job.seed)
     mode = "constant-velocity" if opened.site is not None else "error-state"  # which takes all of slow fixes
@@ -467,56 +406,30 @@ def _play_on_robot(job: Job, path: Path, opened: Session) -> dict[str, Any] | No
     try:
         motion = read_record(record, job.task, vehicle, guide=trial.guide, duration=trial.duration).estimate
     except RecordedError:  # stopped before its first decision
-        nowhere = np.full((2, 3), np.nan)
-        motion = Motion(t=np.array([0.0, 0.1]), position=nowhere, yaw=nowhere[:, 0])
-    write_series(path, {"t": motion.t, "position": motion.position, "yaw": motion.yaw})
-    return {
-        **measure(job.task, trial.guide, motion, vehicle.force_limits, stopped=bool(outcome.fault)),
-        "fault": outcome.fault,
-        "room": room(vehicle.body.size),
-        "localization": None,
-        "robot": opened.robot.title,
-        "record": record.name,
-        "missed_decisions": outcome.runtime.counters.missed,
-        "seconds": time.perf_counter() - began,
-        "provenance": provenance(),
-    }
+        nowhere = np.full((2, 4), np.nan)
+        motion = Motion(t=np.array([0.0, 0.1]), position=nowhere[:, :3], quaternion=nowhere)
+    where = {"robot": opened.robot.title, "record": record.name}
+    return _result(job, path, motion, outcome, began) | where
 
 
-def pool_jobs(controllers: Mapping[str, str], targets: Sequence[str], **settings: Any) -> list[Job]:
-    """A trial of every controller on every setpoint.
-
-    Args:
-        controllers: Name of the row -> policy directory or name of a PID.
-        targets: Setpoints of T1.
-        settings: What all jobs have in common.
-    """
-    return [
-        Job(row=name, controller=controller, target=target, **settings)
-        for name, controller in controllers.items()
-        for target in targets
-    ]
-
-
-def pool_evaluation(jobs: Sequence[Job], results: Sequence[Mapping[str, Any]], folder: Path) -> Evaluation:
+def pool_evaluation(job: Job, results: Sequence[Mapping[str, Any]], folder: Path) -> Evaluation:
     """The trials of one controller in the form of an evaluation.
 
     Args:
-        jobs: Of one row, on setpoints.
-        results: Of `run_jobs`, in the same order.
-        folder: Where `run_jobs` left the series.
+        job: One of them, on setpoints.
+        results: Of `run_jobs`.
+        folder: Where `run_jobs` left the motions.
     """
-    job, first = jobs[0], results[0]
-    vehicle, standing = load_vehicle(job.vehicle), load_vehicle(job.pool_vehicle)
+    vehicle, first = load_vehicle(job.vehicle), results[0]
     agent = agent_for(job.controller, vehicle, task_named("t1"))
-    measures = [
-        {"trial": i, "setpoint": job.target}
-        | {key: value for key, value in result.items() if key not in ("job", "key", "provenance")}
-        for i, (job, result) in enumerate(zip(jobs, results, strict=True))
-    ]
     plant = {"name": "pool", "title": f"virtual pool {job.plant}, {job.severity}, around {job.pool_vehicle}"}
     if first.get("robot"):
-        plant = {"name": "hardware", "title": f"robot {first['robot']}, by its own estimate"}
+        plant = {"name": HARDWARE, "title": f"robot {first['robot']}, by its own estimate"}
+    trials = [played_trial(result, folder) for result in results]
+    measures = [
+        {key: value for key, value in result.items() if key not in ("job", "key", "provenance")}
+        for result in results
+    ]
     result = {
         "controller": agent.describe() | {"name": job.row},
         "task": "t1",
@@ -525,10 +438,7 @@ def pool_evaluation(jobs: Sequence[Job], results: Sequence[Mapping[str, Any]], f
         "plant": plant,
         "camera": job.camera,
         "seed": job.seed,
-        **summarize(measures),
+        **summary_of("t1", measures, trials),
         "provenance": dict(first["provenance"]),
     }
-    series = [read_series(folder / str(r["key"])) for r in results]
-    motions = [Motion(t=s["t"], position=s["position"], yaw=s["yaw"]) for s in series]
-    goals = np.array([in_room(T1_SETPOINTS[job.target], standing) for job in jobs])
-    return Evaluation(result, Trials(tuple(job.target for job in jobs), goals, *on_grid(motions, DURATION)))
+    return Evaluation(result, trials)

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import csv
-import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
-from rich.console import Console
 
 from finssim.control.allocation import Allocator
 from finssim.engine import Simulator, Water
@@ -23,13 +20,14 @@ from finssim.engine.ranges_file import Ranges
 from finssim.engine.ranges_table import ENTRIES, INDEX, drawn_entries
 from finssim.experiments.campaign import write_json
 from finssim.experiments.figures import COLORS, clean, legend_below, new_figure, save_figure
-from finssim.experiments.tables import console_table
+from finssim.experiments.tables import Table
 from finssim.files import atomic_directory
 from finssim.provenance import provenance
+from finssim.text_table import write_csv
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.terms import unit_of
 
-__all__ = ["randomize_show"]
+__all__ = ["randomize_show", "tables_of"]
 
 FAMILIES = {
     "added_mass": ("M_A", "kg", "kg m²"),
@@ -84,7 +82,8 @@ def rows_of(ranges: Ranges, vehicle: Vehicle, hydrodynamics: str = "calibrated")
     for center, field in (("center_of_gravity", "r_g"), ("center_of_buoyancy", "r_b")):
         for i, letter in enumerate("xyz"):
             if (entry := f"{center}.{letter}") in drawn:
-                rows.append(_shifted(entry, float(p[field][i]), "m", drawn[entry]))
+                (low, high), own = _bounds(drawn[entry], 0.0), float(p[field][i])
+                rows.append(Row(entry, own, own + low, own + high, "m", drawn[entry].text()))
     for family, (field, *units) in FAMILIES.items():
         for i, axis in enumerate(AXES):
             nominal = matrices[field][i][i]
@@ -110,18 +109,15 @@ def rows_of(ranges: Ranges, vehicle: Vehicle, hydrodynamics: str = "calibrated")
 def _scaled(entry: str, nominal: float, unit: str, factors: list[Distribution]) -> Row:
     low, high = nominal, nominal
     for factor in factors:
-        ends = factor.bounds()
-        if factor.probability < 1.0:
-            ends = min(ends[0], 1.0), max(ends[1], 1.0)
-        low, high = low * ends[0], high * ends[1]
+        least, most = _bounds(factor, 1.0)
+        low, high = low * least, high * most
     return Row(entry, nominal, min(low, high), max(low, high), unit, " × ".join(f.text() for f in factors))
 
 
-def _shifted(entry: str, nominal: float, unit: str, drawn: Distribution) -> Row:
+def _bounds(drawn: Distribution, otherwise: float) -> tuple[float, float]:
+    """Least and greatest; what it is where it is drawn in some episodes only counts too."""
     low, high = drawn.bounds()
-    if drawn.probability < 1.0:
-        low, high = min(low, 0.0), max(high, 0.0)
-    return Row(entry, nominal, nominal + low, nominal + high, unit, drawn.text())
+    return (low, high) if drawn.probability >= 1.0 else (min(low, otherwise), max(high, otherwise))
 
 
 def _others(drawn: dict[str, Distribution]) -> Iterator[Row]:
@@ -207,7 +203,6 @@ def randomize_show(
     hydrodynamics: str = "calibrated",
     samples: Annotated[int, (2, 100000)] = 200,
     seed: int = 0,
-    as_json: bool = False,
 ) -> dict[str, Any]:
     """Tell what ranges mean for a vehicle: its numbers in SI, and how far its step responses spread.
 
@@ -223,7 +218,6 @@ def randomize_show(
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
         samples: Vehicles to draw.
         seed: Seed of every random number; equal seeds give equal results.
-        as_json: Print one JSON object instead of tables.
 
     Returns:
         The record.
@@ -251,17 +245,12 @@ def randomize_show(
             "provenance": provenance(),
         }
         write_json(place / RECORD, record)
-        with (place / "entries.csv").open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, [field.name for field in fields(Row)])
-            writer.writeheader()
-            writer.writerows(record["entries"])
+        write_csv(
+            place / "entries.csv", list(record["entries"][0]), [one.values() for one in record["entries"]]
+        )
         title = f"{randomization.ranges.name} on {chosen.name}: half the wrench limit on one axis, {samples} draws"
         own = {axis: nominal[axis][0] for axis in STEPS}
         save_figure(draw_spread(t, drawn, own, title), place / "spread.png")
-    if as_json:
-        print(json.dumps(record))
-    else:
-        _print(record, rows, out)
     return record
 
 
@@ -324,29 +313,30 @@ def _speeds(drawn: Array, nominal: Array) -> dict[str, float]:
     return {"nominal": float(nominal[-1])} | {f"p{p:g}": x for p, x in zip(BAND, bounds, strict=True)}
 
 
-def _print(record: Mapping[str, Any], rows: Sequence[Row], out: Path) -> None:
-    console = Console()
-    cells = [
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
+    """The entries in SI, and the speeds after the steps."""
+    entries = [
         [
-            row.entry,
-            *("–" if x is None else f"{x:.4g}" for x in (row.nominal, row.low, row.high)),
-            row.unit,
-            row.drawn,
+            one["entry"],
+            *("–" if x is None else f"{x:.4g}" for x in (one["nominal"], one["low"], one["high"])),
+            one["unit"],
+            one["drawn"],
         ]
-        for row in rows
+        for one in result["entries"]
     ]
-    heads = ("entry", "file", "low", "high", "unit", "drawn as")
-    title = f"{record['ranges']['name']} on {record['vehicle']['name']}"
-    console.print(console_table(heads, cells, left=(0, 4, 5), title=title))
-    cells = [
+    speeds = [
         [
             "heave, down" if axis == "heave" else axis,
-            *(f"{speeds[key]:.3f}" for key in ("nominal", "p5", "p50", "p95")),
+            *(f"{of_axis[key]:.3f}" for key in ("nominal", "p5", "p50", "p95")),
             "rad/s" if axis == "yaw" else "m/s",
         ]
-        for axis, speeds in record["speeds"].items()
+        for axis, of_axis in result["speeds"].items()
     ]
-    heads = ("axis", "file", "5 %", "median", "95 %", "unit")
-    title = f"speed after {DURATION:g} s at half the wrench limit"
-    console.print(console_table(heads, cells, left=(0, 5), title=title))
-    console.print(f"written: {out}", highlight=False, markup=False, soft_wrap=True)
+    title = f"{result['ranges']['name']} on {result['vehicle']['name']}"
+    heads = ("entry", "file", "low", "high", "unit", "drawn as")
+    speed_heads = ("axis", "file", "5 %", "median", "95 %", "unit")
+    after = f"speed after {DURATION:g} s at half the wrench limit"
+    return [
+        Table(title=title, heads=heads, rows=entries, left=(0, 4, 5)),
+        Table(title=after, heads=speed_heads, rows=speeds, left=(0, 5)),
+    ]

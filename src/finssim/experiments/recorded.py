@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,26 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.calibration.trials.table_file import read_table
-from finssim.control.guidance import Guide, Reference, Track
-from finssim.control.trajectories import load_trajectory
+from finssim.control.guidance import Guide, Reference
 from finssim.experiments.driven import SAME_GOAL, Drive, read_drive, station_at, trajectory_of
-from finssim.experiments.metrics import (
-    ERRORS,
-    MAX_GAP,
-    T1_SETPOINTS,
-    in_room,
-    measure_tracking,
-    measure_trial,
-)
-from finssim.experiments.trials import DURATION, TrackingTrials, Trials
-from finssim.geometry.rotations import (
-    quat_conjugate,
-    quat_from_yaw,
-    quat_inverse_rotate,
-    quat_multiply,
-    quat_to_rotvec,
-    quat_yaw,
-)
+from finssim.experiments.metrics import MAX_GAP, T1_SETPOINTS, in_room
+from finssim.experiments.trials import DURATION, Motion, Trial, follows, localization_errors
+from finssim.geometry.rotations import quat_from_yaw
 from finssim.pool.task_site import Referee
 from finssim.pool.virtual_pool import read_truth
 from finssim.robot.record_reader import open_record
@@ -44,175 +27,9 @@ from finssim.viewer.sources.alignment import offset_between
 from finssim.viewer.sources.series import PoseSeries
 from finssim.yaml_file import json_value
 
-__all__ = ["RecordedError", "RecordedTrial", "measured_records", "read_record"]
+__all__ = ["RecordedError", "RecordedTrial", "read_record"]
 
 Array = NDArray[np.float64]
-
-PERIOD = 0.1
-"""Between the samples of a common grid [s]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Motion:
-    """Samples of a trial in the order of their times; world frame, SI, NaN where unknown."""
-
-    t: Array
-    """Time since the guide's start [s], (T,)."""
-    position: Array
-    """Body origin [m], (T, 3)."""
-    yaw: Array
-    """Heading [rad], (T,)."""
-    quaternion: Array | None = None
-    """Body to world, xyzw, (T, 4); None where roll and pitch are not known."""
-    nu: Array | None = None
-    """Velocity of the body origin, body frame [m/s, rad/s], (T, 6); None where it is not measured."""
-    thrust: Array | None = None
-    """Of each thruster [N], (T, n); None where not known."""
-    action: Array | None = None
-    """What was done from then on, in [-1, 1], (T, size); None where not known."""
-
-    def at(self, t: float) -> Track:
-        """Where the vehicle was at a time [s], between the samples; velocities that are not measured are differences
-        over a `PERIOD` to either side."""
-        position = self._between(self.position, t)
-        quaternion = self._attitude(t)
-        if self.nu is not None:
-            return Track(position, quaternion, self._between(self.nu, t))
-        first, last = max(t - PERIOD, float(self.t[0])), min(t + PERIOD, float(self.t[-1]))
-        way = self._between(self.position, last) - self._between(self.position, first)
-        turn = quat_to_rotvec(quat_multiply(quat_conjugate(self._attitude(first)), self._attitude(last)))
-        linear = np.asarray(quat_inverse_rotate(quaternion, way))
-        return Track(position, quaternion, np.concatenate([linear, turn]) / max(last - first, 1e-9))
-
-    def done(self, t: float) -> Array:
-        """What was done from a time on [s], by the last decision before it; empty where not known."""
-        if self.action is None or t < self.t[0] - 1e-3:
-            return np.zeros(0)
-        done: Array = self.action[int(np.searchsorted(self.t, t + 1e-3)) - 1]
-        return done
-
-    def _attitude(self, t: float) -> Array:
-        if self.quaternion is None:
-            return np.asarray(quat_from_yaw(float(np.interp(t, self.t, np.unwrap(self.yaw)))))
-        flips = np.cumprod(
-            np.where(np.sum(self.quaternion[1:] * self.quaternion[:-1], axis=1) < 0.0, -1.0, 1.0)
-        )
-        q = self._between(self.quaternion * np.concatenate([[1.0], flips])[:, None], t)
-        return q / np.linalg.norm(q)
-
-    def _between(self, columns: Array, t: float) -> Array:
-        return np.array([np.interp(t, self.t, column) for column in columns.T])
-
-
-def follows(task: Task) -> bool:
-    """Whether it follows a reference that is known ahead."""
-    return hasattr(task, "knot_spacing")
-
-
-def score(
-    task: Task, vehicle: Vehicle, guide: Guide, motion: Motion, done: Motion, duration: float
-) -> tuple[dict[str, float | None], str]:
-    """How the task itself measures an episode of one vehicle that was played elsewhere.
-
-    Args:
-        task: Fitted to the vehicle.
-        vehicle: Which was driven.
-        guide: Where the task's goal is, by the time from the start.
-        motion: By which it is measured, from the start.
-        done: With the actions.
-        duration: Up to when it was played [s].
-
-    Returns:
-        Its metrics, None where there is none; and why there are none, in a sentence, which counts without success.
-    """
-    size = 0 if done.action is None else done.action.shape[1]
-    referee = Referee(task, [vehicle], guide=guide, start=motion.at(0.0), action_size=size or None)
-    (name,), fault = task.agents, ""
-    times = np.concatenate([[0.0], motion.t, [duration]])
-    widest = int(np.argmax(np.diff(times)))
-    if times[widest + 1] - times[widest] > MAX_GAP:
-        fault = f"no position from {times[widest]:.1f} to {times[widest + 1]:.1f} s"
-    for k in range(round(duration / task.control_step) if not fault else 0):
-        actions = {name: done.done(k * task.control_step)}
-        referee.look({name: motion.at((k + 1) * task.control_step)}, actions)
-        if referee.over:
-            break
-    if not referee.over:
-        unknown: dict[str, float | None] = dict.fromkeys(referee.metrics())
-        return unknown | ({"success": 0.0} if "success" in unknown else {}), fault or "ended early"
-    return {key: x if math.isfinite(x) else None for key, x in referee.metrics().items()}, ""
-
-
-def measure(
-    task: str, guide: Guide, motion: Motion, limits: tuple[ArrayLike, ArrayLike], *, stopped: bool
-) -> dict[str, Any]:
-    """What `measure_trial` says of a trial of T1, with its goal, or `measure_tracking` of one of T2, with `success`.
-
-    Args:
-        task: t1 or t2.
-        guide: Station or trajectory.
-        motion: From the guide's start.
-        limits: Lower and upper limit of each thruster [N], (n,) each.
-        stopped: Whether it ended before its time: errors of half a way say nothing of the other half.
-    """
-    if task == "t1":
-        at = guide.at(0.0)
-        x, y, z = map(float, at.position)
-        measures = measure_trial(motion.t, motion.position, motion.yaw, (x, y, z, float(at.yaw)))
-        return {"goal": [x, y, z, math.degrees(at.yaw)], **measures}
-    measures = measure_tracking(
-        motion.t,
-        motion.position,
-        guide,
-        quaternion=motion.quaternion,
-        thrust=motion.thrust,
-        limits=limits,
-    )
-    if stopped:
-        measures |= dict.fromkeys(ERRORS)
-    return {"success": bool(measures["complete"]) and not stopped, **measures}
-
-
-def localization_errors(truth: Motion, estimate: Motion) -> dict[str, float] | None:
-    """Errors of an estimate at its own times: rms in 3-D and horizontally [m], and in heading [°]; None without any."""
-    t = estimate.t
-    inside = (t >= truth.t[:1].max(initial=0.0)) & (t <= truth.t[-1:].max(initial=-1.0))
-    inside &= np.isfinite(estimate.position).all(axis=1)
-    if not inside.any():
-        return None
-    true = np.stack([np.interp(t[inside], truth.t, column) for column in truth.position.T], axis=1)
-    error = estimate.position[inside] - true
-    turn = estimate.yaw[inside] - np.interp(t[inside], truth.t, np.unwrap(truth.yaw))
-    turn = (turn + math.pi) % (2.0 * math.pi) - math.pi
-    return {
-        "position_m": float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),
-        "horizontal_m": float(np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1)))),
-        "heading_deg": math.degrees(float(np.sqrt(np.mean(turn**2)))),
-    }
-
-
-def on_grid(motions: Sequence[Motion], duration: float) -> tuple[Array, Array, Array]:
-    """Motions on one grid of times; NaN after a trial that ended early.
-
-    Args:
-        motions: Of n trials, their samples no more than `PERIOD` apart.
-        duration: Of the grid [s].
-
-    Returns:
-        Times [s], (T,); positions [m], (T, n, 3); headings [rad], (T, n).
-    """
-    t: Array = np.arange(round(duration / PERIOD) + 1, dtype=np.float64) * PERIOD
-    position, yaw = np.full((len(t), len(motions), 3), np.nan), np.full((len(t), len(motions)), np.nan)
-    for i, motion in enumerate(motions):
-        if not len(motion.t):
-            continue
-        # The motion's own first and last samples lie within a period of the grid's.
-        inside = (t >= motion.t[0] - PERIOD) & (t <= motion.t[-1] + PERIOD)
-        for axis in range(3):
-            position[inside, i, axis] = np.interp(t[inside], motion.t, motion.position[:, axis])
-        yaw[inside, i] = np.interp(t[inside], motion.t, np.unwrap(motion.yaw))
-    return t, position, yaw
-
 
 PUBLISHED = ("t1", "t2")
 """Tasks that are measured as in the paper; every other one measures itself."""
@@ -224,18 +41,15 @@ class RecordedError(ValueError):
     """A record or a truth that cannot be measured."""
 
 
-@dataclass(frozen=True)
-class RecordedTrial:
+@dataclass(frozen=True, kw_only=True)
+class RecordedTrial(Trial):
     """What one record shows."""
 
     path: Path
-    guide: Guide
     pilot: dict[str, Any]
     """Who steered, as the record describes it."""
     estimate: Motion
-    """What the robot knew at its decisions."""
-    motion: Motion
-    """By which it is measured: the truth, or the estimate."""
+    """What the robot knew at its decisions; the motion is the truth, where there is one, or the estimate."""
     stopped: bool
     """Whether it ended before its time."""
     duration: float
@@ -243,24 +57,47 @@ class RecordedTrial:
     offset: float | None
     """Added to the truth's times to put them on the robot's clock [s]; None without a truth."""
 
-    def measures(self, task: str, vehicle: Vehicle) -> dict[str, Any]:
-        """What `motion.measure` says of T1 and T2 and the task of itself, and how far the estimate was from the truth.
+    def scores(self, task: str, vehicle: Vehicle) -> dict[str, Any]:
+        """`measures` of T1 and T2 or what the task measures of itself, and how far the estimate was from the truth.
 
         Raises:
             ControlError: The task cannot score what was played elsewhere.
         """
         if task in PUBLISHED:
             fault = "ended early" if self.stopped else ""
-            row = measure(task, self.guide, self.motion, vehicle.force_limits, stopped=self.stopped)
+            row = self.measures(task, vehicle.force_limits, stopped=self.stopped)
         else:
-            fitted = fitted_task(task, vehicle)
-            row, fault = score(fitted, vehicle, self.guide, self.motion, self.estimate, self.duration)
+            row, fault = self._scored(fitted_task(task, vehicle), vehicle)
         return {
             **row,
             "fault": fault,
             "localization": None if self.offset is None else localization_errors(self.motion, self.estimate),
             "clock_offset_s": self.offset,
         }
+
+    def _scored(self, task: Task, vehicle: Vehicle) -> tuple[dict[str, float | None], str]:
+        """How a task measures an episode of one vehicle that was played elsewhere.
+
+        Returns:
+            Its metrics, None where there is none; and why there are none, in a sentence, which counts without success.
+        """
+        motion, actions = self.motion, self.estimate.action
+        size = 0 if actions is None else actions.shape[1]
+        referee = Referee(task, [vehicle], guide=self.guide, start=motion.at(0.0), action_size=size or None)
+        (name,), fault = task.agents, ""
+        times = np.concatenate([[0.0], motion.t, [self.duration]])
+        widest = int(np.argmax(np.diff(times)))
+        if times[widest + 1] - times[widest] > MAX_GAP:
+            fault = f"no position from {times[widest]:.1f} to {times[widest + 1]:.1f} s"
+        for k in range(round(self.duration / task.control_step) if not fault else 0):
+            action = {name: self.estimate.action_at(k * task.control_step)}
+            referee.look({name: motion.at((k + 1) * task.control_step)}, action)
+            if referee.over:
+                break
+        if not referee.over:
+            unknown: dict[str, float | None] = dict.fromkeys(referee.metrics())
+            return unknown | ({"success": 0.0} if "success" in unknown else {}), fault or "ended early"
+        return {key: x if math.isfinite(x) else None for key, x in referee.metrics().items()}, ""
 
 
 def read_record(
@@ -299,9 +136,10 @@ def read_record(
     drive = read_drive(path, vehicle)
     pilot = _pilot(path)
     steered = drive.stretch >= 0
-    if not (steered & (drive.since >= 0.0)).any():
+    t = drive.motion.t
+    if not (steered & (t >= 0.0)).any():
         raise RecordedError(f"{path}: the robot was never armed with its state known: nothing was done in it")
-    if task not in PUBLISHED and not drive.action.shape[1]:
+    if task not in PUBLISHED and not np.size(drive.motion.action):
         raise RecordedError(
             f"{path}: does not tell what the pilot did, in [-1, 1], which '{task}' scores: record a run of this version"
         )
@@ -310,79 +148,22 @@ def read_record(
     else:
         the_guide = GoalHistory.of(drive, steered) if fitted.moving else _station(drive, steered, task)
     longest = {"t1": duration, "t2": math.inf}.get(task, fitted.time_limit)
-    whole = min(the_guide.duration, longest)
-    rows = steered & (drive.since >= 0.0) & (drive.since <= whole + 1e-6)
-    estimate = Motion(
-        t=drive.since[rows],
-        position=drive.position[rows],
-        yaw=np.asarray(quat_yaw(drive.quaternion[rows])),
-        quaternion=drive.quaternion[rows],
-        nu=drive.nu[rows],
-        thrust=drive.force[rows],
-        action=drive.action[rows],
+    full = min(the_guide.duration, longest)
+    estimate = drive.motion.between(steered & (t >= 0.0) & (t <= full + 1e-6))
+    stopped = float(estimate.t[-1]) < full - EARLY
+    until = float(estimate.t[-1]) if stopped else full
+    motion, offset = (estimate, None) if truth is None else _truth(truth, drive, until)
+    return RecordedTrial(
+        name=_setpoint(the_guide, vehicle) if task == "t1" else the_guide.name,
+        guide=the_guide,
+        motion=motion,
+        path=path,
+        pilot=pilot or {"name": drive.driver},
+        estimate=estimate,
+        stopped=stopped,
+        duration=until,
+        offset=offset,
     )
-    last = float(estimate.t[-1])
-    stopped = last < whole - EARLY
-    played = last if stopped else whole
-    motion, offset = estimate, None
-    if truth is not None:
-        motion, offset = _truth(truth, drive, played)
-    about = pilot or {"name": drive.driver}
-    return RecordedTrial(path, the_guide, about, estimate, motion, stopped, played, offset)
-
-
-def measured_records(
-    records: Sequence[Path],
-    task: str,
-    vehicle: Vehicle,
-    *,
-    trajectory: str | Path | None = None,
-    truth: Path | None = None,
-) -> tuple[dict[str, Any], list[dict[str, Any]], Trials | TrackingTrials | None]:
-    """What an evaluation says of records: who and where, the measures by trial, and of t1 and t2 the motions to draw.
-
-    Args:
-        records: MCAP files.
-        task: As of `read_record`.
-        vehicle: The very one that was driven.
-        trajectory: Name or file of what was followed; the record's own if None.
-        truth: As of `read_record`, of one record or of all.
-
-    Raises:
-        RecordedError: As `read_record`, or the records are of several controllers.
-    """
-    guide = None if trajectory is None else load_trajectory(trajectory, vehicle=vehicle)
-    found = [read_record(path, task, vehicle, guide=guide, truth=truth) for path in records]
-    pilots = [trial.pilot for trial in found]
-    if any(pilot != pilots[0] for pilot in pilots):
-        names = ", ".join(dict.fromkeys(str(pilot.get("name")) for pilot in pilots))
-        raise RecordedError(
-            f"the records are of several controllers ({names}): evaluate those of one at a time"
-        )
-    measures = [
-        {
-            "trial": i,
-            **_goal_named(task, trial.guide, vehicle),
-            "record": trial.path.name,
-            **trial.measures(task, vehicle),
-        }
-        for i, trial in enumerate(found)
-    ]
-    described = {
-        "controller": {"kind": "pid", "action": "wrench6", "hydrodynamics": "calibrated"} | pilots[0],
-        "task": task,
-        "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
-        "hydrodynamics": "calibrated",
-        "plant": {
-            "name": "record",
-            "title": f"as recorded, by {'its own estimate' if truth is None else truth.name}",
-        },
-        "records": [
-            {"file": t.path.name, "sha256": hashlib.sha256(t.path.read_bytes()).hexdigest()} for t in found
-        ],
-        "truth": None if truth is None else truth.name,
-    }
-    return described, measures, _trials(found, task, vehicle) if task in PUBLISHED else None
 
 
 def _pilot(path: Path) -> dict[str, Any]:
@@ -415,8 +196,8 @@ class GoalHistory:
         Raises:
             RecordedError: There was no goal.
         """
-        goals, rows = _goals(drive, steered), steered & (drive.since >= 0.0)
-        return cls(drive.since[rows], np.column_stack([goals[:, :3], np.unwrap(goals[:, 3])]))
+        goals, rows = _goals(drive, steered), steered & (drive.motion.t >= 0.0)
+        return cls(drive.motion.t[rows], np.column_stack([goals[:, :3], np.unwrap(goals[:, 3])]))
 
     def at(self, t: ArrayLike) -> Reference:
         """The goal between the decisions."""
@@ -432,7 +213,7 @@ def _goals(drive: Drive, steered: NDArray[np.bool_]) -> Array:
     """Where the vehicle should have been, by decision."""
     if not drive.has_goal:
         raise RecordedError(f"{drive.path}: was driven by hand to no goal: a record of finssim run has one")
-    return drive.goal[steered & (drive.since >= 0.0)]
+    return drive.goal[steered & (drive.motion.t >= 0.0)]
 
 
 def _station(drive: Drive, steered: NDArray[np.bool_], task: str) -> Guide:
@@ -446,57 +227,32 @@ def _station(drive: Drive, steered: NDArray[np.bool_], task: str) -> Guide:
     return station_at(goals[0])
 
 
-def _goal_named(task: str, guide: Guide, vehicle: Vehicle) -> dict[str, str]:
-    """What a trial of t1 and t2 went to, for its row."""
-    if task not in PUBLISHED:
-        return {}
-    return {"setpoint": _setpoint(guide, vehicle)} if task == "t1" else {"trajectory": guide.name}
-
-
 def _setpoint(guide: Guide, vehicle: Vehicle) -> str:
     """Name of the published setpoint that a station is, else its numbers."""
-    goal = _row(guide)
-    known = {name: in_room(pose, vehicle) for name, pose in T1_SETPOINTS.items()}
-    near = (name for name, pose in known.items() if np.abs(pose - goal).max() <= SAME_GOAL)
-    return next(near, ",".join(f"{x:.3g}" for x in _goal(guide)))
-
-
-def _row(guide: Guide) -> Array:
-    goal = guide.at(0.0)
-    return np.array([*goal.position, float(goal.yaw)])
-
-
-def _goal(guide: Guide) -> list[float]:
-    x, y, z, yaw = _row(guide).tolist()
-    return [x, y, z, math.degrees(yaw)]
+    start = guide.at(0.0)
+    goal = np.array([*start.position, float(start.yaw)])
+    published = {name: in_room(pose, vehicle) for name, pose in T1_SETPOINTS.items()}
+    near = (name for name, pose in published.items() if np.abs(pose - goal).max() <= SAME_GOAL)
+    return next(near, ",".join(f"{x:.3g}" for x in (*goal[:3], math.degrees(goal[3]))))
 
 
 def _truth(path: Path, drive: Drive, until: float) -> tuple[Motion, float]:
     """The true motion from the guide's start to a time after it [s], and what was added to its times."""
-    time, position, yaw, quaternion, nu = _table(path)
+    motion = _table(path)
     try:
-        offset = offset_between(PoseSeries(drive.time, drive.position, drive.quaternion), time, position)
+        robot = PoseSeries(drive.time, drive.motion.position, drive.motion.quaternion)
+        offset = offset_between(robot, motion.t, motion.position)
     except ViewError as error:
         raise RecordedError(f"{path}: {error}") from None
-    t = time + offset - (drive.time[0] - drive.since[0])
-    rows = (t >= 0.0) & (t <= until + 1e-6)
-    return (
-        Motion(
-            t=t[rows],
-            position=position[rows],
-            yaw=yaw[rows],
-            quaternion=None if quaternion is None else quaternion[rows],
-            nu=None if nu is None else nu[rows],
-        ),
-        offset,
-    )
+    t = motion.t + offset - (drive.time[0] - drive.motion.t[0])
+    return replace(motion, t=t).between((t >= 0.0) & (t <= until + 1e-6)), offset
 
 
-def _table(path: Path) -> tuple[Array, Array, Array, Array | None, Array | None]:
-    """Times [s], positions [m], headings [rad], orientations and velocities of a truth; None where it has none."""
+def _table(path: Path) -> Motion:
+    """A truth, by its own clock."""
     if path.suffix.lower() not in (".csv", ".txt", ".tsv", ".parquet"):
-        found = read_truth(path)
-        return found.time, found.position, np.asarray(quat_yaw(found.quaternion)), found.quaternion, found.nu
+        truth = read_truth(path)
+        return Motion(t=truth.time, position=truth.position, quaternion=truth.quaternion, nu=truth.nu)
     columns = read_table(path).numbers
     attitude = ("qx", "qy", "qz", "qw")
     turned = set(attitude) <= set(columns)
@@ -512,24 +268,5 @@ def _table(path: Path) -> tuple[Array, Array, Array, Array | None, Array | None]
         raise RecordedError(
             f"{path}: {len(rows)} rows with all numbers, expected 2 or more with t increasing"
         )
-    quaternion = rows[:, 4:8] if turned else None
-    yaw = rows[:, 4] if quaternion is None else np.asarray(quat_yaw(quaternion))
-    return rows[:, 0], rows[:, 1:4], yaw, quaternion, None
-
-
-def _trials(found: Sequence[RecordedTrial], task: str, vehicle: Vehicle) -> Trials | TrackingTrials:
-    """The motions on one grid, for figures."""
-    guides = tuple(trial.guide for trial in found)
-    longest = DURATION if task == "t1" else max(guide.duration for guide in guides)
-    t, position, yaw = on_grid([trial.motion for trial in found], longest)
-    if task == "t1":
-        return Trials(
-            tuple(_setpoint(guide, vehicle) for guide in guides),
-            np.stack([_row(guide) for guide in guides]),
-            t,
-            position,
-            yaw,
-        )
-    shape = (len(t), len(found))
-    unknown = np.full((*shape, 4), np.nan), np.full((*shape, len(vehicle.thrusters)), np.nan)
-    return TrackingTrials(guides, t, position, *unknown, vehicle.force_limits)
+    quaternion = rows[:, 4:8] if turned else quat_from_yaw(rows[:, 4])
+    return Motion(t=rows[:, 0], position=rows[:, 1:4], quaternion=quaternion, heading_only=not turned)

@@ -13,19 +13,19 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
-from finssim.experiments.campaign import Say, choice, write_json
+from finssim.experiments.campaign import Say, check_choices, write_json
 from finssim.experiments.pool_trial import stand_in_pool
-from finssim.pool import TruthError, VirtualPool, read_truth
+from finssim.experiments.tables import Table
+from finssim.pool import TruthError, read_truth
 from finssim.provenance import provenance
 from finssim.robot.goals import station_of
 from finssim.robot.lockstep import run_lockstep
@@ -40,9 +40,8 @@ __all__ = [
     "await_flush",
     "await_thrust",
     "pair",
-    "print_soak",
-    "print_timing",
     "soak",
+    "tables_of",
     "timing",
 ]
 
@@ -108,23 +107,20 @@ class Process:
             self.kill()
             return self._process.returncode
 
+    def __enter__(self) -> Process:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """A process does not outlive its block."""
+        if self.running:
+            self.kill()
+
     def broke(self) -> str:
         """What broke through to the person who started it; nothing if it ended as it should."""
         lines = self.complained.splitlines()
         if any(line.startswith("Traceback") for line in lines) or self._process.returncode == 1:
             return f"{self.name}: {lines[-1] if lines else 'exit status 1'}"
         return ""
-
-
-@contextmanager
-def start(words: Sequence[str], folder: Path, name: str) -> Iterator[Process]:
-    """A process that does not outlive the block; arguments as of `Process`."""
-    process = Process(words, folder, name)
-    try:
-        yield process
-    finally:
-        if process.running:
-            process.kill()
 
 
 @dataclass(frozen=True)
@@ -158,25 +154,37 @@ def pair(
     world = ["pool", *both, "--port", str(port), "--robot", end, *pool]
     ours = ["run", *both, "--goal", goal, "--arm", "--json", "--bind", end, *robot]
     wires = ["--robot", f"udp://127.0.0.1:{port}", "--pictures", f"udp://127.0.0.1:{port + 1}"]
-    with start(world, folder, "pool") as first:
-        await_line("pictures: ", first)
-        with start([*ours, *wires], folder, "robot") as second:
+    with Process(world, folder, "pool") as first:
+        silent = "the pool never said 'pictures: '"
+        _await(
+            lambda: "pictures: " in first.said,
+            10.0 * POLL,
+            lambda: first.running,
+            lambda: f"{silent}: {first.complained.strip()[-300:] or 'no error'}",
+        )
+        with Process([*ours, *wires], folder, "robot") as second:
             yield Pair(first, second, port)
 
 
-def await_line(text: str, process: Process) -> None:
-    """Wait until a process has said something.
+def _await(
+    ready: Callable[[], bool], poll: float, running: Callable[[], bool], failure: Callable[[], str]
+) -> None:
+    """Wait for something.
+
+    Args:
+        ready: Whether it has come about.
+        poll: Between looks [s].
+        running: Whether it still can.
+        failure: What is raised if it does not, or takes too long.
 
     Raises:
-        ReliabilityError: It ended, or took too long.
+        ReliabilityError: It did not come about.
     """
     deadline = time.monotonic() + STARTING
-    while text not in process.said:
-        if not process.running or time.monotonic() > deadline:
-            raise ReliabilityError(
-                f"{process.name} never said '{text}': {process.complained.strip()[-300:] or 'no error'}"
-            )
-        time.sleep(10.0 * POLL)
+    while not ready():
+        if not running() or time.monotonic() > deadline:
+            raise ReliabilityError(failure())
+        time.sleep(poll)
 
 
 def await_thrust(truth: Path, bound: float, process: Process) -> None:
@@ -185,17 +193,18 @@ def await_thrust(truth: Path, bound: float, process: Process) -> None:
     Raises:
         ReliabilityError: They never do, or the process that should turn them has ended.
     """
-    deadline = time.monotonic() + STARTING
-    while True:
+
+    def turning() -> bool:
         try:
-            if abs(read_truth(truth).thrust[-50:]).max(initial=0.0) > bound:
-                return
+            return bool(abs(read_truth(truth).thrust[-50:]).max(initial=0.0) > bound)
         except TruthError:
-            pass  # not begun yet
-        if not process.running or time.monotonic() > deadline:
-            why = (process.complained + process.said).strip()[-300:] or "it said nothing"
-            raise ReliabilityError(f"no thruster ever turned: {process.name}: {why}")
-        time.sleep(20.0 * POLL)
+            return False  # not begun yet
+
+    def failure() -> str:
+        why = (process.complained + process.said).strip()[-300:] or "it said nothing"
+        return f"no thruster ever turned: {process.name}: {why}"
+
+    _await(turning, 20.0 * POLL, lambda: process.running, failure)
 
 
 def await_flush(truth: Path) -> float:
@@ -203,34 +212,29 @@ def await_flush(truth: Path) -> float:
 
     The pool writes half a second at a time, so that the last record is as old as one look takes.
     """
-    size, deadline = truth.stat().st_size, time.monotonic() + STARTING
-    while truth.stat().st_size == size:
-        if time.monotonic() > deadline:
-            raise ReliabilityError(f"{truth} does not grow: the pool stands still")
-        time.sleep(POLL)
+    size = truth.stat().st_size
+    still = f"{truth} does not grow: the pool stands still"
+    _await(lambda: truth.stat().st_size > size, POLL, lambda: True, lambda: still)
     return float(read_truth(truth).time[-1])
 
 
 def free_ports() -> tuple[int, int]:
     """Ports of the pool's and of the robot's end; the two after the first and the one after the second are free too."""
     for _ in range(100):
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.bind(("127.0.0.1", 0))
-            first = probe.getsockname()[1]
-        wanted = [first + k for k in range(6)]
-        if wanted[-1] < 65536 and all(map(_free, wanted)):
+        with ExitStack() as stack:
+            probes = [
+                stack.enter_context(socket.socket(socket.AF_INET, kind))
+                for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM) * 6
+            ]
+            try:
+                probes[0].bind(("127.0.0.1", 0))
+                first: int = probes[0].getsockname()[1]
+                for k, probe in enumerate(probes[1:], start=1):
+                    probe.bind(("127.0.0.1", first + k // 2))
+            except (OSError, OverflowError):
+                continue
             return first, first + 4
     raise ReliabilityError("no six free ports in a row on this machine: end some programs")
-
-
-def _free(port: int) -> bool:
-    try:
-        for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM):
-            with socket.socket(socket.AF_INET, kind) as probe:
-                probe.bind(("127.0.0.1", port))
-    except OSError:
-        return False
-    return True
 
 
 # `finssim experiment soak`: the robot's whole software at work for hours of vehicle time, its memory watched.
@@ -280,13 +284,28 @@ def soak(
     pool, site = stand_in_pool(body, station, plant=seed, severity=severity, seed=seed)
     runtime = Runtime(body, site, make_pilot("pid", body), station, arm=True)
     began = time.perf_counter()
+    samples: list[tuple[float, ...]] = []
     with (folder / "soak.csv").open("w", newline="", encoding="utf-8") as file:
-        samples = _Samples(file, pool, lambda t, words: say(min(t / duration, 1.0), words))
+        writer = csv.writer(file)
+        writer.writerow(HEADS)
+
+        def sample(runtime: Runtime) -> None:
+            """A row of the table for every so much of vehicle time."""
+            if pool.time < len(samples) * SAMPLED:
+                return
+            error = float(np.linalg.norm(pool.plant.position - runtime.guide.at(0.0).position))
+            row = (pool.time, time.perf_counter() - began, memory_mib(), error)
+            samples.append(row)
+            writer.writerow([*(f"{value:.4f}" for value in row), runtime.bridge.state])
+            file.flush()
+            text = f"{row[0] / 3600.0:.2f} h, {row[2]:.1f} MiB, {runtime.bridge.state}"
+            say(min(pool.time / duration, 1.0), text)
+
         run_lockstep(
-            runtime, pool, duration, gentle=True, show=samples, until=lambda r: r.bridge.state == "fault"
+            runtime, pool, duration, gentle=True, show=sample, until=lambda r: r.bridge.state == "fault"
         )
     took = time.perf_counter() - began
-    rows = np.array([row[:4] for row in samples.rows], float)
+    rows = np.array(samples, float)
     result = {
         "experiment": "soak",
         "vehicle_h": pool.time / 3600.0,
@@ -338,37 +357,11 @@ def memory_mib() -> float:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
-class _Samples:
-    """A row of the table for every so much of vehicle time."""
-
-    def __init__(self, file: Any, pool: VirtualPool, say: Any) -> None:
-        self.rows: list[tuple[float, float, float, float, str]] = []
-        self._file, self._writer, self._pool, self._say = file, csv.writer(file), pool, say
-        self._began, self._next = time.perf_counter(), 0.0
-        self._writer.writerow(HEADS)
-
-    def __call__(self, runtime: Runtime) -> None:
-        if self._pool.time >= self._next:
-            self._next += SAMPLED
-            self._sample(runtime)
-
-    def _sample(self, runtime: Runtime) -> None:
-        goal = runtime.guide.at(0.0).position
-        error = float(np.linalg.norm(self._pool.plant.position - goal))
-        wall = time.perf_counter() - self._began
-        row = (self._pool.time, wall, memory_mib(), error, runtime.bridge.state)
-        self.rows.append(row)
-        self._writer.writerow([f"{value:.4f}" if isinstance(value, float) else value for value in row])
-        self._file.flush()
-        self._say(row[0], f"{row[0] / 3600.0:.2f} h, {row[2]:.1f} MiB, {row[4]}")
-
-
-def print_soak(result: Mapping[str, Any], console: Console) -> None:
-    """Print what came out."""
+def _soak_lines(result: Mapping[str, Any]) -> list[str]:
     slope = result["slope_mib_per_h"]
     grown = "" if slope is None else f", {slope:+.2f} MiB per hour of vehicle time"
     rms = result["error_rms_m"]
-    lines = [
+    return [
         f"{result['vehicle_h']:.2f} h of vehicle time in {result['wall_s'] / 60.0:.1f} min, "
         f"{result['times_real_time']:.1f} times real time",
         f"memory: {result['verdict']}{grown}; {result['first_mib']:.1f} MiB at the start, "
@@ -377,8 +370,6 @@ def print_soak(result: Mapping[str, Any], console: Console) -> None:
         f"faults: {'; '.join(result['faults']) or 'none'}; "
         f"decisions missed: {result['missed_decisions']} of {result['decisions']}",
     ]
-    for line in lines:
-        console.print(line, highlight=False, soft_wrap=True)
 
 
 # `finssim experiment timing`: does the robot keep its times on this machine, and how fast does lock-step go?
@@ -429,7 +420,7 @@ def timing(
     Raises:
         ReliabilityError: An unknown camera, or a process that did not start or end.
     """
-    choice(CAMERAS, camera, "camera", ReliabilityError)
+    check_choices([camera], CAMERAS, "camera", ReliabilityError)
     lockstep = {}
     for k, mode in enumerate(CAMERAS):
         say(0.1 * k, f"lock-step, {mode}")
@@ -506,12 +497,11 @@ def _wait(robot: Process, seconds: float, say: Say) -> None:
         time.sleep(0.5)
 
 
-def print_timing(result: Mapping[str, Any], console: Console) -> None:
-    """Print what came out."""
+def _timing_lines(result: Mapping[str, Any]) -> list[str]:
     told, reached = result["realtime"]["robot"], result["reached"]
     latency = told["latency_s"]
     ms = ", ".join(f"{name} {1e3 * value:.0f} ms" for name, value in latency.items() if value is not None)
-    lines = [
+    return [
         f"real time, {result['camera']}, {result['minutes']:g} min, {result['processors']} processors, "
         f"load {result['load']:.1f} before: ended {told['state']}{': ' + told['reason'] if told['reason'] else ''}",
         f"decisions missed: {told['missed']} of {told['decisions'] + told['missed']}; "
@@ -520,5 +510,9 @@ def print_timing(result: Mapping[str, Any], console: Console) -> None:
         *(f"lock-step, {mode}: {speed:.1f} times real time" for mode, speed in result["lockstep"].items()),
         "; ".join(f"{what}: {'reached' if good else 'not reached'}" for what, good in reached.items()),
     ]
-    for line in lines:
-        console.print(line, highlight=False, soft_wrap=True)
+
+
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
+    """What came out of either, in sentences."""
+    lines = _soak_lines if result["experiment"] == "soak" else _timing_lines
+    return [Table(title=str(result["experiment"]), sentences=lines(result))]

@@ -6,13 +6,11 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
-from rich.console import Console
 
 from finssim.calibration.excitation.programmes import Programme, programmes
 from finssim.calibration.excitation.recording import Recording, record
@@ -28,9 +26,10 @@ from finssim.calibration.trials.trial import Trial
 from finssim.engine import Simulator, TetherLine
 from finssim.experiments.campaign import Say, write_json
 from finssim.experiments.figures import save_figure
+from finssim.experiments.metrics import PAPER
 from finssim.experiments.plants import PlantError
 from finssim.experiments.statistics import RESAMPLES, SEED, bootstrap
-from finssim.experiments.tables import console_table, markdown_table
+from finssim.experiments.tables import Table
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.pool.plant_spec import CoupledMatrix, Section, Three
 from finssim.provenance import provenance
@@ -39,7 +38,7 @@ from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.vehicle import Axis
 from finssim.yaml_file import first_problem, read_mapping
 
-__all__ = ["RESULT_FILE", "load_replay_plant", "print_table", "replay_experiment", "tables_of"]
+__all__ = ["RESULT_FILE", "load_replay_plant", "replay_experiment", "tables_of"]
 
 Array = NDArray[np.float64]
 
@@ -176,44 +175,35 @@ LEVELS = {
 }
 
 
-def tables_of(result: Mapping[str, Any]) -> dict[str, tuple[list[str], list[list[str]]]]:
-    """Words about a table -> its head and rows: ours by set of levels, then the paper's."""
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
+    """Ours by set of levels, then the paper's."""
     axes = list(next(iter(result["same_levels"]["models"].values()))["by_axis"])
-    out = {}
-    for key, words in LEVELS.items():
+    tables = [Table(title="Replay error of three hydrodynamic models", headline=_headline(result))]
+    for key, title in LEVELS.items():
         rows = []
         for model, m in result[key]["models"].items():
             values = [f"{m['by_axis'][a]:.3f}" if a in m["by_axis"] else "–" for a in axes]
             rows.append([f"ours, {MODEL_LABELS[model]}", f"{m['aggregate']:.3f}", _range(m["ci95"]), *values])
-        out[words] = (["", "NRMSE", "95 % interval", *axes], rows)
+        tables.append(Table(title=title, heads=["", "NRMSE", "95 % interval", *axes], rows=rows))
     theirs = [
         [f"paper, {MODEL_LABELS[model]}", f"{p['aggregate']:.3f}", _range(p["ci95"])]
         for model, p in result["paper"].items()
     ]
-    return {**out, "the paper: its vehicle in its pool": (["", "NRMSE", "95 % interval"], theirs)}
-
-
-def print_table(result: Mapping[str, Any], console: Console) -> None:
-    """Print the tables, ours by set of levels, then the paper's."""
-    console.print(_headline(result), highlight=False)
-    for words, (heads, rows) in tables_of(result).items():
-        console.print(console_table(heads, rows, title=words, title_style="bold"))
-    console.print(NOTE, highlight=False)
-
-
-def markdown(result: Mapping[str, Any]) -> str:
-    """`replay_experiment.md`."""
-    parts = ["# Replay error of three hydrodynamic models", _headline(result)]
-    for words, (heads, rows) in tables_of(result).items():
-        parts += [f"## {words[0].upper()}{words[1:]}", markdown_table(heads, rows)]
     hashes = ", ".join(fit["vehicle_sha256"][:12] for fit in result["fits"])
     origin = result["provenance"]
     about = (
         f"Vehicle file {result['vehicle']['name']} {result['vehicle']['sha256'][:12]}; calibrated vehicles {hashes}; "
         f"seeds {', '.join(map(str, result['seeds']))}; FinsSim {origin['finssim']}, revision {origin['revision']}."
     )
-    parts += [NOTE, "![Response envelopes](envelope.png)", DEFINITION, about]
-    return "\n\n".join(parts) + "\n"
+    paper = Table(
+        title="the paper: its vehicle in its pool",
+        heads=["", "NRMSE", "95 % interval"],
+        rows=theirs,
+        note=NOTE,
+        sentences=[DEFINITION, about],
+        pictures={"envelope.png": "Response envelopes"},
+    )
+    return [*tables, paper]
 
 
 def _headline(result: Mapping[str, Any]) -> str:
@@ -234,13 +224,7 @@ def _range(ci95: Sequence[float]) -> str:
 AXES: tuple[Axis, ...] = ("surge", "sway", "heave", "yaw")
 MODELS = ("calibrated", "mesh", "simplified")
 
-PAPER_TABLE_3 = MappingProxyType(
-    {
-        "calibrated": (0.315, (0.255, 0.338)),
-        "mesh": (1.104, (0.923, 1.282)),
-        "simplified": (1.374, (1.201, 1.447)),
-    }
-)
+PAPER_TABLE_3: Mapping[str, Any] = PAPER["replay"]
 """Model -> NRMSE and 95 % interval in the paper: Unity against its real vehicle in its pool."""
 
 REPEATS = 8
@@ -340,7 +324,7 @@ def replay_experiment(
         (folder / "vehicles").mkdir()
         for one in done:
             write_vehicle(one.vehicle, folder / "vehicles" / f"seed_{one.seed}.yaml")
-        write_json(folder / RESULT_FILE, result, markdown(result))
+        write_json(folder / RESULT_FILE, result, tables_of(result))
     return result
 
 

@@ -9,16 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from finssim.experiments import anatomy
-from finssim.experiments.tables import Shown, markdown_table
-from finssim.experiments.transfer import T1, T2
+from finssim.experiments import anatomy, transfer
+from finssim.experiments.tables import Table, markdown_table
 from finssim.files import atomic_write
 
 __all__ = ["ReportError", "filled", "report"]
 
-TABLES: Mapping[str, Callable[[Mapping[str, Any]], Sequence[Shown]]] = {
-    "t1": lambda result: [T1.shown(result)],
-    "t2": lambda result: [T2.shown(result)],
+TABLES: Mapping[str, Callable[[Mapping[str, Any]], Sequence[Table]]] = {
+    **dict.fromkeys(transfer.SPECS, transfer.tables_of),
     "anatomy": anatomy.tables_of,
 }
 """Experiment -> the tables of its result."""
@@ -104,14 +102,14 @@ def filled(page: str, results: Mapping[str, Mapping[str, Any]], name: str) -> st
     return BLOCK.sub(made, page)
 
 
-def _table(tables: Sequence[Shown], options: str) -> str:
+def _table(tables: Sequence[Table], options: str) -> str:
     chosen = dict(re.findall(r"(table|columns|rows)=((?:[^=]*?)(?=\s+\w+=|\s+sentences|$))", options))
     number = int(chosen.get("table", "1"))
     if not 1 <= number <= len(tables):
         raise ReportError(f"table {number}: the result has {len(tables)}")
     shown = tables[number - 1]
     if "rows" in chosen:
-        by_name = {row[0].strip(): row for row in shown.rows}
+        by_name = {row[0].strip(): row for row in shown.rows if row}
         names = chosen["rows"].split(";")
         missing = [row for row in names if row not in by_name]
         if missing:
@@ -124,8 +122,8 @@ def _table(tables: Sequence[Shown], options: str) -> str:
         shown = replace(
             shown,
             heads=[shown.heads[k] for k in columns],
-            rows=[[row[k] for k in columns] for row in shown.rows],
+            rows=[[row[k] for k in columns] for row in shown.rows if row],
         )
-    rows = [[row[0].strip(), *row[1:]] for row in shown.rows]
+    rows = [[row[0].strip(), *row[1:]] for row in shown.rows if row]
     sentences = "".join(f"\n- {line}" for line in shown.sentences) if options.endswith("sentences") else ""
     return markdown_table(shown.heads, rows) + (f"\n{sentences}" if sentences else "")

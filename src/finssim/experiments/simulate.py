@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 import difflib
 import json
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +14,12 @@ from rich.console import Console
 from finssim.control.allocation import Allocator
 from finssim.engine import Simulator
 from finssim.engine.recorder import STATE_COLUMNS
-from finssim.experiments.tables import console_table
+from finssim.experiments.tables import Table, print_tables
 from finssim.files import atomic_write
 from finssim.geometry.rotations import quat_to_euler
 from finssim.provenance import provenance
-from finssim.vehicles import AXES, Vehicle, load_vehicle
+from finssim.text_table import write_csv
+from finssim.vehicles import AXES, load_vehicle
 
 __all__ = ["CommandError", "simulate"]
 
@@ -57,19 +56,15 @@ def parse_wrench(text: str) -> NDArray[np.float64]:
         if axis in seen:
             raise CommandError(f"command: '{axis}' is given twice")
         seen.add(axis)
-        tau[AXES.index(axis)] = _finite(axis, number)
+        i = AXES.index(axis)
+        try:
+            tau[i] = float(number)
+        except ValueError:
+            expected = f"expected a number: {axis}=1.5 [{UNITS[i]}]"
+            raise CommandError(f"command: {axis} is '{number}', {expected}") from None
+        if not math.isfinite(tau[i]):
+            raise CommandError(f"command: {axis} is {tau[i]}, expected a finite number [{UNITS[i]}]")
     return tau
-
-
-def _finite(axis: str, number: str) -> float:
-    unit = UNITS[AXES.index(axis)]
-    try:
-        value = float(number)
-    except ValueError:
-        raise CommandError(f"command: {axis} is '{number}', expected a number: {axis}=1.5 [{unit}]") from None
-    if not math.isfinite(value):
-        raise CommandError(f"command: {axis} is {value}, expected a finite number [{unit}]")
-    return value
 
 
 CONTROL_STEP = 0.1
@@ -110,76 +105,54 @@ def simulate(
         CommandError: The command, a time or the file's name cannot be used, or the motion did not stay finite.
         VehicleError, SimulatorError, OutputError: As they say.
     """
-    _check(duration, depth, out)
-    tau = parse_wrench(command)
-    chosen = load_vehicle(vehicle)
-    allocator = Allocator.from_vehicle(chosen)
-    thrust = allocator.allocate(tau)
-    simulator = Simulator(chosen, hydrodynamics=hydrodynamics, control_step=CONTROL_STEP, device=device)
-    with atomic_write(out) as table, atomic_write(f"{out}.json") as origin:
-        rows = _run(simulator, thrust, depth, steps=round(duration / CONTROL_STEP))
-        _write_table(table, chosen, rows)
-        about = {
-            "vehicle": {"name": chosen.name, "sha256": chosen.sha256},
-            "hydrodynamics": hydrodynamics,
-            "command": dict(zip(AXES, tau.tolist(), strict=True)),
-            "thrust": dict(zip(chosen.thruster_names, thrust.tolist(), strict=True)),
-            "depth": depth,
-            "control_step": CONTROL_STEP,
-            "provenance": provenance(),
-        }
-        origin.write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
-    _print(chosen, tau, allocator.achieved(thrust), rows[-1], out)
-
-
-def _check(duration: float, depth: float, out: Path) -> None:
     if not CONTROL_STEP <= duration <= LONGEST:
         raise CommandError(f"duration is {duration} s, expected {CONTROL_STEP} to {LONGEST:g} s")
     if not math.isfinite(depth):
         raise CommandError(f"depth is {depth} m, expected a finite number")
     if out.suffix != ".csv":
         raise CommandError(f"{out} ends in '{out.suffix}', expected .csv")
+    tau, chosen = parse_wrench(command), load_vehicle(vehicle)
+    allocator, names = Allocator.from_vehicle(chosen), chosen.thruster_names
+    thrust = allocator.allocate(tau)
+    simulator = Simulator(chosen, hydrodynamics=hydrodynamics, control_step=CONTROL_STEP, device=device)
+    with atomic_write(out) as table, atomic_write(f"{out}.json") as origin:
+        rows = _run(simulator, thrust, depth, steps=round(duration / CONTROL_STEP))
+        columns = ["t", *(name for state in STATE_COLUMNS.values() for name in state)]
+        columns += [f"thrust_{name}" for name in names]
+        write_csv(table, columns, [[f"{value:.9g}" for value in row] for row in rows])
+        about = {
+            "vehicle": {"name": chosen.name, "sha256": chosen.sha256},
+            "hydrodynamics": hydrodynamics,
+            "command": dict(zip(AXES, tau.tolist(), strict=True)),
+            "thrust": dict(zip(names, thrust.tolist(), strict=True)),
+            "depth": depth,
+            "control_step": CONTROL_STEP,
+            "provenance": provenance(),
+        }
+        origin.write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+    last, achieved = rows[-1], allocator.achieved(thrust)
+    angles_deg = np.degrees(quat_to_euler(last[4:8]))
+    cells = [
+        ["wrench asked [N, N m]", *(f"{x:.4g}" for x in tau)],
+        ["wrench given [N, N m]", *(f"{x:.4g}" for x in achieved.round(4) + 0.0)],
+        ["velocity [m/s, rad/s]", *(f"{x:.3f}" for x in last[8:14])],
+        ["place [m, deg]", *(f"{x:.2f}" for x in last[1:4]), *(f"{x:.1f}" for x in angles_deg)],
+    ]
+    title, note = f"{chosen.name} after {last[0]:g} s", f"written: {out} and {out}.json"
+    print_tables([Table(title=title, heads=["", *AXES], rows=cells, left=(), note=note)], Console())
 
 
 def _run(simulator: Simulator, thrust: NDArray[np.float64], depth: float, steps: int) -> NDArray[np.float64]:
     """Time [s], state and delivered thrusts [N] at the start and after every control step, (steps + 1, columns)."""
     simulator.place(position=(0.0, 0.0, -depth))
     simulator.set_thrust(thrust)
-    rows = [_row(simulator, 0, len(thrust))]
-    for step in range(1, steps + 1):
-        simulator.step()
-        rows.append(_row(simulator, step, len(thrust)))
+    rows = []
+    for step in range(steps + 1):
+        if step:
+            simulator.step()
+        state = [simulator.numpy(name)[0, 0] for name in STATE_COLUMNS]
+        delivered = simulator.numpy("thrust")[0, 0, : len(thrust)]
+        rows.append(np.concatenate([[step * simulator.control_step], *state, delivered]))
     if len(simulator.frozen_worlds()):
         raise CommandError(f"the motion stopped being finite before {steps * CONTROL_STEP:g} s: command less")
     return np.array(rows)
-
-
-def _row(simulator: Simulator, step: int, thrusters: int) -> NDArray[np.float64]:
-    state = [simulator.numpy(name)[0, 0] for name in STATE_COLUMNS]
-    return np.concatenate(
-        [[step * simulator.control_step], *state, simulator.numpy("thrust")[0, 0, :thrusters]]
-    )
-
-
-def _write_table(path: Path, vehicle: Vehicle, rows: NDArray[np.float64]) -> None:
-    columns = ["t", *(name for names in STATE_COLUMNS.values() for name in names)]
-    columns += [f"thrust_{name}" for name in vehicle.thruster_names]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        writer.writerows([f"{value:.9g}" for value in row] for row in rows)
-
-
-def _print(
-    vehicle: Vehicle, tau: NDArray[Any], achieved: NDArray[Any], last: NDArray[Any], out: Path
-) -> None:
-    angles_deg = np.degrees(quat_to_euler(last[4:8]))
-    rows = [
-        ["wrench asked [N, N m]", *(f"{x:.4g}" for x in tau)],
-        ["wrench given [N, N m]", *(f"{x:.4g}" for x in achieved.round(4) + 0.0)],
-        ["velocity [m/s, rad/s]", *(f"{x:.3f}" for x in last[8:14])],
-        ["place [m, deg]", *(f"{x:.2f}" for x in last[1:4]), *(f"{x:.1f}" for x in angles_deg)],
-    ]
-    console, title = Console(), f"{vehicle.name} after {last[0]:g} s"
-    console.print(console_table(["", *AXES], rows, left=(), title=title))
-    console.print(f"written: {out} and {out}.json", highlight=False, markup=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -10,15 +9,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from rich.console import Console
 
 from finssim.control.guidance import Guide
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.experiments.campaign import keep_result, kept_result
 from finssim.experiments.plants import load_plant
-from finssim.experiments.recorded import follows
-from finssim.experiments.tables import console_table, figure_text
-from finssim.experiments.trials import EpisodeError, run_episodes, summarize_episodes
+from finssim.experiments.tables import Table, figure_text
+from finssim.experiments.trials import EpisodeError, follows, run_episodes, summarize_episodes
 from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.draw_plant import draw_plant
 from finssim.pool.draw_plant import site_of as plant_at
@@ -30,7 +27,7 @@ from finssim.tasks.communication import Communication
 from finssim.tasks.observer import fitted_task
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["BATCH", "play", "site_of"]
+__all__ = ["BATCH", "play", "site_of", "tables_of"]
 
 BATCH = 256
 """Episodes in the batch, beside those through the stack."""
@@ -101,7 +98,6 @@ def play(
     seed: int = 1,
     out: Path | None = None,
     records: bool = False,
-    as_json: bool = False,
     show: Callable[[str], None] = lambda line: print(line, file=sys.stderr),
 ) -> dict[str, Any]:
     """Play any task through the deployed software, all its vehicles in lock-step; print it beside the batch.
@@ -121,7 +117,6 @@ def play(
         seed: Seed of every random number; equal seeds give equal results.
         out (DIR): Directory that keeps every episode; one that was interrupted goes on.
         records: Keep in --out what every agent recorded (.mcap), and its truth (.truth).
-        as_json: Print one JSON object instead of tables.
         show: Called with a line after each episode.
 
     Returns:
@@ -155,15 +150,8 @@ def play(
             keep_result(out / ROWS, {**about, "episodes": rows})
         show(f"episode {k + 1} of {episodes}: success {measured.get('success', float('nan')):g}")
     agent, nominal = make_pilot(policy, body, task=task).agent, load_plant("nominal")
-    batch = run_episodes(
-        agent, fitted_task(task, vehicles), body, nominal, trials=BATCH, seed=seed
-    ).measures()
-    told = {**about, "stack": summarize_episodes(rows[:episodes]), "batch": summarize_episodes(batch)}
-    if as_json:
-        print(json.dumps(told, allow_nan=False))
-    else:
-        _print(told)
-    return told
+    batch = run_episodes(agent, fitted_task(task, vehicles), body, nominal, trials=BATCH, seed=seed)
+    return {**about, "stack": summarize_episodes(rows[:episodes]), "batch": summarize_episodes(batch)}
 
 
 def _kept(out: Path | None, about: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -174,15 +162,13 @@ def _kept(out: Path | None, about: Mapping[str, Any]) -> list[dict[str, Any]]:
     return list(data["episodes"]) if {**about, "episodes": data.get("episodes")} == data else []
 
 
-def _print(told: Mapping[str, Any]) -> None:
-    stack, batch = told["stack"], told["batch"]
-    heads = [
-        f"{told['task']}, {told['controller']}",
-        f"stack, {stack['trials']}",
-        f"batch, {batch['trials']}",
-    ]
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
+    """A row for each measure: the stack beside the batch."""
+    stack, batch = result["stack"], result["batch"]
+    title = f"{result['task']}, {result['controller']}"
+    heads = [title, f"stack, {stack['trials']}", f"batch, {batch['trials']}"]
     rows = [
         [name, *(figure_text(one["metrics"].get(name), ".3g") for one in (stack, batch))]
         for name in stack["metrics"]
     ]
-    Console().print(console_table(heads, rows, left=(0, 1, 2)))
+    return [Table(title=title, heads=heads, rows=rows, left=(0, 1, 2), intervals=True)]

@@ -23,18 +23,18 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from rich.console import Console
 
-from finssim.experiments.campaign import keep_result, kept_result, progress_bar, spread, write_json
+from finssim.experiments.campaign import Say, keep_result, kept_result, spread, write_json
 from finssim.experiments.compare import MEASURES
 from finssim.experiments.evaluate import evaluate_controller
 from finssim.experiments.plants import load_plant
-from finssim.experiments.tables import console_table, markdown_table
+from finssim.experiments.tables import Table
 from finssim.files import atomic_directory, plain_name
 from finssim.learning.train import train
 from finssim.provenance import provenance
 from finssim.tasks import TASKS
 from finssim.yaml_file import first_problem, read_mapping
 
-__all__ = ["SweepError", "sweep"]
+__all__ = ["SweepError", "sweep", "tables_of"]
 
 RESULT_FILE = "sweep.json"
 ROW_FILE = "sweep-row.json"
@@ -264,8 +264,7 @@ def sweep(
     out: Path,
     address: str | None = None,
     processes: Annotated[int | None, (1, None)] = None,
-    as_json: bool = False,
-    console: Console | None = None,
+    say: Say = lambda part, what: None,
 ) -> dict[str, Any]:
     """Train every setting with every seed on one machine or many, and evaluate each policy; goes on where it was.
 
@@ -278,8 +277,7 @@ def sweep(
         out (DIR): Directory of the runs; those that it has are kept.
         address (ADDRESS): Of a Ray cluster to join, HOST:PORT or auto; this machine alone if not given.
         processes: Trainings at once on this machine; one a processor if not given.
-        as_json: Print one JSON object instead of tables.
-        console: Where the table goes; standard output if None.
+        say: Told the share that is done.
 
     Returns:
         What `sweep.json` has: `rows` (name, seed, run, training_s, machine, plants; or `error`), `ok`, provenance.
@@ -294,7 +292,7 @@ def sweep(
     missing = [job for job in jobs if job.key not in rows]
     screen = Console(stderr=True)
     played = _here(missing, processes) if address is None else _on_cluster(missing, address)
-    with closing(played), progress_bar("sweep") as say:
+    with closing(played):
         for job, outcome in played if missing else ():
             rows[job.key] = row = _keep(job, outcome, runs)
             say(len(rows) / len(jobs), f"{len(rows)} of {len(jobs)} trainings")
@@ -307,13 +305,7 @@ def sweep(
         "seconds": time.perf_counter() - began,
         "provenance": provenance(),
     }
-    heads, cells = rows_of(result)
-    page = f"# Sweep\n\n{markdown_table(heads, cells, left=range(len(heads)))}\n"
-    write_json(out / RESULT_FILE, result, page)
-    if as_json:
-        print(json.dumps(result, allow_nan=False))
-    else:
-        (console or Console()).print(console_table(heads, cells, left=(0, 2)))
+    write_json(out / RESULT_FILE, result, tables_of(result))
     return result
 
 
@@ -330,30 +322,27 @@ def _keep(job: Job, outcome: Any, runs: Path) -> dict[str, Any]:
     return row
 
 
-def rows_of(result: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """The heads, and a row for each run and plant: its measures, or what went wrong."""
-    first: dict[str, Any] = next(
-        (one for row in result["rows"] for one in row.get("plants", {}).values()), {}
-    )
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
+    """A row for each run and plant: its measures, or what went wrong."""
+    evaluated = [one for row in result["rows"] for one in row.get("plants", {}).values()]
+    first: dict[str, Any] = evaluated[0] if evaluated else {}
     measures = list(first.get("metrics", ())) or [
         name for name in MEASURES.get(str(first.get("task")), ()) if name in first
     ]
     rows = []
     for row in result["rows"]:
         if "error" in row:
-            words = [row["error"], *[""] * len(measures)][: len(measures)]
-            rows.append([row["name"], str(row["seed"]), "–", "–", *words])
+            texts = [row["error"], *[""] * len(measures)][: len(measures)]
+            rows.append([row["name"], str(row["seed"]), "–", "–", *texts])
         for plant, one in row.get("plants", {}).items():
-            cells = [_cell(one, measure) for measure in measures]
-            rows.append([row["name"], str(row["seed"]), plant, f"{row['training_s']:.0f}", *cells])
-    return ["run", "seed", "plant", "time [s]", *measures], rows
+            texts = [_cell(one, measure) for measure in measures]
+            rows.append([row["name"], str(row["seed"]), plant, f"{row['training_s']:.0f}", *texts])
+    heads = ["run", "seed", "plant", "time [s]", *measures]
+    return [Table(title="Sweep", heads=heads, rows=rows, left=(0, 2))]
 
 
 def _cell(result: Mapping[str, Any], measure: str) -> str:
-    if "metrics" in result:
-        value = result["metrics"][measure]["value"]
-    elif measure == "success":
+    if "metrics" not in result and measure == "success":
         return f"{result['success']}/{result['trials']}"
-    else:
-        value = result[measure]
+    value = result["metrics"][measure]["value"] if "metrics" in result else result[measure]
     return "–" if value is None else f"{value:.4g}"

@@ -4,26 +4,27 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from html import escape
+from pathlib import Path
 from typing import Any
 
+import rich.table
 from rich import box
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
-from finssim.page import html_table
+from finssim.page import html_picture, html_table
 
 __all__ = [
-    "Shown",
+    "Table",
     "console_table",
     "figure_text",
     "html_of",
     "html_row",
     "markdown_of",
     "markdown_table",
-    "print_shown",
+    "print_tables",
 ]
 
 Rows = Sequence[Sequence[str] | None]
@@ -40,7 +41,7 @@ def paper(row: Sequence[str]) -> bool:
 
 def console_table(
     heads: Sequence[str], rows: Rows, *, left: Sequence[int] = (0,), whole: Sequence[int] = (), **options: Any
-) -> Table:
+) -> rich.table.Table:
     """A table for a console, none of whose cells is taken for markup.
 
     Args:
@@ -50,7 +51,7 @@ def console_table(
         whole: Columns whose cells are never broken.
         options: Of `rich.table.Table`.
     """
-    table = Table(
+    table = rich.table.Table(
         **{
             "box": box.SIMPLE_HEAD,
             "padding": (0, 1, 0, 0),
@@ -84,46 +85,68 @@ def html_row(cells: Sequence[str], kind: str | None = None) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shown:
-    """What a person reads of an experiment."""
+class Table:
+    """What a person reads of an experiment: a table with the words around it, or the words alone."""
 
     title: str
     headline: str = ""
     """The title says all if empty."""
-    heads: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    note: str
+    heads: Sequence[str] = ()
+    rows: Rows = ()
+    note: str = ""
     sentences: Sequence[str] = ()
+    left: Sequence[int] = (0,)
+    """Columns that are aligned to the left."""
+    whole: Sequence[int] = ()
+    """Columns whose cells are never broken on a screen."""
+    intervals: bool = False
+    """Whether a narrow screen shows the intervals of cells too."""
+    pictures: Mapping[str, str] = field(default_factory=dict)
+    """File beside the page -> what it shows."""
 
 
-def print_shown(shown: Shown, console: Console, *, intervals: bool = False) -> None:
-    """On a screen; one that is narrow shows no intervals of the table, unless they are asked for."""
-    console.print(shown.headline or shown.title, highlight=False)
-    rows = shown.rows
-    if not intervals and console.width < WIDE:
-        rows = [[re.sub(r" \[.+\]$", "", cell) for cell in row] for row in rows]
-    console.print(console_table(shown.heads, rows))
-    console.print(shown.note, highlight=False)
-    for sentence in shown.sentences:
-        console.print(f"- {sentence}", highlight=False, markup=False)
+def print_tables(tables: Sequence[Table], console: Console) -> None:
+    """Print tables on a screen; one that is narrow shows no intervals, unless the table asks for them."""
+    for table in tables:
+        if text := table.headline or table.title:
+            console.print(Text(text, style="" if table.headline or len(tables) == 1 else "bold"))
+        rows: Rows = table.rows
+        if not table.intervals and console.width < WIDE:
+            rows = [row and [re.sub(r" \[.+\]$", "", cell) for cell in row] for row in rows]
+        if rows:
+            console.print(console_table(table.heads, rows, left=table.left, whole=table.whole))
+        if table.note:
+            console.print(Text(table.note))
+        for sentence in table.sentences:
+            console.print(Text(f"- {sentence}"))
 
 
-def markdown_of(shown: Shown) -> str:
-    """As a page."""
-    sentences = "".join(f"\n- {sentence}" for sentence in shown.sentences)
-    table = markdown_table(shown.heads, shown.rows)
-    headline = f"{shown.headline}\n\n" if shown.headline else ""
-    return f"# {shown.title}\n\n{headline}{table}\n\n{shown.note}\n{sentences}\n"
+def markdown_of(tables: Sequence[Table]) -> str:
+    """The page of some tables."""
+    parts = []
+    for k, table in enumerate(tables):
+        parts += [f"{'##' if k else '#'} {table.title[:1].upper()}{table.title[1:]}", table.headline]
+        parts.append(markdown_table(table.heads, table.rows, left=table.left) if table.rows else "")
+        parts += [table.note, "\n".join(f"- {sentence}" for sentence in table.sentences)]
+        parts += [f"![{text}]({file})" for file, text in table.pictures.items()]
+    return "\n\n".join(filter(None, parts)) + "\n"
 
 
-def html_of(shown: Shown) -> str:
-    """As a section of a page."""
-    sentences = "".join(f"<li>{escape(sentence)}</li>" for sentence in shown.sentences)
-    return (
-        f"<h2>{escape(shown.title)}</h2><p>{escape(shown.headline)}</p>"
-        f"{html_table(shown.heads, [html_row(row) for row in shown.rows])}"
-        f'<p class="note">{escape(shown.note)}</p><ul>{sentences}</ul>'
-    )
+def html_of(tables: Sequence[Table], folder: Path) -> list[str]:
+    """Sections of a page; pictures that are in the folder are inside them."""
+    parts = []
+    for table in tables:
+        parts += [f"<h2>{escape(table.title)}</h2>", f"<p>{escape(table.headline)}</p>"]
+        rows = [html_row(row) for row in table.rows if row is not None]
+        parts.append(html_table(table.heads, rows) if rows else "")
+        sentences = "".join(f"<li>{escape(sentence)}</li>" for sentence in table.sentences)
+        parts.append(f'<p class="note">{escape(table.note)}</p><ul>{sentences}</ul>')
+        parts += [
+            html_picture((folder / file).read_bytes(), text)
+            for file, text in table.pictures.items()
+            if (folder / file).is_file()
+        ]
+    return parts
 
 
 def figure_text(figure: Mapping[str, Any] | None, form: str, factor: float = 1.0) -> str:

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import ast
 import inspect
-import json
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, is_dataclass
 from typing import Any
 
-from rich.console import Console
-from rich.text import Text
-
 from finssim.control.modes import AXES, action_mode
-from finssim.experiments.tables import console_table
+from finssim.experiments.tables import Table
 from finssim.tasks import TASKS
 from finssim.tasks import terms as library
 from finssim.tasks.agents import BASELINES
@@ -25,17 +21,14 @@ from finssim.tasks.sensing import Sensing, seen_with
 from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle
 
-__all__ = ["attribute_docs", "describe_task", "tasks_list", "tasks_show"]
-
-
-# A task as plain data: what is seen, done, rewarded and called a success, as vehicles do it.
-
-
-# The sentences written under a dataclass' fields: Python does not keep them, their source does.
+__all__ = ["attribute_docs", "describe_task", "tables_of", "tasks_list", "tasks_show"]
 
 
 def attribute_docs(kind: type) -> dict[str, str]:
-    """Field -> the string that follows it, of a class and those it is derived from; where the source can be had."""
+    """Field -> the string that follows it, of a class and those it is derived from; where the source can be had.
+
+    Python does not keep the sentences under a dataclass' fields, their source does.
+    """
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__[:-1]):
         try:
@@ -54,7 +47,7 @@ def attribute_docs(kind: type) -> dict[str, str]:
     return found
 
 
-APART = ("name", "observation", "control_step", "substeps", "time_limit", "training_noise")
+SEPARATE = ("name", "observation", "control_step", "substeps", "time_limit", "training_noise")
 """Fields that are told by themselves."""
 
 
@@ -80,25 +73,32 @@ def describe_task(
     mode = action or the_task.action
     vehicles = crew(vehicle, the_task, mode)
     the_task = the_task.fitted(vehicles)
+    terms, parts, first = the_task.terms(), [], 0
+    for part in the_task.observation:
+        about = {name: getattr(part, name) for name in ("name", "size", "unit", "scale", "clip")}
+        parts.append({"first": first, **about, "told": _text(the_task, part.term)})
+        first += part.size
     return {
         "name": the_task.name,
-        "title": title_of(the_task),
+        "title": the_task.title or (inspect.getdoc(type(the_task)) or "").partition("\n")[0].rstrip("."),
         "vehicles": {
             place: {"name": one.name, "sha256": one.sha256}
             for place, one in zip(the_task.vehicles, vehicles, strict=True)
         },
         "agents": list(the_task.agents),
         "others": list(the_task.others),
-        "observation": {"size": the_task.observation_size, "parts": _observation(the_task)},
+        "observation": {"size": the_task.observation_size, "parts": parts},
         "action": _action(mode, vehicles[0]),
         "period_s": the_task.control_step,
         "substeps": the_task.substeps,
         "time_limit_s": the_task.time_limit,
         "levels": the_task.levels,
         "reward": _reward(the_task),
-        "ends": _ends(the_task),
-        "totals": _totals(the_task),
-        "inside": _told(the_task, the_task.terms().inside),
+        "ends": [
+            {"name": one.name, "reward": one.reward, "told": _text(the_task, one.term)} for one in terms.ends
+        ],
+        "totals": [{"name": one.name, "told": _text(the_task, one.term)} for one in terms.totals],
+        "inside": _text(the_task, terms.inside),
         "success": the_task.success_rule(),
         "settings": _settings(the_task),
         "training_noise": seen_with(the_task.training_noise, vehicles[0]),
@@ -107,35 +107,12 @@ def describe_task(
     }
 
 
-def title_of(task: Task) -> str:
-    """What is to be done, in a few words."""
-    return task.title or (inspect.getdoc(type(task)) or "").partition("\n")[0].rstrip(".")
-
-
-def _observation(task: Task) -> list[dict[str, Any]]:
-    parts, first = [], 0
-    for part in task.observation:
-        parts.append(
-            {
-                "first": first,
-                "name": part.name,
-                "size": part.size,
-                "unit": part.unit,
-                "scale": part.scale,
-                "clip": part.clip,
-                "told": _told(task, part.term),
-            }
-        )
-        first += part.size
-    return parts
-
-
-def _told(task: Task, term: Any) -> str:
-    """What is written of a term, or of what is shared under its name; an expression itself."""
+def _text(task: Task, term: Any) -> str:
+    """The docstring of a term, or of what is shared under its name; an expression itself."""
     if isinstance(term, str):
         terms = task.terms()
         named = {**terms.shared, **terms.seen}.get(term, getattr(library, term, None))
-        return term.replace("wp.", "") if named is None else _told(task, named)
+        return term.replace("wp.", "") if named is None else _text(task, named)
     return " ".join((inspect.getdoc(term.func) or "").split()) if term is not None else ""
 
 
@@ -155,20 +132,10 @@ def _reward(task: Task) -> dict[str, Any]:
     weights = asdict(own) if is_dataclass(own) and not isinstance(own, type) else {}
     told = inspect.getdoc(type(own) if weights else own) if weights or callable(own) else ""
     terms = [
-        {"name": one.name, "weight": one.weight, "told": _told(task, one.term)}
+        {"name": one.name, "weight": one.weight, "told": _text(task, one.term)}
         for one in task.terms().rewards
     ]
     return {"terms": terms, "weights": weights, "told": told or ""}
-
-
-def _ends(task: Task) -> list[dict[str, Any]]:
-    return [
-        {"name": one.name, "reward": one.reward, "told": _told(task, one.term)} for one in task.terms().ends
-    ]
-
-
-def _totals(task: Task) -> list[dict[str, Any]]:
-    return [{"name": one.name, "told": _told(task, one.term)} for one in task.terms().totals]
 
 
 def _settings(task: Task) -> list[dict[str, Any]]:
@@ -176,7 +143,7 @@ def _settings(task: Task) -> list[dict[str, Any]]:
     docs, told = attribute_docs(type(task)), []
     for field in fields(task):
         value = getattr(task, field.name)
-        if field.name in APART or field.name == "reward":
+        if field.name in SEPARATE or field.name == "reward":
             continue
         plain = asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
         told.append({"name": field.name, "value": _limited(plain), "told": docs.get(field.name, "")})
@@ -192,34 +159,15 @@ def _limited(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def tasks_list(*, as_json: bool = False, console: Console | None = None) -> None:
+def tasks_list() -> dict[str, Any]:
     """List the tasks: agents, sizes of observation and action, period and length [s]; `show NAME` tells one in full.
 
     Example: finssim tasks
     """
-    found = {name: describe_task(name) for name in TASKS}
-    if as_json:
-        print(json.dumps(found, allow_nan=False))
-        return
-    rows = [
-        [
-            name, str(len(told["agents"])), str(told["observation"]["size"]), str(told["action"]["size"]),
-            f"{told['period_s']:g}", f"{told['time_limit_s']:g}", ", ".join(told["baselines"]), told["title"],
-        ]
-        for name, told in found.items()
-    ]  # fmt: skip
-    heads = ("task", "agents", "sees", "does", "every [s]", "for [s]", "baseline", "what is to be done")
-    (console or Console()).print(console_table(heads, rows, left=(0, 6, 7), whole=(0, 6)))
+    return {name: describe_task(name) for name in TASKS}
 
 
-def tasks_show(
-    task: str,
-    *,
-    vehicle: str = "finsrov",
-    action: str | None = None,
-    as_json: bool = False,
-    console: Console | None = None,
-) -> None:
+def tasks_show(task: str, *, vehicle: str = "finsrov", action: str | None = None) -> dict[str, Any]:
     """Tell all of a task as a vehicle does it: observation, action [N, N m], reward, success, settings.
 
     Example: finssim tasks show docking --vehicle bluerov2_heavy
@@ -228,19 +176,25 @@ def tasks_show(
         task (NAME|FILE.py:CLASS): Task, or one's own as FILE.py:CLASS.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         action (MODE): wrench6, wrench4 or thruster8; the task's own if not given.
-        as_json: Print one JSON object instead of tables.
-        console: Standard output if None.
 
     Raises:
         EnvironmentSetupError, ControlError, VehicleError: As `describe_task`.
     """
-    told = describe_task(task, vehicle, action)
-    if as_json:
-        print(json.dumps(told, allow_nan=False))
-        return
-    console = console or Console()
-    for line in _head(told):
-        console.print(Text(line))
+    return describe_task(task, vehicle, action)
+
+
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
+    """A row for each of the tasks; or all of one."""
+    if "observation" not in result:
+        rows = [
+            [
+                name, str(len(one["agents"])), str(one["observation"]["size"]), str(one["action"]["size"]),
+                f"{one['period_s']:g}", f"{one['time_limit_s']:g}", ", ".join(one["baselines"]), one["title"],
+            ]
+            for name, one in result.items()
+        ]  # fmt: skip
+        heads = ("task", "agents", "sees", "does", "every [s]", "for [s]", "baseline", "what is to be done")
+        return [Table(title="", heads=heads, rows=rows, left=(0, 6, 7), whole=(0, 6))]
     parts = [
         [
             f"{one['first']}–{one['first'] + one['size'] - 1}" if one["size"] > 1 else str(one["first"]),
@@ -249,55 +203,58 @@ def tasks_show(
             "" if one["scale"] == 1.0 else f"{one['scale']:g}",
             "" if one["clip"] is None else f"±{one['clip']:g}",
         ]
-        for one in told["observation"]["parts"]
+        for one in result["observation"]["parts"]
     ]
     action = [
         [one["name"], f"{one['low']:.4g}", f"{one['high']:.4g}", f"[{one['unit']}]"]
-        for one in told["action"]["components"]
+        for one in result["action"]["components"]
     ]
-    settings = [[one["name"], _value(one["value"]), one["told"]] for one in told["settings"]]
-    rewards, ends = told["reward"]["terms"], told["ends"]
-    for title, heads, rows, left in (
-        (
-            "Observation, of one agent",
-            ("index", "quantity", "unit", "divided by", "limited to"),
-            parts,
-            (0, 1, 2),
+    rewards = [[one["name"], f"{one['weight']:g}", one["told"]] for one in result["reward"]["terms"]]
+    ends = [[one["name"], f"{one['reward']:g}", one["told"]] for one in result["ends"]]
+    totals = [[one["name"], one["told"]] for one in result["totals"]]
+    settings = [[one["name"], _value(one["value"]), one["told"]] for one in result["settings"]]
+    observation = ("index", "quantity", "unit", "divided by", "limited to")
+    reward, about = result["reward"]["told"], result["name"]
+    tables = (
+        Table(title="Observation, of one agent", heads=observation, rows=parts, left=(0, 1, 2)),
+        Table(
+            title="Action, from -1 to 1",
+            heads=("component", "at -1", "at 1", "unit"),
+            rows=action,
+            left=(0, 3),
         ),
-        ("Action, from -1 to 1", ("component", "at -1", "at 1", "unit"), action, (0, 3)),
-        ("Reward, in every step", ("name", "weight", "term"), _terms(rewards, "weight"), (0, 2)),
-        ("Ends", ("name", "reward", "term"), _terms(ends, "reward"), (0, 2)),
-        ("Counted", ("name", "term"), [[one["name"], one["told"]] for one in told["totals"]], (0, 1)),
-        ("Settings", ("name", "value", "meaning"), settings, (0, 1, 2)),
-    ):
-        if rows:
-            console.print(Text(f"\n{title}", style="bold"))
-            console.print(console_table(heads, rows, left=left))
-        if title.startswith("Reward") and told["reward"]["told"]:
-            console.print(Text(told["reward"]["told"]))
+        Table(
+            title="Reward, in every step",
+            heads=("name", "weight", "term"),
+            rows=rewards,
+            left=(0, 2),
+            note=reward,
+        ),
+        Table(title="Ends", heads=("name", "reward", "term"), rows=ends, left=(0, 2)),
+        Table(title="Counted", heads=("name", "term"), rows=totals, left=(0, 1)),
+        Table(title="Settings", heads=("name", "value", "meaning"), rows=settings, left=(0, 1, 2)),
+    )
+    first = Table(title=about, headline="\n".join(_head(result)))
+    return [first, *(table for table in tables if table.rows or table.note)]
 
 
-def _terms(terms: Sequence[Mapping[str, Any]], number: str) -> list[list[str]]:
-    return [[one["name"], f"{one[number]:g}", one["told"]] for one in terms]
-
-
-def _head(told: Mapping[str, Any]) -> list[str]:
-    vehicles = told["vehicles"]
+def _head(result: Mapping[str, Any]) -> list[str]:
+    vehicles = result["vehicles"]
     lines = [
-        f"{told['name']}: {told['title']}",
-        "agents: " + ", ".join(f"{name} ({vehicles[name]['name']})" for name in told["agents"]),
-        f"success: {told['success']}",
-        f"acts every {told['period_s']:g} s, in {told['substeps']} physics steps; an episode takes up to "
-        f"{told['time_limit_s']:g} s",
-        f"baselines: {', '.join(told['baselines']) or 'none'}",
-        "noise in training: " + (_words(told["training_noise"]) or "none"),
-        *(f"seen with sensors, {name}: {_words(one)}" for name, one in told["sensors"].items()),
+        f"{result['name']}: {result['title']}",
+        "agents: " + ", ".join(f"{name} ({vehicles[name]['name']})" for name in result["agents"]),
+        f"success: {result['success']}",
+        f"acts every {result['period_s']:g} s, in {result['substeps']} physics steps; an episode takes up to "
+        f"{result['time_limit_s']:g} s",
+        f"baselines: {', '.join(result['baselines']) or 'none'}",
+        "noise in training: " + (_pairs(result["training_noise"]) or "none"),
+        *(f"seen with sensors, {name}: {_pairs(one)}" for name, one in result["sensors"].items()),
     ]
-    if told["others"]:
-        others = ", ".join(f"{name} ({vehicles[name]['name']})" for name in told["others"])
+    if result["others"]:
+        others = ", ".join(f"{name} ({vehicles[name]['name']})" for name in result["others"])
         lines.insert(2, f"commanded by the task: {others}")
-    if told["levels"]:
-        lines.append(f"levels: 0 to {told['levels'] - 1}; training may climb them with --set level_at=0.8")
+    if result["levels"]:
+        lines.append(f"levels: 0 to {result['levels'] - 1}; training may climb them with --set level_at=0.8")
     return lines
 
 
@@ -305,11 +262,11 @@ def _value(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, Mapping):
-        return _words(value)
+        return _pairs(value)
     if isinstance(value, list | tuple):
         return ", ".join(_value(one) for one in value)
     return "none" if value is None else str(value)
 
 
-def _words(values: Mapping[str, Any]) -> str:
+def _pairs(values: Mapping[str, Any]) -> str:
     return ", ".join(f"{name} {_value(value)}" for name, value in values.items())

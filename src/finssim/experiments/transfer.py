@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import yaml
 from rich.console import Console
 
 from finssim.calibration.output.calibrated_ranges import write_ranges
+from finssim.control.controllers import COSTLY
 from finssim.control.policy import Policy, PolicyError
-from finssim.control.trajectories import TRAJECTORIES, load_trajectory
-from finssim.experiments.campaign import Say, choice, run_jobs, write_json
-from finssim.experiments.evaluate import T1_COLUMNS, TrackingRun, cells, draw_tracking
-from finssim.experiments.figures import (
-    draw_envelopes,
-    error_envelope,
-    save_figure,
-)
+from finssim.control.trajectories import TRAJECTORIES
+from finssim.experiments.campaign import Say, check_choices, run_jobs, write_json
+from finssim.experiments.evaluate import T1_COLUMNS, cells
+from finssim.experiments.figures import draw_envelopes, draw_tracking, error_envelope, save_figure
 from finssim.experiments.identify import identify
-from finssim.experiments.metrics import PAPER_T2, T1_SETPOINTS, paper_row, paper_t2_row
+from finssim.experiments.metrics import T1_SETPOINTS, paper_row, paper_t2_row
 from finssim.experiments.on_robot import Attendant, OnRobot
-from finssim.experiments.pool_trial import HARDWARE, Job, play, read_series, run_on_robot
+from finssim.experiments.pool_trial import HARDWARE, Job, play, played_trial, run_on_robot
 from finssim.experiments.statistics import Interval, Statistic, paired_difference, with_interval
-from finssim.experiments.tables import Shown, figure_text, markdown_of, print_shown
+from finssim.experiments.tables import Table, figure_text
 from finssim.experiments.trials import T2_TRAJECTORIES
 from finssim.files import atomic_directory
 from finssim.learning.train import train
@@ -35,13 +32,14 @@ from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = [
     "MEASURES",
+    "SPECS",
     "T1",
-    "T1_ROWS",
+    "ROWS",
     "T2",
-    "policies_of",
-    "print_transfer",
+    "controllers_of",
     "t1",
     "t2",
+    "tables_of",
     "transfer_experiment",
 ]
 
@@ -82,19 +80,19 @@ class Training:
     """Whether the policy has integrals of its errors and sees what it saw and did before; those of the paper do not."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Row:
-    """One row of a table: who steers and what is taken from it."""
+    """One row of a table: who steers and what is taken from it; see `rows.yaml`."""
 
     title: str
-    training: Training | None = None
+    training: Training | None
     """None for a PID."""
+    controller: str = ""
+    """Name of the PID."""
     paper: str | None = None
     """Row of the paper's table; None where it has none."""
     module: str = ""
     """What the row takes away or puts in place of the reference, as a sentence begins."""
-    controller: str = ""
-    """Name of the PID."""
     changes: dict[str, Any] = field(default_factory=dict)
     """Fields of its jobs."""
 
@@ -105,32 +103,74 @@ class Spec:
 
     name: str
     """Its command, and the name of its files."""
+    title: str
     rows: Mapping[str, Row]
     """In the order of the table."""
     targets: Sequence[str]
     """Setpoints or trajectories that are played."""
     known_targets: Sequence[str]
-    """All that may be asked for."""
+    """All that may be requested."""
+    kind: str
+    """What targets are, in the plural."""
+    by_target: bool
+    """Whether the table has a line for each target."""
+    columns: Mapping[str, tuple[str, str]]
+    """Key of a trial's result -> heading and format."""
+    note: str
     base: str
     """The row that the others are compared with."""
     figures: Mapping[str, Statistic]
     """Key of a trial's result -> how the trials that have it become one figure."""
     differences: Sequence[str]
     """Keys of `MEASURES` in which rows are compared."""
-    paper: Callable[[str], Mapping[str, float]]
-    """Row of the paper's table -> key of `differences` -> its figure."""
-    shown: Callable[[Mapping[str, Any]], Shown]
-    """The table of a result."""
+    paper: Callable[[str, str], Mapping[str, Any] | None]
+    """Row of the paper's table and target -> key -> its figure; None where it has none."""
     draw: Callable[[Results, Path], Path | None]
     """Draws the results of the rows into the folder."""
+    picture: tuple[str, str]
+    """File of that figure, and what it shows."""
 
     def paper_differences(self, row: Row) -> dict[str, float] | None:
         """Key of `differences` -> the paper's row less its reference; None where it has not both."""
         base = self.rows[self.base].paper
         if row.paper is None or base is None:
             return None
-        theirs, reference = self.paper(row.paper), self.paper(base)
-        return {key: theirs[key] - reference[key] for key in self.differences}
+        targets = self.targets if self.by_target else [""]
+        theirs, reference = ([self.paper(name, t) or {} for t in targets] for name in (row.paper, base))
+        return {
+            key: float(np.mean([a[key] - b[key] for a, b in zip(theirs, reference, strict=True)]))
+            for key in self.differences
+        }
+
+    def table(self, result: Mapping[str, Any]) -> Table:
+        """The table of a result; on hardware its rows say so."""
+        hardware, rows = result.get("robot"), []
+        for name, of_row in result["rows"].items():
+            row = self.rows[name]
+            title = f"{row.title}, hardware" if hardware else row.title
+            for target, figures in (of_row["by_target"] if self.by_target else {"": of_row}).items():
+                names = [target] if self.by_target else []
+                texts = [figure_text(figures[key], form) for key, (_, form) in self.columns.items()]
+                rows.append([title, *names, f"{figures['success']}/{figures['trials']}", *texts])
+                theirs = self.paper(row.paper, target) if row.paper else None
+                if theirs is not None:
+                    success = f"{theirs['success']}/{theirs['trials']}" if "success" in theirs else ""
+                    rows.append([f"  paper: {row.paper}", *names, success, *cells(theirs, self.columns)])
+        source, units = (
+            ("hardware, by the robot's own estimate, whose error is not in it", "seeds")
+            if hardware
+            else ("a virtual pool whose vehicle, water and camera no training has seen", "plants and seeds")
+        )
+        first = ["trajectory", "done"] if self.by_target else ["success"]
+        return Table(
+            title=f"{self.title} ({self.name.upper()})",
+            headline=f"{self.name.upper()} {played_in(result, self.kind)}",
+            heads=["", *first, *(heading for heading, _ in self.columns.values())],
+            rows=rows,
+            note=f"ours: {source}; mean, in brackets 95 % from a bootstrap of {units}{self.note}",
+            sentences=result["sentences"],
+            pictures=dict([self.picture]),
+        )
 
 
 def transfer_experiment(
@@ -165,7 +205,7 @@ def transfer_experiment(
         severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
         camera (MODE): corners (projected through the rippling water, with noise), or pictures (drawn, and searched for
             tags: several times slower).
-        rows (NAMES): Rows of the table, separated by commas; all if not given.
+        rows (NAMES): Rows of the table, separated by commas; all but nmpc, which takes an extra, if not given.
         targets: What is played; the published ones if None.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         steps: Control steps to learn from, all worlds together; what the task needs if not given.
@@ -182,31 +222,27 @@ def transfer_experiment(
     """
     if robot is not None and (plants, severity, camera) != (3, "realistic", "corners"):
         raise ValueError("a robot has its own plant and camera: leave --plants, --severity and --camera out")
-    rows, targets = list(rows or spec.rows), list(targets or spec.targets)
-    for known, kind, names in (
-        (spec.rows, "row", rows),
-        (spec.known_targets, "target", targets),
-        (("nominal", "realistic", "hard"), "severity", [severity]),
-        (("corners", "pictures"), "camera", [camera]),
-    ):
-        for name in names:
-            choice(known, name, kind, ValueError)
+    usual = [name for name, row in spec.rows.items() if row.controller not in COSTLY]
+    rows, targets = list(rows or usual), list(targets or spec.targets)
+    check_choices(rows, spec.rows, "row", ValueError)
+    check_choices(targets, spec.known_targets, "target", ValueError)
+    check_choices([severity], ("nominal", "realistic", "hard"), "severity", ValueError)
+    check_choices([camera], ("corners", "pictures"), "camera", ValueError)
     if plants < 1 or seeds < 1:
         raise ValueError(f"plants is {plants}, seeds {seeds}: expected at least 1 of each")
     chosen = {name: spec.rows[name] for name in rows}
-    places, run_seeds, folder = range(seed, seed + plants), range(seed, seed + seeds), Path(out)
-    policies = policies_of(
+    pools, run_seeds, folder = range(seed, seed + plants), range(seed, seed + seeds), Path(out)
+    controllers = controllers_of(
         chosen, run_seeds, folder, vehicle, steps, lambda part, what: say(TRAINING_SHARE * part, what)
     )
     if robot is not None:  # there is one plant, and nobody chose its severity
-        places, severity, camera = range(1), HARDWARE, HARDWARE
+        pools, severity, camera = range(1), HARDWARE, HARDWARE
     jobs = [
         Job(
-            row=name, controller=str(policies[row.training.name, s]) if row.training else row.controller, target=target,
-            vehicle=vehicle, pool_vehicle=vehicle, plant=plant, severity=severity, seed=s, camera=camera,
-            **row.changes,
+            row=name, controller=controllers[name, s], target=target, vehicle=vehicle, pool_vehicle=vehicle,
+            plant=plant, severity=severity, seed=s, camera=camera, **row.changes,
         )
-        for name, row in chosen.items() for plant in places for s in run_seeds for target in targets
+        for name, row in chosen.items() for plant in pools for s in run_seeds for target in targets
     ]  # fmt: skip
     if robot is None:
         results = run_jobs(
@@ -219,40 +255,46 @@ def transfer_experiment(
     by_row = {name: played for name, played in by_row.items() if played}  # all of a row may have been skipped
     body = load_vehicle(vehicle)
     result = {
-        "experiment": spec.name, "severity": severity, "camera": camera, "plants": list(places),
+        "experiment": spec.name, "severity": severity, "camera": camera, "plants": list(pools),
         "seeds": list(run_seeds), "targets": targets, "robot": robot and robot.title,
         "vehicle": {"name": body.name, "sha256": body.sha256},
         **scores(spec, by_row), "trials": results, "provenance": provenance(),
     }  # fmt: skip
-    write_json(folder / f"{spec.name}.json", result, markdown_of(spec.shown(result)))
+    write_json(folder / f"{spec.name}.json", result, [spec.table(result)])
     spec.draw(by_row, folder)
     return result
 
 
-def policies_of(
+def controllers_of(
     rows: Mapping[str, Row],
     seeds: Sequence[int],
     folder: Path,
     vehicle: str,
     steps: int | None,
     say: Say,
-) -> dict[tuple[str, int], Path]:
-    """The policies of rows by training and seed, in `policies` of the folder; arguments as of `trained`."""
+) -> dict[tuple[str, int], str]:
+    """Who steers, by row and seed: a policy's directory in `policies` of the folder, or the name of a PID.
+
+    Args:
+        rows: Of a table.
+        seeds, vehicle, steps, say: As of `trained`.
+        folder: Of the experiment.
+    """
     trainings = list(dict.fromkeys(row.training for row in rows.values() if row.training))
     if any(training.randomize == INTERVALS for training in trainings):
         say(0.0, "identifying the vehicle, for the ranges of its intervals")
-        ranges = str(_interval_ranges(folder / "identification", vehicle, seeds[0]))
-        trainings = [replace(t, randomize=ranges) if t.randomize == INTERVALS else t for t in trainings]
-    return trained(trainings, seeds, folder / "policies", vehicle=vehicle, steps=steps, say=say)
-
-
-def _interval_ranges(folder: Path, vehicle: str, seed: int) -> Path:
-    """The ranges file in a folder; where there is none yet, the vehicle is identified from trials first."""
-    if not (folder / RANGES_FILE).is_file():
-        with atomic_directory(folder, replaces=RANGES_FILE) as place:
-            found = identify(place, vehicle, seed=seed, shown=folder)
-            write_ranges(found.fit, place / RANGES_FILE, found.vehicle)
-    return folder / RANGES_FILE
+        ranges = folder / "identification" / RANGES_FILE
+        if not ranges.is_file():
+            with atomic_directory(ranges.parent, replaces=RANGES_FILE) as place:
+                found = identify(place, vehicle, seed=seeds[0], shown=ranges.parent)
+                write_ranges(found.fit, place / RANGES_FILE, found.vehicle)
+        trainings = [replace(t, randomize=str(ranges)) if t.randomize == INTERVALS else t for t in trainings]
+    policies = trained(trainings, seeds, folder / "policies", vehicle=vehicle, steps=steps, say=say)
+    return {
+        (name, seed): str(policies[row.training.name, seed]) if row.training else row.controller
+        for name, row in rows.items()
+        for seed in seeds
+    }
 
 
 def trained(
@@ -308,16 +350,15 @@ def scores(spec: Spec, by_row: Results) -> dict[str, Any]:
     """Figures of every row, all targets together and each alone; differences from the reference; sentences."""
     rows = {}
     for name, results in by_row.items():
-        targets = dict.fromkeys(r["job"]["target"] for r in results)
-        each = {
-            t: row_figures([r for r in results if r["job"]["target"] == t], spec.figures) for t in targets
-        }
+        by_target: dict[str, list[Mapping[str, Any]]] = {}
+        for result in results:
+            by_target.setdefault(result["job"]["target"], []).append(result)
+        each = {target: row_figures(of_target, spec.figures) for target, of_target in by_target.items()}
         rows[name] = {**row_figures(results, spec.figures), "by_target": each}
-    others = by_row.keys() - {spec.base} if spec.base in by_row else ()
     differences = {
-        name: {key: _difference(by_row[spec.base], by_row[name], key) for key in spec.differences}
-        for name in by_row
-        if name in others
+        name: {key: _difference(by_row[spec.base], results, key) for key in spec.differences}
+        for name, results in by_row.items()
+        if spec.base in by_row and name != spec.base
     }
     return {
         "rows": rows,
@@ -329,14 +370,14 @@ def scores(spec: Spec, by_row: Results) -> dict[str, Any]:
         "sentences": [
             sentence(spec.rows[name].module, of_row)
             for name, of_row in differences.items()
-            if _units(by_row[name]) >= FEWEST_UNITS
+            if len({_cluster(r) for r in by_row[name]}) >= FEWEST_UNITS
         ],
     }
 
 
-def _units(results: Sequence[Mapping[str, Any]]) -> int:
-    """How many pairs of plant and seed results rest on."""
-    return len({(r["job"]["plant"], r["job"]["seed"]) for r in results})
+def _cluster(result: Mapping[str, Any]) -> tuple[int, int]:
+    """Plant and seed, which trials share."""
+    return result["job"]["plant"], result["job"]["seed"]
 
 
 def row_figures(results: Sequence[Mapping[str, Any]], figures: Mapping[str, Statistic]) -> dict[str, Any]:
@@ -352,7 +393,7 @@ def row_figures(results: Sequence[Mapping[str, Any]], figures: Mapping[str, Stat
     """
     clusters: dict[Hashable, list[Mapping[str, Any]]] = {}
     for result in results:
-        clusters.setdefault((result["job"]["plant"], result["job"]["seed"]), []).append(result)
+        clusters.setdefault(_cluster(result), []).append(result)
     counts = [sum(bool(r["success"]) for r in group) for group in clusters.values()]
     out: dict[str, Any] = {
         "trials": len(results),
@@ -376,11 +417,7 @@ def _difference(
 ) -> Interval | None:
     """Mean of other - reference over the trials that both have a figure for, paired by plant, seed and target."""
     ours, theirs = (
-        {
-            (r["job"]["plant"], r["job"]["seed"], r["job"]["target"]): x
-            for r in results
-            if (x := _figure(r, key)) is not None
-        }
+        {(*_cluster(r), r["job"]["target"]): x for r in results if (x := _figure(r, key)) is not None}
         for results in (reference, other)
     )
     return paired_difference(ours, theirs)
@@ -424,103 +461,24 @@ def _listed(items: list[str]) -> str:
     return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
 
 
-DR = "hold_for_position"
-"""The published ranges of station keeping."""
-INTEGRAL = "An integral of the errors"
-POOL = "Randomisation made for a pool, with an integral of the errors,"
-
-CALIBRATED = Training("calibrated")
-CALIBRATED_DR = Training("calibrated-dr", "t2", randomize=DR)
-
-T1_ROWS: dict[str, Row] = {
-    "calibrated": Row("Calibrated Fossen", CALIBRATED, "calibrated"),
-    "calibrated-dr": Row(
-        "+ DR", Training("calibrated-dr", randomize=DR), "calibrated + DR", "Domain randomisation"
-    ),
-    "noise": Row(
-        "+ localization noise",
-        CALIBRATED,
-        "calibrated, localisation noise",
-        "Localization noise of 5 cm and 10°",
-        changes={"position_noise": 0.05, "yaw_noise": math.radians(10.0)},
-    ),
-    "no-fusion": Row(
-        "without EKF", CALIBRATED, "without EKF", "Leaving out the fusion", changes={"fusion": False}
-    ),
-    "no-lag": Row(
-        "without thruster dynamics",
-        Training("calibrated-no-lag", randomize="no_thruster_dynamics"),
-        "without thruster dynamics",
-        "Training without thruster dynamics",
-    ),
-    "mesh": Row("Physics-Mesh", Training("mesh", hydrodynamics="mesh"), "mesh", "Training in the mesh model"),
-    "mesh-dr": Row(
-        "Physics-Mesh + DR",
-        Training("mesh-dr", hydrodynamics="mesh", randomize=DR),
-        "mesh + DR",
-        "Training in the mesh model with DR",
-    ),
-    "simplified": Row(
-        "Simplified Fossen",
-        Training("simplified", hydrodynamics="simplified"),
-        "simplified",
-        "Training in the simplified model",
-    ),
-    "simplified-dr": Row(
-        "Simplified Fossen + DR",
-        Training("simplified-dr", hydrodynamics="simplified", randomize=DR),
-        "simplified + DR",
-        "Training in the simplified model with DR",
-    ),
-    "pid-paper": Row("PID, published gains", None, "PID", "The published PID", "pid-paper"),
-    "pid": Row("PID, tuned from the model", None, None, "The tuned PID", "pid"),
-    "calibrated-intervals": Row(
-        "Calibrated + ranges of its intervals",
-        Training("calibrated-intervals", randomize=INTERVALS, remembers=True),
-        module="Randomisation within the calibration's intervals, with an integral of the errors,",
-    ),
-    "calibrated-integral": Row(
-        "Calibrated, integrating", Training("calibrated-integral", remembers=True), module=INTEGRAL
-    ),
-    "calibrated-pool": Row(
-        "Pool ranges, integrating",
-        Training("calibrated-pool", randomize="pool", remembers=True),
-        module=POOL,
-    ),
+ROWS: Mapping[str, Mapping[str, Row]] = {
+    task: {
+        name: Row(
+            **{k: v for k, v in row.items() if k != "training"},
+            training=Training(**{"name": name, "task": task, **row["training"]})
+            if "training" in row
+            else None,
+        )
+        for name, row in rows.items()
+    }
+    for task, rows in yaml.safe_load(
+        Path(__file__).with_name("rows.yaml").read_text(encoding="utf-8")
+    ).items()
 }
-"""The paper's ten rows of station keeping in the order of its table, and ours beyond them."""
-T1_NOTE = (
-    ". paper: its vehicle in its pool, one seed. errors: 40-60 s; e_y is vertical; "
-    "success: 0.10 m on each axis and 10° for 10 s. t_s (median) and jitter are of successful trials."
-)
+"""Task -> the rows of its table, in their order."""
 T1_DRAWN = ("calibrated", "mesh", "simplified", "pid-paper", "pid", "calibrated-pool")
 """The paper's four curves, and ours."""
 
-T2_ROWS: dict[str, Row] = {
-    "calibrated-dr": Row("Calibrated + DR", CALIBRATED_DR, "calibrated + DR"),
-    "calibrated": Row(
-        "Calibrated", Training("calibrated", "t2"), "calibrated", "Training without randomisation"
-    ),
-    "pid": Row("PID, tuned from the model", None, None, "The tuned PID", "pid"),
-    "pid-paper": Row("PID, published gains", None, "PID", "The published PID", "pid-paper"),
-    "calibrated-dr-integral": Row(
-        "Calibrated + DR, integrating",
-        Training("calibrated-dr-integral", "t2", randomize=DR, remembers=True),
-        module=INTEGRAL,
-    ),
-    "calibrated-pool": Row(
-        "Pool ranges, integrating",
-        Training("calibrated-pool", "t2", randomize="pool", remembers=True),
-        module=POOL,
-    ),
-}
-"""The paper's three rows of tracking, and ours beyond them."""
-T2_HEADS = {
-    "horizontal_rmse_m": "horizontal RMSE [m]",
-    "vertical_rmse_m": "vertical RMSE [m]",
-    "p95_m": "3-D P95 [m]",
-}
-T2_NOTE = "; done: trials that reached the end. paper: its vehicle in its pool."
 T2_DRAWN = 4
 """Rows that are drawn, at most: more cannot be told apart."""
 
@@ -535,110 +493,49 @@ def played_in(result: Mapping[str, Any], what: str) -> str:
     return f"in the virtual pool, {pool}, seeds: {seeds}, {of}"
 
 
-def _ours(result: Mapping[str, Any]) -> str:
-    """What our rows are, as a note begins."""
-    source, units = (
-        ("hardware, by the robot's own estimate, whose error is not in it", "seeds")
-        if result.get("robot")
-        else ("a virtual pool whose vehicle, water and camera no training has seen", "plants and seeds")
-    )
-    return f"ours: {source}; mean, in brackets 95 % from a bootstrap of {units}"
-
-
-def _title(row: Row, result: Mapping[str, Any]) -> str:
-    """Of a row of ours; on hardware it says so."""
-    return f"{row.title}, hardware" if result.get("robot") else row.title
-
-
-def _t1_table(result: Mapping[str, Any]) -> Shown:
-    rows = []
-    for name, figures in result["rows"].items():
-        row = T1_ROWS[name]
-        texts = [figure_text(figures[key], form) for key, (_, form) in list(T1_COLUMNS.items())[1:]]
-        rows.append([_title(row, result), f"{figures['success']}/{figures['trials']}", *texts])
-        if row.paper is not None:
-            rows.append([f"  paper: {row.paper}", *cells(paper_row(row.paper))])
-    return Shown(
-        title="Station keeping (T1)",
-        headline=f"T1 {played_in(result, 'setpoints')}",
-        heads=["", *(heading for heading, _ in T1_COLUMNS.values())],
-        rows=rows,
-        note=_ours(result) + T1_NOTE,
-        sentences=result["sentences"],
-    )
-
-
-def _t2_table(result: Mapping[str, Any]) -> Shown:
-    rows = []
-    for name, figures in result["rows"].items():
-        row = T2_ROWS[name]
-        for target, one in figures["by_target"].items():
-            texts = [figure_text(one[key], ".3f") for key in T2_HEADS]
-            rows.append([_title(row, result), target, f"{one['success']}/{one['trials']}", *texts])
-            paper = PAPER_T2.get(row.paper or "", {}).get(target)
-            if paper is not None:
-                rows.append([f"  paper: {row.paper}", target, "", *(f"{value:.3f}" for value in paper)])
-    return Shown(
-        title="Trajectory tracking (T2)",
-        headline=f"T2 {played_in(result, 'trajectories')}",
-        heads=["", "trajectory", "done", *T2_HEADS.values()],
-        rows=rows,
-        note=_ours(result) + T2_NOTE,
-        sentences=result["sentences"],
-    )
-
-
-def _draw_t1(by_row: Results, folder: Path) -> Path | None:
-    """Position and yaw error against time of the rows of `T1_DRAWN` that were played; None if none was."""
-    envelopes = {}
-    for name in T1_DRAWN:
-        trials = []
-        for result in by_row.get(name, []):
-            series = read_series(folder / "trials" / result["key"])
-            goal = T1_SETPOINTS[result["job"]["target"]] * np.array([*[result.get("room", 1.0)] * 3, 1.0])
-            trials.append((series["t"], series["position"], series["yaw"], goal))
-        if trials:
-            envelopes[T1_ROWS[name].title] = error_envelope(trials)
-    if not envelopes:
-        return None
-    severities = {result["job"]["severity"] for results in by_row.values() for result in results}
-    place = "on hardware" if "hardware" in severities else "in the virtual pool"
-    figure = draw_envelopes(envelopes, f"T1 {place}: median and middle half")
-    return save_figure(figure, folder / "t1_envelopes.png")
+def _draw_t1(by_row: Results, folder: Path) -> Path:
+    """Position and yaw error against time of the rows of `T1_DRAWN` that were played, or of all."""
+    drawn = {name: by_row[name] for name in T1_DRAWN if name in by_row} or by_row
+    envelopes = {
+        ROWS["t1"][name].title: error_envelope([played_trial(r, folder / "trials") for r in results])
+        for name, results in drawn.items()
+    }
+    hardware = any(r["job"]["severity"] == HARDWARE for results in by_row.values() for r in results)
+    title = f"T1 {'on hardware' if hardware else 'in the virtual pool'}: median and middle half"
+    return save_figure(draw_envelopes(envelopes, title), folder / "t1_envelopes.png")
 
 
 def _draw_t2(by_row: Results, folder: Path) -> Path | None:
     """Of each row and trajectory the trial with the median error; None if nothing was flown."""
-    runs: dict[str, list[TrackingRun]] = {}
+    runs = {}
     for name, results in by_row.items():
-        flown = sorted((r for r in results if r["p95_m"] is not None), key=lambda r: float(r["p95_m"]))
-        for target in dict.fromkeys(r["job"]["target"] for r in results):
-            of_target = [r for r in flown if r["job"]["target"] == target]
-            if of_target:
-                middle = of_target[len(of_target) // 2]
-                series = read_series(folder / "trials" / middle["key"])
-                guide = load_trajectory(target).scaled(middle.get("room", 1.0))
-                runs.setdefault(T2_ROWS[name].title, []).append((guide, series["t"], series["position"]))
+        flown: dict[str, list[Mapping[str, Any]]] = {}
+        for result in sorted((r for r in results if r["p95_m"] is not None), key=lambda r: float(r["p95_m"])):
+            flown.setdefault(result["job"]["target"], []).append(result)
+        middle = [of_target[len(of_target) // 2] for of_target in flown.values()]
+        if middle:
+            runs[ROWS["t2"][name].title] = [played_trial(result, folder / "trials") for result in middle]
     if not runs:
         return None
     return save_figure(draw_tracking(dict(list(runs.items())[:T2_DRAWN])), folder / "t2_paths.png")
 
 
-def _paper_t1(row: str) -> dict[str, float]:
+def _paper_t1(row: str, target: str) -> Mapping[str, Any]:
     theirs = paper_row(row)
     return {**theirs, "success_rate": theirs["success"] / theirs["trials"]}
 
 
-def _paper_t2(row: str) -> dict[str, float]:
-    each = [paper_t2_row(row, name) for name in T2_TRAJECTORIES]
-    return {key: sum(theirs[key] for theirs in each) / len(each) for key in each[0]}
-
-
 T1 = Spec(
     name="t1",
-    rows=T1_ROWS,
+    title="Station keeping",
+    rows=ROWS["t1"],
     targets=tuple(T1_SETPOINTS),
     known_targets=tuple(T1_SETPOINTS),
+    kind="setpoints",
+    by_target=False,
+    columns={key: column for key, column in T1_COLUMNS.items() if key != "success"},
+    note=". paper: its vehicle in its pool, one seed. errors: 40-60 s; e_y is vertical; "
+    "success: 0.10 m on each axis and 10° for 10 s. t_s (median) and jitter are of successful trials.",
     base="calibrated",
     figures={
         **dict.fromkeys(("success_rate", "e_p_m", "e_y_m", "e_psi_deg", "J_p_m", "J_psi_deg"), np.mean),
@@ -646,23 +543,33 @@ T1 = Spec(
     },
     differences=("success_rate", "e_p_m", "e_psi_deg"),
     paper=_paper_t1,
-    shown=_t1_table,
     draw=_draw_t1,
+    picture=("t1_envelopes.png", "Station keeping: error against time"),
 )
 """`finssim experiment t1`."""
 T2 = Spec(
     name="t2",
-    rows=T2_ROWS,
+    title="Trajectory tracking",
+    rows=ROWS["t2"],
     targets=T2_TRAJECTORIES,
     known_targets=tuple(TRAJECTORIES),
+    kind="trajectories",
+    by_target=True,
+    columns={
+        "horizontal_rmse_m": ("horizontal RMSE [m]", ".3f"),
+        "vertical_rmse_m": ("vertical RMSE [m]", ".3f"),
+        "p95_m": ("3-D P95 [m]", ".3f"),
+    },
+    note="; done: trials that reached the end. paper: its vehicle in its pool.",
     base="calibrated-dr",
     figures=dict.fromkeys(("horizontal_rmse_m", "vertical_rmse_m", "p95_m", "cross_track_rmse_m"), np.mean),
     differences=("horizontal_rmse_m", "vertical_rmse_m", "p95_m"),
-    paper=_paper_t2,
-    shown=_t2_table,
+    paper=paper_t2_row,
     draw=_draw_t2,
+    picture=("t2_paths.png", "Trajectory tracking: paths from above"),
 )
 """`finssim experiment t2`."""
+SPECS: Mapping[str, Spec] = {"t1": T1, "t2": T2}
 
 
 def t1(*, setpoints: Annotated[Sequence[str] | None, ","] = None, **options: Any) -> dict[str, Any]:
@@ -695,6 +602,6 @@ def t2(*, trajectories: Annotated[Sequence[str] | None, ","] = None, **options: 
     return transfer_experiment(T2, targets=trajectories, **options)
 
 
-def print_transfer(result: Mapping[str, Any], console: Console) -> None:
-    """Print the table of either."""
-    print_shown({"t1": T1, "t2": T2}[result["experiment"]].shown(result), console)
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
+    """The table of either."""
+    return [SPECS[result["experiment"]].table(result)]

@@ -1,35 +1,59 @@
-"""Trials in the simulator, one world each, all stepped together: station keeping, tracking, and whole episodes."""
+"""Trials: what a vehicle did on its way to a goal, measured alike wherever it was played, and those in the simulator.
+
+In the simulator there is one world for each trial, all stepped together: station keeping, tracking, and episodes of any
+task from start to end.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from finssim.control.guidance import Goal, Guide, acceleration_at
+from finssim.control.guidance import Goal, Guide, Station, Track, acceleration_at
 from finssim.control.trajectories import load_trajectory
-from finssim.experiments.metrics import T1_SETPOINTS, T1_START, in_room, measure_tracking, measure_trial
+from finssim.experiments.metrics import (
+    ERRORS,
+    T1_SETPOINTS,
+    T1_START,
+    in_room,
+    measure_tracking,
+    measure_trial,
+)
 from finssim.experiments.plants import Plant
 from finssim.experiments.statistics import with_interval
-from finssim.geometry.rotations import quat_from_yaw, quat_yaw
-from finssim.tasks import Environment, Task, TrajectoryTracking, follow
+from finssim.files import atomic_write
+from finssim.geometry.rotations import (
+    quat_conjugate,
+    quat_from_yaw,
+    quat_inverse_rotate,
+    quat_multiply,
+    quat_to_rotvec,
+    quat_yaw,
+    wrap_angle,
+)
+from finssim.tasks import Task, follow
 from finssim.tasks.agents import NOWHERE, Agent, rollout
 from finssim.vehicles import Vehicle
+from finssim.vehicles.defaults import room
 
 __all__ = [
     "DURATION",
     "EPISODES",
+    "PERIOD",
     "T2_TRAJECTORIES",
     "EpisodeError",
-    "TrackingTrials",
-    "Trials",
+    "Motion",
+    "Trial",
+    "follows",
+    "guide_of",
+    "localization_errors",
     "run_episodes",
-    "run_tracking",
     "run_trials",
     "summarize_episodes",
 ]
@@ -38,46 +62,165 @@ Array = NDArray[np.float64]
 Show = Callable[[float], None]
 
 DURATION = 60.0
-"""Length of a trial [s]."""
-
+"""Length of a trial of station keeping [s]."""
+PERIOD = 0.1
+"""Between the samples of a motion that is kept [s]."""
 PHYSICS_STEP = 0.025
 """Longest physics step [s]."""
+T2_TRAJECTORIES = ("straight", "broken", "ellipse", "lemniscate")
+"""The four of the paper's table."""
 
 
-@dataclass(frozen=True)
-class Trials:
-    """What happened, by trial; world frame, SI. From the moment a world broke its numbers are NaN."""
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """Samples of a vehicle's motion in the order of their times; world frame, SI, NaN where unknown."""
 
-    setpoints: tuple[str, ...]
-    """Name of each trial's setpoint, n."""
-    goals: Array
-    """[x, y, z [m], yaw [rad]], (n, 4)."""
     t: Array
-    """Time since the start [s], (T,)."""
+    """Time since the guide's start [s], (T,)."""
     position: Array
-    """Body origin [m], (T, n, 3)."""
-    yaw: Array
-    """Heading [rad], (T, n)."""
+    """Body origin [m], (T, 3)."""
+    quaternion: Array
+    """Body to world, xyzw, (T, 4)."""
+    nu: Array | None = None
+    """Velocity of the body origin, body frame [m/s, rad/s], (T, 6); None where it is not measured."""
+    thrust: Array | None = None
+    """Of each thruster [N], (T, n); None where not known."""
+    action: Array | None = None
+    """Of the agent from then on, in [-1, 1], (T, size); None where not known."""
+    heading_only: bool = False
+    """Whether roll and pitch are not known."""
 
-    def measures(self) -> list[dict[str, Any]]:
-        """What `measure_trial` says of each trial, with its number, setpoint and goal."""
-        return [
-            {
-                "trial": i,
-                "setpoint": name,
-                "goal": [*self.goals[i, :3].tolist(), math.degrees(self.goals[i, 3])],
-                **measure_trial(*self.series(i)),
-            }
-            for i, name in enumerate(self.setpoints)
-        ]
+    @property
+    def yaw(self) -> Array:
+        """Heading [rad], (T,)."""
+        return np.asarray(quat_yaw(self.quaternion))
 
-    def series(self, i: int) -> tuple[Array, Array, Array, Array]:
-        """t, position, yaw and goal of one trial, as the measures and the envelope take them."""
-        return self.t, self.position[:, i], self.yaw[:, i], self.goals[i]
+    def between(self, rows: NDArray[Any]) -> Motion:
+        """Some of the samples: a mask or indices of (T,)."""
+        arrays = {
+            field.name: getattr(self, field.name) for field in fields(self) if field.name != "heading_only"
+        }
+        return replace(self, **{name: None if x is None else x[rows] for name, x in arrays.items()})
 
-    def all_series(self) -> list[tuple[Array, Array, Array, Array]]:
-        """The same of every trial."""
-        return [self.series(i) for i in range(len(self.setpoints))]
+    def at(self, t: float) -> Track:
+        """Where the vehicle was at a time [s], between the samples; velocities that are not measured are differences
+        over a `PERIOD` to either side."""
+        position, quaternion = self._pose(t)
+        if self.nu is not None:
+            return Track(position, quaternion, _interpolated(t, self.t, self.nu))
+        first, last = max(t - PERIOD, float(self.t[0])), min(t + PERIOD, float(self.t[-1]))
+        (from_position, from_attitude), (to_position, to_attitude) = self._pose(first), self._pose(last)
+        turn = quat_to_rotvec(quat_multiply(quat_conjugate(from_attitude), to_attitude))
+        linear = np.asarray(quat_inverse_rotate(quaternion, to_position - from_position))
+        return Track(position, quaternion, np.concatenate([linear, turn]) / max(last - first, 1e-9))
+
+    def action_at(self, t: float) -> Array:
+        """The action from a time on [s], by the last decision before it; empty where not known."""
+        if self.action is None or t < self.t[0] - 1e-3:
+            return np.zeros(0)
+        action: Array = self.action[int(np.searchsorted(self.t, t + 1e-3)) - 1]
+        return action
+
+    def _pose(self, t: float) -> tuple[Array, Array]:
+        opposite = np.sum(self.quaternion[1:] * self.quaternion[:-1], axis=1) < 0.0
+        signs = np.cumprod(np.where(np.concatenate([[False], opposite]), -1.0, 1.0))
+        q = _interpolated(t, self.t, self.quaternion * signs[:, None])
+        return _interpolated(t, self.t, self.position), q / np.linalg.norm(q)
+
+    def write(self, path: Path) -> None:
+        """Write PATH.npz."""
+        arrays = {name: x for name, x in vars(self).items() if isinstance(x, np.ndarray)}
+        with atomic_write(path.with_name(f"{path.name}.npz")) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+    @classmethod
+    def read(cls, path: Path) -> Motion:
+        """Read PATH.npz, which a trial leaves for figures, at 10 Hz."""
+        with np.load(path.with_name(f"{path.name}.npz")) as file:
+            return cls(**{field.name: file[field.name] for field in fields(cls) if field.name in file.files})
+
+
+def _interpolated(t: ArrayLike, times: Array, columns: Array) -> Array:
+    """Columns (T, n) between their times (T,), at one time (n,) or at several (k, n)."""
+    return np.stack([np.interp(t, times, column) for column in columns.T], axis=-1)
+
+
+def localization_errors(truth: Motion, estimate: Motion) -> dict[str, float] | None:
+    """Errors of an estimate at its own times: rms in 3-D and horizontally [m], and in heading [°]; None without any."""
+    t = estimate.t
+    inside = (t >= truth.t[:1].max(initial=0.0)) & (t <= truth.t[-1:].max(initial=-1.0))
+    inside &= np.isfinite(estimate.position).all(axis=1)
+    if not inside.any():
+        return None
+    error = estimate.position[inside] - _interpolated(t[inside], truth.t, truth.position)
+    turn = wrap_angle(estimate.yaw[inside] - np.interp(t[inside], truth.t, np.unwrap(truth.yaw)))
+    return {
+        "position_m": float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),
+        "horizontal_m": float(np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1)))),
+        "heading_deg": math.degrees(float(np.sqrt(np.mean(turn**2)))),
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """What a vehicle did on its way, in the simulator, in the virtual pool, on a robot or in a record."""
+
+    name: str
+    """Of its setpoint or trajectory."""
+    guide: Guide
+    motion: Motion
+    """By which it is measured, from the guide's start."""
+
+    @property
+    def goal(self) -> Array:
+        """Where the guide begins: x, y, z [m], yaw [rad], world frame, (4,)."""
+        start = self.guide.at(0.0)
+        return np.array([*start.position, float(start.yaw)])
+
+    def measures(
+        self, task: str, limits: tuple[ArrayLike, ArrayLike], *, stopped: bool = False
+    ) -> dict[str, Any]:
+        """What `measure_trial` gives for T1, with its goal, or `measure_tracking` for T2, with `success`.
+
+        Args:
+            task: t1 or t2.
+            limits: Lower and upper limit of each thruster [N], (n,) each.
+            stopped: Whether it ended before its time: errors of half a way say nothing of the other half.
+        """
+        motion = self.motion
+        if task == "t1":
+            *place, yaw = self.goal.tolist()
+            measures = measure_trial(motion.t, motion.position, motion.yaw, self.goal)
+            return {"goal": [*place, math.degrees(yaw)], **measures}
+        attitude = None if motion.heading_only else motion.quaternion
+        measures = measure_tracking(
+            motion.t, motion.position, self.guide, quaternion=attitude, thrust=motion.thrust, limits=limits
+        )
+        if stopped:
+            measures |= dict.fromkeys(ERRORS)
+        return {"success": bool(measures["complete"]) and not stopped, **measures}
+
+
+def follows(task: Task) -> bool:
+    """Whether it follows a reference that is known ahead."""
+    return hasattr(task, "knot_spacing")
+
+
+def guide_of(target: str | Path, vehicle: Vehicle | None = None, *, size: float = 1.0) -> Guide:
+    """A published setpoint by its name, or a trajectory by name or file.
+
+    Args:
+        target: What is to be done.
+        vehicle: In whose room; one that cannot follow the trajectory is refused.
+        size: Of the room, where no vehicle is named: 1 for FinsROV.
+    """
+    if str(target) in T1_SETPOINTS:
+        size = size if vehicle is None else room(vehicle.body.size)
+        x, y, z, yaw = (T1_SETPOINTS[str(target)] * (size, size, size, 1.0)).tolist()
+        return Station((x, y, z), yaw, name=str(target))
+    if vehicle is None:
+        return load_trajectory(target).scaled(size)
+    return load_trajectory(target, vehicle=vehicle)
 
 
 def run_trials(
@@ -86,134 +229,68 @@ def run_trials(
     vehicle: Vehicle,
     plant: Plant,
     *,
-    trials: int = 8,
+    guides: Sequence[Guide] | None = None,
+    trials: int | None = None,
     seed: int = 42,
     record: Path | None = None,
     show: Show = lambda part: None,
     **world: Any,
-) -> Trials:
-    """Run trials of 60 s from the published start, level and at rest, towards the eight setpoints in turn.
+) -> list[Trial]:
+    """Run trials of T1, each 60 s from the published start, level and at rest; or of T2, from rest on the first pose.
 
     Args:
         agent: Who acts.
         task: Its observation is what the agent sees.
         vehicle: As its file has it and the agent knows it; the plant changes what it delivers.
         plant: What differs.
-        trials: How many, all at once.
+        guides: Setpoints or trajectories, in turn; the published ones if None.
+        trials: How many, all at once; one for each guide if None.
         seed: Of everything that the plant draws.
         record: New folder for every state, command and thrust; none if None.
         show: Called with the part done.
         world: Of `Environment`: hydrodynamics (unless the plant names one), crash_directory (where the last states of a
             world that broke are written).
+
+    Returns:
+        The trials; from the moment that its world broke the numbers of one are NaN.
     """
-    names = tuple(list(T1_SETPOINTS)[i % len(T1_SETPOINTS)] for i in range(trials))
-    goals = np.array([in_room(T1_SETPOINTS[name], vehicle) for name in names])
-    start = in_room(T1_START, vehicle)
-    environment = plant.environment(
-        agent, _at_pace_of(agent, task), vehicle, worlds=trials, seed=seed, auto_reset=False, **world
+    moving = follows(task)
+    ways = guides or [guide_of(name, vehicle) for name in (T2_TRAJECTORIES if moving else T1_SETPOINTS)]
+    chosen = [ways[i % len(ways)] for i in range(trials or len(ways))]
+    duration = max(guide.duration for guide in chosen) if moving else DURATION
+    paced: Any = replace(
+        task,
+        control_step=agent.period,
+        substeps=math.ceil(agent.period / PHYSICS_STEP - 1e-9),
+        **({"time_limit": duration + 1.0, "knot_spacing": 0.1} if moving else {}),
     )
-    environment.start(start[:3], quat_from_yaw(start[3]), goals[:, :3], quat_from_yaw(goals[:, 3]))
-    goal = Goal(goals[:, :3], quat_from_yaw(goals[:, 3]))
-    t, position, quaternion, _ = _played(agent, environment, DURATION, lambda t: goal, record, show)
-    return Trials(names, goals, t, position, np.asarray(quat_yaw(quaternion)))
-
-
-def _at_pace_of(agent: Agent, task: Any, **changes: Any) -> Any:
-    """The task at the agent's rate, its physics steps short enough."""
-    substeps = math.ceil(agent.period / PHYSICS_STEP - 1e-9)
-    return replace(task, control_step=agent.period, substeps=substeps, **changes)
-
-
-def _played(
-    agent: Agent,
-    environment: Environment,
-    duration: float,
-    goal: Callable[[float], Goal],
-    record: Path | None,
-    show: Show,
-) -> tuple[Array, ...]:
-    """Times (T,), positions (T, n, 3), quaternions (T, n, 4) and thrusts (T, n, thrusters) of the first vehicle."""
+    environment = plant.environment(
+        agent, paced, vehicle, worlds=len(chosen), seed=seed, auto_reset=False, **world
+    )
+    first = _goals(chosen, 0.0)
+    if moving:
+        follow(environment, chosen)
+    else:
+        start = in_room(T1_START, vehicle)
+        environment.start(start[:3], quat_from_yaw(start[3]), first.position, first.quaternion)
     steps, state = round(duration / agent.period), environment.simulator.state
     widths = {"position": 3, "quaternion": 4, "thrust": len(environment.simulator.vehicles[0].thrusters)}
     columns = {name: np.full((steps + 1, environment.worlds, n), np.nan) for name, n in widths.items()}
     episode = state.episode.numpy().copy()
+    goal: Callable[[float], Goal] = (lambda t: _goals(chosen, t)) if moving else (lambda t: first)
     for k, _ in rollout(agent, environment, steps, goal, record=record):
         same = state.episode.numpy() == episode  # a world that broke has started over
         for name, column in columns.items():
             column[k, same] = getattr(state, name).numpy()[same, 0, : widths[name]]
         show(k / steps)
-    return np.arange(steps + 1, dtype=np.float64) * agent.period, *columns.values()
-
-
-T2_TRAJECTORIES = ("straight", "broken", "ellipse", "lemniscate")
-"""The four of the paper's table."""
-
-
-@dataclass(frozen=True)
-class TrackingTrials:
-    """What happened, by trial; world frame, SI. From the moment a world broke its numbers are NaN."""
-
-    guides: tuple[Guide, ...]
-    """What each trial followed, n."""
-    t: Array
-    """Time since the start [s], (T,)."""
-    position: Array
-    """Body origin [m], (T, n, 3)."""
-    quaternion: Array
-    """Body to world, xyzw, (T, n, 4)."""
-    thrust: Array
-    """Delivered by each thruster [N], (T, n, thrusters)."""
-    limits: tuple[Array, Array]
-    """Lower and upper limit of each thruster [N]."""
-
-    def measures(self) -> list[dict[str, Any]]:
-        """What `measure_tracking` says of each trial, with its number and trajectory."""
-        return [
-            {
-                "trial": i,
-                "trajectory": guide.name,
-                **measure_tracking(
-                    self.t,
-                    self.position[:, i],
-                    guide,
-                    quaternion=self.quaternion[:, i],
-                    thrust=self.thrust[:, i],
-                    limits=self.limits,
-                ),
-            }
-            for i, guide in enumerate(self.guides)
-        ]
-
-
-def run_tracking(
-    agent: Agent,
-    task: TrajectoryTracking,
-    vehicle: Vehicle,
-    plant: Plant,
-    *,
-    trials: int = len(T2_TRAJECTORIES),
-    guides: Sequence[Guide] | None = None,
-    seed: int = 42,
-    record: Path | None = None,
-    show: Show = lambda part: None,
-    **world: Any,
-) -> TrackingTrials:
-    """Follow trajectories, each from rest on its first pose; arguments as `run_trials`.
-
-    Args:
-        guides: What is followed, in turn; the four published trajectories if None.
-    """
-    ways = guides or [load_trajectory(name, vehicle=vehicle) for name in T2_TRAJECTORIES]
-    chosen = tuple(ways[i % len(ways)] for i in range(trials))
-    longest = max(guide.duration for guide in chosen)
-    paced = _at_pace_of(agent, task, time_limit=longest + 1.0, knot_spacing=0.1)
-    environment = plant.environment(
-        agent, paced, vehicle, worlds=trials, seed=seed, auto_reset=False, **world
+    t = np.arange(steps + 1, dtype=np.float64) * agent.period
+    motions = (
+        Motion(t=t, **{name: column[:, i] for name, column in columns.items()}) for i in range(len(chosen))
     )
-    follow(environment, chosen)
-    played = _played(agent, environment, longest, lambda t: _goals(chosen, t), record, show)
-    lower, upper = environment.simulator.vehicles[0].force_limits
-    return TrackingTrials(chosen, *played, (np.asarray(lower, float), np.asarray(upper, float)))
+    return [
+        Trial(name=guide.name, guide=guide, motion=motion)
+        for guide, motion in zip(chosen, motions, strict=True)
+    ]
 
 
 def _goals(guides: Sequence[Guide], t: float) -> Goal:
@@ -223,36 +300,18 @@ def _goals(guides: Sequence[Guide], t: float) -> Goal:
         np.stack([getattr(reference, name) for reference in references])
         for name in ("position", "velocity", "yaw")
     )
-    return Goal(
-        position, quat_from_yaw(yaw), velocity, np.stack([acceleration_at(guide, t) for guide in guides])
-    )
+    acceleration = np.stack([acceleration_at(guide, t) for guide in guides])
+    return Goal(position, quat_from_yaw(yaw), velocity, acceleration)
 
 
 EPISODES = 64
-"""Unless told otherwise: an interval of a rate is then some ±0.12."""
+"""Unless another number is requested: an interval of a rate is then some ±0.12."""
 LABELS = ("trial", "record", "fault", "localization", "clock_offset_s")
 """What a trial's row has besides its metrics."""
 
 
 class EpisodeError(ValueError):
     """Episodes that cannot be run."""
-
-
-@dataclass(frozen=True)
-class Episodes:
-    """How each episode went."""
-
-    metrics: Mapping[str, NDArray[np.float64]]
-    """`Task.metrics`, (n,) each; NaN where there is none, such as a time never reached, or a world that broke."""
-
-    def measures(self) -> list[dict[str, Any]]:
-        """The metrics of each episode with its number; None where there is none."""
-        count = len(next(iter(self.metrics.values())))
-        rows = ({name: float(values[i]) for name, values in self.metrics.items()} for i in range(count))
-        return [
-            {"trial": i, **{k: x if np.isfinite(x) else None for k, x in row.items()}}
-            for i, row in enumerate(rows)
-        ]
 
 
 def run_episodes(
@@ -266,10 +325,14 @@ def run_episodes(
     record: Path | None = None,
     show: Show = lambda part: None,
     **world: Any,
-) -> Episodes:
+) -> list[dict[str, Any]]:
     """Run one episode in each of `trials` worlds to its end; starts and goals are those of training, drawn with `seed`.
 
     Arguments as `run_trials`; several agents of a world share one agent, and every vehicle of it is the same.
+
+    Returns:
+        `trial` and the `Task.metrics` of each episode; None where there is none, such as a time never reached, or a
+        world that broke.
 
     Raises:
         EpisodeError: The agent acts at another rate than the task.
@@ -281,7 +344,7 @@ def run_episodes(
         )
     environment = plant.environment(agent, task, vehicle, worlds=trials, seed=seed, **world)
     running = np.ones(trials, dtype=np.bool_)
-    found = {name: np.full(trials, np.nan) for name in task.metrics(environment.arrays)}
+    metrics = {name: np.full(trials, np.nan) for name in task.metrics(environment.arrays)}
     longest = round(task.time_limit / task.control_step) + 1
     for k, step in rollout(agent, environment, longest, lambda t: NOWHERE, record=record):
         if step is None:
@@ -289,14 +352,17 @@ def run_episodes(
         ended = running & (step.terminated | step.truncated)
         if ended.any():
             # A world that broke is terminated but not done; having begun anew, it is not frozen any more.
-            whole = ended & (environment.arrays.done.numpy() != 0)
+            complete = ended & (environment.arrays.done.numpy() != 0)
             for name, values in task.metrics(environment.arrays).items():
-                found[name][whole] = values[whole]
+                metrics[name][complete] = values[complete]
             running &= ~ended
         show(k / longest)
         if not running.any():
             break
-    return Episodes(found)
+    columns = {
+        name: [x if math.isfinite(x) else None for x in values.tolist()] for name, values in metrics.items()
+    }
+    return [{"trial": i, **{name: values[i] for name, values in columns.items()}} for i in range(trials)]
 
 
 def summarize_episodes(trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -308,8 +374,8 @@ def summarize_episodes(trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     metrics: dict[str, Any] = {}
     for name in (name for name in trials[0] if name not in LABELS):
         values = [float(trial[name]) for trial in trials if trial[name] is not None]
-        found = with_interval({i: [x] for i, x in enumerate(values)})
-        metrics[name] = {"value": found and found.value, "ci95": found and [found.low, found.high]}
+        mean = with_interval({i: [x] for i, x in enumerate(values)})
+        metrics[name] = {"value": mean and mean.value, "ci95": mean and [mean.low, mean.high]}
     return {
         "trials": len(trials),
         "valid": sum(trial["return"] is not None for trial in trials),

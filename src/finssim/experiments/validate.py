@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -10,15 +10,14 @@ from typing import Any
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from rich.console import Console
 
 from finssim.control.allocation import Allocator
 from finssim.engine import Simulator
-from finssim.experiments.tables import console_table
+from finssim.experiments.tables import Table
 from finssim.provenance import provenance
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
-__all__ = ["ValidationError", "validate"]
+__all__ = ["ValidationError", "tables_of", "validate"]
 
 PUBLISHED = Path(__file__).parent / "published"
 DURATION = 6.0
@@ -133,12 +132,7 @@ def steady_speeds(vehicle: Vehicle, hydrodynamics: str, thrust: NDArray[np.float
     return total / (steps - 3 * steps // 4)
 
 
-def validate(
-    name: str,
-    *,
-    hydrodynamics: str = "calibrated",
-    as_json: bool = False,
-) -> None:
+def validate(name: str, *, hydrodynamics: str = "calibrated") -> dict[str, Any]:
     """Print simulated beside published pool responses, and say where they disagree.
 
     Example: finssim validate finsrov
@@ -146,7 +140,6 @@ def validate(
     Args:
         name (NAME): Vehicle with published responses: finsrov.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
-        as_json: Print one JSON object instead of tables.
 
     Raises:
         ValidationError: nothing is published of this vehicle.
@@ -154,25 +147,31 @@ def validate(
     vehicle = load_vehicle(name)
     source = published(vehicle)["source"]
     responses = simulate_responses(vehicle, hydrodynamics)
-    if as_json:
-        rows = [{**asdict(r), "difference": r.difference, "agrees": r.agrees} for r in responses]
-        about = {"vehicle": {"name": vehicle.name, "sha256": vehicle.sha256}, "hydrodynamics": hydrodynamics}
-        print(
-            json.dumps({**about, "source": source, "responses": rows, "provenance": provenance()}, indent=2)
-        )
-        return
+    return {
+        "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
+        "hydrodynamics": hydrodynamics,
+        "source": source,
+        "responses": [{**asdict(r), "difference": r.difference, "agrees": r.agrees} for r in responses],
+        "provenance": provenance(),
+    }
+
+
+def tables_of(result: Mapping[str, Any]) -> list[Table]:
+    """A row for each response, and what is known of those that disagree."""
     rows = []
-    for r in responses:
-        unit, speed = ("N m", "rad/s") if r.axis in AXES[3:] else ("N", "m/s")
-        low, high = r.measured
+    for r in result["responses"]:
+        unit, speed = ("N m", "rad/s") if r["axis"] in AXES[3:] else ("N", "m/s")
+        low, high = r["measured"]
         measured = f"{low:.3f}" if low == high else f"{low:.3f} to {high:.3f}"
-        numbers = (f"{r.applied:.2f} {unit}", f"{abs(r.simulated):.3f} {speed}", f"{measured} {speed}")
-        verdict = "agrees" if r.agrees else "DISAGREES"
-        rows.append([r.name, *numbers, f"{100.0 * r.difference:+.0f} %", verdict])
-    console, title = Console(), f"{vehicle.name}, {hydrodynamics}: steady speeds"
-    heads = ("command", "applied", "simulated", "measured in the pool", "difference", "")
-    console.print(console_table(heads, rows, left=(0, 5), title=title))
-    for r in responses:
-        if r.why and not r.agrees:
-            console.print(f"{r.name}: {r.why}", markup=False, highlight=False)
-    console.print(f"measured: {source}; agreement is within {100 * AGREES:.0f} %", highlight=False)
+        numbers = (f"{r['applied']:.2f} {unit}", f"{abs(r['simulated']):.3f} {speed}", f"{measured} {speed}")
+        verdict = "agrees" if r["agrees"] else "DISAGREES"
+        rows.append([r["name"], *numbers, f"{100.0 * r['difference']:+.0f} %", verdict])
+    table = Table(
+        title=f"{result['vehicle']['name']}, {result['hydrodynamics']}: steady speeds",
+        heads=("command", "applied", "simulated", "measured in the pool", "difference", ""),
+        rows=rows,
+        left=(0, 5),
+        note=f"measured: {result['source']}; agreement is within {100 * AGREES:.0f} %",
+        sentences=[f"{r['name']}: {r['why']}" for r in result["responses"] if r["why"] and not r["agrees"]],
+    )
+    return [table]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -233,6 +234,11 @@ class Programme:
     def duration(self) -> float:
         """[s]"""
         return len(self.phase) / self.rate
+
+    @property
+    def sha256(self) -> str:
+        """Of what it commands, and when."""
+        return hashlib.sha256(self.tau_desired.tobytes() + "".join(self.phase).encode()).hexdigest()
 
 
 def which_axes(words: str | Sequence[str], vehicle: Vehicle) -> tuple[Axis, ...]:
