@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from finssim.learning.gymnasium_env import Env, VectorEnv
 from finssim.tasks import TASKS, EnvironmentSetupError, StationKeeping
@@ -95,6 +96,56 @@ def test_the_batch_says_how_it_resets_and_gives_final_observations():
     assert info["final_info"]["episode_length"].tolist() == [0, 0, 5, 5, 5, 5]
     assert info["final_info"]["success"].tolist() == [0.0] * 6 and info["_final_info"][5]
     assert batch.observation_space.contains(observation) and reward.shape == (6,)
+
+
+def test_the_next_episode_may_begin_in_the_next_step():
+    """NEXT_STEP: the last observation comes with the end, the first of the next episode a step later, for reward 0.
+
+    A world in mid-episode does what it does beside worlds that begin anew: bit for bit as in SAME_STEP.
+    """
+    batch, same = VectorEnv(3, SHORT, autoreset_mode="NextStep"), VectorEnv(3, SHORT)
+    assert batch.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    action = np.full((3, 6), 0.2, np.float32)
+    for env in (batch, same):
+        env.reset(seed=4)
+        env.environment.simulator.state.steps.assign(np.array([2, 2, 0], np.int32))
+    for _ in range(3):
+        observation, reward, _terminated, truncated, info = batch.step(action)
+        *_, final = same.step(action)
+    assert truncated.tolist() == [True, True, False] and info["_episode_length"].tolist() == [
+        True,
+        True,
+        False,
+    ]
+    assert info["episode_length"].tolist() == [5, 5, 0]
+    np.testing.assert_array_equal(observation[0], final["final_obs"][0])
+    last = observation.copy()
+    observation, reward, terminated, truncated, info = batch.step(action)
+    other, *_ = same.step(action)
+    assert reward[:2].tolist() == [0.0, 0.0] and not (terminated | truncated).any() and info == {}
+    assert (
+        not np.allclose(observation[:2], last[:2]) and batch.environment.simulator.state.steps.numpy()[0] == 0
+    )
+    np.testing.assert_array_equal(observation[2], other[2])
+    *_, truncated, _ = batch.step(action)
+    assert truncated.tolist() == [False, False, True]
+
+
+def test_gymnasiums_statistics_are_the_tasks():
+    """Its wrapper, which takes NEXT_STEP alone, counts returns and lengths as the task does."""
+    batch = RecordEpisodeStatistics(VectorEnv(2, SHORT, autoreset_mode=AutoresetMode.NEXT_STEP))
+    batch.reset(seed=2)
+    for _ in range(11):
+        *_, info = batch.step(np.zeros((2, 6), np.float32))
+    assert info["episode"]["l"].tolist() == [5, 5] == info["episode_length"].tolist()
+    np.testing.assert_allclose(info["episode"]["r"], info["episode_return"], rtol=1e-5)
+
+
+def test_another_way_to_begin_is_refused():
+    with pytest.raises(
+        EnvironmentSetupError, match="autoreset_mode is Disabled, expected SameStep or NextStep"
+    ):
+        VectorEnv(1, SHORT, autoreset_mode="Disabled")
 
 
 def test_what_was_returned_stays():

@@ -98,33 +98,51 @@ class Env(gymnasium.Env[Any, Any]):
 
 
 class VectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any]]):
-    """A batch of worlds. Where an episode ends, the next starts in the same step (`AutoresetMode.SAME_STEP`).
+    """A batch of worlds, with Gymnasium's two ways to begin the next episode.
 
-    `info` then has `final_obs` (an array of observations, None elsewhere) and `final_info` (`episode_return`,
-    `episode_length` and the task's other metrics, such as `held`: time within the success tolerance when it ended [s]),
-    with their masks.
+    `AutoresetMode.SAME_STEP`, the default: the step that ends an episode begins the next one. `info` then has
+    `final_obs` (an array of observations, None elsewhere) and `final_info` (`episode_return`, `episode_length` and the
+    task's other metrics, such as `held`: time within the success tolerance when it ended [s]), with their masks.
+
+    `AutoresetMode.NEXT_STEP`, which Gymnasium's own wrappers expect: the step that ends an episode returns its last
+    observation, and these metrics in `info` itself; the next step begins an episode there, whatever the action, with
+    reward 0.
     """
 
-    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
-
     def __init__(
-        self, num_envs: int | None = None, task: str | Task | Environment = "t1", **options: Any
+        self,
+        num_envs: int | None = None,
+        task: str | Task | Environment = "t1",
+        *,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        **options: Any,
     ) -> None:
         """Set up the worlds.
 
         Args:
             num_envs: How many, Gymnasium's word for `worlds`; 1 if neither is given.
-            task: A task or its name; or an environment.
+            task: A task or its name; or an environment, made with auto_reset=False for NEXT_STEP.
+            autoreset_mode: When the next episode begins: SAME_STEP or NEXT_STEP, or Gymnasium's text for it.
             options: The other arguments of `finssim.make`: vehicle, hydrodynamics, action, randomize, seed, ...
 
         Raises:
-            EnvironmentSetupError: As `finssim.make`; or the task has several agents.
+            EnvironmentSetupError: As `finssim.make`; the task has several agents, or there is no such mode.
         """
         self.render_mode = options.pop("render_mode", None)
+        modes = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
+        if autoreset_mode not in (*modes, *(mode.value for mode in modes)):
+            raise EnvironmentSetupError(
+                f"autoreset_mode is {autoreset_mode}, expected {' or '.join(mode.value for mode in modes)}"
+            )
+        mode = AutoresetMode(autoreset_mode)
+        self.metadata = {"render_modes": [], "autoreset_mode": mode}
+        self._same_step = mode is AutoresetMode.SAME_STEP
         if num_envs is not None:
             options["worlds"] = num_envs
-        self.environment = one_agent(served(task, options), "Gymnasium")
+        environment = served(task, options, auto_reset=self._same_step)
+        self.environment = one_agent(environment, "Gymnasium")
         self.num_envs = self.environment.worlds
+        self._ended = np.zeros(self.num_envs, bool)
         self.single_observation_space = observation_space(self.environment)
         self.single_action_space = action_space(self.environment)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -136,29 +154,44 @@ class VectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any
         """Start an episode in every world, or in those of `options["reset_mask"]`; one seed serves the batch."""
         super().reset(seed=seed)
         mask = (options or {}).get("reset_mask")
+        self._ended &= False if mask is None else ~np.asarray(mask, bool)
         return self.environment.reset(mask=mask, seed=seed).copy(), {}
 
     def step(
         self, actions: Observation
     ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Act for one control step; actions (worlds, size), each in [-1, 1]."""
-        step = self.environment.step(actions)
-        ended = step.terminated | step.truncated
-        info = self._final(step.final_observation, ended) if ended.any() else {}
-        return step.observation.copy(), step.reward.copy(), step.terminated, step.truncated, info
+        before, step = self._ended, self.environment.step(actions)
+        observation, reward = step.observation.copy(), step.reward.copy()
+        terminated, truncated = step.terminated & ~before, step.truncated & ~before
+        ended = terminated | truncated
+        if self._same_step:
+            info = self._final(step.final_observation, ended) if ended.any() else {}
+            return observation, reward, terminated, truncated, info
+        observation[ended] = step.final_observation[ended]
+        info = self._metrics(ended) if ended.any() else {}
+        if before.any():
+            observation[before] = self.environment.reset(mask=before)[before]
+            reward[before] = 0.0
+        self._ended = ended
+        return observation, reward, terminated, truncated, info
+
+    def _metrics(self, ended: NDArray[np.bool_]) -> dict[str, Any]:
+        """How the episodes went that have ended, with masks."""
+        totals: dict[str, Any] = {}
+        for key, value in self.environment.task.metrics(self.environment.arrays).items():
+            name = f"episode_{key}" if key in ("return", "length") else key
+            totals |= {name: np.where(ended, value, 0), f"_{name}": ended.copy()}
+        return totals
 
     def _final(self, observation: Observation, ended: NDArray[np.bool_]) -> dict[str, Any]:
         final = np.full(self.num_envs, None, dtype=object)
         for w in np.flatnonzero(ended):
             final[w] = observation[w].copy()
-        totals: dict[str, Any] = {}
-        for key, value in self.environment.task.metrics(self.environment.arrays).items():
-            name = f"episode_{key}" if key in ("return", "length") else key
-            totals |= {name: np.where(ended, value, 0), f"_{name}": ended.copy()}
         return {
             "final_obs": final,
             "_final_obs": ended.copy(),
-            "final_info": totals,
+            "final_info": self._metrics(ended),
             "_final_info": ended.copy(),
         }
 
