@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import EnvBase, RewardSum, TransformedEnv
+from torchrl.envs import EnvBase, GymWrapper, RewardSum, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from finssim.learning.gymnasium_env import VectorEnv
 from finssim.learning.torchrl_env import TorchRlEnv
 from finssim.tasks import TASKS, EnvironmentSetupError, StationKeeping, make
 from reference.pair import Pair
@@ -26,6 +27,14 @@ def test_torchrls_checker_passes_with_groups():
     env = TorchRlEnv(Pair(), worlds=3, groups=APART)
     check_env_specs(env, break_when_any_done="both")
     assert set(env.rollout(2)["next"].keys()) >= {"port", "starboard", "done", "terminated", "truncated"}
+
+
+def test_torchrls_own_wrapper_takes_gymnasiums_form():
+    """GymWrapper around VectorEnv: its checker passes, and a rollout goes through two ends."""
+    env = GymWrapper(VectorEnv(3, SHORT))
+    check_env_specs(env)
+    done = env.rollout(12, break_when_any_done=False)["next", "done"][..., 0]
+    assert done.sum(1).tolist() == [2, 2, 2] and done[:, [4, 9]].all()
 
 
 def played(env, steps=12, seed=5):

@@ -134,9 +134,9 @@ class VectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any
             raise EnvironmentSetupError(
                 f"autoreset_mode is {autoreset_mode}, expected {' or '.join(mode.value for mode in modes)}"
             )
-        mode = AutoresetMode(autoreset_mode)
-        self.metadata = {"render_modes": [], "autoreset_mode": mode}
-        self._same_step = mode is AutoresetMode.SAME_STEP
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
+        self._same_step = self.autoreset_mode is AutoresetMode.SAME_STEP
         if num_envs is not None:
             options["worlds"] = num_envs
         environment = served(task, options, auto_reset=self._same_step)
