@@ -104,6 +104,7 @@ def test_dagger_takes_demonstrations_to_begin_with(shown):
     assert len(few._observation) == 100
 
 
+@pytest.mark.slow  # importing torchrl starts a process
 def test_a_judge_tells_the_expert_from_noise(shown):
     """After some rounds the reward of what was shown is above that of random actions in the same places."""
     learner = made("gail", demonstrations=shown, discriminator_updates=50, discriminator_rate=3e-3)
@@ -116,6 +117,7 @@ def test_a_judge_tells_the_expert_from_noise(shown):
     assert all(0.0 <= row["passes_for_expert"] <= 1.0 for row in rows)
 
 
+@pytest.mark.slow  # importing torchrl starts a process
 def test_the_reward_of_gail_is_the_judges_and_not_the_tasks(shown):
     """log(1 + exp(logit)) of what was seen and done, while the tally counts the task's own."""
     learner = made("gail", demonstrations=shown)
@@ -145,7 +147,7 @@ def test_a_training_goes_on_bitwise(name, shown, tmp_path):
         assert torch.equal(a, b)
 
 
-@pytest.mark.parametrize("name", ["bc", "gail"])
+@pytest.mark.parametrize("name", ["bc", pytest.param("gail", marks=pytest.mark.slow)])
 def test_what_does_not_fit_is_refused(name, shown):
     """No set, another task, vehicle or mode."""
     with pytest.raises(LearningError, match="no demonstrations are named: collect some with finssim collect"):

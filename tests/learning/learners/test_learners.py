@@ -107,6 +107,7 @@ def test_it_finds_the_best_action(name, task):
     assert held["evaluation_success"] == 1.0 and held["evaluation_return"] > 0.96
 
 
+@pytest.mark.slow  # importing torchrl starts a process
 @pytest.mark.parametrize(("name", "task"), [("torchrl-ppo", "team-pursuit"), ("torchrl-mappo", "t1")])
 def test_one_agent_is_not_several(name, task):
     """With what to take instead."""
