@@ -195,6 +195,7 @@ def test_a_library_that_is_missing_is_named(monkeypatch, name, library, extra):
         kind.settings(Guess())
 
 
+@pytest.mark.slow  # importing torchrl starts a process
 def test_settings_are_changed_by_name():
     """As numbers or as words, in the setting's own type."""
     changes = {"learning_rate": "1e-3", "hidden": [32, 16], "epochs": 3}
