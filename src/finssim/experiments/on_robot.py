@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -20,7 +21,7 @@ from finssim.control.guidance import Guide, Station
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.geometry.rotations import quat_yaw, wrap_angle
 from finssim.localization.pool import Pool, load_pool
-from finssim.robot.goals import check_reachable
+from finssim.robot.goals import check_reachable, place_of
 from finssim.robot.link.transports import DEFAULT_BIND
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import Pilot, WrenchPilot, make_pilot
@@ -297,6 +298,9 @@ class OnRobot:
     """Somebody carries the vehicle to every start; False: the tuned PID steers it there."""
     unattended: bool = False
     """Nobody presses a key: the way to a start begins as soon as the state is known, and a fault ends it all."""
+    let_in: tuple[float, float] | None = None
+    """Where the vehicle is when the session begins, x and y, world frame [m]: dead reckoning goes on from there through
+    all trials. None: a camera or position fixes locate it."""
 
     @property
     def title(self) -> str:
@@ -309,6 +313,7 @@ class OnRobot:
         wiring = self.wiring
         words = ["--robot", wiring.robot, "--pool-file", str(self.pool_file or "none")]
         words += ["--site", self.site] if self.site != "pool" else []
+        words += ["--let-in", ",".join(f"{x:g}" for x in self.let_in)] if self.let_in is not None else []
         words += ["--bind", wiring.bind] if wiring.bind != DEFAULT_BIND else []
         words += ["--pictures", wiring.pictures] if wiring.pictures else []
         return shlex.join([*words, *(["--lockstep"] if wiring.lockstep else [])])
@@ -325,6 +330,7 @@ def robot_or_none(
     arm: bool = False,
     by_hand: bool = False,
     unattended: bool = False,
+    let_in: str | None = None,
 ) -> OnRobot | None:
     """The robot that options name; none where they name none, and nothing tells of one.
 
@@ -342,16 +348,19 @@ def robot_or_none(
         arm: Let thrusters turn, as soon as the state is known. Without it they never do.
         by_hand: Somebody carries the vehicle to where each trial starts; the tuned PID steers it there if not given.
         unattended: Nobody presses enter before each trial; a fault ends the session, and nothing is armed after it.
+        let_in (X,Y): Where the vehicle is when the command begins, world frame [m], known to 5 cm: its position is
+            reckoned on from there by Doppler log and compass through all trials. With --pool-file none.
 
     Raises:
+        GoalError: --let-in is no place.
         RobotError: Something tells of a robot and none is named, or it has no pool file.
     """
     if robot is None:
-        told = (arm, by_hand, unattended, lockstep, pool_file, pictures, site)
+        told = (arm, by_hand, unattended, lockstep, pool_file, pictures, site, let_in)
         if any(x is not None and x is not False for x in told):
             raise RobotError(
-                "--arm, --by-hand, --unattended, --lockstep, --pool-file, --site and --pictures tell of a robot: name "
-                "one with --robot"
+                "--arm, --by-hand, --unattended, --lockstep, --pool-file, --site, --let-in and --pictures tell of a "
+                "robot: name one with --robot"
             )
         return None
     if pool_file is None:
@@ -360,9 +369,14 @@ def robot_or_none(
         )
     wiring = Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep)
     file = None if pool_file == "none" else Path(pool_file)
+    if let_in is not None and file is not None:
+        raise RobotError(
+            "--let-in is for dead reckoning, and a camera locates the vehicle: give --pool-file none"
+        )
     return OnRobot(
-        wiring=wiring, pool_file=file, site=site or "pool", arm=arm, by_hand=by_hand, unattended=unattended
-    )
+        wiring=wiring, pool_file=file, site=site or "pool", arm=arm, by_hand=by_hand, unattended=unattended,
+        let_in=None if let_in is None else place_of(let_in),
+    )  # fmt: skip
 
 
 class _Screen:
@@ -397,6 +411,11 @@ class Session:
         """The vehicle as it is equipped where it is."""
         return vehicle_at(self.robot.site, self.vehicle)
 
+    @cached_property
+    def _reckoning(self) -> Perception:
+        """Of a robot that was let in: one for all trials, so that what it reckons is carried from each to the next."""
+        return Perception(self.equipped, None, mode="error-state", let_in=self.robot.let_in)
+
     def say(self, text: str) -> None:
         """Tell whoever watches."""
         self.console.print(text, highlight=False, markup=False)
@@ -422,7 +441,7 @@ class Session:
                 operator stopped never counts.
             exact: Whether the vehicle must be at its start and at rest, however long that takes: to 10 cm, in open
                 water to 30 cm and at a speed of waves.
-            perception: Otherwise than by default, made anew for every attempt.
+            perception: Otherwise than by default, made anew for every attempt; not of a robot that was let in.
             about: Metadata of the record.
 
         Returns:
@@ -452,7 +471,8 @@ class Session:
                     trial, self.equipped, start, start_bounds(self.robot.site, exact), by_hand=self.robot.by_hand,
                     attendant=self.attendant, recorder=recorder,
                 )  # fmt: skip
-                outcome = stages.play(self.drive, self.site, perception and perception())
+                known = self._reckoning if self.robot.let_in is not None else perception and perception()
+                outcome = stages.play(self.drive, self.site, known)
             if recorder is not None and recorder.problem and outcome.ended == "over":
                 raise RobotError(f"{record}: {recorder.problem}")
             stopped = (
