@@ -93,7 +93,7 @@ def test_a_policy_pilot_gives_the_thrusts_of_its_network(policy):
         ({"task": "t2"}, "observation schema does not fit"),
         (
             {"action": {**action_mode("wrench4", VEHICLE).describe(), "limits": [1.0] * 6}},
-            "wrench4: limits was",
+            r"wrench4.limits\[0\] is 1.0 in the policy and",
         ),
         (
             {"action": {**action_mode("wrench4", VEHICLE).describe(), "mode": "jet"}},
