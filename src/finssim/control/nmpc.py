@@ -161,9 +161,8 @@ class Nmpc:
 
         state = np.concatenate([p, q / np.linalg.norm(q), nu, memory.thrust])
         first = state
-        for k, under_way in enumerate(
-            memory.queue
-        ):  # what is under way acts before anything that is decided now
+        # What is under way acts before anything that is decided now.
+        for k, under_way in enumerate(memory.queue):
             state = np.asarray(self.advance(state, under_way, w)).ravel()
             first = state if k == 0 else first
         hold = self.body.holding_wrench(q_goal, q_goal)
@@ -179,9 +178,8 @@ class Nmpc:
         plan = np.asarray(answer["x"]).ravel()
         lower, upper = self.allocator.lower, self.allocator.upper
         thrust = np.clip(plan[state.size : state.size + steady.size], lower, upper)
-        if not np.isfinite(
-            plan
-        ).all():  # a solver that fails does not stop the vehicle: hold it and begin anew
+        # A solver that fails does not stop the vehicle: hold it and begin anew.
+        if not np.isfinite(plan).all():
             thrust, plan = steady, np.full_like(plan, np.nan)
         queue = np.concatenate([memory.queue, thrust[None]])
         if not self.delays:
@@ -207,9 +205,8 @@ def _model(vehicle: Vehicle, hydrodynamics: str, lag: float, period: float) -> A
     n, point = len(vehicle.thrusters), np.asarray(chosen.reference_point, float)
     M, B = vehicle.mass_matrix(hydrodynamics), vehicle.thruster_matrix()
     D1 = moved_to_origin(np.asarray(chosen.linear_damping, float), point)
-    to_point = np.eye(
-        6
-    )  # twist of the body origin -> twist of the point that the quadratic damping is given for
+    # Twist of the body origin -> twist of the point that the quadratic damping is given for.
+    to_point = np.eye(6)
     to_point[:3, 3:] = -skew(point)
     D2 = np.asarray(chosen.quadratic_damping, float)
     r_g, r_b = (
