@@ -5,12 +5,11 @@ import pytest
 
 from calibration.made_steps import RPM, held, lagged, sampled, step_log
 from finssim.calibration.actuators.motor import cut_steps, fit_motor, fit_response, loop_gains
-from finssim.calibration.actuators.steps import find_steps, levels
+from finssim.calibration.actuators.thrust_table import find_steps, levels
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation.programmes import programmes
 from finssim.calibration.excitation.synthetic import simulate_programme
-from finssim.calibration.trials.header import Header
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial import Header, Trial
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")

@@ -8,9 +8,8 @@ import pytest
 from calibration.moving_body import MovingBody
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.motion.signals import motion
-from finssim.calibration.trials.header import Header, TrialWater
-from finssim.calibration.trials.time_base import merged
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.conversion import merged
+from finssim.calibration.trials.trial import Header, Trial, TrialWater
 from finssim.geometry.rotations import quat_inverse_rotate, quat_to_euler
 from finssim.vehicles import load_vehicle
 

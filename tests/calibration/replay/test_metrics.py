@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 
 from finssim.calibration.replay.metrics import (
+    Pair,
     aggregate,
     error_ahead,
+    excited_axes,
+    find_phases,
     nrmse,
+    onset,
     phase_score,
     response_span,
     score,
     span,
 )
-from finssim.calibration.replay.pairs import Pair, excited_axes, find_phases, onset
 from finssim.calibration.replay.report import LIMITS, classify, coupling, gates
 
 RATE, HOLD, COAST, LEVEL, DAMPING, MASS = 50.0, 9.0, 4.0, 12.0, 40.0, 27.0

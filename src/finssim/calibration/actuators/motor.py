@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.actuators.steps import find_steps
-from finssim.calibration.actuators.thrust_curve import jackknife
+from finssim.calibration.actuators.thrust_table import find_steps
+from finssim.calibration.actuators.thruster import jackknife
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
@@ -24,7 +24,7 @@ from finssim.calibration.uncertainty import Evidence, correlated_samples, interv
 from finssim.vehicles import Vehicle
 from finssim.vehicles.thruster import Thruster
 
-__all__ = ["LOOP_RATE", "Response", "StepRecord", "cut_steps", "fit_motor", "fit_response", "loop_gains"]
+__all__ = ["cut_steps", "fit_motor", "fit_response", "loop_gains"]
 
 Array = NDArray[np.float64]
 

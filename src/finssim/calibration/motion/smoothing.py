@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.fft import dst
 from scipy.linalg import solveh_banded
 
-__all__ = ["Smooth", "longest_step", "smooth", "stretches", "without_spikes"]
+__all__ = ["longest_step", "smooth", "stretches", "without_spikes"]
 
 Array = NDArray[np.float64]
 

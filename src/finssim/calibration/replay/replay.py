@@ -17,15 +17,17 @@ from finssim.calibration.replay.metrics import (
     SEED,
     Aggregate,
     Ahead,
+    Pair,
     Score,
     aggregate,
     error_ahead,
+    excited_axes,
+    find_phases,
+    resampled,
     response_span,
     score,
 )
-from finssim.calibration.replay.pairs import Pair, excited_axes, find_phases, resampled
-from finssim.calibration.simulation.rollout import Response, Rollouts
-from finssim.calibration.simulation.segments import Segment, Streams, segments, streams
+from finssim.calibration.simulation.rollout import Response, Rollouts, Segment, Streams, segments, streams
 from finssim.calibration.trials.trial import NU, Array, Trial
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.geometry.rotations import quat_rotate, quat_to_euler

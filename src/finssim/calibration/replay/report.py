@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from rich import box
@@ -15,16 +15,321 @@ from rich.table import Table
 from rich.text import Text
 
 from finssim.calibration.findings import Finding, finding, sentences
-from finssim.calibration.replay.figure import MODEL_LABELS, draw_ahead, draw_overlay, draw_response_envelopes
-from finssim.calibration.replay.metrics import RESAMPLES, Aggregate, Score, phase_score, response_span, score
-from finssim.calibration.replay.pairs import Pair, onset
+from finssim.calibration.replay.metrics import (
+    RESAMPLES,
+    UNITS,
+    Aggregate,
+    Ahead,
+    Pair,
+    Score,
+    aggregate,
+    models_of,
+    onset,
+    phase_score,
+    response_span,
+    score,
+)
 from finssim.calibration.replay.replay import Replay
 from finssim.calibration.trials.trial import Array
 from finssim.files import atomic_directory
 from finssim.provenance import provenance
 from finssim.vehicles.vehicle import AXES, Axis
 
-__all__ = ["DEFINITION", "REPLAY_FILE", "print_replay", "replay_json", "replay_markdown", "write_replay"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "DEFINITION",
+    "MODEL_LABELS",
+    "REPLAY_FILE",
+    "draw_ahead",
+    "draw_overlay",
+    "draw_response_envelopes",
+    "normalised",
+    "print_replay",
+    "replay_json",
+    "write_replay",
+]
+
+MODEL_LABELS = {"calibrated": "Calibrated Fossen", "mesh": "Physics-mesh", "simplified": "Simplified Fossen"}
+COLORS = {"calibrated": "#0072B2", "mesh": "#009E73", "simplified": "#D55E00"}
+OTHERS = ("#CC79A7", "#56B4E9", "#E69F00")
+"""Okabe and Ito's palette: tells models apart for the colour-blind too."""
+BLACK, GRAY = "#1a1a1a", "0.6"
+STYLES = {"calibrated": (0, ()), "mesh": (0, (6, 1.6)), "simplified": (0, (1.6, 1.2))}
+"""Line styles, for a print without colours."""
+
+BEFORE = 0.5
+"""Time shown before the onset [s]."""
+SYMBOLS = {"roll": "roll", "pitch": "pitch", "depth": "depth"} | {name: f"${name}$" for name in "uvwpqr"}
+
+
+def normalised(pair: Pair, values: Array, axis: Axis) -> tuple[Array, Array] | None:
+    """A response over the time since the onset, sign-aligned and relative to the measured P5-P95 span.
+
+    Signs are those of the input, and of the response itself where there is none.
+
+    Args:
+        pair: The trial.
+        values: Measured or simulated response of the axis, (n,).
+        axis: The axis.
+
+    Returns:
+        Times since the onset of the input [s] and values [-], (n,) each; None where the trial has no such response. A
+        passive trial starts at its first scored sample.
+    """
+    width = response_span(pair, pair.response(axis)).value
+    if width is None:
+        return None
+    start = onset(pair, axis)
+    begin = int(np.argmax(pair.scored())) if start is None else start
+    inside = pair.scored()
+    push = pair.tau[inside, AXES.index(axis)]
+    leading = push if start is not None else pair.measured[pair.response(axis)][inside]
+    sign = 1.0 if np.nansum(leading) >= 0.0 else -1.0
+    return pair.t - pair.t[begin], sign * values / width
+
+
+def draw_response_envelopes(pairs: Sequence[Pair], title: str = "") -> Figure:
+    """Axis-wise envelopes: a panel for each axis, pointwise median and middle half over its trials.
+
+    Held-out trials are drawn where there are any; else those the vehicle was fitted on, and the figure says so.
+
+    Args:
+        pairs: Trials with their replays.
+        title: Written above, or left out when empty.
+
+    Raises:
+        ValueError: No trial has a response that could be drawn.
+    """
+    held_out = [pair for pair in pairs if not pair.in_sample]
+    shown = held_out or list(pairs)
+    panels = {axis: [p for p in shown if axis in p.axes and _drawable(p, axis)] for axis in AXES}
+    panels = {axis: chosen for axis, chosen in panels.items() if chosen}
+    if not panels:
+        raise ValueError(
+            "no trial has a response that could be drawn: nothing was measured on an excited axis"
+        )
+    models = models_of(shown)
+    columns = 1 if len(panels) == 1 else 2
+    rows = -(-len(panels) // columns)
+    figure, axes_of = _panels(len(panels), rows, columns, (3.6 * columns, 2.15 * rows + 0.55))
+    for i, (axis, chosen) in enumerate(panels.items()):
+        _envelope_panel(axes_of.flat[i], axis, chosen, models)
+    for i in range(0, len(panels), columns):
+        axes_of.flat[i].set_ylabel("normalised response")
+    for axes in axes_of.flat[max(len(panels) - columns, 0) : len(panels)]:
+        axes.set_xlabel("time since onset [s]")
+    handles, labels = axes_of.flat[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False, fontsize=8.5)
+    warning = "" if held_out else "in-sample: the vehicle was fitted on these trials"
+    if title or warning:
+        heading = "\n".join(filter(None, (title, warning)))
+        figure.suptitle(heading, fontsize=10, color="#a00000" if warning else BLACK)
+    return figure
+
+
+def draw_overlay(pair: Pair) -> Figure:
+    """One trial: the input if any, the responses of the excited axes, attitude and depth where they were measured."""
+    responses = [pair.response(axis) for axis in pair.axes]
+    responses += [r for r in ("roll", "pitch", "depth") if response_span(pair, r).value is not None]
+    responses = [r for r in responses if r in pair.measured]
+    driven = bool(np.nan_to_num(pair.tau).any())
+    rows = len(responses) + driven
+    figure, grid = _panels(rows, rows, 1, (7.2, 1.1 + 1.45 * rows), sharex=True)
+    axes_of = grid[:, 0]
+    if driven:
+        _input_panel(axes_of[0], pair)
+    models = models_of([pair])
+    for axes, response in zip(axes_of[driven:], responses, strict=True):
+        if response in pair.raw:
+            axes.plot(pair.t, pair.raw[response], color="0.8", linewidth=0.8)
+        axes.plot(pair.t, pair.measured[response], color=BLACK, linewidth=2.4, label="measured")
+        for model in models:
+            values = _broken(pair, pair.simulated[model][response])
+            figure_of = score(pair, model, response).value
+            note = "" if figure_of is None else f" {figure_of:.3f}"
+            label = f"{MODEL_LABELS.get(model, model)}{note}"
+            axes.plot(
+                pair.t, values, color=_color(model, models), linestyle=_style(model), lw=1.3, label=label
+            )
+        axes.set_ylabel(f"{SYMBOLS[response]} [{UNITS[response]}]")
+        source = pair.source.get(response, "")
+        if source not in ("", "measured"):
+            axes.plot([], [], " ", label=f"({source})")
+        axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=7.5)
+    for axes in axes_of:
+        _tidy(axes)
+        axes.set_xlim(pair.t[0], pair.t[-1])
+    axes_of[-1].set_xlabel("time [s]")
+    label = f"{pair.name}: {', '.join(pair.axes) if driven else 'passive'}" + (
+        ", in-sample" if pair.in_sample else ""
+    )
+    figure.suptitle(label, fontsize=10, color="#a00000" if pair.in_sample else BLACK)
+    return figure
+
+
+def draw_ahead(ahead: Mapping[Axis, Mapping[str, Ahead]]) -> Figure:
+    """Error of predictions from measured states by how far they look ahead, a panel for each axis.
+
+    Relative to the span of the response; persistence, the prediction that nothing changes, is gray.
+
+    Args:
+        ahead: Axis -> model -> error.
+    """
+    columns = min(len(ahead), 3)
+    rows = -(-len(ahead) // columns)
+    figure, axes_of = _panels(len(ahead), rows, columns, (1.2 + 2.4 * columns, 2.0 * rows + 0.5))
+    for axes, (axis, by_model) in zip(axes_of.flat, ahead.items(), strict=False):
+        for model, a in by_model.items():
+            label, color = MODEL_LABELS.get(model, model), _color(model, tuple(by_model))
+            look = {"color": color, "linestyle": _style(model), "linewidth": 1.4}
+            axes.plot(a.seconds, a.nrmse, marker="o", markersize=3, label=label, **look)
+        first = next(iter(by_model.values()))
+        axes.plot(first.seconds, first.nrmse_persistence, "s-", color=GRAY, ms=3, lw=1.2, label="persistence")
+        axes.set_title(axis, fontsize=9, loc="left")
+        axes.set_xlabel("seconds ahead")
+        axes.set_ylim(bottom=0.0)
+        axes.set_xlim(left=0.0)
+        _tidy(axes)
+    for row in axes_of:
+        row[0].set_ylabel("error / span")
+    handles, labels = axes_of.flat[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False, fontsize=8.5)
+    return figure
+
+
+def _panels(
+    count: int, rows: int, columns: int, size: tuple[float, float], **shared: Any
+) -> tuple[Figure, Any]:
+    """A figure of that size [inch] with `count` visible axes in a grid, (rows, columns)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes_of = figure.subplots(rows, columns, squeeze=False, **shared)
+    for axes in axes_of.flat[count:]:
+        axes.set_visible(False)
+    return figure, axes_of
+
+
+def _envelope_panel(axes: Any, axis: Axis, pairs: Sequence[Pair], models: Sequence[str]) -> None:
+    grid = _grid(pairs, axis)
+    measured = [_on(grid, normalised(p, p.measured[p.response(axis)], axis)) for p in pairs]
+    _band(axes, grid, np.array(measured), BLACK, "measured", (0, ()), zorder=2.5, width=3.2)
+    for k, model in enumerate(models):
+        values = [
+            _on(grid, normalised(p, p.simulated[model][p.response(axis)], axis))
+            for p in pairs
+            if model in p.simulated
+        ]
+        color = _color(model, models)
+        _band(axes, grid, np.array(values), color, MODEL_LABELS.get(model, model), _style(model), zorder=3)
+        scores = [{axis: score(p, model, p.response(axis)).value} for p in pairs if model in p.simulated]
+        value = aggregate(scores, resamples=1).value
+        if value is not None:
+            place = (1.0 - 0.14 * (len(models) - 1 - k), 1.03)
+            axes.text(*place, f"{value:.3f}", transform=axes.transAxes, color=color, fontsize=8, ha="right")
+    place = (1.0 - 0.14 * len(models), 1.03)
+    axes.text(*place, "NRMSE", transform=axes.transAxes, color="0.45", fontsize=7, ha="right")
+    coast = [p.t[np.argmax(p.phase == "coast")] - p.t[onset(p, axis) or 0] for p in pairs if _coasts(p, axis)]
+    if coast:
+        axes.axvspan(float(np.median(coast)), grid[-1], color="0.945", zorder=0, linewidth=0.0)
+        axes.annotate(
+            "coast", (float(np.median(coast)), 0.02), xycoords=("data", "axes fraction"),
+            xytext=(3, 1), textcoords="offset points", fontsize=7, color="0.45",
+        )  # fmt: skip
+    count = f"{len(pairs)} trial{'s' if len(pairs) != 1 else ''}"
+    axes.set_title(f"{axis} ({count})", fontsize=9, loc="left")
+    axes.set_xlim(grid[0], grid[-1])
+    _tidy(axes)
+
+
+def _input_panel(axes: Any, pair: Pair) -> None:
+    names = pair.axes or AXES[:1]
+    for axis, style in zip(names, ("-", "--", ":", "-.", "-", "--"), strict=False):
+        unit = "N" if axis in AXES[:3] else "N m"
+        values = pair.tau[:, AXES.index(axis)]
+        axes.plot(pair.t, values, color="0.35", linestyle=style, linewidth=1.1, label=f"{axis} [{unit}]")
+    axes.set_ylabel("input")
+    axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=7.5)
+
+
+def _drawable(pair: Pair, axis: Axis) -> bool:
+    return response_span(pair, pair.response(axis)).value is not None
+
+
+def _coasts(pair: Pair, axis: Axis) -> bool:
+    return bool((pair.phase == "coast").any()) and onset(pair, axis) is not None
+
+
+def _grid(pairs: Sequence[Pair], axis: Axis) -> Array:
+    """Times since the onset that three quarters of the trials cover [s], so that no trial's end shows as a step."""
+    ends = []
+    for pair in pairs:
+        aligned = normalised(pair, pair.t, axis)
+        assert aligned is not None
+        ends.append(aligned[0][np.flatnonzero(pair.scored())[-1]])
+    first = max(-BEFORE, float(np.median([-(p.t[onset(p, axis) or 0] - p.t[0]) for p in pairs])))
+    rate = max(pair.rate for pair in pairs)
+    return np.asarray(
+        np.arange(np.ceil(first * rate), np.floor(float(np.quantile(ends, 0.25)) * rate) + 1) / rate
+    )
+
+
+def _on(grid: Array, aligned: tuple[Array, Array] | None) -> Array:
+    assert aligned is not None
+    t, x = aligned
+    good = np.isfinite(x)
+    if not good.any():
+        return np.full(len(grid), np.nan)
+    return np.asarray(np.interp(grid, t[good], x[good], left=np.nan, right=np.nan))
+
+
+def _band(
+    axes: Any,
+    grid: Array,
+    values: Array,
+    color: str,
+    label: str,
+    style: Any,
+    zorder: float,
+    width: float = 1.5,
+) -> None:
+    """Median and middle half where at least half of the trials have a value."""
+    enough = np.isfinite(values).mean(axis=0) >= 0.5
+    quartiles = np.full((3, len(grid)), np.nan)
+    if enough.any():
+        quartiles[:, enough] = np.nanquantile(values[:, enough], (0.25, 0.5, 0.75), axis=0)
+    low, median, high = quartiles
+    axes.fill_between(grid, low, high, color=color, alpha=0.18, linewidth=0.0, zorder=zorder - 1.0)
+    axes.plot(grid, median, color=color, linewidth=width, linestyle=style, label=label, zorder=zorder)
+
+
+def _broken(pair: Pair, values: Array) -> Array:
+    """A gap in the line wherever a new replay starts."""
+    if pair.segment is None:
+        return values
+    out = values.copy()
+    out[1:][np.diff(pair.segment) != 0] = np.nan
+    return out
+
+
+def _color(model: str, models: Sequence[str]) -> str:
+    strange = [name for name in models if name not in COLORS]
+    return COLORS[model] if model in COLORS else OTHERS[strange.index(model) % len(OTHERS)]
+
+
+def _style(model: str) -> Any:
+    return STYLES.get(model, (0, (4, 1, 1, 1)))
+
+
+def _tidy(axes: Any) -> None:
+    axes.grid(True, color="0.88", linewidth=0.5)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=8)
+
 
 # The gates of the replay validation: does a model respond as the vehicle does, or where not.
 
