@@ -82,8 +82,6 @@ class Pair:
     """Response -> standard deviation of the noise of one measured sample, in its unit."""
     simulated: dict[str, dict[str, Array]] = field(default_factory=dict)
     """Model -> response -> (n,)."""
-    applied: dict[str, Array] = field(default_factory=dict)
-    """Model -> wrench that the simulation applied, as `tau`, (n, 6)."""
     segment: NDArray[np.int64] | None = None
     """Which uninterrupted replay a sample belongs to, -1 for none, (n,); None for a single one."""
     diverged: dict[str, float] = field(default_factory=dict)
