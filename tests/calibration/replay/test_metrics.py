@@ -14,6 +14,7 @@ from finssim.calibration.replay.metrics import (
     nrmse,
     onset,
     phase_score,
+    response_span,
     score,
     span,
 )

@@ -65,10 +65,10 @@ def read_stream(path: Path, source: SourceMap | None) -> Stream:
     if source is None:
         source = _by_names(table, shown)
     if source.time is None:
-        raise CalibrationError(f"{shown}: no time: give 'time: COLUMN' of its columns {_listed(table)}")
+        raise CalibrationError(f"{shown}: no time: give 'time: COLUMN' of its columns {_column_list(table)}")
     if not source.columns and source.phase is None:
         raise CalibrationError(
-            f"{shown}: no columns: give 'columns: {{u: NAME, ...}}' of its columns {_listed(table)}"
+            f"{shown}: no columns: give 'columns: {{u: NAME, ...}}' of its columns {_column_list(table)}"
         )
     t = _time(table, source.time, shown) + source.time_offset
     channels = {}
@@ -102,7 +102,7 @@ def _by_names(table: Table, shown: str) -> SourceMap:
     if time is None or not known:
         what = "time" if time is None else "column with the name of a trial's column"
         raise CalibrationError(
-            f"{shown}: no {what}; its columns are {_listed(table)}: write a map file and give it with --map"
+            f"{shown}: no {what}; its columns are {_column_list(table)}: write a map file and give it with --map"
         )
     phase = "phase" if "phase" in table.words else None
     return SourceMap.model_validate({"time": time, "columns": {name: name for name in known}, "phase": phase})
@@ -111,7 +111,7 @@ def _by_names(table: Table, shown: str) -> SourceMap:
 def _known(table: Table, name: str, shown: str) -> None:
     if name not in table.columns:
         raise CalibrationError(
-            f"{shown}: no column '{name}'{did_you_mean(name, table.columns)} its columns are {_listed(table)}"
+            f"{shown}: no column '{name}'{did_you_mean(name, table.columns)} its columns are {_column_list(table)}"
         )
 
 

@@ -1,4 +1,4 @@
-"""One trial on a uniform grid: velocities, accelerations, attitude and applied wrench about the body origin.
+"""One trial on a uniform grid: velocities, attitude and applied wrench about the body origin.
 
 What is measured is smoothed (`finssim.calibration.motion.smoothing`) and moved to the body origin; what is not is
 derived where the other columns allow it, and NaN where they do not. Nothing is interpolated across a gap.
@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
@@ -47,8 +46,6 @@ class AttitudeSignal:
     """omega from the derivative of the attitude, body frame [rad/s], (m, 3); NaN where unknown."""
     rates_std: Array
     """Standard deviation of `rates` [rad/s], (3,)."""
-    rates_slope_std: Array
-    """Standard deviation of the slope of `rates` [rad/s²], (3,)."""
     turn: Array
     """Rotation to use for vectors: `quaternion`, or level with the measured heading, (m, 4); NaN where unknown."""
     heading: bool
@@ -93,7 +90,6 @@ def attitude_signal(trial: Trial, at: Array, max_gap: float | None = None) -> At
             quaternion=nothing,
             rates=nothing[:, :3],
             rates_std=np.full(3, np.nan),
-            rates_slope_std=np.full(3, np.nan),
             turn=nothing,
             heading=False,
             tilt=False,
@@ -103,15 +99,13 @@ def attitude_signal(trial: Trial, at: Array, max_gap: float | None = None) -> At
     quaternion = s.value / length
     # q_dot = q omega / 2, with omega in body axes; the length of q drops out of the vector part.
     rates = 2.0 * quat_multiply(quat_conjugate(quaternion), s.slope / length)[:, :3]
-    stds = 2.0 * np.mean([s.slope_std, s.bend_std], axis=1)
     tilt, heading = "roll" in given, "yaw" in given
     measured = np.array([tilt, tilt, heading])
     rates[:, ~measured] = np.nan
     return AttitudeSignal(
         quaternion=quaternion if tilt else nothing,
         rates=rates,
-        rates_std=np.where(measured, stds[0], np.nan),
-        rates_slope_std=np.where(measured, stds[1], np.nan),
+        rates_std=np.where(measured, 2.0 * np.mean(s.slope_std), np.nan),
         turn=quaternion,
         heading=heading,
         tilt=tilt,
@@ -140,8 +134,6 @@ class Velocities:
     source: tuple[str, ...]
     noise_std: Array
     """(6,)"""
-    slope_std: Array
-    """Standard deviation of the slope of `nu` [m/s², rad/s²], (6,)."""
     position: Array
     """World frame [m], (m, 3)."""
     findings: tuple[Finding, ...]
@@ -156,7 +148,6 @@ class _Column:
     raw: Array
     noise: float = np.nan
     slope_std: float = np.nan
-    bend_std: float = np.nan
 
 
 def velocities(
@@ -175,12 +166,11 @@ def velocities(
     measured = [_column(trial, name, at, 2, max_gap) for name in NU]
     nu = np.stack([c.value for c in measured], axis=-1)
     raw = np.stack([c.raw for c in measured], axis=-1)
-    noise, slope_std = np.array([(c.noise, c.slope_std) for c in measured]).T
+    noise = np.array([c.noise for c in measured])
     source = ["measured" if trial.has(name) else "" for name in NU]
     for i in range(3, 6):
         if not source[i] and np.isfinite(attitude.rates[:, i - 3]).any():
             nu[:, i], noise[i] = attitude.rates[:, i - 3], attitude.rates_std[i - 3]
-            slope_std[i] = attitude.rates_slope_std[i - 3]
             source[i] = "derived from attitude"
     omega = nu[:, 3:]
     arm = np.asarray(header.velocity_at, float)
@@ -197,13 +187,12 @@ def velocities(
     for i, (column, name) in enumerate(_derived(nu, source, flow, attitude, trial, findings)):
         if name:
             nu[:, i], source[i] = column, name
-            noise[i], slope_std[i] = stds[2] if i == 2 else stds[:2].mean(axis=0)
+            noise[i] = stds[2] if i == 2 else stds[:2].mean()
     return Velocities(
         nu=nu,
         raw=raw,
         source=tuple(source),
         noise_std=noise,
-        slope_std=slope_std,
         position=position,
         findings=tuple(findings),
     )
@@ -235,9 +224,7 @@ def _column(trial: Trial, name: str, at: Array, order: int, max_gap: float | Non
     gap = longest_step(t) if max_gap is None else max_gap
     bridged = (at >= t[0] - 1e-6) & (at <= t[-1] + 1e-6) & (t[i + 1] - t[i] <= gap)
     raw = np.where(bridged, np.interp(at, t, y), np.nan)
-    return _Column(
-        s.value[:, 0], s.slope[:, 0], raw, *(float(std[0]) for std in (s.noise, s.slope_std, s.bend_std))
-    )
+    return _Column(s.value[:, 0], s.slope[:, 0], raw, float(s.noise[0]), float(s.slope_std[0]))
 
 
 def _origin(
@@ -267,7 +254,7 @@ def _origin(
             slope[:, i] -= quat_rotate(turn, arm_velocity(omega, arm))[:, i]
             if attitude.tilt or attitude.heading:
                 value[~known, i] = slope[~known, i] = np.nan
-    return value, slope, np.array([(c.slope_std, c.bend_std) for c in (x, y, z)])
+    return value, slope, np.array([c.slope_std for c in (x, y, z)])
 
 
 def _depth_at(trial: Trial, vehicle: Vehicle) -> Array:
@@ -305,74 +292,6 @@ def _derived(
 
 ACCELERATION = ("ax", "ay", "az")
 
-NOTHING = 1e-3
-"""Errors below this are no reason to prefer one source to another [m/s²]."""
-
-
-def accelerations(
-    trial: Trial,
-    vehicle: Vehicle,
-    at: Array,
-    attitude: AttitudeSignal,
-    found: Velocities,
-    max_gap: float | None = None,
-) -> tuple[Array, tuple[str, ...], tuple[Finding, ...]]:
-    """Rates of the components of nu.
-
-    An accelerometer at body point P reads f = a_P - g in body axes, and
-
-        a_P = v_dot + ω × v + ω_dot × r + ω × (ω × r),   so   v_dot = f + g - ω × v - ω_dot × r - ω × (ω × r).
-
-    Its bias, and what a wrong attitude leaves of gravity, would be a force: the median difference from the slope of the
-    smoothed velocity is taken off. ω_dot is the slope of the smoothed rates. An accelerometer that is sampled much more
-    slowly than the velocity, or tells less than its slope by the errors that smoothing estimates of both, is not used.
-
-    Returns:
-        nu_dot (m, 6), its source by axis, and findings.
-    """
-    nu_dot = slopes(at, found.nu)
-    source = ["smoothed velocity" if np.isfinite(column).any() else "" for column in nu_dot.T]
-    given = [name for name in ACCELERATION if trial.has(name)]
-    if not given:
-        return nu_dot, tuple(source), ()
-    f, std = np.full((len(at), 3), np.nan), np.full(3, np.nan)
-    for i, name in enumerate(ACCELERATION):
-        t, y = trial.series(name)
-        if len(t) >= 2:
-            s = smooth(t, y[:, None], at, order=2, max_gap=max_gap)
-            f[:, i], std[i] = s.value[:, 0], s.value_std[0]
-    slow = _slow(trial)
-    gravity = vehicle.water.gravity
-    if holds_gravity(trial, gravity):
-        if not attitude.tilt:
-            return nu_dot, tuple(source), (finding("accelerations_unused"),)
-        f = f - gravity * up_in_body(attitude.quaternion)
-    r = accelerometer_place(trial, vehicle)
-    nu = np.nan_to_num(found.nu)
-    v, omega, omega_dot = nu[:, :3], nu[:, 3:], np.nan_to_num(nu_dot[:, 3:])
-    a = f - np.cross(omega, v) - np.cross(omega_dot, r) - np.cross(omega, np.cross(omega, r))
-    for i in range(3):
-        both = np.isfinite(a[:, i]) & np.isfinite(nu_dot[:, i])
-        if both.any() and std[i] <= found.slope_std[i] + NOTHING and not slow[i]:
-            nu_dot[:, i] = a[:, i] - np.median(a[both, i] - nu_dot[both, i])
-            nu_dot[~np.isfinite(found.nu[:, i]), i] = np.nan
-            source[i] = "imu"
-    return nu_dot, tuple(source), ()
-
-
-def _slow(trial: Trial) -> list[bool]:
-    """Whether ax, ay, az are sampled at less than half the rate of what the velocity comes from."""
-
-    def step(names: tuple[str, ...]) -> float:
-        return min(float(np.median(np.diff(trial.series(n)[0]))) if trial.has(n) else np.inf for n in names)
-
-    from_velocity = [step((name,)) for name in ("u", "v", "w")]
-    usual = step(("x", "y", "z", "depth"))
-    return [
-        step((name,)) > 2.0 * (usual if np.isinf(own) else own)
-        for name, own in zip(ACCELERATION, from_velocity, strict=True)
-    ]
-
 
 def accelerometer_place(trial: Trial, vehicle: Vehicle) -> Array:
     """Body point of the accelerometer [m], (3,): the header's, the vehicle's IMU, or the origin."""
@@ -401,18 +320,6 @@ def holds_gravity(trial: Trial, gravity: float) -> bool:
     return float(np.sqrt(np.sum(squares))) > 0.5 * gravity
 
 
-def slopes(t: Array, x: Array) -> Array:
-    """Time derivative of smooth columns, by cubic splines through every stretch without NaN, (m, c)."""
-    out = np.full(x.shape, np.nan)
-    for i, column in enumerate(x.T):
-        known = np.isfinite(column)
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
-        for a, b in edges.reshape(-1, 2):
-            if b - a >= 4:
-                out[a:b, i] = CubicSpline(t[a:b], column[a:b])(t[a:b], 1)
-    return out
-
-
 FASTEST = 100.0
 """Rate of the grid that is not exceeded unless asked for [Hz]; bodies in water do not need more."""
 
@@ -433,8 +340,6 @@ class Motion:
     the header says so and gives no current."""
     raw: Array
     """The same for measured axes, not smoothed, in straight lines between samples, (n, 6); NaN where not measured."""
-    nu_dot: Array
-    """Rate of the components of nu [m/s², rad/s²], (n, 6); NaN where unknown."""
     quaternion: Array
     """Body to world, (n, 4); NaN where roll and pitch are unknown. The heading is 0 where nobody measured it."""
     position: Array
@@ -447,8 +352,6 @@ class Motion:
     """Whether the wrench and every axis that is known for most of the trial are known, (n,)."""
     nu_source: tuple[str, ...]
     """By axis: `measured`, `derived from position`, `derived from depth`, `derived from attitude`, or nothing."""
-    nu_dot_source: tuple[str, ...]
-    """By axis: `imu`, where that tells more than the velocity, `smoothed velocity`, or nothing."""
     noise_std: Array
     """By axis, the standard deviation of one sample of a measured velocity, or of the value of a derived one, (6,)."""
     findings: tuple[Finding, ...] = ()
@@ -477,23 +380,20 @@ def motion(
     t = trial.t[0] + np.arange(int(np.floor(trial.duration * rate + 1e-6)) + 1) / rate
     attitude = attitude_signal(trial, t, max_gap)
     found = velocities(trial, vehicle, t, attitude, max_gap)
-    nu_dot, nu_dot_source, unused = accelerations(trial, vehicle, t, attitude, found, max_gap)
     tau = applied_wrench(inputs, vehicle, t)
     return Motion(
         t=t,
         rate=rate,
         nu=found.nu,
         raw=found.raw,
-        nu_dot=nu_dot,
         quaternion=attitude.quaternion,
         position=found.position,
         tau=tau,
         phase=_phase(trial, t),
         valid=_valid(tau, found),
         nu_source=found.source,
-        nu_dot_source=nu_dot_source,
         noise_std=found.noise_std,
-        findings=(*inputs.findings, *found.findings, *unused),
+        findings=(*inputs.findings, *found.findings),
     )
 
 

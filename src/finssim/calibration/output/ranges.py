@@ -320,7 +320,7 @@ def _entry(name: str) -> str | None:
     """Entry of the ranges table for a parameter of a fit; None where there is none."""
     axis, _, what = name.partition(".")
     if axis in AXES and what in FAMILY_OF:
-        return f"{FAMILIES[what]}.{axis}"
+        return f"{FAMILY_OF[what]}.{axis}"
     return "thrust.all" if name == "thrust_scale" else None
 
 
