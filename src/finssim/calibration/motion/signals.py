@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.motion.smoothing import longest_step, smooth
 from finssim.calibration.trials.inputs import Drive, applied_wrench, drive
@@ -81,7 +80,7 @@ def attitude_samples(trial: Trial) -> tuple[Array, Array, tuple[str, ...]]:
     return t, q, given
 
 
-def attitude_signal(trial: Trial, at: Array, max_gap: float | None = None) -> AttitudeSignal:
+def attitude_signal(trial: Trial, at: Array) -> AttitudeSignal:
     """The attitude of a trial, smoothed, at given times (m,)."""
     t, q, given = attitude_samples(trial)
     nothing = np.full((len(at), 4), np.nan)
@@ -94,7 +93,7 @@ def attitude_signal(trial: Trial, at: Array, max_gap: float | None = None) -> At
             heading=False,
             tilt=False,
         )
-    s = smooth(t, q, at, order=3, max_gap=max_gap, together=True)
+    s = smooth(t, q, at, order=3, together=True)
     length = np.linalg.norm(s.value, axis=1, keepdims=True)
     quaternion = s.value / length
     # q_dot = q omega / 2, with omega in body axes; the length of q drops out of the vector part.
@@ -150,9 +149,7 @@ class _Column:
     slope_std: float = np.nan
 
 
-def velocities(
-    trial: Trial, vehicle: Vehicle, at: Array, attitude: AttitudeSignal, max_gap: float | None = None
-) -> Velocities:
+def velocities(trial: Trial, vehicle: Vehicle, at: Array, attitude: AttitudeSignal) -> Velocities:
     """Velocity and position of the body origin.
 
     Args:
@@ -160,10 +157,9 @@ def velocities(
         vehicle: Gives the place of the pressure sensor where the header does not.
         at: Times [s], (m,).
         attitude: At these times.
-        max_gap: As for `smooth`.
     """
     header, findings = trial.header, list[Finding]()
-    measured = [_column(trial, name, at, 2, max_gap) for name in NU]
+    measured = [_column(trial, name, at, 2) for name in NU]
     nu = np.stack([c.value for c in measured], axis=-1)
     raw = np.stack([c.raw for c in measured], axis=-1)
     noise = np.array([c.noise for c in measured])
@@ -183,7 +179,7 @@ def velocities(
         drift = quat_inverse_rotate(attitude.turn, np.asarray(header.water.current, float))
         nu[:, :3] += drift
         raw[:, :3] += drift
-    position, flow, stds = _origin(trial, vehicle, at, attitude, omega, max_gap)
+    position, flow, stds = _origin(trial, vehicle, at, attitude, omega)
     for i, (column, name) in enumerate(_derived(nu, source, flow, attitude, trial, findings)):
         if name:
             nu[:, i], source[i] = column, name
@@ -214,14 +210,14 @@ def _lacks(omega: Array, arm: Array) -> bool:
     return any(unknown[i] and np.delete(arm, i).any() for i in range(3))
 
 
-def _column(trial: Trial, name: str, at: Array, order: int, max_gap: float | None) -> _Column:
+def _column(trial: Trial, name: str, at: Array, order: int) -> _Column:
     t, y = trial.series(name)
     nothing = np.full(len(at), np.nan)
     if len(t) < 2:
         return _Column(nothing, nothing, nothing)
-    s = smooth(t, y[:, None], at, order=order, max_gap=max_gap)
+    s = smooth(t, y[:, None], at, order=order)
     i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-    gap = longest_step(t) if max_gap is None else max_gap
+    gap = longest_step(t)
     bridged = (at >= t[0] - 1e-6) & (at <= t[-1] + 1e-6) & (t[i + 1] - t[i] <= gap)
     raw = np.where(bridged, np.interp(at, t, y), np.nan)
     return _Column(s.value[:, 0], s.slope[:, 0], raw, float(s.noise[0]), float(s.slope_std[0]))
@@ -233,15 +229,14 @@ def _origin(
     at: Array,
     attitude: AttitudeSignal,
     omega: Array,
-    max_gap: float | None,
 ) -> tuple[Array, Array, Array]:
     """Position and velocity of the body origin in the world, (m, 3) each, and the standard deviations of the latter and
     of its slope by axis, (3, 2)."""
     header = trial.header
-    x, y, z = (_column(trial, name, at, 3, max_gap) for name in "xyz")
+    x, y, z = (_column(trial, name, at, 3) for name in "xyz")
     arms = [np.asarray(header.position_at, float)] * 3
     if not trial.has("z") and trial.has("depth"):
-        depth = _column(trial, "depth", at, 3, max_gap)
+        depth = _column(trial, "depth", at, 3)
         z = replace(depth, value=-depth.value, slope=-depth.slope)
         arms[2] = _depth_at(trial, vehicle)
     known = np.asarray(np.isfinite(attitude.turn).all(axis=1))
@@ -358,28 +353,23 @@ class Motion:
     """What was assumed."""
 
 
-def motion(
-    trial: Trial, vehicle: Vehicle, *, rate: float | None = None, max_gap: float | None = None
-) -> Motion:
-    """A trial on a uniform grid.
+def motion(trial: Trial, vehicle: Vehicle) -> Motion:
+    """A trial on a uniform grid, of the rate of its fastest stream up to 100 Hz.
+
+    Times between samples of a stream of up to 0.2 s, or four usual steps, are bridged.
 
     Args:
         trial: The trial.
         vehicle: Gives the places of sensors that the header leaves out, the motors and gravity.
-        rate: Of the grid [Hz]; that of the fastest stream, up to 100, if None.
-        max_gap: Longest time between samples of a stream that is bridged [s]; 0.2 s or four usual steps if None.
 
     Raises:
-        CalibrationError: The inputs are missing or not of this vehicle, or a rate or gap is not above zero.
+        CalibrationError: The inputs are missing or not of this vehicle.
     """
-    for name, value in (("rate", rate), ("max_gap", max_gap)):
-        if value is not None and not value > 0.0:
-            raise CalibrationError(f"{name} is {value}, expected a number above 0", trial.name)
     inputs = drive(trial, vehicle)
-    rate = grid_rate(trial, inputs) if rate is None else rate
+    rate = grid_rate(trial, inputs)
     t = trial.t[0] + np.arange(int(np.floor(trial.duration * rate + 1e-6)) + 1) / rate
-    attitude = attitude_signal(trial, t, max_gap)
-    found = velocities(trial, vehicle, t, attitude, max_gap)
+    attitude = attitude_signal(trial, t)
+    found = velocities(trial, vehicle, t, attitude)
     tau = applied_wrench(inputs, vehicle, t)
     return Motion(
         t=t,

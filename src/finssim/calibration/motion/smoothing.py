@@ -97,9 +97,7 @@ def without_spikes(t: Array, y: Array) -> NDArray[np.bool_]:
     return ~bad if bad.sum() <= 0.05 * n else np.ones(n, bool)
 
 
-def smooth(
-    t: Array, y: Array, at: Array, *, order: int = 2, max_gap: float | None = None, together: bool = False
-) -> Smooth:
+def smooth(t: Array, y: Array, at: Array, *, order: int = 2, together: bool = False) -> Smooth:
     """Smooth signals that share their sample times.
 
     Args:
@@ -108,14 +106,13 @@ def smooth(
         at: Times asked for [s], (m,).
         order: m, the difference that is penalised: 2 for signals whose slope may jump, as velocities under a step of
             force; 3 for their integrals.
-        max_gap: Longest step that is bridged [s]; `longest_step` if None.
         together: One λ for all columns, for parts of one quantity such as a quaternion.
 
     Returns:
         On `at`.
     """
     good = without_spikes(t, y)
-    gap = longest_step(t) if max_gap is None else max_gap
+    gap = longest_step(t)
     t, y = t[good], y[good]
     m, c = len(at), y.shape[1]
     value, slope = np.full((m, c), np.nan), np.full((m, c), np.nan)

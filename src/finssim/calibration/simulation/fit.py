@@ -760,12 +760,10 @@ class Stages:
         axes: tuple[str, ...],
         estimate: tuple[str, ...],
         length: float | None,
-        start: Fit | None,
         seed: int,
         say: Clock,
     ) -> None:
         self.prepared, self.vehicle, self.axes, self.seed, self.say = prepared, vehicle, axes, seed, say
-        self.base = vehicle.replace(start.changes) if start is not None and start.changes else vehicle
         self.given = length
         self.excites = [excites(s, vehicle) for s in prepared]
         # The added mass of axes that are not fitted pushes and turns the others; roll's and pitch's hardly does.
@@ -785,13 +783,12 @@ class Stages:
         biased = [a for a in axes if a != "heave"]
         self.trial_biases = biased if "trial_bias" in estimate else []
         self.biases = [] if self.trial_biases else biased
-        self.guess = {} if start is None else {name: e.estimate for name, e in start.estimates.items()}
 
     def first(self, kinds: dict[str, str]) -> Stage:
         """Short segments from a rough start, then segments of the length that the answer calls for."""
         short = max(SHORT, 15.0 * sampling(self.prepared))
         self.cut(min(short, self.given or short))
-        problem = self.problem(kinds, self.base, self.guess)
+        problem = self.problem(kinds, self.vehicle, {})
         point = self._rough(problem, problem.start())
         problem.hold_clocks(True)
         rough = solve(
@@ -806,8 +803,8 @@ class Stages:
         if rough.interrupted:
             problem.hold_clocks(False)
             return Stage(problem, rough, confidence(problem, rough))
-        self.cut(self.given or horizon(self.base.replace(_matrices(p, x)), self.prepared, self.axes))
-        problem = self.problem(kinds, self.base, dict(zip(p.names, x, strict=True)))
+        self.cut(self.given or horizon(self.vehicle.replace(_matrices(p, x)), self.prepared, self.axes))
+        problem = self.problem(kinds, self.vehicle, dict(zip(p.names, x, strict=True)))
         for _ in range(0 if self.given else HALVINGS):
             growth = problem.growth(problem.start())
             wild = {self.used[g].trial.name for g in np.unique(problem.groups[growth > GROWTH])}
@@ -816,13 +813,13 @@ class Stages:
             for name in wild:
                 self.shorter[name] = 0.5 * self.shorter.get(name, 1.0)
             self.cut(self.length)
-            problem = self.problem(kinds, self.base, dict(zip(p.names, x, strict=True)))
+            problem = self.problem(kinds, self.vehicle, dict(zip(p.names, x, strict=True)))
         return self.finish(problem, problem.start(), 0.6)
 
     def next(self, kinds: dict[str, str], before: Stage, full: bool = False) -> Stage:
         """Another set of parameters, from where a fit ended."""
         old, x = before.problem.parameters, before.x
-        base = self.base.replace(_matrices(old, x)) if full else self.base
+        base = self.vehicle.replace(_matrices(old, x)) if full else self.vehicle
         problem = self.problem(kinds, base, dict(zip(old.names, x, strict=True)), full)
         rest = before.solution.point.theta[len(old.names) :]
         point = Point(np.concatenate([problem.parameters.start, rest]), before.solution.point.z)
@@ -1018,7 +1015,6 @@ def fit_by_simulation(
     damping: str = "auto",
     horizon: float | None = None,
     seed: int = 0,
-    start: Fit | None = None,
     progress: Progress | None = None,
 ) -> Fit:
     """Fit by simulation error over all trials at once.
@@ -1037,7 +1033,6 @@ def fit_by_simulation(
         damping: `auto`, `linear`, `quadratic` or `both`.
         horizon: Length of the segments [s]; from the data if None.
         seed: Of the coarse search.
-        start: A fit to begin from, such as that of a regression.
         progress: Called with the part done and a few words.
 
     Returns:
@@ -1050,9 +1045,7 @@ def fit_by_simulation(
     prepared = [streams(trial, vehicle) for trial in trials]
     chosen, remarks = _axes(prepared, vehicle, axes)
     say = Clock(progress)
-    fit = Stages(
-        telling(prepared, vehicle, chosen), vehicle, chosen, tuple(estimate), horizon, start, seed, say
-    )
+    fit = Stages(telling(prepared, vehicle, chosen), vehicle, chosen, tuple(estimate), horizon, seed, say)
     kinds = dict.fromkeys(chosen, "both" if damping == "auto" else damping)
     stage = fit.first(kinds)
     wider: dict[str, tuple[float, float]] = {}
