@@ -148,7 +148,6 @@ HOMES = {
         "ros2_worlds/sim.py",
     },
     "viser": {"viewer/app.py"},
-    "mitsuba": {"experiments/mitsuba_renderer.py"},
 }
 """Library -> the files that may import it, each of which does."""
 

@@ -73,9 +73,6 @@ EXTRAS = {
         {"opencv-python-headless": "cv2", "pupil-apriltags": "pupil_apriltags", "matplotlib": "matplotlib"},
         "detect tags, calibrate cameras and pools from pictures, locate a vehicle from pictures or video",
     ),
-    "render": Extra(
-        {"mitsuba": "mitsuba"}, "render the localization experiment with Mitsuba instead of our own"
-    ),
     "ros2": Extra(
         {"cyclonedds": "cyclonedds", "rosbags": "rosbags"}, "be ROS 2 nodes without an installed ROS 2"
     ),

@@ -124,7 +124,7 @@ def run(
             on this machine).
         bind (ADDRESS:PORT): This end of the wire, for UDP.
         pool_file (FILE): Pool file: camera, water plane and frames (.yaml); without it nobody knows the position.
-        pictures (ADDRESS): Overhead camera: udp://HOST:PORT, shm:NAME or none; the virtual pool's with --robot pool,
+        pictures (ADDRESS): Overhead camera: udp://HOST:PORT or none; the virtual pool's with --robot pool,
             otherwise none, if not given. Needs --pool-file.
         policy (DIR|pid): Whom SELECT or m hands over to: pid, or a policy's directory. Needs --pool-file and --goal.
         goal (X,Y,Z,YAW): Where the policy steers to, in m and deg.
