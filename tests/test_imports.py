@@ -132,7 +132,7 @@ HOMES = {
         "robot/recorder.py",
         "robot/record_reader.py",
     },
-    "pygame": {"robot/teleop_devices.py"},
+    "pygame": {"robot/teleop.py"},
     "cyclonedds": {
         "ros2/wire/dds_types.py",
         "ros2/wire/endpoints.py",

@@ -28,7 +28,7 @@ from finssim.robot.pilots import Pilot, WrenchPilot, make_pilot
 from finssim.robot.recorder import Recorder, recording
 from finssim.robot.robot import Reading
 from finssim.robot.runtime import Runtime
-from finssim.robot.teleop_devices import Keyboard
+from finssim.robot.teleop import Keyboard
 from finssim.robot.wiring import Drive, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import vehicle_at
