@@ -73,6 +73,9 @@ EXTRAS = {
         {"opencv-python-headless": "cv2", "pupil-apriltags": "pupil_apriltags", "matplotlib": "matplotlib"},
         "detect tags, calibrate cameras and pools from pictures, locate a vehicle from pictures or video",
     ),
+    "render": Extra(
+        {"mitsuba": "mitsuba"}, "let the tests compare the overhead camera's pictures with Mitsuba's"
+    ),
     "ros2": Extra(
         {"cyclonedds": "cyclonedds", "rosbags": "rosbags"}, "be ROS 2 nodes without an installed ROS 2"
     ),
