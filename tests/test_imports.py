@@ -132,7 +132,7 @@ HOMES = {
         "robot/recorder.py",
         "robot/record_reader.py",
     },
-    "pygame": {"robot/teleop_devices.py"},
+    "pygame": {"robot/teleop.py"},
     "cyclonedds": {
         "ros2/wire/dds_types.py",
         "ros2/wire/endpoints.py",
@@ -148,7 +148,6 @@ HOMES = {
         "ros2_worlds/sim.py",
     },
     "viser": {"viewer/app.py"},
-    "mitsuba": {"experiments/mitsuba_renderer.py"},
 }
 """Library -> the files that may import it, each of which does."""
 

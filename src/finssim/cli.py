@@ -63,7 +63,7 @@ COMMANDS: dict[str, str | Experiment] = {
     "record info": "finssim.robot.record_show:info",
     "record repair": "finssim.robot.record_reader:repair",
     "play": "finssim.robot.record_show:play_record",
-    "teleop": "finssim.robot.teleop_run:run",
+    "teleop": "finssim.robot.teleop:run",
     "run": "finssim.robot.run:run",
     "pool": "finssim.pool.run:run",
     "view": "finssim.viewer.run:run",

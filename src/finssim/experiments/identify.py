@@ -52,8 +52,6 @@ class Identification:
     """The vehicle of the catalogue that made the trials, or around which the pool's own was drawn."""
     findings: tuple[Finding, ...]
     seconds: float
-    steps: tuple[dict[str, float | str], ...] = ()
-    """Terminal speeds and time constants beside those of a plant, of `programmes.compare_steps`."""
 
 
 def rough_vehicle(truth: Vehicle) -> Vehicle:
