@@ -58,39 +58,46 @@ def worthless(data: AxisData, figures: dict[str, float], chosen: Selection) -> s
     return ""
 
 
-def damping_known(data: AxisData, chosen: Selection, before: tuple[float, float]) -> bool:
-    """Whether the drag is known at the speeds of the trials, at their median and near their top.
-
-    To `USEFUL_DRAG`, or well enough to exclude that of the vehicle file.
+def drag_known(
+    d: Array,
+    free: NDArray[np.bool_],
+    covariances: Sequence[Array],
+    quantile: float,
+    speeds: Sequence[float],
+    before: tuple[float, float],
+) -> bool:
+    """Whether the drag of an axis is known at some speeds: to `USEFUL_DRAG`, or to exclude that of the vehicle file.
 
     Args:
-        data: The trials.
-        chosen: The model.
+        d: d1 [N s/m, N m s] and d2 [N s²/m², N m s²], (2,).
+        free: Which of them were fitted, (2,).
+        covariances: Of those that were; the widest counts.
+        quantile: Half widths of an interval, in standard deviations.
+        speeds: At which the drag has to be known [m/s, rad/s].
         before: d1 and d2 of the file.
     """
-    from scipy.stats import t
-
-    fit = chosen.fit
-    found = (
-        (fit.covariance.local, fit.covariance.trials)
-        if fit.covariance.alone.any()
-        else (fit.covariance.trials,)
-    )
-    dof = fit.covariance.dof[np.isin(np.flatnonzero(fit.terms), (D1, D2))]
-    quantile = float(t.ppf(0.975, min(float(np.min(dof, initial=np.inf)), 1e6)))
-    for speed in np.percentile(_moving(data, chosen), [50.0, 95.0]):
-        weights = np.zeros(len(fit.terms))
-        weights[[D1, D2]] = speed, speed**2
-        force, w = float(weights @ fit.theta), weights[fit.terms]
+    for speed in speeds:
+        powers = np.array([speed, speed**2])
+        force, w = float(powers @ d), powers[free]
         with np.errstate(invalid="ignore"):
-            std = np.sqrt(max(w @ covariance @ w for covariance in found))
-        if not (np.isfinite(std) and force > 0.0):
+            half = quantile * np.sqrt(max(max(w @ C @ w for C in covariances), 0.0))
+        if not (np.isfinite(half) and force > 0.0):
             return False
-        close = quantile * std < USEFUL_DRAG * force
-        excluded = abs(before[0] * speed + before[1] * speed**2 - force) > quantile * std
-        if not close and not excluded:
+        if not (half < USEFUL_DRAG * force or abs(powers @ before - force) > half):
             return False
     return True
+
+
+def _damping_known(data: AxisData, chosen: Selection, before: tuple[float, float]) -> bool:
+    """`drag_known` at the median and near the top of the speeds of the trials."""
+    from scipy.stats import t
+
+    fit, C = chosen.fit, chosen.fit.covariance
+    at = np.flatnonzero(np.isin(np.flatnonzero(fit.terms), (D1, D2)))
+    covariances = [V[np.ix_(at, at)] for V in ((C.local, C.trials) if C.alone.any() else (C.trials,))]
+    quantile = float(t.ppf(0.975, min(float(np.min(C.dof[at], initial=np.inf)), 1e6)))
+    speeds = np.percentile(_moving(data, chosen), [50.0, 95.0]).tolist()
+    return drag_known(fit.theta[[D1, D2]], fit.terms[[D1, D2]], covariances, quantile, speeds, before)
 
 
 def _moving(data: AxisData, chosen: Selection) -> Array:
@@ -347,7 +354,7 @@ class _Draft:
             elif self.chosen.fit.terms[term]:
                 self.add(name, term, unit, self.path(family))
         i = self.data.axis
-        if damping_known(self.data, self.chosen, (float(self.file.D1[i, i]), float(self.file.D2[i, i]))):
+        if _damping_known(self.data, self.chosen, (float(self.file.D1[i, i]), float(self.file.D2[i, i]))):
             self.changes[self.path("linear_damping")] = max(float(theta[D1]), 0.0)
             self.changes[self.path("quadratic_damping")] = max(float(theta[D2]), 0.0)
         else:

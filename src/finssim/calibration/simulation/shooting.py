@@ -610,7 +610,7 @@ class Shooting:
         none = np.zeros(len(free))
         self.prior_mean = np.concatenate([parameters.expected, 0.0 * far, none])
         imposed = np.arange(len(parameters.low)) >= self.judged
-        wide = [VAGUE * (name != "thrust_scale" and not parameters.coupled) for name in parameters.names]
+        wide = [VAGUE * (name != "thrust_scale") for name in parameters.names]
         size = np.where(imposed, 1.0, np.array(wide, float)) * parameters.scale
         known = np.where(size > 0.0, np.maximum(size, 1e-150) ** -2.0, 0.0)
         self.prior_precision = np.concatenate([known, 0.0 * far + LATE_STD**-2.0, none])
