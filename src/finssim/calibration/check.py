@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import SEVERITIES, Finding, finding
+from finssim.calibration.findings import SEVERITIES, Finding, finding, plain
 from finssim.calibration.motion.signals import (
     AttitudeSignal,
     Motion,
@@ -36,7 +35,7 @@ from finssim.vehicles import AXES, Vehicle, VehicleError, load_vehicle
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["check", "check_trials"]
+__all__ = ["as_object", "check", "check_trials", "print_reports", "together"]
 
 # What holds between the trials of a set: vehicles, roles, names, what all of them tell together.
 
@@ -208,16 +207,7 @@ class TrialReport:
         record = {key: value for key, value in asdict(self).items() if key != "axes"}
         record |= {"verdict": self.verdict, "findings": [one.as_json() for one in self.findings]}
         axes = {axis.axis: {k: v for k, v in asdict(axis).items() if k != "axis"} for axis in self.axes}
-        return {**_plain(record), "axes": _plain(axes)}
-
-
-def _plain(value: Any) -> Any:
-    """The same without numbers that are not finite."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        return {**plain(record), "axes": plain(axes)}
 
 
 # Reports of checked trials as tables for people, readable at a hundred columns.

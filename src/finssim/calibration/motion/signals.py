@@ -25,8 +25,8 @@ from finssim.geometry.rotations import (
 from finssim.vehicles import Vehicle
 
 __all__ = [
-    "AttitudeSignal", "Motion", "accelerometer_place", "attitude_samples", "attitude_signal",
-    "holds_gravity", "motion",
+    "ACCELERATION", "AttitudeSignal", "Motion", "accelerometer_place", "attitude_samples",
+    "attitude_signal", "holds_gravity", "motion", "up_in_body",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]

@@ -11,11 +11,11 @@ from rich.console import Console
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.fit import Fit
-from finssim.calibration.output.calibrate import all_findings, calibrated, kept
+from finssim.calibration.output.calibrate import all_findings, calibrated
 from finssim.calibration.output.report import (
     command_line,
     fit_json,
-    print_fit,
+    fit_report,
     progress_bar,
     publish,
     refuse_places,
@@ -253,14 +253,8 @@ def _finish(
 
         write_ranges(fit, ranges, vehicle)
 
-    def show(console: Console) -> None:
-        print_fit(fit, vehicle, console, findings)
-        if unchanged := kept(fit, vehicle):
-            text = f"not identifiable, so the file keeps its own: {', '.join(unchanged)}"
-            console.print(text, highlight=False, markup=False)
-
     record = fit_json(fit, vehicle, out=out, findings=findings) if as_json else None
-    publish(record, show, (out, report, ranges))
+    publish(record, fit_report(fit, vehicle, findings).show, (out, report, ranges))
     if fit.interrupted:
         raise KeyboardInterrupt
     return vehicle

@@ -16,7 +16,10 @@ from finssim.calibration.regression.plant_terms import Matrices, matrices
 from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.terms import unit_of
 
-__all__ = ["AxisResult", "BIAS_NOTE", "CERTAIN", "axis_result", "hydrostatics", "term_estimate"]
+__all__ = [
+    "AxisResult", "BIAS_NOTE", "CERTAIN", "LARGE_DELAY", "USEFUL", "axis_result", "drag_known",
+    "hydrostatics", "late_velocity", "outside", "quality", "term_estimate", "trim", "worthless",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 

@@ -44,7 +44,7 @@ from finssim.calibration.uncertainty import (
 from finssim.calibration.vision.least_squares import boxed, huber_weight
 
 __all__ = [
-    "AxisData", "DAMPING", "Run", "Selection", "Signals", "TERMS", "axis_rows", "cut", "fit_axis",
+    "AKAIKE", "AxisData", "Run", "Selection", "Signals", "TERMS", "axis_rows", "cut", "fit_axis",
     "informative", "joined", "kernel", "select", "signals", "simulate_axis",
 ]  # fmt: skip
 

@@ -28,7 +28,10 @@ from finssim.geometry.rotations import (
 )
 from finssim.vehicles import AXES
 
-__all__ = ["CUT", "Linear", "Point", "Shooting", "Solution", "solve", "weights_of"]
+__all__ = [
+    "CUT", "Linear", "Point", "Shooting", "Solution", "blocks_of", "costs_of", "solve", "step_of",
+    "weights_of",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
