@@ -17,7 +17,7 @@ from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.terms import unit_of
 
 __all__ = [
-    "AxisResult", "BIAS_NOTE", "CERTAIN", "LARGE_DELAY", "USEFUL", "axis_result", "drag_known",
+    "AxisResult", "BIAS_NOTE", "CERTAIN", "LARGE_DELAY", "USEFUL", "curves_of", "drag_known",
     "hydrostatics", "late_velocity", "outside", "quality", "term_estimate", "trim", "worthless",
 ]  # fmt: skip
 
@@ -207,63 +207,42 @@ BIAS_NOTE = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class AxisResult:
-    """What the report says of one axis."""
-
-    estimates: dict[str, Estimate]
-    changes: dict[str, Any]
-    quality: dict[str, float]
-    findings: list[Finding]
-    curves: list[Curve] = field(default_factory=list)
-    worthless: str = ""
-    """Why nothing that was found can be believed; empty where it can."""
-
-
-def axis_result(data: AxisData, chosen: Selection, file: Matrices) -> AxisResult:
-    """Estimates of an axis.
+    """What the report says of one axis.
 
     What the data know well is written, and so is what they know badly where the vehicle file's number lies outside the
     interval: a wide interval is a better answer than a number that it excludes.
-
-    Args:
-        data: Its trials.
-        chosen: The model and its intervals.
-        file: The vehicle as its file has it.
     """
-    axis = AXES[data.axis]
-    low, high = speed_range(data, chosen)
-    speeds = {"low": low, "high": high, "unit": "m/s" if data.axis < 3 else "rad/s"}
-    draft = _Draft(data=data, chosen=chosen, file=file)
-    draft.inertia()
-    draft.added_mass(float(file.M_RB[data.axis, data.axis]))
-    draft.damping(speeds)
-    if data.restoring:
-        draft.add("k", K, "N m/rad", "body.center_of_buoyancy.2")
-    draft.bias()
-    if 0.0 < low and high < DECADE * low:
-        draft.findings.append(finding("few_speeds", axis, **speeds))
-    draft.findings += axis_findings(axis, data, chosen)
-    figures = quality(data, chosen)
-    reason = worthless(data, figures, chosen)
-    if reason:
-        draft.believe_nothing(reason)
-    return AxisResult(
-        estimates=draft.estimates, changes=draft.changes, quality=figures, findings=draft.findings,
-        curves=_curves(data, chosen), worthless=reason,
-    )  # fmt: skip
-
-
-@dataclass(kw_only=True)
-class _Draft:
-    """What is found of one axis, term by term."""
 
     data: AxisData
+    """Its trials."""
     chosen: Selection
+    """The model and its intervals."""
     file: Matrices
+    """The vehicle as its file has it."""
     estimates: dict[str, Estimate] = field(default_factory=dict)
     changes: dict[str, Any] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Estimate term by term."""
+        data, chosen = self.data, self.chosen
+        low, high = speed_range(data, chosen)
+        speeds = {"low": low, "high": high, "unit": "m/s" if data.axis < 3 else "rad/s"}
+        self.inertia()
+        self.added_mass(float(self.file.M_RB[data.axis, data.axis]))
+        self.damping(speeds)
+        if data.restoring:
+            self.add("k", K, "N m/rad", "body.center_of_buoyancy.2")
+        self.bias()
+        if 0.0 < low and high < DECADE * low:
+            self.findings.append(finding("few_speeds", self.axis, **speeds))
+        self.findings += axis_findings(self.axis, data, chosen)
+        self.quality = quality(data, chosen)
+        self.worthless = worthless(data, self.quality, chosen)
+        if self.worthless:
+            self.believe_nothing(self.worthless)
 
     @property
     def axis(self) -> str:
@@ -475,7 +454,8 @@ def outside(value: float, ends: Array | tuple[float, float]) -> bool:
     return bool(np.isfinite(ends).all() and not ends[0] <= value <= ends[1])
 
 
-def _curves(data: AxisData, chosen: Selection) -> list[Curve]:
+def curves_of(data: AxisData, chosen: Selection) -> list[Curve]:
+    """Wrench, and velocity simulated from the wrench alone, over all trials of an axis."""
     axis, linear = AXES[data.axis], data.axis < 3
     lines: list[list[Array]] = [[] for _ in range(6)]
     t, y, p, tv, v, vs = lines

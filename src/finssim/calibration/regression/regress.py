@@ -16,7 +16,7 @@ from finssim.calibration.motion.signals import Motion, attitude_samples, motion
 from finssim.calibration.regression.axis_estimates import (
     LARGE_DELAY,
     AxisResult,
-    axis_result,
+    curves_of,
     hydrostatics,
     late_velocity,
     quality,
@@ -411,7 +411,7 @@ def regress(
     changes: dict[str, Any] = {}
     results: dict[str, AxisResult] = {}
     for i, (data, selection) in chosen.items():
-        results[AXES[i]] = result = axis_result(data, selection, file)
+        results[AXES[i]] = result = AxisResult(data=data, chosen=selection, file=file)
         estimates |= result.estimates
         changes |= result.changes
         findings += result.findings
@@ -433,7 +433,7 @@ def regress(
     changes |= still
     findings += notes
     figures = {axis: result.quality for axis, result in results.items()}
-    curves = [curve for result in results.values() for curve in result.curves]
+    curves = [curve for result in results.values() for curve in curves_of(result.data, result.chosen)]
     findings += late_velocity(figures, explained=[AXES[i] for i in told])
     quiet = _passive(trials, vehicle, [i for i in wanted if i not in told], known or {})
     if quiet is not None:
