@@ -24,8 +24,8 @@ from finssim.calibration.motion.signals import (
     motion,
     up_in_body,
 )
-from finssim.calibration.motion.smoothing import longest_step, smooth
-from finssim.calibration.motion.synchronisation import Offset, stream_offsets
+from finssim.calibration.motion.smoothing import longest_step
+from finssim.calibration.motion.synchronisation import Offset, on_grid, stream_offsets
 from finssim.calibration.trials.inputs import Drive, drive, implausible
 from finssim.calibration.trials.trial import COLUMNS, NU, TAU, Array, Trial, column_of
 from finssim.calibration.trials.trial_files import load_trial, trials_at
@@ -774,21 +774,10 @@ def frame_findings(trial: Trial, vehicle: Vehicle, offsets: dict[str, Offset]) -
     ]
 
 
-def _on(trial: Trial, names: tuple[str, ...], t: Array, order: int = 2) -> tuple[Array, Array]:
-    """Smoothed columns and their slopes, (m, c) each; NaN where there are none."""
-    value, slope = np.full((len(t), len(names)), np.nan), np.full((len(t), len(names)), np.nan)
-    for i, name in enumerate(names):
-        at, y = trial.series(name)
-        if len(at) >= 5:
-            s = smooth(at, y[:, None], t, order=order)
-            value[:, i], slope[:, i] = s.value[:, 0], s.slope[:, 0]
-    return value, slope
-
-
 def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list[Finding]:
     if not trial.has("az") or trial.header.acceleration == "kinematic":
         return []
-    f, _ = _on(trial, ("ax", "ay", "az"), t)
+    f, _ = on_grid(trial, ("ax", "ay", "az"), t)
     f = np.nan_to_num(f[np.isfinite(f[:, 2])])
     mean = np.linalg.norm(f.mean(axis=0))
     for size, unit, scale in (
@@ -803,7 +792,7 @@ def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list
             return [_upside_down(f.mean(axis=0))]
         return [finding("no_gravity")] if mean < 0.3 * g else []
     up = up_in_body(attitude.quaternion) if attitude.tilt else np.tile([0.0, 0.0, 1.0], (len(t), 1))
-    f, _ = _on(trial, ("ax", "ay", "az"), t)
+    f, _ = on_grid(trial, ("ax", "ay", "az"), t)
     good = np.isfinite(f).all(axis=1) & np.isfinite(up).all(axis=1)
     if good.sum() < FEWEST:
         return []
@@ -830,7 +819,7 @@ def _upside_down(felt: Array) -> Finding:
 
 def _rates(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
     found = []
-    gyro, _ = _on(trial, ("p", "q", "r"), t)
+    gyro, _ = on_grid(trial, ("p", "q", "r"), t)
     for i, (rate, angle) in enumerate((("p", "roll"), ("q", "pitch"), ("r", "yaw"))):
         derived = attitude.rates[:, i]
         moving = (
@@ -884,7 +873,7 @@ def _heading(trial: Trial, late: float) -> list[Finding]:
 
 def _vertical(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
     found = []
-    _, up = _on(trial, ("z", "depth"), t, 3)
+    _, up = on_grid(trial, ("z", "depth"), t, 3)
     both = np.isfinite(up).all(axis=1)
     if (
         both.sum() >= FEWEST
@@ -907,7 +896,7 @@ def _vertical(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]
 def _horizontal(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
     if not (trial.has("x", "y", "u", "v") and attitude.heading):
         return []
-    _, world = _on(trial, ("x", "y"), t, 3)
+    _, world = on_grid(trial, ("x", "y"), t, 3)
     through = _through_world(trial, t, attitude)[:, :2]
     good = np.isfinite(world).all(axis=1) & np.isfinite(through).all(axis=1)
     if good.sum() < FEWEST or min(np.std(world[good]), np.std(through[good])) < 0.02:
@@ -927,7 +916,7 @@ def _horizontal(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Findin
 
 
 def _through_world(trial: Trial, t: Array, attitude: AttitudeSignal) -> Array:
-    nu, _ = _on(trial, ("u", "v", "w"), t)
+    nu, _ = on_grid(trial, ("u", "v", "w"), t)
     known = np.isfinite(attitude.turn).all(axis=1)
     through = quat_rotate(np.where(known[:, None], attitude.turn, [0.0, 0.0, 0.0, 1.0]), np.nan_to_num(nu))
     if attitude.heading:

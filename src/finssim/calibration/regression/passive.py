@@ -21,7 +21,7 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.motion.signals import Motion, attitude_samples, motion
-from finssim.calibration.motion.smoothing import without_spikes
+from finssim.calibration.motion.smoothing import spans_of, without_spikes
 from finssim.calibration.regression.axis_fit import Run, simulate_axis
 from finssim.calibration.regression.plant_terms import Matrices, matrices
 from finssim.calibration.trials.trial import NU, Trial
@@ -220,8 +220,7 @@ def _coasting(moved: Motion, axis: str, name: str) -> tuple[float, float]:
 def _rising(moved: Motion, name: str) -> tuple[float, float]:
     """The longest stretch in which the height grows faster than `RISING` [s]."""
     up = np.gradient(moved.position[:, 2], moved.t) > RISING
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], up, [False]]).astype(np.int8))).reshape(-1, 2)
-    begin, end = max(edges, key=lambda e: e[1] - e[0], default=(0, 1))
+    begin, end = max(spans_of(up), key=lambda e: e[1] - e[0], default=(0, 1))
     if moved.t[end - 1] - moved.t[begin] < SHORTEST_RISE:
         raise CalibrationError(
             f"nothing rises faster than {RISING} m/s for {SHORTEST_RISE:g} s: expected a vehicle let go under water",

@@ -13,6 +13,7 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.fit import Correlation, Estimate, Fit
 from finssim.calibration.motion.signals import Motion, attitude_samples, motion
+from finssim.calibration.motion.smoothing import spans_of
 from finssim.calibration.regression.axis_estimates import (
     LARGE_DELAY,
     AxisResult,
@@ -79,8 +80,7 @@ def coasts(data: AxisData) -> list[tuple[str, float]]:
     for s, rows in zip(data.signals, data.rows, strict=True):
         speed, push = rows.X[:, 1], np.interp(s.t[rows.at], s.t, np.nan_to_num(s.tau[:, 2]))
         free = (np.abs(push) < HANDS_OFF * largest) & (np.abs(speed) > RISING)
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], free, [False]]).astype(np.int8)))
-        for b, e in edges.reshape(-1, 2):
+        for b, e in spans_of(free):
             t = s.t[rows.at[b:e]]
             last = t > t[-1] - STEADY
             fading = abs(speed[e - 1]) < LEVEL * np.abs(speed[b:e][last]).max()

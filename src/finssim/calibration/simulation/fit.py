@@ -564,7 +564,7 @@ class Clock:
     """Tells progress over several stages: iteration, cost, rate and what may remain."""
 
     def __init__(self, progress: Callable[[float, str], None] | None) -> None:
-        self.progress, self.begin, self.part, self.worlds = progress, time.perf_counter(), 0.0, 0
+        self.progress, self.begin, self.part = progress, time.perf_counter(), 0.0
 
     def __call__(self, words: str, toward: float = 1.0) -> None:
         # How many iterations remain nobody knows; each takes a share of the rest.
