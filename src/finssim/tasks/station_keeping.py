@@ -33,7 +33,7 @@ class Reward:
       - distance · e                             a slope everywhere: far goals are approached. A weight of 0.3 was too
                                                  little: with random buoyancy, lying on the floor was learnt
       + heading · exp(-θ / heading_scale) - turn · θ     the same for the attitude error θ, roll and pitch included
-      - leaning · clip(2 tilt / max_tilt - 1, 0, 2)    no pitching over on the way, where a bridge would stop. To end the
+      - leaning · clip(2 tilt / max_tilt - 1, 0, 2)   no pitching over on the way, where a bridge would stop. To end the
                                                  episode there taught to capsize at once: an end ends the losses
       - action · mean(a²)                        the cheapest thrusts that do it
       - change · mean(Δa²)                       commands that a motor can follow, no chatter
