@@ -335,6 +335,8 @@ class FreeMotion:
 
     def _predicted(self, points: Sequence[Array]) -> list[Array]:
         """What the samples of every release would be, (n, C) each."""
+        if self.axis not in (*SWINGING, "heave"):
+            return [self._coast(*pair) for pair in zip(self.releases, points, strict=True)]
         out = []
         for release, (nu, s) in zip(self.releases, self._lines(points), strict=True):
             parts = [
@@ -343,6 +345,17 @@ class FreeMotion:
             ]
             out.append(np.concatenate([np.stack(part, axis=1) for part in parts]))
         return out
+
+    def _coast(self, release: Release, point: Array) -> Array:
+        """The samples of a coast: nu_dot = -c1 nu - c2 |nu| nu has a closed form, (n, C)."""
+        _, _, c1, c2 = self.ratios(point)
+        c1, c2, nu = c1 + 1e-12, c2 + 1e-12, point[:, self.shared]
+        fallen = -np.expm1(-c1 * (release.t - release.begin)[:, None])
+        grown = c2 * np.abs(nu) / c1 * fallen
+        rates = len(release.rate[0])
+        place = point[:, self.shared + 1] if release.own > 1 else 0.0
+        travel = place + np.sign(nu) * np.log1p(grown[rates:]) / c2
+        return np.concatenate([nu * (1.0 - fallen[:rates]) / (1.0 + grown[:rates]), travel])
 
     def _points(self, x: Array) -> list[Array]:
         """Shared and own unknowns of every release, (1, ...) each."""
