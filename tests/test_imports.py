@@ -103,11 +103,11 @@ HOMES = {
     "onnxruntime": {"control/policy.py"},
     "mujoco": {"engine/scene_model.py", "engine/scene_picture.py", "experiments/bench.py"},
     "pandas": {"engine/recorder.py"},
-    "pyarrow": {"calibration/trials/table_file.py", "engine/recorder.py"},
+    "pyarrow": {"calibration/trials/trial_files.py", "engine/recorder.py"},
     "matplotlib": {
-        "calibration/output/fit_figures.py",
-        "calibration/replay/figure.py",
-        "calibration/vision/camera_command.py",
+        "calibration/output/report.py",
+        "calibration/replay/report.py",
+        "calibration/vision/camera.py",
         "calibration/vision/pool_command.py",
         "calibration/vision/report.py",
         "experiments/figures.py",
@@ -121,8 +121,8 @@ HOMES = {
         "ros2/definitions.py",
     },
     "cv2": {
-        "calibration/vision/camera_fit.py",
-        "calibration/vision/pool_search.py",
+        "calibration/vision/camera.py",
+        "calibration/vision/pool_fit.py",
         "localization/detection/pictures.py",
         "robot/pictures.py",
     },
@@ -132,7 +132,7 @@ HOMES = {
         "robot/recorder.py",
         "robot/record_reader.py",
     },
-    "pygame": {"robot/teleop_devices.py"},
+    "pygame": {"robot/teleop.py"},
     "cyclonedds": {
         "ros2/wire/dds_types.py",
         "ros2/wire/endpoints.py",
@@ -148,7 +148,6 @@ HOMES = {
         "ros2_worlds/sim.py",
     },
     "viser": {"viewer/app.py"},
-    "mitsuba": {"experiments/mitsuba_renderer.py"},
 }
 """Library -> the files that may import it, each of which does."""
 

@@ -74,7 +74,7 @@ EXTRAS = {
         "detect tags, calibrate cameras and pools from pictures, locate a vehicle from pictures or video",
     ),
     "render": Extra(
-        {"mitsuba": "mitsuba"}, "render the localization experiment with Mitsuba instead of our own"
+        {"mitsuba": "mitsuba"}, "let the tests compare the overhead camera's pictures with Mitsuba's"
     ),
     "ros2": Extra(
         {"cyclonedds": "cyclonedds", "rosbags": "rosbags"}, "be ROS 2 nodes without an installed ROS 2"

@@ -13,9 +13,7 @@ from finssim.calibration.excitation.programmes import Programme, programmes
 from finssim.calibration.regression.regress import regress
 from finssim.calibration.trials.trial_files import load_trials
 from finssim.cli import app
-from finssim.experiments.demo import step_responses
 from finssim.experiments.excitation import PoolRun, play_programme, pool_trials
-from finssim.pool import draw_plant
 from finssim.vehicles import load_vehicle
 
 pytestmark = pytest.mark.slow
@@ -103,14 +101,6 @@ def test_a_programme_that_the_bridge_stops_is_refused(tmp_path):
             severity="nominal",
             processes=1,
         )
-
-
-def test_steps_on_rails_reach_the_closed_form():
-    """Nominal surge of 12 N: linear damping alone, v = 12 / 39.07."""
-    responses = step_responses(FINSROV, draw_plant(FINSROV, 1, "nominal"), {"surge": [12.0]})
-    speed, time_constant = responses["surge", 12.0]
-    assert speed == pytest.approx(12.0 / 39.073593, rel=0.02)
-    assert 27.14 / 39.07 < time_constant < 27.14 / 39.07 + 0.4  # motors and their delay come on top
 
 
 def test_excite_in_a_pool_by_command(tmp_path):

@@ -223,7 +223,7 @@ def test_a_method_that_locates_nothing_is_no_error(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"renderer": "blender"}, "unknown renderer 'blender'; available: own, mitsuba, geometry"),
+        ({"renderer": "blender"}, "unknown renderer 'blender'; available: own, geometry"),
         ({"seeds": 0}, "seeds is 0, expected at least 1"),
     ],
 )

@@ -96,18 +96,8 @@ def test_our_camera_shows_the_tag_where_it_is():
     assert np.sqrt(np.mean(moved**2)) > 3.0 * np.sqrt(np.mean(still**2))
 
 
-@pytest.mark.slow
-def test_mitsuba_shows_the_tag_where_it_is():
-    """Two crops by the renderer that shares no code with ours: the corners within half a pixel of the projection."""
-    pytest.importorskip("mitsuba")
-    campaign = some(draw_campaign(CONDITIONS["flat"], 1, **SMALL), 2)
-    seen = list(pictures(campaign, "mitsuba"))
-    assert [p.detection.tag for p in seen] == [*TAG.mounts] * 2
-    assert np.abs(errors(campaign, seen)).max() < 0.5
-
-
 def test_an_unknown_renderer_is_refused_by_name():
     campaign = draw_campaign(CONDITIONS["quiet"], 1, **SMALL)
-    with pytest.raises(ValueError, match=r"unknown renderer 'blender'; available: own, mitsuba, geometry"):
+    with pytest.raises(ValueError, match=r"unknown renderer 'blender'; available: own, geometry"):
         next(pictures(campaign, "blender"))
-    assert set(RENDERERS) == {"own", "mitsuba", "geometry"}
+    assert set(RENDERERS) == {"own", "geometry"}

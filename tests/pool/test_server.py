@@ -14,7 +14,7 @@ import pytest
 from finssim.localization.pool import load_pool
 from finssim.pool.draw_plant import draw_plant
 from finssim.pool.fleet import Fleet
-from finssim.pool.run import make_plan, memory_of
+from finssim.pool.run import make_plan
 from finssim.pool.server import LockstepServer, serve_realtime
 from finssim.pool.virtual_pool import VirtualPool, read_truth
 from finssim.robot.goals import station_of
@@ -22,7 +22,7 @@ from finssim.robot.link.frames import Decoder, LinkError
 from finssim.robot.link.transports import UdpTransport, memory_pair
 from finssim.robot.lockstep import LockstepClient, LockstepError, encode_request
 from finssim.robot.messages import Telemetry
-from finssim.robot.pictures import SharedMemoryPictures, UdpPictures
+from finssim.robot.pictures import UdpPictures
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")
@@ -249,14 +249,12 @@ def test_the_command_in_lockstep(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("way", ["udp", "shm"])
-def test_the_command_in_real_time(tmp_path, way):
+def test_the_command_in_real_time(tmp_path):
     """Telemetry and tags of a subprocess arrive at the rates of their instruments; Ctrl-C closes its files."""
     truth = tmp_path / "truth.fst"
-    with Process("--camera", "corners", "--pictures", way, "--truth", truth) as pool:
+    with Process("--camera", "corners", "--truth", truth) as pool:
         link = UdpTransport((HERE, pool.robot), (HERE, pool.port))
-        over_udp = UdpPictures((HERE, pool.robot + 1), (HERE, pool.port + 1))
-        source = over_udp if way == "udp" else SharedMemoryPictures(f"pool-{pool.port}")
+        source = UdpPictures((HERE, pool.robot + 1), (HERE, pool.port + 1))
         pool.until("pictures")
         frames, pictures, end = [], [], time.monotonic() + 30.0
         while (len(frames) < 200 or len(pictures) < 60) and time.monotonic() < end:
@@ -266,7 +264,6 @@ def test_the_command_in_real_time(tmp_path, way):
         assert pool.end(signal.SIGINT) == 0
         assert any("frames in" in line for line in pool.lines)
         link.close()
-        over_udp.close()
         source.close()
     sequence = [m.sequence for m in telemetry(frames)]
     assert len(sequence) >= 200 and sequence == sorted(sequence)
@@ -302,7 +299,6 @@ def test_the_command_draws_pictures():
     ("words", "sentence"),
     [
         (["--camera", "film"], "unknown camera 'film'"),
-        (["--pictures", "post"], "give udp, shm or shm:NAME"),
         (["--severity", "easy"], "easy"),
         (["--camera", "none", "--pool-file", "x.yaml"], "leave one out"),
         (["--start", "0,0"], "0,0"),
@@ -311,8 +307,6 @@ def test_the_command_draws_pictures():
         (["--robot", "elsewhere"], "elsewhere"),
         (["--start", "9,0,-0.5,0"], "outside the pool"),
         (["--start", "0,0,0.5,0"], "outside the pool"),
-        (["--pictures", "shm:../x"], "shm:../x"),
-        (["--pictures", "shm", "--lockstep"], "leave --pictures out"),
     ],
 )
 def test_the_command_refuses_in_one_sentence(capsys, tmp_path, monkeypatch, words, sentence):
@@ -340,12 +334,6 @@ def test_a_pool_that_finds_its_port_taken_leaves_the_files_of_the_other_alone(tm
         assert boundary.run(app, ["pool", *map(str, words)]) == 2
     assert str(port) in capsys.readouterr().err
     assert [file.read_text() for file in files] == ["of the pool that is running"] * 2
-
-
-def test_shared_memory_has_the_name_asked_for_or_one_of_its_port():
-    """So that two pools on their own ports do not meet."""
-    assert memory_of("udp", 58766) == "" and memory_of("shm", 58766) == "pool"
-    assert memory_of("shm", 40000) == "pool-40000" and memory_of("shm:left", 40000) == "left"
 
 
 def test_a_robot_that_sends_garbage_and_leaves_ends_lockstep_without_an_error():

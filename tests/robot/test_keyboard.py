@@ -8,8 +8,7 @@ import termios
 
 import pytest
 
-from finssim.robot.teleop import TeleopError
-from finssim.robot.teleop_devices import Keyboard, Keys
+from finssim.robot.teleop import Keyboard, Keys, TeleopError
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="terminals of Unix")
 

@@ -23,9 +23,14 @@ from finssim.robot.messages import Delivery, Picture, TagCorners
 
 finite = st.floats(allow_nan=False)
 images = st.none() | st.tuples(st.integers(1, 9), st.integers(1, 9)).flatmap(lambda s: arrays(np.uint8, s))
-tags = st.builds(TagCorners, st.integers(0, 500), arrays(np.float64, (4, 2), elements=finite))
+corners = arrays(np.float64, (4, 2), elements=st.floats(allow_nan=False, allow_infinity=False))
+tags = st.builds(TagCorners, st.integers(0, 500), corners)
 pictures = st.builds(
-    Picture, finite, st.integers(0, 2**32 - 1), images, st.lists(tags, max_size=2).map(tuple)
+    Picture,
+    st.floats(allow_nan=False, allow_infinity=False),
+    st.integers(0, 2**32 - 1),
+    images,
+    st.lists(tags, max_size=2).map(tuple),
 )
 deliveries = st.builds(
     Delivery,

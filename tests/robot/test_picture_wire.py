@@ -1,10 +1,6 @@
 """Pictures on their way to the robot: whole or not at all, from one peer, through the death of either side."""
 
-import os
-import signal
 import socket
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -12,15 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from finssim.pool.pictures import SharedMemorySender, UdpSender
+from finssim.pool.pictures import UdpSender
 from finssim.robot.link.frames import LinkError
 from finssim.robot.messages import Picture, TagCorners
 from finssim.robot.pictures import (
-    MEMORY_HEAD,
     MOST_BYTES,
     Assembler,
     NoPictures,
-    SharedMemoryPictures,
     UdpPictures,
     decode_picture,
     encode_picture,
@@ -35,11 +29,6 @@ TAGS = (
     TagCorners(15, RANDOM.normal(300.0, 100.0, (4, 2))),
     TagCorners(16, RANDOM.normal(500.0, 50.0, (4, 2))),
 )
-
-
-def name():
-    """A name of shared memory that no other test has."""
-    return f"test-{os.getpid()}-{time.monotonic_ns()}"
 
 
 def until(receive, count=1, patience=10.0):
@@ -164,108 +153,12 @@ def test_others_are_refused_and_named_once(caplog):
         robot.close()
 
 
-def test_shared_memory_gives_the_newest_pictures_once():
-    """Pictures arrive once, in order and to the bit; a reader that fell behind goes on with the newest."""
-    key = name()
-    camera, robot = SharedMemorySender(key, slots=4, slot_bytes=8192), SharedMemoryPictures(key)
-    try:
-        now = time.monotonic()
-        for i in range(2):
-            camera.send(Picture(now - 0.01, i, NOISE, TAGS), now)
-        found = robot.receive(now)
-        assert [p.sequence for p in found] == [0, 1] and np.array_equal(found[1].image, NOISE)
-        assert found[0].time == now - 0.01 and robot.receive(now) == []
-        for i in range(2, 12):
-            camera.send(Picture(now, i, NOISE), now)
-        assert [p.sequence for p in robot.receive(now)] == [9, 10, 11] and robot.missed == 7
-        camera.send(Picture(now, 12, np.zeros((200, 200), np.uint8)), now)
-        assert camera.lost == 1 and robot.receive(now) == []
-    finally:
-        camera.close()
-        robot.close()
-    assert not camera.path.exists()
-
-
-def test_shared_memory_belongs_to_one_camera_at_a_time():
-    """A second one is refused while the first lives, and leaves no file."""
-    key = name()
-    first = SharedMemorySender(key, slots=4, slot_bytes=8192)
-    before = sorted(first.path.parent.glob(f"*{key}*"))
-    with pytest.raises(LinkError, match="belongs to a camera that is running"):
-        SharedMemorySender(key, slots=4, slot_bytes=8192)
-    assert sorted(first.path.parent.glob(f"*{key}*")) == before
-    first.close()
-    SharedMemorySender(key, slots=4, slot_bytes=8192).close()
-    assert not first.path.exists()
-
-
-@pytest.mark.slow
-def test_shared_memory_outlives_either_side():
-    """A camera killed in the middle and started anew is found again; so is the picture after a reader's restart."""
-    key = name()
-    script = (
-        "import sys, time, numpy as np\n"
-        "from finssim.pool.pictures import SharedMemorySender\n"
-        "from finssim.robot.messages import Picture\n"
-        "camera = SharedMemorySender(sys.argv[1], slots=4, slot_bytes=8192)\n"
-        "i = 0\n"
-        "while True:\n"
-        "    i += 1\n"
-        "    t = time.monotonic()\n"
-        "    camera.send(Picture(t, i, np.full((48, 64), i % 256, np.uint8)), t)\n"
-        "    time.sleep(0.001)\n"
-    )
-    robot = SharedMemoryPictures(key)
-    assert robot.receive(0.0) == []
-    for _ in range(2):
-        camera = subprocess.Popen([sys.executable, "-c", script, key])
-        try:
-            found = until(robot.receive, 20, 30.0)
-            assert len(found) >= 20
-            assert all((p.image == p.sequence % 256).all() for p in found)
-        finally:
-            camera.send_signal(signal.SIGKILL)
-            camera.wait()
-        robot.receive(time.monotonic())
-        robot.close()  # the robot restarts too
-        robot = SharedMemoryPictures(key)
-        assert len(robot.receive(time.monotonic())) > 0
-    robot.path.unlink()
-
-
-def test_a_slot_that_is_being_written_is_left_out():
-    """A number that does not fit, bytes that do not fit and a file cut short give no picture and raise nothing."""
-    key = name()
-    camera, robot = SharedMemorySender(key, slots=4, slot_bytes=8192), SharedMemoryPictures(key)
-    try:
-        slot = MEMORY_HEAD.size
-        for at, data in (
-            (slot, bytes(8)),
-            (slot + 100, b"spoilt"),
-            (0, b"????"),
-            (MEMORY_HEAD.size - 8, b"\xff" * 8),
-        ):
-            camera.send(Picture(0.0, 1, NOISE), 0.0)
-            slot = MEMORY_HEAD.size + (camera.sent - 1) % 4 * 8192
-            place = at + (slot - MEMORY_HEAD.size if at >= MEMORY_HEAD.size else 0)
-            os.pwrite(camera._file, data, place)
-            assert robot.receive(0.0) == []
-        os.truncate(camera._file, 30)
-        assert robot.receive(0.0) == []
-        os.truncate(camera._file, 3)
-        assert robot.receive(0.0) == []
-    finally:
-        camera.close()
-        robot.close()
-
-
 def test_a_source_is_opened_by_its_address():
     """Each address opens its source; others are refused in one sentence."""
     assert isinstance(open_pictures("none"), NoPictures) and open_pictures("none").receive(0.0) == []
-    assert isinstance(open_pictures("shm:pool"), SharedMemoryPictures)
     source = open_pictures("udp://127.0.0.1:58767", "127.0.0.1:0")
     assert isinstance(source, UdpPictures) and source.peer == ("127.0.0.1", 58767)
     source.close()
-    for address in ("tcp://1.2.3.4:5", "shm:", "shm:../x", "udp://127.0.0.1", "", "udp://localhost:99999"):
+    for address in ("tcp://1.2.3.4:5", "shm:pool", "udp://127.0.0.1", "", "udp://localhost:99999"):
         with pytest.raises(LinkError, match=r"."):
             open_pictures(address, "127.0.0.1:0")

@@ -10,18 +10,34 @@ from hypothesis import strategies as st
 
 from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.messages import Telemetry
-from finssim.robot.teleop import GEARS, Hands, Operator, Teleop, TeleopSettings, shaped
+from finssim.robot.teleop import GEARS, LOST, Hands, Operator, shaped
 from finssim.vehicles import load_vehicle
 
 VEHICLE = load_vehicle("finsrov")
 FULL = Hands(surge=1.0, sway=-1.0, heave=1.0, yaw=-1.0, dead_man=True)
 
 
-def looked(*shown, settings=None):
+class Shown:
+    """A device that shows what it is told to."""
+
+    hands = Hands()
+
+    def read(self, now):
+        return self.hands
+
+
+def looks(*shown):
+    """The command after each look at (time [s], hands)."""
+    operator = Operator(Shown())
+    commands = []
+    for now, operator.device.hands in shown:
+        commands.append(operator.look(now))
+    return commands
+
+
+def looked(*shown):
     """The last command after looking at each, 0.1 s apart, beginning with hands that rest."""
-    teleop = Teleop(settings)
-    commands = [teleop.look(0.1 * i, hands) for i, hands in enumerate((Hands(), *shown))]
-    return commands[-1]
+    return looks(*((0.1 * i, hands) for i, hands in enumerate((Hands(), *shown))))[-1]
 
 
 @pytest.mark.parametrize(
@@ -54,42 +70,34 @@ def test_a_press_toggles_once_however_long_it_lasts():
     """Arm, acknowledge and mode are edges; the stop is not."""
     down = Hands(arm=True, acknowledge=True, mode=True)
     first, held = looked(down), looked(down, down)
-    assert first.arm_toggle and first.acknowledge and first.mode_toggle
-    assert not (held.arm_toggle or held.acknowledge or held.mode_toggle)
-    assert looked(down, Hands(), down).arm_toggle
+    assert first.pressed == {"arm", "acknowledge", "mode"} and not held.pressed
+    assert "arm" in looked(down, Hands(), down).pressed
 
 
 def test_a_button_that_hangs_at_the_start_arms_nothing():
-    teleop = Teleop()
-    assert not teleop.look(0.0, Hands(arm=True)).arm_toggle
-    assert not teleop.look(0.1, Hands(arm=True)).arm_toggle
+    commands = looks((0.0, Hands(arm=True)), (0.1, Hands(arm=True)))
+    assert not any(command.pressed for command in commands)
 
 
 def test_a_lost_device_gives_zeros_and_its_return_arms_nothing():
-    teleop = Teleop()
-    teleop.look(0.0, Hands())
-    assert teleop.look(0.1, FULL).wrench.any()
-    lost = teleop.look(0.2, Hands(present=False))
-    assert lost.lost and not lost.wrench.any()
-    back = teleop.look(0.3, replace(FULL, arm=True))
-    assert not (back.lost or back.arm_toggle or back.wrench.any())
+    _, driven, lost, back = looks(
+        (0.0, Hands()), (0.1, FULL), (0.2, Hands(present=False)), (0.3, replace(FULL, arm=True))
+    )
+    assert driven.wrench.any() and lost.lost and not lost.wrench.any()
+    assert not (back.lost or back.pressed or back.wrench.any())
 
 
 def test_silence_counts_as_loss_after_half_a_second():
     """Until then the last hands hold."""
-    teleop = Teleop(TeleopSettings(lost=0.5))
-    teleop.look(0.0, Hands())
-    teleop.look(0.1, FULL)
-    assert teleop.look(0.5, None).wrench.any()
-    assert teleop.look(0.65, None).lost
+    *_, silent, lost = looks((0.0, Hands()), (0.1, FULL), (0.5, None), (0.15 + LOST, None))
+    assert silent.wrench.any() and lost.lost
 
 
 @given(st.floats(-1.0, 1.0), st.floats(0.0, 0.5), st.floats(0.0, 1.0))
 def test_the_answer_grows_with_the_deflection(deflection, dead_band, expo):
     """Odd, monotone, nothing within the dead band, full at the end."""
-    settings = TeleopSettings(dead_band=dead_band, expo=expo)
     (answer, mirrored, more, full) = shaped(
-        np.array([deflection, -deflection, min(deflection + 0.01, 1.0), 1.0]), settings
+        np.array([deflection, -deflection, min(deflection + 0.01, 1.0), 1.0]), dead_band, expo
     )
     assert answer == pytest.approx(-mirrored) and more >= answer - 1e-12 and full == pytest.approx(1.0)
     if abs(deflection) <= dead_band:
@@ -97,16 +105,7 @@ def test_the_answer_grows_with_the_deflection(deflection, dead_band, expo):
 
 
 def test_numbers_that_are_none_push_nothing():
-    assert not shaped(np.array([math.nan, 0.0, 0.0, 0.0]), TeleopSettings()).any()
-
-
-class Shown:
-    """A device that shows what it is told to."""
-
-    hands = Hands()
-
-    def read(self, now):
-        return self.hands
+    assert not shaped(np.array([math.nan, 0.0, 0.0, 0.0])).any()
 
 
 class Drive:
@@ -151,16 +150,16 @@ def test_a_drive_from_arming_to_the_emergency_stop():
     drive = Drive()
     assert not drive.turn(FULL, 10).enable and drive.bridge.state == "disarmed"
     drive.turn(replace(FULL, arm=True))
-    assert drive.bridge.state == "disarmed" and "release the sticks" in drive.operator.said
+    assert drive.bridge.state == "disarmed" and "release the sticks" in drive.operator.message
     drive.turn(Hands(), 2)
     drive.turn(Hands(arm=True))
-    assert drive.bridge.state == "armed", drive.operator.said
+    assert drive.bridge.state == "armed", drive.operator.message
     assert any(drive.turn(FULL, 20).normalised)
     stopped = drive.turn(replace(FULL, stop=True))
     assert drive.bridge.state == "fault" and not stopped.enable and not any(stopped.normalised)
     drive.turn(Hands())
     drive.turn(Hands(arm=True))
-    assert drive.bridge.state == "fault" and "acknowledge the fault first" in drive.operator.said
+    assert drive.bridge.state == "fault" and "acknowledge the fault first" in drive.operator.message
     drive.turn(Hands())
     drive.turn(Hands(acknowledge=True))
     assert drive.bridge.state == "disarmed"
@@ -189,5 +188,5 @@ def test_an_unplugged_pad_disarms():
     drive.turn(Hands(arm=True))
     assert drive.bridge.state == "armed"
     frame = drive.turn(Hands(present=False))
-    assert drive.bridge.state == "disarmed" and not frame.enable and "lost" in drive.operator.said
+    assert drive.bridge.state == "disarmed" and not frame.enable and "lost" in drive.operator.message
     assert not drive.turn(replace(FULL, arm=True), 5).enable

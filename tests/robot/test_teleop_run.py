@@ -14,9 +14,8 @@ from finssim.robot.interrupt import interruptible
 from finssim.robot.link.frames import MCU, Decoder, encode_telemetry
 from finssim.robot.link.transports import memory_pair
 from finssim.robot.messages import Telemetry
-from finssim.robot.teleop import Hands
-from finssim.robot.teleop_run import drive
-from finssim.robot.wiring import Wiring, open_camera
+from finssim.robot.teleop import Hands, drive
+from finssim.robot.wiring import Wiring, open_camera, run_realtime
 from finssim.vehicles import load_vehicle
 from reference.rounds import overhead
 
@@ -43,6 +42,10 @@ class World:
         self.ours, self.theirs = memory_pair()
         self.decoder = Decoder(MCU)
         self.frames = []
+
+    def drive(self, runtime, **how):
+        """As `wiring.connected` gives it."""
+        return run_realtime(runtime, self.ours, clock=self.clock, wait=self.wait, **how)
 
     def clock(self):
         return self.now
@@ -75,7 +78,7 @@ def world():
 @pytest.mark.slow
 def test_a_drive_by_hand(world):
     """Thrust only while the hand is on; the last three frames are off."""
-    runtime = drive(VEHICLE, Script(), world.ours, duration=3.0, clock=world.clock, wait=world.wait)
+    runtime = drive(VEHICLE, Script(), world.drive, duration=3.0)
     moving = [t for t, frame in world.frames if frame.enable and any(frame.normalised)]
     assert 1.0 <= moving[0] < 1.2 and 2.0 <= moving[-1] < 2.3
     assert all(not frame.enable and not any(frame.normalised) for _, frame in world.frames[-3:])
@@ -88,7 +91,7 @@ def test_nobody_arms_nothing_moves(world):
         def read(self, now):
             return replace(super().read(now), arm=False, dead_man=True, surge=1.0)
 
-    drive(VEHICLE, Held(), world.ours, duration=2.0, clock=world.clock, wait=world.wait)
+    drive(VEHICLE, Held(), world.drive, duration=2.0)
     assert world.frames and not any(frame.enable for _, frame in world.frames)
 
 
@@ -98,7 +101,7 @@ def test_a_device_that_vanishes_disarms(world):
         def read(self, now):
             return super().read(now) if now < 1.5 else Hands(present=False)
 
-    runtime = drive(VEHICLE, Gone(), world.ours, duration=2.5, clock=world.clock, wait=world.wait)
+    runtime = drive(VEHICLE, Gone(), world.drive, duration=2.5)
     moving = [t for t, frame in world.frames if frame.enable]
     assert moving[-1] < 1.6 and runtime.bridge.state == "disarmed"
 
@@ -113,9 +116,7 @@ def test_a_drive_is_recorded(world, tmp_path):
     from finssim.robot.recorder import Recorder
 
     with Recorder(tmp_path / "drive.mcap", VEHICLE, {}) as recorder:
-        drive(
-            VEHICLE, Script(), world.ours, duration=3.0, recorder=recorder, clock=world.clock, wait=world.wait
-        )
+        drive(VEHICLE, Script(), world.drive, duration=3.0, recorder=recorder)
     with open_record(tmp_path / "drive.mcap") as record:
         told = describe_record(record)
     assert "armed" in [event["kind"] for event in told["events"]]
@@ -151,7 +152,7 @@ class Modes(Script):
 @pytest.mark.slow
 def test_the_mode_button_hands_over_to_a_controller_and_back(world):
     """The controller's thrust comes from 1 s on, the person's zeros again from 2 s on."""
-    drive(VEHICLE, Modes(), world.ours, other=Hold(), duration=3.0, clock=world.clock, wait=world.wait)
+    drive(VEHICLE, Modes(), world.drive, other=Hold(), duration=3.0)
     moving = [t for t, frame in world.frames if frame.enable and any(frame.normalised)]
     assert 1.0 <= moving[0] < 1.2 and 2.0 <= moving[-1] < 2.3
 
@@ -164,9 +165,8 @@ def test_who_steers_is_on_record(world, tmp_path):
     from finssim.robot.record_reader import open_record
     from finssim.robot.recorder import Recorder
 
-    how = {"other": Hold(), "duration": 3.0, "clock": world.clock, "wait": world.wait}
     with Recorder(tmp_path / "drive.mcap", VEHICLE, {}) as recorder:
-        drive(VEHICLE, Modes(), world.ours, recorder=recorder, **how)
+        drive(VEHICLE, Modes(), world.drive, recorder=recorder, other=Hold(), duration=3.0)
     with open_record(tmp_path / "drive.mcap") as record:
         told = [json.loads(entry.message.data) for entry in record.messages(["events"])]
     modes = [(event["text"], event["time"]) for event in told if event["kind"] == "mode"]

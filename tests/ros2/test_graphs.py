@@ -75,7 +75,7 @@ def told(graph, tmp_path, **choices):
         ("pool", {"namespace": "robot_1"}, "**", {"frame_prefix": "robot_1/"}),
         ("pool", {"site": "open-water", "positioning": "usbl"}, "virtual_pool", {"camera": "none"}),
         ("robot", {"robot": "dry-run", "pool_file": FILE}, "camera", {"pictures": "none"}),
-        ("robot", {"pictures": "shm:a", "pool_file": FILE}, "camera", {"pictures": "shm:a"}),
+        ("robot", {"pictures": "udp://a:1", "pool_file": FILE}, "camera", {"pictures": "udp://a:1"}),
     ],
 )
 def test_choices_reach_their_node(tmp_path, graph, choices, node, parameters):

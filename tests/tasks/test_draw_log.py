@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from finssim.engine.randomize import Randomization
 from finssim.engine.ranges_file import Ranges
 from finssim.tasks import Environment, EnvironmentSetupError, StationKeeping
-from finssim.tasks.drawing import LogError, read_draws
+from finssim.tasks.drawing import OUTCOME, LogError
 
 RANGES = Ranges(name="test", mass=(0.9, 1.3), current=(0.0, 0.2))
 
@@ -32,40 +33,28 @@ def logged():
 def test_every_episode_that_ended_has_its_row(logged):
     log, seen = logged
     e = log.episodes()
-    assert e.names == ("mass", "current", "current.direction") and e.units == ("1", "m/s", "rad")
-    assert e.values.shape == (15, 1, 3)
-    np.testing.assert_array_equal(e.world, np.tile(np.arange(5), 3))
-    np.testing.assert_array_equal(e.episode, np.repeat([1, 2, 3], 5))
-    assert (e.length == 4).all()
-    np.testing.assert_allclose(e.column("mass"), np.concatenate(seen[0:6:2]), rtol=1e-6)
-    np.testing.assert_allclose(e.episode_return, np.concatenate([x[0] for x in seen[1:6:2]]), rtol=1e-6)
-    np.testing.assert_allclose(e.held, np.concatenate([x[1] for x in seen[1:6:2]]), rtol=1e-6)
+    assert list(e) == [*OUTCOME, "mass", "current", "current.direction"] and len(e["mass"]) == 15
+    np.testing.assert_array_equal(e["world"], np.tile(np.arange(5), 3))
+    np.testing.assert_array_equal(e["episode"], np.repeat([1, 2, 3], 5))
+    assert (e["length"] == 4).all()
+    np.testing.assert_allclose(e["mass"], np.concatenate(seen[0:6:2]), rtol=1e-6)
+    np.testing.assert_allclose(e["episode_return"], np.concatenate([x[0] for x in seen[1:6:2]]), rtol=1e-6)
+    np.testing.assert_allclose(e["held"], np.concatenate([x[1] for x in seen[1:6:2]]), rtol=1e-6)
 
 
-def test_what_is_written_is_read_back(logged, tmp_path):
+def test_the_table_has_a_row_for_each_episode_and_says_what_it_was_drawn_from(logged, tmp_path):
+    """As `episodes` has them; ranges, units, vehicles and seed beside it."""
     log, _ = logged
-    e, back = log.episodes(), read_draws(log.save(tmp_path / "draws.npz"))
-    for name in ("values", "world", "episode", "length", "episode_return", "held"):
-        np.testing.assert_array_equal(getattr(e, name), getattr(back, name))
-    assert back.names == e.names and back.units == e.units
-    assert back.about["ranges"]["mass"] == [0.9, 1.3] and back.about["seed"] == 6
-    assert back.about["vehicles"][0]["name"] == "finsrov" and "revision" in back.about["provenance"]
-
-
-def test_the_table_has_a_row_for_each_vehicle_of_each_episode(logged, tmp_path):
-    log, _ = logged
-    with log.save(tmp_path / "draws.csv").open(encoding="utf-8") as file:
+    target = log.save(tmp_path / "draws.csv")
+    with target.open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     e = log.episodes()
-    assert len(rows) == 15 and list(rows[0])[:6] == [
-        "world",
-        "episode",
-        "length",
-        "episode_return",
-        "held",
-        "vehicle",
-    ]
-    np.testing.assert_allclose([float(row["mass"]) for row in rows], e.column("mass"), rtol=1e-6)
+    assert len(rows) == 15 and list(rows[0]) == list(e)
+    for name, column in e.items():
+        np.testing.assert_allclose([float(row[name]) for row in rows], column, rtol=1e-6)
+    about = json.loads((tmp_path / "draws.csv.json").read_text(encoding="utf-8"))
+    assert about["ranges"]["mass"] == [0.9, 1.3] and about["seed"] == 6 and about["units"]["current"] == "m/s"
+    assert about["vehicles"][0]["name"] == "finsrov" and "revision" in about["provenance"]
 
 
 def test_episodes_that_are_cut_off_are_left_out():
@@ -74,11 +63,11 @@ def test_episodes_that_are_cut_off_are_left_out():
     env.step(np.zeros((3, 6)))
     env.reset()
     mass = env.drawing.draws.numpy(["mass"])[:, 0, 0]
-    assert len(log.episodes().world) == 0
+    assert len(log.episodes()["world"]) == 0
     for _ in range(4):
         env.step(np.zeros((3, 6)))
-    np.testing.assert_array_equal(log.episodes().column("mass"), mass)
-    assert (log.episodes().episode == 2).all()
+    np.testing.assert_array_equal(log.episodes()["mass"], mass)
+    assert (log.episodes()["episode"] == 2).all()
 
 
 def test_a_world_that_waits_for_its_reset_has_one_row():
@@ -93,23 +82,21 @@ def test_a_world_that_waits_for_its_reset_has_one_row():
     log = env.drawing.start_log()
     for _ in range(4):
         env.step(np.zeros((3, 6)))
-    assert log.episodes().world.tolist() == [0, 1, 2]
+    assert log.episodes()["world"].tolist() == [0, 1, 2]
     env.reset(mask=[True, False, False])
     for _ in range(3):
         env.step(np.zeros((3, 6)))
-    assert log.episodes().world.tolist() == [0, 1, 2, 0] and log.episodes().episode.tolist() == [1, 1, 1, 2]
+    assert log.episodes()["world"].tolist() == [0, 1, 2, 0] and log.episodes()["episode"].tolist() == [
+        1,
+        1,
+        1,
+        2,
+    ]
 
 
-def test_what_cannot_be_logged_or_read_is_refused(logged, tmp_path):
+def test_what_cannot_be_logged_is_refused(logged, tmp_path):
     log, _ = logged
-    with pytest.raises(LogError, match="ends in '.txt', expected .npz or .csv"):
+    with pytest.raises(LogError, match="ends in '.txt', expected .csv"):
         log.save(tmp_path / "draws.txt")
-    with pytest.raises(LogError, match="'slew' was not drawn; drawn were: mass"):
-        log.episodes().column("slew")
-    with pytest.raises(LogError, match="no such file"):
-        read_draws(tmp_path / "none.npz")
-    (tmp_path / "bad.npz").write_bytes(b"no")
-    with pytest.raises(LogError, match="not a log of draws"):
-        read_draws(tmp_path / "bad.npz")
     with pytest.raises(EnvironmentSetupError, match="nothing is drawn that could be logged"):
         Environment(StationKeeping()).drawing.start_log()

@@ -135,6 +135,17 @@ def test_leaving_the_pool_terminates_with_a_loss(position, left):
     assert (step.reward[0] < -TASK.reward.loss + 2.0) == left
 
 
+@pytest.mark.parametrize(("roll", "ended"), [(44.0, False), (60.0, True), (-60.0, True), (180.0, True)])
+def test_capsizing_terminates_with_a_loss(roll, ended):
+    """Beyond 45°, where a bridge stops the vehicle, and either way round."""
+    env = environment(1, auto_reset=False)
+    pose = (0.0, 0.0, -0.5), Rotation.from_euler("x", roll, degrees=True).as_quat()
+    env.start(*pose, *pose)
+    step = env.step(np.zeros((1, 6)))
+    assert (step.terminated[0], step.truncated[0]) == (ended, False)
+    assert (step.reward[0] < -TASK.reward.loss + 2.0) == ended
+
+
 def test_the_time_limit_truncates_and_nothing_else_does():
     """After time_limit / control_step steps, exactly, and as a truncation."""
     env = environment(4, replace(TASK, time_limit=1.5))

@@ -254,8 +254,6 @@ TITLES = {
     "p95_m": "95th percentile of the error [m]",
 }
 """What measures are; others are called by their names."""
-DARK = 0.3
-"""A chance so far from a half stands on a dark square."""
 POINTS = 60
 """Of a curve."""
 CURVE_RESAMPLES = 200
@@ -265,21 +263,17 @@ def draw_comparison(groups: Sequence[Group], result: Mapping[str, Any], path: Pa
     """Write the figure."""
     runs = [run for group in groups for run in group.runs]
     curves = [name for name in CURVES if all(_drawable(run, name) for run in runs)][:2]
-    measures, pairs = list(result["measures"]), len(groups) > 1
+    measures = list(result["measures"])
     height = 0.42 * len(groups) + 0.9
-    columns = max(len(measures), len(curves) + pairs)
+    columns = max(len(measures), len(curves))
     figure = new_figure(2.4 + 2.6 * columns, height + 3.4)
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(height, 3.4))[:, 0]
     above.suptitle("interquartile means, with 95 % intervals over the seeds", fontsize=9)
     for k, axes in enumerate(above.subplots(1, len(measures), squeeze=False)[0]):
         _intervals(axes, groups, result, measures[k], labels=k == 0)
-    if not curves and not pairs:
-        return save_figure(figure, path)
-    panels = below.subplots(1, len(curves) + pairs, squeeze=False)[0]
-    for k, name in enumerate(curves):
-        _draw_curves(panels[k], groups, name, legend=k == 0)
-    if pairs:
-        _matrix(panels[-1], groups, result, measures[0])
+    panels = below.subplots(1, len(curves), squeeze=False)[0] if curves else ()
+    for axes, name in zip(panels, curves, strict=True):
+        _draw_curves(axes, groups, name, legend=name == curves[0])
     return save_figure(figure, path)
 
 
@@ -350,25 +344,6 @@ def _draw_curves(axes: Any, groups: Sequence[Group], name: str, *, legend: bool)
     if legend:
         axes.legend(frameon=False, fontsize=8)
     clean(axes)
-
-
-def _matrix(axes: Any, groups: Sequence[Group], result: Mapping[str, Any], name: str) -> None:
-    n = len(groups)
-    table = np.full((n, n), np.nan)
-    for pair in result["pairs"]:
-        if pair["measure"] == name:
-            i, j = (next(k for k, g in enumerate(groups) if g.name == pair[side]) for side in ("a", "b"))
-            table[i, j], table[j, i] = pair["probability"], 1.0 - pair["probability"]
-    axes.imshow(table, vmin=0.0, vmax=1.0, cmap="PuOr")
-    for (i, j), value in np.ndenumerate(table):
-        if np.isfinite(value):
-            color = "white" if abs(value - 0.5) > DARK else "black"
-            axes.annotate(f"{value:.2f}", (j, i), ha="center", va="center", fontsize=9, color=color)
-    axes.set_xticks(
-        range(n), [g.name for g in groups], fontsize=8, rotation=30, ha="right", rotation_mode="anchor"
-    )
-    axes.set_yticks(range(n), [g.name for g in groups], fontsize=8)
-    axes.set_title(f"chance that the row is better:\n{TITLES.get(name, name)}", fontsize=10)
 
 
 RESULT_FILE = "compare.json"

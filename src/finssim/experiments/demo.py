@@ -18,15 +18,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
 from finssim.calibration.excitation.programmes import RATE, Programme, programmes, which_axes
 from finssim.calibration.findings import sentences
 from finssim.calibration.output.calibrate import number_in
-from finssim.calibration.output.fit_output import interval_text, number_text, state_text
+from finssim.calibration.output.report import interval_text, number_text, state_text
 from finssim.calibration.trials.trial import Trial
-from finssim.control.allocation import Allocator
 from finssim.control.pid import AxisModel, axis_model
 from finssim.control.policy import DESCRIPTION_FILE, Policy
 from finssim.engine import Pool
@@ -54,10 +52,8 @@ from finssim.files import atomic_directory
 from finssim.learning.train import train
 from finssim.localization.detection.detector import detector
 from finssim.page import html_page
-from finssim.pool import PlantSpec, draw_plant
+from finssim.pool import draw_plant
 from finssim.pool.camera import PoolCamera, camera_of
-from finssim.pool.plant import Plant
-from finssim.pool.plant_spec import Basin, BuoyancyDrift, Circulation
 from finssim.pool.positioning import Exposure
 from finssim.quiet import start_warp
 from finssim.vehicles import AXES, Vehicle, load_vehicle
@@ -180,80 +176,6 @@ def _shuttle(axis: str, level: float, period: float) -> Programme:
     )
 
 
-Array = NDArray[np.float64]
-
-PUSH, REST = 6.0, 1.0
-"""Lengths of a step and of the pause before the next one [s]."""
-OPEN = Basin(length=60.0, width=60.0, depth=60.0)
-DEEP = (0.0, 0.0, -30.0)
-
-
-def step_responses(
-    vehicle: Vehicle, spec: PlantSpec, levels: Mapping[str, Sequence[float]]
-) -> dict[tuple[str, float], tuple[float, float]]:
-    """Steps of a plant on rails: it can move along one axis alone, in water at rest, far from everything.
-
-    Args:
-        vehicle: By whose file the wrench is allocated and becomes shaft speeds.
-        spec: The plant; current, tether and drift of the buoyancy are left out.
-        levels: Axis -> wrenches [N, N m].
-
-    Returns:
-        (axis, level) -> terminal speed [m/s, rad/s] and time to 63 % of it, motors included [s]: means of both
-        directions.
-    """
-    start_warp()
-    still = {"basin": OPEN, "circulation": Circulation(), "tether": None, "buoyancy": BuoyancyDrift()}
-    plant = Plant(vehicle, spec.model_copy(update=still), position=DEEP)
-    allocator, thrusters = Allocator.from_vehicle(vehicle), list(vehicle.thrusters.values())
-
-    def ride(axis: int, target: Array, duration: float) -> Array:
-        """Speed along the rail at every physics step."""
-        speeds = np.empty(round(duration / plant.step))
-        plant.target[:] = target
-        for k in range(len(speeds)):
-            plant.advance()
-            speeds[k] = abs(plant.nu[axis])
-            plant.nu[:] = np.where(np.arange(6) == axis, plant.nu, 0.0)
-            plant.position[:], plant.quaternion[:] = DEEP, (0.0, 0.0, 0.0, 1.0)
-        return speeds
-
-    def respond(axis: int, level: float) -> tuple[float, float]:
-        force = allocator.allocate(np.where(np.arange(6) == axis, level, 0.0))
-        ride(axis, np.zeros(len(thrusters)), REST)
-        plant.nu[:] = 0.0
-        speeds = ride(axis, np.array([t.speed(f) for t, f in zip(thrusters, force, strict=True)]), PUSH)
-        terminal = float(speeds[-round(0.5 / plant.step) :].mean())
-        return terminal, float(np.argmax(speeds >= 0.632 * terminal) * plant.step)
-
-    responses = {}
-    for axis, values in levels.items():
-        for level in values:
-            both = [respond(AXES.index(axis), sign * level) for sign in (1.0, -1.0)]  # type: ignore[arg-type]
-            responses[axis, level] = tuple(np.mean(both, axis=0).tolist())
-    return responses
-
-
-def compare_steps(
-    identified: Vehicle, standing: Vehicle, spec: PlantSpec, levels: Mapping[str, Sequence[float]]
-) -> list[dict[str, float | str]]:
-    """Terminal speeds and time constants of an identified vehicle beside those of the plant that it was identified in.
-
-    Args:
-        identified: The vehicle; its plant is its file to the letter.
-        standing: Around which the plant was drawn.
-        spec: The plant.
-        levels: Axis -> wrenches, by the file that robots have [N, N m].
-
-    Returns:
-        A row for each axis and level: axis, level, speed and time constant of `model` and `plant`.
-    """
-    model = step_responses(identified, draw_plant(identified, 0, "nominal"), levels)
-    real = step_responses(standing, spec, levels)
-    names = ("axis", "level", "model_speed", "model_time_constant", "plant_speed", "plant_time_constant")
-    return [dict(zip(names, (*step, *model[step], *real[step]), strict=True)) for step in real]
-
-
 ZOOM = 110
 """Half the width of the part of a picture that is shown larger [px]."""
 BLUE, ORANGE = COLORS[:2]
@@ -261,7 +183,6 @@ ARROW = 0.18
 """Length of an arrow that shows a heading [m]."""
 
 HEADS = ("parameter", "estimate", "95 % interval", "catalogue", "unit", "state")
-STEP_HEADS = ("axis", "push", "identified", "in the plant", "ratio", "time constant", "in the plant")
 UNSURE = (
     "unsure: told together with another number and not alone, as a part of the drag. file kept: the trials do not "
     "determine the number, and the vehicle keeps its guess."
@@ -270,10 +191,6 @@ POOL_VEHICLE = (
     " The catalogue's vehicle is the one around which the pool drew its own: the plant's coefficients are known to the "
     "pool alone. Its propellers push up to 15 % more or less than the bench said, so what is found are effective "
     "masses and dampings: those of the thrust that the vehicle file promises."
-)
-RAILS = (
-    "On rails, in water at rest, mean of both directions: what the coefficients come to. Only this comparison opens "
-    "the plant."
 )
 VIEW = (
     "Drawn again from the true pose of a trial of the policy with pictures, by that trial's camera and water."
@@ -372,12 +289,10 @@ def _paths(trials: Sequence[PlayedTrial]) -> Any:
     return figure
 
 
-def _identification(result: Identification) -> list[Table]:
+def _identification(result: Identification, hardware: bool) -> list[Table]:
     """What the trials made identifiable, and how the result replays others."""
     score = result.replay.aggregate(result.replay.models[0]).value
-    source, same = (
-        ("the virtual pool", "in the same pool") if result.steps else ("a robot", "on the same robot")
-    )
+    source, same = ("a robot", "on the same robot") if hardware else ("the virtual pool", "in the same pool")
     lead = (
         f"Identified in {result.seconds:.0f} s from {len(result.fit.trials)} trials of {source}, beginning with "
         "guessed hydrodynamics: the robot's own software played each programme, and its record became a trial. "
@@ -393,28 +308,17 @@ def _identification(result: Identification) -> list[Table]:
         ]
         for name, e in estimates.items() if str(e.path).startswith("hydrodynamics.")
     ]  # fmt: skip
-    tables = [
+    return [
         Table(
             title="Identification",
             headline=lead,
             heads=HEADS,
             rows=rows,
-            note=UNSURE + (POOL_VEHICLE if result.steps else ""),
+            note=UNSURE + ("" if hardware else POOL_VEHICLE),
             sentences=sentences(result.findings),
             pictures={"replay.png": "Held-out trials: measured and replayed by the identified vehicle"},
         )
     ]
-    speeds = []
-    for step in result.steps:
-        unit, push = ("m/s", "N") if step["axis"] in AXES[:3] else ("rad/s", "N m")
-        model, plant = float(step["model_speed"]), float(step["plant_speed"])
-        ratio = f"{model / plant:.2f}" if plant else "–"
-        times = (f"{step[f'{name}_time_constant']:.2f} s" for name in ("model", "plant"))
-        row = [str(step["axis"]), f"{step['level']:g} {push}", f"{model:.3f} {unit}", f"{plant:.3f} {unit}"]
-        speeds.append([*row, ratio, *times])
-    if speeds:
-        tables.append(Table(title="Terminal speeds", heads=STEP_HEADS, rows=speeds, note=RAILS))
-    return tables
 
 
 def _lead(evaluations: Sequence[Evaluation], seconds: float) -> str:
@@ -633,7 +537,7 @@ class _Demonstration:
             yield lambda part, what: status.update(f"{text}: {what}")
 
     def _identified(self) -> Identification:
-        """Trials, the vehicle that they make identifiable, and in a pool how its speeds compare with the plant's."""
+        """Trials, and the vehicle that they make identifiable."""
         standing, scope = self.standing, self.scope
         plans = {
             role: programmes(tuple(levels), standing, levels=levels, coast=COAST)
@@ -670,17 +574,11 @@ class _Demonstration:
                     )  # fmt: skip
 
                 result = identify(self.folder, self.name, seed=self.seed, shown=self.out, record=simulated)
-                linear = {
-                    axis: levels for axis, levels in scope.levels.items() if axis not in ("roll", "pitch")
-                }
-                result = replace(result, steps=tuple(compare_steps(result.vehicle, standing, spec, linear)))
-        off = [abs(float(s["model_speed"]) / float(s["plant_speed"]) - 1.0) for s in result.steps]
-        speeds = f", terminal speeds within {100.0 * max(off):.0f} % of the pool's own vehicle" if off else ""
         identifiable = sum(e.identifiable for e in result.fit.estimates.values())
         self.tell(
             f"identified from {len(result.fit.trials)} trials in {result.seconds:.0f} s: {identifiable} of "
             f"{len(result.fit.estimates)} parameters told, NRMSE on {len(result.replay.pairs)} other trials "
-            f"{result.replay.aggregate('calibrated').value:.3f}{speeds}"
+            f"{result.replay.aggregate('calibrated').value:.3f}"
         )
         return result
 
@@ -724,11 +622,10 @@ class _Demonstration:
         self.tell(f"  {job.row} at {job.target}: {held}")
 
     def _report(self, result: Identification, evaluations: Sequence[Evaluation], seconds: float) -> None:
-        """Write NAME.json of every controller, `steps.json`, the pictures and `report.html`."""
+        """Write NAME.json of every controller, the pictures and `report.html`."""
         folder, policy = self.folder, evaluations[0]
         for evaluation in evaluations:
             write_json(folder / f"{evaluation.result['controller']['name']}.json", evaluation.result)
-        (folder / "steps.json").write_text(json.dumps(result.steps, indent=2) + "\n", encoding="utf-8")
         with (folder / "policy" / "curves.csv").open(encoding="utf-8", newline="") as file:
             curves = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
         compared = [e for e in evaluations if e.result["trials"] == policy.result["trials"]]
@@ -747,7 +644,7 @@ class _Demonstration:
         sections = [
             f"<h1>{escape(title)}</h1>",
             f'<p class="lead">{escape(_lead(compared, seconds))}</p>',
-            *html_of([*_identification(result), *_results(evaluations)], folder),
+            *html_of([*_identification(result, self.robot is not None), *_results(evaluations)], folder),
             "<h2>How to repeat it</h2>",
             f"<pre>{escape(chr(10).join(self._commands()))}</pre>",
             "<h2>Provenance</h2>",

@@ -16,8 +16,8 @@ from finssim.calibration.output.calibrate import all_findings, calibrated
 from finssim.calibration.output.report import write_report
 from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.calibration.regression.regress import regress
-from finssim.calibration.replay.figure import draw_response_envelopes
 from finssim.calibration.replay.replay import Replay, replay
+from finssim.calibration.replay.report import draw_response_envelopes
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import write_trial
 from finssim.experiments.figures import save_figure
@@ -52,8 +52,6 @@ class Identification:
     """The vehicle of the catalogue that made the trials, or around which the pool's own was drawn."""
     findings: tuple[Finding, ...]
     seconds: float
-    steps: tuple[dict[str, float | str], ...] = ()
-    """Terminal speeds and time constants beside those of a plant, of `programmes.compare_steps`."""
 
 
 def rough_vehicle(truth: Vehicle) -> Vehicle:

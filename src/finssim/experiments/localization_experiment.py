@@ -214,12 +214,10 @@ SURROUND = 40
 """Pixels around the tag that the detector is given."""
 INTERVAL = 0.5
 """Between pictures, as the published replay ran [s]."""
-MITSUBA_RAYS = 16
-"""Rays a fine pixel."""
 CORNER_NOISE = 0.2
 """Of the corners that `geometry` makes up [px]."""
-RENDERERS = ("own", "mitsuba", "geometry")
-"""What looks at a visit: our camera, Mitsuba, or exact projection and noise, without pictures."""
+RENDERERS = ("own", "geometry")
+"""What looks at a visit: the overhead camera, or exact projection and noise, without pictures."""
 
 
 @dataclass(frozen=True)
@@ -253,7 +251,7 @@ def pictures(campaign: Campaign, renderer: str = "own") -> Iterator[Picture]:
 
 
 def scene_of(campaign: Campaign) -> Scene:
-    """The pool as our camera and Mitsuba see it, without the tag."""
+    """The pool as the overhead camera sees it, without the tag."""
     slope = campaign.conditions.ripples
     return Scene(
         camera=campaign.truth.camera,
@@ -280,8 +278,8 @@ def _rendered(campaign: Campaign, renderer: str) -> Callable[..., Detection | No
     """A picture, and what the default detector finds in it; of `geometry` exact projection with white noise."""
     from finssim.localization.detection.detector import detector
 
-    scene, find, lens = scene_of(campaign), detector(TAG.family), campaign.truth.camera.lens
-    camera = OverheadCamera(scene) if renderer == "own" else None
+    find, lens = detector(TAG.family), campaign.truth.camera.lens
+    camera = OverheadCamera(scene_of(campaign))
 
     def look(visit: Visit, time: float, seed: int) -> Detection | None:
         points = visit.position + corners(TAG.edge) @ visit.R_pb.T
@@ -293,13 +291,7 @@ def _rendered(campaign: Campaign, renderer: str) -> Callable[..., Detection | No
         low = np.maximum(np.floor(exact.pixels.min(0)) - SURROUND, 0)
         high = np.minimum(np.ceil(exact.pixels.max(0)) + SURROUND + 1, [lens.width, lens.height])
         region = (*low.astype(int).tolist(), *high.astype(int).tolist())
-        tags, moment = (tag_of(visit),), {"time": time, "seed": seed, "region": region}
-        if camera is not None:
-            picture = camera.render(tags=tags, **moment)
-        else:
-            from finssim.experiments.mitsuba_renderer import render_with_mitsuba
-
-            picture = render_with_mitsuba(replace(scene, tags=tags), rays=MITSUBA_RAYS, **moment)
+        picture = camera.render(tags=(tag_of(visit),), time=time, seed=seed, region=region)
         return next((d for d in find.detect(picture, region) if d.tag == TAG_ID), None)
 
     return look
@@ -724,7 +716,7 @@ def localization_experiment(
 
     Args:
         out (DIR): Directory for JSON, Markdown and figures.
-        renderer (NAME): own, mitsuba (slow), or geometry (no pictures: exact corners with noise).
+        renderer (NAME): own, or geometry (no pictures: exact corners with noise).
         seeds: Repetitions with other errors.
         seed: Seed of every random number; equal seeds give equal results.
         say: Told the share that is done and what comes next.

@@ -28,7 +28,7 @@ from finssim.robot.pilots import Pilot, WrenchPilot, make_pilot
 from finssim.robot.recorder import Recorder, recording
 from finssim.robot.robot import Reading
 from finssim.robot.runtime import Runtime
-from finssim.robot.teleop_devices import Keyboard
+from finssim.robot.teleop import Keyboard
 from finssim.robot.wiring import Drive, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import vehicle_at
@@ -342,7 +342,7 @@ def robot_or_none(
         site (NAME): Where that robot is: pool, tank or open-water, by which it is equipped. If not given: pool.
         bind (ADDRESS:PORT): Address and port of this end, for udp; pictures come to the port after it. Loopback unless
             given.
-        pictures (ADDRESS): Overhead camera: udp://HOST:PORT, shm:NAME or none; the virtual pool's with --robot pool,
+        pictures (ADDRESS): Overhead camera: udp://HOST:PORT or none; the virtual pool's with --robot pool,
             otherwise none, if not given.
         lockstep: Take turns with finssim pool --lockstep, as fast as both compute.
         arm: Let thrusters turn, as soon as the state is known. Without it they never do.

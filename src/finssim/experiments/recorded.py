@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.calibration.trials.table_file import read_table
+from finssim.calibration.trials.trial_files import read_table
 from finssim.control.guidance import Guide, Reference
 from finssim.experiments.driven import SAME_GOAL, Drive, read_drive, station_at, trajectory_of
 from finssim.experiments.metrics import MAX_GAP, T1_SETPOINTS, in_room

@@ -1,23 +1,18 @@
-"""The camera's end of the picture wire: over UDP to one robot, or into shared memory."""
+"""The camera's end of the picture wire: over UDP to one robot."""
 
 from __future__ import annotations
 
-import fcntl
 import multiprocessing
 import os
 import queue
 import signal
 import socket
-import struct
-import tempfile
 import threading
 import time
-import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 
@@ -30,43 +25,19 @@ from finssim.robot.link.frames import LinkError
 from finssim.robot.messages import Picture
 from finssim.robot.pictures import (
     LONGEST_FRAGMENT,
-    MEMORY_HEAD,
-    MEMORY_MAGIC,
-    MEMORY_SLOT,
-    MEMORY_VERSION,
     encode_picture,
     fragments,
-    memory_path,
 )
 from finssim.vehicles import Vehicle
+
+Address = tuple[str, int]
 
 __all__ = [
     "CameraPlan",
     "PictureProcess",
-    "PictureSink",
-    "PictureWire",
-    "SharedMemorySender",
     "UdpSender",
     "bound_socket",
 ]
-
-
-# The camera's end of the picture wire: over UDP to one robot, or into shared memory.
-
-
-SLOTS = 8
-SLOT_BYTES = 2 * 2**20
-"""A raw picture of 1920 x 1080 fits."""
-
-
-class PictureSink(Protocol):
-    """Takes pictures for a robot."""
-
-    def send(self, picture: Picture, now: float) -> None:
-        """Hand a picture on; `now` and `picture.time` are on this machine's `time.monotonic` [s]."""
-
-    def close(self) -> None:
-        """Let go of the wire."""
 
 
 def bound_socket(kind: int, address: tuple[str, int]) -> socket.socket:
@@ -110,7 +81,12 @@ class UdpSender:
         self.address: tuple[str, int] = self._socket.getsockname()
 
     def send(self, picture: Picture, now: float) -> None:
-        """Send a picture; one that cannot leave is counted and forgotten."""
+        """Send a picture; one that cannot leave is counted and forgotten.
+
+        Args:
+            picture: With its time on `time.monotonic` [s].
+            now: `time.monotonic` [s].
+        """
         data = encode_picture(picture, late=max(now - picture.time, 0.0), compress=True)
         try:
             for datagram in fragments(data, self.sent + self.lost, self._fragment):
@@ -122,93 +98,6 @@ class UdpSender:
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
-
-
-class SharedMemorySender:
-    """A ring in memory under a name: made anew at every start, taken away at the end.
-
-    Its file is locked for as long as its writer lives: no other camera can take the name meanwhile.
-    """
-
-    def __init__(self, name: str, *, slots: int = SLOTS, slot_bytes: int = SLOT_BYTES) -> None:
-        """
-        Args:
-            name: Letters, digits, - and _.
-            slots: Pictures that it holds.
-            slot_bytes: Longest picture [bytes].
-
-        Raises:
-            LinkError: It is not a plain name, another camera has it, or the memory cannot be had.
-        """
-        self.path = memory_path(name)
-        self.sent = self.lost = 0
-        self._slots, self._size = slots, slot_bytes
-        if _taken(self.path):
-            raise LinkError(f"shm:{name} belongs to a camera that is running: end it, or give another name")
-        try:
-            self._file = _ring(
-                self.path,
-                MEMORY_HEAD.pack(MEMORY_MAGIC, MEMORY_VERSION, slots, slot_bytes, 0),
-                slots * slot_bytes,
-            )
-        except OSError as problem:
-            raise LinkError(f"shared memory {self.path}: {problem.strerror}: free some or use udp") from None
-
-    def send(self, picture: Picture, now: float) -> None:
-        """Write a picture into the next slot; one that is too long, or finds no memory, is counted and forgotten."""
-        data = encode_picture(picture, late=max(now - picture.time, 0.0))
-        if len(data) > self._size - MEMORY_SLOT.size:
-            self.lost += 1
-            return
-        number = self.sent + 1
-        at = MEMORY_HEAD.size + (number - 1) % self._slots * self._size
-        try:
-            os.pwrite(self._file, bytes(MEMORY_SLOT.size), at)
-            os.pwrite(self._file, data, at + MEMORY_SLOT.size)
-            os.pwrite(self._file, MEMORY_SLOT.pack(number, len(data), zlib.crc32(data)), at)
-            os.pwrite(self._file, struct.pack("<Q", number), MEMORY_HEAD.size - 8)
-            self.sent = number
-        except OSError:
-            self.lost += 1
-
-    def close(self) -> None:
-        """Take the memory away, unless another camera has taken the name since."""
-        try:
-            if os.stat(self.path).st_ino == os.fstat(self._file).st_ino:
-                os.unlink(self.path)
-        except OSError:
-            pass
-        os.close(self._file)
-
-
-def _taken(path: Path) -> bool:
-    """Whether a camera that lives has the file. A lock ends with its process, however that ends."""
-    try:
-        file = os.open(path, os.O_RDONLY)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return True
-    finally:
-        os.close(file)
-    return False
-
-
-def _ring(path: Path, head: bytes, size: int) -> int:
-    """A new file under the name, locked and empty but for its head; returns its descriptor."""
-    file, temporary = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        os.truncate(file, len(head) + size)
-        os.pwrite(file, head, 0)
-        os.replace(temporary, path)
-    except OSError:
-        os.close(file)
-        os.unlink(temporary)
-        raise
-    return file
 
 
 # Drawing pictures in a process of its own, so that telemetry never waits for one.
@@ -240,29 +129,16 @@ class CameraPlan:
         )
 
 
-@dataclass(frozen=True)
-class PictureWire:
-    """Where pictures go."""
-
-    bind: tuple[str, int]
-    peer: tuple[str, int]
-    memory: str = ""
-    """Name of shared memory; empty: over UDP."""
-
-    def open(self) -> PictureSink:
-        """Begin to send.
-
-        Raises:
-            LinkError: The address or the memory cannot be had.
-        """
-        return SharedMemorySender(self.memory) if self.memory else UdpSender(self.bind, self.peer)
-
-
 class PictureProcess:
     """The camera of a `VirtualPool` in real time: exposes here, draws and sends elsewhere; `advance` gives nothing."""
 
-    def __init__(self, plan: CameraPlan, wire: PictureWire) -> None:
+    def __init__(self, plan: CameraPlan, bind: Address, peer: Address) -> None:
         """Start the process and wait until it can draw.
+
+        Args:
+            plan: What draws.
+            bind: Address and port of the sending end.
+            peer: Of the robot.
 
         Raises:
             LinkError: The wire cannot be opened, or the process did not start.
@@ -276,7 +152,7 @@ class PictureProcess:
         ready, theirs = context.Pipe(duplex=False)
         self._process = context.Process(
             target=_draw,
-            args=(plan, wire, self._undrawn, theirs, os.getpid()),
+            args=(plan, bind, peer, self._undrawn, theirs, os.getpid()),
             name="pool camera",
             daemon=True,
         )
@@ -336,12 +212,12 @@ def _deaf() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _draw(plan: CameraPlan, wire: PictureWire, undrawn: Any, ready: Any, parent: int) -> None:
+def _draw(plan: CameraPlan, bind: Address, peer: Address, undrawn: Any, ready: Any, parent: int) -> None:
     """The process: draw each exposure, wait until it is to arrive, send it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all; the parent says when to end
     start_warp()
     try:
-        sink, camera = wire.open(), plan.camera()
+        sink, camera = UdpSender(bind, peer), plan.camera()
         camera.develop(_first(plan))  # draws the background, and compiles the renderer where it is not
     except ValueError as problem:
         ready.send(str(problem))
@@ -368,7 +244,7 @@ def _first(plan: CameraPlan) -> Exposure:
     return Exposure(0, 0.0, 0.0, pose, pose)
 
 
-def _send(camera: PoolCamera, sink: PictureSink, exposure: Exposure, arrival: float) -> None:
+def _send(camera: PoolCamera, sink: UdpSender, exposure: Exposure, arrival: float) -> None:
     picture = replace(camera.develop(exposure), time=arrival)
     time.sleep(max(arrival - time.monotonic(), 0.0))
     sink.send(picture, time.monotonic())

@@ -21,7 +21,7 @@ from finssim.localization.pool import Pool, write_pool
 from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.draw_plant import draw_plant, positioning_of, site_of
 from finssim.pool.fleet import Fleet
-from finssim.pool.pictures import CameraPlan, PictureProcess, PictureSink, PictureWire, UdpSender
+from finssim.pool.pictures import CameraPlan, PictureProcess, UdpSender
 from finssim.pool.plant_spec import Basin, PlantSpec, PlantSpecError, Severity, load_plant_spec
 from finssim.pool.server import LockstepServer, MediumServer, serve_realtime
 from finssim.pool.task_site import TaskSite
@@ -29,7 +29,6 @@ from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.goals import station_of
 from finssim.robot.link.frames import LinkError
 from finssim.robot.link.transports import UdpTransport, host_port
-from finssim.robot.pictures import memory_path
 from finssim.tasks.observer import fitted_task
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
@@ -42,8 +41,6 @@ MESSAGES = 5
 """The messages of a team are this far from the first port."""
 ROOM = 2.0
 """Vehicles of a team start so many lengths of the longest apart."""
-MEMORY = "pool"
-"""Name of the shared memory of a pool on the default port; on others the port follows: pool-40000."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +121,6 @@ def run(
     severity: Severity = "realistic",
     lockstep: bool = False,
     camera: Literal["pictures", "corners", "none"] | None = None,
-    pictures: str = "udp",
     port: int = MCU_PORT,
     bind: str = "127.0.0.1",
     robot: str = "127.0.0.1:54321",
@@ -149,8 +145,6 @@ def run(
         lockstep: Time goes as fast as one robot asks, instead of in real time.
         camera (KIND): What the camera sends: pictures, corners (of the tags) or none. If not given: pictures, over a
             team or a tank corners, in open water and of a task none.
-        pictures (WAY): How pictures travel in real time: udp, or shm:NAME (shared memory; shm alone: pool, and
-            pool-PORT on another port than the default).
         port: UDP port of the motor controller; pictures leave from the next, lock-step (TCP) is the one after.
         bind (ADDRESS): Address of this end: this machine alone unless given.
         robot (HOST:PORT): The only robot that may command in real time; its pictures go to the port after this.
@@ -201,9 +195,6 @@ def run(
         raise LinkError(f"port {port}: expected 1 to 65533, as the two after it are taken too")
     if pool_file is not None and plan.calibrated is None:
         raise PlantSpecError("--pool-file tells of the camera, and --camera none has none: leave one out")
-    memory = memory_of(pictures, port)
-    if lockstep and memory:
-        raise LinkError("in lock-step pictures come with the telemetry: leave --pictures out")
 
     def make_world(eye: Any) -> VirtualPool:
         """Begins to write files: only when every wire is open, lest those of a pool that is running are replaced."""
@@ -217,8 +208,7 @@ def run(
     if lockstep:
         _lockstep(plan, make_world, (bind, port + 2), longest)
     else:
-        wire = PictureWire((bind, port + 1), _next(robot), memory)
-        _realtime(plan, make_world, (bind, port), host_port(robot, "--robot"), wire, longest)
+        _realtime(plan, make_world, (bind, port), host_port(robot, "--robot"), longest)
 
 
 def _serve_team(
@@ -374,21 +364,6 @@ def _tell_episode(site: Fleet) -> None:
         _say(f"episode: not ended after {site.scored} control steps")
 
 
-def memory_of(pictures: str, port: int) -> str:
-    """Name of the shared memory that `--pictures` asks for; empty for UDP.
-
-    Raises:
-        LinkError: It asks for neither.
-    """
-    kind, _, name = pictures.partition(":")
-    if pictures == "udp":
-        return ""
-    if kind != "shm" or pictures == "shm:":
-        raise LinkError(f"pictures over '{pictures}': give udp, shm or shm:NAME")
-    memory_path(name or MEMORY)  # refuses what is no name
-    return name or (MEMORY if port == MCU_PORT else f"{MEMORY}-{port}")
-
-
 def _check_start(start: Station, basin: Basin, text: str) -> None:
     x, y, z = start.position
     if abs(x) > 0.5 * basin.length or abs(y) > 0.5 * basin.width or not -basin.depth <= z <= 0.0:
@@ -418,13 +393,12 @@ def _realtime(
     make_world: Callable[[Any], VirtualPool],
     bind: tuple[str, int],
     robot: tuple[str, int],
-    wire: PictureWire,
     duration: float,
 ) -> None:
     with _stoppable() as asked, ExitStack() as stack:
         transport = UdpTransport(bind, robot)
         stack.callback(transport.close)
-        drawn, sink, eye = _camera(plan, wire)
+        drawn, sink, eye = _camera(plan, _next(bind), _next(robot))
         for end in (drawn, sink):
             if end is not None:
                 stack.callback(end.close)
@@ -432,8 +406,7 @@ def _realtime(
         stack.callback(world.close)
         _say(f"motor controller: {_name(transport.address)}, for {_name(transport.peer)} alone")
         if eye is not None:
-            where = f"shm:{wire.memory}" if wire.memory else f"{_name(wire.bind)}, for {_name(wire.peer)}"
-            _say(f"pictures: {where}")
+            _say(f"pictures: {_name(_next(bind))}, for {_name(_next(robot))}")
         site, sinks = Fleet({plan.vehicle.name: world}), [] if sink is None else [sink]
         transports = {plan.vehicle.name: transport}
         pace = serve_realtime(site, transports, sinks=sinks, camera=drawn, duration=duration, until=asked)
@@ -442,13 +415,15 @@ def _realtime(
             _say(drawn.complaint)
 
 
-def _camera(plan: PoolPlan, wire: PictureWire) -> tuple[PictureProcess | None, PictureSink | None, Any]:
+def _camera(
+    plan: PoolPlan, bind: tuple[str, int], peer: tuple[str, int]
+) -> tuple[PictureProcess | None, UdpSender | None, Any]:
     """The process that draws, or the sink for what is computed here, and the camera for the world."""
     if plan.camera is None:
         return None, None, None
     if plan.camera.mode == "corners":
-        return None, wire.open(), plan.camera.camera()
-    drawn = PictureProcess(plan.camera, wire)
+        return None, UdpSender(bind, peer), plan.camera.camera()
+    drawn = PictureProcess(plan.camera, bind, peer)
     return drawn, None, drawn
 
 
@@ -473,10 +448,9 @@ def _stoppable(*, at_once: bool = False) -> Iterator[Callable[..., bool]]:
             signal.signal(number, handler)
 
 
-def _next(robot: str) -> tuple[str, int]:
-    """Where the robot takes its pictures: the port after that of its own end."""
-    host, port = host_port(robot, "--robot")
-    return host, port + 1
+def _next(address: tuple[str, int]) -> tuple[str, int]:
+    """Pictures leave and arrive at the port after that of the motor controller's wire."""
+    return address[0], address[1] + 1
 
 
 def _tell_plant(plan: PoolPlan, pool_file: Path | None, truth: Path | None) -> None:

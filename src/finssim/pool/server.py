@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from finssim.pool.fleet import Fleet, Medium, one_picture
-from finssim.pool.pictures import PictureSink, bound_socket
+from finssim.pool.pictures import UdpSender, bound_socket
 from finssim.pool.virtual_pool import PoolClockError, VirtualPool
 from finssim.robot.link.transports import Transport
 from finssim.robot.lockstep import (
@@ -167,7 +167,7 @@ def serve_realtime(
     transports: Mapping[str, Transport],
     messages: MediumServer | None = None,
     *,
-    sinks: Sequence[PictureSink] = (),
+    sinks: Sequence[UdpSender] = (),
     camera: Clocked | None = None,
     duration: float = math.inf,
     until: Callable[[Pace], bool] = lambda pace: False,

@@ -6,8 +6,7 @@ Over a stream every message is its length (u32), a kind (u8) and a body, all lit
     2 delivery  time f64, n u32, n x (arrival f64, frame), m u32, m pictures
     3 refusal   a sentence, UTF-8: the world cannot go on
 
-A frame is its length (u32) and bytes. A picture is time f64, sequence u32, rows u32, columns u32, rows x columns bytes,
-k u32, k x (tag id i32, corners 8 x f64); without an image, rows and columns are zero.
+A frame or a picture is its length (u32) and bytes; those of a picture are as on the UDP wire, uncompressed.
 """
 
 from __future__ import annotations
@@ -19,10 +18,9 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from typing import Protocol
 
-import numpy as np
-
 from finssim.robot.interrupt import interruptible
-from finssim.robot.messages import Delivery, Picture, TagCorners
+from finssim.robot.messages import Delivery, Picture
+from finssim.robot.pictures import decode_picture, encode_picture
 from finssim.robot.runtime import Runtime
 
 __all__ = [
@@ -47,7 +45,7 @@ LONGEST = 256 * 2**20
 """A longer message is none [bytes]."""
 
 _F8, _U4, _KIND = struct.Struct("<d"), struct.Struct("<I"), struct.Struct("<IB")
-_ARRIVED, _PICTURE, _TAG = struct.Struct("<dI"), struct.Struct("<dIII"), struct.Struct("<i8d")
+_ARRIVED = struct.Struct("<dI")
 
 
 class LockstepError(ValueError):
@@ -84,12 +82,8 @@ def encode_delivery(delivery: Delivery) -> bytes:
         parts += (_ARRIVED.pack(arrival, len(frame)), frame)
     parts.append(_U4.pack(len(delivery.pictures)))
     for picture in delivery.pictures:
-        rows, columns = (0, 0) if picture.image is None else picture.image.shape
-        parts.append(_PICTURE.pack(picture.time, picture.sequence, rows, columns))
-        if picture.image is not None:
-            parts.append(np.ascontiguousarray(picture.image).tobytes())
-        parts.append(_U4.pack(len(picture.tags)))
-        parts += [_TAG.pack(tag.tag_id, *np.ravel(tag.corners)) for tag in picture.tags]
+        data = encode_picture(picture)
+        parts += (_U4.pack(len(data)), data)
     return _message(DELIVERY, parts)
 
 
@@ -145,15 +139,10 @@ def _message(kind: int, parts: Sequence[bytes]) -> bytes:
 
 
 def _picture(reader: _Reader) -> Picture:
-    time, sequence, rows, columns = reader.take(_PICTURE)
-    image = None
-    if rows and columns:
-        image = np.frombuffer(reader.block(rows * columns), np.uint8).reshape(rows, columns)
-    tags = []
-    for _ in range(reader.take(_U4)[0]):
-        tag, *corners = reader.take(_TAG)
-        tags.append(TagCorners(tag, np.array(corners).reshape(4, 2)))
-    return Picture(time, sequence, image, tuple(tags))
+    posted = decode_picture(reader.block(reader.take(_U4)[0]))
+    if posted is None:
+        raise LockstepError("a picture cannot be read: is the other end of this version?")
+    return posted.picture
 
 
 def _exactly(connection: socket.socket, size: int) -> bytes | None:

@@ -314,7 +314,7 @@ def run(
             With --lockstep: pool, or HOST:PORT.
         bind (ADDRESS:PORT): Address and port of this end, for udp; pictures come to the port after it. Loopback unless
             given.
-        pictures (ADDRESS): Overhead camera: udp://HOST:PORT, shm:NAME or none; the virtual pool's with --robot pool,
+        pictures (ADDRESS): Overhead camera: udp://HOST:PORT or none; the virtual pool's with --robot pool,
             otherwise none, if not given.
         pool_file (FILE|none): Pool file: camera, water plane and frames (.yaml); none where no camera looks. If not
             given: pool.yaml, of --team none.

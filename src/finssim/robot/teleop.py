@@ -1,29 +1,40 @@
-"""A person's hands to a wrench: gears, dead zones and the dead-man switch, and what their presses do to a robot."""
+"""`finssim teleop`: a person drives, over the same bridge and with the same record as a controller.
+
+Hands on a gamepad or a keyboard become a wrench by gears, a dead zone and a dead-man switch; presses arm, disarm and
+stop the vehicle, or hand over to a controller.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import os
+import select
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from pathlib import Path
+from types import TracebackType
+from typing import Annotated, Any, Literal, Protocol, TextIO
 
 import numpy as np
 import numpy.typing as npt
 
-from finssim.robot.bridge import Bridge
+from finssim.control.guidance import Guide, Station
+from finssim.localization.pool import Pool, load_pool
+from finssim.robot.bridge import Bridge, BridgeSettings
+from finssim.robot.goals import check_reachable, station_of
+from finssim.robot.perception import Perception, Unlocated
+from finssim.robot.pilots import ModeSwitch, Pilot, WrenchPilot, make_pilot
+from finssim.robot.recorder import Recorder, recording
+from finssim.robot.runtime import Runtime
+from finssim.robot.wiring import Drive, Wiring, connected
+from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = [
-    "GEARS",
-    "Device",
-    "Hands",
-    "Operator",
-    "Teleop",
-    "TeleopCommand",
-    "TeleopError",
-    "TeleopSettings",
-    "shaped",
-]
-
+    "BUTTONS", "GAMEPAD_HELP", "GEARS", "KEYBOARD_HELP", "STICKS", "Device", "Gamepad", "Hands", "Keyboard", "Keys",
+    "Operator", "Pad", "TeleopCommand", "TeleopError", "drive", "run", "shaped",
+]  # fmt: skip
 
 Array = npt.NDArray[np.float64]
 
@@ -35,22 +46,16 @@ GEARS: dict[Gear, tuple[float, float, float, float]] = {
     "boost": (10.0, 7.0, 8.0, 1.2),
 }
 """Full deflection of surge, sway, heave [N] and yaw [N m], as published."""
+DEAD_BAND = 0.1
+"""Deflections below do nothing, those above count from it."""
+EXPO = 0.3
+"""Share of the cube in the answer to a deflection: small ones become finer, the full one stays."""
+LOST = 0.5
+"""Without news of the device for so long it counts as lost [s]."""
 
 
 class TeleopError(ValueError):
     """A device for teleoperation is not there, or cannot be used."""
-
-
-@dataclass(frozen=True)
-class TeleopSettings:
-    """How hands become a wrench."""
-
-    dead_band: float = 0.1
-    """Deflections below do nothing, those above count from it."""
-    expo: float = 0.3
-    """Share of the cube in the answer to a deflection: small ones become finer, the full one stays."""
-    lost: float = 0.5
-    """Without news of the device for so long it counts as lost [s]."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +81,26 @@ class Hands:
     present: bool = True
     """Whether the device is there."""
 
+    @property
+    def gear(self) -> Gear:
+        """Precision before boost, for it is the careful one."""
+        return "precision" if self.precision else "boost" if self.boost else "cruise"
+
+    @property
+    def wrench(self) -> Array:
+        """Body frame [N, N m], (6,); zero without the dead-man switch, and while the emergency stop is down."""
+        if not self.dead_man or self.stop:
+            return np.zeros(6)
+        x, y, z, n = shaped(np.array([self.surge, self.sway, self.heave, self.yaw])) * GEARS[self.gear]
+        return np.array([x, y, z, 0.0, 0.0, n])
+
+
+def shaped(deflection: Array, dead_band: float = DEAD_BAND, expo: float = EXPO) -> Array:
+    """Answer to deflections: e d³ + (1 - e) d with d counted from the dead band, within [-1, 1]; NaN counts as none."""
+    x = np.clip(np.nan_to_num(deflection, nan=0.0), -1.0, 1.0)
+    beyond = np.maximum(np.abs(x) - dead_band, 0.0) / (1.0 - dead_band)
+    return np.asarray(np.sign(x) * (expo * beyond**3 + (1.0 - expo) * beyond), float)
+
 
 @dataclass(frozen=True)
 class TeleopCommand:
@@ -84,134 +109,474 @@ class TeleopCommand:
     wrench: Array = field(default_factory=lambda: np.zeros(6))
     """Body frame [N, N m], (6,)."""
     gear: Gear = "cruise"
-    arm_toggle: bool = False
-    """Arm if disarmed, disarm if armed; true once for each press."""
     stop: bool = False
-    acknowledge: bool = False
-    """True once for each press."""
-    mode_toggle: bool = False
-    """True once for each press."""
+    pressed: frozenset[str] = frozenset()
+    """Buttons that went down just now, of arm, acknowledge and mode: once for each press."""
     lost: bool = False
     """The device is lost: disarm."""
-
-
-class Teleop:
-    """Turns what a device shows into what a person wants; remembers which buttons were down.
-
-    A lost device, a released dead-man and the emergency stop each mean no thrust. The first look after the start or
-    after a loss only learns which buttons are down, so that none that hangs can arm.
-    """
-
-    def __init__(self, settings: TeleopSettings | None = None) -> None:
-        self.settings = settings or TeleopSettings()
-        self._before: Hands | None = None
-        self._heard = -math.inf
-
-    def look(self, now: float, hands: Hands | None) -> TeleopCommand:
-        """What is wanted now.
-
-        Args:
-            now: [s]
-            hands: What the device shows; None where it has not been heard since the last look.
-        """
-        if hands is not None and hands.present:
-            self._heard = now
-        before = self._before
-        if (hands is not None and not hands.present) or now - self._heard > self.settings.lost:
-            self._before = None
-            return TeleopCommand(lost=True)
-        if hands is None:
-            hands = before or Hands()
-        self._before = hands
-        if before is None:
-            return TeleopCommand(gear=gear_of(hands), stop=hands.stop)
-        return TeleopCommand(
-            wrench=self._wrench(hands),
-            gear=gear_of(hands),
-            arm_toggle=hands.arm and not before.arm,
-            stop=hands.stop,
-            acknowledge=hands.acknowledge and not before.acknowledge,
-            mode_toggle=hands.mode and not before.mode,
-        )
-
-    def _wrench(self, hands: Hands) -> Array:
-        if not hands.dead_man or hands.stop:
-            return np.zeros(6)
-        deflections = np.array([hands.surge, hands.sway, hands.heave, hands.yaw])
-        x, y, z, n = shaped(deflections, self.settings) * GEARS[gear_of(hands)]
-        return np.array([x, y, z, 0.0, 0.0, n])
-
-
-def gear_of(hands: Hands) -> Gear:
-    """Precision before boost, for it is the careful one."""
-    return "precision" if hands.precision else "boost" if hands.boost else "cruise"
-
-
-def shaped(deflection: Array, settings: TeleopSettings) -> Array:
-    """Answer to deflections: e d³ + (1 - e) d with d counted from the dead band, within [-1, 1]; NaN counts as none."""
-    x = np.clip(np.nan_to_num(deflection, nan=0.0), -1.0, 1.0)
-    beyond = np.maximum(np.abs(x) - settings.dead_band, 0.0) / (1.0 - settings.dead_band)
-    return np.asarray(np.sign(x) * (settings.expo * beyond**3 + (1.0 - settings.expo) * beyond), float)
-
-
-# A person at the controls of a running robot: presses become arming, stops and a wrench.
 
 
 class Device(Protocol):
     """A gamepad, a keyboard, or what stands in for one."""
 
-    def read(self, now: float) -> Hands:
-        """What it shows now [s]; never waits."""
+    def read(self, now: float) -> Hands | None:
+        """What it shows now [s]; None where it has not been heard since the last call. Never waits."""
 
 
 class Operator:
-    """Reads a device at each turn of the loop and does what its buttons say.
+    """A person at the controls of a running robot: reads a device at each turn of the loop and does what it shows.
 
-    A vehicle is armed by a press of the arm button alone. A lost device disarms; its return arms nothing.
+    A vehicle is armed by a press of the arm button alone. A lost device, a released dead-man and the emergency stop
+    each mean no thrust; a lost device disarms, and its return arms nothing: the first look after the start or after a
+    loss only learns which buttons are down.
     """
 
-    def __init__(
-        self, device: Device, teleop: Teleop | None = None, swap: Callable[[], None] | None = None
-    ) -> None:
+    def __init__(self, device: Device, swap: Callable[[], None] | None = None) -> None:
         """
         Args:
             device: What the person holds.
-            teleop: Otherwise than by default.
             swap: Hands over between person and controller, at a press; None: there is no controller.
         """
-        self.device, self.teleop, self._swap = device, teleop or Teleop(), swap
+        self.device, self._swap = device, swap
         self.command = TeleopCommand()
         """The latest."""
-        self.said = ""
+        self.message = ""
         """What to tell the person: why arming was refused, or what is wrong."""
+        self._before: Hands | None = None
+        self._heard = -math.inf
 
     def wrench(self) -> Array:
         """The wanted wrench, body frame [N, N m], (6,); for `pilots.WrenchPilot`."""
         return self.command.wrench
 
+    def look(self, now: float) -> TeleopCommand:
+        """What the person wants at a time [s]."""
+        hands, before = self.device.read(now), self._before
+        if hands is not None and hands.present:
+            self._heard = now
+        if (hands is not None and not hands.present) or now - self._heard > LOST:
+            self._before = None
+            return TeleopCommand(lost=True)
+        self._before = hands = hands or before or Hands()
+        if before is None:
+            return TeleopCommand(gear=hands.gear, stop=hands.stop)
+        edges = (b for b in ("arm", "acknowledge", "mode") if getattr(hands, b) and not getattr(before, b))
+        return TeleopCommand(hands.wrench, hands.gear, hands.stop, frozenset(edges))
+
     def turn(self, now: float, bridge: Bridge) -> None:
         """Look at the device at a time [s], and arm, disarm or stop as it says."""
-        self.command = command = self.teleop.look(now, self.device.read(now))
+        self.command = command = self.look(now)
+        armed = bridge.state in ("armed", "hold")
         if command.lost:
-            if bridge.state in ("armed", "hold"):
+            if armed:
                 bridge.disarm(now)
-                self.said = "the device is lost: disarmed"
+                self.message = "the device is lost: disarmed"
             return
         if command.stop:
             if bridge.state != "fault":
                 bridge.stop(now, "emergency stop by the operator")
             return
-        if command.acknowledge and bridge.state == "fault":
+        if "acknowledge" in command.pressed and bridge.state == "fault":
             bridge.acknowledge(now)
-            self.said = ""
-        if command.arm_toggle:
-            self._toggle(now, bridge)
-        if command.mode_toggle and self._swap is not None:
+            self.message = ""
+        if "arm" in command.pressed and armed:
+            bridge.disarm(now)
+            self.message = ""
+        elif "arm" in command.pressed:
+            self.message = bridge.arm(now, "operator")
+        if "mode" in command.pressed and self._swap is not None:
             self._swap()
 
-    def _toggle(self, now: float, bridge: Bridge) -> None:
-        if bridge.state in ("armed", "hold"):
-            bridge.disarm(now)
-            self.said = ""
+
+# A terminal's keyboard, also over ssh; the terminal is put back as it was.
+
+
+KEYBOARD_HELP = (
+    "w s forward back | a d left right | r f up down | q e turn left, right | 1 2 3 precision, cruise, boost | "
+    "space let go | enter arm, disarm | x emergency stop | k end a fault | m other pilot | Ctrl-C quit"
+)
+KEY_AXES = {
+    "w": ("surge", 1.0),
+    "s": ("surge", -1.0),
+    "a": ("sway", 1.0),
+    "d": ("sway", -1.0),
+    "r": ("heave", 1.0),
+    "f": ("heave", -1.0),
+    "q": ("yaw", 1.0),
+    "e": ("yaw", -1.0),
+    "\x1b[A": ("surge", 1.0),
+    "\x1b[B": ("surge", -1.0),
+    "\x1b[D": ("yaw", 1.0),
+    "\x1b[C": ("yaw", -1.0),
+}
+"""Key -> axis and deflection; the arrows drive and turn."""
+KEY_BUTTONS = {"\r": "arm", "\n": "arm", "x": "stop", "k": "acknowledge", "m": "mode"}
+GEAR_KEYS = {"1": "precision", "2": "cruise", "3": "boost"}
+
+
+class Keys:
+    """Which keys are held: a terminal tells presses and repeats, but no release.
+
+    A key counts as held for `hold` seconds after its last press, which has to be longer than the keyboard waits before
+    it repeats. That is the dead-man switch too: nobody at the keys, no thrust.
+    """
+
+    def __init__(self, hold: float = 0.6) -> None:
+        """Args:
+        hold: [s]
+        """
+        if not 0.0 < hold <= 2.0:
+            raise TeleopError(f"hold is {hold:g} s, expected above 0 and at most 2 s")
+        self.hold = hold
+        self._pressed: dict[str, tuple[float, float]] = {}
+        self._gear = "cruise"
+
+    def press(self, now: float, key: str) -> None:
+        """A key was pressed, or repeats; unknown keys do nothing."""
+        key = key if len(key) > 1 else key.lower()
+        if key in KEY_AXES:
+            axis, deflection = KEY_AXES[key]
+            self._pressed[axis] = (now, deflection)
+        elif key in KEY_BUTTONS:
+            self._pressed[KEY_BUTTONS[key]] = (now, 1.0)
+        elif key in GEAR_KEYS:
+            self._gear = GEAR_KEYS[key]
+        elif key == " ":
+            self._pressed.clear()
+
+    def hands(self, now: float) -> Hands:
+        """What is held now."""
+        held = {name: value for name, (at, value) in self._pressed.items() if 0.0 <= now - at < self.hold}
+        axes: dict[str, Any] = {name: held.get(name, 0.0) for name in ("surge", "sway", "heave", "yaw")}
+        buttons: dict[str, Any] = {name: name in held for name in KEY_BUTTONS.values()}
+        gear: dict[str, Any] = {name: self._gear == name for name in ("precision", "boost")}
+        return Hands(**axes, **buttons, **gear, dead_man=any(axes.values()))
+
+
+class Keyboard:
+    """The terminal's keyboard.
+
+    with Keyboard() as keyboard:
+        hands = keyboard.read(now)
+    """
+
+    def __init__(self, stream: TextIO | None = None, hold: float = 0.6) -> None:
+        """Args:
+            stream: A terminal; standard input if None.
+            hold: See `Keys` [s].
+
+        Raises:
+            TeleopError: Not a terminal.
+        """
+        stream = stream or sys.stdin
+        if not stream.isatty():
+            raise TeleopError(
+                "the keyboard needs a terminal as standard input: run it in one, or use a gamepad"
+            )
+        self.keys = Keys(hold)
+        self._descriptor = stream.fileno()
+        self._before: list[Any] = []
+        self._open = True
+
+    def __enter__(self) -> Keyboard:
+        import termios
+        import tty
+
+        self._before = termios.tcgetattr(self._descriptor)
+        tty.setcbreak(self._descriptor)  # Ctrl-C still interrupts
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        import termios
+
+        try:
+            termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
+        except termios.error:
+            self._open = False  # the terminal is gone, and nothing is left to put back
+
+    def pressed(self) -> list[str]:
+        """Keys since the last call, arrows as their sequence of three characters; never waits."""
+        keys: list[str] = []
+        while self._open and select.select([self._descriptor], [], [], 0.0)[0]:
+            try:
+                data = os.read(self._descriptor, 256)
+            except OSError:
+                data = b""
+            self._open = bool(data)
+            text = data.decode("utf-8", errors="ignore")
+            while text:
+                length = 3 if text[:3] in KEY_AXES else 1
+                keys.append(text[:length])
+                text = text[length:]
+        return keys
+
+    def read(self, now: float) -> Hands:
+        """What is held now; never waits. A terminal that was closed is a device that is lost."""
+        for key in self.pressed():
+            self.keys.press(now, key)
+        return self.keys.hands(now) if self._open else Hands(present=False)
+
+
+# A gamepad through pygame; no window is opened.
+
+
+GAMEPAD_HELP = (
+    "hold LB to drive | left stick surge, sway | right stick yaw | RT LT up, down | RB precision | X boost | "
+    "START arm, disarm | B emergency stop | Y end a fault | SELECT other pilot | Ctrl-C quit"
+)
+STICKS = {"left_x": 0, "left_y": 1, "left_trigger": 2, "right_x": 3, "right_trigger": 5}
+"""Axes of pads of the Xbox family, as Linux numbers them."""
+BUTTONS = {"stop": 1, "boost": 2, "acknowledge": 3, "dead_man": 4, "precision": 5, "mode": 6, "arm": 7}
+"""Their buttons."""
+AXIS_COUNT, BUTTON_COUNT = 1 + max(STICKS.values()), 1 + max(BUTTONS.values())
+"""How many a pad has to have."""
+
+
+class Pad:
+    """Axes and buttons of a pad as `Hands`."""
+
+    def __init__(self) -> None:
+        self._moved = set[int]()
+
+    def hands(self, axes: Sequence[float], buttons: Sequence[Any]) -> Hands:
+        """What the pad shows, as SDL has it: right and backwards are positive, a trigger goes from -1 to 1."""
+        return Hands(
+            surge=-axes[STICKS["left_y"]],
+            sway=-axes[STICKS["left_x"]],
+            heave=self._pulled(axes, STICKS["right_trigger"]) - self._pulled(axes, STICKS["left_trigger"]),
+            yaw=-axes[STICKS["right_x"]],
+            **{name: bool(buttons[number]) for name, number in BUTTONS.items()},
+        )
+
+    def _pulled(self, axes: Sequence[float], axis: int) -> float:
+        """How far a trigger is pulled, [0, 1]; 0, which is half way, is shown until it is moved for the first time."""
+        if axes[axis] != 0.0:
+            self._moved.add(axis)
+        return (axes[axis] + 1.0) / 2.0 if axis in self._moved else 0.0
+
+
+class Gamepad:
+    """The first gamepad; one that is unplugged is lost, and found again when it comes back.
+
+    with Gamepad() as pad:
+        hands = pad.read()
+    """
+
+    def __init__(self) -> None:
+        """Raises:
+        TeleopError: No gamepad, or one with too few axes or buttons.
+        ModuleNotFoundError: pygame is not installed.
+        """
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+        os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+        import pygame
+
+        self._pygame, self._device, self._pad = pygame, None, Pad()
+        pygame.display.init()
+        pygame.joystick.init()
+        self._find()
+        problem = "no gamepad is connected: plug one in, or use --device keyboard"
+        if self._device is not None:
+            axes, buttons = self._device.get_numaxes(), self._device.get_numbuttons()
+            if axes >= AXIS_COUNT and buttons >= BUTTON_COUNT:
+                return
+            problem = (
+                f"gamepad {self._device.get_name()} has {axes} axes and {buttons} buttons, expected {AXIS_COUNT} and "
+                f"{BUTTON_COUNT}: use one of the Xbox family"
+            )
+        self.__exit__()
+        raise TeleopError(problem)
+
+    def __enter__(self) -> Gamepad:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._device = None
+        self._pygame.joystick.quit()
+        self._pygame.display.quit()
+
+    def read(self, now: float = 0.0) -> Hands:
+        """What the pad shows; never waits."""
+        for event in self._pygame.event.get():
+            if event.type == self._pygame.JOYDEVICEREMOVED:
+                self._device = None
+            elif event.type == self._pygame.JOYDEVICEADDED and self._device is None:
+                self._find()
+        if self._device is None:
+            return Hands(present=False)
+        try:
+            axes = [float(self._device.get_axis(i)) for i in range(AXIS_COUNT)]
+            return self._pad.hands(axes, [self._device.get_button(i) for i in range(BUTTON_COUNT)])
+        except self._pygame.error:  # it went between two events
+            self._device = None
+            return Hands(present=False)
+
+    def _find(self) -> None:
+        if self._pygame.joystick.get_count():
+            self._device, self._pad = self._pygame.joystick.Joystick(0), Pad()
+
+
+# The drive.
+
+
+SHOWN_EVERY = 0.2
+"""Between two lines on the terminal [s]."""
+
+
+def drive(
+    vehicle: Vehicle,
+    device: Device,
+    connection: Drive,
+    *,
+    pool: Pool | None = None,
+    recorder: Recorder | None = None,
+    other: Pilot | None = None,
+    guide: Guide | None = None,
+    rate: float = 60.0,
+    duration: float = math.inf,
+    show: Callable[[Runtime, Operator], None] = lambda runtime, operator: None,
+) -> Runtime:
+    """Drive until the time is over or Ctrl-C; the vehicle starts disarmed, and ends with frames without thrust.
+
+    Args:
+        vehicle: As its file has it.
+        device: In the person's hands.
+        connection: Runs the robot's software on its wires.
+        pool: Camera, water and frames; None: the vehicle is driven, and armed, without localization.
+        recorder: Takes down everything.
+        other: Whom the mode button hands over to; None: nobody.
+        guide: Where `other` steers to.
+        rate: Turns of the loop a second [Hz].
+        duration: [s]
+        show: Called at every turn.
+    """
+
+    def swap() -> None:
+        if other is not None:
+            switch.select("other" if switch.mode == "person" else "person")
+
+    operator = Operator(device, swap=swap)
+    person = WrenchPilot(operator.wrench, vehicle, period=1.0 / rate)
+    switch = ModeSwitch({"person": person, **({} if other is None else {"other": other})})
+    runtime = Runtime(
+        vehicle,
+        pool,
+        switch,
+        guide or Station((0.0, 0.0, 0.0), 0.0),
+        perception=Unlocated(vehicle) if pool is None else Perception(vehicle, pool),
+        bridge=Bridge(vehicle, BridgeSettings.of(vehicle, need_reading=False)),
+        recorder=recorder,
+    )
+
+    def turn(running: Runtime) -> None:
+        if running.reading is not None:
+            before = switch.mode
+            operator.turn(running.reading.time, running.bridge)
+            if recorder is not None and switch.mode != before:
+                recorder.event(running.reading.time, "mode", switch.mode)
+        show(running, operator)
+
+    connection(runtime, rate=rate, duration=duration, show=turn, until=lambda running: False)
+    return runtime
+
+
+def run(
+    *,
+    vehicle: str = "finsrov",
+    device: str = "gamepad",
+    robot: str = "pool",
+    bind: str = "127.0.0.1:54321",
+    pool_file: Path | None = None,
+    pictures: str | None = None,
+    policy: str | None = None,
+    goal: str | None = None,
+    record: Path | None = None,
+    key_hold: float = 0.6,
+    rate: Annotated[float, (20.0, 200.0)] = 60.0,
+    duration: Annotated[float | None, (0.0, None)] = None,
+) -> None:
+    """Drive by hand. Starts disarmed; START or enter arms; without a hand on LB or the keys there is no thrust.
+
+    Example: finssim teleop --device keyboard --robot pool --record drive.mcap
+
+    Args:
+        vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
+        device (NAME): What is in the hands: gamepad or keyboard.
+        robot (WIRE): Wire to the motor controller: udp://HOST:PORT, serial:DEVICE, dry-run, or pool (the virtual pool
+            on this machine).
+        bind (ADDRESS:PORT): This end of the wire, for UDP.
+        pool_file (FILE): Pool file: camera, water plane and frames (.yaml); without it nobody knows the position.
+        pictures (ADDRESS): Overhead camera: udp://HOST:PORT or none; the virtual pool's with --robot pool,
+            otherwise none, if not given. Needs --pool-file.
+        policy (DIR|pid): Whom SELECT or m hands over to: pid, or a policy's directory. Needs --pool-file and --goal.
+        goal (X,Y,Z,YAW): Where the policy steers to, in m and deg.
+        record (FILE): Record of the run to write (.mcap).
+        key_hold (S): A key counts as held so long after its last press [s].
+        rate: Turns of the loop a second [Hz].
+        duration: End after so long [s]; with Ctrl-C if not given.
+
+    Raises:
+        TeleopError, LinkError, VehicleError, LocalizationError, PolicyError, OutputError: What cannot be used.
+    """
+    body = load_vehicle(vehicle)
+    pool = load_pool(pool_file) if pool_file is not None else None
+    other, guide = _controller(policy, goal, body, pool)
+    if pictures is not None and pool is None:
+        raise TeleopError("--pictures says nothing without the camera's pose: give --pool-file, too")
+    with ExitStack() as stack:
+        if device == "keyboard":
+            hands, keys = stack.enter_context(Keyboard(hold=key_hold)), KEYBOARD_HELP
+        elif device == "gamepad":
+            hands, keys = stack.enter_context(Gamepad()), GAMEPAD_HELP
         else:
-            self.said = bridge.arm(now, "operator")
+            raise TeleopError(f"unknown device '{device}': expected gamepad or keyboard")
+        connection = stack.enter_context(
+            connected(Wiring(robot=robot, bind=bind, pictures=pictures), body, pool)
+        )
+        meta = {"command": "finssim teleop", "robot": robot}
+        recorder = stack.enter_context(recording(record, body, meta, pool_file=pool_file))
+        print(keys, file=sys.stderr)
+        drive(
+            body, hands, connection, pool=pool, recorder=recorder, other=other, guide=guide, rate=rate,
+            duration=math.inf if duration is None else duration, show=_status_line(),
+        )  # fmt: skip
+        print(file=sys.stderr)
+
+
+def _controller(
+    policy: str | None, goal: str | None, vehicle: Vehicle, pool: Pool | None
+) -> tuple[Pilot | None, Station | None]:
+    """Whom the person hands over to, and where it steers to."""
+    if policy is None:
+        if goal is not None:
+            raise TeleopError("--goal is where a controller steers to: give --policy, too, or leave it out")
+        return None, None
+    if pool is None or goal is None:
+        raise TeleopError(
+            "a controller to hand over to needs a state and a goal: give --pool-file and --goal"
+        )
+    station = station_of(goal)
+    check_reachable(station, vehicle)
+    return make_pilot(policy, vehicle), station
+
+
+def _status_line() -> Callable[[Runtime, Operator], None]:
+    """Updates one line on the terminal: state, gear, wrench, and what there is to tell."""
+    newest = -math.inf
+
+    def show(runtime: Runtime, operator: Operator) -> None:
+        nonlocal newest
+        now = runtime.reading.time if runtime.reading is not None else -math.inf
+        if now - newest < SHOWN_EVERY:
+            return
+        newest = now
+        x, y, z, _, _, n = operator.command.wrench
+        problem = runtime.recorder.problem if runtime.recorder is not None else ""
+        message = problem or runtime.bridge.reason or operator.message
+        line = f"{runtime.bridge.state:8} {operator.command.gear:9} surge {x:5.1f} sway {y:5.1f} heave {z:5.1f} N "
+        print(f"\r{line}yaw {n:5.2f} N m  {message}\x1b[K", end="", file=sys.stderr, flush=True)
+
+    return show

@@ -152,6 +152,7 @@ class Drive(Protocol):
         duration: float,
         show: Callable[[Runtime], None],
         until: Callable[[Runtime], bool],
+        rate: float = 60.0,
     ) -> float: ...
 
 

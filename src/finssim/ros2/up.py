@@ -63,7 +63,7 @@ class Options:
     bind: str = "127.0.0.1:54321"
     """(ADDRESS:PORT) Own end for udp; pictures are taken at the port after it."""
     pictures: str | None = None
-    """(ADDRESS) Overhead camera of a robot: udp://HOST:PORT, shm:NAME or none; the pool's with --robot pool."""
+    """(ADDRESS) Overhead camera of a robot: udp://HOST:PORT or none; the pool's with --robot pool."""
     pool_file: Path | None = None
     """(FILE|none) Pool file: read by a robot, written by a virtual pool (.yaml); none where no camera looks."""
     plant: str = "1"

@@ -22,7 +22,6 @@ class VirtualPoolNode(RobotNode):
             "plant": str(self.parameter("plant", "1")),
             "severity": self.parameter("severity", "realistic"),
             "camera": self.parameter("camera", "pictures"),
-            "pictures": self.parameter("pictures", "udp"),
             "port": self.parameter("port", MCU_PORT),
             "robot": self.parameter("bind", DEFAULT_BIND),
             "pool_file": _path(self.parameter("pool_file", "")),

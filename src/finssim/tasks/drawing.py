@@ -1,10 +1,8 @@
 """What randomisation does in one environment: the draws, how their ranges grow, what agents and logs are told."""
 
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -21,9 +19,9 @@ from finssim.provenance import provenance
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.task import Task
-from finssim.yaml_file import json_value
+from finssim.text_table import write_csv
 
-__all__ = ["LOOK", "Drawing", "LogError", "Schedule", "read_draws"]
+__all__ = ["LOOK", "Drawing", "LogError", "Schedule"]
 
 
 # Ranges that grow while a policy learns: with the training's progress, with success, or each end by itself.
@@ -207,45 +205,14 @@ def _counts(success: Success, draws: Draws, names: int) -> Counts:
     return counts
 
 
-# What was drawn for every episode, and how the episode went: kept while a run goes on, written as CSV or NPZ.
+# What was drawn for every episode, and how the episode went: kept while a run goes on, written as CSV.
 
-OUTCOME = ("world", "episode", "length", "episode_return", "held")
+OUTCOME = ("world", "episode", "length", "episode_return", "held", "vehicle")
 """First columns of a table of episodes."""
 
 
 class LogError(ValueError):
-    """A log of draws that cannot be written or read."""
-
-
-@dataclass(frozen=True)
-class DrawnEpisodes:
-    """Episodes that ended, in the order of their ends."""
-
-    names: tuple[str, ...]
-    """Entries of the table that vary."""
-    units: tuple[str, ...]
-    values: NDArray[np.float32]
-    """(episodes, vehicles, len(names)); nominal factors are 1."""
-    world: NDArray[np.int64]
-    episode: NDArray[np.int64]
-    """Number of the episode in its world, from 1."""
-    length: NDArray[np.int64]
-    """Control steps."""
-    episode_return: NDArray[np.float64]
-    held: NDArray[np.float64]
-    """Time inside the tolerance when it ended [s]."""
-    about: Mapping[str, Any]
-    """Ranges, vehicles and provenance."""
-
-    def column(self, name: str, vehicle: int = 0) -> NDArray[np.float32]:
-        """One entry of every episode.
-
-        Raises:
-            LogError: It was not drawn.
-        """
-        if name not in self.names:
-            raise LogError(f"'{name}' was not drawn; drawn were: {', '.join(self.names)}")
-        return np.asarray(self.values[:, vehicle, self.names.index(name)])
+    """A log of draws that cannot be written."""
 
 
 class DrawLog:
@@ -281,71 +248,48 @@ class DrawLog:
         self._open[ended] = episode != self._episode[ended]  # without automatic reset a world waits for one
         self._episode[ended] = episode
 
-    def episodes(self) -> DrawnEpisodes:
-        """All that ended so far."""
-        names, vehicles = tuple(self._draws.names), self._draws.simulator.vehicles
-        rows = np.concatenate([np.zeros((0, len(OUTCOME))), *self._rows])
-        empty = np.zeros((0, len(vehicles), len(names)), np.float32)
-        about = {
-            "ranges": self._draws.randomization.ranges.model_dump(mode="json"),
-            "vehicles": [{"name": v.name, "sha256": v.sha256} for v in vehicles],
-            "seed": self._draws.simulator.seed,
-            "provenance": provenance(),
-        }
-        units = tuple(ENTRIES[INDEX[name]].unit for name in names)
-        values = np.concatenate([empty, *self._values])
-        counts = (rows[:, i].astype(np.int64) for i in range(3))
-        return DrawnEpisodes(names, units, values, *counts, rows[:, 3], rows[:, 4], about)
+    def episodes(self) -> dict[str, NDArray[np.float64]]:
+        """A column by name, (rows,): a row for each vehicle of each episode that ended, in the order of their ends.
+
+        First `OUTCOME`: world, number of the episode in it (from 1), control steps, return, time held inside the
+        tolerance when it ended [s] and vehicle; then every entry that varies, in its unit, factors of 1 being nominal.
+        """
+        names, vehicles = self._draws.names, len(self._draws.simulator.vehicles)
+        rows = np.concatenate([np.zeros((0, len(OUTCOME) - 1)), *self._rows])
+        drawn = np.concatenate([np.zeros((0, vehicles, len(names))), *self._values])
+        vehicle = np.tile(np.arange(vehicles), len(rows))
+        table = np.column_stack(
+            [np.repeat(rows, vehicles, axis=0), vehicle, drawn.reshape(len(vehicle), len(names))]
+        )
+        return dict(zip((*OUTCOME, *names), table.T, strict=True))
 
     def save(self, path: str | Path) -> Path:
-        """Write the episodes so far.
-
-        Args:
-            path: A .npz file, which `read_draws` reads back, or a .csv table: a row for each vehicle of each episode.
+        """Write the episodes so far as a .csv table; PATH.json beside it says what they were drawn from.
 
         Raises:
             LogError: Another suffix.
             OutputError: The place cannot be written.
         """
-        target, e = Path(path), self.episodes()
-        if target.suffix not in (".npz", ".csv"):
-            raise LogError(f"{path} ends in '{target.suffix}', expected .npz or .csv")
-        with atomic_write(target) as temporary, temporary.open("wb") as file:
-            if target.suffix == ".npz":
-                np.savez_compressed(file, **{**asdict(e), "about": json.dumps(dict(e.about))})
-            else:
-                episodes, vehicles, _ = e.values.shape
-                outcome = np.column_stack([getattr(e, name) for name in OUTCOME])
-                vehicle = np.tile(np.arange(vehicles), episodes)
-                drawn = e.values.reshape(episodes * vehicles, -1)
-                rows = np.column_stack([np.repeat(outcome, vehicles, axis=0), vehicle, drawn])
-                head = ",".join([*OUTCOME, "vehicle", *e.names])
-                form = ["%d"] * 3 + ["%.7g"] * 2 + ["%d"] + ["%.7g"] * len(e.names)
-                np.savetxt(file, rows, fmt=form, delimiter=",", header=head, comments="")
+        target, draws = Path(path), self._draws
+        if target.suffix != ".csv":
+            raise LogError(f"{path} ends in '{target.suffix}', expected .csv")
+        about = {
+            "ranges": draws.randomization.ranges.model_dump(mode="json"),
+            "units": {name: ENTRIES[INDEX[name]].unit for name in draws.names},
+            "vehicles": [{"name": v.name, "sha256": v.sha256} for v in draws.simulator.vehicles],
+            "seed": draws.simulator.seed,
+            "provenance": provenance(),
+        }
+        columns = self.episodes()
+        with atomic_write(target) as temporary:
+            write_csv(
+                temporary,
+                list(columns),
+                [[f"{x:.7g}" for x in row] for row in zip(*columns.values(), strict=True)],
+            )
+        with atomic_write(f"{target}.json") as temporary:
+            temporary.write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
         return target
-
-
-def read_draws(path: str | Path) -> DrawnEpisodes:
-    """Read what `DrawLog.save` wrote.
-
-    Args:
-        path: A .npz file.
-
-    Raises:
-        LogError: It is not such a file.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            data: dict[str, Any] = dict(file)
-        names = {name: tuple(map(str, data[name])) for name in ("names", "units")}
-        about = json_value(str(data["about"]), LogError, str(path))
-        return DrawnEpisodes(**{**data, **names, "about": about})
-    except FileNotFoundError:
-        raise LogError(f"{path}: no such file") from None
-    except (KeyError, OSError, TypeError, ValueError) as error:
-        raise LogError(
-            f"{path}: not a log of draws ({error}): give a .npz file that DrawLog.save wrote"
-        ) from None
 
 
 class Drawing:

@@ -36,7 +36,7 @@ class Reward:
       - action · mean(a²)                        the cheapest thrusts that do it
       - change · mean(Δa²)                       commands that a motor can follow, no chatter
       - rate · min(|ω|², 4)                      no spinning on the way
-      - loss                                     once, on leaving the pool: more than a bad episode costs
+      - loss                                     once, on leaving the pool or capsizing: more than a bad episode costs
     """
 
     position: float = 1.0
@@ -74,6 +74,12 @@ def within_tolerance(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
 
 
 @wp.func
+def capsized(state: State, p: Any, w: int) -> bool:
+    """The body z axis is further than `max_tilt` from the vertical."""
+    return wp.quat_rotate(state.quaternion[w, 0], wp.vec3(0.0, 0.0, 1.0))[2] < wp.cos(p.max_tilt)
+
+
+@wp.func
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
     """A goal pose, a start pose and velocity."""
     pi = 3.14159265
@@ -108,6 +114,8 @@ class StationKeeping(PoolTask):
     goal_low: tuple[float, float, float] = (-1.2, -0.5, -0.82)
     """Goals are uniform in this box; yaw is uniform over the circle, roll and pitch are level."""
     goal_high: tuple[float, float, float] = (1.2, 0.5, -0.28)
+    max_tilt: float = math.radians(45.0)
+    """Tilting further [rad] ends the episode: the default `safety.max_tilt`, where a bridge stops the vehicle."""
     speed: float = 0.30
     """Largest starting speed per axis [m/s]."""
     rate: float = 0.35
@@ -145,6 +153,6 @@ class StationKeeping(PoolTask):
                 RewardTerm("change", "action_change", -r.change),
                 RewardTerm("rate", "turning", -r.rate),
             ),
-            ends=(End("left", "out_of_pool", -r.loss),),
+            ends=(End("left", "out_of_pool", -r.loss), End("capsized", capsized, -r.loss)),
             inside=within_tolerance,
         )

@@ -16,7 +16,7 @@ from finssim.sensors.overhead_camera import Body, OverheadCamera, Pose, Ripples,
 pytest.importorskip("mitsuba")
 pytest.importorskip("pupil_apriltags")
 
-from finssim.experiments.mitsuba_renderer import render_with_mitsuba
+from tests.reference.mitsuba_renderer import render_with_mitsuba
 
 PUBLISHED = (0.02944176, -0.05975546, 0.00088098, 0.00179148, 0.01256862)
 POSITION = np.array([0.032897, -0.167178, 2.171935])

@@ -6,8 +6,18 @@ import sys
 from contextlib import ExitStack
 from typing import Any
 
-from finssim.robot.teleop import Device, Hands, Operator, TeleopError
-from finssim.robot.teleop_devices import XBOX, Pad
+from finssim.robot.teleop import (
+    AXIS_COUNT,
+    BUTTON_COUNT,
+    KEYBOARD_HELP,
+    Device,
+    Gamepad,
+    Hands,
+    Keyboard,
+    Operator,
+    Pad,
+    TeleopError,
+)
 from finssim.ros2.nodes.remote import RemoteBridge
 from finssim.ros2.nodes.robot_node import RobotNode
 from finssim.ros2.nodes.ros_messages import ros_type
@@ -29,7 +39,7 @@ class Teleop(RobotNode):
         self._stack = ExitStack()
         device = self._device(self.parameter("device", "joy"))
         self.bridge, self.operator = RemoteBridge(self), Operator(device, swap=self._swap)
-        self._said = ""
+        self._message = ""
         self.create_timer(1.0 / self.parameter("rate", 30.0), self._turn)
 
     def _device(self, name: str) -> Device:
@@ -40,12 +50,8 @@ class Teleop(RobotNode):
             )
             return device
         if name == "gamepad":
-            from finssim.robot.teleop_devices import Gamepad
-
             return self._stack.enter_context(Gamepad())
         if name == "keyboard":
-            from finssim.robot.teleop_devices import KEYBOARD_HELP, Keyboard
-
             print(KEYBOARD_HELP, file=sys.stderr)
             return self._stack.enter_context(Keyboard())
         raise TeleopError(f"unknown device '{name}': expected joy, gamepad or keyboard")
@@ -54,9 +60,9 @@ class Teleop(RobotNode):
         now = self.now()
         self.operator.turn(now, self.bridge)
         self.send("wrench", self.make.wrench(self.ns(now), self.operator.wrench()))
-        if self.operator.said and self.operator.said != self._said:
-            self.event("teleop", self.operator.said)
-        self._said = self.operator.said
+        if self.operator.message and self.operator.message != self._message:
+            self.event("teleop", self.operator.message)
+        self._message = self.operator.message
 
     def _swap(self) -> None:
         self._mine = not self._mine
@@ -84,6 +90,6 @@ class JoyDevice:
     def read(self, now: float) -> Hands | None:
         """What the newest message shows; None where none came since the last look, or it is too short."""
         message, self._newest = self._newest, None
-        if message is None or len(message.axes) < XBOX.axes or len(message.buttons) < XBOX.buttons:
+        if message is None or len(message.axes) < AXIS_COUNT or len(message.buttons) < BUTTON_COUNT:
             return None
         return self._pad.hands([-float(x) for x in message.axes], message.buttons)
