@@ -604,8 +604,8 @@ def find_targets(
 ) -> tuple[list[Target], list[Finding]]:
     """Targets with their tables, and findings.
 
-    A group that the caller names comes first. Otherwise a table speaks about the thruster that its columns name; or about
-    the thruster or group whose name is a word of its file's name (`H_LF.csv`, `run2-CCW.csv`); or about all thrusters.
+    A group that the caller names comes first. Otherwise a table speaks about the thruster that its columns name; or
+    about the thruster or group whose name is a word of its file's name (`H_LF.csv`, `run2-CCW.csv`); or about all.
 
     Raises:
         CalibrationError: Unknown names.
