@@ -18,7 +18,7 @@ from finssim.learning.export import ExportError
 from finssim.learning.learners import learner_named
 from finssim.learning.recurrent import RecurrentNetwork
 from finssim.robot.pilots import make_pilot
-from finssim.robot.robot import Reading
+from finssim.robot.reading import Reading
 from finssim.tasks import StationKeeping
 from finssim.tasks.agents import NOWHERE, Known, WorldReadings, agent_for, expert_for, restarted
 from finssim.tasks.observer import Observer

@@ -19,8 +19,8 @@ from finssim.robot.messages import (
     TagCorners,
     Telemetry,
 )
+from finssim.robot.reading import Reading
 from finssim.robot.record_messages import TOPICS
-from finssim.robot.robot import Reading
 from finssim.vehicles import load_vehicle
 
 pytest.importorskip("mcap")

@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
-from finssim.control.guidance import Guide, Measured, Station, Track
+from finssim.control.guidance import Station
 from finssim.experiments import campaign
 from finssim.experiments.evaluate import Evaluation, summary_of
 from finssim.experiments.metrics import T1_SETPOINTS, T1_START, in_room
@@ -34,7 +33,7 @@ from finssim.experiments.on_robot import (
 )
 from finssim.experiments.recorded import RecordedError, read_record
 from finssim.experiments.trials import PERIOD, Motion, Trial, guide_of, localization_errors
-from finssim.geometry.rotations import quat_from_yaw, quat_multiply
+from finssim.geometry.rotations import quat_from_yaw
 from finssim.localization.pool import Pool
 from finssim.pool import VirtualPool, draw_plant, read_truth
 from finssim.pool.camera import PoolCamera, camera_of
@@ -43,7 +42,7 @@ from finssim.quiet import start_warp
 from finssim.robot.goals import check_reachable
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.perception import Perception
-from finssim.robot.pilots import Pilot, make_pilot
+from finssim.robot.pilots import make_pilot
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.tasks import task_named
@@ -54,7 +53,6 @@ from finssim.vehicles.defaults import room
 __all__ = [
     "HARDWARE",
     "Job",
-    "NoisyInput",
     "noise_seed",
     "play",
     "play_in_pool",
@@ -63,57 +61,6 @@ __all__ = [
     "run_on_robot",
     "stand_in_pool",
 ]
-
-
-# What an ablation takes away from a pilot: noise on the state that it sees.
-
-
-Array = NDArray[np.float64]
-
-
-class NoisyInput:
-    """A pilot that sees its position and heading with independent errors, drawn anew for every decision.
-
-    The published ablation "+ localization noise" has 5 cm per axis and 10 degrees; it touches the controller's input
-    alone.
-    """
-
-    def __init__(
-        self,
-        pilot: Pilot,
-        *,
-        position_std: float = 0.05,
-        yaw_std: float = math.radians(10.0),
-        seed: int = 0,
-    ) -> None:
-        """
-        Args:
-            pilot: Who decides.
-            position_std: Standard deviation of each coordinate [m].
-            yaw_std: Of the heading [rad].
-            seed: Of the errors; `reset` starts them again.
-        """
-        self._pilot, self._stds, self._seed = pilot, (position_std, yaw_std), seed
-        self.name, self.period, self.needs_state = pilot.name, pilot.period, pilot.needs_state
-        self._random = np.random.default_rng(seed)
-
-    def describe(self) -> dict[str, Any]:
-        """The pilot and the noise."""
-        position_std, yaw_std = self._stds
-        noise = {"position_std_m": position_std, "yaw_std_rad": yaw_std, "seed": self._seed}
-        return {**self._pilot.describe(), "input_noise": noise}
-
-    def reset(self) -> None:
-        """Forget what was before, the errors too."""
-        self._random = np.random.default_rng(self._seed)
-        self._pilot.reset()
-
-    def act(self, reading: Measured, guide: Guide, t: float) -> Array:
-        """Wanted thrusts in canonical order [N], (n,)."""
-        position_std, yaw_std = self._stds
-        moved = np.asarray(reading.position, float) + self._random.normal(0.0, position_std, 3)
-        turned = quat_multiply(quat_from_yaw(self._random.normal(0.0, yaw_std)), reading.quaternion)
-        return self._pilot.act(Track(moved, turned, np.asarray(reading.nu, float)), guide, t)
 
 
 HARDWARE = "hardware"
@@ -237,9 +184,9 @@ def job_trial(job: Job, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotTrial,
     first = guide.at(0.0)
     *place, yaw = in_room(T1_START, standing) if job.task == "t1" else (*first.position, float(first.yaw))
     duration = guide.duration if math.isfinite(guide.duration) else job.duration
-    pilot: Pilot = make_pilot(job.controller, vehicle, task=job.task)
+    pilot = make_pilot(job.controller, vehicle, task=job.task)
     if job.position_noise or job.yaw_noise:
-        pilot = NoisyInput(pilot, position_std=job.position_noise, yaw_std=job.yaw_noise, seed=seed)
+        pilot.disturb_input(position_std=job.position_noise, yaw_std=job.yaw_noise, seed=seed)
     trial = RobotTrial(
         name=f"{job.row}, {job.target}",
         pilot=pilot,

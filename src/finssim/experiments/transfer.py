@@ -53,6 +53,10 @@ INTERVALS = "intervals"
 RANGES_FILE = "ranges.yaml"
 FEWEST_UNITS = 3
 """Plants and seeds on which a sentence about a difference rests at least; below it there are numbers alone."""
+DIFFERENCES_NOTE = (
+    "Each figure is the mean of row less reference, over pairs of trials with the same pool, seed and target; in "
+    "brackets 95 % from a bootstrap of plants and seeds. paper: the difference of its rows, on hardware, single runs."
+)
 FORGETFUL = {"integral": False, "history": 0, "last_action": False}
 """Settings of the learner, for policies as the paper's."""
 
@@ -142,7 +146,25 @@ class Spec:
             for key in self.differences
         }
 
-    def table(self, result: Mapping[str, Any]) -> Table:
+    def tables(self, result: Mapping[str, Any]) -> list[Table]:
+        """The table of a result, and that of the differences from the reference row, where there are some."""
+        units = {key: MEASURES[key] for key in self.differences}
+        rows = []
+        for name, differences in result["differences"].items():
+            row, theirs = self.rows[name], self.paper_differences(self.rows[name])
+            texts = (figure_text(differences[key], f"+{u[4]}", u[2]) for key, u in units.items())
+            rows.append([row.title, *texts])
+            if theirs is not None:
+                rows.append(["  paper", *(f"{u[2] * theirs[key]:+{u[4]}}" for key, u in units.items())])
+        differences = Table(
+            title=f"{self.name.upper()}: differences from {self.rows[self.base].title}",
+            heads=["", *(heading for _, heading, *_ in units.values())],
+            rows=rows,
+            note=DIFFERENCES_NOTE,
+        )
+        return [self._table(result), *([differences] if rows else [])]
+
+    def _table(self, result: Mapping[str, Any]) -> Table:
         """The table of a result; on hardware its rows say so."""
         hardware, rows = result.get("robot"), []
         for name, of_row in result["rows"].items():
@@ -260,7 +282,7 @@ def transfer_experiment(
         "vehicle": {"name": body.name, "sha256": body.sha256},
         **scores(spec, by_row), "trials": results, "provenance": provenance(),
     }  # fmt: skip
-    write_json(folder / f"{spec.name}.json", result, [spec.table(result)])
+    write_json(folder / f"{spec.name}.json", result, spec.tables(result))
     spec.draw(by_row, folder)
     return result
 
@@ -603,5 +625,5 @@ def t2(*, trajectories: Annotated[Sequence[str] | None, ","] = None, **options: 
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
-    """The table of either."""
-    return [SPECS[result["experiment"]].table(result)]
+    """Those of either."""
+    return SPECS[result["experiment"]].tables(result)
