@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import shutil
@@ -29,11 +28,11 @@ from finssim.control.pid import AxisModel, axis_model
 from finssim.control.policy import DESCRIPTION_FILE, Policy
 from finssim.engine import Pool
 from finssim.experiments.campaign import Say, run_jobs, write_json
+from finssim.experiments.compare import draw_training
 from finssim.experiments.evaluate import CAPTION, Evaluation, by_target, cells, comparison_table
 from finssim.experiments.excitation import pool_trials, trials_on_robot
 from finssim.experiments.figures import (
     COLORS,
-    clean,
     draw_envelopes,
     error_envelope,
     legend_below,
@@ -240,28 +239,6 @@ def camera_view(job: Job, series: Path, at: float, seed: int, path: Path) -> Non
         x, y = np.concatenate([tag.corners for tag in tags]).mean(axis=0)
         close.set(xlim=(x - ZOOM, x + ZOOM), ylim=(y + ZOOM, y - ZOOM))
     save_figure(figure, path)
-
-
-def _training_curve(curves: Sequence[Mapping[str, Any]]) -> Any:
-    """Mean return and share of episodes held, against control steps and wall time, of rows of `curves.csv`."""
-    figure = new_figure(7.2, 3.0)
-    axes = figure.subplots()
-    # Episodes last as long as several updates: before the first ends there is no return to show.
-    rows = [row for row in curves if row["mean_length"] > 0.0]
-    steps = np.array([row["steps"] for row in rows]) / 1e6
-    share = axes.twinx()
-    axes.plot(steps, [row["mean_return"] for row in rows], color=BLUE, linewidth=1.6)
-    share.plot(steps, [100.0 * row["held"] for row in rows], color=ORANGE, linewidth=1.6)
-    clean(axes)
-    axes.set_xlabel("control steps, all worlds [million]")
-    axes.set_ylabel("mean return of an episode", color=BLUE)
-    share.set_ylabel("episodes held [%]", color=ORANGE)
-    share.set_ylim(-3.0, 103.0)
-    share.spines[["top"]].set_visible(False)
-    if rows:
-        last = rows[-1]
-        axes.set_title(f"{last['steps'] / 1e6:.1f} million steps in {last['seconds']:.0f} s", fontsize=10)
-    return figure
 
 
 def _paths(trials: Sequence[PlayedTrial]) -> Any:
@@ -626,13 +603,11 @@ class _Demonstration:
         folder, policy = self.folder, evaluations[0]
         for evaluation in evaluations:
             write_json(folder / f"{evaluation.result['controller']['name']}.json", evaluation.result)
-        with (folder / "policy" / "curves.csv").open(encoding="utf-8", newline="") as file:
-            curves = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
         compared = [e for e in evaluations if e.result["trials"] == policy.result["trials"]]
         envelopes = {e.label: error_envelope(e.trials) for e in compared}
         save_figure(draw_envelopes(envelopes), folder / "envelopes.png")
         save_figure(_paths(policy.trials), folder / "paths.png")
-        save_figure(_training_curve(curves), folder / "training.png")
+        draw_training([str(folder / "policy")], folder / "training.png")
         title = f"Station keeping of {policy.result['vehicle']['name']}"
         origin = {
             "vehicle": policy.result["vehicle"],

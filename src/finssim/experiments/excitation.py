@@ -40,6 +40,7 @@ from finssim.files import atomic_directory, atomic_write
 from finssim.geometry.rotations import quat_inverse_rotate, quat_rotate
 from finssim.pool import draw_plant
 from finssim.pool.plant_spec import Basin
+from finssim.pool.run import make_plan
 from finssim.quiet import start_warp
 from finssim.robot.perception import Perception
 from finssim.robot.recorder import Recorder
@@ -349,16 +350,21 @@ def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
     record = path / f"{run.target}.mcap"
     record.parent.mkdir(parents=True, exist_ok=True)
     record.unlink(missing_ok=True)
-    vehicle, standing = load_vehicle(run.vehicle), load_vehicle(run.pool_vehicle)
+    vehicle, seed = load_vehicle(run.vehicle), noise_seed(run.seed, run.row, run.target)
+    pool = make_plan(run.pool_vehicle, str(run.plant), run.severity, camera="corners", seed=seed)  # type: ignore[arg-type]
     place = place_of(run.programme, vehicle, run.water)
     trial = programme_trial(run.programme, vehicle, place, hold=run.hold)
     about = {**about_programme(run.programme, "virtual pool"), "seed": run.seed}
     with Recorder(record, vehicle, about, pictures="none") as recorder:
         outcome = play_in_pool(
-            trial, Station(place.position, place.yaw), vehicle, standing, recorder=recorder,
-            estimator={"mode": ESTIMATOR}, plant=run.plant, severity=run.severity,
-            seed=noise_seed(run.seed, run.row, run.target),
-        )  # fmt: skip
+            trial,
+            Station(place.position, place.yaw),
+            vehicle,
+            pool,
+            seed=seed,
+            recorder=recorder,
+            mode=ESTIMATOR,
+        )
     t, pilot = outcome.runtime.t, outcome.trial.pilot
     assert isinstance(pilot, ProgrammePilot)
     return {

@@ -23,10 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.experiments.campaign import Job, Say, check_choices, run_jobs, write_json
-from finssim.experiments.pool_trial import noise_seed, stand_in_pool
+from finssim.experiments.pool_trial import noise_seed
 from finssim.experiments.reliability import Pair, ReliabilityError, await_flush, await_thrust, pair
 from finssim.experiments.tables import Table
 from finssim.pool import VirtualPool, read_truth
+from finssim.pool.run import make_plan
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.robot.bridge import Bridge, BridgeSettings
@@ -443,13 +444,9 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
     start, goal, when, _ = MOTIONS[job.motion]
     box = inset(vehicle.safety.workspace_lower, vehicle.safety.workspace_upper)
     workspace = {"workspace_lower": box[0], "workspace_upper": box[1]}
-    pool, site = stand_in_pool(
-        vehicle,
-        station_of(start),
-        plant=job.plant,
-        severity=job.severity,
-        seed=noise_seed(job.seed, job.target),
-    )
+    seed = noise_seed(job.seed, job.target)
+    plan = make_plan(vehicle, str(job.plant), job.severity, camera="corners", seed=seed)  # type: ignore[arg-type]
+    pool, site = plan.standing(station_of(start), seed=seed), plan.calibrated
     with tempfile.TemporaryDirectory() as folder:
         record = Path(folder) / "run.mcap"
         with Recorder(record, vehicle, {"command": "finssim experiment faults"}) as recorder:

@@ -31,12 +31,10 @@ from finssim.experiments.on_robot import (
     fault_of,
     session,
 )
-from finssim.experiments.recorded import RecordedError, read_record
+from finssim.experiments.records import DriveError, read_record
 from finssim.experiments.trials import PERIOD, Motion, Trial, guide_of, localization_errors
-from finssim.geometry.rotations import quat_from_yaw
-from finssim.localization.pool import Pool
-from finssim.pool import VirtualPool, draw_plant, read_truth
-from finssim.pool.camera import PoolCamera, camera_of
+from finssim.pool import read_truth
+from finssim.pool.run import PoolPlan, make_plan
 from finssim.provenance import provenance
 from finssim.quiet import start_warp
 from finssim.robot.goals import check_reachable
@@ -59,7 +57,6 @@ __all__ = [
     "played_trial",
     "pool_evaluation",
     "run_on_robot",
-    "stand_in_pool",
 ]
 
 
@@ -101,48 +98,16 @@ def noise_seed(*words: Any) -> int:
     return zlib.crc32(" ".join(map(str, words)).encode()) & 0x7FFFFFFF
 
 
-def stand_in_pool(
-    vehicle: Vehicle,
-    start: Station,
-    *,
-    plant: int,
-    severity: Any,
-    seed: int,
-    camera: Any = "corners",
-    truth: Path | None = None,
-) -> tuple[VirtualPool, Pool]:
-    """A vehicle at rest at its start in a drawn pool, and the site as its calibration has it.
-
-    Args:
-        vehicle: Around which the pool's own is drawn.
-        start: Where it is.
-        plant: Seed of the pool: vehicle, camera and water.
-        severity: nominal, realistic or hard.
-        seed: Of the noise.
-        camera: pictures or corners.
-        truth: File of the truth; none if None.
-    """
-    true_site, known_site, settings = camera_of(vehicle, plant, severity)
-    pool = VirtualPool(
-        vehicle,
-        draw_plant(vehicle, plant, severity),
-        camera=PoolCamera(vehicle, true_site, mode=camera, settings=settings, seed=seed),
-        start=(np.asarray(start.position), quat_from_yaw(start.yaw)),
-        seed=seed,
-        truth=truth,
-    )
-    return pool, known_site
-
-
 def play_in_pool(
     trial: RobotTrial,
     start: Station,
     vehicle: Vehicle,
-    standing: Vehicle,
+    plan: PoolPlan,
     *,
+    seed: int,
+    truth: Path | None = None,
     recorder: Recorder | None = None,
-    estimator: Mapping[str, Any],
-    **pool: Any,
+    **estimator: Any,
 ) -> Outcome:
     """Play a trial by the robot's whole software in lock-step with a pool.
 
@@ -150,15 +115,16 @@ def play_in_pool(
         trial: What to do.
         start: Where the vehicle is, at rest.
         vehicle: As the robot knows it.
-        standing: Around which the pool's own is drawn.
+        plan: Of the pool and the vehicle in it.
+        seed: Of the noise.
+        truth: File of the truth; none if None.
         recorder: Takes it down.
         estimator: Options of `Perception`.
-        pool: As of `stand_in_pool`.
     """
-    world, site = stand_in_pool(standing, start, **pool)
-    perception = Perception(vehicle, site, **estimator)
+    world = plan.standing(start, seed=seed, truth=truth)
+    perception = Perception(vehicle, plan.calibrated, **estimator)
     runtime = Runtime(
-        vehicle, site, trial.pilot, trial.guide, arm=True, perception=perception, recorder=recorder
+        vehicle, plan.calibrated, trial.pilot, trial.guide, arm=True, perception=perception, recorder=recorder
     )
     longest = GETTING_READY + trial.duration
     with closing(world):
@@ -230,15 +196,19 @@ def play(job: Job, path: Path) -> dict[str, Any]:
     """
     start_warp()
     began = time.perf_counter()
-    vehicle, standing = load_vehicle(job.vehicle), load_vehicle(job.pool_vehicle)
+    vehicle = load_vehicle(job.vehicle)
+    plan = make_plan(
+        job.pool_vehicle,
+        str(job.plant),
+        job.severity,
+        camera=job.camera,
+        seed=noise_seed(job.seed, job.target),
+    )  # type: ignore[arg-type]
     seed = noise_seed(job.seed, job.target)
     trial, start = job_trial(job, vehicle, seed=seed)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "truth"
-        outcome = play_in_pool(
-            trial, start, vehicle, standing, estimator={"fusion": job.fusion}, plant=job.plant,
-            severity=job.severity, seed=seed, camera=job.camera, truth=file,
-        )  # fmt: skip
+        outcome = play_in_pool(trial, start, vehicle, plan, seed=seed, truth=file, fusion=job.fusion)
         truth = read_truth(file)
     t = truth.time - outcome.runtime.started
     rows = np.flatnonzero((t >= 0.0) & (t <= trial.duration + 1e-6))
@@ -352,7 +322,7 @@ def _play_on_robot(job: Job, path: Path, opened: Session) -> dict[str, Any] | No
         return None
     try:
         motion = read_record(record, job.task, vehicle, guide=trial.guide, duration=trial.duration).estimate
-    except RecordedError:  # stopped before its first decision
+    except DriveError:  # stopped before its first decision
         nowhere = np.full((2, 4), np.nan)
         motion = Motion(t=np.array([0.0, 0.1]), position=nowhere[:, :3], quaternion=nowhere)
     where = {"robot": opened.robot.title, "record": record.name}

@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.experiments.campaign import Say, check_choices, write_json
-from finssim.experiments.pool_trial import stand_in_pool
 from finssim.experiments.tables import Table
 from finssim.pool import TruthError, read_truth
+from finssim.pool.run import make_plan
 from finssim.provenance import provenance
 from finssim.robot.goals import station_of
 from finssim.robot.lockstep import run_lockstep
@@ -281,7 +281,8 @@ def soak(
     duration, folder = 3600.0 * hours, Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     body, station = load_vehicle(vehicle), station_of(GOAL)
-    pool, site = stand_in_pool(body, station, plant=seed, severity=severity, seed=seed)
+    plan = make_plan(body, str(seed), severity, camera="corners", seed=seed)  # type: ignore[arg-type]
+    pool, site = plan.standing(station, seed=seed), plan.calibrated
     runtime = Runtime(body, site, make_pilot("pid", body), station, arm=True)
     began = time.perf_counter()
     samples: list[tuple[float, ...]] = []
@@ -466,7 +467,8 @@ def lockstep_speed(
         duration: Vehicle time [s]; long enough for the camera if None.
     """
     body, station = load_vehicle(vehicle), station_of(STATION)
-    pool, site = stand_in_pool(body, station, plant=seed, severity="realistic", seed=seed, camera=camera)
+    plan = make_plan(body, str(seed), "realistic", camera=camera, seed=seed)
+    pool, site = plan.standing(station, seed=seed), plan.calibrated
     runtime = Runtime(body, site, make_pilot(policy, body), station, arm=True)
     run_lockstep(runtime, pool, WARM_UP)
     before, began = pool.time, time.perf_counter()

@@ -9,7 +9,7 @@ from finssim import boundary
 from finssim.cli import app
 from finssim.control.allocation import Allocator
 from finssim.control.modes import action_mode
-from finssim.experiments.driven import (
+from finssim.experiments.records import (
     DriveError,
     actions_of,
     collect_records,
