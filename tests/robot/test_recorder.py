@@ -30,8 +30,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2.metadata import dump_qos_v8, parse_qos
 
 from finssim.robot.record_messages import Messages
-from finssim.robot.record_reader import open_record
-from finssim.robot.record_show import describe_record
+from finssim.robot.record_reader import describe_record, open_record
 from finssim.robot.recorder import Recorder
 
 VEHICLE = load_vehicle("finsrov")

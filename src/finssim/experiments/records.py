@@ -29,8 +29,7 @@ from finssim.pool.virtual_pool import read_truth
 from finssim.provenance import provenance
 from finssim.robot.goals import station_of
 from finssim.robot.record_messages import STATES
-from finssim.robot.record_reader import Record, open_record
-from finssim.robot.record_show import events_of
+from finssim.robot.record_reader import Record, events_of, open_record
 from finssim.tasks import Task
 from finssim.tasks.observer import Observer, fitted_task
 from finssim.vehicles import Vehicle, load_vehicle
