@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.control.policy import Policy, PolicyDescription
-from finssim.experiments.campaign import Say, run_jobs, write_json
+from finssim.experiments.campaign import Progress, run_jobs, write_json
 from finssim.experiments.evaluate import Job, play
 from finssim.experiments.figures import COLORS, clean, new_figure, save_figure
 from finssim.experiments.plants import load_plant
@@ -374,7 +374,7 @@ def compare(
     plant: str = "nominal",
     trials: Annotated[int | None, (1, 100_000)] = None,
     seed: int = 42,
-    say: Say = lambda part, what: None,
+    progress: Progress = lambda part, what: None,
 ) -> dict[str, Any]:
     """Compare trainings over seeds: interquartile means with intervals, who is likely better, learning curves.
 
@@ -388,7 +388,7 @@ def compare(
         plant (FILE|NAME): What differs from the vehicle file, as for evaluate.
         trials: Trials of each run; as many as evaluate makes if not given.
         seed: Seed of every random number; equal seeds give equal results.
-        say: Told the share that is done and what comes next.
+        progress: Told the share that is done and what comes next.
 
     Raises:
         CompareError, EvaluationError, PolicyError, PlantError, VehicleError, OutputError: As they say.
@@ -402,7 +402,7 @@ def compare(
         )
         for group in groups for run in group.runs
     ]  # fmt: skip
-    results = run_jobs(jobs, out / "evaluations", play, say=say)
+    results = run_jobs(jobs, out / "evaluations", play, progress=progress)
     scored = {(job.row, job.seed): r["per_trial"] for job, r in zip(jobs, results, strict=True)}
     result = {
         **comparison(groups, scored, measures),

@@ -27,7 +27,7 @@ from finssim.calibration.trials.trial import Trial
 from finssim.control.pid import AxisModel, axis_model
 from finssim.control.policy import DESCRIPTION_FILE, Policy
 from finssim.engine import Pool
-from finssim.experiments.campaign import Say, run_jobs, write_json
+from finssim.experiments.campaign import Progress, run_jobs, write_json
 from finssim.experiments.compare import draw_training
 from finssim.experiments.evaluate import CAPTION, Evaluation, by_target, cells, comparison_table
 from finssim.experiments.excitation import pool_trials, trials_on_robot
@@ -507,7 +507,7 @@ class _Demonstration:
         self.console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     @contextmanager
-    def _working(self, text: str) -> Iterator[Say]:
+    def _working(self, text: str) -> Iterator[Progress]:
         """Show what is done, and how far it is."""
         self.tell(text)
         with self.console.status(text) as status:
@@ -536,7 +536,7 @@ class _Demonstration:
         else:
             spec = draw_plant(standing, PLANT, SEVERITY)
             spec.write(self.folder / PLANT_FILE)
-            with self._working("recording trials in the virtual pool") as say:
+            with self._working("recording trials in the virtual pool") as progress:
 
                 def show(run: Any, result: Mapping[str, Any]) -> None:
                     unit = "m/s" if run.programme.axes[0] in AXES[:3] else "rad/s"
@@ -547,7 +547,7 @@ class _Demonstration:
                 def simulated(folder: Path, rough: Path, seed: int) -> dict[str, list[Trial]]:
                     return pool_trials(
                         plans, folder, vehicle=str(rough), pool_vehicle=self.name, plant=PLANT, severity=SEVERITY,
-                        seed=seed, leave_out=True, processes=self.processes, say=say, show=show,
+                        seed=seed, leave_out=True, processes=self.processes, progress=progress, show=show,
                     )  # fmt: skip
 
                 result = identify(self.folder, self.name, seed=self.seed, shown=self.out, record=simulated)
@@ -580,8 +580,10 @@ class _Demonstration:
         if self.robot is not None:
             results = run_on_robot(jobs, place, self.robot, attendant=self.attendant, console=self.console)
         else:
-            with self._working("holding setpoints in the virtual pool") as say:
-                results = run_jobs(jobs, place, play, processes=self.processes, say=say, show=self._show)
+            with self._working("holding setpoints in the virtual pool") as progress:
+                results = run_jobs(
+                    jobs, place, play, processes=self.processes, progress=progress, show=self._show
+                )
             if pictures:
                 series = place / pictures[0].key()
                 camera_view(pictures[0], series, VIEW_AT, self.seed, self.folder / "camera.png")

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from finssim.control.guidance import Station
 from finssim.control.trajectories import Trajectory
-from finssim.experiments.campaign import Say, check_choices, write_json
+from finssim.experiments.campaign import Progress, check_choices, write_json
 from finssim.experiments.on_robot import RobotTrial
 from finssim.experiments.pool_trial import play_in_pool
 from finssim.experiments.tables import Table
@@ -164,7 +164,7 @@ def open_water(
     seeds: Annotated[int, (1, 1000)] = 3,
     seed: int = 1,
     severity: Severity = "realistic",
-    say: Say = lambda part, what: None,
+    progress: Progress = lambda part, what: None,
 ) -> dict[str, Any]:
     """Drift of Doppler log, depth, IMU and compass in open water [m], and whether the estimator's ellipse holds it.
 
@@ -180,13 +180,13 @@ def open_water(
         seeds: Ways, each with its own water and noise.
         seed: Seed of every random number; equal seeds give equal results.
         severity (WORD): How far the pools are from the vehicle file: nominal, realistic or hard.
-        say: Told the share that is done and what comes next.
+        progress: Told the share that is done and what comes next.
     """
     ours, way = load_vehicle(vehicle), way_of(shape, 60.0 * minutes, speed)
     positioning_of(positioning, seed)  # refuses what is none
     trials = []
     for k, s in enumerate(range(seed, seed + seeds)):
-        say(k / seeds, f"seed {s}")
+        progress(k / seeds, f"seed {s}")
         trials.append(swim(ours, way, plant=s, severity=severity, positioning=positioning, seed=s))
     result = {
         "experiment": "open-water",

@@ -11,7 +11,7 @@ from typing import Any
 from finssim.experiments import localization_experiment as localization
 from finssim.experiments import replay_experiment as replay
 from finssim.experiments import transfer
-from finssim.experiments.campaign import ResultError, Say
+from finssim.experiments.campaign import Progress, ResultError
 from finssim.experiments.tables import Table, html_of
 from finssim.files import atomic_write
 from finssim.page import html_page
@@ -40,14 +40,14 @@ TABLES = {
 }
 
 
-def everything(*, out: Path, say: Say = lambda part, what: None, **options: Any) -> dict[str, Any]:
+def everything(*, out: Path, progress: Progress = lambda part, what: None, **options: Any) -> dict[str, Any]:
     """Run localization, replay, t1 and t2, and write one report with the paper's figures beside ours.
 
     Example: finssim experiment all --seeds 1 --plants 1 --out everything
 
     Args:
         out (DIR): Directory for JSON, Markdown, figures, policies and trials; one that was interrupted goes on.
-        say: Told the share that is done and what comes next.
+        progress: Told the share that is done and what comes next.
         options: As of `experiments.transfer.transfer_experiment`, without rows, robot; localization and replay are of
             the published vehicle.
 
@@ -60,17 +60,19 @@ def everything(*, out: Path, say: Say = lambda part, what: None, **options: Any)
         folder = Path(out) / name
 
         def tell(part: float, what: str, name: str = name, done: float = done, share: float = share) -> None:
-            say(done + share * part, f"{name}: {what}")
+            progress(done + share * part, f"{name}: {what}")
 
         if name in ONCE:
             file, work = ONCE[name]
             if not (folder / file).is_file():
                 work(
-                    out=folder, say=tell, **{key: options[key] for key in ("seeds", "seed") if key in options}
+                    out=folder,
+                    progress=tell,
+                    **{key: options[key] for key in ("seeds", "seed") if key in options},
                 )
             results[name] = read_json(folder / file, ResultError, such_as="provenance")
         else:
-            result = transfer.transfer_experiment(transfer.SPECS[name], out=folder, say=tell, **options)
+            result = transfer.transfer_experiment(transfer.SPECS[name], out=folder, progress=tell, **options)
             results[name] = {key: value for key, value in result.items() if key != "trials"}
         done += share
     sections = [

@@ -17,7 +17,7 @@ from finssim.calibration.trials.table_file import read_table
 from finssim.control.guidance import Guide, Reference, Station, Track
 from finssim.control.modes import AXES, ActionMode, action_mode
 from finssim.control.trajectories import PUBLISHED_NAMES, TRAJECTORIES, load_trajectory
-from finssim.experiments.campaign import Say
+from finssim.experiments.campaign import Progress
 from finssim.experiments.metrics import MAX_GAP, T1_SETPOINTS, in_room
 from finssim.experiments.tables import Table
 from finssim.experiments.trials import DURATION, Motion, Trial, follows, localization_errors
@@ -425,7 +425,7 @@ def collect(
     disturb: float = 0.0,
     goal: str | None = None,
     seed: int = 42,
-    say: Say = lambda part, what: None,
+    progress: Progress = lambda part, what: None,
 ) -> dict[str, Any]:
     """Keep episodes of a task as a Minari data set: let an expert do it, or take what was done with a vehicle.
 
@@ -447,7 +447,7 @@ def collect(
         goal (GOAL): Of records: where to, in place of what they say: x,y,z,yaw_deg [m, deg], or end: where each stretch
             ended; of t2 the trajectory.
         seed: Seed of every random number; equal seeds give equal results.
-        say: Told the share that is done.
+        progress: Told the share that is done.
     """
     records = [Path(word) for word in experts if word.endswith(".mcap")]
     if records and (len(records) < len(experts) or episodes or randomize or disturb):
@@ -461,7 +461,7 @@ def collect(
         raise DriveError("give one expert and --episodes, and no --goal, which is of records")
     return collect_episodes(
         experts[0], task, episodes=episodes, out=out, vehicle=vehicle, hydrodynamics=hydrodynamics,
-        action=action, randomize=randomize, observe=observe, disturb=disturb, seed=seed, show=say,
+        action=action, randomize=randomize, observe=observe, disturb=disturb, seed=seed, show=progress,
     )  # fmt: skip
 
 
