@@ -21,8 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from finssim.calibration.excitation.programmes import Programme
-from finssim.calibration.excitation.recording import record
-from finssim.calibration.excitation.synthetic import NoiseProfile, trials_of
+from finssim.calibration.excitation.synthetic import NoiseProfile, record, trials_of
 from finssim.calibration.hydrodynamics import fit_hydrodynamics, scaled
 from finssim.calibration.output.calibrate import calibrated
 from finssim.calibration.replay.replay import replay

@@ -27,8 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.excitation.programmes import Programme, programmes
-from finssim.calibration.excitation.recording import Recording, record
-from finssim.calibration.excitation.synthetic import simulate_programme, trials_of
+from finssim.calibration.excitation.synthetic import Recording, record, simulate_programme, trials_of
 from finssim.calibration.fit import Estimate, Fit
 from finssim.calibration.regression.regress import regress
 from finssim.calibration.replay.replay import replay

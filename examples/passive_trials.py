@@ -14,8 +14,7 @@ import numpy as np
 
 from finssim.calibration.fit import Curve
 from finssim.calibration.regression.passive import passive
-from finssim.calibration.trials.header import Header
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial import Header, Trial
 from finssim.vehicles import load_vehicle
 
 MOCAP = ("", "x", "y", "z", "qx", "qy", "qz", "qw")

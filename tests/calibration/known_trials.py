@@ -3,8 +3,7 @@
 from functools import cache
 
 from finssim.calibration.excitation.programmes import programmes
-from finssim.calibration.excitation.recording import record
-from finssim.calibration.excitation.synthetic import NoiseProfile, trials_of
+from finssim.calibration.excitation.synthetic import NoiseProfile, record, trials_of
 from finssim.calibration.regression.plant_terms import matrices
 from finssim.vehicles import AXES, load_vehicle
 

@@ -56,10 +56,6 @@ class MovingBody:
         """Of the body origin, (n, 6)."""
         return np.concatenate([self.velocity(t), self.omega(t)], axis=-1)
 
-    def nu_dot(self, t):
-        """Rates of the components of nu, (n, 6)."""
-        return derivative(self.nu, t)
-
     def specific_force(self, t, point=(0.0, 0.0, 0.0)):
         """What an accelerometer at a body point reads: R' (second derivative of its place - g), (n, 3)."""
         a = derivative(lambda s: derivative(lambda z: self.position(z, point), s), t)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from finssim.calibration.check.check import check_trials
+from finssim.calibration.check import check_trials
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation.programmes import programmes
 from finssim.calibration.excitation.synthetic import simulate_programme

@@ -5,8 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.calibration.degeneracy import correlation, degeneracy
-from finssim.calibration.uncertainty import Evidence, correlated_samples, intervals, trial_covariance
+from finssim.calibration.uncertainty import (
+    Evidence,
+    correlated_samples,
+    correlation,
+    degeneracy,
+    intervals,
+    trial_covariance,
+)
 
 TRUTH = np.array([3.0, -1.0, 0.5])
 

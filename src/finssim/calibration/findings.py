@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import yaml
 
-__all__ = ["SEVERITIES", "Finding", "Severity", "finding", "sentences", "wordings"]
+__all__ = ["SEVERITIES", "Finding", "finding", "sentences", "wordings"]
 
 Severity = Literal["refused", "care", "note"]
 """What a finding makes of a trial or fit: nothing can rest on it; something may not; worth knowing."""

@@ -25,7 +25,7 @@ from finssim.calibration.trials.inputs import drive
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import AXES, Vehicle
 
-__all__ = ["METHODS", "fit_hydrodynamics", "scaled"]
+__all__ = ["fit_hydrodynamics", "scaled"]
 
 METHODS = ("auto", "regression", "simulation")
 

@@ -22,7 +22,7 @@ from rich.console import Console
 from finssim.calibration.excitation.programmes import RATE, Programme, programmes, which_axes
 from finssim.calibration.findings import sentences
 from finssim.calibration.output.calibrate import number_in
-from finssim.calibration.output.fit_output import interval_text, number_text, state_text
+from finssim.calibration.output.report import interval_text, number_text, state_text
 from finssim.calibration.trials.trial import Trial
 from finssim.control.pid import AxisModel, axis_model
 from finssim.control.policy import DESCRIPTION_FILE, Policy

@@ -16,8 +16,8 @@ from finssim.calibration.output.calibrate import all_findings, calibrated
 from finssim.calibration.output.report import write_report
 from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.calibration.regression.regress import regress
-from finssim.calibration.replay.figure import draw_response_envelopes
 from finssim.calibration.replay.replay import Replay, replay
+from finssim.calibration.replay.report import draw_response_envelopes
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import write_trial
 from finssim.experiments.figures import save_figure

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.calibration.trials.table_file import read_table
+from finssim.calibration.trials.trial_files import read_table
 from finssim.control.guidance import Guide, Reference, Station, Track
 from finssim.control.modes import AXES, ActionMode, action_mode
 from finssim.control.trajectories import PUBLISHED_NAMES, TRAJECTORIES, load_trajectory

@@ -13,15 +13,13 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
 from finssim.calibration.excitation.programmes import Programme, programmes
-from finssim.calibration.excitation.recording import Recording, record
-from finssim.calibration.excitation.synthetic import trials_of
+from finssim.calibration.excitation.synthetic import Recording, record, trials_of
 from finssim.calibration.fit import Fit
 from finssim.calibration.output.calibrate import calibrated
 from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.calibration.regression.regress import regress
-from finssim.calibration.replay.figure import MODEL_LABELS, draw_response_envelopes
 from finssim.calibration.replay.replay import Replay, replay
-from finssim.calibration.replay.report import DEFINITION
+from finssim.calibration.replay.report import DEFINITION, MODEL_LABELS, draw_response_envelopes
 from finssim.calibration.trials.trial import Trial
 from finssim.engine import Simulator, TetherLine
 from finssim.experiments.campaign import Progress, write_json

@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 from rich.console import Console
 
-from finssim.calibration.output.calibrated_ranges import write_ranges
+from finssim.calibration.output.ranges import write_ranges
 from finssim.control.controllers import COSTLY
 from finssim.control.policy import Policy, PolicyError
 from finssim.control.trajectories import TRAJECTORIES

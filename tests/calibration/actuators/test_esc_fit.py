@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finssim.calibration.actuators.thruster_bench import fit_esc
+from finssim.calibration.actuators.thruster import fit_esc
 from finssim.calibration.errors import CalibrationError
 from finssim.vehicles import Esc, load_vehicle
 

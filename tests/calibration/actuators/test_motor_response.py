@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 
 from calibration.made_steps import RPM, held, lagged, sampled, step_log
-from finssim.calibration.actuators.motor import cut_steps, fit_motor, fit_response, loop_gains
-from finssim.calibration.actuators.steps import find_steps, levels
+from finssim.calibration.actuators.motor import LOOP_RATE, cut_steps, fit_motor, fit_response, loop_gains
+from finssim.calibration.actuators.thrust_table import find_steps, levels
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation.programmes import programmes
 from finssim.calibration.excitation.synthetic import simulate_programme
-from finssim.calibration.trials.header import Header
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial import Header, Trial
 from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")
@@ -262,7 +261,7 @@ def test_a_step_log_gives_the_gains_of_a_loop():
     """The feed-forward is one over the gain, and the integral gain that of the rule, or a slower loop's."""
     vehicle = FINSROV.replace({"thrusters.*.domain": "speed"})
     trial = step_log(vehicle.thrusters["H_LF"], "H_LF", PULSES, domain="speed", gain=0.9)
-    fit = fit_motor([trial], vehicle, loop_rate=100.0)
+    fit = fit_motor([trial], vehicle)
     assert fit.estimates["speed_loop.feedforward"].estimate == pytest.approx(1.0 / 0.9, rel=0.01)
-    theta = 0.05 + 1.5 / 100.0
+    theta = 0.05 + 1.5 / LOOP_RATE
     assert 0.3 / (0.9 * 2.0 * theta) < fit.estimates["speed_loop.ki"].estimate <= 1.05 / (0.9 * 2.0 * theta)

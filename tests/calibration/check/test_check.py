@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from finssim.calibration.check.check import as_object, check, check_trials, print_reports, together
+from finssim.calibration.check import as_object, check, check_trials, print_reports, together
 from finssim.calibration.excitation.programmes import programmes
 from finssim.calibration.excitation.synthetic import simulate_programme
 from finssim.calibration.trials.trial_files import write_trial

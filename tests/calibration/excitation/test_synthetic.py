@@ -7,10 +7,10 @@ import pytest
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.excitation.programmes import programmes
-from finssim.calibration.excitation.recording import record
 from finssim.calibration.excitation.synthetic import (
     NOISE_PROFILES,
     NoiseProfile,
+    record,
     simulate_programme,
     trials_of,
 )

@@ -7,7 +7,7 @@ import pytest
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.importers import import_trials
-from finssim.calibration.importers.column_map import read_map
+from finssim.calibration.importers.assemble import read_map
 from finssim.calibration.importers.dispatch import read_trials
 from finssim.calibration.trials.trial_files import load_trial
 from finssim.calibration.trials.units import factor

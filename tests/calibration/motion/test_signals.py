@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from calibration.moving_body import MovingBody
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.motion.signals import motion
-from finssim.calibration.trials.header import Header, TrialWater
-from finssim.calibration.trials.time_base import merged
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.motion.signals import holds_gravity, motion
+from finssim.calibration.trials.conversion import merged
+from finssim.calibration.trials.trial import Header, Trial, TrialWater
 from finssim.geometry.rotations import quat_inverse_rotate, quat_to_euler
 from finssim.vehicles import load_vehicle
 
@@ -37,34 +35,13 @@ def assert_close(values, truth, rows, atol):
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("turns", [False, True])
-def test_an_accelerometer_anywhere_gives_the_rate_of_nu_at_the_origin(seed, turns):
-    """Gravity, ω × v, ω_dot × r and ω × (ω × r) are all taken off: what is left is v_dot, also upside down."""
+def test_what_is_measured_at_the_origin_is_the_motion(seed, turns):
+    """Also upside down; nothing is made up of what was not measured."""
     body = MovingBody(seed, turns=turns)
-    channels = body.columns(T, "velocity", "rates", "quaternion") | body.columns(T, "acceleration", at=POINT)
-    m = motion(trial(channels, acceleration_at=POINT), VEHICLE)
-    assert m.nu_dot_source == ("imu",) * 3 + ("smoothed velocity",) * 3
+    m = motion(trial(body.columns(T, "velocity", "rates", "quaternion")), VEHICLE)
     assert_close(m.nu, body.nu(m.t), inner(m), 1e-5)
-    assert_close(m.nu_dot, body.nu_dot(m.t), inner(m), 2e-3)
-    forgotten = motion(trial(channels, acceleration_at=(0.0, 0.0, 0.0)), VEHICLE)
-    assert np.abs(forgotten.nu_dot - body.nu_dot(m.t))[inner(m)].max() > 0.05  # the lever arm matters here
-
-
-def test_without_an_accelerometer_the_slope_of_the_velocity_is_taken():
-    """The same rates from the smoothed velocity."""
-    body = MovingBody(1)
-    m = motion(trial(body.columns(T, "velocity", "rates")), VEHICLE)
-    assert m.nu_dot_source == ("smoothed velocity",) * 6
-    assert_close(m.nu_dot, body.nu_dot(m.t), inner(m), 2e-3)
-    assert np.isnan(m.quaternion).all() and np.isnan(m.position).all()
-
-
-def test_a_bias_of_the_accelerometer_is_no_force():
-    """A constant error in ax, ay, az leaves nu_dot as it is, for the velocity knows better."""
-    body = MovingBody(2)
-    channels = body.columns(T, "velocity", "rates", "quaternion", "acceleration")
-    biased = channels | {name: channels[name] + b for name, b in (("ax", 0.2), ("ay", -0.1), ("az", 0.3))}
-    m = motion(trial(biased), VEHICLE)
-    assert_close(m.nu_dot, body.nu_dot(m.t), inner(m), 5e-3)
+    blind = motion(trial(body.columns(T, "velocity", "rates")), VEHICLE)
+    assert np.isnan(blind.quaternion).all() and np.isnan(blind.position).all()
 
 
 def test_acceleration_without_gravity_is_recognised():
@@ -72,15 +49,15 @@ def test_acceleration_without_gravity_is_recognised():
     body = MovingBody(3)
     channels = body.columns(T, "velocity", "rates", "quaternion", "acceleration")
     f = np.stack([channels[name] for name in ("ax", "ay", "az")], axis=-1)
-    q = body.quaternion(T)
-    kinematic = f + quat_inverse_rotate(q, np.array([0.0, 0.0, -9.81]))
-    for values, said in ((f, "auto"), (f, "specific_force"), (kinematic, "auto"), (kinematic, "kinematic")):
+    kinematic = f + quat_inverse_rotate(body.quaternion(T), np.array([0.0, 0.0, -9.81]))
+    for values, kind, gravity in (
+        (f, "auto", True),
+        (f, "specific_force", True),
+        (kinematic, "auto", False),
+        (kinematic, "kinematic", False),
+    ):
         made = channels | dict(zip(("ax", "ay", "az"), values.T, strict=True))
-        m = motion(trial(made, acceleration=said), VEHICLE)
-        assert_close(m.nu_dot, body.nu_dot(m.t), inner(m), 2e-3)
-    blind = {name: values for name, values in channels.items() if not name.startswith("q") or name == "q"}
-    m = motion(trial(blind), VEHICLE)
-    assert m.nu_dot_source[0] == "smoothed velocity" and m.findings[0].code == "accelerations_unused"
+        assert holds_gravity(trial(made, acceleration=kind), 9.81) == gravity
 
 
 def test_a_velocity_measured_elsewhere_is_moved_to_the_origin():
@@ -160,22 +137,19 @@ def test_what_nothing_tells_stays_unknown():
     body = MovingBody(10)
     gyro = motion(trial(body.columns(T, "rates")), VEHICLE)
     assert gyro.nu_source == ("", "", "", "measured", "measured", "measured")
-    assert np.isnan(gyro.nu[:, :3]).all() and np.isnan(gyro.nu_dot[:, :3]).all() and gyro.valid[5:-5].all()
-    assert_close(gyro.nu_dot[:, 3:], body.nu_dot(T)[:, 3:], inner(gyro), 2e-3)
+    assert np.isnan(gyro.nu[:, :3]).all() and gyro.valid[5:-5].all()
     half = motion(trial({"roll": body.columns(T, "euler")["roll"], "r": T * 0.0}), VEHICLE)
     assert np.isnan(half.quaternion).all()
     lost = motion(trial({name: body.columns(T, "position")[name] for name in "xy"} | {"r": T * 0.0}), VEHICLE)
     assert np.isnan(lost.nu[:, :3]).all()
 
 
-def test_a_tilt_without_heading_still_finds_gravity():
-    """Roll and pitch from an inertial sensor are enough to free its accelerations of gravity."""
+def test_a_tilt_without_heading_is_a_tilt():
+    """Roll and pitch from an inertial sensor, with a heading of 0."""
     body = MovingBody(11)
-    channels = body.columns(T, "velocity", "rates", "acceleration", "euler")
+    channels = body.columns(T, "velocity", "rates", "euler")
     del channels["yaw"]
     m = motion(trial(channels), VEHICLE)
-    assert m.nu_dot_source[:3] == ("imu",) * 3
-    assert_close(m.nu_dot, body.nu_dot(m.t), inner(m), 2e-3)
     roll, pitch, _ = quat_to_euler(m.quaternion)
     np.testing.assert_allclose(roll[inner(m)], channels["roll"][inner(m)], atol=1e-5)
     np.testing.assert_allclose(pitch[inner(m)], channels["pitch"][inner(m)], atol=1e-5)
@@ -195,9 +169,6 @@ def test_streams_of_different_rates_and_jitter_come_onto_one_grid():
     assert m.rate == pytest.approx(100.0, rel=0.05)
     np.testing.assert_allclose(np.diff(m.t), 1.0 / m.rate)
     assert_close(m.nu, body.nu(m.t), inner(m), 5e-3)
-    slow = motion(trial(channels, t=t, depth_at=(0.0, 0.0, 0.0)), VEHICLE, rate=20.0)
-    assert slow.rate == 20.0 and len(slow.t) == pytest.approx(200, abs=3)
-    assert_close(slow.nu, body.nu(slow.t), inner(slow), 5e-3)
 
 
 def test_five_hertz_of_wrench_and_velocity():
@@ -208,7 +179,6 @@ def test_five_hertz_of_wrench_and_velocity():
     m = motion(trial(channels, t=t, passive=False, wrench_at="origin"), VEHICLE)
     assert m.rate == pytest.approx(5.0) and m.valid.all()
     assert_close(m.nu, body.nu(m.t), inner(m), 2e-3)
-    assert_close(m.nu_dot, body.nu_dot(m.t), inner(m, 1.0), 0.05)
     np.testing.assert_allclose(m.tau[:, 0], np.sin(m.t), atol=1e-9)
     np.testing.assert_array_equal(m.tau[:, 1:], 0.0)
 
@@ -221,12 +191,9 @@ def test_a_gap_is_left_open_and_is_not_valid():
     for name in "uvw":
         channels[name] = np.where(hole, np.nan, channels[name])
     m = motion(trial(channels), VEHICLE)
-    assert np.isnan(m.nu[hole, :3]).all() and np.isnan(m.nu_dot[hole, :3]).all() and not m.valid[hole].any()
+    assert np.isnan(m.nu[hole, :3]).all() and not m.valid[hole].any()
     assert_close(m.nu, body.nu(m.t), ~hole & inner(m), 1e-4)
     assert m.valid[~hole].all()
-    away = inner(m) & ((m.t < 3.5) | (m.t > 6.5))
-    assert_close(m.nu_dot, body.nu_dot(m.t), away, 2e-3)
-    assert motion(trial(channels), VEHICLE, max_gap=3.0).valid.all()
 
 
 def test_noise_is_estimated_by_axis():
@@ -250,33 +217,9 @@ def test_phases_and_the_wrench_ride_along():
     channels = body.columns(T, "velocity") | {"tau_z": np.where(T < 8.0, 2.0, np.nan)}
     made = trial(channels, passive=False, wrench_at=(0.5, 0.0, 0.0))
     made = replace(made, phase=np.where(T < 3.0, "baseline", np.where(T < 7.0, "excitation", "")))
-    m = motion(made, VEHICLE, rate=40.0)
+    m = motion(made, VEHICLE)
     assert [str(m.phase[np.argmin(abs(m.t - s))]) for s in (1.0, 2.98, 3.0, 6.9, 9.0)] == [
         "baseline", "baseline", "excitation", "excitation", "",
     ]  # fmt: skip
     np.testing.assert_allclose(m.tau[10], [0.0, 0.0, 2.0, 0.0, -1.0, 0.0])
     assert m.valid[m.t < 7.9].all() and not m.valid[m.t > 8.1].any()
-
-
-@pytest.mark.parametrize("wrong", [{"rate": 0.0}, {"rate": -5.0}, {"max_gap": 0.0}])
-def test_rates_and_gaps_must_be_positive(wrong):
-    """A refusal that names the number."""
-    with pytest.raises(CalibrationError, match="expected a number above 0"):
-        motion(trial({"r": T * 0.0}), VEHICLE, **wrong)
-
-
-def test_an_accelerometer_that_tells_less_than_the_velocity_is_not_used():
-    """Too noisy, or sampled too slowly to follow: the slope of the velocity is closer to the truth."""
-    body = MovingBody(17)
-    rng = np.random.default_rng(0)
-    channels = body.columns(T, "velocity", "rates", "quaternion", "acceleration")
-    for name in "uvw":
-        channels[name] = channels[name] + 0.003 * rng.normal(size=len(T))
-    noisy = channels | {name: channels[name] + 3.0 * rng.normal(size=len(T)) for name in ("ax", "ay", "az")}
-    sparse = channels | {
-        name: np.where(np.arange(len(T)) % 30 == 0, channels[name], np.nan) for name in ("ax", "ay", "az")
-    }
-    for made in (noisy, sparse):
-        m = motion(trial(made), VEHICLE)
-        assert m.nu_dot_source == ("smoothed velocity",) * 6
-    assert motion(trial(channels), VEHICLE).nu_dot_source[:3] == ("imu",) * 3

@@ -48,7 +48,7 @@ def test_a_sine_without_noise_and_its_slope(rate):
 @pytest.mark.parametrize("rate", [5.0, 20.0, 50.0, 100.0])
 @pytest.mark.parametrize("noise", [0.003, 0.01, 0.03])
 def test_the_strength_follows_the_noise(rate, noise):
-    """Noise is estimated from the data, and value and slope are wrong by about what is claimed."""
+    """Noise is estimated from the data, and the slope is wrong by about what is claimed."""
     at = np.linspace(0.5, 14.0, 500)
     v, a = surge(at)
     errors, found = [], []
@@ -59,10 +59,10 @@ def test_the_strength_follows_the_noise(rate, noise):
         errors.append(
             [np.sqrt(np.mean((s.value[:, 0] - v) ** 2)), np.sqrt(np.mean((s.slope[:, 0] - a) ** 2))]
         )
-        found.append([s.noise[0], s.value_std[0], s.slope_std[0]])
-    (value, slope), (sigma, value_std, slope_std) = np.mean(errors, axis=0), np.mean(found, axis=0)
+        found.append([s.noise[0], s.slope_std[0]])
+    (value, slope), (sigma, slope_std) = np.mean(errors, axis=0), np.mean(found, axis=0)
     assert sigma == pytest.approx(noise, rel=0.25, abs=0.002)
-    assert value < noise and 0.5 < value / value_std < 2.0
+    assert value < noise
     assert 0.5 < slope / slope_std < 2.5
 
 

@@ -12,9 +12,8 @@ from rich.console import Console
 from calibration.made_fits import SET, made_fit
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.output.calibrate import all_findings, calibrated, concerns, kept, number_in
-from finssim.calibration.output.fit_output import fit_json, print_fit, state_text
-from finssim.calibration.output.origins import number_origins
-from finssim.calibration.output.vehicle_file import write_vehicle
+from finssim.calibration.output.report import fit_json, print_fit, state_text
+from finssim.calibration.output.vehicle_file import number_origins, write_vehicle
 from finssim.vehicles import load_vehicle
 
 

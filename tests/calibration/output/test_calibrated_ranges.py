@@ -10,7 +10,7 @@ from calibration.made_fits import SET, made_fit
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Estimate
 from finssim.calibration.output.calibrate import calibrated
-from finssim.calibration.output.calibrated_ranges import range_factors, write_ranges
+from finssim.calibration.output.ranges import range_factors, write_ranges
 from finssim.engine.randomize import Randomization
 from finssim.engine.ranges_file import load_ranges
 from finssim.tasks import TASKS, Environment

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.output.correlated_ranges import correlated_normals, write_correlated_ranges
+from finssim.calibration.output.ranges import correlated_normals, write_correlated_ranges
 from finssim.engine.ranges_file import load_ranges
 from finssim.vehicles import load_vehicle
 from reference.draws import column, draw

@@ -9,8 +9,7 @@ import pytest
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.regression.passive import free_motion, passive
 from finssim.calibration.regression.regress import regress
-from finssim.calibration.trials.header import Header
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial import Header, Trial
 from finssim.geometry.rotations import quat_from_euler
 from finssim.vehicles import load_vehicle
 

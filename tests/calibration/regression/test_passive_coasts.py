@@ -5,8 +5,7 @@ import pytest
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.regression.passive import passive
-from finssim.calibration.trials.header import Header
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial import Header, Trial
 from finssim.vehicles import load_vehicle
 
 VEHICLE = load_vehicle("bluerov2")

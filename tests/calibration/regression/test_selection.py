@@ -61,8 +61,7 @@ def test_unknown_damping_is_refused():
 def test_slow_speeds_do_not_make_a_quadratic_term():
     """Steps of 1 N: at 2 cm/s the quadratic damping of heave cannot show; it is not called identifiable."""
     from finssim.calibration.excitation.programmes import programmes
-    from finssim.calibration.excitation.recording import record
-    from finssim.calibration.excitation.synthetic import trials_of
+    from finssim.calibration.excitation.synthetic import record, trials_of
     from finssim.vehicles import load_vehicle
 
     vehicle = load_vehicle("finsrov").replace(

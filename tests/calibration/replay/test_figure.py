@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from finssim.calibration.replay.figure import draw_ahead, draw_overlay, draw_response_envelopes, normalised
-from finssim.calibration.replay.metrics import error_ahead
-from finssim.calibration.replay.pairs import Pair, find_phases
+from finssim.calibration.replay.metrics import Pair, error_ahead, find_phases
+from finssim.calibration.replay.report import draw_ahead, draw_overlay, draw_response_envelopes, normalised
 
 T = np.arange(501) / 50.0
 MODELS = (("calibrated", 0.8), ("mesh", 1.5))

@@ -155,11 +155,6 @@ def test_a_slow_log_is_compared_at_its_own_rate(rate):
 def test_every_kind_of_input_drives_the_replay(inputs):
     result = replay(make("yaw", inputs=(inputs,)), FINSROV)
     assert result.aggregate("calibrated").value < 0.03
-    gate = result.as_json()["trials"]["yaw_plus_1"]["models"]["calibrated"]["gates"]["yaw"]["input wrench"]
-    if inputs == "command":
-        assert gate["passed"] is None and "not known" in gate["why"]
-    else:
-        assert gate["passed"]
 
 
 def test_a_passive_trial_is_replayed_from_its_initial_state():

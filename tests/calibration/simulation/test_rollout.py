@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.simulation.rollout import Rollouts, warm_motors
-from finssim.calibration.simulation.segments import Segment
+from finssim.calibration.simulation.rollout import Rollouts, Segment, warm_motors
 from finssim.engine.simulator import Simulator
 from finssim.vehicles import load_vehicle
 

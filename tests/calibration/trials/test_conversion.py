@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.calibration.trials.conversion import shifted
-from finssim.calibration.trials.header import Conversion
+from finssim.calibration.trials.trial import Conversion
 from finssim.calibration.trials.trial_files import load_trial
 from finssim.geometry.frames import TO_FOSSEN
 from finssim.geometry.rotations import quat_from_euler, quat_multiply, quat_rotate, quat_to_euler

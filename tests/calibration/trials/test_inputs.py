@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.trials.header import Header
 from finssim.calibration.trials.inputs import applied_wrench, drive, implausible, require_fittable
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial import Header, Trial
 from finssim.vehicles import Vehicle, load_vehicle
 
 FINSROV = load_vehicle("finsrov")

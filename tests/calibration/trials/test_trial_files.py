@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.trials.header import Header
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.trials.trial import Header, Trial
 from finssim.calibration.trials.trial_files import load_trial, load_trials, write_trial
 from finssim.files import OutputError
 

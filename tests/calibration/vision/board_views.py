@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from finssim.calibration.vision.camera_fit import Board, BoardView, see_board
+from finssim.calibration.vision.camera import Board, BoardView, see_board
 from finssim.geometry.optics import Lens
 from finssim.geometry.rotations import quat_from_euler, quat_to_matrix
 from finssim.localization.detection.pictures import pictures

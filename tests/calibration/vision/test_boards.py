@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.vision.camera_fit import Board, board_found, parse_size, see_board
+from finssim.calibration.vision.camera import Board, board_found, parse_size, see_board
 
 CHESSBOARD = Board(columns=9, rows=6, square=0.025)
 H = np.array([[1500.0, 260.0, 120.0], [-180.0, 1420.0, 130.0], [0.35, 0.25, 1.0]])

@@ -7,7 +7,7 @@ import pytest
 
 from calibration.vision.board_views import PHOTOGRAPHS
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.vision.camera_command import run
+from finssim.calibration.vision.camera import run
 from finssim.localization.camera_file import load_camera
 
 SOME = [PHOTOGRAPHS / f"left{i:02d}.jpg" for i in (1, 2, 3, 5, 6, 8)]

@@ -9,7 +9,7 @@ import pytest
 from calibration.vision.board_views import LENSES, PHOTOGRAPHS, photographed, views
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.uncertainty import intervals, trial_covariance
-from finssim.calibration.vision.camera_fit import (
+from finssim.calibration.vision.camera import (
     MODELS,
     adjust,
     calibrate_camera,

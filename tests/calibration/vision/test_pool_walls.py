@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.calibration.vision.pool_fit import calibrate_pool
+from finssim.calibration.vision.pool_fit import CAMERA, calibrate_pool
 from finssim.calibration.vision.pool_model import Settings
-from finssim.calibration.vision.pool_search import CAMERA
 from finssim.geometry.optics import Interface, Status, project
 from finssim.geometry.rotations import quat_from_rotvec, quat_to_matrix
 

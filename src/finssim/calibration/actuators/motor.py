@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.actuators.steps import find_steps
-from finssim.calibration.actuators.thrust_curve import jackknife
+from finssim.calibration.actuators.thrust_table import find_steps
+from finssim.calibration.actuators.thruster import jackknife
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
@@ -24,7 +24,7 @@ from finssim.calibration.uncertainty import Evidence, correlated_samples, interv
 from finssim.vehicles import Vehicle
 from finssim.vehicles.thruster import Thruster
 
-__all__ = ["LOOP_RATE", "Response", "StepRecord", "cut_steps", "fit_motor", "fit_response", "loop_gains"]
+__all__ = ["LOOP_RATE", "cut_steps", "fit_motor", "fit_response", "loop_gains"]
 
 Array = NDArray[np.float64]
 
@@ -562,8 +562,6 @@ def fit_motor(
     trials: Iterable[Trial],
     vehicle: Vehicle,
     *,
-    thrusters: Sequence[str] | None = None,
-    loop_rate: float | None = None,
     seed: int = 0,
 ) -> Fit:
     """Fit first order plus dead time to the steps of each thruster, in the vehicle file's domain.
@@ -574,8 +572,6 @@ def fit_motor(
     Args:
         trials: With a held and changed command and its response per thruster; see `log_of` for the columns.
         vehicle: Whose thrusters they are; its curves turn thrust into speed.
-        thrusters: The only ones to look at; all that the trials hold where not given.
-        loop_rate: Of the motor controller's speed loop [Hz]; `LOOP_RATE` if None.
         seed: For the record; the intervals need no random numbers.
 
     Returns:
@@ -584,9 +580,9 @@ def fit_motor(
     Raises:
         CalibrationError: No trial holds a command that steps and its response.
     """
-    trials, loop_rate = list(trials), LOOP_RATE if loop_rate is None else loop_rate
+    trials = list(trials)
     studies, findings = [], list[Finding]()
-    for name in _names(trials, vehicle, thrusters):
+    for name in _names(trials, vehicle):
         found = study(name, trials, vehicle.thrusters[name])
         if found is None:
             findings.append(finding("no_steps", name))
@@ -610,27 +606,18 @@ def fit_motor(
         kind="motor",
         method="first order plus dead time",
         vehicle=vehicle,
-        estimates={e.name: e for e in [*estimates, *_loop([s for s in speeds if s is not None], loop_rate)]},
+        estimates={e.name: e for e in [*estimates, *_loop([s for s in speeds if s is not None])]},
         changes=changes,
         quality={found.name: quality_of(found) for found in studies},
         curves=tuple(curve_of(found) for found in studies),
         findings=tuple(dict.fromkeys(findings)),
         trials={trial.name: trial.sha256 for trial in trials},
-        settings={"thrusters": thrusters, "loop_rate": loop_rate, "seed": seed},
+        settings={"loop_rate": LOOP_RATE, "seed": seed},
     )
 
 
-def _names(trials: Sequence[Trial], vehicle: Vehicle, thrusters: Sequence[str] | None) -> list[str]:
-    unknown = [name for name in thrusters or () if name not in vehicle.thrusters]
-    if unknown:
-        raise CalibrationError(
-            f"{vehicle.name} has no thruster '{unknown[0]}': it has {', '.join(vehicle.thrusters)}"
-        )
-    names = [
-        name
-        for name in vehicle.thrusters
-        if (thrusters is None or name in thrusters) and any(_columns(trial, name) for trial in trials)
-    ]
+def _names(trials: Sequence[Trial], vehicle: Vehicle) -> list[str]:
+    names = [name for name in vehicle.thrusters if any(_columns(trial, name) for trial in trials)]
     if not names:
         shown = ", ".join(trial.name for trial in trials) or "no trial"
         raise CalibrationError(
@@ -678,7 +665,7 @@ def _untested(
 # Feed-forward plus PID for the motor controller.
 
 LOOP_RATE = 200.0
-"""Of the motor controller where the caller does not say [Hz]."""
+"""Of the motor controller [Hz]."""
 
 LEAST_CLOSED = 0.2
 """Least time constant of the closed loop, as a part of the motor's: keeps the gain below 5 / K."""
@@ -737,7 +724,7 @@ def _in_speed(found: Study, trials: Sequence[Trial], vehicle: Vehicle) -> Study 
     )
 
 
-def _loop(studies: Sequence[Study], loop_rate: float) -> list[Estimate]:
+def _loop(studies: Sequence[Study]) -> list[Estimate]:
     """One set of gains for all motors; none where no speed follows a speed."""
     usable = [found for found in studies if found.same_unit and found.gain[0] > 0.0]
     if not usable:
@@ -749,8 +736,8 @@ def _loop(studies: Sequence[Study], loop_rate: float) -> list[Estimate]:
         )
     )
     late = max(found.response.delay_interval[1] for found in usable)
-    gains = loop_gains(gain, delay, tau, late=min(late, delay + tau), loop_rate=loop_rate)
-    note = f"speed over speed, loop at {loop_rate:g} Hz; follows from gain, delay and time constant"
+    gains = loop_gains(gain, delay, tau, late=min(late, delay + tau), loop_rate=LOOP_RATE)
+    note = f"speed over speed, loop at {LOOP_RATE:g} Hz; follows from gain, delay and time constant"
     return [
         Estimate(
             name=f"speed_loop.{key}", estimate=gains[key], ci95=(math.nan, math.nan), unit=unit, identifiable=True,

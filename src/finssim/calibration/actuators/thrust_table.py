@@ -6,6 +6,7 @@ import hashlib
 import math
 import os
 import re
+import statistics
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from itertools import zip_longest
@@ -15,14 +16,126 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.actuators.steps import last_parts
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.units import TIME_UNITS, UNITS
 from finssim.text_table import TextTable, read_text_table
 
-__all__ = ["ThrustTable", "read_table", "tables_of_trial", "STANDING"]
+__all__ = ["STANDING", "ThrustTable", "find_steps", "levels", "read_table", "tables_of_trial"]
+
+Array = NDArray[np.float64]
+
+LAST = 0.4
+"""Part of a level that counts as settled: the last 2 s of 5 s."""
+SHORTEST = 0.5
+"""Shortest level that can settle [s]."""
+LEAST_COVERED = 0.5
+"""Share of the time that levels must cover for a log to be one of levels; a slower sweep is used as it is."""
+SETTLING = 50
+"""Samples of a run after which its median no longer moves, so that a slow ramp is not one run."""
+TOLERANCE = 0.02
+"""Band around a level within which a measured signal still counts as held, of its range."""
+
+
+class Step(NamedTuple):
+    """A change of a held signal and what follows until the next one."""
+
+    start: float
+    """Time of the last sample before the change, from which the signal could have changed [s]."""
+    time: float
+    """Time of the first sample after the change [s]."""
+    end: float
+    """Time of the last sample before the next change, or of the log [s]."""
+    before: float
+    after: float
+
+
+def levels(x: Array, tolerance: float) -> list[tuple[int, int]]:
+    """Runs of samples that stay within `tolerance` of their running median, [first, last) each, covering all.
+
+    One stray sample does not end a run, two do.
+    """
+    runs, first = [], 0
+    values = x.tolist()
+    centre = values[0] if values else 0.0
+    for i in range(1, len(values)):
+        if values[i] == centre:
+            continue
+        outside = abs(values[i] - centre) > tolerance
+        if outside and (i + 1 >= len(values) or abs(values[i + 1] - centre) > tolerance):
+            runs.append((first, i))
+            first, centre = i, values[i]
+        elif not outside and i - first < SETTLING:
+            centre = statistics.median(values[first : i + 1])
+    if values:
+        runs.append((first, len(values)))
+    return runs
+
+
+def last_parts(values: dict[str, Array]) -> tuple[dict[str, Array], Finding]:
+    """Steady rows of a log over time: the mean over the last 40 % of each level of the pulse or of the speed.
+
+    Args:
+        values: `time` [s] and any of speed, force, pulse, voltage, (n,) each.
+
+    Returns:
+        The same without `time`, one row per level, and a finding; the rows as they are if the log holds no levels (a
+        slow sweep).
+    """
+    times = values["time"]
+    others = {key: value for key, value in values.items() if key != "time"}
+    drive = values.get("pulse", values.get("speed"))
+    assert drive is not None
+    good = np.flatnonzero(np.isfinite(drive) & np.isfinite(times))
+    span = float(np.ptp(drive[good])) if good.size else 0.0
+    band = TOLERANCE * span if "pulse" not in values else 0.002 * span
+    rows, covered = [], 0.0
+    for first, last in levels(drive[good], band):
+        index = good[first:last]
+        length = float(times[index[-1]] - times[index[0]])
+        half = len(index) // 2
+        if length < SHORTEST or half < 2:
+            continue
+        settled = index[times[index] >= times[index[-1]] - LAST * length]
+        drift = abs(np.mean(drive[index[half:]]) - np.mean(drive[index[half // 2 : half]]))
+        if drift <= 0.25 * band:
+            rows.append(settled)
+            covered += length
+    if len(rows) < 3 or covered < LEAST_COVERED * float(times[good[-1]] - times[good[0]]):
+        return others, finding("read_as_sweep", rows=len(times))
+    steady = {key: np.array([_mean(value[row]) for row in rows]) for key, value in others.items()}
+    return steady, finding("read_as_levels", levels=len(rows), share=LAST)
+
+
+def _mean(values: Array) -> float:
+    good = values[np.isfinite(values)]
+    return float(np.mean(good)) if good.size else float("nan")
+
+
+def find_steps(t: Array, command: Array, *, shortest: float = 0.2) -> list[Step]:
+    """Every change of a held command that lasts.
+
+    Args:
+        t: Times [s], (n,).
+        command: Its values, finite, (n,).
+        shortest: Levels shorter than this are passed over [s].
+
+    Returns:
+        Steps in order of time; none where the command never holds still.
+    """
+    span = float(np.ptp(command)) if command.size else 0.0
+    if span == 0.0:
+        return []
+    runs = levels(command, 0.01 * span)
+    held = [(a, b) for a, b in runs if t[b - 1] - t[a] >= shortest]
+    if len(runs) > 4 * len(held):  # a command that moves all the time
+        return []
+    return [
+        Step(float(t[a2 - 1]), float(t[a2]), float(t[b2 - 1]), _mean(command[a1:b1]), _mean(command[a2:b2]))
+        for (a1, b1), (a2, b2) in zip(held, held[1:], strict=False)
+    ]
+
 
 # Which column of a bench table holds what, and in which unit.
 
@@ -198,8 +311,6 @@ def _plain(unit: str) -> str:
     text = unit.strip().lower().replace("µ", "u").replace("μ", "u").replace("·", "").replace("^", "")
     return re.sub(r"\s+|\.", "", text.replace(" per ", "/")).replace("rad_s", "rad/s")
 
-
-Array = NDArray[np.float64]
 
 # The signs of speeds and forces in a table, and the zero of its load cell.
 

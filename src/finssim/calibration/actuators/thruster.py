@@ -6,7 +6,8 @@ import math
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,16 +15,580 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.calibration.actuators.thrust_table import STANDING, ThrustTable, read_table, tables_of_trial
-from finssim.calibration.actuators.thruster_bench import SIDES, Bench, bench
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding, finding
+from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.trials.trial import Trial
 from finssim.calibration.trials.trial_files import load_trial
-from finssim.vehicles import Vehicle
+from finssim.vehicles import Esc, Vehicle
 from finssim.vehicles.thruster import Thruster
 
-__all__ = ["fit_thruster"]
+__all__ = ["dead_zone", "fit_esc", "fit_side", "fit_thruster", "jackknife"]
+
+Array = NDArray[np.float64]
+
+BLOCKS = 10
+"""Parts of equal weight that a table is cut into for intervals."""
+OUTLIER = 6.0
+"""Scaled median deviations beyond which a row is left out, if it is also off by `COARSE` of the largest force."""
+COARSE = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class Side:
+    """c of one direction of rotation."""
+
+    c: float
+    """T = c ω², [N s²/rad²]."""
+    half_width: float
+    """Of the 95 % interval; infinite from a single row."""
+    r2: float
+    """Share of the variance of the forces of this direction that the curve explains."""
+    rmse: float
+    """[N]"""
+    samples: int
+    rejected: int
+    per_table: tuple[float, ...]
+    """c of every table alone."""
+
+
+def fit_side(tables: Sequence[tuple[Array, Array]]) -> Side | None:
+    """Least squares of |T| = c ω² (paper, eq. 16) over one direction of rotation.
+
+    The residuals of real tables are not noise but the curve's own misfit, alike in neighbouring rows. The interval is
+    the widest of three: a jackknife over blocks of neighbouring speeds (heteroscedastic residuals), first-order
+    autocorrelated residuals (long-lived ones), and, of several tables, what the tables' own c's vary by.
+
+    Args:
+        tables: Speed |ω| [rad/s] and thrust along this direction [N] of the turning rows, (n,) each, per table.
+
+    Returns:
+        None where there is no row.
+    """
+    tables = [(w, f) for w, f in tables if len(w)]
+    if not tables:
+        return None
+    square, force = np.concatenate([w**2 for w, _ in tables]), np.concatenate([f for _, f in tables])
+    keep = np.ones(len(square), bool)
+    for _ in range(5):
+        c = _slope(square[keep], force[keep])
+        error = np.abs(force - c * square)
+        limit = max(OUTLIER * 1.4826 * float(np.median(error)), COARSE * float(np.max(np.abs(force))))
+        if np.array_equal(keep, error <= limit):
+            break
+        keep = error <= limit
+    owner = np.concatenate([np.full(len(w), i) for i, (w, _) in enumerate(tables)])
+    rows = [keep & (owner == i) for i in range(len(tables))]
+    blocks = [_blocks(square[row], force[row]) for row in rows]
+    per_table = tuple(_slope(*_joined(parts)) for parts in blocks if parts)
+    parts = [part for of_table in blocks for part in of_table]
+    leave_out = (
+        [_slope(*_joined(parts[:i] + parts[i + 1 :])) for i in range(len(parts))] if len(parts) > 1 else []
+    )
+    half_width = jackknife(np.array(leave_out)[:, None])[0] if leave_out else np.inf
+    half_width = max(half_width, _autocorrelated([(square[row], force[row]) for row in rows], c))
+    if len(per_table) > 1:
+        spread = float(np.std(per_table, ddof=1)) / np.sqrt(len(per_table))
+        half_width = max(half_width, t_quantile(len(per_table) - 1) * spread)
+    error = force[keep] - c * square[keep]
+    total = float(np.sum((force[keep] - np.mean(force[keep])) ** 2))
+    return Side(
+        c=c,
+        half_width=float(half_width),
+        r2=1.0 - float(error @ error) / total if total > 0.0 else float("nan"),
+        rmse=float(np.sqrt(np.mean(error**2))),
+        samples=int(np.count_nonzero(keep)),
+        rejected=int(np.count_nonzero(~keep)),
+        per_table=per_table,
+    )
+
+
+def jackknife(leave_one_out: Array) -> Array:
+    """Half-widths of 95 % intervals from estimates that each leave one of G blocks out, (G, P) -> (P,)."""
+    G = len(leave_one_out)
+    deviation = leave_one_out - np.mean(leave_one_out, axis=0)
+    return t_quantile(G - 1) * np.sqrt((G - 1) / G * np.sum(deviation**2, axis=0))
+
+
+def t_quantile(dof: int) -> float:
+    """97.5 % point of Student's t."""
+    from scipy.stats import t  # SciPy is slow to import
+
+    return float(t.ppf(0.975, dof))
+
+
+def _slope(square: Array, force: Array) -> float:
+    return float(square @ force / (square @ square))
+
+
+def _blocks(square: Array, force: Array) -> list[tuple[Array, Array]]:
+    """Neighbouring speeds in at most `BLOCKS` parts of about equal Σ ω⁴; of a short table every row."""
+    if square.size == 0:
+        return []
+    order = np.argsort(square)
+    square, force = square[order], force[order]
+    if len(square) < 2 * BLOCKS:
+        return [(square[i : i + 1], force[i : i + 1]) for i in range(len(square))]
+    share = (np.cumsum(square**2) - 0.5 * square**2) / np.sum(square**2)
+    label = np.minimum(share * BLOCKS, BLOCKS - 1).astype(int)
+    return [(square[label == i], force[label == i]) for i in np.unique(label)]
+
+
+def _autocorrelated(tables: Sequence[tuple[Array, Array]], c: float) -> float:
+    """Half-width of the interval of c if residuals in order of speed are a first-order autoregression."""
+    from scipy.signal import lfilter  # SciPy is slow to import
+
+    variance, information, independent = 0.0, 0.0, 0.0
+    for square, force in tables:
+        order = np.argsort(square)
+        x, error = square[order], force[order] - c * square[order]
+        n, power = len(x), float(error @ error)
+        if n < 3 or power == 0.0:
+            continue
+        phi = float(error[1:] @ error[:-1]) / power
+        phi = float(
+            np.clip(phi + (1.0 + 3.0 * phi) / n, 0.0, 0.95)
+        )  # least squares finds it too small (Kendall 1954)
+        spread = 2.0 * float(x @ lfilter([1.0], [1.0, -phi], x)) - float(x @ x)  # Σ_ij x_i x_j φ^|i-j|
+        spent = spread / float(x @ x)  # degrees of freedom that fitting c takes out of the residuals
+        variance += power / max(n - spent, 0.5 * n) * spread
+        information += float(x @ x)
+        independent += n * (1.0 - phi**2) / (1.0 + phi**2)
+    if information == 0.0:
+        return 0.0
+    return t_quantile(max(int(independent) - 1, 1)) * float(np.sqrt(variance)) / information
+
+
+def _joined(parts: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
+    return np.concatenate([s for s, _ in parts]), np.concatenate([f for _, f in parts])
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeadZone:
+    """The slowest speed of one direction that turns the shaft [rad/s, >= 0]."""
+
+    speed: float
+    interval: tuple[float, float]
+    known: bool
+    """Whether the table shows a gap; otherwise `speed` is 0 and the interval ends at the slowest speed seen."""
+    note: str = ""
+
+
+def dead_zone(speed: Array) -> DeadZone | None:
+    """The gap between standstill and the slowest turning shaft.
+
+    It shows only where the table goes down to standstill and the gap is more than three times the distance between the
+    speeds above it; otherwise the speeds in between were not tried.
+
+    Args:
+        speed: Along one direction [rad/s]; standing rows near 0, (n,).
+
+    Returns:
+        None where nothing turns.
+    """
+    fastest = float(np.max(speed, initial=0.0))
+    turning = np.sort(speed[speed > STANDING * fastest])
+    if fastest <= 0.0 or turning.size < 2:
+        return None
+    slowest = float(turning[0])
+    standing = speed[np.abs(speed) <= STANDING * fastest]
+    if standing.size == 0:
+        note = "the table holds no standstill: its slowest speed is an upper limit"
+        return DeadZone(speed=0.0, interval=(0.0, slowest), known=False, note=note)
+    gap, spacing = slowest - float(np.max(standing)), float(np.median(np.diff(turning[:8])))
+    if gap <= 3.0 * spacing:
+        note = "speeds between standstill and the slowest were not tried"
+        return DeadZone(speed=0.0, interval=(0.0, slowest), known=False, note=note)
+    return DeadZone(speed=slowest, interval=(max(slowest - 2.0 * spacing, 0.0), slowest), known=True)
+
+
+# The law between pulse width, battery voltage and shaft speed, fitted to tables.
+
+PULSE_BLOCKS = 8
+"""Parts that the pulses of a direction are cut into for intervals."""
+LEAST_ROWS = 5
+"""Turning rows per direction from which the law is fitted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EscFit:
+    """A fitted speed controller."""
+
+    esc: Esc
+    intervals: dict[str, tuple[float, float]]
+    """95 %, of every fitted field of `esc`."""
+    rmse: float
+    """Of the speed [rad/s]."""
+    fastest: float
+    """Fastest speed among the rows [rad/s]."""
+    unsure: dict[str, str]
+    """Field -> why the data do not determine it."""
+
+
+def fit_esc(
+    pulse: Array,
+    speed: Array,
+    voltage: Array,
+    *,
+    pulse_range: tuple[float, float, float],
+    weight: Array | None = None,
+    at: float | None = None,
+) -> EscFit:
+    """Fit `finssim.vehicles.Esc` by least squares of the shaft speed, each direction by itself.
+
+    Args:
+        pulse: [µs], (n,).
+        speed: Steady shaft speed [rad/s], of the sign of pulse - neutral, 0 where the shaft stands, (n,).
+        voltage: Of the battery [V], (n,).
+        pulse_range: Full reverse, neutral, full forward [µs].
+        weight: Of the rows' speeds, (n,); 1 where not given.
+        at: Voltage for which the dead band is told [V]; the mean where not given.
+
+    Raises:
+        CalibrationError: A direction has too few turning rows, or the shaft turns against the pulse.
+    """
+    low, neutral, high = pulse_range
+    volts = float(np.mean(voltage)) if at is None else at
+    weight = np.ones_like(speed) if weight is None else weight
+    numbers: dict[str, float] = {}
+    intervals: dict[str, tuple[float, float]] = {}
+    unsure: dict[str, str] = {}
+    for name, sign, span in (("minus", -1, neutral - low), ("plus", 1, high - neutral)):
+        side = sign * (pulse - neutral) > 0.0
+        throw, omega = sign * (pulse[side] - neutral), sign * speed[side]
+        turning = np.abs(omega) > STANDING * np.max(np.abs(omega), initial=0.0)
+        _check(omega[turning], name)
+        near = np.abs(voltage[side] - volts) <= 0.05 * volts
+        edge, edge_interval, note = _edge(throw, turning, near if np.any(near & turning) else near | True)
+        if note:
+            unsure[f"dead_{name}"] = note
+        law = (throw[turning] / span, voltage[side][turning], omega[turning], weight[side][turning])
+        zero, emf, load = _law(*law, edge / span)
+        label = np.argsort(np.argsort(law[0], kind="stable")) * PULSE_BLOCKS // len(law[0])
+        left_out = [
+            _law(*_others(law, label != i), edge / span) for i in range(PULSE_BLOCKS) if np.any(label == i)
+        ]
+        half = jackknife(np.array(left_out))
+        numbers |= {f"dead_{name}": neutral + sign * edge, f"zero_{name}": neutral + sign * span * zero}
+        numbers |= {f"emf_{name}": emf, f"load_{name}": load}
+        ends = sorted(neutral + sign * x for x in edge_interval)
+        intervals[f"dead_{name}"] = (ends[0], ends[1])
+        intervals[f"zero_{name}"] = _around(numbers[f"zero_{name}"], span * half[0])
+        intervals[f"emf_{name}"] = _around(emf, half[1])
+        intervals[f"load_{name}"] = _around(load, half[2])
+        for key, value, ceiling in (
+            ("zero", zero, edge / span),
+            ("emf", emf, np.inf),
+            ("load", load, np.inf),
+        ):
+            if value <= 1e-9 or value >= ceiling * (1.0 - 1e-9):
+                unsure[f"{key}_{name}"] = "rests on a bound of the law"
+    esc = Esc(pulse_neutral=neutral, pulse_min=low, pulse_max=high, voltage=volts, **numbers)
+    error = esc.shaft_speed(pulse, voltage) - speed
+    both = (speed != 0.0) & (esc.shaft_speed(pulse, voltage) != 0.0)
+    return EscFit(
+        esc=esc,
+        intervals=intervals,
+        rmse=float(np.sqrt(np.mean(error[both] ** 2))),
+        fastest=float(np.max(np.abs(speed))),
+        unsure=unsure,
+    )
+
+
+def _check(omega: Array, name: str) -> None:
+    direction = {"minus": "below", "plus": "above"}[name]
+    if omega.size < LEAST_ROWS:
+        raise CalibrationError(
+            f"{omega.size} rows turn the shaft at pulses {direction} neutral, expected at least {LEAST_ROWS}: "
+            "add rows, or leave the pulse column out to fit the thrust curve alone"
+        )
+    if np.count_nonzero(omega < 0.0) > 0.5 * omega.size:
+        raise CalibrationError(
+            f"the shaft turns backwards at pulses {direction} neutral: turn the sign of the pulse's thruster or of "
+            "speed and force in the table"
+        )
+
+
+def _edge(
+    throw: Array, turning: NDArray[np.bool_], near: NDArray[np.bool_]
+) -> tuple[float, tuple[float, float], str]:
+    """Pulse from neutral at which the shaft starts [µs], its interval, and why it is not known."""
+
+    first = float(np.min(throw[turning & near]))
+    standing = throw[~turning & near & (throw < first)]
+    if standing.size == 0:
+        return first, (0.0, first), "the table holds no pulse that leaves the shaft standing"
+    last = float(np.max(standing))
+    return 0.5 * (last + first), (last, first), ""
+
+
+def _law(duty: Array, volts: Array, omega: Array, weight: Array, edge: float) -> tuple[float, float, float]:
+    """zero, emf and load of (duty - zero) V = emf ω + load ω² with 0 <= zero <= edge."""
+    from scipy.optimize import least_squares, nnls  # SciPy is slow to import
+
+    # Linear in the parameters where the balance of voltages is the residual: the start of the search in speed.
+    rows = np.column_stack([omega, omega**2, volts])
+    start, _ = nnls(rows, duty * volts)
+    scale = np.array([max(edge, 1e-3), float(np.median(volts / omega)), float(np.median(volts / omega**2))])
+    first = np.clip(
+        [min(start[2], 0.9 * edge), start[0], start[1]], 1e-3 * scale, [max(edge, 1e-3), np.inf, np.inf]
+    )
+    found = least_squares(
+        partial(_residual, duty=duty, volts=volts, omega=omega, weight=weight),
+        first,
+        bounds=([0.0, 0.0, 0.0], [max(edge, 2e-3), np.inf, np.inf]),
+        x_scale=scale,
+    )
+    zero, emf, load = (float(x) for x in found.x)
+    return min(zero, edge), emf, load
+
+
+def _residual(parameters: Array, duty: Array, volts: Array, omega: Array, weight: Array) -> Array:
+    zero, emf, load = parameters
+    share = np.maximum((duty - zero) * volts, 0.0)
+    denominator = np.maximum(emf + np.sqrt(emf**2 + 4.0 * load * share), 1e-12)
+    return weight * (2.0 * share / denominator - omega)
+
+
+def _others(
+    law: tuple[Array, Array, Array, Array], rows: NDArray[np.bool_]
+) -> tuple[Array, Array, Array, Array]:
+    duty, volts, omega, weight = law
+    return duty[rows], volts[rows], omega[rows], weight[rows]
+
+
+def _around(value: float, half: float) -> tuple[float, float]:
+    return (float(value - half), float(value + half))
+
+
+SIDES = (("plus", 1.0), ("minus", -1.0))
+"""Name and sign of the two directions of rotation."""
+
+SAME_VOLTAGE = 0.75
+"""Voltages nearer than this are one level [V]; a battery's sag within a run is not another level."""
+PULSE_RANGE = (1100.0, 1500.0, 1900.0)
+"""Reverse, neutral and forward of hobby speed controllers [µs], where the vehicle file does not say."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bench:
+    """What the tables of one target say."""
+
+    levels: tuple[tuple[float, ThrustTable], ...]
+    """Tables by voltage [V], NaN where it is not known."""
+    voltage: float
+    """At which the numbers hold [V]; NaN where it is not known."""
+    fitted: tuple[ThrustTable, ...]
+    """The tables that were fitted; the others only check the prediction."""
+    sides: dict[str, Side]
+    """By `plus` and `minus`."""
+    dead: dict[str, DeadZone]
+    fastest: dict[str, tuple[float, bool, float]]
+    """Fastest speed at the voltage [rad/s, > 0], whether the pulse was at its end there, and the distance to the row
+    that is next in speed [rad/s]."""
+    esc: EscFit | None
+    speeds_measured: bool
+    """Whether there are speeds; otherwise they follow from the forces by the vehicle file's curve."""
+    findings: tuple[Finding, ...]
+
+
+def bench(
+    tables: Sequence[ThrustTable],
+    thruster: Thruster,
+    shown: str,
+    *,
+    voltage: float | None,
+    pool_voltages: bool,
+) -> Bench:
+    """Analyse tables of one thruster or of several alike.
+
+    Args:
+        tables: At least one.
+        thruster: As the vehicle file has it.
+        shown: How messages call the target.
+        voltage: At which the numbers shall hold [V]; where not given, the only one of the tables, else that of the
+            vehicle file's ESC, else the middle one.
+        pool_voltages: Fit the speed controller to all voltages together, rather than to this one alone.
+
+    Raises:
+        CalibrationError: The tables hold no such voltage, or nothing to fit.
+    """
+    findings: list[Finding] = []
+    measured = any(np.isfinite(table.speed).any() for table in tables)
+    if measured:
+        tables = [table for table in tables if np.isfinite(table.speed).any()]
+    else:
+        tables = [_with_speeds(table, thruster) for table in tables]
+        findings.append(finding("no_shaft_speeds", shown))
+    levels = [level for table in tables for level in split_by_voltage(table)]
+    chosen = _reference([volts for volts, _ in levels], thruster, shown, voltage)
+    at = [table for volts, table in levels if not abs(volts - chosen) > SAME_VOLTAGE]
+    trends = _trends(levels) if measured else ()
+    others = sorted({round(volts, 1) for volts, table in levels if not any(table is t for t in at)})
+    pooled = pool_voltages or not trends
+    fitted = [table for _, table in levels] if pooled else at
+    if trends and pooled:
+        findings.append(finding("voltage_trend", shown, trends=trends))
+    elif trends:
+        findings.append(finding("voltage_chosen", shown, trends=trends, voltage=chosen))
+    elif others and measured:
+        findings.append(finding("voltage_pooled", shown))
+    sides, dead, fastest = {}, {}, {}
+    for name, sign in SIDES:
+        side = fit_side([turning(table, sign) for table in fitted]) if measured else None
+        if side is not None:
+            sides[name] = side
+        zones = [zone for zone in (dead_zone(sign * table.speed) for table in at) if zone is not None]
+        if zones and measured:
+            dead[name] = _together(zones)
+        speeds = [_fastest(table, sign, _pulse_range(thruster, tables)) for table in at]
+        fastest[name] = max(speeds, default=(0.0, False, 0.0))
+    esc = None
+    if any(np.isfinite(table.pulse).any() for table in tables):
+        on = [table for _, table in levels] if pool_voltages else at
+        esc = _esc(on, thruster, tables, shown, chosen, measured, findings)
+    if not sides and esc is None:
+        said = "; ".join(sentences(findings)) or f"{shown}: no row turns the shaft"
+        raise CalibrationError(f"{said}: nothing could be fitted")
+    findings += [one.about(table.name) for table in tables for one in table.findings]
+    return Bench(
+        levels=tuple(levels),
+        voltage=chosen,
+        fitted=tuple(fitted),
+        sides=sides,
+        dead=dead,
+        fastest=fastest,
+        esc=esc,
+        speeds_measured=measured,
+        findings=tuple(dict.fromkeys(findings)),
+    )
+
+
+def turning(table: ThrustTable, sign: float) -> tuple[Array, Array]:
+    """Speed and thrust along one direction of the rows in which the shaft turns that way."""
+    speed = sign * table.speed
+    rows = speed > STANDING * float(np.max(np.abs(table.speed)))
+    return speed[rows], sign * table.force[rows]
+
+
+def split_by_voltage(table: ThrustTable) -> list[tuple[float, ThrustTable]]:
+    """The rows of every voltage level with its mean; (NaN, table) where no voltage is known."""
+    known = np.isfinite(table.voltage)
+    if not known.any():
+        return [(math.nan, table)]
+    values = np.sort(table.voltage[known])
+    cuts = values[:-1][np.diff(values) > SAME_VOLTAGE] + 0.5 * SAME_VOLTAGE
+    label = np.searchsorted(cuts, table.voltage)
+    parts = [table.at(known & (label == i)) for i in range(len(cuts) + 1)]
+    return [(float(np.mean(part.voltage)), part) for part in parts]
+
+
+def _reference(volts: Sequence[float], thruster: Thruster, shown: str, asked: float | None) -> float:
+    known = sorted(v for v in volts if not math.isnan(v))
+    if not known:
+        return math.nan if asked is None else asked
+    if asked is None:
+        wanted = thruster.esc.voltage if thruster.esc else math.nan
+        near = [v for v in known if abs(v - wanted) <= SAME_VOLTAGE]
+        return near[0] if near else known[len(known) // 2]
+    near = [v for v in known if abs(v - asked) <= SAME_VOLTAGE]
+    if not near:
+        listed = ", ".join(f"{v:g}" for v in dict.fromkeys(round(v, 2) for v in known))
+        raise CalibrationError(f"{shown}: no table at {asked:g} V; there are {listed} V")
+    return min(near, key=lambda v: abs(v - asked))
+
+
+def _trends(levels: Sequence[tuple[float, ThrustTable]]) -> tuple[str, ...]:
+    """How c± change with the voltage, where it is beyond chance and by more than 2 % over the tables."""
+    found = []
+    for name, sign in SIDES:
+        pairs = [
+            (volts, fit_side([turning(table, sign)])) for volts, table in levels if not math.isnan(volts)
+        ]
+        points = np.array([(volts, side.c) for volts, side in pairs if side is not None])
+        if len(points) < 3 or np.ptp(points[:, 0]) < 2.0 * SAME_VOLTAGE:
+            continue
+        V = points[:, 0] - np.mean(points[:, 0])
+        slope = float(V @ points[:, 1] / (V @ V))
+        mean = float(np.mean(points[:, 1]))
+        residual = points[:, 1] - mean - slope * V
+        error = math.sqrt(float(residual @ residual) / (len(V) - 2) / float(V @ V))
+        if abs(slope) > t_quantile(len(V) - 2) * error and abs(slope) * np.ptp(V) > 0.02 * mean:
+            found.append(f"c_{name} changes by {100.0 * slope / mean:+.2g} % per volt")
+    return tuple(found)
+
+
+def _together(zones: Sequence[DeadZone]) -> DeadZone:
+    """One dead zone from those of several tables: their median, over all of their intervals."""
+    known = [zone for zone in zones if zone.known]
+    chosen = known or list(zones)
+    ends = [end for zone in chosen for end in zone.interval]
+    middle = float(np.median([zone.speed for zone in chosen]))
+    return DeadZone(speed=middle, interval=(min(ends), max(ends)), known=bool(known), note=chosen[0].note)
+
+
+def _pulse_range(thruster: Thruster, tables: Sequence[ThrustTable]) -> tuple[float, float, float]:
+    """Reverse, neutral and forward [µs], wide enough for every pulse of the tables."""
+    low, neutral, high = PULSE_RANGE
+    if thruster.esc is not None:
+        low, neutral, high = thruster.esc.pulse_min, thruster.esc.pulse_neutral, thruster.esc.pulse_max
+    pulses = np.concatenate([table.pulse[np.isfinite(table.pulse) & (table.pulse > 0.0)] for table in tables])
+    if pulses.size == 0:
+        return low, neutral, high
+    return min(low, float(pulses.min())), neutral, max(high, float(pulses.max()))
+
+
+def _fastest(
+    table: ThrustTable, sign: float, pulse_range: tuple[float, float, float]
+) -> tuple[float, bool, float]:
+    """Fastest steady speed along a direction, whether the pulse was at its end, and the distance to the next speed."""
+    speeds = np.sort(np.maximum(sign * table.speed, 0.0))
+    best, gap = float(speeds[-1]), float(speeds[-1] - speeds[-2])
+    low, neutral, high = pulse_range
+    end = (high - neutral) if sign > 0.0 else (neutral - low)
+    throws = sign * (table.pulse - neutral)
+    return best, bool(np.isfinite(throws).any() and np.nanmax(throws) >= 0.98 * end), gap
+
+
+def _with_speeds(table: ThrustTable, thruster: Thruster) -> ThrustTable:
+    """The same with the speeds that the vehicle file's curve gives to the forces."""
+    force = np.where(np.abs(table.force) <= STANDING * np.max(np.abs(table.force)), 0.0, table.force)
+    return replace(table, speed=thruster.speed(force))
+
+
+def _esc(
+    on: Sequence[ThrustTable],
+    thruster: Thruster,
+    tables: Sequence[ThrustTable],
+    shown: str,
+    volts: float,
+    measured: bool,
+    findings: list[Finding],
+) -> EscFit | None:
+    """The speed controller, or None and a finding that says why not."""
+    pulse, speed, voltage = (
+        np.concatenate([getattr(t, key) for t in on]) for key in ("pulse", "speed", "voltage")
+    )
+    if math.isnan(volts):
+        findings.append(finding("law_without_voltage", shown))
+        return None
+    voltage = np.where(np.isfinite(voltage), voltage, volts)
+    good = np.isfinite(pulse) & np.isfinite(speed) & (pulse > 0.0)
+    # Speeds that follow from forces are the surer the faster: dω = dT / (2 c ω).
+    weight = None if measured else np.abs(speed[good]) / np.max(np.abs(speed[good]))
+    try:
+        return fit_esc(
+            pulse[good],
+            speed[good],
+            voltage[good],
+            pulse_range=_pulse_range(thruster, tables),
+            weight=weight,
+            at=volts,
+        )
+    except CalibrationError as error:
+        findings.append(finding("law_refused", shown, reason=str(error)))
+        return None
+
 
 # Which tables speak about which thrusters of a vehicle.
 
@@ -117,8 +682,6 @@ def _spoken_of(table: ThrustTable, vehicle: Vehicle, groups: set[str]) -> str:
 
 
 # How well a thruster's curve and speed controller describe the tables, also those they were not fitted to.
-
-Array = NDArray[np.float64]
 
 
 def predicted_thrust(result: Bench, before: Thruster, speed: Array) -> Array:

@@ -20,7 +20,7 @@ from finssim.files import atomic_directory, atomic_write
 from finssim.quiet import start_warp
 from finssim.vehicles import Vehicle, load_vehicle
 
-__all__ = ["excite", "write_programme"]
+__all__ = ["excite"]
 
 Array = NDArray[np.float64]
 

@@ -16,10 +16,7 @@ from numpy.typing import NDArray
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import finding
 from finssim.calibration.importers.ardusub_outputs import NEUTRAL, outputs_of
-from finssim.calibration.importers.assemble import in_our_axes
-from finssim.calibration.importers.column_map import ArduSubMap
-from finssim.calibration.importers.source_map import Frame
-from finssim.calibration.importers.streams import Stream
+from finssim.calibration.importers.assemble import ArduSubMap, Frame, Stream, in_our_axes
 from finssim.calibration.trials.trial import Array
 from finssim.calibration.trials.units import GRAVITY
 from finssim.geometry.rotations import wrap_angle

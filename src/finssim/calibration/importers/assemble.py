@@ -2,25 +2,590 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.importers.ardusub_outputs import FRAMES, NEUTRAL, STICKS, mixed_pulses, outputs_of
-from finssim.calibration.importers.column_map import ArduSubMap, ColumnMap
-from finssim.calibration.importers.source_map import Frame
-from finssim.calibration.importers.streams import Stream, Table
-from finssim.calibration.trials.conversion import in_our_frames, tidy_quaternions
-from finssim.calibration.trials.header import Conversion, Header
-from finssim.calibration.trials.trial import NU, PHASES, Array, Trial
-from finssim.calibration.trials.units import GRAVITY
+from finssim.calibration.trials.conversion import SAME_ROW, in_our_frames, merged, ordered, tidy_quaternions
+from finssim.calibration.trials.trial import (
+    COLUMNS,
+    INPUT_PREFIXES,
+    NU,
+    PHASES,
+    Array,
+    Conversion,
+    Header,
+    Trial,
+    column_of,
+)
+from finssim.calibration.trials.units import EXTRA_COLUMNS, GRAVITY, TIME_UNITS, factor
 from finssim.geometry.frames import FROM_FOSSEN
 from finssim.geometry.rotations import quat_from_euler, quat_inverse_rotate
 from finssim.vehicles import load_vehicle
+from finssim.vehicles.part import Part, did_you_mean, refuse_section, refuse_value
+from finssim.yaml_file import read_mapping
 
-__all__ = ["in_our_axes", "trial_of"]
+__all__ = [
+    "ArduSubMap", "ColumnMap", "ColumnSource", "Frame", "PhaseColumn", "SourceMap", "SplitRule",
+    "Stream", "TimeColumn", "in_our_axes", "merge", "read_map", "split_rule", "split_table", "trial_of",
+]  # fmt: skip
+
+
+class ColumnSource(Part):
+    """Where the numbers of one canonical column come from: sign (scale * column + offset) in `unit`."""
+
+    column: str | None = None
+    """Name of a column, or dotted path of a field such as `twist.twist.linear.x` or `data[3]`."""
+    value: float | None = None
+    """A constant in place of a column."""
+    scale: float = 1.0
+    offset: float = 0.0
+    """In `unit`, added after scaling."""
+    sign: Literal[1, -1] = 1
+    unit: str | None = None
+    """Of scale * column + offset; the unit of the canonical column where not given."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, data: Any) -> Any:
+        if isinstance(data, str):
+            return {"column": data}
+        if isinstance(data, (int, float)) and not isinstance(data, bool):
+            return {"value": data}
+        if not isinstance(data, dict):
+            raise refuse_section(
+                f"is {data!r}, expected the name of a column, a number, or column, unit, scale ..."
+            )
+        return data
+
+    @model_validator(mode="after")
+    def _one_source(self) -> ColumnSource:
+        if (self.column is None) == (self.value is None):
+            raise refuse_section("expected either 'column: NAME' or 'value: NUMBER'")
+        return self
+
+
+class TimeColumn(Part):
+    """The column that holds the time."""
+
+    column: str
+    unit: str = "s"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, data: Any) -> Any:
+        return {"column": data} if isinstance(data, str) else data
+
+    @field_validator("unit")
+    @classmethod
+    def _known(cls, unit: str) -> str:
+        if unit not in TIME_UNITS and unit != "date":
+            raise refuse_value(
+                f"is '{unit}', expected one of {', '.join(TIME_UNITS)}, or date for written dates"
+            )
+        return unit
+
+
+class PhaseColumn(Part):
+    """The column that names the phases of an experiment."""
+
+    column: str
+    words: dict[str, str] = Field(default_factory=dict)
+    """Word of the log -> baseline, excitation, coast or rest; other words become none."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, data: Any) -> Any:
+        return {"column": data} if isinstance(data, str) else data
+
+    @field_validator("words")
+    @classmethod
+    def _known(cls, words: dict[str, str]) -> dict[str, str]:
+        for word in words.values():
+            if word not in PHASES:
+                raise refuse_value(
+                    f"holds '{word}'{did_you_mean(word, list(PHASES))} expected {', '.join(PHASES)}"
+                )
+        return words
+
+
+class Frame(Part):
+    """Axes that the log uses."""
+
+    body: Literal["FLU", "FRD"] = "FLU"
+    """Forward-left-up or forward-right-down."""
+    world: Literal["z_up", "NED"] = "z_up"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, data: Any) -> Any:
+        if not isinstance(data, str):
+            return data
+        forms = {
+            "FLU": {},
+            "z_up": {},
+            "FRD": {"body": "FRD", "world": "NED"},
+            "NED": {"body": "FRD", "world": "NED"},
+        }
+        if data not in forms:
+            raise refuse_section(
+                f"is '{data}', expected FLU, FRD, or {{body: FLU or FRD, world: z_up or NED}}"
+            )
+        return forms[data]
+
+
+class SourceMap(Part):
+    """How one file or topic is read."""
+
+    time: TimeColumn | None = None
+    """Needed for files; topics have stamps."""
+    columns: dict[str, ColumnSource] = Field(default_factory=dict)
+    """Canonical column -> its source; for topics of known types the usual ones where nothing is given."""
+    frame: Frame = Field(default_factory=Frame)
+    time_offset: float = 0.0
+    """Added to the times [s]."""
+    phase: PhaseColumn | None = None
+    split: str | None = None
+    """Column whose changes of value begin a new trial."""
+    spaces: bool = False
+    """Whether blanks separate the columns of a text table; commas, semicolons and tabs are found out."""
+    skip_rows: int = Field(default=0, ge=0)
+    """Lines before the line of names."""
+    names: tuple[str, ...] | None = None
+    """Names of the columns of a file that has no line of names."""
+    stamps: Literal["header", "received"] = "header"
+    """Of a topic: the stamps in its messages, where it has them, or the times at which they were recorded."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, data: Any) -> Any:
+        if isinstance(data, (list, tuple)):
+            raise refuse_section("is a list, expected columns: {CANONICAL: FIELD}")
+        return {} if data is None else data
+
+    @field_validator("columns", mode="before")
+    @classmethod
+    def _same_names(cls, columns: Any) -> Any:
+        """A list is of columns that the log calls as we do."""
+        if isinstance(columns, (list, tuple)) and all(isinstance(name, str) for name in columns):
+            return {name: name for name in columns}
+        if not isinstance(columns, dict):
+            raise refuse_value(f"is {columns!r}, expected {{CANONICAL: COLUMN}}")
+        return columns
+
+    @field_validator("columns")
+    @classmethod
+    def _known(cls, columns: dict[str, ColumnSource]) -> dict[str, ColumnSource]:
+        known = [*COLUMNS, *EXTRA_COLUMNS]
+        for name, source in columns.items():
+            if name not in EXTRA_COLUMNS and column_of(name) is None:
+                inputs = ", ".join(f"{prefix}NAME" for prefix in INPUT_PREFIXES)
+                raise refuse_value(
+                    f"names '{name}'{did_you_mean(name, known)} columns of a trial are {', '.join(known)}, {inputs}"
+                )
+            try:
+                factor(source.unit, name)
+            except CalibrationError as error:
+                raise refuse_value(f"holds a wrong unit: {error}") from None
+        return columns
+
+
+HEADER_KEYS = tuple(name for name in Header.model_fields if name != "convert")
+
+
+class ArduSubMap(Part):
+    """What is taken from an ArduSub log, and how its mixer turns sticks into pulses."""
+
+    outputs: dict[str, str] = Field(default_factory=dict)
+    """Output of the autopilot -> thruster, `{C1: T1, C2: -T2}`; a minus where longer pulses push backwards."""
+    velocity: Literal["auto", "ekf", "vision", "none"] = "auto"
+    """Source of u v w: the state estimate, or the position deltas of a DVL or visual odometry."""
+    imu: int = Field(default=0, ge=0)
+    barometer: int | None = Field(default=None, ge=0)
+    """The pressure sensor in the water; the primary one where not given."""
+    stamps: Literal["header", "received"] = "header"
+    """Of a .tlog: the autopilot's own clock where a message has it, or the times at which messages were received."""
+    frame: Literal["VECTORED", "VECTORED_6DOF"] | None = None
+    """Of the mixer that `stick_*` columns went through."""
+    gain: float = Field(default=1.0, gt=0.0, le=1.0)
+    """Pilot gain (PilotGain, JS_GAIN_DEFAULT) of `stick_*` columns, where they are the joystick's, not scaled yet."""
+    motor_directions: tuple[Literal[1, -1], ...] = ()
+    """MOT_n_DIRECTION of motors 1, 2, ..., for `stick_*` columns; 1 where not given."""
+
+
+class SplitRule(Part):
+    """What makes several trials of one log."""
+
+    by: Literal["phase", "gaps", "arming", "column", "windows"]
+    longest_gap: float = Field(default=2.0, gt=0.0)
+    """Of `gaps`: a longer pause begins a new trial [s]."""
+    windows: dict[str, tuple[float, float]] = Field(default_factory=dict)
+    """Of `windows`: trial -> from and to [s] after the start of the log."""
+    shortest: float = Field(default=1.0, ge=0.0)
+    """Shorter pieces are left out [s]."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, data: Any) -> Any:
+        if isinstance(data, str):
+            return {"by": data}
+        if isinstance(data, dict) and "by" not in data:
+            if "windows" in data:
+                return {"by": "windows", **data}
+            if "gaps" in data:
+                return {
+                    "by": "gaps",
+                    "longest_gap": data["gaps"],
+                    **{k: v for k, v in data.items() if k != "gaps"},
+                }
+        return data
+
+    @model_validator(mode="after")
+    def _windows(self) -> SplitRule:
+        if (self.by == "windows") != bool(self.windows):
+            raise refuse_section("expected 'windows: {NAME: [FROM, TO]}' with windows, and only with them")
+        for name, (low, high) in self.windows.items():
+            if not high > low:
+                raise refuse_section(
+                    f"window {name} is [{low:g}, {high:g}], expected the end after the start"
+                )
+        return self
+
+
+class ColumnMap(Part):
+    """One map file."""
+
+    files: dict[str, SourceMap] = Field(default_factory=dict)
+    """Name or pattern of a file (`imu.csv`, `*_imu.csv`, `{trial}_imu.csv`) -> how it is read."""
+    topics: dict[str, SourceMap] = Field(default_factory=dict)
+    ardusub: ArduSubMap = Field(default_factory=ArduSubMap)
+    split: SplitRule | None = None
+    surface_pressure: float | None = Field(default=None, ge=0.0)
+    """Of the surface as the sensor reads it, for `pressure` columns [Pa]; 0 for a gauge."""
+    header: dict[str, Any] = Field(default_factory=dict)
+    """What `trial.yaml` of every trial says."""
+    trials: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    """Trial -> what its `trial.yaml` says beside or instead of that."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, data: Any) -> Any:
+        """`trial.yaml` keys stand at the top level; one source for all files may stand there too."""
+        data = dict(data)
+        single = {
+            key: data.pop(key) for key in list(data) if key in SourceMap.model_fields and key != "split"
+        }
+        if single:
+            if "files" in data:
+                raise refuse_section(f"'{next(iter(single))}' stands beside 'files': write it inside a file")
+            data["files"] = {"*": single}
+        header = {key: data.pop(key) for key in list(data) if key in HEADER_KEYS}
+        for key in data:
+            if key not in cls.model_fields:
+                known = [*cls.model_fields, *HEADER_KEYS, *SourceMap.model_fields]
+                raise refuse_section(
+                    f"unknown key '{key}'{did_you_mean(str(key), known)} known keys: {', '.join(known)}"
+                )
+        return {**data, "header": {**data.get("header", {}), **header}}
+
+    def header_of(self, trial: str, vehicle: str | None, recorded: Mapping[str, Any] | None = None) -> Header:
+        """The header of a trial; a vehicle given on the command line comes first, what the log says itself last.
+
+        Raises:
+            CalibrationError: A key or value that `trial.yaml` does not take.
+        """
+        keys = {**(recorded or {}), **self.header, **self.trials.get(trial, {})}
+        if vehicle is not None:
+            keys["vehicle"] = vehicle
+        for key in keys:
+            if key not in HEADER_KEYS:
+                raise CalibrationError(
+                    f"trials.{trial}: unknown key '{key}'{did_you_mean(str(key), list(HEADER_KEYS))} "
+                    f"known keys: {', '.join(HEADER_KEYS)}"
+                )
+        try:
+            return Header.model_validate(keys)
+        except ValidationError as error:
+            raise CalibrationError(_sentence(error)) from None
+
+
+def read_map(path: Path) -> ColumnMap:
+    """Read and check a map file.
+
+    Raises:
+        CalibrationError: Unreadable, malformed, or a key or value that is refused.
+    """
+    tree = read_mapping(path, CalibrationError, such_as="files: {log.csv: {time: t, columns: {u: vel_x}}}")
+    try:
+        found = ColumnMap.model_validate(tree)
+        found.header_of("", None)
+    except ValidationError as error:
+        raise CalibrationError(f"{path}: {_sentence(error)}") from None
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {error}") from None
+    return found
+
+
+def split_rule(text: str) -> SplitRule:
+    """The rule that a word of the command line names: phase, gaps, gaps=SECONDS, arming or column.
+
+    Raises:
+        CalibrationError: Another word.
+    """
+    word, _, seconds = text.partition("=")
+    try:
+        return SplitRule.model_validate(
+            {"gaps": float(seconds)} if word == "gaps" and seconds else {"by": text}
+        )
+    except ValueError:
+        raise CalibrationError(
+            f"split is '{text}', expected phase, gaps, gaps=SECONDS, arming or column; time windows stand in a map file"
+        ) from None
+
+
+def _sentence(error: ValidationError) -> str:
+    first = error.errors()[0]
+    where = ".".join(str(x) for x in first["loc"] if "[" not in str(x) or "*" in str(x))
+    message = first["msg"].removeprefix("Value error, ")
+    if first["type"] in ("section", "value"):
+        return f"{where}: {message}" if where else message
+    given = "" if first["type"] == "missing" else f" is {first['input']!r},"
+    return f"{where}:{given} {message[0].lower()}{message[1:]}"
+
+
+# One table of a long log into several, one for each trial.
+
+Rows = NDArray[np.bool_]
+
+
+def split_table(name: str, table: Table, rule: SplitRule | None) -> dict[str, Table]:
+    """Name of a trial -> its part of the table, with times from 0; one part of that name without a rule.
+
+    Raises:
+        CalibrationError: The log has not what the rule goes by, or nothing is left.
+    """
+    if rule is None:
+        return {name: table}
+    pieces = {
+        "phase": _by_phase,
+        "gaps": _by_gaps,
+        "arming": _by_arming,
+        "column": _by_column,
+        "windows": _by_windows,
+    }[rule.by](name, table, rule)
+    long_enough = {
+        piece: rows
+        for piece, rows in pieces.items()
+        if rows.sum() >= 2 and np.ptp(table.t[rows]) >= rule.shortest
+    }
+    if not long_enough:
+        raise CalibrationError(
+            f"{name}: splitting by {rule.by} leaves no piece of {rule.shortest:g} s or more"
+        )
+    return {piece: _part(table, rows) for piece, rows in long_enough.items()}
+
+
+def _part(table: Table, rows: Rows) -> Table:
+    t = table.t[rows]
+    return replace(
+        table,
+        start=table.start + float(t[0]),
+        t=np.round(t - t[0], 6),
+        channels={column: values[rows] for column, values in table.channels.items()},
+        words={column: spoken[rows] for column, spoken in table.words.items()},
+        findings=(*table.findings, finding("log_cut", start=t[0], end=t[-1])),
+    )
+
+
+def _words(name: str, table: Table, which: str, what: str) -> NDArray[np.str_]:
+    if which not in table.words:
+        raise CalibrationError(f"{name}: cannot be split by {which}: {what}")
+    return table.words[which]
+
+
+def _runs(labels: NDArray[np.str_]) -> list[tuple[str, Rows]]:
+    """Stretches of equal labels in their order."""
+    number = np.concatenate([[0], np.cumsum(labels[1:] != labels[:-1])])
+    return [(str(labels[number == i][0]), number == i) for i in range(int(number[-1]) + 1)]
+
+
+def _numbered(name: str, pieces: list[Rows]) -> dict[str, Rows]:
+    digits = len(str(len(pieces)))
+    return {f"{name}_{i + 1:0{digits}d}": rows for i, rows in enumerate(pieces)}
+
+
+def _by_phase(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
+    """A trial begins with each baseline; without baselines, with each excitation after something else."""
+    phase = _words(name, table, "phase", "no source of the map names a phase column")
+    opening = "baseline" if (phase == "baseline").any() else "excitation"
+    begins = (phase == opening) & np.concatenate([[True], phase[:-1] != opening])
+    number = np.cumsum(begins)
+    return _numbered(name, [number == i for i in range(1, int(number[-1]) + 1)] if begins.any() else [])
+
+
+def _by_gaps(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
+    number = np.concatenate([[0], np.cumsum(np.diff(table.t) > rule.longest_gap)])
+    return _numbered(name, [number == i for i in range(int(number[-1]) + 1)])
+
+
+def _by_arming(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
+    arming = _words(name, table, "arming", "the log says nothing about arming")
+    return _numbered(name, [rows for word, rows in _runs(arming) if word == "armed"])
+
+
+def _by_column(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
+    labels = _words(name, table, "split", "no source of the map names a split column")
+    runs = [(word, rows) for word, rows in _runs(labels) if word not in ("", "nan", "None")]
+    return _numbered(name, [rows for _, rows in runs])
+
+
+def _by_windows(name: str, table: Table, rule: SplitRule) -> dict[str, Rows]:
+    pieces = {window: (table.t >= low) & (table.t <= high) for window, (low, high) in rule.windows.items()}
+    empty = [window for window, rows in pieces.items() if not rows.any()]
+    if empty:
+        raise CalibrationError(
+            f"{name}: window {empty[0]} is {list(rule.windows[empty[0]])} s, the log runs to {table.t[-1]:.3f} s"
+        )
+    return pieces
+
+
+Words = NDArray[np.str_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stream:
+    """What one file, topic or kind of message says, in canonical columns and SI."""
+
+    source: str
+    """What messages call it."""
+    t: Array
+    """On the clock of the log [s], (n,)."""
+    channels: dict[str, Array] = field(default_factory=dict)
+    """Canonical or extra column -> values, (n,) each."""
+    words: dict[str, Words] = field(default_factory=dict)
+    """`phase`, `split` or `arming` -> a word for every sample, (n,) each; a word holds until the next."""
+    findings: tuple[Finding, ...] = ()
+    """What was repaired or left out."""
+
+    def taken(self, rows: NDArray[np.intp] | NDArray[np.bool_], t: Array | None = None) -> Stream:
+        """Some of the samples, in that order; at times `t` where given."""
+        return replace(
+            self,
+            t=self.t[rows] if t is None else t,
+            channels={name: values[rows] for name, values in self.channels.items()},
+            words={name: values[rows] for name, values in self.words.items()},
+        )
+
+    def noting(self, *findings: Finding) -> Stream:
+        """The same with more findings."""
+        return replace(self, findings=(*self.findings, *findings))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """Several streams on the union of their times."""
+
+    start: float
+    """Of the log's clock at t = 0 [s]."""
+    t: Array
+    """Strictly increasing from 0 [s], (n,)."""
+    channels: dict[str, Array]
+    """NaN where a stream has no sample, (n,) each."""
+    words: dict[str, Words]
+    """(n,) each."""
+    findings: tuple[Finding, ...]
+
+
+def in_order(stream: Stream, *, alone: bool) -> Stream:
+    """The stream with strictly increasing times.
+
+    Samples without a time are left out, late ones are sorted in, of samples with one time the first is kept. Where the
+    clock was set back, the rest follows after a gap if the stream is `alone`
+    (`finssim.calibration.trials.conversion.ordered`).
+
+    Raises:
+        CalibrationError: No samples, or a clock set back in one of several streams, which cannot be aligned again.
+    """
+    timed = np.isfinite(stream.t)
+    untimed = [] if timed.all() else [finding("samples_untimed", samples=(~timed).sum())]
+    stream = stream.taken(timed)
+    if len(stream.t) < 2:
+        raise CalibrationError(f"{stream.source}: {len(stream.t)} samples, expected at least two")
+    t, rows, repaired = ordered(stream.t, stream.channels)
+    jumps = [one.values for one in repaired if one.code == "clock_jump"]
+    if not alone and jumps:
+        raise CalibrationError(
+            f"the clock jumps back from {jumps[0]['before']:.6g} s to {jumps[0]['after']:.6g} s at row "
+            f"{jumps[0]['row']}, so its samples cannot be placed among those of the other sources: import the parts on "
+            "their own, or cut the log there",
+            stream.source,
+        )
+    stream = stream.taken(rows, t)
+    first = np.concatenate([[True], np.diff(t) > SAME_ROW])
+    if not first.all():
+        repaired = [*repaired, finding("samples_repeat", samples=(~first).sum())]
+        stream = stream.taken(first)
+    if len(stream.t) < 2:
+        raise CalibrationError(
+            f"{stream.source}: the time never increases: name the column that holds the time"
+        )
+    return stream.noting(*(one.about(stream.source) for one in (*untimed, *repaired)))
+
+
+def merge(streams: Sequence[Stream]) -> Table:
+    """All streams on the union of their times, which start at 0.
+
+    Raises:
+        CalibrationError: A column in two streams, or streams that lie apart in time.
+    """
+    each = [in_order(stream, alone=len(streams) == 1) for stream in streams]
+    _refuse_doubles(each)
+    _refuse_apart(each)
+    start = min(float(stream.t[0]) for stream in each)
+    # On whole microseconds, so that a written and read trial has the same times.
+    each = [replace(stream, t=np.round(stream.t - start, 6)) for stream in each]
+    columns = {name: (stream.t, values) for stream in each for name, values in stream.channels.items()}
+    spoken = {name: (stream.t, words) for stream in each for name, words in stream.words.items()}
+    t, channels = merged(columns)
+    words = {}
+    for name, (times, said) in spoken.items():
+        held = np.searchsorted(times, t, side="right") - 1
+        words[name] = np.where(held >= 0, said[np.maximum(held, 0)], "")
+    findings = [one for stream in each for one in stream.findings]
+    if start > 1e8:
+        findings.append(finding("clock_origin", start=start))
+    return Table(start=start, t=t, channels=channels, words=words, findings=tuple(dict.fromkeys(findings)))
+
+
+def _refuse_doubles(streams: Sequence[Stream]) -> None:
+    seen: dict[str, str] = {}
+    for stream in streams:
+        for name in (*stream.channels, *stream.words):
+            if name in seen:
+                raise CalibrationError(
+                    f"{name} comes from {seen[name]} and from {stream.source}: take it from one of them in the map"
+                )
+            seen[name] = stream.source
+
+
+def _refuse_apart(streams: Sequence[Stream]) -> None:
+    longest = max(streams, key=lambda stream: stream.t[-1] - stream.t[0])
+    for stream in streams:
+        if stream.t[0] > longest.t[-1] or stream.t[-1] < longest.t[0]:
+            raise CalibrationError(
+                f"times of {longest.source} run from {longest.t[0]:.6g} to {longest.t[-1]:.6g} s and those of "
+                f"{stream.source} from {stream.t[0]:.6g} to {stream.t[-1]:.6g} s: they do not overlap: give the "
+                f"unit of the time, or a time_offset in the map that puts them on one clock"
+            )
+
 
 EULER = ("roll", "pitch", "yaw")
 QUATERNION = ("qx", "qy", "qz", "qw")

@@ -12,15 +12,28 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
-from finssim.calibration.importers.assemble import in_our_axes, trial_of
-from finssim.calibration.importers.column_map import ColumnMap, SplitRule, read_map, split_rule
-from finssim.calibration.importers.source_map import ColumnSource, SourceMap
-from finssim.calibration.importers.streams import Stream, merge, split_table
-from finssim.calibration.importers.tables import TABLES, read_table, spoken, values_of
-from finssim.calibration.trials.trial import Trial
+from finssim.calibration.importers.assemble import (
+    ColumnMap,
+    ColumnSource,
+    PhaseColumn,
+    SourceMap,
+    SplitRule,
+    Stream,
+    TimeColumn,
+    in_our_axes,
+    merge,
+    read_map,
+    split_rule,
+    split_table,
+    trial_of,
+)
+from finssim.calibration.trials.trial import Array, Trial, column_of
+from finssim.calibration.trials.trial_files import Table, read_table
+from finssim.calibration.trials.units import TIME_UNITS, factor
 from finssim.files import plain_name
 from finssim.mcap_metadata import mcap_metadata
 from finssim.mcap_repair import whole_mcap
@@ -28,7 +41,122 @@ from finssim.vehicles import VehicleError, catalogue_vehicle, load_vehicle
 from finssim.vehicles.part import did_you_mean
 from finssim.yaml_file import json_value
 
-__all__ = ["FORMATS", "Format", "import_logs", "import_trials", "print_folders", "read_trials"]
+__all__ = ["FORMATS", "import_trials", "print_folders", "read_trials"]
+
+TABLES = (".csv", ".tsv", ".txt", ".dat", ".parquet", ".pq")
+TIME_NAMES = ("t", "time", "time_s", "time_secs", "timestamp", "stamp")
+"""Names under which the time is looked for where no map says it; seconds."""
+
+
+def read_stream(path: Path, source: SourceMap | None) -> Stream:
+    """One table as a stream.
+
+    Args:
+        path: Text or Parquet file.
+        source: How it is read; without it the columns with canonical names are taken.
+
+    Raises:
+        CalibrationError: Unreadable, or a column that it has not.
+    """
+    shown = path.name
+    how = source or SourceMap()
+    table = read_table(path, skip=how.skip_rows, names=how.names, spaces=how.spaces)
+    findings = tuple(one.about(shown) for one in table.findings)
+    if source is None:
+        source = _by_names(table, shown)
+    if source.time is None:
+        raise CalibrationError(f"{shown}: no time: give 'time: COLUMN' of its columns {_column_list(table)}")
+    if not source.columns and source.phase is None:
+        raise CalibrationError(
+            f"{shown}: no columns: give 'columns: {{u: NAME, ...}}' of its columns {_column_list(table)}"
+        )
+    t = _time(table, source.time, shown) + source.time_offset
+    channels = {}
+    for name, spec in source.columns.items():
+        raw = np.zeros(len(t)) if spec.column is None else _numbers(table, spec.column, shown)
+        channels[name] = values_of(raw, name, spec)
+    words = {}
+    if source.phase is not None:
+        words["phase"] = spoken(_text(table, source.phase.column, shown), source.phase)
+    if source.split is not None:
+        words["split"] = np.array(_text(table, source.split, shown), dtype=np.str_)
+    stream = Stream(source=shown, t=t, channels=channels, words=words, findings=findings)
+    return in_our_axes(stream, source.frame)
+
+
+def values_of(raw: Array, name: str, spec: ColumnSource) -> Array:
+    """Values of a canonical column from the numbers of the log: a constant, or scaled, shifted, in our unit, signed."""
+    given = np.full(len(raw), spec.value) if spec.column is None else raw
+    return np.asarray(spec.sign * (spec.scale * given + spec.offset) * factor(spec.unit, name), dtype=float)
+
+
+def spoken(words: Iterable[str], phase: PhaseColumn) -> NDArray[np.str_]:
+    """Words of the log as phases."""
+    return np.array([phase.words.get(word, "") if phase.words else word for word in words], dtype=np.str_)
+
+
+def _by_names(table: Table, shown: str) -> SourceMap:
+    """A map of the columns that have canonical names."""
+    time = next((name for name in TIME_NAMES if name in table.numbers), None)
+    known = [name for name in table.numbers if column_of(name) is not None]
+    if time is None or not known:
+        what = "time" if time is None else "column with the name of a trial's column"
+        raise CalibrationError(
+            f"{shown}: no {what}; its columns are {_column_list(table)}: write a map file and give it with --map"
+        )
+    phase = "phase" if "phase" in table.words else None
+    return SourceMap.model_validate({"time": time, "columns": {name: name for name in known}, "phase": phase})
+
+
+def _known(table: Table, name: str, shown: str) -> None:
+    if name not in table.columns:
+        raise CalibrationError(
+            f"{shown}: no column '{name}'{did_you_mean(name, table.columns)} its columns are {_column_list(table)}"
+        )
+
+
+def _numbers(table: Table, name: str, shown: str) -> Array:
+    _known(table, name, shown)
+    if name not in table.numbers:
+        example = next((word for word in table.words[name] if word), "")
+        raise CalibrationError(f"{shown}: column '{name}' holds no numbers, for instance '{example}'")
+    return table.numbers[name]
+
+
+def _text(table: Table, name: str, shown: str) -> list[str]:
+    _known(table, name, shown)
+    return table.words[name] if name in table.words else [f"{x:g}" for x in table.numbers[name]]
+
+
+def _time(table: Table, time: TimeColumn, shown: str) -> Array:
+    """Seconds on the clock of the log."""
+    _known(table, time.column, shown)
+    if time.unit != "date" and time.column in table.numbers:
+        return table.numbers[time.column] * TIME_UNITS[time.unit]
+    try:
+        dates = np.array(
+            [_date(word) for word in _text(table, time.column, shown)],
+            dtype="datetime64[us]",
+        )
+    except ValueError:
+        raise CalibrationError(
+            f"{shown}: column '{time.column}' holds neither numbers nor dates such as 2026-05-31 12:30:00.25: "
+            "give a column that does"
+        ) from None
+    seconds = dates.astype(np.int64) * 1e-6
+    return np.where(np.isnat(dates), np.nan, seconds)
+
+
+def _date(word: str) -> str:
+    """A date as NumPy reads it: universal time without saying so, and a day for a time without one."""
+    word = re.sub(r"(Z|[+-]00:?00)$", "", word.strip())
+    return f"1970-01-01T{word}" if re.match(r"\d\d:\d", word) else word or "NaT"
+
+
+def _column_list(table: Table) -> str:
+    names = table.columns
+    return ", ".join(names[:40]) + (f" and {len(names) - 40} more" if len(names) > 40 else "")
+
 
 # What our own records add to a bag: thrusters by name, phases and arming from events, the vehicle they are of.
 
@@ -663,7 +791,7 @@ def _table_groups(paths: list[Path], mapped: ColumnMap, has_map: bool) -> list[G
                     f"{twice} all fit {pattern} of the map for one trial: use {{trial}} in it"
                 )
         missing = [pattern for pattern in mapped.files if pattern not in patterns]
-        streams = [read_table(path, source) for _, path, source in sources]
+        streams = [read_stream(path, source) for _, path, source in sources]
         streams[0] = streams[0].noting(*(finding("file_missing", pattern=p) for p in missing))
         left_out = [name for name in unread if len(found) == 1 or name.startswith(trial)]
         streams[0] = streams[0].noting(*(finding("file_left_out", file=name) for name in left_out))

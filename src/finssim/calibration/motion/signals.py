@@ -1,4 +1,4 @@
-"""One trial on a uniform grid: velocities, accelerations, attitude and applied wrench about the body origin.
+"""One trial on a uniform grid: velocities, attitude and applied wrench about the body origin.
 
 What is measured is smoothed (`finssim.calibration.motion.smoothing`) and moved to the body origin; what is not is
 derived where the other columns allow it, and NaN where they do not. Nothing is interpolated across a gap.
@@ -6,22 +6,314 @@ derived where the other columns allow it, and NaN where they do not. Nothing is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.errors import CalibrationError
-from finssim.calibration.findings import Finding
-from finssim.calibration.motion.accelerations import Velocities, accelerations, velocities
-from finssim.calibration.motion.attitude_signal import attitude_signal
+from finssim.calibration.findings import Finding, finding
+from finssim.calibration.motion.smoothing import longest_step, smooth
 from finssim.calibration.trials.inputs import Drive, applied_wrench, drive
 from finssim.calibration.trials.trial import COLUMNS, NU, Trial
+from finssim.geometry.rotations import (
+    quat_conjugate,
+    quat_from_euler,
+    quat_inverse_rotate,
+    quat_multiply,
+    quat_rotate,
+)
 from finssim.vehicles import Vehicle
 
-__all__ = ["Motion", "grid_rate", "motion"]
+__all__ = [
+    "AttitudeSignal", "Motion", "accelerometer_place", "attitude_samples", "attitude_signal",
+    "holds_gravity", "motion",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
+
+QUATERNION = ("qx", "qy", "qz", "qw")
+EULER = ("roll", "pitch", "yaw")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttitudeSignal:
+    """Attitude on a grid of m times, as far as it is known."""
+
+    quaternion: Array
+    """Body to world, (m, 4); NaN where unknown, and everywhere if the tilt is not measured."""
+    rates: Array
+    """omega from the derivative of the attitude, body frame [rad/s], (m, 3); NaN where unknown."""
+    rates_std: Array
+    """Standard deviation of `rates` [rad/s], (3,)."""
+    turn: Array
+    """Rotation to use for vectors: `quaternion`, or level with the measured heading, (m, 4); NaN where unknown."""
+    heading: bool
+    """Whether the heading is measured; where it is not, `quaternion` has heading 0 and only its tilt means anything."""
+    tilt: bool
+    """Whether roll and pitch are measured."""
+
+
+def attitude_samples(trial: Trial) -> tuple[Array, Array, tuple[str, ...]]:
+    """Attitude as sampled.
+
+    Returns:
+        Times (n,) [s], quaternions (n, 4) with 0 for angles that are not measured, and which of roll, pitch, yaw are.
+    """
+    if trial.has(*QUATERNION):
+        q = np.stack([trial.channels[name] for name in QUATERNION], axis=-1)
+        good = np.isfinite(q).all(axis=1)
+        return trial.t[good], q[good], EULER
+    given = tuple(name for name in EULER if trial.has(name))
+    if "roll" in given and "pitch" not in given or "pitch" in given and "roll" not in given:
+        given = tuple(name for name in given if name == "yaw")  # half a tilt is no attitude
+    if not given:
+        return np.empty(0), np.empty((0, 4)), ()
+    t = max((trial.series(name)[0] for name in given), key=len)
+    t = t[
+        (t >= max(trial.series(n)[0][0] for n in given)) & (t <= min(trial.series(n)[0][-1] for n in given))
+    ]
+    angles = {name: np.interp(t, trial.series(name)[0], np.unwrap(trial.series(name)[1])) for name in given}
+    zero = np.zeros(len(t))
+    q = quat_from_euler(*(angles.get(name, zero) for name in EULER))
+    flips = np.cumsum(np.sum(q[1:] * q[:-1], axis=-1) < 0.0) % 2 == 1
+    q[1:][flips] *= -1.0
+    return t, q, given
+
+
+def attitude_signal(trial: Trial, at: Array) -> AttitudeSignal:
+    """The attitude of a trial, smoothed, at given times (m,)."""
+    t, q, given = attitude_samples(trial)
+    nothing = np.full((len(at), 4), np.nan)
+    if len(t) < 2:
+        return AttitudeSignal(
+            quaternion=nothing,
+            rates=nothing[:, :3],
+            rates_std=np.full(3, np.nan),
+            turn=nothing,
+            heading=False,
+            tilt=False,
+        )
+    s = smooth(t, q, at, order=3, together=True)
+    length = np.linalg.norm(s.value, axis=1, keepdims=True)
+    quaternion = s.value / length
+    # q_dot = q omega / 2, with omega in body axes; the length of q drops out of the vector part.
+    rates = 2.0 * quat_multiply(quat_conjugate(quaternion), s.slope / length)[:, :3]
+    tilt, heading = "roll" in given, "yaw" in given
+    measured = np.array([tilt, tilt, heading])
+    rates[:, ~measured] = np.nan
+    return AttitudeSignal(
+        quaternion=quaternion if tilt else nothing,
+        rates=rates,
+        rates_std=np.where(measured, 2.0 * np.mean(s.slope_std), np.nan),
+        turn=quaternion,
+        heading=heading,
+        tilt=tilt,
+    )
+
+
+def up_in_body(quaternion: Array) -> Array:
+    """World z in the body frame, (m, 4) -> (m, 3)."""
+    return quat_rotate(quat_conjugate(quaternion), np.array([0.0, 0.0, 1.0]))
+
+
+# Velocity and position of the body origin on a grid, measured or derived from what is.
+
+STEEPEST = 0.3
+"""Cosine of the tilt below which a vertical velocity tells nothing of heave."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Velocities:
+    """Velocity and position of the body origin, (m, ...) on the grid."""
+
+    nu: Array
+    """(m, 6)"""
+    raw: Array
+    """(m, 6)"""
+    source: tuple[str, ...]
+    noise_std: Array
+    """(6,)"""
+    position: Array
+    """World frame [m], (m, 3)."""
+    findings: tuple[Finding, ...]
+
+
+@dataclass
+class _Column:
+    """One column on the grid; all NaN if the trial does not have it."""
+
+    value: Array
+    slope: Array
+    raw: Array
+    noise: float = np.nan
+    slope_std: float = np.nan
+
+
+def velocities(trial: Trial, vehicle: Vehicle, at: Array, attitude: AttitudeSignal) -> Velocities:
+    """Velocity and position of the body origin.
+
+    Args:
+        trial: The trial.
+        vehicle: Gives the place of the pressure sensor where the header does not.
+        at: Times [s], (m,).
+        attitude: At these times.
+    """
+    header, findings = trial.header, list[Finding]()
+    measured = [_column(trial, name, at, 2) for name in NU]
+    nu = np.stack([c.value for c in measured], axis=-1)
+    raw = np.stack([c.raw for c in measured], axis=-1)
+    noise = np.array([c.noise for c in measured])
+    source = ["measured" if trial.has(name) else "" for name in NU]
+    for i in range(3, 6):
+        if not source[i] and np.isfinite(attitude.rates[:, i - 3]).any():
+            nu[:, i], noise[i] = attitude.rates[:, i - 3], attitude.rates_std[i - 3]
+            source[i] = "derived from attitude"
+    omega = nu[:, 3:]
+    arm = np.asarray(header.velocity_at, float)
+    if arm.any():
+        if _lacks(omega, arm) and any(source[:3]):
+            findings.append(finding("rates_unknown"))
+        nu[:, :3] -= arm_velocity(omega, arm)
+        raw[:, :3] -= arm_velocity(omega, arm)
+    if header.velocity == "water" and header.water.current is not None:
+        drift = quat_inverse_rotate(attitude.turn, np.asarray(header.water.current, float))
+        nu[:, :3] += drift
+        raw[:, :3] += drift
+    position, flow, stds = _origin(trial, vehicle, at, attitude, omega)
+    for i, (column, name) in enumerate(_derived(nu, source, flow, attitude, trial, findings)):
+        if name:
+            nu[:, i], source[i] = column, name
+            noise[i] = stds[2] if i == 2 else stds[:2].mean()
+    return Velocities(
+        nu=nu,
+        raw=raw,
+        source=tuple(source),
+        noise_std=noise,
+        position=position,
+        findings=tuple(findings),
+    )
+
+
+def arm_velocity(omega: Array, arm: Array) -> Array:
+    """omega × r, with unknown rates taken as 0, body frame [m/s], (m, 3).
+
+    Args:
+        omega: Angular velocity, body frame [rad/s], (m, 3).
+        arm: r from the body origin, body frame [m], (3,).
+    """
+    return np.cross(np.nan_to_num(omega), arm)
+
+
+def _lacks(omega: Array, arm: Array) -> bool:
+    """Whether a rate that would move a point at `arm` is unknown throughout."""
+    unknown = ~np.asarray(np.isfinite(omega).any(axis=0))
+    return any(unknown[i] and np.delete(arm, i).any() for i in range(3))
+
+
+def _column(trial: Trial, name: str, at: Array, order: int) -> _Column:
+    t, y = trial.series(name)
+    nothing = np.full(len(at), np.nan)
+    if len(t) < 2:
+        return _Column(nothing, nothing, nothing)
+    s = smooth(t, y[:, None], at, order=order)
+    i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+    gap = longest_step(t)
+    bridged = (at >= t[0] - 1e-6) & (at <= t[-1] + 1e-6) & (t[i + 1] - t[i] <= gap)
+    raw = np.where(bridged, np.interp(at, t, y), np.nan)
+    return _Column(s.value[:, 0], s.slope[:, 0], raw, float(s.noise[0]), float(s.slope_std[0]))
+
+
+def _origin(
+    trial: Trial,
+    vehicle: Vehicle,
+    at: Array,
+    attitude: AttitudeSignal,
+    omega: Array,
+) -> tuple[Array, Array, Array]:
+    """Position and velocity of the body origin in the world, (m, 3) each, and the standard deviations of the latter and
+    of its slope by axis, (3, 2)."""
+    header = trial.header
+    x, y, z = (_column(trial, name, at, 3) for name in "xyz")
+    arms = [np.asarray(header.position_at, float)] * 3
+    if not trial.has("z") and trial.has("depth"):
+        depth = _column(trial, "depth", at, 3)
+        z = replace(depth, value=-depth.value, slope=-depth.slope)
+        arms[2] = _depth_at(trial, vehicle)
+    known = np.asarray(np.isfinite(attitude.turn).all(axis=1))
+    turn = np.where(known[:, None], attitude.turn, [0.0, 0.0, 0.0, 1.0])
+    value = np.stack([x.value, y.value, z.value], axis=-1)
+    slope = np.stack([x.slope, y.slope, z.slope], axis=-1)
+    for i, arm in enumerate(arms):
+        if arm.any():
+            value[:, i] -= quat_rotate(turn, arm)[:, i]
+            slope[:, i] -= quat_rotate(turn, arm_velocity(omega, arm))[:, i]
+            if attitude.tilt or attitude.heading:
+                value[~known, i] = slope[~known, i] = np.nan
+    return value, slope, np.array([c.slope_std for c in (x, y, z)])
+
+
+def _depth_at(trial: Trial, vehicle: Vehicle) -> Array:
+    if trial.header.depth_at is not None:
+        return np.asarray(trial.header.depth_at, float)
+    return np.zeros(3) if vehicle.sensors.depth is None else np.asarray(vehicle.sensors.depth.position, float)
+
+
+def _derived(
+    nu: Array, source: list[str], flow: Array, attitude: AttitudeSignal, trial: Trial, findings: list[Finding]
+) -> list[tuple[Array, str]]:
+    """u, v, w from the world velocity of the origin, and the names of their sources; no name where it tells nothing."""
+    known = np.asarray(np.isfinite(attitude.turn).all(axis=1))
+    turn = np.where(known[:, None], attitude.turn, [0.0, 0.0, 0.0, 1.0])
+    horizontal = trial.has("x", "y") and attitude.heading
+    vertical = bool(np.isfinite(flow[:, 2]).any())
+    wanted = [not source[i] and (vertical if i == 2 else horizontal) for i in range(3)]
+    if any(wanted) and not attitude.tilt:
+        findings.append(finding("taken_level"))
+    if horizontal:
+        world = flow if vertical else np.concatenate([flow[:, :2], np.zeros((len(flow), 1))], axis=1)
+        body = quat_inverse_rotate(turn, world)
+        body[~known] = np.nan
+    else:
+        # Vertical velocity alone: z_dot = up · v, solved for heave with surge and sway as far as they are known.
+        up = quat_inverse_rotate(turn, np.array([0.0, 0.0, 1.0]))
+        if attitude.tilt:
+            up[~known] = np.nan
+        rest = np.sum(up[:, :2] * np.nan_to_num(nu[:, :2]), axis=1)
+        heave = np.where(up[:, 2] > STEEPEST, (flow[:, 2] - rest) / up[:, 2], np.nan)
+        body = np.stack([heave * np.nan, heave * np.nan, heave], axis=-1)
+    names = ["derived from position"] * 2 + [f"derived from {'position' if trial.has('z') else 'depth'}"]
+    return [(column, name if use else "") for column, name, use in zip(body.T, names, wanted, strict=True)]
+
+
+ACCELERATION = ("ax", "ay", "az")
+
+
+def accelerometer_place(trial: Trial, vehicle: Vehicle) -> Array:
+    """Body point of the accelerometer [m], (3,): the header's, the vehicle's IMU, or the origin."""
+    if trial.header.acceleration_at is not None:
+        return np.asarray(trial.header.acceleration_at, float)
+    imu = vehicle.sensors.imu
+    return np.zeros(3) if imu is None else np.asarray(imu.position, float)
+
+
+def holds_gravity(trial: Trial, gravity: float) -> bool:
+    """Whether the accelerations are specific force, from the header or from their size.
+
+    Vehicles under water accelerate far less than gravity: what is about as large as gravity holds it. With only ax or
+    ay there is nothing to tell it by, and an accelerometer is assumed.
+
+    Args:
+        trial: Its header and its columns ax, ay, az.
+        gravity: [m/s²]
+    """
+    if trial.header.acceleration != "auto":
+        return trial.header.acceleration == "specific_force"
+    given = [name for name in ACCELERATION if trial.has(name)]
+    if "az" not in given:
+        return True
+    squares = [np.median(np.square(trial.series(name)[1])) for name in given]
+    return float(np.sqrt(np.sum(squares))) > 0.5 * gravity
+
 
 FASTEST = 100.0
 """Rate of the grid that is not exceeded unless asked for [Hz]; bodies in water do not need more."""
@@ -43,8 +335,6 @@ class Motion:
     the header says so and gives no current."""
     raw: Array
     """The same for measured axes, not smoothed, in straight lines between samples, (n, 6); NaN where not measured."""
-    nu_dot: Array
-    """Rate of the components of nu [m/s², rad/s²], (n, 6); NaN where unknown."""
     quaternion: Array
     """Body to world, (n, 4); NaN where roll and pitch are unknown. The heading is 0 where nobody measured it."""
     position: Array
@@ -57,53 +347,43 @@ class Motion:
     """Whether the wrench and every axis that is known for most of the trial are known, (n,)."""
     nu_source: tuple[str, ...]
     """By axis: `measured`, `derived from position`, `derived from depth`, `derived from attitude`, or nothing."""
-    nu_dot_source: tuple[str, ...]
-    """By axis: `imu`, where that tells more than the velocity, `smoothed velocity`, or nothing."""
     noise_std: Array
     """By axis, the standard deviation of one sample of a measured velocity, or of the value of a derived one, (6,)."""
     findings: tuple[Finding, ...] = ()
     """What was assumed."""
 
 
-def motion(
-    trial: Trial, vehicle: Vehicle, *, rate: float | None = None, max_gap: float | None = None
-) -> Motion:
-    """A trial on a uniform grid.
+def motion(trial: Trial, vehicle: Vehicle) -> Motion:
+    """A trial on a uniform grid, of the rate of its fastest stream up to 100 Hz.
+
+    Times between samples of a stream of up to 0.2 s, or four usual steps, are bridged.
 
     Args:
         trial: The trial.
         vehicle: Gives the places of sensors that the header leaves out, the motors and gravity.
-        rate: Of the grid [Hz]; that of the fastest stream, up to 100, if None.
-        max_gap: Longest time between samples of a stream that is bridged [s]; 0.2 s or four usual steps if None.
 
     Raises:
-        CalibrationError: The inputs are missing or not of this vehicle, or a rate or gap is not above zero.
+        CalibrationError: The inputs are missing or not of this vehicle.
     """
-    for name, value in (("rate", rate), ("max_gap", max_gap)):
-        if value is not None and not value > 0.0:
-            raise CalibrationError(f"{name} is {value}, expected a number above 0", trial.name)
     inputs = drive(trial, vehicle)
-    rate = grid_rate(trial, inputs) if rate is None else rate
+    rate = grid_rate(trial, inputs)
     t = trial.t[0] + np.arange(int(np.floor(trial.duration * rate + 1e-6)) + 1) / rate
-    attitude = attitude_signal(trial, t, max_gap)
-    found = velocities(trial, vehicle, t, attitude, max_gap)
-    nu_dot, nu_dot_source, unused = accelerations(trial, vehicle, t, attitude, found, max_gap)
+    attitude = attitude_signal(trial, t)
+    found = velocities(trial, vehicle, t, attitude)
     tau = applied_wrench(inputs, vehicle, t)
     return Motion(
         t=t,
         rate=rate,
         nu=found.nu,
         raw=found.raw,
-        nu_dot=nu_dot,
         quaternion=attitude.quaternion,
         position=found.position,
         tau=tau,
         phase=_phase(trial, t),
         valid=_valid(tau, found),
         nu_source=found.source,
-        nu_dot_source=nu_dot_source,
         noise_std=found.noise_std,
-        findings=(*inputs.findings, *found.findings, *unused),
+        findings=(*inputs.findings, *found.findings),
     )
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.fft import dst
 from scipy.linalg import solveh_banded
 
-__all__ = ["Smooth", "longest_step", "smooth", "stretches", "without_spikes"]
+__all__ = ["longest_step", "smooth", "stretches", "without_spikes"]
 
 Array = NDArray[np.float64]
 
@@ -59,12 +59,8 @@ class Smooth(NamedTuple):
     """Its time derivative, (m, c)."""
     noise: Array
     """Standard deviation of one sample, (c,)."""
-    value_std: Array
-    """Standard deviation of `value`, of what noise remains and what signal was lost (Wahba 1983), (c,)."""
     slope_std: Array
-    """Standard deviation of `slope`, in the same sense, (c,)."""
-    bend_std: Array
-    """Standard deviation of the slope of `slope`, in the same sense, (c,)."""
+    """Standard deviation of `slope`, of what noise remains and what signal was lost (Wahba 1983), (c,)."""
 
 
 def longest_step(t: Array) -> float:
@@ -101,9 +97,7 @@ def without_spikes(t: Array, y: Array) -> NDArray[np.bool_]:
     return ~bad if bad.sum() <= 0.05 * n else np.ones(n, bool)
 
 
-def smooth(
-    t: Array, y: Array, at: Array, *, order: int = 2, max_gap: float | None = None, together: bool = False
-) -> Smooth:
+def smooth(t: Array, y: Array, at: Array, *, order: int = 2, together: bool = False) -> Smooth:
     """Smooth signals that share their sample times.
 
     Args:
@@ -112,22 +106,21 @@ def smooth(
         at: Times asked for [s], (m,).
         order: m, the difference that is penalised: 2 for signals whose slope may jump, as velocities under a step of
             force; 3 for their integrals.
-        max_gap: Longest step that is bridged [s]; `longest_step` if None.
         together: One λ for all columns, for parts of one quantity such as a quaternion.
 
     Returns:
         On `at`.
     """
     good = without_spikes(t, y)
-    gap = longest_step(t) if max_gap is None else max_gap
+    gap = longest_step(t)
     t, y = t[good], y[good]
     m, c = len(at), y.shape[1]
     value, slope = np.full((m, c), np.nan), np.full((m, c), np.nan)
     runs = [run for run in stretches(t, gap) if run.stop - run.start >= FEWEST]
     if not runs:
-        return Smooth(value, slope, *(np.full(c, np.nan) for _ in range(4)))
+        return Smooth(value, slope, *(np.full(c, np.nan) for _ in range(2)))
     shared = [slice(0, c)] if together else [slice(i, i + 1) for i in range(c)]
-    figures = np.empty((4, c))
+    figures = np.empty((2, c))
     for columns in shared:
         windows = [window for run in runs for window in _windows(t, run)]
         strength, figures[:, columns] = _choose([_spectrum(t[w], y[w, columns], order) for w in windows])
@@ -185,7 +178,7 @@ def _first(y: Array) -> Array:
 
 
 def _choose(spectra: list[tuple[Array, Array, Array]]) -> tuple[Array, Array]:
-    """λ of every window (w,), and noise, value_std, slope_std and bend_std by column (4, c)."""
+    """λ of every window (w,), and noise and slope_std by column (2, c)."""
     smallest, largest = min(p.min() for p, _, _ in spectra), max(p.max() for p, _, _ in spectra)
     candidates = np.geomspace(1e-4 / largest, 1e1 / smallest, CANDIDATES)
     unlikely, sizes = np.empty((len(spectra), CANDIDATES)), np.array([len(p) for p, _, _ in spectra])
@@ -198,10 +191,8 @@ def _choose(spectra: list[tuple[Array, Array, Array]]) -> tuple[Array, Array]:
     for strength, (penalty, omega, power) in zip(best, spectra, strict=True):
         lost = strength * penalty / (1.0 + strength * penalty)
         noise = np.sqrt((lost**2 @ power) / lost.sum())
-        figures.append(
-            [noise, *(noise * np.sqrt(np.mean((1.0 - lost) * omega ** (2 * k))) for k in range(3))]
-        )
-    squares = np.square(figures)  # (w, 4, c)
+        figures.append([noise, noise * np.sqrt(np.mean((1.0 - lost) * omega**2))])
+    squares = np.square(figures)  # (w, 2, c)
     errors = np.sqrt(np.average(squares, axis=0, weights=sizes))
     errors[0] = np.sqrt(np.median(squares[:, 0], axis=0))
     return best, errors

@@ -7,8 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.motion.accelerations import ACCELERATION, accelerometer_place, holds_gravity
-from finssim.calibration.motion.attitude_signal import attitude_signal, up_in_body
+from finssim.calibration.motion.signals import (
+    ACCELERATION,
+    accelerometer_place,
+    attitude_signal,
+    holds_gravity,
+    up_in_body,
+)
 from finssim.calibration.motion.smoothing import smooth
 from finssim.calibration.trials.trial import Trial
 from finssim.geometry.rotations import quat_rotate

@@ -12,7 +12,7 @@ import numpy as np
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Estimate, Fit
-from finssim.calibration.output.origins import Path, file_tree, folded, leaves, numbers
+from finssim.calibration.output.vehicle_file import Key, file_tree, folded, leaves, numbers
 from finssim.provenance import provenance
 from finssim.vehicles import CalibrationRecord, Provenance, Vehicle, VehicleError, check_vehicle
 
@@ -160,7 +160,7 @@ def _plain(value: Any) -> Any:
     return str(value)
 
 
-def _covers(changes: Sequence[Path], leaf: Path, vehicle: Vehicle) -> bool:
+def _covers(changes: Sequence[Key], leaf: Key, vehicle: Vehicle) -> bool:
     """Whether one of the changes set this number, or a list or section that holds it."""
     return any(
         _same_place(change, leaf[: len(change)], vehicle) or _same_place(change, leaf, vehicle)
@@ -168,7 +168,7 @@ def _covers(changes: Sequence[Path], leaf: Path, vehicle: Vehicle) -> bool:
     )
 
 
-def _same_place(pattern: Path, leaf: Path, vehicle: Vehicle) -> bool:
+def _same_place(pattern: Key, leaf: Key, vehicle: Vehicle) -> bool:
     """Whether a path of an estimate or change means a number of the file's tree.
 
     `*` is any name; `thruster_groups.G.x` is x of every thruster of G; an entry of a diagonal matrix may be given by
@@ -188,14 +188,14 @@ def _same_place(pattern: Path, leaf: Path, vehicle: Vehicle) -> bool:
     )
 
 
-def _estimate_of(leaf: Path, estimates: Mapping[str, Estimate], vehicle: Vehicle) -> Estimate | None:
+def _estimate_of(leaf: Key, estimates: Mapping[str, Estimate], vehicle: Vehicle) -> Estimate | None:
     for estimate in estimates.values():
         if estimate.path is not None and _same_place(tuple(estimate.path.split(".")), leaf, vehicle):
             return estimate
     return None
 
 
-def _scale_of(leaf: Path, estimates: Mapping[str, Estimate]) -> Estimate | None:
+def _scale_of(leaf: Key, estimates: Mapping[str, Estimate]) -> Estimate | None:
     """The common scale of all thrusts, for the numbers that it multiplies."""
     return estimates.get("thrust_scale") if leaf[0] == "thrusters" and leaf[-1] in SCALED else None
 

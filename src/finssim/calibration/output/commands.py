@@ -12,13 +12,19 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.fit import Fit
 from finssim.calibration.output.calibrate import all_findings, calibrated, kept
-from finssim.calibration.output.fit_output import fit_json, print_fit
-from finssim.calibration.output.publish import command_line, progress_bar, publish, refuse_places
+from finssim.calibration.output.report import (
+    command_line,
+    fit_json,
+    print_fit,
+    progress_bar,
+    publish,
+    refuse_places,
+)
 from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.calibration.trials.trial import Trial
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
-__all__ = ["calibrate_hydrodynamics", "calibrate_motor", "calibrate_thruster", "usable"]
+__all__ = []
 
 ONLY_SIMULATION = "needs --method simulation"
 
@@ -246,7 +252,7 @@ def _finish(
 
         write_report(fit, report, vehicle, command=command, findings=findings, out=out)
     if ranges is not None:
-        from finssim.calibration.output.calibrated_ranges import write_ranges
+        from finssim.calibration.output.ranges import write_ranges
 
         write_ranges(fit, ranges, vehicle)
 

@@ -13,13 +13,103 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from finssim.calibration.errors import CalibrationError
-from finssim.calibration.output import origins as tree_of
 from finssim.files import atomic_write
 from finssim.vehicles import Provenance, Vehicle, load_vehicle
 from finssim.vehicles.terms import TERMS
 
-__all__ = ["check_vehicle_path", "write_vehicle"]
+__all__ = ["file_tree", "folded", "leaves", "number_origins", "numbers", "write_vehicle"]
+
+Key = tuple[str, ...]
+
+
+def file_tree(vehicle: Vehicle) -> dict[str, Any]:
+    """The values that the vehicle's file gives, with diagonal matrices by their diagonals."""
+    tree: dict[str, Any] = _shortened(vehicle.values())
+    return tree
+
+
+def leaves(node: Any, path: Key = ()) -> Iterator[tuple[Key, float]]:
+    """Path and value of every number below a node of plain values."""
+    if isinstance(node, Mapping):
+        for key, value in node.items():
+            yield from leaves(value, (*path, str(key)))
+    elif isinstance(node, list):
+        for i, value in enumerate(node):
+            yield from leaves(value, (*path, str(i)))
+    elif isinstance(node, (int, float)) and not isinstance(node, bool):
+        yield path, node
+
+
+def number_origins(vehicle: Vehicle) -> dict[Key, Provenance]:
+    """Origin of every number of `file_tree(vehicle)`, by path; calibration records are not numbers of the vehicle."""
+    return {path: vehicle.origin_of(".".join(whole)) for path, whole, _ in numbers(vehicle)}
+
+
+def numbers(vehicle: Vehicle) -> Iterator[tuple[Key, Key, float]]:
+    """Every number of `file_tree(vehicle)`: its path there, its path in `vehicle.values()`, and its value.
+
+    The two paths differ in a diagonal matrix, where the tree has one row; calibration records are left out.
+    """
+    tree, whole = file_tree(vehicle), vehicle.values()
+    tree.pop("calibrations", None)
+    for path, value in leaves(tree):
+        yield path, (*path, path[-1]) if isinstance(_at(whole, path), list) else path, value
+
+
+def folded(tree: Any, origins: Mapping[Key, Provenance]) -> dict[str, Provenance]:
+    """Origins by dotted path, as reading the file gives them: one entry for a list whose numbers share theirs."""
+    found: dict[str, Provenance] = {}
+    _fold(tree, (), origins, found)
+    return found
+
+
+def _fold(
+    node: Any, path: Key, origins: Mapping[Key, Provenance], found: dict[str, Provenance]
+) -> Provenance | None:
+    """Record what lies below; returns the common origin of a number or list, which the caller records."""
+    if isinstance(node, Mapping):
+        for key, value in node.items():
+            common = _fold(value, (*path, str(key)), origins, found)
+            if common is not None:
+                found[".".join((*path, str(key)))] = common
+        return None
+    if isinstance(node, list):
+        parts = [_fold(value, (*path, str(i)), origins, found) for i, value in enumerate(node)]
+        if parts and parts[0] is not None and all(part == parts[0] for part in parts):
+            return parts[0]
+        for i, part in enumerate(parts):
+            if part is not None:
+                found[".".join((*path, str(i)))] = part
+        return None
+    return origins.get(path)
+
+
+def _shortened(node: Any) -> Any:
+    if isinstance(node, dict):
+        return {key: value if key == "calibrations" else _shortened(value) for key, value in node.items()}
+    if (
+        _is_list(node)
+        and len(node) in (3, 6)
+        and all(_is_list(row) and len(row) == len(node) for row in node)
+    ):
+        matrix = np.array(node)
+        if not np.any(matrix - np.diag(np.diag(matrix))):
+            return np.diag(matrix).tolist()
+    return list(node) if isinstance(node, tuple) else node
+
+
+def _at(tree: Any, path: Key) -> Any:
+    for key in path:
+        tree = tree[int(key)] if _is_list(tree) else tree[key if key in tree else int(key)]
+    return tree
+
+
+def _is_list(node: Any) -> bool:
+    return isinstance(node, list)
+
 
 # The text of a vehicle file: sections in the catalogue's order, origins at the highest level they hold for, units.
 
@@ -68,7 +158,7 @@ ONE_LINE = (("water",), ("hull",), ("thrusters", "*"), ("tags", "mounts", "*"))
 """Sections that are written on one line where they fit."""
 
 
-def vehicle_text(tree: Mapping[str, Any], origins: Mapping[tree_of.Path, Provenance]) -> str:
+def vehicle_text(tree: Mapping[str, Any], origins: Mapping[Key, Provenance]) -> str:
     """YAML of a vehicle file.
 
     Args:
@@ -93,9 +183,9 @@ def vehicle_text(tree: Mapping[str, Any], origins: Mapping[tree_of.Path, Provena
 def _lines(
     key: Any,
     node: Any,
-    path: tree_of.Path,
+    path: Key,
     inherited: Provenance | None,
-    origins: Mapping[tree_of.Path, Provenance],
+    origins: Mapping[Key, Provenance],
     pad: str,
 ) -> Iterator[str]:
     """Lines of `key: node`, block or flow."""
@@ -118,7 +208,7 @@ def _lines(
         for i, item in enumerate(node):
             yield from _item(item, (*path, str(i)), inherited, origins, pad + "  ")
     elif isinstance(node, list) and node and isinstance(node[0], list):  # a matrix: one row on a line
-        common = origins.get(next(tree_of.leaves(node, path))[0])
+        common = origins.get(next(leaves(node, path))[0])
         marks = _marks(common, inherited)
         inner = pad
         if marks:
@@ -134,7 +224,7 @@ def _lines(
         yield flow + unit
 
 
-def _unit(path: tree_of.Path) -> str:
+def _unit(path: Key) -> str:
     """Of the value at a path; empty where there is none to write."""
     term = TERMS.get(path[2]) if path[0] == "hydrodynamics" and len(path) > 2 else None
     return UNITS.get(path[-1], "") if term is None else term.units.get(path[-1], "")
@@ -142,9 +232,9 @@ def _unit(path: tree_of.Path) -> str:
 
 def _item(
     node: Any,
-    path: tree_of.Path,
+    path: Key,
     inherited: Provenance | None,
-    origins: Mapping[tree_of.Path, Provenance],
+    origins: Mapping[Key, Provenance],
     pad: str,
 ) -> Iterator[str]:
     """An item of a list on one line; a row whose entries have long notes on a line for each."""
@@ -157,9 +247,7 @@ def _item(
         yield flow
 
 
-def _flow(
-    node: Any, path: tree_of.Path, inherited: Provenance | None, origins: Mapping[tree_of.Path, Provenance]
-) -> str:
+def _flow(node: Any, path: Key, inherited: Provenance | None, origins: Mapping[Key, Provenance]) -> str:
     """A node on one line."""
     if isinstance(node, Mapping):
         common = _common(node, path, origins, inherited)
@@ -169,7 +257,7 @@ def _flow(
         ]
         return "{" + ", ".join(parts) + "}"
     if isinstance(node, list):
-        first = next((origins.get(leaf) for leaf, _ in tree_of.leaves(node, path)), None)
+        first = next((origins.get(leaf) for leaf, _ in leaves(node, path)), None)
         common = first if _uniform(node, path, origins) else inherited
         items = [_flow(item, (*path, str(i)), common, origins) for i, item in enumerate(node)]
         value, marks = f"[{', '.join(items)}]", _marks(common, inherited)
@@ -181,15 +269,15 @@ def _flow(
 
 
 def _common(
-    node: Any, path: tree_of.Path, origins: Mapping[tree_of.Path, Provenance], inherited: Provenance | None
+    node: Any, path: Key, origins: Mapping[Key, Provenance], inherited: Provenance | None
 ) -> Provenance | None:
     """The origin to state for a section: that of most of its values, counting a list once.
 
     Values of one origin and source that differ in their notes share the section's, each with its note alone.
     """
     notes: dict[tuple[Any, str], list[str]] = {}
-    seen: set[tuple[tree_of.Path, Provenance]] = set()
-    for leaf, _ in tree_of.leaves(node, path):
+    seen: set[tuple[Key, Provenance]] = set()
+    for leaf, _ in leaves(node, path):
         value = leaf[:-1] if leaf[-1].isdigit() else leaf
         if leaf in origins and (value, origins[leaf]) not in seen:
             seen.add((value, origins[leaf]))
@@ -217,8 +305,8 @@ def _shared(notes: list[str]) -> str:
     return note if several and notes.count(note) > 2 * notes.count("") else ""
 
 
-def _uniform(node: list[Any], path: tree_of.Path, origins: Mapping[tree_of.Path, Provenance]) -> bool:
-    return len({origins.get(leaf) for leaf, _ in tree_of.leaves(node, path)}) <= 1
+def _uniform(node: list[Any], path: Key, origins: Mapping[Key, Provenance]) -> bool:
+    return len({origins.get(leaf) for leaf, _ in leaves(node, path)}) <= 1
 
 
 def _marks(own: Provenance | None, inherited: Provenance | None) -> dict[str, str]:
@@ -234,7 +322,7 @@ def _marks(own: Provenance | None, inherited: Provenance | None) -> dict[str, st
     return {mark: text for mark, text in marks.items() if text}
 
 
-def _on_one_line(path: tree_of.Path) -> bool:
+def _on_one_line(path: Key) -> bool:
     return any(
         len(path) == len(pattern) and all(p in ("*", q) for p, q in zip(pattern, path, strict=True))
         for pattern in ONE_LINE
@@ -314,7 +402,7 @@ def write_vehicle(vehicle: Vehicle, path: str | os.PathLike[str]) -> None:
         OutputError: The place cannot be written.
     """
     target = check_vehicle_path(path)
-    tree, origins = tree_of.file_tree(vehicle), tree_of.number_origins(vehicle)
+    tree, origins = file_tree(vehicle), number_origins(vehicle)
     tree, origins = _grouped(tree, origins)
     with atomic_write(target) as temporary:
         if vehicle.hull is not None and vehicle.hull.file is not None:
@@ -373,7 +461,7 @@ def _grouped(
         ]
         groups[group] = {key: thrusters[first][key] for key in shared}
         for key in shared:
-            for path, _ in tree_of.leaves(thrusters[first][key], ("thrusters", first, key)):
+            for path, _ in leaves(thrusters[first][key], ("thrusters", first, key)):
                 origins[("thruster_groups", group, *path[2:])] = origins[path]
             for member in members:
                 del thrusters[member][key]
@@ -398,7 +486,7 @@ def _same(
     """Whether two thrusters hold the same under a key, of the same origin."""
     if key not in thrusters[member] or thrusters[first][key] != thrusters[member][key]:
         return False
-    paths = [path for path, _ in tree_of.leaves(thrusters[first][key], (key,))]
+    paths = [path for path, _ in leaves(thrusters[first][key], (key,))]
     return all(origins[("thrusters", first, *p)] == origins[("thrusters", member, *p)] for p in paths)
 
 

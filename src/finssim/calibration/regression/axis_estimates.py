@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate
-from finssim.calibration.regression.axis_fit import TERMS, AxisData
+from finssim.calibration.regression.axis_fit import TERMS, AxisData, Selection
 from finssim.calibration.regression.plant_terms import Matrices, matrices
-from finssim.calibration.regression.selection import Selection
 from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.terms import unit_of
 

@@ -1,23 +1,435 @@
 """The regression of one axis: m nu_dot + d1 nu + d2 |nu| nu + b (+ k sin eta) = tau over all its trials.
 
 Two further terms, `delay` and `smoothing`, take up what the recording did to the motion: see
-`finssim.calibration.regression.rows`.
+`finssim.calibration.regression.axis_fit`.
+
+The derivative of a noisy velocity is not taken. Both sides of the equation are weighted with a smooth bump phi that
+vanishes at its ends, and integration by parts moves the derivative onto it (the weak form; the same low-pass filter on
+both sides):
+
+    ∫ phi tau = -m ∫ phi_dot nu + d1 ∫ phi nu + d2 ∫ phi |nu| nu + b ∫ phi (+ k ∫ phi sin eta)
+                + c1 ∫ phi tau_dot - c2 ∫ phi tau_dot_dot (- Σ θ_j ∫ phi tau_j)
+
+The last two allow for a motion that was recorded late by c1 [s] and smoothed by a filter of variance 2 c2 [s²]: to
+second order, that filter may act on tau instead. tau_j are the wrenches of the vehicle's further terms for units of the
+parameters θ_j that are fitted. Equations hold about the reference point of the hydrodynamic
+coefficients; what the vehicle file knows (Coriolis terms, couplings off the diagonal, gravity and buoyancy but for the
+parts that are fitted) is moved to the left side.
+
+Measured velocities on the right side of a regression carry noise, which biases least squares towards zero. Velocities
+simulated from the recorded input alone are close to the true ones and know nothing of that noise: as instruments they
+remove the bias (Young 1981; Janot, Vandanjon and Gautier 2014, IDIM-IV).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.regression.instruments import Piece, Run, cut, joined, simulate_axis
-from finssim.calibration.regression.rows import Kernel, Rows, Signals, simulated_columns
-from finssim.calibration.uncertainty import Covariance, Evidence, correlated_samples, trial_covariance
+from finssim.calibration.errors import CalibrationError
+from finssim.calibration.motion.signals import Motion
+from finssim.calibration.motion.smoothing import without_spikes
+from finssim.calibration.regression.plant_terms import Matrices, known_wrench, unit_wrenches
+from finssim.calibration.uncertainty import (
+    Covariance,
+    Evidence,
+    correlated_samples,
+    intervals,
+    trial_covariance,
+)
 from finssim.calibration.vision.least_squares import boxed, huber_weight
 
-__all__ = ["TERMS", "AxisData", "AxisFit", "fit_axis", "informative"]
+__all__ = [
+    "AxisData", "DAMPING", "Run", "Selection", "Signals", "TERMS", "axis_rows", "cut", "fit_axis",
+    "informative", "joined", "kernel", "select", "signals", "simulate_axis",
+]  # fmt: skip
+
+Array = NDArray[np.float64]
+
+SLOW = 25.0
+"""Rate up to which what looks like a spike may be a turn [Hz]."""
+
+LONGEST_REPAIR = 3
+"""Outliers in a row that are bridged by a straight line; longer runs break the record."""
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """Bump phi, its derivative, and a shorter bump that smooths nu before |nu| nu is formed."""
+
+    phi: Array
+    """Sums to 1, (L,)."""
+    phi_dot: Array
+    """Reads a derivative: Σ phi_dot_k x_k is the mean of x_dot under phi, (L,) [1/s]."""
+    phi_dot_dot: Array
+    """Reads a second derivative in the same way, (L,) [1/s²]."""
+    short: Array
+    """Sums to 1, (S,)."""
+    stride: int
+    """Rows are taken at every so many samples; neighbours share most of their noise."""
+
+
+def _bump(half_width: float, rate: float) -> tuple[Array, Array, Array]:
+    """(1 - s²)³ on (-1, 1) and what reads the first and second derivative, exact for parabolas."""
+    n = max(1, round(half_width * rate))
+    s = np.arange(-n, n + 1) / (n + 1)
+    t = np.arange(-n, n + 1) / rate
+    phi = (1.0 - s**2) ** 3
+    phi /= phi.sum()
+    slope = s * (1.0 - s**2) ** 2
+    curve = (1.0 - s**2) * (5.0 * s**2 - 1.0)
+    curve = curve - curve.sum() * phi
+    return phi, slope / (slope @ t), 2.0 * curve / (curve @ t**2)
+
+
+def kernel(rate: float, *, half_width: float = 0.25, short: float = 0.06) -> Kernel:
+    """The kernels for a sampling rate; at low rates at least two samples to each side.
+
+    Args:
+        rate: [Hz]
+        half_width: Of phi [s].
+        short: Half width of the smoothing before |nu| nu [s].
+    """
+    phi, phi_dot, phi_dot_dot = _bump(max(half_width, 2.0 / rate), rate)
+    brief = _bump(short, rate)[0] if short * rate >= 0.75 else np.ones(1)
+    return Kernel(phi, phi_dot, phi_dot_dot, brief, max(1, len(phi) // 6))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Signals:
+    """One trial about the reference point of the coefficients, body frame, on a uniform grid."""
+
+    name: str
+    rate: float
+    t: Array
+    nu: Array
+    """(n, 6), NaN where unknown; relative to the water where the current is known."""
+    tau: Array
+    """Applied, (n, 6)."""
+    left: Array
+    """`tau` without what the vehicle file explains: what the diagonal model of each axis has to balance, (n, 6)."""
+    up: Array
+    """World z in the body frame, (n, 3); NaN where the attitude is unknown."""
+    usable: NDArray[np.bool_]
+    """Synchronised, without gap, under water, (n,)."""
+    wanted: NDArray[np.bool_]
+    """Within the phases that are fitted, (n,)."""
+    unknown: tuple[int, ...]
+    """Axes whose velocity is unknown; their couplings are taken as zero."""
+    unit: Array
+    """Wrench of the vehicle's terms for a unit of each parameter that is fitted, (n, 6, k)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rows:
+    """Rows of one axis of one trial."""
+
+    name: str
+    X: Array
+    """Columns nu_dot, nu, |nu| nu, 1, tau_dot, -tau_dot_dot, sin eta (zero but on roll and pitch), and -tau_j of the
+    parameters of terms, (n, 7 + k)."""
+    y: Array
+    """(n,)"""
+    at: NDArray[np.int64]
+    """Sample of the trial at the middle of each row, (n,)."""
+    spans: tuple[tuple[int, int], ...]
+    """Stretches of consecutive good samples, [begin, end)."""
+    samples: int
+    """Samples that entered."""
+    rejected: int
+    """Samples left out as outliers."""
+
+
+def signals(
+    name: str, motion: Motion, up: Array, matrices: Matrices, *, current: Array | None = None
+) -> Signals:
+    """What the axes' equations need of a trial.
+
+    Args:
+        name: Of the trial.
+        motion: The trial on a uniform grid, about the body origin.
+        up: World z in the body frame, not smoothed, (n, 3).
+        matrices: The vehicle, about the reference point of its coefficients.
+        current: Velocity of the water that `motion.nu` does not know of, world frame [m/s], (3,).
+    """
+    from finssim.geometry.rotations import quat_inverse_rotate
+
+    n = len(motion.t)
+    given = np.array([source == "measured" for source in motion.nu_source])
+    nu = np.where(
+        given, motion.raw, motion.nu
+    )  # the weak form smooths both sides alike; a smoother would only one
+    known = np.asarray(np.isfinite(nu).any(axis=0))
+    q_known = np.asarray(np.isfinite(motion.quaternion).all(axis=1))
+    q = np.where(q_known[:, None], motion.quaternion, [0.0, 0.0, 0.0, 1.0])
+    if current is not None and q_known.any():
+        nu[:, :3] -= np.where(
+            q_known[:, None], quat_inverse_rotate(q, np.broadcast_to(current, (n, 3))), np.nan
+        )
+    # A shift to another point mixes axes; what is unknown takes no part.
+    filled = np.where(known, nu, 0.0)
+    shifted = filled @ matrices.H.T
+    nu = np.where(known, shifted, np.nan)
+    tau = motion.tau @ np.linalg.inv(matrices.H)  # wrench moves with the inverse transpose
+    state = (
+        np.where(np.isfinite(nu), nu, 0.0),
+        np.where(np.isfinite(up), up, [0, 0, 1.0]),
+        np.nan_to_num(-motion.position[:, 2]),
+    )
+    left = tau - known_wrench(*state, motion.rate, matrices)
+    phase = motion.phase
+    named = bool(np.isin(phase, ["excitation", "coast"]).any())
+    return Signals(
+        name=name,
+        rate=motion.rate,
+        t=motion.t,
+        nu=nu,
+        tau=tau,
+        left=left,
+        up=up,
+        usable=motion.valid & matrices.submerged(motion.position, up),
+        wanted=np.isin(phase, ["excitation", "coast"]) if named else np.ones(n, bool),
+        unknown=tuple(int(i) for i in np.flatnonzero(~known)),
+        unit=unit_wrenches(*state, matrices),
+    )
+
+
+def axis_rows(found: Signals, axis: int, kernels: Kernel) -> Rows | None:
+    """Rows of one axis; None where there are no usable samples.
+
+    Args:
+        found: The trial.
+        axis: 0 surge to 5 yaw.
+        kernels: For its rate.
+    """
+    nu, left = found.nu[:, axis].copy(), found.left[:, axis]
+    good = found.usable & np.isfinite(nu) & np.isfinite(left)
+    sine = _sine(found.up, axis)
+    if sine is not None:
+        good &= np.isfinite(sine)
+    outlying = np.zeros(len(nu), bool)
+    for begin, end in _spans(good) if found.rate > SLOW else ():
+        outlying[begin:end] = ~without_spikes(found.t[begin:end], nu[begin:end, None])
+    nu, good = _bridge(nu, good, outlying)
+    spans = [(b, e) for b, e in _spans(good) if e - b >= len(kernels.phi) + 2]
+    if not spans:
+        return None
+    X, y, at = [], [], []
+    offset = np.where(np.isfinite(found.up[:, 2]), found.up[:, 2], 1.0) if axis == 2 else np.ones(len(nu))
+    for begin, end in spans:
+        cut = slice(begin, end)
+        centre, rhs = _filtered(left[cut, None], kernels)
+        _, constant = _filtered(offset[cut, None], kernels)
+        _, first = _filtered(left[cut, None], kernels, kernels.phi_dot)
+        _, second = _filtered(left[cut, None], kernels, kernels.phi_dot_dot)
+        _, terms = _filtered(found.unit[cut, axis], kernels)
+        moving = _columns(nu[cut], None if sine is None else sine[cut], kernels)
+        X.append(np.concatenate([moving[:, :3], constant, first, -second, moving[:, 3:], -terms], axis=1))
+        y.append(rhs[:, 0])
+        at.append(begin + centre)
+    return Rows(
+        name=found.name,
+        X=np.concatenate(X),
+        y=np.concatenate(y),
+        at=np.concatenate(at),
+        spans=tuple(spans),
+        samples=sum(e - b for b, e in spans),
+        rejected=int(outlying.sum()),
+    )
+
+
+def simulated_columns(nu: Array, sine: Array | None, rows: Rows, kernels: Kernel) -> Array:
+    """The columns of `axis_rows` from simulated signals of the whole trial, filtered in the same way.
+
+    Args:
+        nu: Simulated velocity of the axis, body frame [m/s or rad/s], (n,).
+        sine: Of the simulated angle, (n,); None without stiffness.
+        rows: Of the same trial and axis, as measured.
+        kernels: For the trial's rate.
+    """
+    moving = np.concatenate(
+        [_columns(nu[b:e], None if sine is None else sine[b:e], kernels) for b, e in rows.spans]
+    )
+    return np.concatenate([moving[:, :3], rows.X[:, 3:6], moving[:, 3:], rows.X[:, 7:]], axis=1)
+
+
+def _columns(nu: Array, sine: Array | None, kernels: Kernel) -> Array:
+    """[nu_dot, nu, |nu| nu, sine] under phi, (rows, 4)."""
+    if len(kernels.short) > 1:
+        weight = np.convolve(np.ones(len(nu)), kernels.short, "same")
+        smooth = np.convolve(nu, kernels.short, "same") / weight
+    else:
+        smooth = nu
+    signals = [nu, np.abs(smooth) * smooth, np.zeros(len(nu)) if sine is None else sine]
+    _, out = _filtered(np.stack(signals, axis=1), kernels)
+    _, first = _filtered(nu[:, None], kernels, kernels.phi_dot)
+    return np.concatenate([first, out], axis=1)
+
+
+def _filtered(x: Array, kernels: Kernel, weights: Array | None = None) -> tuple[NDArray[np.int64], Array]:
+    """Sums under phi or other weights at every `stride`-th place where they fit: middle samples (r,), values (r, c)."""
+    phi = kernels.phi if weights is None else weights
+    windows = np.lib.stride_tricks.sliding_window_view(x, len(phi), axis=0)[:: kernels.stride]
+    return np.arange(len(windows)) * kernels.stride + len(phi) // 2, windows @ phi
+
+
+def _sine(up: Array, axis: int) -> Array | None:
+    """The component of `up` that restores: sin(roll) cos(pitch), sin(pitch); None on the other axes."""
+    return {3: up[:, 1], 4: -up[:, 0]}.get(axis)
+
+
+def _spans(good: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
+    return [(int(b), int(e)) for b, e in edges.reshape(-1, 2)]
+
+
+def _bridge(
+    x: Array, good: NDArray[np.bool_], outlying: NDArray[np.bool_]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Short runs of outliers replaced by straight lines; longer ones are no longer good."""
+    if not outlying.any():
+        return x, good
+    good = good.copy()
+    keep = np.flatnonzero(good & ~outlying)
+    for begin, end in _spans(outlying):
+        inside = begin > 0 and end < len(x) and good[begin - 1] and good[end]
+        if end - begin > LONGEST_REPAIR or not inside:
+            good[begin:end] = False
+    if len(keep):
+        x = np.where(outlying, np.interp(np.arange(len(x)), keep, x[keep]), x)
+    return x, good
+
+
+RATE = 25.0
+"""Steps per second that are enough for time constants of 0.3 s and swings of 1 s [Hz]; slower logs keep their own."""
+
+BLOCK = 20.0
+"""Longest run from one measured state [s]."""
+
+LEAD = 2.0
+"""Before each further block, for the noise of the state that it starts from to fade [s]."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """From one measured state."""
+
+    push: Array
+    """Mean of tau over every step, (n,)."""
+    step: float
+    """[s]"""
+    nu: float
+    s: float
+    """At the begin."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Where a run goes in its trial, and the measured state that it starts from."""
+
+    start: int
+    first: int
+    last: int
+    """The run begins at `start`; samples from `first` to before `last` are taken from it."""
+    every: int
+    """Samples in a step."""
+    rate: float
+    """Of the samples [Hz]"""
+    nu: float
+    s: float
+
+    def run(self, wrench: Array) -> Run:
+        """The run under the trial's force or moment on the axis.
+
+        Args:
+            wrench: Without bias and known terms, body axes [N or N m], (n,).
+        """
+        q = self.every
+        steps = -(-(self.last - 1 - self.start) // q)
+        inside = wrench[self.start : self.start + steps * q + 1]
+        inside = np.pad(inside, (0, steps * q + 1 - len(inside)), mode="edge")
+        push = inside[:-1].reshape(steps, q).mean(axis=1) + np.diff(inside[::q]) / (2 * q)  # trapezoids
+        return Run(push, q / self.rate, self.nu, self.s)
+
+
+def cut(rate: float, spans: Sequence[tuple[int, int]], nu: Array, sine: Array | None) -> list[Piece]:
+    """Pieces of one trial: each starts from the measured state and is no longer than `BLOCK`, after a `LEAD`.
+
+    Args:
+        rate: [Hz]
+        spans: Stretches of consecutive good samples, [begin, end).
+        nu: Measured velocity of the axis, body frame [m/s or rad/s], (n,); the state is the median of a tenth of a
+            second.
+        sine: Of the angle, (n,); None without stiffness.
+    """
+    q = max(1, int(rate / RATE + 1e-9))
+    few, lead = max(1, round(0.1 * rate)), round(LEAD * rate)
+    pieces = []
+    for begin, end in spans:
+        count = max(1, int(np.ceil((end - begin) / (BLOCK * rate))))
+        edges = (begin + (end - begin) * np.arange(count + 1) // count).tolist()
+        for first, last in zip(edges[:-1], edges[1:], strict=True):
+            start = max(begin, first - lead)
+            v = float(np.median(nu[start : start + few]))
+            s = 0.0 if sine is None else float(np.median(sine[start : start + few]))
+            pieces.append(Piece(start, first, last, q, rate, v, s))
+    return pieces
+
+
+def joined(lines: Sequence[Array], pieces: Sequence[Piece], n: int) -> Array:
+    """A signal of the runs of a trial on its n samples, zero where there is none, (n,)."""
+    out = np.zeros(n)
+    for line, piece in zip(lines, pieces, strict=True):
+        at = np.arange(piece.first, piece.last)
+        knots = piece.start + piece.every * np.arange(len(line))
+        out[piece.first : piece.last] = np.interp(at, knots, line)
+    return out
+
+
+def simulate_axis(theta: Array, runs: Sequence[Run]) -> tuple[list[Array], list[Array]]:
+    """Velocities and angles of several runs at once.
+
+    m nu_dot = tau - d1 nu - d2 |nu| nu - k s,  s_dot = nu          (paper, eq. 6 and its form for roll and pitch)
+
+    The step is implicit in the damping and central in s: of second order, stable for any stiffness.
+
+    Args:
+        theta: m, d1, d2, k of all runs (4,), or of each (4, G); m > 0.
+        runs: Inputs and initial states.
+
+    Returns:
+        nu and s of every run, the sine of the angle, (n_g + 1,) each; not finite from where a run leaves all bounds.
+    """
+    m, d1, d2, k = (np.broadcast_to(x, len(runs)) for x in np.asarray(theta, float))
+    n = max((len(run.push) for run in runs), default=0)
+    step = np.array([run.step for run in runs])
+    push = np.zeros((n, len(runs)))
+    for g, run in enumerate(runs):
+        push[: len(run.push), g] = run.push * (run.step / m[g])
+    nu, s = np.empty((n + 1, len(runs))), np.zeros((n + 1, len(runs)))
+    nu[0], s[0] = [run.nu for run in runs], [run.s for run in runs]
+    linear, quadratic, spring, half = d1 * step / (2.0 * m), d2 * step / (2.0 * m), k * step / m, 0.5 * step
+    v, x = nu[0], s[0]
+    previous, drag, swings = v, bool(d2.any()), bool(k.any())
+    with np.errstate(over="ignore", invalid="ignore"):
+        for i in range(n):
+            force = push[i]
+            a = linear
+            if drag:
+                a = a + quadratic * np.abs(1.5 * v - 0.5 * previous)  # speed at mid-step, extrapolated
+            if swings:
+                force = force - spring * (x + half * v)
+            previous, v = v, (v * (1.0 - a) + force) / (1.0 + a)
+            nu[i + 1] = v
+            x = x + half * (previous + v)
+            s[i + 1] = x
+    ends = [len(run.push) + 1 for run in runs]
+    return [nu[:end, g] for g, end in enumerate(ends)], [s[:end, g] for g, end in enumerate(ends)]
+
 
 # Sums over the rows of each trial, and the instrumental-variable estimate that follows from them.
 
@@ -138,8 +550,6 @@ def evidence(
     """For `trial_covariance`, in units of the variance of an independent row."""
     return Evidence(names=names, normal=N_g / variance, score=scores / variance, unit=unit, prior=prior)
 
-
-Array = NDArray[np.float64]
 
 TERMS = ("m_eff", "d1", "d2", "bias", "delay", "smoothing", "k")
 """Names of the first columns; see the module for `delay` [s] and `smoothing` [s²]."""
@@ -387,3 +797,139 @@ def _offset(found: Signals, axis: int) -> Array:
     if axis != 2:
         return np.ones(len(found.t))
     return np.where(np.isfinite(found.up[:, 2]), found.up[:, 2], 1.0)
+
+
+Damping = Literal["auto", "linear", "quadratic", "both"]
+DAMPING: tuple[Damping, ...] = ("auto", "linear", "quadratic", "both")
+
+AKAIKE = 0.157
+"""Akaike's criterion keeps one more term when it is significant at this level (χ² of one degree above 2)."""
+
+TELLING = 6.0
+"""Twice a logarithm of likelihoods below which linear drag is not preferred to quadratic: odds of 20 to 1."""
+
+D1, D2 = TERMS.index("d1"), TERMS.index("d2")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """The model of one axis and the fuller one it was chosen from."""
+
+    fit: AxisFit
+    full: AxisFit
+    """With both dampings."""
+    dropped: tuple[str, ...]
+    """Dampings that were left out because the data do not show them."""
+    p_value: dict[str, float]
+    """For each damping: probability of an estimate as large as that of the fuller model if it were zero."""
+    interval: Array
+    """95 % intervals of all terms, (7, 2): of a dropped term from the fuller model; of a kept one the hull of both
+    models' when another was dropped, for nobody can be sure that it is zero. NaN for terms that were not asked for."""
+
+
+def select(data: AxisData, damping: str = "auto") -> Selection:
+    """Fit an axis with the dampings that the data support.
+
+    `auto` starts from both and leaves out a term that is negative or that Akaike's criterion, with the standard error
+    from the disagreement of the trials, does not keep; of two such terms the one with less evidence. One always stays,
+    and where the data hardly tell linear from quadratic it is the quadratic one: a bluff body's drag is, and a linear
+    one would be far off at higher speeds. The intervals hold both answers.
+
+    Raises:
+        CalibrationError: An unknown `damping`.
+    """
+    if damping not in DAMPING:
+        raise CalibrationError(f"unknown damping '{damping}'; available: {', '.join(DAMPING)}")
+    terms = data.terms
+    if damping in ("linear", "quadratic"):
+        terms[D2 if damping == "linear" else D1] = False
+        smoothed = fit_axis(data, terms)
+        fit = _without_needless_smoothing(data, smoothed)
+        return Selection(
+            fit=fit, full=fit, dropped=(), p_value={}, interval=_with_lag(data, _interval(fit), smoothed)
+        )
+    smoothed = fit_axis(data, terms)
+    full = _without_needless_smoothing(data, smoothed)
+    terms = full.terms.copy()
+    p_value = {name: _p_value(full, TERMS.index(name)) for name in ("d1", "d2")}
+    weak = [name for name, p in p_value.items() if p > AKAIKE]
+    if damping == "both" or not weak:
+        interval = _with_lag(data, _interval(full), smoothed)
+        return Selection(fit=full, full=full, dropped=(), p_value=p_value, interval=interval)
+    dropped = max(weak, key=lambda name: p_value[name])
+    fit = fit_axis(data, _without(terms, dropped))
+    tried = [full, fit]
+    if dropped == "d2":
+        other = fit_axis(data, _without(terms, "d1"))
+        if _evidence(data, fit, other) < TELLING:
+            dropped, fit = "d1", other
+            tried.append(other)
+    ends = np.stack([_interval(one) for one in tried])
+    with np.errstate(all="ignore"):
+        hull = np.stack([np.fmin.reduce(ends[..., 0]), np.fmax.reduce(ends[..., 1])], axis=-1)
+    interval = _with_lag(data, hull, smoothed)
+    return Selection(fit=fit, full=full, dropped=(dropped,), p_value=p_value, interval=interval)
+
+
+def _without(terms: NDArray[np.bool_], name: str) -> NDArray[np.bool_]:
+    out = terms.copy()
+    out[TERMS.index(name)] = False
+    return out
+
+
+def _evidence(data: AxisData, one: AxisFit, other: AxisFit) -> float:
+    """Twice the logarithm of the likelihood of one fit over another's with as many terms."""
+    if not (one.theta[0] > 0.0 and other.theta[0] > 0.0) or other.active[D2]:
+        return np.inf
+    rss = [
+        sum(
+            float(np.sum((rows.y - line)[used] ** 2))
+            for rows, line, used in zip(data.rows, fit.fitted, fit.used, strict=True)
+        )
+        for fit in (one, other)
+    ]
+    return one.independent * float(np.log(max(rss[1], 1e-300) / max(rss[0], 1e-300)))
+
+
+def _without_needless_smoothing(data: AxisData, fit: AxisFit) -> AxisFit:
+    """Once more without `smoothing` where the recording shows none: it costs certainty of the inertia."""
+    term = TERMS.index("smoothing")
+    if _p_value(fit, term) <= AKAIKE:
+        return fit
+    terms = fit.terms.copy()
+    terms[term] = False
+    return fit_axis(data, terms)
+
+
+def _with_lag(data: AxisData, interval: Array, smoothed: AxisFit) -> Array:
+    """Where the motion is late, nobody knows whether by a delay or by a lag of first order, which `smoothing` takes up.
+
+    The inertia's interval then holds both answers.
+    """
+    inertia = TERMS.index("m_eff")
+    if not data.shift or smoothed.active[inertia]:
+        return interval
+    out, other = interval.copy(), _interval(smoothed)[inertia]
+    out[inertia] = np.fmin(out[inertia, 0], other[0]), np.fmax(out[inertia, 1], other[1])
+    return out
+
+
+def _p_value(fit: AxisFit, term: int) -> float:
+    """Two-sided for a positive estimate, 1 for one that cannot be."""
+    from scipy.stats import norm, t
+
+    place = int(fit.terms[:term].sum())
+    std, dof = float(fit.covariance.std[place]), float(fit.covariance.dof[place])
+    if fit.free[term] <= 0.0 or not np.isfinite(std):
+        return 1.0
+    size = fit.free[term] / max(std, 1e-300)
+    return float(2.0 * (t.sf(size, dof) if np.isfinite(dof) else norm.sf(size)))
+
+
+def _interval(fit: AxisFit) -> Array:
+    """About the free estimates, and where a bound moved them about the held ones too."""
+    out = np.full((len(fit.terms), 2), np.nan)
+    free, held = (intervals(x[fit.terms], fit.covariance) for x in (fit.free, fit.theta))
+    out[fit.terms, 0] = np.minimum(free[:, 0], held[:, 0])
+    out[fit.terms, 1] = np.maximum(free[:, 1], held[:, 1])
+    return out

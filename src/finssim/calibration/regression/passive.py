@@ -20,17 +20,16 @@ from numpy.typing import NDArray
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
-from finssim.calibration.motion.attitude_signal import attitude_samples
-from finssim.calibration.motion.signals import Motion, motion
+from finssim.calibration.motion.signals import Motion, attitude_samples, motion
 from finssim.calibration.motion.smoothing import without_spikes
-from finssim.calibration.regression.instruments import Run, simulate_axis
+from finssim.calibration.regression.axis_fit import Run, simulate_axis
 from finssim.calibration.regression.plant_terms import Matrices, matrices
 from finssim.calibration.trials.trial import NU, Trial
 from finssim.calibration.uncertainty import Evidence, correlated_samples, trial_covariance
 from finssim.geometry.rotations import quat_inverse_rotate, quat_to_euler
 from finssim.vehicles import AXES, Vehicle
 
-__all__ = ["FreeMotion", "Release", "free_motion", "passive"]
+__all__ = ["free_motion", "passive"]
 
 Array = NDArray[np.float64]
 Samples = tuple[Array, Array]

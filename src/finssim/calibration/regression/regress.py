@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.calibration.degeneracy import degeneracy
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding, sentences
 from finssim.calibration.fit import Correlation, Estimate, Fit
-from finssim.calibration.motion.attitude_signal import attitude_samples
-from finssim.calibration.motion.signals import Motion, motion
+from finssim.calibration.motion.signals import Motion, attitude_samples, motion
 from finssim.calibration.regression.axis_estimates import (
     LARGE_DELAY,
     AxisResult,
@@ -25,12 +23,22 @@ from finssim.calibration.regression.axis_estimates import (
     term_estimate,
     worthless,
 )
-from finssim.calibration.regression.axis_fit import TERMS, AxisData, informative
+from finssim.calibration.regression.axis_fit import (
+    DAMPING,
+    TERMS,
+    AxisData,
+    Selection,
+    Signals,
+    axis_rows,
+    informative,
+    kernel,
+    select,
+    signals,
+)
 from finssim.calibration.regression.plant_terms import Matrices, matrices
-from finssim.calibration.regression.rows import Signals, axis_rows, kernel, signals
-from finssim.calibration.regression.selection import DAMPING, Selection, select
 from finssim.calibration.trials.inputs import drive, require_axes, require_fittable
 from finssim.calibration.trials.trial import Trial
+from finssim.calibration.uncertainty import degeneracy
 from finssim.geometry.rotations import quat_inverse_rotate
 from finssim.vehicles import AXES, Vehicle
 

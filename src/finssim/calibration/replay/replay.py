@@ -17,15 +17,17 @@ from finssim.calibration.replay.metrics import (
     SEED,
     Aggregate,
     Ahead,
+    Pair,
     Score,
     aggregate,
     error_ahead,
+    excited_axes,
+    find_phases,
+    resampled,
     response_span,
     score,
 )
-from finssim.calibration.replay.pairs import Pair, excited_axes, find_phases, resampled
-from finssim.calibration.simulation.rollout import Response, Rollouts
-from finssim.calibration.simulation.segments import Segment, Streams, segments, streams
+from finssim.calibration.simulation.rollout import Response, Rollouts, Segment, Streams, segments, streams
 from finssim.calibration.trials.trial import NU, Array, Trial
 from finssim.files import atomic_directory, refuse_unwritable
 from finssim.geometry.rotations import quat_rotate, quat_to_euler
@@ -192,7 +194,6 @@ def _add(
 ) -> None:
     """Write what a model made of a trial's segments into its pair."""
     n = len(pair.t)
-    applied = np.full((n, 6), np.nan)
     pieces = []
     for number, (segment, k) in enumerate(zip(own, which, strict=True)):
         since = pair.t + pair.t0 - segment.t0
@@ -205,10 +206,6 @@ def _add(
             whole = np.isfinite(response.nu[rows, 0, k]).all(axis=1)
             pair.diverged.setdefault(model, float(segment.t0 - pair.t0 + t[int(np.argmin(whole))]))
         pieces.append((inside, since[inside], t, _responses(segment, response, rows, k)))
-        if not segment.commanded:
-            force = np.concatenate([segment.before[-1:], segment.force])
-            tau = _shifted(force @ segment.B.T, vehicle.wrench_reference)
-            applied[inside] = np.stack([np.interp(since[inside], t, x) for x in tau.T], axis=-1)
 
     def at(late: float) -> dict[str, Array]:
         values = {name: np.full(n, np.nan) for name in (*NU, "roll", "pitch", "depth")}
@@ -223,8 +220,6 @@ def _add(
     if late:
         pair.late[model] = late
     pair.simulated[model] = at(late)
-    if np.isfinite(applied).any():
-        pair.applied[model] = applied
 
 
 def _late(pair: Pair, at: Callable[[float], dict[str, Array]]) -> float:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich import box
@@ -15,220 +15,319 @@ from rich.table import Table
 from rich.text import Text
 
 from finssim.calibration.findings import Finding, finding, sentences
-from finssim.calibration.replay.figure import MODEL_LABELS, draw_ahead, draw_overlay, draw_response_envelopes
-from finssim.calibration.replay.metrics import RESAMPLES, Aggregate, Score, phase_score, response_span, score
-from finssim.calibration.replay.pairs import Pair, onset
+from finssim.calibration.replay.metrics import (
+    RESAMPLES,
+    UNITS,
+    Aggregate,
+    Ahead,
+    Pair,
+    aggregate,
+    models_of,
+    onset,
+    phase_score,
+    response_span,
+    score,
+)
 from finssim.calibration.replay.replay import Replay
 from finssim.calibration.trials.trial import Array
 from finssim.files import atomic_directory
 from finssim.provenance import provenance
 from finssim.vehicles.vehicle import AXES, Axis
 
-__all__ = ["DEFINITION", "REPLAY_FILE", "print_replay", "replay_json", "replay_markdown", "write_replay"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
-# The gates of the replay validation: does a model respond as the vehicle does, or where not.
+__all__ = [
+    "DEFINITION",
+    "MODEL_LABELS",
+    "REPLAY_FILE",
+    "draw_ahead",
+    "draw_overlay",
+    "draw_response_envelopes",
+    "normalised",
+    "print_replay",
+    "replay_json",
+    "write_replay",
+]
 
-LIMITS = {
-    "input wrench": 0.05,
-    "excitation": 0.20,
-    "coast": 0.30,
-    "initial slope": 0.30,
-    "steady value": 0.20,
-    "coast t10": 0.25,
-}
-"""Gate -> largest value that passes (facts of the published replay validation)."""
+MODEL_LABELS = {"calibrated": "Calibrated Fossen", "mesh": "Physics-mesh", "simplified": "Simplified Fossen"}
+COLORS = {"calibrated": "#0072B2", "mesh": "#009E73", "simplified": "#D55E00"}
+OTHERS = ("#CC79A7", "#56B4E9", "#E69F00")
+"""Okabe and Ito's palette: tells models apart for the colour-blind too."""
+BLACK, GRAY = "#1a1a1a", "0.6"
+STYLES = {"calibrated": (0, ()), "mesh": (0, (6, 1.6)), "simplified": (0, (1.6, 1.2))}
+"""Line styles, for a print without colours."""
 
-INITIAL = 0.5
-"""Time after the onset over which the initial slope is taken [s]."""
-LAST = 0.25
-"""Share of the excitation, at its end, over which the steady value is taken."""
-STEADY = 0.2
-"""An input is steady there if its deviation stays below this share of its mean."""
-SMOOTHING = 0.2
-"""Width of the moving average before the decay time of a coast is read [s]."""
-
-
-class Gate(NamedTuple):
-    """One check."""
-
-    value: float | None
-    limit: float
-    why: str = ""
-    """Why there is no value."""
-
-    @property
-    def passed(self) -> bool | None:
-        """None where it could not be evaluated."""
-        return None if self.value is None else self.value <= self.limit
+BEFORE = 0.5
+"""Time shown before the onset [s]."""
+SYMBOLS = {"roll": "roll", "pitch": "pitch", "depth": "depth"} | {name: f"${name}$" for name in "uvwpqr"}
 
 
-def gates(pair: Pair, model: str, axis: Axis) -> dict[str, Gate]:
-    """Every gate of one model on one axis of one trial.
+def normalised(pair: Pair, values: Array, axis: Axis) -> tuple[Array, Array] | None:
+    """A response over the time since the onset, sign-aligned and relative to the measured P5-P95 span.
 
-    - input wrench: P95 of the difference between the wrench simulated and logged, over the P95 of the logged one
-    - excitation, coast: NRMSE of the phase
-    - initial slope: relative difference of the slopes over the first 0.5 s after the onset
-    - steady value: relative difference of the means over the last quarter of the excitation
-    - coast t10: relative difference of the times to fall to a tenth of the speed at the start of the coast
-
-    The onset is where the input reaches a tenth of its greatest magnitude. Slope, steady value and decay are those of
-    the measurement before smoothing, which would delay them.
-
-    Args:
-        pair: Trial and replays.
-        model: Which replay.
-        axis: Which axis.
-
-    Returns:
-        Key of `LIMITS` -> gate.
-    """
-    response = pair.response(axis)
-    width = response_span(pair, response)
-    if width.value is None:
-        return {name: Gate(None, limit, width.why) for name, limit in LIMITS.items()}
-    real, simulated = pair.raw.get(response, pair.measured[response]), pair.simulated[model][response]
-    found = {
-        "input wrench": _input_difference(pair, model, axis),
-        "excitation": phase_score(pair, model, response, "excitation"),
-        "coast": phase_score(pair, model, response, "coast"),
-        "initial slope": _initial_slope(pair, axis, real, simulated),
-        "steady value": _steady_value(pair, axis, real, simulated),
-        "coast t10": _decay(pair, real, simulated),
-    }
-    return {name: Gate(s.value, LIMITS[name], s.why) for name, s in found.items()}
-
-
-def classify(results: dict[str, Gate]) -> str:
-    """`mismatch` where a gate fails, else `incomplete` where one could not be evaluated, else `consistent`."""
-    passed = [gate.passed for gate in results.values()]
-    if False in passed:
-        return "mismatch"
-    return "incomplete" if None in passed else "consistent"
-
-
-def coupling(pair: Pair, values: dict[str, Array], axis: Axis) -> dict[str, float]:
-    """Response on the other axes per response on the excited one, by root mean square over the excitation.
-
-    There is no gate on it: it shows what a model without coupling terms leaves out. Noise counts as response.
+    Signs are those of the input, and of the response itself where there is none.
 
     Args:
         pair: The trial.
-        values: `pair.measured` or those of a model.
-        axis: The excited axis.
+        values: Measured or simulated response of the axis, (n,).
+        axis: The axis.
 
     Returns:
-        Axis of the same kind (linear or angular) -> ratio [-]; only where both were measured.
+        Times since the onset of the input [s] and values [-], (n,) each; None where the trial has no such response. A
+        passive trial starts at its first scored sample.
     """
-    here = pair.phase == "excitation"
-    kind = AXES[:3] if axis in AXES[:3] else AXES[3:]
-
-    def rms(other: Axis) -> float:
-        x = values.get(pair.response(other), np.empty(0))
-        x = x[here & np.isfinite(x)] if len(x) else x
-        return float(np.sqrt(np.mean(np.square(x)))) if len(x) else float("nan")
-
-    ratios = {other: rms(other) / max(rms(axis), 1e-12) for other in kind if other != axis}
-    return {other: ratio for other, ratio in ratios.items() if np.isfinite(ratio)}
-
-
-def _input_difference(pair: Pair, model: str, axis: Axis) -> Score:
-    k = AXES.index(axis)
-    logged = np.abs(pair.tau[pair.scored(), k])
-    logged = logged[np.isfinite(logged)]
-    level = float(np.percentile(logged, 95.0)) if len(logged) else 0.0
-    if not level > 0.0:
-        return Score(None, f"no input on {axis}")
-    if model not in pair.applied:
-        return Score(None, "the wrench that was simulated is not known")
-    difference = np.abs(pair.applied[model][:, k] - pair.tau[:, k])[pair.scored()]
-    difference = difference[np.isfinite(difference)]
-    if not len(difference):
-        return Score(None, "the input and the replay have no time in common")
-    return Score(float(np.percentile(difference, 95.0)) / level)
-
-
-def _initial_slope(pair: Pair, axis: Axis, real: Array, simulated: Array) -> Score:
+    width = response_span(pair, pair.response(axis)).value
+    if width is None:
+        return None
     start = onset(pair, axis)
-    if start is None:
-        return Score(None, f"no input on {axis}")
-    rows = slice(start, start + round(INITIAL * pair.rate) + 1)
-    both = np.isfinite(real[rows]) & np.isfinite(simulated[rows])
-    if both.sum() < 4:
-        return Score(None, f"fewer than 4 samples in the first {INITIAL:g} s after the onset")
-    t = pair.t[rows][both]
-    covered = pair.measured[pair.response(axis)][rows]
-    covered = covered[np.isfinite(covered)]
-    theirs, ours = np.polyfit(t - t[0], np.c_[real[rows][both], simulated[rows][both]], 1)[0]
-    if abs(theirs) * INITIAL < 0.5 * float(np.ptp(covered)):
-        return Score(None, f"the response turns within {INITIAL:g} s of the onset")
-    return _relative(ours, theirs, _slope_noise(t, pair.noise.get(pair.response(axis), 0.0)), "initial slope")
+    begin = int(np.argmax(pair.scored())) if start is None else start
+    inside = pair.scored()
+    push = pair.tau[inside, AXES.index(axis)]
+    leading = push if start is not None else pair.measured[pair.response(axis)][inside]
+    sign = 1.0 if np.nansum(leading) >= 0.0 else -1.0
+    return pair.t - pair.t[begin], sign * values / width
 
 
-def _slope_noise(t: Array, noise: float) -> float:
-    """Standard deviation of a fitted slope."""
-    return float(noise / np.sqrt(np.sum(np.square(t - t.mean()))))
+def draw_response_envelopes(pairs: Sequence[Pair], title: str = "") -> Figure:
+    """Axis-wise envelopes: a panel for each axis, pointwise median and middle half over its trials.
+
+    Held-out trials are drawn where there are any; else those the vehicle was fitted on, and the figure says so.
+
+    Args:
+        pairs: Trials with their replays.
+        title: Written above, or left out when empty.
+
+    Raises:
+        ValueError: No trial has a response that could be drawn.
+    """
+    held_out = [pair for pair in pairs if not pair.in_sample]
+    shown = held_out or list(pairs)
+    panels = {axis: [p for p in shown if axis in p.axes and _drawable(p, axis)] for axis in AXES}
+    panels = {axis: chosen for axis, chosen in panels.items() if chosen}
+    if not panels:
+        raise ValueError(
+            "no trial has a response that could be drawn: nothing was measured on an excited axis"
+        )
+    models = models_of(shown)
+    columns = 1 if len(panels) == 1 else 2
+    rows = -(-len(panels) // columns)
+    figure, axes_of = _panels(len(panels), rows, columns, (3.6 * columns, 2.15 * rows + 0.55))
+    for i, (axis, chosen) in enumerate(panels.items()):
+        _envelope_panel(axes_of.flat[i], axis, chosen, models)
+    for i in range(0, len(panels), columns):
+        axes_of.flat[i].set_ylabel("normalised response")
+    for axes in axes_of.flat[max(len(panels) - columns, 0) : len(panels)]:
+        axes.set_xlabel("time since onset [s]")
+    handles, labels = axes_of.flat[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False, fontsize=8.5)
+    warning = "" if held_out else "in-sample: the vehicle was fitted on these trials"
+    if title or warning:
+        heading = "\n".join(filter(None, (title, warning)))
+        figure.suptitle(heading, fontsize=10, color="#a00000" if warning else BLACK)
+    return figure
 
 
-def _steady_value(pair: Pair, axis: Axis, real: Array, simulated: Array) -> Score:
-    rows = np.flatnonzero(pair.phase == "excitation")
-    rows = rows[len(rows) - int(LAST * len(rows)) :]
-    tau = pair.tau[rows, AXES.index(axis)]
-    rows, tau = rows[np.isfinite(tau)], tau[np.isfinite(tau)]
-    if len(rows) < 4:
-        return Score(None, "the excitation is too short for a steady value")
-    if np.std(tau) > STEADY * abs(float(np.mean(tau))):
-        return Score(None, "the input is not steady at the end of the excitation")
-    both = np.isfinite(real[rows]) & np.isfinite(simulated[rows])
-    if both.sum() < 4:
-        return Score(None, "fewer than 4 samples at the end of the excitation")
-    smooth = pair.measured[pair.response(axis)][rows]
-    if np.nanstd(smooth) > STEADY * abs(float(np.nanmean(smooth))):
-        return Score(None, "the response is not steady at the end of the excitation")
-    noise = pair.noise.get(pair.response(axis), 0.0) / np.sqrt(both.sum())
-    return _relative(
-        float(simulated[rows][both].mean()), float(real[rows][both].mean()), noise, "steady value"
+def draw_overlay(pair: Pair) -> Figure:
+    """One trial: the input if any, the responses of the excited axes, attitude and depth where they were measured."""
+    responses = [pair.response(axis) for axis in pair.axes]
+    responses += [r for r in ("roll", "pitch", "depth") if response_span(pair, r).value is not None]
+    responses = [r for r in responses if r in pair.measured]
+    driven = bool(np.nan_to_num(pair.tau).any())
+    rows = len(responses) + driven
+    figure, grid = _panels(rows, rows, 1, (7.2, 1.1 + 1.45 * rows), sharex=True)
+    axes_of = grid[:, 0]
+    if driven:
+        _input_panel(axes_of[0], pair)
+    models = models_of([pair])
+    for axes, response in zip(axes_of[driven:], responses, strict=True):
+        if response in pair.raw:
+            axes.plot(pair.t, pair.raw[response], color="0.8", linewidth=0.8)
+        axes.plot(pair.t, pair.measured[response], color=BLACK, linewidth=2.4, label="measured")
+        for model in models:
+            values = _broken(pair, pair.simulated[model][response])
+            figure_of = score(pair, model, response).value
+            note = "" if figure_of is None else f" {figure_of:.3f}"
+            label = f"{MODEL_LABELS.get(model, model)}{note}"
+            axes.plot(
+                pair.t, values, color=_color(model, models), linestyle=_style(model), lw=1.3, label=label
+            )
+        axes.set_ylabel(f"{SYMBOLS[response]} [{UNITS[response]}]")
+        source = pair.source.get(response, "")
+        if source not in ("", "measured"):
+            axes.plot([], [], " ", label=f"({source})")
+        axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=7.5)
+    for axes in axes_of:
+        _tidy(axes)
+        axes.set_xlim(pair.t[0], pair.t[-1])
+    axes_of[-1].set_xlabel("time [s]")
+    label = f"{pair.name}: {', '.join(pair.axes) if driven else 'passive'}" + (
+        ", in-sample" if pair.in_sample else ""
+    )
+    figure.suptitle(label, fontsize=10, color="#a00000" if pair.in_sample else BLACK)
+    return figure
+
+
+def draw_ahead(ahead: Mapping[Axis, Mapping[str, Ahead]]) -> Figure:
+    """Error of predictions from measured states by how far they look ahead, a panel for each axis.
+
+    Relative to the span of the response; persistence, the prediction that nothing changes, is gray.
+
+    Args:
+        ahead: Axis -> model -> error.
+    """
+    columns = min(len(ahead), 3)
+    rows = -(-len(ahead) // columns)
+    figure, axes_of = _panels(len(ahead), rows, columns, (1.2 + 2.4 * columns, 2.0 * rows + 0.5))
+    for axes, (axis, by_model) in zip(axes_of.flat, ahead.items(), strict=False):
+        for model, a in by_model.items():
+            label, color = MODEL_LABELS.get(model, model), _color(model, tuple(by_model))
+            look = {"color": color, "linestyle": _style(model), "linewidth": 1.4}
+            axes.plot(a.seconds, a.nrmse, marker="o", markersize=3, label=label, **look)
+        first = next(iter(by_model.values()))
+        axes.plot(first.seconds, first.nrmse_persistence, "s-", color=GRAY, ms=3, lw=1.2, label="persistence")
+        axes.set_title(axis, fontsize=9, loc="left")
+        axes.set_xlabel("seconds ahead")
+        axes.set_ylim(bottom=0.0)
+        axes.set_xlim(left=0.0)
+        _tidy(axes)
+    for row in axes_of:
+        row[0].set_ylabel("error / span")
+    handles, labels = axes_of.flat[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False, fontsize=8.5)
+    return figure
+
+
+def _panels(
+    count: int, rows: int, columns: int, size: tuple[float, float], **shared: Any
+) -> tuple[Figure, Any]:
+    """A figure of that size [inch] with `count` visible axes in a grid, (rows, columns)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes_of = figure.subplots(rows, columns, squeeze=False, **shared)
+    for axes in axes_of.flat[count:]:
+        axes.set_visible(False)
+    return figure, axes_of
+
+
+def _envelope_panel(axes: Any, axis: Axis, pairs: Sequence[Pair], models: Sequence[str]) -> None:
+    grid = _grid(pairs, axis)
+    measured = [_on(grid, normalised(p, p.measured[p.response(axis)], axis)) for p in pairs]
+    _band(axes, grid, np.array(measured), BLACK, "measured", (0, ()), zorder=2.5, width=3.2)
+    for k, model in enumerate(models):
+        values = [
+            _on(grid, normalised(p, p.simulated[model][p.response(axis)], axis))
+            for p in pairs
+            if model in p.simulated
+        ]
+        color = _color(model, models)
+        _band(axes, grid, np.array(values), color, MODEL_LABELS.get(model, model), _style(model), zorder=3)
+        scores = [{axis: score(p, model, p.response(axis)).value} for p in pairs if model in p.simulated]
+        value = aggregate(scores, resamples=1).value
+        if value is not None:
+            place = (1.0 - 0.14 * (len(models) - 1 - k), 1.03)
+            axes.text(*place, f"{value:.3f}", transform=axes.transAxes, color=color, fontsize=8, ha="right")
+    place = (1.0 - 0.14 * len(models), 1.03)
+    axes.text(*place, "NRMSE", transform=axes.transAxes, color="0.45", fontsize=7, ha="right")
+    coast = [p.t[np.argmax(p.phase == "coast")] - p.t[onset(p, axis) or 0] for p in pairs if _coasts(p, axis)]
+    if coast:
+        axes.axvspan(float(np.median(coast)), grid[-1], color="0.945", zorder=0, linewidth=0.0)
+        axes.annotate(
+            "coast", (float(np.median(coast)), 0.02), xycoords=("data", "axes fraction"),
+            xytext=(3, 1), textcoords="offset points", fontsize=7, color="0.45",
+        )  # fmt: skip
+    count = f"{len(pairs)} trial{'s' if len(pairs) != 1 else ''}"
+    axes.set_title(f"{axis} ({count})", fontsize=9, loc="left")
+    axes.set_xlim(grid[0], grid[-1])
+    _tidy(axes)
+
+
+def _input_panel(axes: Any, pair: Pair) -> None:
+    names = pair.axes or AXES[:1]
+    for axis, style in zip(names, ("-", "--", ":", "-.", "-", "--"), strict=False):
+        unit = "N" if axis in AXES[:3] else "N m"
+        values = pair.tau[:, AXES.index(axis)]
+        axes.plot(pair.t, values, color="0.35", linestyle=style, linewidth=1.1, label=f"{axis} [{unit}]")
+    axes.set_ylabel("input")
+    axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=7.5)
+
+
+def _drawable(pair: Pair, axis: Axis) -> bool:
+    return response_span(pair, pair.response(axis)).value is not None
+
+
+def _coasts(pair: Pair, axis: Axis) -> bool:
+    return bool((pair.phase == "coast").any()) and onset(pair, axis) is not None
+
+
+def _grid(pairs: Sequence[Pair], axis: Axis) -> Array:
+    """Times since the onset that three quarters of the trials cover [s], so that no trial's end shows as a step."""
+    ends = []
+    for pair in pairs:
+        aligned = normalised(pair, pair.t, axis)
+        assert aligned is not None
+        ends.append(aligned[0][np.flatnonzero(pair.scored())[-1]])
+    first = max(-BEFORE, float(np.median([-(p.t[onset(p, axis) or 0] - p.t[0]) for p in pairs])))
+    rate = max(pair.rate for pair in pairs)
+    return np.asarray(
+        np.arange(np.ceil(first * rate), np.floor(float(np.quantile(ends, 0.25)) * rate) + 1) / rate
     )
 
 
-def _relative(ours: float, theirs: float, noise: float, what: str) -> Score:
-    if not abs(theirs) > 3.0 * (noise if np.isfinite(noise) else 0.0) or theirs == 0.0:
-        return Score(None, f"the measured {what} is zero within its noise")
-    return Score(abs(float(ours) - float(theirs)) / abs(float(theirs)))
-
-
-def _decay(pair: Pair, real: Array, simulated: Array) -> Score:
-    rows = np.flatnonzero(pair.phase == "coast")
-    before = np.flatnonzero(pair.phase == "excitation")
-    if len(rows) < 4 or not len(before) or before[-1] > rows[0]:
-        return Score(None, "no coast after the excitation")
-    first = rows[: np.argmax(np.diff(rows, append=rows[-1] + 2) > 1) + 1]
-    theirs, ours = (_fall_time(x[first], pair.rate) for x in (real, simulated))
-    if theirs == 0.0:
-        return Score(None, "the coast is no decay: the response oscillates, or there is none")
-    if theirs is None:
-        return Score(None, "the measured speed does not fall to a tenth within the coast")
-    if ours is None:
-        # It takes longer than the coast lasts: at least that much is known, and where that fails the gate, it fails.
-        least = len(first) / pair.rate / theirs - 1.0
-        if least > LIMITS["coast t10"]:
-            return Score(least)
-        return Score(None, "the simulated speed does not fall to a tenth within the coast")
-    return Score(abs(ours - theirs) / theirs)
-
-
-def _fall_time(x: Array, rate: float) -> float | None:
-    """Time until the magnitude is a tenth of what it was at first [s]; None if it never is, 0 if it comes back."""
-    width = max(1, round(SMOOTHING * rate))
+def _on(grid: Array, aligned: tuple[Array, Array] | None) -> Array:
+    assert aligned is not None
+    t, x = aligned
     good = np.isfinite(x)
-    if good.sum() < 4 * min(width, 2):
-        return None
-    full = np.interp(np.arange(len(x)), np.flatnonzero(good), x[good])
-    padded = np.pad(full, (width // 2, width - 1 - width // 2), mode="edge")
-    smooth = np.abs(np.convolve(padded, np.full(width, 1.0 / width), mode="valid"))
-    below = np.flatnonzero(smooth <= 0.1 * smooth[0])
-    if not len(below):
-        return None
-    return 0.0 if smooth[below[0] :].max() > 0.3 * smooth[0] else float(max(below[0], 1) / rate)
+    if not good.any():
+        return np.full(len(grid), np.nan)
+    return np.asarray(np.interp(grid, t[good], x[good], left=np.nan, right=np.nan))
+
+
+def _band(
+    axes: Any,
+    grid: Array,
+    values: Array,
+    color: str,
+    label: str,
+    style: Any,
+    zorder: float,
+    width: float = 1.5,
+) -> None:
+    """Median and middle half where at least half of the trials have a value."""
+    enough = np.isfinite(values).mean(axis=0) >= 0.5
+    quartiles = np.full((3, len(grid)), np.nan)
+    if enough.any():
+        quartiles[:, enough] = np.nanquantile(values[:, enough], (0.25, 0.5, 0.75), axis=0)
+    low, median, high = quartiles
+    axes.fill_between(grid, low, high, color=color, alpha=0.18, linewidth=0.0, zorder=zorder - 1.0)
+    axes.plot(grid, median, color=color, linewidth=width, linestyle=style, label=label, zorder=zorder)
+
+
+def _broken(pair: Pair, values: Array) -> Array:
+    """A gap in the line wherever a new replay starts."""
+    if pair.segment is None:
+        return values
+    out = values.copy()
+    out[1:][np.diff(pair.segment) != 0] = np.nan
+    return out
+
+
+def _color(model: str, models: Sequence[str]) -> str:
+    strange = [name for name in models if name not in COLORS]
+    return COLORS[model] if model in COLORS else OTHERS[strange.index(model) % len(OTHERS)]
+
+
+def _style(model: str) -> Any:
+    return STYLES.get(model, (0, (4, 1, 1, 1)))
+
+
+def _tidy(axes: Any) -> None:
+    axes.grid(True, color="0.88", linewidth=0.5)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=8)
 
 
 # A replay as plain values.
@@ -331,7 +430,6 @@ def _trial(replay: Replay, i: int, pair: Pair) -> dict[str, Any]:
                     for a in pair.axes
                 },
                 "other_responses": _others(pair, model, others),
-                **_gates(pair, model),
             }
             for model in replay.models
         },
@@ -342,27 +440,6 @@ def _others(pair: Pair, model: str, responses: list[str]) -> dict[str, float]:
     """NRMSE of what was measured besides the excited axes, where it is more than noise."""
     found = {r: score(pair, model, r).value for r in responses}
     return {r: value for r, value in found.items() if value is not None}
-
-
-def _gates(pair: Pair, model: str) -> dict[str, Any]:
-    checked = {axis: gates(pair, model, axis) for axis in pair.axes}
-    return {
-        "gates": {
-            axis: {
-                name: {"value": g.value, "limit": g.limit, "passed": g.passed, "why": g.why}
-                for name, g in found.items()
-            }
-            for axis, found in checked.items()
-        },
-        "class": {axis: classify(found) for axis, found in checked.items()},
-        "coupling": {
-            axis: {
-                "measured": coupling(pair, pair.measured, axis),
-                "simulated": coupling(pair, pair.simulated[model], axis),
-            }
-            for axis in pair.axes
-        },
-    }
 
 
 REPLAY_FILE = "replay.json"
@@ -460,10 +537,9 @@ def _trial_table(replay: Replay) -> tuple[list[str], Rows]:
                 _number(phase_score(pair, model, pair.response(axis), p).value)
                 for p in ("excitation", "coast")
             ]
-            verdict = classify(gates(pair, model, axis))
             kind = "in-sample" if pair.in_sample else "held-out"
-            rows.append([pair.name, axis, kind, _number(one.value), *phases, verdict])
-    return ["trial", "axis", "", "NRMSE", "excitation", "coast", "gates"], rows
+            rows.append([pair.name, axis, kind, _number(one.value), *phases])
+    return ["trial", "axis", "", "NRMSE", "excitation", "coast"], rows
 
 
 def _ahead_table(replay: Replay) -> tuple[list[str], Rows]:

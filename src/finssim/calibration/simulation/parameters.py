@@ -16,7 +16,7 @@ from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.terms import TERMS, unit_of
 
-__all__ = ["Coordinate", "EXTRAS", "Parameters", "Plants", "LONGEST_DELAY"]
+__all__ = ["EXTRAS", "Parameters", "LONGEST_DELAY"]
 
 Array = NDArray[np.float64]
 

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
-from finssim.calibration.trials.header import Header
-from finssim.calibration.trials.trial import INPUT_PREFIXES, TAU, Trial
+from finssim.calibration.trials.trial import INPUT_PREFIXES, TAU, Header, Trial
 from finssim.geometry.rotations import skew
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.vehicles import AXES, Vehicle
@@ -20,7 +19,7 @@ from finssim.vehicles.capability import terminal_speeds
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.part import did_you_mean
 
-__all__ = ["Drive", "applied_wrench", "delivered", "drive", "thruster_motors", "widest_step", "wrench_motors"]
+__all__ = ["Drive", "applied_wrench", "delivered", "drive", "thruster_motors", "wrench_motors"]
 
 # What every fit asks of the trials and axes that it is given.
 

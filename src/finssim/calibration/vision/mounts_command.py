@@ -17,9 +17,14 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Curve, Estimate, Fit
 from finssim.calibration.output.calibrate import all_findings, calibrated, kept
-from finssim.calibration.output.fit_output import fit_json, print_fit
-from finssim.calibration.output.publish import command_line, publish, refuse_places
-from finssim.calibration.output.report import write_report
+from finssim.calibration.output.report import (
+    command_line,
+    fit_json,
+    print_fit,
+    publish,
+    refuse_places,
+    write_report,
+)
 from finssim.calibration.output.vehicle_file import write_vehicle
 from finssim.calibration.vision.least_squares import Pose
 from finssim.calibration.vision.sensor_mounts import (

@@ -14,11 +14,16 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.fit import Estimate
-from finssim.calibration.output.fit_figures import draw_correlation, new_figure, png
-from finssim.calibration.output.publish import command_line, publish, refuse_places
-from finssim.calibration.vision.pool_fit import PoolFit, calibrate_pool, doubted
+from finssim.calibration.output.report import (
+    command_line,
+    draw_correlation,
+    new_figure,
+    png,
+    publish,
+    refuse_places,
+)
+from finssim.calibration.vision.pool_fit import HeldOut, PoolFit, calibrate_pool, doubted, rms
 from finssim.calibration.vision.pool_model import Settings
-from finssim.calibration.vision.pool_search import HeldOut, rms
 from finssim.calibration.vision.report import (
     AS_GIVEN,
     Report,

@@ -2,55 +2,793 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 from scipy.stats import chi2
 from scipy.stats import t as student
 
-from finssim.calibration.degeneracy import correlation
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
 from finssim.calibration.fit import Correlation, Estimate
+from finssim.calibration.uncertainty import correlation
+from finssim.calibration.vision.least_squares import huber_weight
 from finssim.calibration.vision.pool_model import (
     LENS_NAMES,
     NAMES,
     PoolModel,
     Prior,
     Settings,
+    Solution,
     active_names,
     clearances,
     extended_lens,
     lens_std,
+    normal_equations,
     residuals,
     solve,
 )
-from finssim.calibration.vision.pool_search import (
-    UP,
-    Found,
-    HeldOut,
-    Noise,
-    Refined,
-    Whitener,
-    error_vectors,
-    held_out,
-    prior_of,
-    refine,
-    rms,
-    search,
-    surprise,
-    touched,
-)
 from finssim.calibration.vision.report import AS_GIVEN
 from finssim.calibration.vision.survey import Observations
-from finssim.geometry.optics import Lens
-from finssim.geometry.rotations import quat_to_euler
+from finssim.geometry.optics import Camera, Interface, Lens, back_project
+from finssim.geometry.rotations import matrix_to_quat, quat_from_rotvec, quat_to_euler, quat_to_matrix
 
-__all__ = ["PoolFit", "calibrate_pool", "doubted"]
+__all__ = ["HeldOut", "PoolFit", "calibrate_pool", "doubted", "rms"]
 
 Array = NDArray[np.float64]
+
+UP = np.array([0.0, 0.0, 1.0])
+SURFACE_TILT, PLANE_TILT = np.radians(0.2), np.radians(0.5)
+
+DRAWS, DRAWN = 60, 6
+"""Samples of that many points, of which those that suit most of the others are kept."""
+
+FLAT, SOLID = 0.02, 0.2
+"""Thickness of the points, over their lesser width, from which they count as solid, and no longer as flat."""
+
+STARTS = 12
+"""Straight-line poses that are refined."""
+
+SHARES = (0.1, 0.3, 0.55, 0.8, 1.0, 1.2)
+"""Depth of the water as a part of the straight-line distance between camera and points: the camera is on the surface
+at 1.33."""
+
+REACHED = (1.0, 0.75)
+"""Parts of the points that the plane begins before: all, or not the highest, which may be wrong or above the water."""
+
+ENOUGH = 500
+"""Rows from which the search begins; the fit takes all."""
+
+ANYWHERE = 0.5
+"""Depth of the water over the distance of the camera, where nobody measured it, and the standard deviation of that: so
+weak that it only decides where the pixels say nothing."""
+
+MIRRORED = 0.6
+"""Residual of the mirror image over that of the best model, below which the survey's frame is left-handed."""
+
+SAME = 1.15
+"""A surface that fits within this factor of a wall is taken for a surface."""
+
+
+class RobustPixels:
+    """Whitening of rows one by one with Huber's weights, from residuals at one model."""
+
+    def __init__(self, model: PoolModel, seen: Observations, least: float = 0.3) -> None:
+        size = _sizes(model, seen)
+        self.scale = max(least, 1.2 * float(np.median(size)) / 1.1774)
+        self._root = np.sqrt(huber_weight(size, 2.0 * self.scale)) / self.scale
+
+    def __call__(self, values: Array) -> Array:
+        scaled = values * self._root.reshape(-1, *([1] * (values.ndim - 1)))
+        return np.asarray(scaled.reshape(-1, *values.shape[2:]))
+
+
+def pinhole_poses(seen: Observations, lens: Lens, seed: int = 0) -> list[Solution]:
+    """Poses of a camera that saw the points in straight lines, the best first; costs are comparable.
+
+    Water between changes such a pose much, but not where the search from it ends.
+
+    Raises:
+        CalibrationError: Fewer than four points, all on one line, or no pixel within the lens's reach.
+    """
+    rays, ok = lens.rays(seen.pixels)
+    front = ok & (rays[:, 2] > 0.05)
+    X, rays = seen.points[front], rays[front]
+    count = len(np.unique(X.round(6), axis=0))
+    values = np.linalg.svd(X - X.mean(axis=0), compute_uv=False) if count >= 3 else np.zeros(3)
+    if count < 4 or values[1] < 1e-3 * values[0]:
+        raise CalibrationError(
+            f"{count} usable points{' on one line' if len(X) >= 4 else ''}: expected at least 4 that do not lie on one "
+            "line; whether the camera file belongs to these pixels decides which are usable"
+        )
+    plane, reference = Interface(UP, 0.0), seen.points[~seen.dry].mean(axis=0)
+    near = []
+    for R_cp, C in _candidates(X, rays[:, :2] / rays[:, 2:], np.random.default_rng(seed)):
+        camera = Camera(lens, C, matrix_to_quat(R_cp.T))
+        near.append(_straightened(PoolModel(camera, plane, reference, refractive=False), seen, 10))
+    # Most starts have met by now, and what has met ends at one pose.
+    found = _distinct([_straightened(s.model, seen, 30) for s in _distinct(near)])
+    found = [s for s in found if np.median(_sizes(s.model, seen)) <= 0.2 * lens.width]
+    if not found:
+        raise CalibrationError(
+            "no pose of the camera explains the pixels: check ids, units and the camera file"
+        )
+    return found
+
+
+def _candidates(X: Array, xy: Array, rng: np.random.Generator) -> list[tuple[Array, Array]]:
+    """R_cp and C_p from points and their directions x / z, y / z: of all, of small samples, and of all that agree.
+
+    Of flat points each pose has a reflection about the line of sight, which the water may turn into the better one.
+    """
+    import cv2
+
+    middle = X.mean(axis=0)
+    X = X - middle
+    _, values, axes = np.linalg.svd(X)
+    flat, flatness = X - np.outer(X @ axes[2], axes[2]), values[2] / values[1]
+
+    def poses(rows: NDArray[np.intp]) -> Iterator[tuple[Array, Array, Array]]:
+        solvers = [(cv2.SOLVEPNP_IPPE, flat)] if flatness < SOLID else []
+        solvers += [(cv2.SOLVEPNP_SQPNP, X)] if flatness > FLAT else []
+        for solver, points in solvers:
+            try:
+                _, turns, shifts, _ = cv2.solvePnPGeneric(
+                    points[rows], xy[rows], np.eye(3), None, flags=solver
+                )
+            except cv2.error:  # a sample on one line, say
+                continue
+            for turn, shift in zip(turns, shifts, strict=True):
+                R = quat_to_matrix(quat_from_rotvec(turn.ravel()))
+                at = X @ R.T + shift.ravel()
+                off = np.linalg.norm(at[:, :2] / np.maximum(at[:, 2:], 1e-9) - xy, axis=1)
+                if np.isfinite(off).all() and np.median(at[:, 2]) > 0.0:
+                    yield off, R, middle - R.T @ shift.ravel()
+
+    every = np.arange(len(X))
+    samples = [every]
+    if len(X) > DRAWN:
+        samples += [rng.choice(len(X), DRAWN, replace=False) for _ in range(DRAWS)]
+    runs = sorted((run for rows in samples for run in poses(rows)), key=lambda run: np.median(run[0]))
+    for _ in range(3 if runs else 0):
+        agreeing = np.flatnonzero(runs[0][0] < max(4.0 * np.median(runs[0][0]), 1e-4))
+        if len(agreeing) >= 4:
+            runs = [*poses(agreeing), *runs]
+    return [(R, C) for _, R, C in runs[:STARTS]]
+
+
+def _straightened(model: PoolModel, seen: Observations, iterations: int) -> Solution:
+    """The straight-line pose nearby that suits the pixels better, judged by a scale common to all."""
+    active = np.array([name in NAMES[:6] for name in NAMES])
+    whiten, prior = RobustPixels(model, seen), Prior(start=model)
+    model = solve(model, seen, whiten, active, prior, iterations=iterations, tolerance=1e-6).model
+    return Solution(model, _score(model, seen))
+
+
+def _sizes(model: PoolModel, seen: Observations) -> Array:
+    """Lengths of the residuals (N,) [px]."""
+    return np.asarray(np.linalg.norm(residuals(model, seen)[0], axis=1))
+
+
+def _score(model: PoolModel, seen: Observations) -> float:
+    """Mean length of the residuals [px], long ones counted as three medians."""
+    size = _sizes(model, seen)
+    return float(np.minimum(size, 3.0 * np.median(size)).mean())
+
+
+def _distinct(solutions: list[Solution]) -> list[Solution]:
+    """The best first, without those that are another's pose to a degree and a hundredth of the distance."""
+    kept: list[Solution] = []
+    for s in sorted(solutions, key=lambda s: s.cost):
+        here, reach = s.model.camera, 0.01 * np.linalg.norm(s.model.camera.position - s.model.reference)
+        others = (k.model.camera for k in kept)
+        if all(
+            np.trace(here.R_pc.T @ other.R_pc) < 3.0 - 3e-4
+            or np.linalg.norm(here.position - other.position) > reach
+            for other in others
+        ):
+            kept.append(s)
+    return kept
+
+
+def plane_starts(
+    pinhole: PoolModel, normals: Sequence[Array], plane: Interface, seen: Observations, depth: float
+) -> Iterator[PoolModel]:
+    """The straight-line pose with a plane put before the points and the camera moved back to match.
+
+    Points d under the surface look as if d / n under it, so a camera found at H stands at H + d (1 - 1 / n).
+
+    Args:
+        pinhole: Straight-line pose.
+        normals: Directions to try, each turned to the camera's side.
+        plane: Holds indices and window.
+        seen: Of which the points under water count.
+        depth: Distance of the plane from the reference point where it is known [m], or NaN.
+    """
+    camera, reference = pinhole.camera, pinhole.reference
+    wet = seen.points[~seen.dry]
+    for direction in normals:
+        apparent = float(direction @ (camera.position - reference))
+        normal, apparent = (direction, apparent) if apparent > 0.0 else (-direction, -apparent)
+        heights = (wet - reference) @ normal
+        leasts = [float(np.quantile(heights, share)) + plane.thickness for share in REACHED]
+        depths = (
+            [depth]
+            if np.isfinite(depth)
+            else sorted({max(s * apparent, 1.02 * least + 1e-4) for s in SHARES for least in leasts})
+        )
+        for d in depths:
+            ratio = plane.index_near / plane.index_far
+            position = camera.position + normal * d * (1.0 - ratio)
+            if float(normal @ (position - reference)) - d < 0.01 * apparent:
+                position = position + normal * (d + 0.05 * apparent - float(normal @ (position - reference)))
+            here = replace(plane, normal=normal, offset=-float(normal @ reference) - d)
+            yield replace(pinhole, camera=replace(camera, position=position), interface=here, refractive=True)
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where the search ended."""
+
+    model: PoolModel
+    pinhole: PoolModel
+    surface: bool
+    """The plane's normal is along the survey's z."""
+
+
+def search(seen: Observations, lens: Lens, settings: Settings) -> Found:
+    """The best of many starts, with robust weights.
+
+    Raises:
+        CalibrationError: No pose explains the pixels, the survey is left-handed, or contradicts what was measured.
+    """
+    if len(seen) > ENOUGH:
+        kept = np.random.default_rng(settings.seed).choice(len(seen), ENOUGH, replace=False)
+        seen = seen.subset(np.sort(kept))
+    poses = pinhole_poses(seen, lens, settings.seed)
+    near = [p.model for p in poses[:3] if p.cost < 3.0 * poses[0].cost + 0.5]
+    runs: list[tuple[float, PoolModel, bool]] = []
+    for surface, normals in _families(near[0], seen, settings):
+        runs += _family(near, normals, seen, settings, surface)
+    # Bent rays come first: straight ones may fit the mirror image of a good survey better than the survey.
+    _refuse_left_handed(seen, lens, min([_score(near[0], seen), *(run[0] for run in runs)]))
+    if not runs:
+        raise CalibrationError(
+            "no place of the plane between camera and points explains the pixels: check the water height, its sign and "
+            "the interface"
+        )
+    chosen = _choose(runs, len(seen))
+    return Found(chosen[1], near[0], chosen[2])
+
+
+def prior_of(
+    model: PoolModel, start: PoolModel, settings: Settings, surface: bool, stds: tuple[float, ...]
+) -> Prior:
+    """What is known of the plane before the pictures, as the fit wants it.
+
+    Args:
+        model: On whose side of the points the camera is.
+        start: Holds the index and the lens as given.
+        settings: Options.
+        surface: The normal is along the survey's z.
+        stds: Of the lens's parameters.
+    """
+    normal, depth = known_plane(model, settings, surface)
+    tilt = settings.tilt_sigma
+    if tilt is None:
+        tilt = float(PLANE_TILT if settings.plane is not None else SURFACE_TILT if surface else np.inf)
+    depth_std = max(settings.water_height_sigma, 1e-6)
+    if not np.isfinite(depth):
+        apparent = float(np.linalg.norm(start.camera.position - start.reference))
+        depth, depth_std = ANYWHERE * apparent, ANYWHERE * apparent
+    return Prior(
+        normal=normal,
+        tilt_std=tilt if tilt > 0.0 else np.inf,
+        depth=depth,
+        depth_std=depth_std,
+        start=start,
+        index_std=settings.index_sigma if settings.index_sigma > 0.0 else np.inf,
+        lens_std=stds,
+    )
+
+
+def known_plane(model: PoolModel, settings: Settings, surface: bool) -> tuple[Array | None, float]:
+    """Normal towards the camera, and distance of the plane from the reference point; None and NaN where unknown."""
+    towards, depth = model.camera.position - model.reference, settings.water_depth
+    if settings.plane is not None:
+        normal, offset = settings.unit_plane
+        sign = 1.0 if normal @ towards > 0.0 else -1.0
+        return sign * normal, float(-sign * (normal @ model.reference + offset))
+    normal = UP if towards[2] > 0.0 else -UP
+    if surface and settings.water_height is not None:
+        return normal, float(normal[2] * (settings.water_height - model.reference[2]))
+    return normal if surface else None, np.nan if depth is None else depth
+
+
+def _families(pinhole: PoolModel, seen: Observations, settings: Settings) -> list[tuple[bool, list[Array]]]:
+    """(surface?, normals to try)."""
+    if settings.plane is not None:
+        normal, _ = settings.unit_plane
+        return [(bool(abs(normal[2]) > 0.9), [normal])]
+    surface = [(True, [UP])]
+    if settings.interface == "surface" or settings.interface == "auto" and settings.water_height is not None:
+        return surface
+    towards = pinhole.camera.position - pinhole.reference
+    towards = towards / np.linalg.norm(towards)
+    axes = np.linalg.svd(seen.points - seen.points.mean(axis=0), full_matrices=True)[2]
+    facing: list[Array] = []
+    for n in (towards, -np.asarray(pinhole.camera.R_pc)[:, 2], *np.eye(3), *axes):
+        n = n if n @ towards > 0.0 else -n
+        if n @ towards > 0.35 and all(n @ other < 0.995 for other in facing):
+            facing.append(n)
+    return [*(surface if settings.interface == "auto" else []), (False, facing)]
+
+
+def _family(
+    poses: Sequence[PoolModel],
+    normals: Sequence[Array],
+    seen: Observations,
+    settings: Settings,
+    surface: bool,
+) -> list[tuple[float, PoolModel, bool]]:
+    """Ends of the search from all starts of one family: residual [px], model, surface?; the best first."""
+    plane = Interface(UP, 0.0, settings.index_near, settings.index, settings.window)
+    starts: list[PoolModel] = []
+    for pinhole in poses:
+        _refuse_wrong_side(pinhole, settings, surface)
+        _, depth = known_plane(pinhole, settings, surface)
+        starts += plane_starts(pinhole, normals, plane, seen, depth)
+    ends: list[tuple[float, PoolModel]] = []
+    for counts, most in (((6, 4), len(starts)), ((30, 40), 4)):
+        models = [_descend(model, seen, settings, surface, counts) for model in starts[:most]]
+        ends = [(_score(model, seen), model) for model in models if model is not None]
+        ends.sort(key=lambda pair: pair[0])
+        starts = [model for _, model in ends]
+    return [(value, model, surface) for value, model in ends]
+
+
+def _descend(
+    model: PoolModel, seen: Observations, settings: Settings, surface: bool, counts: tuple[int, int]
+) -> PoolModel | None:
+    """Pose alone, then pose and plane."""
+    start = model
+    for count, names in zip(counts, (NAMES[:6], NAMES[:9]), strict=True):
+        prior = prior_of(model, start, settings, surface, (np.inf,) * 8)
+        active = np.array([name in names for name in NAMES])
+        whiten = RobustPixels(model, seen)
+        model, cost = solve(model, seen, whiten, active, prior, iterations=count, tolerance=1e-7)
+        if not np.isfinite(cost):
+            return None
+    return model
+
+
+def _refuse_left_handed(seen: Observations, lens: Lens, best: float) -> None:
+    """Refuse a survey whose mirror image, in straight lines, fits clearly better than the best model of it.
+
+    A plane of points can always be mirrored, and says nothing.
+    """
+    values = np.linalg.svd(seen.points - seen.points.mean(axis=0), compute_uv=False)
+    if values[2] < 0.02 * values[1]:
+        return
+    mirrored = replace(seen, points=seen.points * np.array([1.0, 1.0, -1.0]))
+    if _score(pinhole_poses(mirrored, lens)[0].model, mirrored) < MIRRORED * best:
+        raise CalibrationError(
+            "the survey's frame is left-handed: its mirror image fits clearly better; negate one axis (usually y or z) "
+            "in the survey and in everything that uses its frame (or the pixels are mirrored: u and v exchanged, v "
+            "counted upwards)"
+        )
+
+
+def _refuse_wrong_side(pinhole: PoolModel, settings: Settings, surface: bool) -> None:
+    _, depth = known_plane(pinhole, settings, surface)
+    if np.isfinite(depth) and depth <= 0.0:
+        sense = "below" if pinhole.camera.position[2] < pinhole.reference[2] else "above"
+        where = "the plane given" if settings.water_height is None else "the water's height given"
+        raise CalibrationError(
+            f"the pixels put the camera at z {sense} the points, and {where} is {-depth:.3g} m on the other side of "
+            f"them: the survey's z points {'down' if sense == 'below' else 'up'}, or its x and y make it left-handed "
+            "(seen from the camera, y must lie to the left of x where z is up); give the water's height with the other "
+            "sign, or negate y in the survey"
+        )
+
+
+def _choose(runs: list[tuple[float, PoolModel, bool]], count: int) -> tuple[float, PoolModel, bool]:
+    """The best run; a level surface wherever it does as well as a wall, or the points are too few to tell."""
+    best = min(runs, key=lambda run: run[0])
+    surfaces = [run for run in runs if run[2]]
+    if surfaces and not best[2]:
+        level = min(surfaces, key=lambda run: run[0])
+        upright = abs(float(best[1].interface.normal[2])) > np.cos(np.radians(5.0))
+        spare = 2.0 * count - 9.0  # a wall's parameters are nine, two more than a surface's
+        freedom = np.sqrt((spare + 2.0) / spare) if spare > 0.0 else 1.0
+        if spare <= 0.0 or level[0] <= SAME * freedom * best[0] + 0.02 or upright:
+            return level
+    return best
+
+
+# The fit proper: full weights, the size of the errors, wrong rows left out, errors at points not seen.
+
+LEAST_PIXEL = 0.02
+"""Smallest standard error of a pixel that an estimate can take [px]: no corner is found better."""
+
+NOISE_ROWS = 2000
+"""Rows from which the size of the errors is estimated."""
+
+KNOWN_SURVEY = 0.35
+"""Standard deviation of the logarithm of the survey's error: what is said of it is right within about a third."""
+
+KNOWN_PIXEL, USUAL_PIXEL = 1.2, 0.4
+"""The same of the pixel's error, and its usual size [px]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise:
+    """Standard errors."""
+
+    pixel: float
+    """Of each image coordinate [px]."""
+    survey: float = 0.002
+    """Of each coordinate of a location, where the survey does not give its own [m]."""
+    survey_yaw: float = 0.0087
+    """Of the direction in which a tag was laid [rad]."""
+    scale: float = 1.0
+    """Of all survey errors, as the residuals tell it."""
+
+    def survey_modes(self, J_point: Array, seen: Observations) -> Array:
+        """What one standard error of a location's x, y, z and of a tag's direction does to each pixel [px], (N, 2, 4).
+
+        Args:
+            J_point: Derivative of the pixel by the point, (N, 2, 3).
+            seen: The rows.
+        """
+        sigma = np.where(np.isfinite(seen.sigma), seen.sigma, self.survey)[:, None, None]
+        turn = self.survey_yaw * np.einsum("nij,nj->ni", J_point, seen.arm)[..., None]
+        return np.asarray(self.scale * np.concatenate([J_point * sigma, turn], axis=-1))
+
+
+class Whitener:
+    """Makes residuals independent and of unit variance; rows of one location belong together.
+
+    V_l = sigma² 1 + J_l B_l S B_lᵀ J_lᵀ: a location is displaced as a whole, and a tag turned, by the survey's error.
+    """
+
+    def __init__(self, J_point: Array, seen: Observations, noise: Noise) -> None:
+        """
+        Args:
+            J_point: Derivative of the pixel by the point, (N, 2, 3).
+            seen: The rows.
+            noise: Standard errors.
+        """
+        modes = noise.survey_modes(J_point, seen)
+        self.logdet = 0.0
+        self._groups: list[tuple[NDArray[np.intp], Array]] = []
+        order = np.argsort(seen.location, kind="stable")
+        _, starts, counts = np.unique(seen.location[order], return_index=True, return_counts=True)
+        for count in np.unique(counts):
+            rows = np.stack([order[s : s + count] for s in starts[counts == count]])
+            B = modes[rows].reshape(len(rows), 2 * count, 4)
+            V = B @ B.transpose(0, 2, 1)
+            index = np.arange(2 * count)
+            V[:, index, index] += noise.pixel**2
+            L = np.linalg.cholesky(V)
+            self.logdet += 2.0 * float(np.log(L[:, index, index]).sum())
+            self._groups.append((rows, np.linalg.inv(L)))
+
+    def __call__(self, values: Array) -> Array:
+        """Whitened rows of values (N, 2) or (N, 2, P), as (2N,) or (2N, P); locations one after another."""
+        tail = values.shape[2:]
+        parts = []
+        for rows, L_inverse in self._groups:
+            block = values[rows].reshape(len(rows), L_inverse.shape[-1], -1)
+            parts.append((L_inverse @ block).reshape(-1, *tail))
+        return np.concatenate(parts)
+
+
+def estimate_noise(
+    residual: Array,
+    J: Array,
+    J_point: Array,
+    seen: Observations,
+    noise: Noise,
+    prior: Array,
+    *,
+    pixel_known: bool,
+) -> Noise:
+    """Most likely standard errors of pixels and survey (restricted likelihood: what the fit swallowed is given back).
+
+    Args:
+        residual: Measured minus predicted [px], (N, 2).
+        J: Derivative of the prediction by the fitted parameters, (N, 2, P).
+        J_point: By the point, (N, 2, 3).
+        seen: The rows.
+        noise: What is believed before.
+        prior: Information of the priors on the parameters, (P, P).
+        pixel_known: The pixel's error is given and stays.
+    """
+    if len(seen) > NOISE_ROWS:  # two numbers need no more; whole locations, evenly
+        every = int(np.ceil(len(seen) / NOISE_ROWS))
+        rows = np.flatnonzero(seen.location % every == 0)
+        if len(rows) > NOISE_ROWS // 4:
+            residual, J, J_point, seen = residual[rows], J[rows], J_point[rows], seen.subset(rows)
+
+    def at(x: Array) -> Noise:
+        pixel = noise.pixel if pixel_known else max(LEAST_PIXEL, math.exp(x[1]))
+        return replace(noise, pixel=pixel, scale=math.exp(x[0]))
+
+    def cost(x: Array) -> float:
+        if np.abs(x).max() > 12.0:
+            return 1e12
+        whiten = Whitener(J_point, seen, at(x))
+        r, A = whiten(residual), whiten(J)
+        N = A.T @ A + prior
+        scale = np.sqrt(np.maximum(np.diagonal(N), 1e-300))
+        logdet = float(np.linalg.slogdet(N / np.outer(scale, scale))[1]) + 2.0 * float(np.log(scale).sum())
+        g = A.T @ r
+        chi2 = float(r @ r) - float(g @ np.linalg.lstsq(N, g, rcond=None)[0])
+        usual = (x[0] / KNOWN_SURVEY) ** 2
+        if not pixel_known:
+            usual += ((x[1] - math.log(USUAL_PIXEL)) / KNOWN_PIXEL) ** 2
+        return chi2 + whiten.logdet + logdet + usual
+
+    start = [0.0, math.log(max(noise.pixel, LEAST_PIXEL))][: 1 if pixel_known else 2]
+    found = minimize(
+        cost, np.array(start), method="Nelder-Mead", options={"xatol": 0.01, "fatol": 0.01, "maxiter": 120}
+    )
+    return at(found.x)
+
+
+CHANCE = 0.02
+"""Chance that a right row is taken for a wrong one anywhere in a survey."""
+
+MOST_WRONG = 0.4
+"""Share of wrong rows beyond which nothing is believed."""
+
+ROUNDS = 6
+
+TOUCHING = 0.0001
+"""Distance of the plane from a point or the camera, below which the one keeps the other from moving on [m]."""
+
+PRESSED = 9.0
+"""Fall of chi² that a plane held by a point or the camera would gain beyond it, from which that is no chance."""
+
+CAMERA = "the camera"
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A fit and what it rests on."""
+
+    model: PoolModel
+    noise: Noise
+    used: NDArray[np.bool_]
+    """Rows that are not outliers, (N,)."""
+    whiten: Whitener
+    """Of the rows used."""
+    active: NDArray[np.bool_]
+    """Parameters fitted, (18,)."""
+    prior: Prior
+    covariance: Array
+    """Of all parameters, zero where held, (18, 18)."""
+    cost: float
+    """Half the sum of squares that was minimised."""
+    dof: float
+    """Rows of residuals less parameters."""
+
+
+def refine(
+    model: PoolModel,
+    seen: Observations,
+    active: NDArray[np.bool_],
+    prior: Prior,
+    noise: Noise,
+    *,
+    pixel_known: bool = False,
+) -> Refined:
+    """Fit with the errors of pixels and survey estimated on the way, and wrong rows named.
+
+    Args:
+        model: From the search.
+        seen: All rows.
+        active: Parameters to fit, (18,).
+        prior: What is known beforehand.
+        noise: What is believed of the errors.
+        pixel_known: The pixel's error is given.
+
+    Raises:
+        CalibrationError: Too many rows do not fit.
+    """
+    robust = RobustPixels(model, seen)
+    model = solve(model, seen, robust, active, prior, iterations=40).model
+    robust = RobustPixels(model, seen, least=0.05)
+    model = solve(model, seen, robust, active, prior, iterations=40).model
+    if not pixel_known:
+        size = np.linalg.norm(residuals(model, seen)[0], axis=1)
+        noise = replace(noise, pixel=max(0.05, float(np.median(size)) / 1.1774))
+    used = _plausible(model, seen, noise)
+    free = np.flatnonzero(active)
+    for _ in range(ROUNDS):
+        _refuse_few(used, seen, int(active.sum()))
+        rows = seen.subset(used)
+        J, J_point = model.jacobians(rows.points, rows.dry)
+        J_prior = prior.rows(model)[1][:, free]
+        off, information = residuals(model, rows)[0], J_prior.T @ J_prior
+        noise = estimate_noise(off, J[..., free], J_point, rows, noise, information, pixel_known=pixel_known)
+        whiten = Whitener(J_point, rows, noise)
+        (model, cost), before = solve(model, rows, whiten, active, prior), used
+        used = _plausible(model, seen, noise)
+        if np.array_equal(used, before):
+            break
+    covariance = _covariance(model, rows, whiten, free, prior)
+    dof = max(3.0, 2.0 * len(rows) - len(free))
+    return Refined(model, noise, before, whiten, active, prior, covariance, cost, dof)
+
+
+def touched(fit: Refined, seen: Observations) -> tuple[str, ...]:
+    """Points used, and the camera, that the plane and its window have come to rest against although the pixels want it
+    further on; the nearest first.
+
+    Args:
+        fit: Of these rows.
+        seen: All rows.
+    """
+    wet = fit.used & ~seen.dry
+    distance = np.where(wet, clearances(fit.model, seen.points), np.inf)
+    near = [i for i in np.argsort(distance) if distance[i] < TOUCHING]
+    if not near and fit.model.clearance >= TOUCHING:
+        return ()
+    N, g = normal_equations(
+        fit.model, seen.subset(fit.used), fit.whiten, np.flatnonzero(fit.active), fit.prior
+    )
+    scale = np.sqrt(np.maximum(np.diagonal(N), 1e-300))
+    if float((g / scale) @ np.linalg.lstsq(N / np.outer(scale, scale), g / scale, rcond=1e-9)[0]) < PRESSED:
+        return ()
+    names = dict.fromkeys(seen.locations[seen.location[i]] for i in near)
+    return (*((CAMERA,) if fit.model.clearance < TOUCHING else ()), *names)
+
+
+def _plausible(model: PoolModel, seen: Observations, noise: Noise) -> NDArray[np.bool_]:
+    """Rows whose residual is of the size that the errors of pixel and survey make, whatever it shares with others."""
+    d2 = surprise(model, seen, noise)
+    inner = max(1.0, float(np.median(d2)) / float(chi2.ppf(0.5, 2)))
+    return np.asarray(d2 < inner * chi2.ppf(1.0 - CHANCE / len(seen), 2))
+
+
+def surprise(model: PoolModel, seen: Observations, noise: Noise, covariance: Array | None = None) -> Array:
+    """Squared residuals over what the errors of pixel and survey make of them, (N,); infinite where there is none.
+
+    Args:
+        model: Predicts.
+        seen: The rows.
+        noise: Standard errors.
+        covariance: Of the model's parameters, if their errors count too, (18, 18).
+    """
+    r, ok = residuals(model, seen)
+    J, J_point = (np.where(ok[:, None, None], part, 0.0) for part in model.jacobians(seen.points, seen.dry))
+    modes = noise.survey_modes(J_point, seen)
+    V = modes @ modes.transpose(0, 2, 1) + noise.pixel**2 * np.eye(2)
+    if covariance is not None:
+        V = V + J @ covariance @ J.transpose(0, 2, 1)
+    return np.where(ok, np.einsum("ni,nij,nj->n", r, np.linalg.inv(V), r), np.inf)
+
+
+def _refuse_few(used: NDArray[np.bool_], seen: Observations, parameters: int) -> None:
+    wrong = len(seen) - int(used.sum())
+    if wrong > MOST_WRONG * len(seen):
+        raise CalibrationError(
+            f"{wrong} of {len(seen)} points do not fit any one camera and plane: check that ids, units and the camera "
+            "file belong together, and that the camera did not move"
+        )
+    if 2 * int(used.sum()) < 6:
+        raise CalibrationError(
+            f"{int(used.sum())} usable points for {parameters} parameters: survey at least 4, better 20"
+        )
+
+
+def _covariance(
+    model: PoolModel, rows: Observations, whiten: Whitener, free: NDArray[np.intp], prior: Prior
+) -> Array:
+    """Inverse information, in the order of `NAMES`; directions that nothing tells get a very large variance."""
+    N, _ = normal_equations(model, rows, whiten, free, prior)
+    scale = np.sqrt(np.maximum(np.diagonal(N), 1e-300))
+    values, vectors = np.linalg.eigh(N / np.outer(scale, scale))
+    half = vectors / np.sqrt(np.maximum(values, 1e-14)) / scale[:, None]
+    covariance = np.zeros((len(NAMES), len(NAMES)))
+    covariance[np.ix_(free, free)] = half @ half.T
+    return covariance
+
+
+FEW = 4
+"""Locations below which single rows are held out instead: a target or two have no parts to leave out."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Errors of K rows, each from a fit without its location."""
+
+    pixels: Array
+    """Measured minus predicted [px], (K, 2)."""
+    points: Array
+    """Back-projected minus surveyed, in the plane of the point [m], (K, 3)."""
+    rows: NDArray[np.intp]
+    """Of the observations, (K,)."""
+    folds: int
+
+    def as_json(self) -> dict[str, float | int | None]:
+        """Root mean squares and 95th percentiles; the error of the survey is in them."""
+        size = np.linalg.norm(self.points, axis=1)
+        size = size[np.isfinite(size)]
+        return {
+            "folds": self.folds,
+            "points": len(self.rows),
+            "rms_px": rms(self.pixels),
+            "rms_cm": 100.0 * rms(size[:, None]) if len(size) else None,
+            "p95_cm": 100.0 * float(np.percentile(size, 95)) if len(size) else None,
+        }
+
+
+def rms(errors: Array) -> float:
+    """Root mean square length of vectors (K, n)."""
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=-1)))) if len(errors) else float("nan")
+
+
+def held_out(fit: Refined, seen: Observations, folds: int, seed: int, normal: Array) -> HeldOut | None:
+    """Refit without each part of the locations in turn; None where too few would be left.
+
+    Args:
+        fit: To all rows; its outliers stay out.
+        seen: All rows.
+        folds: Parts, at most one for each location.
+        seed: Of the parts.
+        normal: Of the planes, one through each point, on which pixels are back-projected: unit, pool frame [-], (3,).
+    """
+    used = np.flatnonzero(fit.used)
+    place = seen.location if len(np.unique(seen.location[used])) >= FEW else np.arange(len(seen))
+    names = np.unique(place[used])
+    folds = min(folds, len(names))
+    if folds < 2:
+        return None
+    fold = np.empty(int(place.max()) + 1, int)
+    fold[np.random.default_rng(seed).permutation(names)] = np.arange(len(names)) % folds
+    pixels, points, rows = [], [], []
+    for k in range(folds):
+        inside = np.zeros(len(seen), bool)
+        inside[used] = fold[place[used]] != k
+        outside = used[fold[place[used]] == k]
+        if 2 * inside.sum() < 8 or len(np.unique(seen.points[inside].round(6), axis=0)) < 4:
+            return None
+        part = seen.subset(inside)  # the errors stay as they were
+        whiten = Whitener(fit.model.jacobians(part.points, part.dry)[1], part, fit.noise)
+        model = solve(fit.model, part, whiten, fit.active, fit.prior).model
+        here = seen.subset(outside)
+        r, ok = residuals(model, here)
+        rows.append(outside[ok])
+        pixels.append(r[ok])
+        points.append(error_vectors(model, here, normal)[ok])
+    return HeldOut(np.concatenate(pixels), np.concatenate(points), np.concatenate(rows), folds)
+
+
+def error_vectors(model: PoolModel, seen: Observations, normal: Array) -> Array:
+    """Where each pixel's ray meets the plane through its point, minus the point [m], (N, 3); NaN where it does not.
+
+    Args:
+        model: Camera and water.
+        seen: Pixels and points.
+        normal: Unit normal of the planes, pool frame [-], (3,).
+    """
+    rays, ok = model.camera.lens.rays(seen.pixels)
+    origin = np.broadcast_to(np.asarray(model.camera.position), seen.points.shape).copy()
+    direction = np.where(ok[:, None], rays, np.nan) @ np.asarray(model.camera.R_pc).T
+    if model.refractive and not seen.dry.all():  # what is dry is seen straight from the camera
+        water = back_project(model.camera, model.interface, seen.pixels[~seen.dry])
+        origin[~seen.dry], direction[~seen.dry] = water.origin, water.direction
+    with np.errstate(all="ignore"):
+        length = ((seen.points - origin) @ normal) / (direction @ normal)
+    return np.asarray(origin + length[:, None] * direction - seen.points)
+
 
 # What was estimated, with intervals and whether the pictures tell it, and what to measure so that they do.
 
@@ -504,10 +1242,10 @@ def _pinhole(seen: Observations, found: Found, settings: Settings, fit: Refined)
 STRAIGHTER = 0.7
 """Held-out error of straight lines over that of refraction below which refraction is not believed."""
 
-ENOUGH = 8
+FEWEST_COMPARED = 8
 """Held-out rows from which the two are compared."""
 
-TOUCHING = 0.01
+ON_PLANE = 0.01
 """Distance of the camera from the plane, over that of the points from the camera, below which it lies on it."""
 
 ODD, ABSURD = 3.0, 10.0
@@ -516,7 +1254,7 @@ ODD, ABSURD = 3.0, 10.0
 TOO_DEEP = 1.5
 """Depth of the points below the plane as it was told, over the deepest that a camera above it could see so large."""
 
-FLAT = 0.02
+LEAST_THICKNESS = 0.02
 """Thickness of the points, over their lesser width, below which their mirror image cannot be told from them."""
 
 AGAINST = 0.002
@@ -574,7 +1312,7 @@ def _measured_depth(fit: PoolFit) -> tuple[float, str]:
 def _touching(fit: PoolFit) -> list[Finding]:
     """Where the camera comes to rest on the plane, which it cannot pass; refused where that is absurd."""
     model, error = fit.model, rms(fit.residual[fit.used])
-    if model.clearance >= TOUCHING * (model.clearance + max(model.depth, 0.0)) or error <= ODD:
+    if model.clearance >= ON_PLANE * (model.clearance + max(model.depth, 0.0)) or error <= ODD:
         return []
     if error > ABSURD:
         raise CalibrationError(
@@ -588,7 +1326,7 @@ def _touching(fit: PoolFit) -> list[Finding]:
 def _straight(fit: PoolFit) -> list[Finding]:
     """Where straight lines foretell points better than refraction."""
     bent, straight = fit.held_out, fit.pinhole_held_out
-    if bent is None or straight is None or len(bent.rows) < ENOUGH:
+    if bent is None or straight is None or len(bent.rows) < FEWEST_COMPARED:
         return []
     errors = rms(bent.pixels), rms(straight.pixels)
     if not errors[1] < STRAIGHTER * errors[0]:
@@ -650,6 +1388,6 @@ def _handed(fit: PoolFit) -> list[Finding]:
     if settings.water_height is not None or settings.plane is not None:
         return []
     values = np.linalg.svd(fit.seen.points - fit.seen.points.mean(axis=0), compute_uv=False)
-    if values[2] >= FLAT * values[1]:
+    if values[2] >= LEAST_THICKNESS * values[1]:
         return []
     return [finding("handedness_open")]

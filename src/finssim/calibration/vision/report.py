@@ -17,7 +17,7 @@ from rich.text import Text
 
 from finssim.calibration.findings import Finding, sentences
 from finssim.calibration.fit import Correlation, Estimate
-from finssim.calibration.output.fit_figures import BLUE, GRAY, ORANGE
+from finssim.calibration.output.report import BLUE, GRAY, ORANGE
 from finssim.page import Page, Pictures
 
 if TYPE_CHECKING:
@@ -25,9 +25,7 @@ if TYPE_CHECKING:
 
     from finssim.geometry.optics import Lens
 
-__all__ = [
-    "AS_GIVEN", "ExtraTable", "Report", "correlation_json", "draw_arrows", "picture_axes", "plain", "plain_axes",
-]  # fmt: skip
+__all__ = ["AS_GIVEN", "ExtraTable", "Report", "correlation_json", "draw_arrows", "picture_axes", "plain"]
 
 HEADS = ("parameter", "estimate", "95 % interval", "unit", "note")
 AS_GIVEN = "as given"

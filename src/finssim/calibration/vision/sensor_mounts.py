@@ -18,7 +18,6 @@ from finssim.geometry.rotations import (
     matrix_to_quat,
     quat_conjugate,
     quat_from_rotvec,
-    quat_inverse_rotate,
     quat_multiply,
     quat_rotate,
     quat_to_matrix,
@@ -34,7 +33,6 @@ __all__ = [
     "fit_depth",
     "fit_imu_mounting",
     "imu_clock",
-    "turn_residual",
     "rotation_between",
 ]
 
@@ -371,35 +369,6 @@ def _imu_findings(estimates: dict[str, Estimate], rejected: float) -> tuple[Find
     if rejected > 0.1:
         findings.append(finding("windows_disagree", share=rejected))
     return tuple(findings)
-
-
-def turn_residual(
-    mounting: ImuMounting,
-    attitude: Attitude,
-    gyro: Gyro,
-    *,
-    time_offset: float | None = None,
-    window: float = WINDOW,
-) -> float:
-    """Disagreement of gyro and attitude on a recording that the mounting was not fitted to, robust rms [rad].
-
-    The bias, which a gyro has anew at every power-on, is that of this recording.
-
-    Args:
-        mounting: From another recording.
-        attitude: Of this one.
-        gyro: Of this one.
-        time_offset: Of its clocks [s]; the mounting's if None.
-        window: Length of the turns [s].
-    """
-    pairs = turn_pairs(attitude, window)
-    offset = mounting.time_offset if time_offset is None else time_offset
-    body, sensor = _both(pairs, gyro, offset)
-    residual = quat_inverse_rotate(mounting.orientation, body) - sensor
-    residual -= np.median(residual, axis=0)
-    size = np.linalg.norm(residual, axis=1)
-    usual = size < 4.0 * np.median(size)
-    return float(np.sqrt(np.mean(size[usual] ** 2)))
 
 
 def imu_clock(attitude: Attitude, up_p: Array, t: Array, vertical_rate: Array) -> Estimate | None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,16 +13,180 @@ import yaml
 from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
+from finssim.calibration.fit import Estimate, Fit
+from finssim.calibration.output.calibrate import calibrated, estimate_at
 from finssim.engine.ranges_file import load_ranges
 from finssim.files import atomic_write
 from finssim.vehicles import AXES, HydrodynamicSet, Vehicle, load_vehicle
 from finssim.yaml_file import read_json
 
-__all__ = ["Normal", "correlated_normals", "write_correlated_ranges"]
+__all__ = ["correlated_normals", "range_factors", "write_correlated_ranges", "write_ranges"]
+
+NARROWEST = 0.02
+"""A told parameter varies by at least this part to either side: intervals know of noise, not of a wrong model."""
+WIDEST = (0.0, 5.0)
+"""Factors beyond these are cut."""
+UNTOLD = (0.5, 2.0)
+"""For what the trials could not tell, and for what the vehicle file guesses."""
+OTHER = (0.9, 1.1)
+"""For what was not asked of the trials, and the vehicle file has from somewhere."""
+
+FAMILIES = ("added_mass", "linear_damping", "quadratic_damping")
+
+
+class Factor(NamedTuple):
+    """Range of a factor, and why."""
+
+    low: float
+    high: float
+    why: str
+
+    def text(self) -> str:
+        """As a YAML list."""
+        return f"[{self.low:.4g}, {self.high:.4g}]"
+
+
+def write_ranges(fit: Fit, path: str | os.PathLike[str], vehicle: Vehicle | None = None) -> None:
+    """Write a ranges file for `finssim train --randomize`, around the calibrated vehicle.
+
+    A factor on a number of the vehicle file is drawn uniformly between
+
+    - the ends of its 95 % interval over the estimate, where the trials tell it; at least 2 % to either side;
+    - 0.5 and 2, where they do not, or where the vehicle file guesses it;
+    - 0.9 and 1.1, where it was not asked for and the file has it from somewhere.
+
+    The numbers are drawn one by one, though the errors of linear and quadratic damping go against each other: the drag
+    varies by more than the data allow, never by less.
+
+    Args:
+        fit: The fit.
+        path: File to write, .yaml.
+        vehicle: `calibrated(fit)`, where it is at hand.
+
+    Raises:
+        CalibrationError: Another suffix, or a vehicle without a calibrated set.
+        OutputError: The place cannot be written.
+    """
+    target = Path(path)
+    if target.suffix not in (".yaml", ".yml"):
+        raise CalibrationError(
+            f"{path} ends in '{target.suffix}', expected .yaml: name a ranges file to write"
+        )
+    vehicle = calibrated(fit) if vehicle is None else vehicle
+    text = _text(fit, vehicle)
+    with atomic_write(target) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+        load_ranges(temporary)
+
+
+def range_factors(fit: Fit, vehicle: Vehicle) -> dict[str, Factor]:
+    """Every factor by its place in the ranges file, `linear_damping.surge` or `delay`.
+
+    Args:
+        fit: The fit.
+        vehicle: `calibrated(fit)`.
+    """
+    chosen = vehicle.hydrodynamics.get("calibrated")
+    if not isinstance(chosen, HydrodynamicSet):
+        raise CalibrationError(f"{vehicle.name} has no coefficients named 'calibrated' to vary")
+    factors = {}
+    for family in FAMILIES:
+        matrix = getattr(chosen, family)
+        for i, axis in enumerate(AXES):
+            if matrix[i, i] != 0.0:  # a factor on nothing is nothing
+                path = f"hydrodynamics.calibrated.{family}.{i}.{i}"
+                factors[f"{family}.{axis}"] = _factor(path, fit, vehicle)
+    for path in chosen.term_scalars:
+        if chosen.term_parameters[path] != 0.0:
+            factors[path] = _factor(f"hydrodynamics.calibrated.{path}", fit, vehicle)
+    excess = fit.estimates.get("buoyancy_excess")
+    if excess is not None and excess.identifiable:
+        low, high = ((vehicle.weight + x) / (vehicle.weight + excess.estimate) for x in excess.ci95)
+        factors["volume"] = Factor(low, high, "told")
+    scale = fit.estimates.get("thrust_scale")
+    if scale is not None:
+        factors["thrust.all"] = _of(scale)
+    names = list(vehicle.thrusters)
+    factors["thrust.each"] = _around(
+        _factor(f"thrusters.{name}.{key}", fit, vehicle) for name in names for key in ("c_plus", "c_minus")
+    )
+    for key in ("time_constant", "delay"):
+        paths = [f"thrusters.{name}.{key}" for name in names if getattr(vehicle.thrusters[name], key) > 0.0]
+        if paths and all(_given(vehicle, path) for path in paths):
+            factors[key] = _around(_factor(path, fit, vehicle) for path in paths)
+    return factors
+
+
+def _factor(path: str, fit: Fit, vehicle: Vehicle) -> Factor:
+    estimate = estimate_at(path, fit, vehicle)
+    if estimate is not None:
+        return _of(estimate)
+    if vehicle.origin_of(path).origin == "guessed":
+        return Factor(*UNTOLD, "guessed")
+    return Factor(*OTHER, "not asked for")
+
+
+def _of(estimate: Estimate) -> Factor:
+    """The range that an estimate allows."""
+    low, high = estimate.ci95
+    if not (
+        estimate.identifiable and math.isfinite(low) and math.isfinite(high) and estimate.estimate != 0.0
+    ):
+        return Factor(*UNTOLD, "not told")
+    low, high = sorted((low / estimate.estimate, high / estimate.estimate))
+    low, high = min(low, 1.0 - NARROWEST), max(high, 1.0 + NARROWEST)
+    return Factor(max(low, WIDEST[0]), min(high, WIDEST[1]), "told")
+
+
+def _around(factors: Iterable[Factor]) -> Factor:
+    """The range that holds all of them."""
+    every = list(factors)
+    why = ", ".join(dict.fromkeys(factor.why for factor in every))
+    return Factor(min(f.low for f in every), max(f.high for f in every), why)
+
+
+def _given(vehicle: Vehicle, path: str) -> bool:
+    return any(path == known or known.startswith(f"{path}.") for known in vehicle.provenance)
+
+
+def _text(fit: Fit, vehicle: Vehicle) -> str:
+    factors = range_factors(fit, vehicle)
+    record = vehicle.calibrations[-1]
+    lines = [
+        "# Factors on the numbers of the calibrated vehicle. told: 95 % interval over the estimate, at least",
+        "# 2 % to either side; not told by the trials, or guessed: half to double; not asked for: 0.9 to 1.1.",
+        f'source: "95 % intervals, {record.sentence()}; vehicle {vehicle.sha256[:16]}"',
+    ]
+    for family in FAMILIES:
+        rows: dict[str, Factor] = {
+            axis: factors[f"{family}.{axis}"] for axis in AXES if f"{family}.{axis}" in factors
+        }
+        lines += _mapping(family, "axes", rows)
+    of_terms = [
+        path.split(".") for path in vehicle.hydrodynamic_set("calibrated").term_scalars if path in factors
+    ]
+    for term in dict.fromkeys(path[0] for path in of_terms if len(path) > 1):
+        own = {path[1]: factors[".".join(path)] for path in of_terms if path[0] == term}
+        lines += _mapping(term, None, own)
+    for key in ("volume", "time_constant", "delay", *(path[0] for path in of_terms if len(path) == 1)):
+        if key in factors:
+            lines.append(f"{key}: {factors[key].text()}  # {factors[key].why}")
+    thrust = {key: factors[f"thrust.{key}"] for key in ("all", "each") if f"thrust.{key}" in factors}
+    lines += _mapping("thrust", None, thrust)
+    return "\n".join(lines) + "\n"
+
+
+def _mapping(head: str, inner: str | None, rows: dict[str, Factor]) -> Sequence[str]:
+    if not rows:
+        return []
+    pad = "  " if inner is None else "    "
+    body = [f"{pad}{key}: {factor.text()}  # {factor.why}" for key, factor in rows.items()]
+    return [f"{head}:", *([] if inner is None else [f"  {inner}:"]), *body]
+
 
 Array = NDArray[np.float64]
 
-FAMILIES = {
+FAMILY_OF = {
     "added_mass": "added_mass",
     "m_eff": "added_mass",
     "d1": "linear_damping",
@@ -31,13 +196,11 @@ FAMILIES = {
 
 WITHIN_95 = 1.959964
 """Half of a 95 % interval in standard deviations."""
-NARROWEST = 0.01
+LEAST_STD = 0.01
 """Least relative standard deviation: intervals know of noise, not of a wrong model."""
 CUT = 4.0
 LEAST = 0.05
 """Factors below this are cut off."""
-UNTOLD = (0.5, 2.0)
-"""Log-uniform, for what the fit could not tell."""
 
 
 class Normal(NamedTuple):
@@ -89,7 +252,7 @@ def correlated_normals(
         ):
             low, high = value["ci95"]
             mean, std = value["estimate"] / nominal, 0.5 * (high - low) / WITHIN_95 / nominal
-            normals[entry], of[entry] = Normal(mean, max(std, NARROWEST * mean)), name
+            normals[entry], of[entry] = Normal(mean, max(std, LEAST_STD * mean)), name
         else:
             untold.append(entry)
     if not normals:
@@ -156,8 +319,8 @@ def write_correlated_ranges(fit: Path, vehicle: Vehicle, out: Path) -> None:
 def _entry(name: str) -> str | None:
     """Entry of the ranges table for a parameter of a fit; None where there is none."""
     axis, _, what = name.partition(".")
-    if axis in AXES and what in FAMILIES:
-        return f"{FAMILIES[what]}.{axis}"
+    if axis in AXES and what in FAMILY_OF:
+        return f"{FAMILY_OF[what]}.{axis}"
     return "thrust.all" if name == "thrust_scale" else None
 
 
@@ -170,7 +333,7 @@ def _nominal(name: str, value: Mapping[str, Any], fit: Mapping[str, Any], vehicl
         raise CalibrationError(f"{vehicle.name} has no coefficients named 'calibrated' to vary")
     axis, _, what = name.partition(".")
     i = AXES.index(axis)
-    return float(getattr(chosen, FAMILIES[what])[i, i])
+    return float(getattr(chosen, FAMILY_OF[what])[i, i])
 
 
 def _correlation(of: Mapping[str, str], found: Mapping[str, Any] | None) -> tuple[list[str], Array]:

@@ -1,1 +1,0 @@
-"""What trials can and cannot tell, and what is wrong with them."""
