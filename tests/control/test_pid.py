@@ -29,11 +29,11 @@ def vehicle():
 
 @pytest.fixture(scope="module")
 def held(vehicle, pool):
-    """A minute of T1 in a plant: errors and memory of `run`, once for every plant."""
+    """40 s of T1 in a plant: errors and memory of `run`, once for every plant."""
 
     @cache
     def run_once(period=0.05, **water):
-        return run(Pid.from_vehicle(vehicle, period=period), pool(vehicle, 8, **water), T1, 60.0)
+        return run(Pid.from_vehicle(vehicle, period=period), pool(vehicle, 8, **water), T1, 40.0)
 
     return run_once
 

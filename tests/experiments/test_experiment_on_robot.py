@@ -17,7 +17,7 @@ from finssim.robot.record_reader import open_record
 from finssim.vehicles import load_vehicle
 from reference.pools import Person, lockstep_pool
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("brief_t1")]
 
 FINSROV = load_vehicle("finsrov")
 T1_ROWS = {"rows": ("pid",), "targets": ("P02", "P03"), "seeds": 1}
@@ -29,7 +29,7 @@ def experiment(spec, out, wiring, person=None, **options):
 
 
 @pytest.fixture(scope="module")
-def held(tmp_path_factory):
+def held(brief_t1, tmp_path_factory):
     """Two setpoints of T1, ended by the operator after the first and gone on with; folder, result, truth."""
     folder = tmp_path_factory.mktemp("t1")
     out, truth = folder / "out", folder / "truth"

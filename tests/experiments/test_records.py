@@ -29,11 +29,12 @@ from finssim.robot.recorder import Recorder
 FINSROV = load_vehicle("finsrov")
 STEP = 1.0 / 60.0
 WRENCH6 = action_mode("wrench6", FINSROV)
+ALLOCATOR = Allocator.from_vehicle(FINSROV)
 
 
 def surge(newtons):
     """Thrusts of a pure surge."""
-    return Allocator.from_vehicle(FINSROV).allocate([newtons, 0.0, 0.0, 0.0, 0.0, 0.0])
+    return ALLOCATOR.allocate([newtons, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
 def written(path, seconds=2.0, *, meta=None, period=1, vehicle=FINSROV, events=(), **at):

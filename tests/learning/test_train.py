@@ -19,11 +19,14 @@ from finssim.engine.ranges_file import RangesError
 from finssim.experiments.evaluate import evaluate_controller
 from finssim.experiments.plants import load_plant
 from finssim.files import OutputError
+from finssim.learning import episodes
+from finssim.learning.export import onnx_bytes
 from finssim.learning.learners import LEARNERS, LearningError
 from finssim.learning.resume import ResumeError
 from finssim.learning.train import TrainingError, train
 from finssim.learning.training_loop import Loop
 from finssim.tasks import EnvironmentSetupError, StationKeeping, Task, TrajectoryTracking
+from finssim.tasks.agents import AgentError
 from finssim.vehicles import VehicleError, load_vehicle
 from reference.guess import Guess
 
@@ -197,10 +200,13 @@ def die_in_the_sixth_update(out, learner, options):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
-@pytest.mark.parametrize("learner", ["ppo", "sb3-sac"])
+@pytest.mark.parametrize("learner", ["ppo", "ppo from pid", "sb3-sac"])
 def test_a_killed_training_goes_on_to_the_same_policy(tmp_path, learner):
     """kill -9 in the sixth of eight updates, then --resume: network and curves as if nothing had been."""
     options = dict(SMALL)
+    if learner == "ppo from pid":
+        learner, options["init"] = "ppo", "pid"
+        options["settings"] = {**SMALL["settings"], "taught": 0.9}
     if learner == "sb3-sac":
         options["settings"] = {"rollout": 32, "batch": 64, "warm_up": 600, "gradient_steps": 4}
     whole = train("t1", out=tmp_path / "whole", learner=learner, **options)
@@ -244,7 +250,7 @@ def test_only_the_same_training_is_resumed(tmp_path, capsys):
     assert "yet: starting from the beginning" in capsys.readouterr().err.replace("\n", " ")
 
 
-@pytest.mark.parametrize("learner", ["ppo", "torchrl-ppo"])
+@pytest.mark.parametrize("learner", ["ppo", pytest.param("torchrl-ppo", marks=pytest.mark.slow)])
 def test_a_learner_whose_numbers_run_away_is_stopped(tmp_path, learner):
     """One sentence, and no policy."""
     options = {**SMALL, "settings": {**SMALL["settings"], "learning_rate": 1e30}}
@@ -275,6 +281,16 @@ def test_a_learner_whose_numbers_run_away_is_stopped(tmp_path, learner):
             "task 't1' has one agent, and this learner trains several",
         ),
         ({"settings": {"gamma": 0.9}}, LearningError, "unknown setting 'gamma'; available: worlds"),
+        (
+            {"init": "pid", "learner": "rsl-rl"},
+            TrainingError,
+            "learner 'rsl-rl' imitates nobody before it learns",
+        ),
+        (
+            {"init": "pdi"},
+            AgentError,
+            "expert 'pdi' is neither a policy directory nor a baseline of task 't1'",
+        ),
         ({"device": "tpu"}, ValueError, "device 'tpu' is not available"),
     ],
 )
@@ -329,6 +345,43 @@ def test_a_training_ends_where_the_held_episodes_succeed(tmp_path):
     assert not any(
         shares[a] >= 0.95 and shares[b] >= 0.95 for a, b in zip(changes, changes[1:-1], strict=False)
     )
+
+
+def test_the_network_that_did_best_is_left(tmp_path, monkeypatch):
+    """Of the held evaluations' the one with the most successes, of equals the greater return, of those the later."""
+    scores = iter(
+        [(0.1, 5.0), (0.9, 1.0), (0.9, 2.0), (0.9, 2.0), (0.5, 9.0), (0.9, 1.9), (0.0, 0.0), (0.8, 8.0)]
+    )
+    networks = []
+
+    def scored(self, network):
+        success, total = next(scores)
+        networks.append(network)
+        return {"evaluation_return": total, "evaluation_success": success}
+
+    monkeypatch.setattr(episodes.HeldEvaluation, "__call__", scored)
+    folder = train("t1", out=tmp_path / "p", **SMALL)
+    description = Policy.load(folder).description
+    assert (folder / "policy.onnx").read_bytes() == onnx_bytes(networks[3], description)
+    told = description.training
+    assert (told["best_after"], told["steps_done"], told["complete"]) == (2048, 4096, True)
+
+
+def test_a_policy_that_begins_from_a_pid_holds_sooner(tmp_path):
+    """50,000 steps, an eighth of the default, hold all setpoints; begun from nothing they hold none."""
+    folder = train("t1", out=tmp_path / "p", seed=1, steps=50_000, init="pid")
+    result = evaluate_controller(folder, load_plant("nominal")).result
+    assert (result["success"], result["trials"]) == (8, 8) and result["e_p_m"] < 0.005
+    again = train("t1", out=tmp_path / "again", seed=2, steps=50_000, init=folder, randomize="pool")
+    assert evaluate_controller(again, load_plant("nominal")).result["success"] == 8
+
+
+def test_team_pursuit_begins_from_its_baseline_where_that_can_act(tmp_path):
+    """In the task's own action mode, unless another teacher or none is asked for."""
+    tiny = {"worlds": 8, "steps": 4096, "settings": {"hidden": [16]}}
+    for options, teacher in (({}, "formation"), ({"action": "wrench6"}, ""), ({"init": "none"}, "")):
+        folder = train("team-pursuit", out=tmp_path / "p", **tiny, **options)
+        assert Policy.load(folder).description.training["teacher"] == teacher
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,8 @@ from finssim import boundary
 from finssim.cli import app
 from finssim.control import ControlError
 from finssim.control.trajectories import TRAJECTORIES
-from finssim.experiments.stack import BATCH, site_of
+from finssim.experiments import stack
+from finssim.experiments.stack import site_of
 from finssim.pool.fleet import Medium
 from finssim.robot.pilots import AgentPilot
 from finssim.tasks import TASKS, task_named
@@ -57,8 +58,9 @@ def test_a_policy_of_ones_own_task_runs_through_the_stack(example, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_keeps_its_episodes_and_goes_on(tmp_path, capsys):
+def test_the_command_keeps_its_episodes_and_goes_on(tmp_path, capsys, monkeypatch):
     """The second call plays the second episode alone, and prints both beside the batch."""
+    monkeypatch.setattr(stack, "BATCH", 32)
     words = [
         "experiment",
         "stack",
@@ -76,7 +78,7 @@ def test_the_command_keeps_its_episodes_and_goes_on(tmp_path, capsys):
     said = capsys.readouterr()
     told = json.loads(said.out)
     assert "episode 1 of" not in said.err and "episode 2 of 2" in said.err
-    assert told["stack"]["trials"] == 2 and told["batch"]["trials"] == BATCH
+    assert told["stack"]["trials"] == 2 and told["batch"]["trials"] == 32
     assert told["batch"]["metrics"]["success"]["value"] > 0.9
 
 

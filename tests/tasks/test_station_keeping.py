@@ -78,7 +78,7 @@ def test_fast_and_far_is_limited_in_the_observation():
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_reward_is_the_sum_of_its_terms(seed):
-    """r = position + distance + heading + turn + action + change + rate, from the state after the step."""
+    """r = position + distance + heading + turn + leaning + action + change + rate, from the state after the step."""
     env, r = environment(seed=seed), TASK.reward
     rng = np.random.default_rng(seed)
     before = rng.uniform(-1.5, 1.5, (64, 6))
@@ -88,12 +88,14 @@ def test_the_reward_is_the_sum_of_its_terms(seed):
     p, R, nu, goal, R_goal = truth(env)
     e = np.linalg.norm(goal - p, axis=1)
     theta = (R.inv() * R_goal).magnitude()
+    tilt = np.arccos(np.clip(R.as_matrix()[:, 2, 2], -1.0, 1.0))
     a, previous = np.clip(action, -1.0, 1.0), np.clip(before, -1.0, 1.0)
     expected = (
         r.position * np.exp(-e / r.position_scale)
         - r.distance * e
         + r.heading * np.exp(-theta / r.heading_scale)
         - r.turn * theta
+        - r.leaning * np.clip(tilt / np.radians(22.5) - 1.0, 0.0, 2.0)
         - r.action * np.mean(a**2, axis=1)
         - r.change * np.mean((a - previous) ** 2, axis=1)
         - r.rate * np.minimum(np.sum(nu[:, 3:] ** 2, axis=1), 4.0)
@@ -135,15 +137,19 @@ def test_leaving_the_pool_terminates_with_a_loss(position, left):
     assert (step.reward[0] < -TASK.reward.loss + 2.0) == left
 
 
-@pytest.mark.parametrize(("roll", "ended"), [(44.0, False), (60.0, True), (-60.0, True), (180.0, True)])
-def test_capsizing_terminates_with_a_loss(roll, ended):
-    """Beyond 45°, where a bridge stops the vehicle, and either way round."""
+@pytest.mark.parametrize(
+    ("roll", "low", "high"), [(20, 0, 0), (50, 0.8, 1), (-50, 0.8, 1), (60, 1.2, 1.4), (180, 2, 2)]
+)
+def test_leaning_is_charged_from_half_of_the_tilt_that_a_bridge_stops_at(roll, low, high):
+    """Nothing to 22.5°, 1 at 45°, 2 at 67.5° and beyond; the episode goes on."""
     env = environment(1, auto_reset=False)
     pose = (0.0, 0.0, -0.5), Rotation.from_euler("x", roll, degrees=True).as_quat()
     env.start(*pose, *pose)
     step = env.step(np.zeros((1, 6)))
-    assert (step.terminated[0], step.truncated[0]) == (ended, False)
-    assert (step.reward[0] < -TASK.reward.loss + 2.0) == ended
+    expected = np.clip(np.degrees(truth(env)[1].magnitude())[0] / 22.5 - 1.0, 0.0, 2.0)
+    earned = env.arrays.earned.numpy()[0, env.task.earnings.index("leaning")]
+    assert earned == pytest.approx(-expected, abs=2e-3) and low <= expected <= high
+    assert not step.terminated[0]
 
 
 def test_the_time_limit_truncates_and_nothing_else_does():

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import expm, solve_discrete_are
 
 from finssim.control.allocation import Allocator
 from finssim.control.guidance import Goal, Measured, tracking_error, velocity_at
@@ -158,6 +157,8 @@ class Lqr:
 
 def _gains(body: Pid, axis: int, scale: float, lag: float, delays: int, period: float) -> Array:
     """Feedback of one axis of e, e', f and the commands under way, (3 + delays,); zero without authority."""
+    from scipy.linalg import expm, solve_discrete_are
+
     model, limit = body.model, float(body.wrench_limits[axis])
     n = 3 + delays
     if not limit > 0.0:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 
 from finssim.control import ControlError
 from finssim.control.guidance import Reference
@@ -152,16 +152,22 @@ def ellipse(a: float, b: float, duration: float, depth: float = DEPTH) -> Motion
         stretch = np.hypot(a * np.sin(angle), b * np.cos(angle))
         return np.asarray(stretch / (0.5 + 0.5 * np.sin(2.0 * angle) ** 2))
 
-    middle = slowness(0.5 * (theta[1:] + theta[:-1]))
-    ends = slowness(theta)
-    pieces = (ends[:-1] + 4.0 * middle + ends[1:]) * np.diff(theta) / 6.0  # Simpson's rule
-    table = np.concatenate([[0.0], np.cumsum(pieces)])
-    turned = CubicHermiteSpline(table / table[-1], theta, table[-1] / ends)
-    turning = turned.derivative()
+    @cache  # where it is first followed: importing the splines takes half a second
+    def turned() -> tuple[Any, Any]:
+        """Angle of the share of the way, and its derivative."""
+        from scipy.interpolate import CubicHermiteSpline
+
+        middle = slowness(0.5 * (theta[1:] + theta[:-1]))
+        ends = slowness(theta)
+        pieces = (ends[:-1] + 4.0 * middle + ends[1:]) * np.diff(theta) / 6.0  # Simpson's rule
+        table = np.concatenate([[0.0], np.cumsum(pieces)])
+        angle = CubicHermiteSpline(table / table[-1], theta, table[-1] / ends)
+        return angle, angle.derivative()
 
     def motion(t: Array) -> tuple[Array, Array]:
         s, s_dot = _smooth_step(t / duration)
-        angle, rate = turned(s), turning(s) * s_dot / duration
+        angle, rate = (of(s) for of in turned())
+        rate = rate * s_dot / duration
         c, n = np.cos(angle), np.sin(angle)
         position = np.stack([a * c, b * n, np.full_like(c, depth)], axis=-1)
         return position, np.stack([-a * rate * n, b * rate * c, 0.0 * c], axis=-1)
@@ -430,6 +436,8 @@ def through_points(name: str, points: npt.ArrayLike, **options: Any) -> Trajecto
     Raises:
         ControlError: Fewer than two points, numbers that are not finite, or times that do not increase from 0.
     """
+    from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
+
     table = _checked_points(points)
     t = table[:, 0]
     table[:, 4:] = np.unwrap(table[:, 4:], axis=0)

@@ -34,7 +34,7 @@ __all__ = ["MEASURES", "CompareError", "compare", "draw_training", "tables_of"]
 
 CURVES_FILE = "curves.csv"
 SEED_AT_END = re.compile(r"[-_]?(?:seed|s)?[-_]?\d+$")
-NOT_SETTINGS = ("steps_done", "complete", "seconds", "resumed")
+NOT_SETTINGS = ("steps_done", "best_after", "complete", "seconds", "resumed")
 """Of a training's record: what tells how it went."""
 
 

@@ -12,9 +12,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import brentq
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 __all__ = [
     "MeshError",
@@ -43,6 +40,8 @@ def unit_hull(fill: float) -> tuple[Vertices, Faces]:
     Returns:
         Vertices (n, 3) and outward faces (m, 3).
     """
+    from scipy.optimize import brentq  # here and below: a robot that needs no hull starts without them
+
     cells = (8, 4, 4)
 
     def excess(along: float, across: float) -> float:
@@ -279,6 +278,8 @@ def check_closed(vertices: ArrayLike, faces: ArrayLike) -> None:
             f"{flat} of {len(triangles)} faces are degenerate (no area): remove them and merge their vertices"
         )
 
+    from scipy.sparse import coo_matrix
+
     start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
     n = len(points)
     edge = (np.minimum(start, end), np.maximum(start, end))
@@ -325,6 +326,9 @@ def outward(vertices: ArrayLike, faces: ArrayLike) -> Faces:
 
 def _parts(vertices: ArrayLike, faces: Faces) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Number of the connected part each face (m,) belongs to, and the volume (parts,) [m³] of each."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     n = int(faces.max()) + 1
     edges = coo_matrix((np.ones(faces.size), (faces.ravel(), np.roll(faces, -1, axis=1).ravel())), (n, n))
     part = connected_components(edges, directed=False)[1][faces[:, 0]]

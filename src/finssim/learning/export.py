@@ -45,6 +45,7 @@ __all__ = [
     "ExportError",
     "description_of",
     "export_policy",
+    "onnx_bytes",
     "save_policy",
     "write_graph",
 ]
@@ -210,7 +211,7 @@ class ExportError(ValueError):
 
 
 def export_policy(
-    network: nn.Module | Network,
+    network: nn.Module | Network | bytes,
     directory: str | Path,
     description: PolicyDescription,
     *,
@@ -224,7 +225,7 @@ def export_policy(
     Args:
         network: A `Network`, or a torch module that maps observations (N, n) float32 to the mean action (N, m), or, as
             a `RecurrentNetwork`, observations and memory to action and memory; the written one clips the action to
-            [-1, 1].
+            [-1, 1]. Or what `onnx_bytes` made of one before.
         directory: Folder to write. An earlier policy directory is replaced; any other folder with files is refused.
         description: What it was trained with; `memory`, `files`, `provenance` and `created` are filled in.
         curves: Rows of `curves.csv`, with equal keys.
@@ -239,10 +240,13 @@ def export_policy(
         ExportError: The network's sizes do not fit the description, or the two disagree.
         OutputError: The folder cannot be written.
     """
-    content = _onnx_bytes(network, description)
+    content = network if isinstance(network, bytes) else onnx_bytes(network, description)
+    inputs = {
+        tensor.name: tensor.type.tensor_type.shape for tensor in onnx.load_from_string(content).graph.input
+    }
     complete = description.model_copy(
         update={
-            "memory": int(getattr(network, "memory_size", 0)),
+            "memory": inputs["memory"].dim[-1].dim_value if "memory" in inputs else 0,
             "files": {NETWORK_FILE: hashlib.sha256(content).hexdigest()},
             "provenance": provenance(),
             "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),
@@ -264,7 +268,9 @@ def export_policy(
             (folder / EVALUATION_FILE).write_text(text, encoding="utf-8")
         if also is not None:
             also(folder)
-        _check_agreement(network, Policy.load(folder), tolerance)
+        policy = Policy.load(folder)
+        if not isinstance(network, bytes):
+            _check_agreement(network, policy, tolerance)
     return Path(directory)
 
 
@@ -352,7 +358,12 @@ def _mean_of(model: Any, kind: str) -> nn.Module | Network:
     )
 
 
-def _onnx_bytes(network: nn.Module | Network, description: PolicyDescription) -> bytes:
+def onnx_bytes(network: nn.Module | Network, description: PolicyDescription) -> bytes:
+    """The ONNX file of a network that fits a description.
+
+    Raises:
+        ExportError: Its sizes do not fit, or it is of a kind that cannot be written.
+    """
     n, m = description.observation.size, description.action_size
     try:
         shape = _answer(network, np.zeros((2, n)), _memory(network, 2), np.float32, limited=False).shape

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -42,6 +42,7 @@ def train(
     worlds: Annotated[int | None, (1, 10_000_000)] = None,
     steps: Annotated[int | None, (1, 1_000_000_000_000)] = None,
     until: float | None = None,
+    init: str | Path | None = None,
     settings: Annotated[Mapping[str, Any] | Sequence[str], "--set"] = (),
     resume: bool = False,
     device: str = "cpu",
@@ -78,6 +79,9 @@ def train(
         steps: Control steps to learn from, all worlds together; what the task needs if not given.
         until (SHARE): Share of successes, such as 0.95, at which the training is done before its steps are: of the held
             episodes, in two evaluations one after the other.
+        init (NAME|DIR): Whom the policy imitates before it learns by itself: a baseline of the task, such as pid, a
+            policy directory, or none; team-pursuit has its baseline if not given. Of ppo; --set taught=SHARE says for
+            how much of the training.
         settings (NAME=VALUE): Change of a setting of the learner, such as learning_rate=1e-3 or hidden=128,128. May be
             given several times.
         resume: Go on from the last checkpoint of a training that was killed.
@@ -122,6 +126,7 @@ def train(
     randomized = randomization is not None
     plan, changes = _level_plan(settings if isinstance(settings, Mapping) else settings_of_words(settings))
     values = kind.settings(the_task, randomized=randomized, worlds=worlds, steps=steps, changes=changes)
+    values = _taught(values, init, learner, mode_name == the_task.action)
 
     def worlds_of(count: int, ranges: Randomization | None, its_seed: int, **more: Any) -> Environment:
         return make(
@@ -171,6 +176,19 @@ def train(
     return place
 
 
+def _taught(values: Any, init: str | Path | None, learner: str, own_action: bool) -> Any:
+    """The settings with whom to imitate first; the task's own teacher acts in the task's own action mode alone."""
+    if not hasattr(values, "teacher"):
+        if init is None:
+            return values
+        raise TrainingError(
+            f"learner '{learner}' imitates nobody before it learns: leave init out, or take ppo"
+        )
+    if init is not None:
+        return replace(values, teacher="" if str(init) == "none" else str(init))
+    return values if own_action else replace(values, teacher="")
+
+
 def _level_plan(settings: Mapping[str, Any]) -> tuple[LevelPlan | None, dict[str, Any]]:
     """How the task's level rises, if a setting of it is given; and the settings of the learner."""
     kinds = {field.name: type(field.default) for field in fields(LevelPlan)}
@@ -210,11 +228,13 @@ def _finish(loop: Any, place: Path, stopped: bool, console: Console, where: Path
         console.print("no policy: interrupted before anything was learned", soft_wrap=True)
         raise KeyboardInterrupt
     done = loop.curves[-1]["steps"]
-    export_policy(
-        loop.learner.network(), place, after(loop.description, done, not stopped), curves=loop.curves
-    )
+    best = loop.best
     what = "policy so far" if stopped else "policy"
-    told = f"{what}: {where}  ({done:,} steps in {took:.1f} s)"
+    export_policy(
+        best.network, place, after(loop.description, done, not stopped, best.steps), curves=loop.curves
+    )
+    kept = f", best after {best.steps:,}" if best.steps < done else ""
+    told = f"{what}: {where}  ({done:,} steps in {took:.1f} s{kept})"
     console.print(told, highlight=False, soft_wrap=True, markup=False)
     if stopped:
         raise KeyboardInterrupt

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -29,7 +30,7 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
 from finssim.control.policy import DESCRIPTION_FILE, PolicyDescription
-from finssim.learning.export import export_policy
+from finssim.learning.export import export_policy, onnx_bytes
 from finssim.learning.learners import Learner, LearningError
 from finssim.learning.resume import RESUME_FILE, ResumeError, read_state, write_state
 
@@ -115,6 +116,18 @@ EVALUATIONS = 10
 """Held evaluations in a training; each takes about as long as an update."""
 
 
+@dataclass(frozen=True)
+class Best:
+    """A network of a training, and how well it did."""
+
+    score: tuple[float, float]
+    """Share of successes and return in the held evaluation."""
+    steps: int
+    """After which it was measured."""
+    network: bytes
+    """As ONNX."""
+
+
 @dataclass
 class Loop:
     """Trains a learner to its end, or until Ctrl-C."""
@@ -137,6 +150,8 @@ class Loop:
     until: float | None = None
     """Share of successes among the held episodes: reached in two evaluations in a row, the training is done."""
     curves: list[dict[str, Any]] = field(default_factory=list)
+    best: Best | None = None
+    """The network that did best in the held evaluations, the later of equals: what a training leaves behind."""
     seconds: float = 0.0
     """Time of the updates and evaluations so far [s], over all the pieces of a training that was resumed."""
 
@@ -191,7 +206,11 @@ class Loop:
                 "take a smaller learning rate, or another seed"
             )
         if self._passed(math.ceil(total / EVALUATIONS)) or self.learner.steps >= total or not self.curves:
-            held = dict(self.evaluate(self.learner.network()))
+            network = self.learner.network()
+            held = dict(self.evaluate(network))
+            if self.best is None or _score(held) >= self.best.score:
+                content = onnx_bytes(network, self.description)
+                self.best = Best(_score(held), self.learner.steps, content)
         else:
             held = {name: value for name, value in self.curves[-1].items() if name.startswith("evaluation_")}
         self.seconds += time.perf_counter() - began
@@ -222,12 +241,15 @@ class Loop:
             "learner": self.learner.state(),
             "curves": self.curves,
             "seconds": self.seconds,
+            "best": [*self.best.score, self.best.steps, np.frombuffer(self.best.network, np.uint8)]
+            if self.best
+            else None,
         }
         place = self.side / f"checkpoint-{steps:09d}"
         export_policy(
             self.learner.network(),
             place,
-            after(self.description, steps, False),
+            after(self.description, steps, False, steps),
             curves=self.curves,
             also=lambda folder: write_state(state, folder / RESUME_FILE),
         )
@@ -251,6 +273,15 @@ class Loop:
                 )
         self.learner.load(state["learner"])
         self.curves, self.seconds = list(state["curves"]), float(state["seconds"])
+        if state["best"]:
+            success, total, steps, network = state["best"]
+            self.best = Best((success, total), steps, network.tobytes())
+
+
+def _score(row: Mapping[str, Any]) -> tuple[float, float]:
+    """How good a held evaluation was: the share of successes, where the task knows one, then the return."""
+    share, total = (float(row.get(f"evaluation_{name}", 0.0)) for name in ("success", "return"))
+    return (share if math.isfinite(share) else 0.0, total if math.isfinite(total) else -1e300)
 
 
 def _checkpoints(side: Path) -> list[Path]:
@@ -277,9 +308,9 @@ def last_checkpoint(side: Path) -> dict[str, Any] | None:
     return None
 
 
-def after(description: PolicyDescription, steps: int, complete: bool) -> PolicyDescription:
-    """The description of the network as it is after so many steps."""
-    record = {**description.training, "steps_done": steps, "complete": complete}
+def after(description: PolicyDescription, steps: int, complete: bool, best: int) -> PolicyDescription:
+    """The description of a network after so many steps of training; it was best after `best` of them."""
+    record = {**description.training, "steps_done": steps, "best_after": best, "complete": complete}
     return description.model_copy(update={"training": record})
 
 

@@ -683,15 +683,16 @@ class BaselineAgent(PidAgent):
 
     kind = "baseline"
 
-    def __init__(self, name: str, vehicle: Vehicle, task: Task) -> None:
-        """Make the task's baseline of that name for a vehicle."""
-        self.name, self.action = name, task.action
+    def __init__(self, name: str, vehicle: Vehicle, task: Task, scale: Any = 1.0) -> None:
+        """Make the task's baseline of that name for a vehicle; action 1 is `scale` of each limit in the worlds."""
+        self.name, self.action, self.scale = name, task.action, scale
         self.controller = baseline(task.name, name, vehicle)
         self.period = self.controller.period
 
     def act(self, memory: Any, known: Known, goal: Goal) -> tuple[NDArray[np.float32], Any]:
         """Actions, a row for each agent of each world."""
-        return self.controller.act(memory, known.observation)
+        action, memory = self.controller.act(memory, known.observation)
+        return np.clip(action / self.scale, -1.0, 1.0).astype(np.float32), memory
 
 
 def agent_for(
@@ -712,9 +713,16 @@ def agent_for(
 
 
 def expert_for(
-    name_or_directory: str | Path, vehicle: Vehicle, task: Task, action: str
+    name_or_directory: str | Path, vehicle: Vehicle, task: Task, action: str, scale: Any = 1.0
 ) -> PolicyAgent | BaselineAgent:
     """Who is imitated: a baseline of the task or the policy of a directory, which see the observation alone.
+
+    Args:
+        name_or_directory: Which.
+        vehicle: Theirs.
+        task: Theirs.
+        action: Mode of the learner's actions.
+        scale: Part of each wrench limit that action 1 of the learner stands for [1].
 
     Raises:
         AgentError: There is neither, or it acts in another mode than `action`.
@@ -726,7 +734,7 @@ def expert_for(
             raise AgentError(
                 f"baseline '{name_or_directory}' acts by {task.action}, expected {action}: leave --action out"
             )
-        return BaselineAgent(str(name_or_directory), vehicle, task)
+        return BaselineAgent(str(name_or_directory), vehicle, task, scale)
     if not (Path(name_or_directory) / DESCRIPTION_FILE).is_file():
         raise AgentError(
             f"expert '{name_or_directory}' is neither a policy directory nor a baseline of task '{task.name}'; "

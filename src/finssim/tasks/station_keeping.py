@@ -33,10 +33,12 @@ class Reward:
       - distance · e                             a slope everywhere: far goals are approached. A weight of 0.3 was too
                                                  little: with random buoyancy, lying on the floor was learnt
       + heading · exp(-θ / heading_scale) - turn · θ     the same for the attitude error θ, roll and pitch included
+      - leaning · clip(2 tilt / max_tilt - 1, 0, 2)   no pitching over on the way, where a bridge would stop. To end the
+                                                 episode there taught to capsize at once: an end ends the losses
       - action · mean(a²)                        the cheapest thrusts that do it
       - change · mean(Δa²)                       commands that a motor can follow, no chatter
       - rate · min(|ω|², 4)                      no spinning on the way
-      - loss                                     once, on leaving the pool or capsizing: more than a bad episode costs
+      - loss                                     once, on leaving the pool: more than a bad episode costs
     """
 
     position: float = 1.0
@@ -45,6 +47,7 @@ class Reward:
     heading: float = 0.6
     heading_scale: float = 0.20
     turn: float = 0.15
+    leaning: float = 1.0
     action: float = 0.03
     change: float = 0.05
     rate: float = 0.01
@@ -74,9 +77,10 @@ def within_tolerance(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
 
 
 @wp.func
-def capsized(state: State, p: Any, w: int) -> bool:
-    """The body z axis is further than `max_tilt` from the vertical."""
-    return wp.quat_rotate(state.quaternion[w, 0], wp.vec3(0.0, 0.0, 1.0))[2] < wp.cos(p.max_tilt)
+def leaning(state: State, p: Any, w: int) -> float:
+    """0 up to half of `max_tilt`, 1 at `max_tilt`, 2 from half beyond it [1]: the tilt at which a bridge stops."""
+    up = wp.quat_rotate(state.quaternion[w, 0], wp.vec3(0.0, 0.0, 1.0))[2]
+    return wp.clamp(2.0 * wp.acos(wp.clamp(up, -1.0, 1.0)) / p.max_tilt - 1.0, 0.0, 2.0)
 
 
 @wp.func
@@ -115,7 +119,7 @@ class StationKeeping(PoolTask):
     """Goals are uniform in this box; yaw is uniform over the circle, roll and pitch are level."""
     goal_high: tuple[float, float, float] = (1.2, 0.5, -0.28)
     max_tilt: float = math.radians(45.0)
-    """Tilting further [rad] ends the episode: the default `safety.max_tilt`, where a bridge stops the vehicle."""
+    """Tilt that the vehicle should stay well below [rad]: the default `safety.max_tilt`, where a bridge stops it."""
     speed: float = 0.30
     """Largest starting speed per axis [m/s]."""
     rate: float = 0.35
@@ -149,10 +153,11 @@ class StationKeeping(PoolTask):
                 RewardTerm("distance", "e", -r.distance / self.fit.size),
                 RewardTerm("heading", "wp.exp(-theta / p.reward.heading_scale)", r.heading),
                 RewardTerm("turn", "theta", -r.turn),
+                RewardTerm("leaning", leaning, -r.leaning),
                 RewardTerm("action", "action_effort", -r.action),
                 RewardTerm("change", "action_change", -r.change),
                 RewardTerm("rate", "turning", -r.rate),
             ),
-            ends=(End("left", "out_of_pool", -r.loss), End("capsized", capsized, -r.loss)),
+            ends=(End("left", "out_of_pool", -r.loss),),
             inside=within_tolerance,
         )

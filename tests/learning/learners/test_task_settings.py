@@ -24,7 +24,13 @@ def test_the_tasks_own_lines_outrank_the_others(monkeypatch):
 
 
 @pytest.mark.parametrize("randomized", [False, True])
-@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if "torchrl" in kind.module + kind.extra else ())
+        for name, kind in LEARNERS.items()
+    ],
+)  # importing torchrl starts a process
 def test_a_training_begins_with_its_tasks_settings(name, randomized):
     """And what the command says outranks them."""
     kind = learner_named(name)

@@ -48,8 +48,6 @@ class Side:
     """[N]"""
     samples: int
     rejected: int
-    per_table: tuple[float, ...]
-    """c of every table alone."""
 
 
 def fit_side(tables: Sequence[tuple[Array, Array]]) -> Side | None:
@@ -99,7 +97,6 @@ def fit_side(tables: Sequence[tuple[Array, Array]]) -> Side | None:
         rmse=float(np.sqrt(np.mean(error**2))),
         samples=int(np.count_nonzero(keep)),
         rejected=int(np.count_nonzero(~keep)),
-        per_table=per_table,
     )
 
 

@@ -41,7 +41,7 @@ from finssim.vehicles import VehicleError, catalogue_vehicle, load_vehicle
 from finssim.vehicles.part import did_you_mean
 from finssim.yaml_file import json_value
 
-__all__ = ["FORMATS", "import_trials", "print_folders", "read_trials"]
+__all__ = ["import_trials", "print_folders", "read_trials"]
 
 TABLES = (".csv", ".tsv", ".txt", ".dat", ".parquet", ".pq")
 TIME_NAMES = ("t", "time", "time_s", "time_secs", "timestamp", "stamp")

@@ -8,7 +8,7 @@ from finssim.calibration.errors import CalibrationError
 from finssim.calibration.trials.trial import column_of
 from finssim.vehicles.part import did_you_mean
 
-__all__ = ["EXTRA_COLUMNS", "GRAVITY", "TIME_UNITS", "UNITS", "factor"]
+__all__ = ["EXTRA_COLUMNS", "GRAVITY", "TIME_UNITS", "factor"]
 
 GRAVITY = 9.80665
 """Standard gravity, of the units g and kgf [m/s²]."""

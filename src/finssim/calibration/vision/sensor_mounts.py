@@ -26,15 +26,9 @@ from finssim.geometry.rotations import (
 )
 
 __all__ = [
-    "Attitude",
-    "DepthFit",
-    "Gyro",
-    "ImuMounting",
-    "fit_depth",
-    "fit_imu_mounting",
-    "imu_clock",
-    "rotation_between",
-]
+    "Attitude", "DepthFit", "Gyro", "ImuMounting", "SALT", "UNSURE_TURN", "fit_depth",
+    "fit_imu_mounting", "imu_clock", "rotation_between", "turn_pairs",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 

@@ -165,7 +165,7 @@ MOST = 10**9
 """Of anything that is counted."""
 SIGNED = ("log_std", "entropy")
 """Numbers that may be negative."""
-SHARES = ("discount", "gae_lambda", "smoothing")
+SHARES = ("discount", "gae_lambda", "smoothing", "taught")
 """Numbers from 0 to 1."""
 
 

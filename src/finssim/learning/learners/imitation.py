@@ -10,13 +10,13 @@ import torch
 from torch import nn
 
 from finssim.learning.demonstrations import Demonstrations, load
-from finssim.learning.learners.base import ActingLearner
+from finssim.learning.learners.base import ActingLearner, expert_in
 from finssim.learning.learners.catalogue import LearningError
 from finssim.learning.recurrent import stack
 from finssim.learning.served import age_episodes
 from finssim.learning.tensors import Tensors
 from finssim.tasks import Environment
-from finssim.tasks.agents import NOWHERE, Known, expert_for, memory_from, memory_leaves, restarted
+from finssim.tasks.agents import NOWHERE, Known, memory_from, memory_leaves, restarted
 
 __all__ = ["Bc", "Dagger", "demonstrations_for"]
 
@@ -179,8 +179,7 @@ class Dagger(_Cloner):
     ) -> None:
         """Find the expert and what it has shown already."""
         super().__init__(environment, settings, seed=seed, device=device)
-        body = environment.simulator.vehicles[0]
-        self._expert = expert_for(settings.expert, body, environment.task, environment.action_mode)
+        self._expert = expert_in(environment, settings.expert)
         rows = environment.worlds * environment.agents
         self._fresh = self._expert.reset(rows)
         self._memory = self._fresh

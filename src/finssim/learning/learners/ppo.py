@@ -8,6 +8,11 @@ agents of a world are rows of their own and share the networks.
     policy      minimise -E min(ρ A, clip(ρ, 1 ± ε) A) - c H,  ρ = π(a|x) / π_old(a|x)
     value       minimise E (V(x) - A - V_old(x))² / 2
 
+A teacher, where one is named, is imitated first: for a share of the steps its action at everything seen is what the
+policy learns (DAgger, Ross et al. 2011), while the value learns what that is worth:
+
+    policy      minimise E |μ(x) - a_teacher|² / 2
+
 Where time ends an episode, the value of its last observation follows; where the task ends it, nothing does.
 """
 
@@ -17,10 +22,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from finssim.learning.layers import Adam, Array, Arrays, Gru, Parameters, Row, Stack
-from finssim.learning.learners.base import ActingLearner
+from finssim.learning.learners.base import ActingLearner, expert_in
 from finssim.learning.network import Activation, Cell, Linear, Network, advance_history, with_integrals
 from finssim.learning.served import age_episodes
 from finssim.tasks import Environment
+from finssim.tasks.agents import NOWHERE, Known, memory_from, memory_leaves, restarted
 
 __all__ = ["Ppo", "PpoSettings"]
 
@@ -68,6 +74,10 @@ class PpoSettings:
     """Units of a GRU in front of the policy's hidden layers, which remembers what cannot be seen; 0: none."""
     asymmetric: bool = True
     """Whether the value sees what randomisation has drawn, which the policy does not."""
+    teacher: str = ""
+    """A baseline of the task by name, or a policy directory, that is imitated first; none if empty."""
+    taught: float = 0.2
+    """Share of the steps in which it is; in the first third of these it also acts."""
 
 
 class Ppo(ActingLearner):
@@ -129,6 +139,12 @@ class Ppo(ActingLearner):
         self._c = self._x if judged == inputs else A.empty(s.rollout + 1, self._rows, judged)
         """What the critic saw."""
         self._u, self._noise = A.empty(s.rollout, self._rows, m), A.empty(self._rows, m)
+        self._teacher = expert_in(environment, s.teacher) if s.teacher else None
+        self._fresh = self._teacher.reset(self._rows) if self._teacher else None
+        self._remembered = self._fresh
+        """What the teacher remembers."""
+        self._label = A.empty(s.rollout, self._rows, m) if self._teacher else None
+        """What the teacher would have done."""
         self._r, self._go, self._density = (A.empty(s.rollout, self._rows) for _ in range(3))
         """Rewards; 0 where an episode ended, else 1; logarithms of the actions' densities, but for what all share."""
 
@@ -163,6 +179,8 @@ class Ppo(ActingLearner):
             self._density[t] = -0.5 * (noise * noise).sum(1)
             A.xp.multiply(noise, sigma, out=action)
             action += self.actor(self._x[t] if h is None else h)
+            if self._taught:
+                self._ask(t)
             self._action[:] = action
             self._remember(x, action, h)
             self._integral[:] = integral
@@ -170,6 +188,19 @@ class Ppo(ActingLearner):
             self.tally.look()
             self._close(t)
         self._c[s.rollout] = self._look(self._integrated(self._observation)[0], self._drawn)[3]
+
+    @property
+    def _taught(self) -> bool:
+        """Whether the teacher is imitated in this update."""
+        return self._teacher is not None and 1.0 - self.left < self.settings.taught
+
+    def _ask(self, t: int) -> None:
+        """Note what the teacher would do at step t, and at first do it."""
+        known = Known(self.arrays.numpy(self._observation))
+        answer, self._remembered = self._teacher.act(self._remembered, known, NOWHERE)  # type: ignore[union-attr]
+        label = self._label[t] = self.arrays.array(answer)  # type: ignore[index]
+        if 1.0 - self.left < self.settings.taught / 3.0:
+            self._u[t] = label
 
     def _integrated(self, observation: Array) -> tuple[Array, Array]:
         """The observation with the errors' integrals in it, and these after the step."""
@@ -209,6 +240,9 @@ class Ppo(ActingLearner):
         value = self.critic(self._look(self._integrated(self._final)[0], self._final_drawn)[3])[:, 0]
         self._r[t] += self.settings.discount * A.xp.where(late, value, 0.0 * value)
         self._go[t] = A.xp.where(done, 0.0 * value, 0.0 * value + 1.0)
+        if self._taught:
+            ended = A.numpy(done)
+            self._remembered = restarted(self._remembered, self._fresh, ended)
         self._memory *= self._go[t][:, None]
         self._integral *= self._go[t][:, None]
 
@@ -229,7 +263,8 @@ class Ppo(ActingLearner):
     def _learn(self, advantage: Array, target: Array, before: Array, rate: float) -> dict[str, float]:
         """Gradient steps on samples in random order; of a policy with a GRU, on whole rows in random order."""
         A, s, T = self.arrays, self.settings, self.settings.rollout
-        samples = [x[:T] for x in (self._x, self._c, self._u, advantage, target, self._density)]
+        shown = self._label if self._taught else self._u
+        samples = [x[:T] for x in (self._x, self._c, shown, advantage, target, self._density)]
         if self.gru is None:
             samples = [x.reshape(T * self._rows, *x.shape[2:]) for x in samples]
         n, size = (self._rows, max(1, s.batch // T)) if self.gru else (T * self._rows, s.batch)
@@ -249,7 +284,10 @@ class Ppo(ActingLearner):
                     c, u, a, v, density = (
                         part.reshape(-1, *part.shape[2:]) for part in (c, u, a, v, density)
                     )
-                losses[:3] += self._improve_policy(y, u, a, density - log_std.sum(), rate)
+                if self._taught:
+                    losses[0] += self._imitate(y, u, rate)
+                else:
+                    losses[:3] += self._improve_policy(y, u, a, density - log_std.sum(), rate)
                 losses[3] += self._improve_value(c, v, rate)
         means = A.numpy(losses / float(s.epochs * (len(edges) - 1))).tolist()
         names = ("policy_gradient_loss", "approx_kl", "clip_fraction", "value_loss")
@@ -279,16 +317,28 @@ class Ppo(ActingLearner):
         free = xp.where(advantage >= 0.0, ratio < 1.0 + s.clip, ratio > 1.0 - s.clip)
         slope = (ratio * advantage * free / -float(len(u)))[:, None]  # of the loss, by log π
         self.noise.gradient[:] = (slope * (z * z - 1.0)).sum(0) - s.entropy_weight
-        slope = self.actor.backward(slope * z * inverse, inputs=self.gru is not None)
-        if self.gru:
-            self.gru.backward(slope.reshape(s.rollout, -1, s.memory))
-        self._optimizers[0].step(rate)
+        self._step_policy(slope * z * inverse, rate)
         limited = xp.where(free, ratio, xp.clip(ratio, 1.0 - s.clip, 1.0 + s.clip))
         numbers = self.arrays.empty(3)
         numbers[0] = -(limited * advantage).mean()
         numbers[1] = (ratio - 1.0 - log_ratio).mean()
         numbers[2] = xp.where(free, 0.0 * ratio, 0.0 * ratio + 1.0).mean()
         return numbers
+
+    def _step_policy(self, slope: Array, rate: float) -> None:
+        """One step of the policy's optimiser, from the loss's slope by the actor's answers, (N, m)."""
+        s = self.settings
+        slope = self.actor.backward(slope, inputs=self.gru is not None)
+        if self.gru:
+            self.gru.backward(slope.reshape(s.rollout, -1, s.memory))
+        self._optimizers[0].step(rate)
+
+    def _imitate(self, mean: Array, label: Array, rate: float) -> Array:
+        """One gradient step towards the teacher's actions, (N, m); the loss."""
+        error = mean - label
+        self.noise.gradient[:] = 0.0
+        self._step_policy(error / float(len(error)), rate)
+        return 0.5 * (error * error).sum(1).mean()
 
     def _improve_value(self, judged: Array, target: Array, rate: float) -> Array:
         """One gradient step; the loss."""
@@ -357,6 +407,7 @@ class Ppo(ActingLearner):
     def learned(self) -> dict[str, Any]:
         """Networks, optimisers, scales, memories and random streams."""
         return {
+            "teacher": memory_leaves(self._remembered) if self._teacher else None,
             "numbers": {name: self.arrays.numpy(array) for name, array in self._numbers().items()},
             "counts": [self._seen, *(optimizer.count for optimizer in self._optimizers)],
             "streams": self.arrays.state(),
@@ -369,4 +420,6 @@ class Ppo(ActingLearner):
         self._seen, *counts = (int(count) for count in state["counts"])
         for optimizer, count in zip(self._optimizers, counts, strict=True):
             optimizer.count = count
+        if self._teacher:
+            self._remembered = memory_from(state["teacher"], self._fresh)
         self.arrays.load(state["streams"])

@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter
-from scipy.special import ndtr
 
 from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Detection, most_certain
@@ -116,6 +114,8 @@ def _inverse(columns: Array) -> Array:
 
 def _weights(places: Array, outside: int, cells: int, blur: float) -> tuple[Array, Array, Array]:
     """Share of every cell in the gray at the places along one axis, and its derivatives by place and blur."""
+    from scipy.special import ndtr  # here and below: who is sent corners starts without them
+
     edges = np.arange(-outside - 3, cells - outside + 4)
     z = (places[:, None] - edges) / blur
     bell = np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
@@ -285,6 +285,8 @@ def _patch(image: Gray, corners: Array, cell: float, smooth: float) -> tuple[Arr
     x, y = low.astype(int)
     patch = image[y : high[1], x : high[0]].astype(np.float64)
     if smooth > 0.0:
+        from scipy.ndimage import gaussian_filter
+
         patch = gaussian_filter(patch, np.sqrt(smooth), mode="nearest", truncate=3.0)
     return patch, low
 

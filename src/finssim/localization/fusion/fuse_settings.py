@@ -8,7 +8,6 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtri
 
 from finssim.localization import LocalizationError
 from finssim.localization.fusion.attitude import YawNoise
@@ -23,6 +22,8 @@ Array = npt.NDArray[np.float64]
 
 @lru_cache(maxsize=64)
 def _quantile(dimension: int, probability: float) -> float:
+    from scipy.special import chdtri
+
     return float(chdtri(dimension, 1.0 - probability))
 
 
