@@ -31,9 +31,9 @@ from finssim.calibration.importers.assemble import (
     split_table,
     trial_of,
 )
+from finssim.calibration.trials.conversion import TIME_UNITS, factor
 from finssim.calibration.trials.trial import Array, Trial, column_of
 from finssim.calibration.trials.trial_files import Table, read_table
-from finssim.calibration.trials.units import TIME_UNITS, factor
 from finssim.files import plain_name
 from finssim.mcap_metadata import mcap_metadata
 from finssim.mcap_repair import whole_mcap

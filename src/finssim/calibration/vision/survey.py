@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from finssim.calibration.errors import CalibrationError
 from finssim.calibration.findings import Finding, finding
-from finssim.calibration.trials.units import UNITS
+from finssim.calibration.trials.conversion import UNITS
 from finssim.geometry.rotations import quat_from_euler, quat_rotate
 from finssim.localization import LocalizationError
 from finssim.localization.camera_file import Fields
