@@ -132,7 +132,11 @@ class StationKeeping(PoolTask):
     """... for this long [s]."""
     reward: Reward = field(default_factory=Reward)
     training_noise: MeasurementNoise = MeasurementNoise(
-        position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02, delay=0.1,
+        position_std=0.01,
+        yaw_std=math.radians(1.0),
+        velocity_std=0.02,
+        rate_std=0.02,
+        delay=0.1,
         graded=True,
     )
     """Up to twice what an estimate is off by, and as late: with exact states alone, gains are learnt that chatter; with
