@@ -66,7 +66,8 @@ def train(
             pursuit, team-pursuit or formation; or one's own, FILE.py:CLASS.
         out: Directory of the policy; an earlier policy there is replaced when done.
         learner (NAME): Who learns: ppo (FinsSim's own), sb3-ppo, sb3-sac, sb3-recurrent-ppo or rsl-rl; one agent also
-            torchrl-ppo, several torchrl-ippo or torchrl-mappo; from demonstrations bc, dagger or gail.
+            torchrl-ppo, several torchrl-ippo or torchrl-mappo; from demonstrations bc, dagger or gail; or one's own,
+            FILE.py:CLASS.
         vehicle (NAME|FILE): Vehicle of the catalogue, or the path of a vehicle file.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
         action (MODE): What the policy commands: wrench6, wrench4 or thruster8; the task's own if not given.
@@ -80,7 +81,7 @@ def train(
         until (SHARE): Share of successes, such as 0.95, at which the training is done before its steps are: of the held
             episodes, in two evaluations one after the other.
         init (NAME|DIR): Whom the policy imitates before it learns by itself: a baseline of the task, such as pid, a
-            policy directory, or none; team-pursuit has its baseline if not given. Of ppo; --set taught=SHARE says for
+            policy directory, or none; team-pursuit and formation have their baselines if not given. Of ppo; --set taught=SHARE says for
             how much of the training.
         settings (NAME=VALUE): Change of a setting of the learner, such as learning_rate=1e-3 or hidden=128,128. May be
             given several times.

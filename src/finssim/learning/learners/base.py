@@ -74,7 +74,7 @@ SETTINGS: Table = {
     "formation": {
         "on-policy": {**CHASE["on-policy"], "learning_rate": 2.5e-3, "steps": 1_800_000},
         "rsl-rl": CHASE["rsl-rl"],
-        "ppo": {"discount": 0.99, "learning_rate": 2.0e-3, "steps": 1_500_000},
+        "ppo": {"discount": 0.99, "learning_rate": 2.0e-3, "steps": 1_500_000, "teacher": "consensus"},
     },
 }
 """Of every training."""
