@@ -57,7 +57,7 @@ SETTINGS: Table = {
     # So is a target that moves, once it has been reached.
     "t3": {"on-policy": {"discount": 0.95}, "ppo": {"steps": 600_000}},
     "docking": {"ppo": {"steps": 900_000}},
-    "pursuit": CHASE,
+    "pursuit": {**CHASE, "ppo": {**CHASE["ppo"], "teacher": "lead"}},
     # With 1.5 million, half of the seeds have only begun to capture.
     "team-pursuit": {
         "on-policy": {**CHASE["on-policy"], "steps": 3_600_000},
